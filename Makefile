@@ -1,0 +1,38 @@
+# Everything runs in the project's own virtual environment; the only needs are Python 3.11 and make.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DATA := $(or $(BIRDSLAM_DATA),../shared/data)
+MODELS := $(or $(BIRDSLAM_MODELS),../shared/models)
+
+.PHONY: setup test test-slow lint demo clean
+
+setup: $(VENV)/.ready
+
+$(VENV)/.ready: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "birdslam needs Python 3.11 or newer; set PYTHON=..."; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { echo "python3-venv is missing: apt-get install python3-venv"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+test: setup
+	$(BIN)/python -m pytest -m 'not slow'
+
+test-slow: setup
+	$(BIN)/python -m pytest -m slow
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# The built-in drive does not exist yet; the demo is the main job on a real sequence.
+demo: setup
+	@test -d $(DATA)/kitti_odometry/sequences/00 || { echo "make demo needs KITTI odometry 00 in $(DATA)/kitti_odometry/sequences/00 (set BIRDSLAM_DATA)"; exit 1; }
+	@test -f $(MODELS)/yolox_nano_416.onnx && test -f $(MODELS)/twinlitenet_640x360.onnx || { echo "make demo needs yolox_nano_416.onnx and twinlitenet_640x360.onnx in $(MODELS) (set BIRDSLAM_MODELS)"; exit 1; }
+	$(BIN)/birdslam run --source kitti:$(DATA)/kitti_odometry/sequences/00 --model detector=$(MODELS)/yolox_nano_416.onnx \
+		--model segmenter=$(MODELS)/twinlitenet_640x360.onnx --output out/00
+
+clean:
+	rm -rf $(VENV) out build *.egg-info

@@ -1,0 +1,115 @@
+"""The camera: intrinsics, lens distortion, and where it stands over the road."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+# Camera axes (x right, y down, z forward) to REP-103 axes (x forward, y left, z up).
+AXES_EGO_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+
+
+class GroundPlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The road under the camera: `height_m` above it, nose down by `pitch_rad`, right side down by `roll_rad`."""
+
+    height_m: Positive
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
+
+    @property
+    def R_ego_cam(self) -> NDArray[np.float64]:
+        """(3, 3): turns vectors of the camera into ego."""
+        cp, sp = math.cos(self.pitch_rad), math.sin(self.pitch_rad)
+        cr, sr = math.cos(self.roll_rad), math.sin(self.roll_rad)
+        Ry = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+        Rx = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+        out: NDArray[np.float64] = Ry @ Rx @ AXES_EGO_CAM
+        return out
+
+    @property
+    def normal_cam(self) -> NDArray[np.float64]:
+        """(3,): the road's unit normal in camera axes, up; [0, -1, 0] on level ground as in Eq. 1."""
+        return self.R_ego_cam[2]
+
+
+class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A pinhole camera over a road, as a camera file (TOML) states it.
+
+    `distortion` holds OpenCV's coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty for an undistorted image.
+    Raises ValueError (on decoding: msgspec.ValidationError) where the numbers can't be a camera's.
+    """
+
+    width_px: Annotated[int, msgspec.Meta(ge=16, le=16384)]
+    height_px: Annotated[int, msgspec.Meta(ge=16, le=16384)]
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: float
+    cy_px: float
+    height_m: Positive
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.height_m, self.pitch_rad, self.roll_rad)
+        if not all(math.isfinite(n) for n in (*numbers, *self.distortion)):
+            raise ValueError("camera: every number must be finite")
+        if not (0.0 < self.cx_px < self.width_px and 0.0 < self.cy_px < self.height_px):
+            raise ValueError(
+                f"camera: the principal point ({self.cx_px}, {self.cy_px}) lies outside the "
+                f"{self.width_px}x{self.height_px} image"
+            )
+        if not 0.2 < self.fx_px / self.width_px < 10.0 or not 0.5 < self.fx_px / self.fy_px < 2.0:
+            raise ValueError(f"camera: focal lengths {self.fx_px}, {self.fy_px} px do not fit a {self.width_px} px image")
+        if not 0.2 < self.height_m < 5.0:
+            raise ValueError(f"camera: height_m = {self.height_m} is no height of a camera over the road (0.2 to 5 m)")
+        if abs(self.pitch_rad) > 0.5 or abs(self.roll_rad) > 0.5:
+            raise ValueError("camera: pitch_rad and roll_rad must lie within 0.5 rad")
+        if len(self.distortion) not in (0, 4, 5, 8):
+            raise ValueError(f"camera: distortion needs 0, 4, 5 or 8 coefficients, got {len(self.distortion)}")
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """(3, 3) intrinsic matrix in pixels."""
+        return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
+
+    @property
+    def ground(self) -> GroundPlane:
+        """The calibrated ground plane: what the online estimate starts from."""
+        return GroundPlane(self.height_m, self.pitch_rad, self.roll_rad)
+
+
+class Undistorter:
+    """Takes the lens distortion out of images of one camera; the maps are made once."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        self._maps: tuple[NDArray[np.int16], NDArray[np.uint16]] | None = None
+        if camera.distortion:
+            self._maps = cv2.initUndistortRectifyMap(  # type: ignore[assignment]
+                camera.K,
+                np.array(camera.distortion),
+                np.eye(3),
+                camera.K,
+                (camera.width_px, camera.height_px),
+                cv2.CV_16SC2,
+            )
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The undistorted image, with the same K. Raises ValueError where the size is not the camera's."""
+        height_px, width_px = image.shape[:2]
+        if (width_px, height_px) != (self.camera.width_px, self.camera.height_px):
+            raise ValueError(
+                f"image of {width_px}x{height_px} does not fit the camera of "
+                f"{self.camera.width_px}x{self.camera.height_px}"
+            )
+        if self._maps is None:
+            return image
+        return cv2.remap(image, *self._maps, cv2.INTER_LINEAR)  # type: ignore[return-value]

@@ -1,0 +1,279 @@
+"""Every record that passes between the parts of BirdSLAM, with its frames and units.
+
+Frames (all REP-103: x forward, y left, z up, yaw counter-clockwise, pitch > 0 is nose down):
+
+| frame   | what                                                                                         |
+|---------|----------------------------------------------------------------------------------------------|
+| world   | the ego pose at the first frame of an `epoch`; the road there is its plane                     |
+| ego     | the camera's foot on the road, x along the optical axis laid on the road                      |
+| vehicle | the centre of a vehicle's footprint, x towards its front                                     |
+| camera  | x right, y down, z forward (only inside birdslam/, and in the columns of KITTI files)        |
+
+Units end the names: `_m _rad _px _ns _mps`. `T_a_b` takes points of b to a. A covariance is row-major, of the tangent
+(x_m, y_m, yaw_rad) at the pose: nine numbers for a pose, four for a point or a velocity.
+
+Time comes in with the data: `t_source_ns` is the recording's or the camera's own clock (what motion is computed from),
+`t_capture_ns` is CLOCK_MONOTONIC when the frame was captured on this computer (what ages are measured from),
+`t_utc_ns` is UTC beside it.
+
+Versions: a field may be appended with a default; a changed meaning is a new version in the topic's key. The records are
+validated on decoding: a number that is not finite, a negative variance or a wrong type is msgspec.ValidationError.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from typing import Annotated
+
+import msgspec
+
+from birdslam.se2 import SE2
+
+Cov3 = Annotated[tuple[float, ...], msgspec.Meta(min_length=9, max_length=9)]
+Cov2 = Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)]
+FrameId = Annotated[int, msgspec.Meta(ge=0)]
+BodyId = Annotated[int, msgspec.Meta(ge=0)]
+
+
+class Status(enum.StrEnum):
+    """Expected trouble, carried in the record; `INVALIDATING` says which make an estimate invalid."""
+
+    END_OF_SOURCE = "end_of_source"  # the source has no further frame; the last record of a run
+    FRAME_UNREADABLE = "frame_unreadable"  # the image was torn or missing: no pixels for this frame
+    FRAMES_DROPPED = "frames_dropped"  # frames between this one and the last never reached perceive
+    CAMERA_FROZEN = "camera_frozen"  # the image is bit for bit the one before
+    CAMERA_DARK = "camera_dark"  # too little contrast to see by
+    LOW_TEXTURE = "low_texture"  # too few feature tracks for a motion
+    ODOMETRY_COASTING = "odometry_coasting"  # the motion is predicted from the one before, not measured
+    SCALE_CARRIED = "scale_carried"  # no road seen: the metric scale is an older one
+    SCALE_INVALID = "scale_invalid"  # the metric scale has been carried for too long to trust
+    STANDSTILL = "standstill"  # the car stands: the pose is held
+    GROUND_VIOLATED = "ground_violated"  # the road does not fit the ground plane
+    CALIBRATION_DRIFT = "calibration_drift"  # the estimated pitch or height left the calibrated one
+    DETECTIONS_CARRIED = "detections_carried"  # the detector did not run on this frame
+    SEGMENTATION_CARRIED = "segmentation_carried"  # the segmenter did not run on this frame
+    NETWORK_FAILED = "network_failed"  # a network gave no usable numbers on this frame
+    INPUT_STALE = "input_stale"  # the record in front of this one came later than it should
+    GRAPH_RESET = "graph_reset"  # the optimizer began a new epoch on this frame
+    NOT_INITIALISED = "not_initialised"  # no motion has been measured yet
+
+
+INVALIDATING = frozenset(
+    {
+        Status.END_OF_SOURCE,
+        Status.FRAME_UNREADABLE,
+        Status.CAMERA_FROZEN,
+        Status.CAMERA_DARK,
+        Status.SCALE_INVALID,
+        Status.NOT_INITIALISED,
+    }
+)
+
+
+def _check_finite(record: msgspec.Struct, *fields: str) -> None:
+    for name in fields:
+        value = getattr(record, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if not math.isfinite(number):
+                raise ValueError(f"{type(record).__name__}.{name} needs finite numbers, got {number}")
+
+
+def _check_cov(record: msgspec.Struct, *fields: str) -> None:
+    _check_finite(record, *fields)
+    for name in fields:
+        cov = getattr(record, name)
+        n = math.isqrt(len(cov))
+        if any(cov[i * n + i] < 0.0 for i in range(n)):
+            raise ValueError(f"{type(record).__name__}.{name} has a negative variance")
+
+
+class FrameRef(msgspec.Struct, frozen=True, kw_only=True):
+    """capture -> perceive: where the pixels of a frame lie in the shared-memory ring.
+
+    Without pixels (`slot` = -1) it only reports: an unreadable image, or the end of the source.
+    """
+
+    frame_id: FrameId
+    t_source_ns: int
+    t_capture_ns: int
+    t_utc_ns: int
+    slot: int = -1
+    sequence: int = 0  # the slot's sequence number when the frame was written (see runtime/frames.py)
+    ring_epoch: int = 0  # which incarnation of the ring
+    width_px: int = 0
+    height_px: int = 0
+    channels: int = 0  # 1 grey, 3 BGR
+    dropped: int = 0  # frames that capture itself had to drop since the start
+    status: tuple[Status, ...] = ()
+
+
+class EgoEdge(msgspec.Struct, frozen=True, kw_only=True):
+    """CC: the ego's motion between two frames (camera-camera edge, Eq. 2)."""
+
+    from_frame: FrameId
+    to_frame: FrameId
+    T_from_to: SE2
+    cov: Cov3
+
+    def __post_init__(self) -> None:
+        _check_cov(self, "cov")
+
+
+class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True):
+    """CV: a vehicle seen from the ego in one frame (camera-vehicle edge, Eq. 2).
+
+    `T_ego_vehicle` is the centre of the footprint; where only the nearest face was seen, it is that face moved back by
+    half of `length_m` along the heading. `box_px` = (x1, y1, x2, y2) of the undistorted image.
+    """
+
+    vehicle: BodyId
+    frame: FrameId
+    T_ego_vehicle: SE2
+    cov: Cov3
+    label: str = "car"
+    score: float = 1.0
+    box_px: Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)] = (0.0, 0.0, 0.0, 0.0)
+    length_m: float = 4.0
+    width_m: float = 1.7
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "score", "box_px", "length_m", "width_m")
+        _check_cov(self, "cov")
+
+
+class MotionEdge(msgspec.Struct, frozen=True, kw_only=True):
+    """VV: a vehicle's own motion between two frames as the tracker predicts it (vehicle-vehicle edge, Eq. 2)."""
+
+    vehicle: BodyId
+    from_frame: FrameId
+    to_frame: FrameId
+    T_from_to: SE2
+    cov: Cov3
+
+    def __post_init__(self) -> None:
+        _check_cov(self, "cov")
+
+
+class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+    """CP: a static point of the road seen from the ego (camera-point edge, Eq. 3), back-projected by Eq. 1."""
+
+    landmark: BodyId
+    frame: FrameId
+    x_m: float  # in ego
+    y_m: float
+    cov: Cov2
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "x_m", "y_m")
+        _check_cov(self, "cov")
+
+
+class LanePoint(msgspec.Struct, frozen=True, array_like=True):
+    """A point of a lane line on the road, in ego; it has no identity and only feeds the map."""
+
+    x_m: float
+    y_m: float
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "x_m", "y_m")
+
+
+class Attitude(msgspec.Struct, frozen=True, kw_only=True):
+    """What SE(2) leaves out: the ego's height and tilt in the world, integrated from image odometry.
+
+    It is no part of the graph; trajectories are written in 6-DoF with it (a graded road, the camera's vibration).
+    """
+
+    z_m: float = 0.0
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "z_m", "pitch_rad", "roll_rad")
+
+
+class Ground(msgspec.Struct, frozen=True, kw_only=True):
+    """The camera over the road in this frame, as the front end estimates it (camera.GroundPlane on the wire)."""
+
+    height_m: float
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "height_m", "pitch_rad", "roll_rad")
+
+
+class Measurements(msgspec.Struct, frozen=True, kw_only=True):
+    """perceive -> optimize: all that the front end has to say about one frame. Its log replays the back end alone."""
+
+    frame_id: FrameId
+    t_source_ns: int
+    t_capture_ns: int
+    t_utc_ns: int
+    cc: EgoEdge | None = None  # None: no motion to an earlier frame is known; the graph begins a new epoch
+    cv: tuple[VehicleEdge, ...] = ()
+    vv: tuple[MotionEdge, ...] = ()
+    cp: tuple[LandmarkEdge, ...] = ()
+    lanes: tuple[LanePoint, ...] = ()
+    attitude: Attitude = Attitude()
+    ground: Ground | None = None
+    scale_sigma_rel: float = 0.0  # 1-sigma of the metric scale as a fraction
+    ages: dict[str, int] = {}  # frames since each network's result in use was computed; 0 is this frame
+    status: tuple[Status, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "scale_sigma_rel")
+
+
+class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True):
+    """One vehicle in an `Estimate`: pose and velocity over the ground, in world."""
+
+    vehicle: BodyId
+    T_world_vehicle: SE2
+    cov: Cov3
+    velocity_mps: Annotated[tuple[float, ...], msgspec.Meta(min_length=2, max_length=2)]  # (x, y) in world
+    velocity_cov: Cov2
+    age_ns: int  # source time since it was last seen; 0: seen in this frame
+    frames: int  # how many frames it has been seen in
+    label: str = "car"
+    length_m: float = 4.0
+    width_m: float = 1.7
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "velocity_mps", "length_m", "width_m")
+        _check_cov(self, "cov", "velocity_cov")
+
+
+class Estimate(msgspec.Struct, frozen=True, kw_only=True):
+    """optimize -> planners, one for each frame: where the ego and every other vehicle are.
+
+    A raised `epoch` says that the world frame began anew: poses of different epochs must not be compared.
+    """
+
+    epoch: int
+    frame_id: FrameId
+    t_source_ns: int
+    t_capture_ns: int
+    t_utc_ns: int
+    T_world_ego: SE2
+    cov: Cov3
+    valid: bool
+    vehicles: tuple[VehicleEstimate, ...] = ()
+    attitude: Attitude = Attitude()
+    ground: Ground | None = None
+    scale_sigma_rel: float = 0.0
+    status: tuple[Status, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "scale_sigma_rel")
+        _check_cov(self, "cov")
+
+
+class MapUpdate(msgspec.Struct, frozen=True, kw_only=True):
+    """optimize -> planners: what the map gained with one frame, in world of `epoch`."""
+
+    epoch: int
+    frame_id: FrameId
+    landmarks_m: tuple[tuple[float, float], ...] = ()  # road points that left the window, settled
+    lanes_m: tuple[tuple[float, float], ...] = ()  # points of lane lines
