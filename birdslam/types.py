@@ -24,9 +24,12 @@ from __future__ import annotations
 
 import enum
 import math
+from dataclasses import dataclass
 from typing import Annotated
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from birdslam.se2 import SE2
 
@@ -86,6 +89,21 @@ def _check_cov(record: msgspec.Struct, *fields: str) -> None:
         n = math.isqrt(len(cov))
         if any(cov[i * n + i] < 0.0 for i in range(n)):
             raise ValueError(f"{type(record).__name__}.{name} has a negative variance")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One undistorted image inside a process; on the bus a `FrameRef` stands for it.
+
+    `image` is (H, W) grey or (H, W, 3) BGR, uint8; None where the frame reports only its status.
+    """
+
+    frame_id: int
+    t_source_ns: int
+    t_capture_ns: int
+    t_utc_ns: int
+    image: NDArray[np.uint8] | None
+    status: tuple[Status, ...] = ()
 
 
 class FrameRef(msgspec.Struct, frozen=True, kw_only=True):
