@@ -67,7 +67,9 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 f"{self.width_px}x{self.height_px} image"
             )
         if not 0.2 < self.fx_px / self.width_px < 10.0 or not 0.5 < self.fx_px / self.fy_px < 2.0:
-            raise ValueError(f"camera: focal lengths {self.fx_px}, {self.fy_px} px do not fit a {self.width_px} px image")
+            raise ValueError(
+                f"camera: focal lengths {self.fx_px}, {self.fy_px} px do not fit a {self.width_px} px image"
+            )
         if not 0.2 < self.height_m < 5.0:
             raise ValueError(f"camera: height_m = {self.height_m} is no height of a camera over the road (0.2 to 5 m)")
         if abs(self.pitch_rad) > 0.5 or abs(self.roll_rad) > 0.5:

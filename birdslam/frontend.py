@@ -1,0 +1,225 @@
+"""The front end, from one image and what the networks say of it to the edges of the pose graph (paper, Fig. 2)."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam import bev
+from birdslam.camera import Camera, GroundPlane
+from birdslam.localisation import LocalisationConfig, localise
+from birdslam.odometry import Motion, Odometry, OdometryConfig
+from birdslam.perception import Perception, Segmentation
+from birdslam.se2 import SE2
+from birdslam.tracking import Track, Tracker, TrackingConfig
+from birdslam.types import (
+    Attitude,
+    EgoEdge,
+    Frame,
+    Ground,
+    LandmarkEdge,
+    LanePoint,
+    Measurements,
+    Status,
+    VehicleEdge,
+)
+
+
+class StaticMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which points of the road become landmarks and lane points."""
+
+    max_landmarks: int = 40
+    landmark_range_m: float = 20.0  # the paper's depth threshold T
+    sigma_landmark_px: float = 1.0
+    sigma_height_rel: float = 0.02
+    max_lane_points: int = 64
+    lane_range_m: float = 20.0
+    lane_cell_m: float = 0.5  # one point for each cell
+    attitude_memory_m: float = 1000.0  # roads are level on average: tilt is forgotten over this distance
+
+
+class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    odometry: OdometryConfig = OdometryConfig()
+    localisation: LocalisationConfig = LocalisationConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    static_map: StaticMapConfig = StaticMapConfig()
+
+
+class Pending(Protocol):
+    """What the networks are still at work on; `perception.Networks.start` returns one."""
+
+    def result(self) -> Perception: ...
+
+
+class FrontEnd:
+    """step(): one frame in, its `Measurements` out. Deterministic; owns no thread."""
+
+    def __init__(self, camera: Camera, config: FrontEndConfig) -> None:
+        self.camera = camera
+        self.config = config
+        self.odometry = Odometry(camera, config.odometry)
+        self.tracker = Tracker(camera, config.tracking)
+        self._attitude = _AttitudeIntegrator(camera, config.static_map.attitude_memory_m)
+        self._T_world_ego = SE2()  # dead reckoning, for the tracker
+        self._last_frame: int | None = None
+
+    def step(self, frame: Frame, pending: Pending) -> Measurements:
+        """`pending` is waited for after the feature tracking, which runs beside the networks."""
+        status = [*frame.status, *self._dropped(frame)]
+        if frame.image is None:
+            return _measurements(frame, status, attitude=self._attitude.attitude)
+
+        # Ego motion and static map initialisation
+        tracks = self.odometry.track(frame.image)
+        perception = pending.result()
+        detections, segmentation = perception.detections, perception.segmentation
+        boxes_px = np.zeros((0, 4)) if detections is None else detections.boxes_px
+        road = None if segmentation is None else segmentation.road
+        motion = self.odometry.estimate(tracks, frame.frame_id, frame.t_source_ns, boxes_px, road)
+        cc = None if motion is None else self._advance(motion)
+        ground = self.camera.ground if motion is None else motion.ground
+        sigma_pitch_rad = self.config.odometry.sigma_pitch_start_rad if motion is None else motion.pitch_sigma_rad
+
+        # Dynamic object localisation: only what the detector saw in this very frame
+        observations = []
+        if detections is not None and perception.ages.get("detector", 0) == 0:
+            observations = localise(
+                boxes_px,
+                detections.scores,
+                detections.labels,
+                self.camera,
+                ground,
+                sigma_pitch_rad,
+                self.config.localisation,
+            )
+        seen = self.tracker.step(observations, self._T_world_ego, ground, frame.frame_id, frame.t_source_ns)
+
+        return _measurements(
+            frame,
+            [*status, *perception.status, *(motion.status if motion else (Status.NOT_INITIALISED,))],
+            cc=cc,
+            cv=tuple(self._vehicle_edge(track) for track in seen),
+            vv=tuple(track.motion for track in seen if track.motion is not None),
+            cp=self._landmarks(frame.frame_id, ground, sigma_pitch_rad),
+            lanes=self._lanes(segmentation, perception.ages.get("segmenter", 0), boxes_px, ground),
+            attitude=self._attitude.attitude,
+            ground=Ground(height_m=ground.height_m, pitch_rad=ground.pitch_rad, roll_rad=ground.roll_rad),
+            scale_sigma_rel=0.0 if motion is None else motion.scale_sigma_rel,
+            ages=dict(perception.ages),
+        )
+
+    def _dropped(self, frame: Frame) -> tuple[Status, ...]:
+        gap = self._last_frame is not None and frame.frame_id > self._last_frame + 1
+        self._last_frame = frame.frame_id
+        return (Status.FRAMES_DROPPED,) if gap else ()
+
+    def _advance(self, motion: Motion) -> EgoEdge:
+        self._T_world_ego = self._T_world_ego @ motion.T_prev_curr
+        self._attitude.advance(motion)
+        return EgoEdge(
+            from_frame=motion.from_frame,
+            to_frame=motion.to_frame,
+            T_from_to=motion.T_prev_curr,
+            cov=tuple(np.ravel(motion.cov).tolist()),
+        )
+
+    def _vehicle_edge(self, track: Track) -> VehicleEdge:
+        seen, tracking = track.observation, self.config.tracking
+        yaw_rad = track.T_world_ego.between(track.pose()).yaw_rad
+        cov = np.zeros((3, 3))
+        cov[:2, :2] = seen.cov
+        cov[2, 2] = (tracking.sigma_yaw_moving_rad if track.yaw_known else tracking.sigma_yaw_unknown_rad) ** 2
+        return VehicleEdge(
+            vehicle=track.vehicle,
+            frame=track.seen_frame,
+            T_ego_vehicle=SE2(float(seen.centre_m[0]), float(seen.centre_m[1]), yaw_rad),
+            cov=tuple(cov.ravel().tolist()),
+            label=track.label,
+            score=seen.score,
+            box_px=seen.box_px,
+            length_m=seen.dimensions.length_m,
+            width_m=seen.dimensions.width_m,
+        )
+
+    def _landmarks(self, frame_id: int, ground: GroundPlane, sigma_pitch_rad: float) -> tuple[LandmarkEdge, ...]:
+        """CP: feature tracks on the road, the nearest first, back-projected by Eq. 1."""
+        config = self.config.static_map
+        ids, px = self.odometry.road_tracks
+        points = bev.pixel_to_ego(self.camera, ground, px)
+        with np.errstate(invalid="ignore"):
+            near = np.flatnonzero(points[:, 0] < config.landmark_range_m)
+        near = near[np.argsort(points[near, 0], kind="stable")][: config.max_landmarks]
+        covs = bev.road_point_cov(
+            self.camera, ground, px[near], config.sigma_landmark_px, sigma_pitch_rad, config.sigma_height_rel
+        )
+        return tuple(
+            LandmarkEdge(int(ids[i]), frame_id, float(points[i, 0]), float(points[i, 1]), tuple(cov.ravel().tolist()))
+            for i, cov in zip(near, covs, strict=True)
+            if np.isfinite(cov).all()
+        )
+
+    def _lanes(
+        self, segmentation: Segmentation | None, age: int, boxes_px: NDArray[np.float64], ground: GroundPlane
+    ) -> tuple[LanePoint, ...]:
+        """Lane line pixels of this frame in bird's-eye view, one for each cell, none under a vehicle's box."""
+        if segmentation is None or age > 0:
+            return ()
+        config = self.config.static_map
+        lane = segmentation.lane.copy()
+        for x1, y1, x2, y2 in boxes_px:
+            lane[max(0, math.floor(y1)) : math.ceil(y2), max(0, math.floor(x1)) : math.ceil(x2)] = False
+        rows, columns = np.nonzero(lane)
+        points = bev.pixel_to_ego(self.camera, ground, np.column_stack([columns, rows]).astype(np.float64))
+        with np.errstate(invalid="ignore"):
+            points = points[points[:, 0] < config.lane_range_m]
+        _, first = np.unique(np.floor(points / config.lane_cell_m).astype(np.int64), axis=0, return_index=True)
+        first = first[np.argsort(points[first, 0], kind="stable")][: config.max_lane_points]
+        return tuple(LanePoint(float(x), float(y)) for x, y in points[first])
+
+
+class _AttitudeIntegrator:
+    """Height and tilt of the ego in the world, by chaining the camera's full motion (types.Attitude)."""
+
+    def __init__(self, camera: Camera, memory_m: float) -> None:
+        self._T_ego_cam = np.eye(4)
+        self._T_ego_cam[:3, :3] = camera.ground.R_ego_cam
+        self._T_ego_cam[2, 3] = camera.height_m
+        self._T_cam_ego = np.linalg.inv(self._T_ego_cam)
+        self._memory_m = memory_m
+        self.attitude = Attitude()
+
+    def advance(self, motion: Motion) -> None:
+        T_prev_curr = np.eye(4)
+        T_prev_curr[:3, :3] = motion.R_prev_curr
+        T_prev_curr[:3, 3] = motion.t_prev_curr_m
+        T_ego_prev_curr = self._T_ego_cam @ T_prev_curr @ self._T_cam_ego
+        R = _tilt(self.attitude) @ T_ego_prev_curr[:3, :3]
+        dz_m = float((_tilt(self.attitude) @ T_ego_prev_curr[:3, 3])[2])
+        keep = math.exp(-float(np.linalg.norm(motion.t_prev_curr_m)) / self._memory_m)
+        self.attitude = Attitude(
+            z_m=self.attitude.z_m + dz_m,
+            pitch_rad=keep * math.asin(max(-1.0, min(1.0, -R[2, 0]))),
+            roll_rad=keep * math.atan2(R[2, 1], R[2, 2]),
+        )
+
+
+def _tilt(attitude: Attitude) -> NDArray[np.float64]:
+    """(3, 3) Ry(pitch) Rx(roll): ego to a frame of the same yaw that is level."""
+    level = GroundPlane(1.0, attitude.pitch_rad, attitude.roll_rad).R_ego_cam
+    out: NDArray[np.float64] = level @ GroundPlane(1.0).R_ego_cam.T
+    return out
+
+
+def _measurements(frame: Frame, status: list[Status], **fields: object) -> Measurements:
+    return Measurements(
+        frame_id=frame.frame_id,
+        t_source_ns=frame.t_source_ns,
+        t_capture_ns=frame.t_capture_ns,
+        t_utc_ns=frame.t_utc_ns,
+        status=tuple(dict.fromkeys(status)),
+        **fields,  # type: ignore[arg-type]
+    )

@@ -1,0 +1,38 @@
+"""BirdSLAM in one process: the front end and the pose graph, one frame at a time."""
+
+from __future__ import annotations
+
+import msgspec
+
+from birdslam.camera import Camera
+from birdslam.frontend import FrontEnd, FrontEndConfig
+from birdslam.graph import GraphConfig, PoseGraph
+from birdslam.perception import Networks
+from birdslam.types import Estimate, Frame, MapUpdate, Measurements
+from birdslam.weights import WeightsConfig
+
+
+class SlamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Every number of the method that can be tuned; one setting serves all roads."""
+
+    frontend: FrontEndConfig = FrontEndConfig()
+    weights: WeightsConfig = WeightsConfig()
+    graph: GraphConfig = GraphConfig()
+
+
+class BirdSLAM:
+    """The whole method. The three processes of `runtime` run the same two objects, and get the same bytes."""
+
+    def __init__(self, camera: Camera, networks: Networks, config: SlamConfig) -> None:
+        self.networks = networks
+        self.frontend = FrontEnd(camera, config.frontend)
+        self.graph = PoseGraph(config.graph, config.weights)
+
+    def step(self, frame: Frame) -> tuple[Measurements, Estimate]:
+        """One undistorted frame (paper, Fig. 2): the networks run beside the feature tracking, then the back end."""
+        measurements = self.frontend.step(frame, self.networks.start(frame.frame_id, frame.image))
+        return measurements, self.graph.update(measurements)
+
+    def map_update(self) -> MapUpdate | None:
+        """What the map gained since the last call."""
+        return self.graph.map_update()

@@ -1,0 +1,222 @@
+"""Vehicles through time: association of boxes, persistent ids, and a constant-velocity filter for each vehicle.
+
+The filter lives in the odometry's own world (dead reckoning since the start), where a parked car stands still. It
+serves association and prediction; the estimates that planners get come from the pose graph.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from birdslam import bev
+from birdslam.camera import Camera, GroundPlane
+from birdslam.localisation import Observation, centre_of, iou
+from birdslam.se2 import SE2, wrap
+from birdslam.types import MotionEdge
+
+
+class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """When boxes are the same vehicle, and how vehicles move."""
+
+    min_iou: float = 0.15  # of a box with the one predicted from bird's-eye view
+    gate_sigma: float = 4.0  # Mahalanobis distance in bird's-eye view past which boxes are never the same vehicle
+    birth_score: float = 0.5
+    confirm_hits: int = 3  # a track gets its id when it has been seen so often
+    forget_unconfirmed_s: float = 0.25
+    forget_s: float = 1.0
+    sigma_accel_mps2: float = 3.0
+    sigma_birth_mps: float = 8.0
+    moving_mps: float = 2.0  # below it, or within moving_sigma of rest, a vehicle's motion says nothing of its yaw
+    moving_sigma: float = 3.0
+    yaw_gain: float = 0.3  # of the direction of motion into the yaw, each time it is seen
+    sigma_yaw_rate_radps: float = 0.5
+    sigma_yaw_unknown_rad: float = 0.5
+    sigma_yaw_moving_rad: float = 0.1
+
+
+@dataclass
+class Track:
+    """One vehicle; `state` is (x_m, y_m, vx_mps, vy_mps) of its centre in the odometry's world, `cov` (4, 4)."""
+
+    state: NDArray[np.float64]
+    cov: NDArray[np.float64]
+    yaw_rad: float
+    observation: Observation  # the last one, in the ego of frame `seen_frame`
+    seen_frame: int
+    seen_ns: int
+    T_world_ego: SE2  # of frame `seen_frame`
+    T_world_seen: SE2  # its own pose then
+    vehicle: int = -1  # the persistent id, once confirmed
+    hits: int = 1
+    votes: Counter[str] = field(default_factory=Counter)
+    yaw_known: bool = False
+    motion: MotionEdge | None = None  # VV: from when it was last seen to now, as predicted before it was seen again
+
+    @property
+    def label(self) -> str:
+        return max(sorted(self.votes), key=self.votes.__getitem__)
+
+    def pose(self) -> SE2:
+        """T_world_vehicle in the odometry's world."""
+        return SE2(float(self.state[0]), float(self.state[1]), self.yaw_rad)
+
+
+class Tracker:
+    """step(): predict, associate, correct, begin and forget tracks; returns those seen in this frame."""
+
+    def __init__(self, camera: Camera, config: TrackingConfig) -> None:
+        self.camera = camera
+        self.config = config
+        self.tracks: list[Track] = []
+        self._next_id = 0
+        self._t_ns: int | None = None
+
+    def step(
+        self, observations: list[Observation], T_world_ego: SE2, ground: GroundPlane, frame_id: int, t_source_ns: int
+    ) -> list[Track]:
+        """Confirmed tracks that were seen in this frame, each with its state corrected, ordered by id."""
+        self._predict(t_source_ns)
+        pairs = self._associate(observations, T_world_ego, ground)
+        for track, observation in pairs:
+            self._correct(track, observation, T_world_ego, frame_id, t_source_ns)
+        matched = {id(observation) for _, observation in pairs}
+        for observation in observations:
+            if id(observation) not in matched and observation.score >= self.config.birth_score:
+                self.tracks.append(self._begin(observation, T_world_ego, frame_id, t_source_ns))
+        self.tracks = [track for track in self.tracks if not self._is_lost(track, t_source_ns)]
+        seen = [t for t in self.tracks if t.seen_frame == frame_id and t.hits >= self.config.confirm_hits]
+        for track in seen:
+            if track.vehicle < 0:
+                track.vehicle, self._next_id = self._next_id, self._next_id + 1
+        return sorted(seen, key=lambda track: track.vehicle)
+
+    def predicted_boxes_px(self, T_world_ego: SE2, ground: GroundPlane) -> NDArray[np.float64]:
+        """(N, 4): where each track's last box is expected in the current image; NaN behind the camera.
+
+        The foot of the box moves as the vehicle does over the road, its size with the depth; errors of the ground plane
+        cancel, since the same plane put the box into bird's-eye view.
+        """
+        boxes = np.full((len(self.tracks), 4), np.nan)
+        T_ego_world = T_world_ego.inverse()
+        for row, track in zip(boxes, self.tracks, strict=True):
+            last = track.observation
+            centre_then = track.T_world_ego.inverse() @ track.state[:2]
+            moved = (T_ego_world @ track.state[:2]) - centre_then
+            near = last.near_m + moved
+            if near[0] <= 1.0 or last.near_m[0] <= 0.0:
+                continue
+            foot_px = bev.ego_to_pixel(self.camera, ground, near)[0]
+            scale = last.near_m[0] / near[0]
+            width_px = (last.box_px[2] - last.box_px[0]) * scale
+            height_px = (last.box_px[3] - last.box_px[1]) * scale
+            row[:] = (foot_px[0] - width_px / 2, foot_px[1] - height_px, foot_px[0] + width_px / 2, foot_px[1])
+        return boxes
+
+    def _predict(self, t_source_ns: int) -> None:
+        dt_s = 0.0 if self._t_ns is None else max(0.0, (t_source_ns - self._t_ns) * 1e-9)
+        self._t_ns = t_source_ns
+        F = np.eye(4)
+        F[0, 2] = F[1, 3] = dt_s
+        G = np.array([[dt_s**2 / 2, 0.0], [0.0, dt_s**2 / 2], [dt_s, 0.0], [0.0, dt_s]])
+        Q = G @ G.T * self.config.sigma_accel_mps2**2
+        for track in self.tracks:
+            track.state = F @ track.state
+            track.cov = F @ track.cov @ F.T + Q
+
+    def _associate(
+        self, observations: list[Observation], T_world_ego: SE2, ground: GroundPlane
+    ) -> list[tuple[Track, Observation]]:
+        """The pairs of least cost (1 - IoU of the predicted and the seen box) within the gates."""
+        if not self.tracks or not observations:
+            return []
+        overlap = iou(self.predicted_boxes_px(T_world_ego, ground), np.array([o.box_px for o in observations]))
+        overlap = np.nan_to_num(overlap, nan=0.0)
+        cost = 1.0 - overlap
+        R = T_world_ego.rotation()
+        for i, track in enumerate(self.tracks):
+            for j, observation in enumerate(observations):
+                gap = T_world_ego @ observation.centre_m - track.state[:2]
+                S = track.cov[:2, :2] + R @ observation.cov @ R.T
+                if overlap[i, j] < self.config.min_iou or gap @ np.linalg.solve(S, gap) > self.config.gate_sigma**2:
+                    cost[i, j] = 2.0
+        rows, columns = linear_sum_assignment(cost)
+        return [(self.tracks[i], observations[j]) for i, j in zip(rows, columns, strict=True) if cost[i, j] <= 1.0]
+
+    def _correct(
+        self, track: Track, observation: Observation, T_world_ego: SE2, frame_id: int, t_source_ns: int
+    ) -> None:
+        track.motion = self._predicted_motion(track, frame_id, t_source_ns)
+        bearing = float(observation.near_m[1] / observation.near_m[0])
+        yaw_ego_rad = wrap(track.yaw_rad - T_world_ego.yaw_rad)
+        centre = centre_of(observation.near_m, bearing, observation.dimensions, yaw_ego_rad)
+        R = T_world_ego.rotation()
+        H = np.eye(2, 4)
+        S = track.cov[:2, :2] + R @ observation.cov @ R.T
+        gain = np.linalg.solve(S, H @ track.cov).T
+        track.state = track.state + gain @ (T_world_ego @ centre - track.state[:2])
+        keep = np.eye(4) - gain @ H
+        track.cov = keep @ track.cov @ keep.T + gain @ (R @ observation.cov @ R.T) @ gain.T
+        track.observation = replace(observation, centre_m=centre)
+        track.seen_frame, track.seen_ns, track.T_world_ego = frame_id, t_source_ns, T_world_ego
+        track.hits += 1
+        track.votes[observation.label] += 1
+        self._turn(track)
+        track.T_world_seen = track.pose()
+
+    def _predicted_motion(self, track: Track, frame_id: int, t_source_ns: int) -> MotionEdge | None:
+        """VV by constant velocity; None until the track has an id, since edges name it."""
+        if track.vehicle < 0:
+            return None
+        dt_s = (t_source_ns - track.seen_ns) * 1e-9
+        R = SE2(yaw_rad=track.yaw_rad).rotation()
+        growth = track.cov[2:, 2:] * dt_s**2 + np.eye(2) * (self.config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
+        cov = np.zeros((3, 3))
+        cov[:2, :2] = R.T @ growth @ R
+        cov[2, 2] = (self.config.sigma_yaw_rate_radps * dt_s) ** 2
+        return MotionEdge(
+            vehicle=track.vehicle,
+            from_frame=track.seen_frame,
+            to_frame=frame_id,
+            T_from_to=track.T_world_seen.between(track.pose()),
+            cov=tuple(cov.ravel().tolist()),
+        )
+
+    def _turn(self, track: Track) -> None:
+        """A vehicle that surely moves heads where it moves; one that may stand keeps its yaw."""
+        vx, vy = track.state[2:]
+        speed = math.hypot(vx, vy)
+        sigma = math.sqrt(max(float(np.trace(track.cov[2:, 2:])) / 2.0, 1e-12))
+        if speed < max(self.config.moving_mps, self.config.moving_sigma * sigma):
+            return
+        turn = wrap(math.atan2(vy, vx) - track.yaw_rad)
+        track.yaw_rad = wrap(track.yaw_rad + (self.config.yaw_gain if track.yaw_known else 1.0) * turn)
+        track.yaw_known = True
+
+    def _begin(self, observation: Observation, T_world_ego: SE2, frame_id: int, t_source_ns: int) -> Track:
+        R = T_world_ego.rotation()
+        cov = np.zeros((4, 4))
+        cov[:2, :2] = R @ observation.cov @ R.T
+        cov[2:, 2:] = np.eye(2) * self.config.sigma_birth_mps**2
+        return Track(
+            state=np.concatenate([T_world_ego @ observation.centre_m, np.zeros(2)]),
+            cov=cov,
+            yaw_rad=T_world_ego.yaw_rad,  # most traffic runs along the road
+            observation=observation,
+            seen_frame=frame_id,
+            seen_ns=t_source_ns,
+            T_world_ego=T_world_ego,
+            T_world_seen=T_world_ego @ SE2(float(observation.centre_m[0]), float(observation.centre_m[1])),
+            votes=Counter({observation.label: 1}),
+        )
+
+    def _is_lost(self, track: Track, t_source_ns: int) -> bool:
+        confirmed = track.hits >= self.config.confirm_hits
+        patience_s = self.config.forget_s if confirmed else self.config.forget_unconfirmed_s
+        return (t_source_ns - track.seen_ns) * 1e-9 > patience_s

@@ -1,0 +1,104 @@
+"""Projection and back-projection (Eq. 1), the camera's checks, and undistortion."""
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam import bev
+from birdslam.camera import Camera, GroundPlane, Undistorter
+
+KITTI_LIKE = {"width_px": 1242, "height_px": 375, "fx_px": 721.5, "fy_px": 721.5, "cx_px": 609.6, "cy_px": 172.9}
+grounds = st.builds(GroundPlane, st.floats(0.5, 3.0), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
+
+
+def camera(**changes: object) -> Camera:
+    return Camera(**{**KITTI_LIKE, "height_m": 1.65, **changes})  # type: ignore[arg-type]
+
+
+@given(grounds, st.floats(3.0, 60.0), st.floats(-1.0, 1.0))
+def test_back_projection_undoes_projection(ground: GroundPlane, x_m: float, slope: float) -> None:
+    p_ego = np.array([[x_m, slope * x_m]])
+    px = bev.ego_to_pixel(camera(), ground, p_ego)
+    np.testing.assert_allclose(bev.pixel_to_ego(camera(), ground, px), p_ego, rtol=1e-6, atol=1e-6)
+
+
+def test_equation_1_as_the_paper_writes_it() -> None:
+    """On level ground the normal is [0, -1, 0], and depth is H * fy / (v - cy)."""
+    ground = GroundPlane(1.65)
+    np.testing.assert_allclose(ground.normal_cam, [0.0, -1.0, 0.0], atol=1e-12)
+    x, y, z = bev.road_point_cam(camera(), ground, np.array([[700.0, 300.0]]))[0]
+    assert z == pytest.approx(1.65 * 721.5 / (300.0 - 172.9))
+    assert x == pytest.approx(z * (700.0 - 609.6) / 721.5)
+    assert y == pytest.approx(1.65)
+
+
+def test_axes_are_rep_103() -> None:
+    ahead_left = bev.pixel_to_ego(camera(), GroundPlane(1.65), np.array([[400.0, 300.0]]))[0]
+    assert ahead_left[0] > 0.0
+    assert ahead_left[1] > 0.0
+    assert GroundPlane(1.65, pitch_rad=0.1).R_ego_cam[2, 2] < 0.0  # nose down: the optical axis meets the road
+
+
+def test_no_road_above_the_horizon() -> None:
+    assert np.isnan(bev.pixel_to_ego(camera(), GroundPlane(1.65), np.array([[600.0, 172.0], [600.0, 173.0]]))).all()
+
+
+@given(st.floats(5.0, 25.0), st.floats(-6.0, 6.0), st.floats(-0.02, 0.02))
+def test_covariance_is_that_of_sampled_errors(x_m: float, y_m: float, pitch_rad: float) -> None:
+    ground, sigma_px, sigma_pitch, sigma_height = GroundPlane(1.65, pitch_rad), 0.3, 0.0005, 0.01
+    px = bev.ego_to_pixel(camera(), ground, np.array([[x_m, y_m]]))
+    cov = bev.road_point_cov(camera(), ground, px, sigma_px, sigma_pitch, sigma_height)[0]
+    rng = np.random.default_rng(0)
+    samples = np.array(
+        [
+            bev.pixel_to_ego(
+                camera(),
+                GroundPlane(1.65 * (1 + sigma_height * h), pitch_rad + sigma_pitch * p),
+                px + sigma_px * np.array([[u, v]]),
+            )[0]
+            for u, v, p, h in rng.standard_normal((1500, 4))
+        ]
+    )
+    np.testing.assert_allclose(np.cov(samples.T), cov, rtol=0.2, atol=0.15 * np.trace(cov))
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({"fx_px": 0.0}, "fx_px"),
+        ({"fx_px": 10.0}, "focal"),
+        ({"cx_px": 5000.0}, "principal point"),
+        ({"height_m": 16.5}, "height_m"),
+        ({"pitch_rad": 2.0}, "pitch_rad"),
+        ({"cy_px": math.nan}, "finite"),
+        ({"distortion": (0.1, 0.2)}, "distortion"),
+        ({"hight_m": 1.6}, "hight_m"),
+    ],
+)
+def test_wrong_calibrations_are_named(changes: dict[str, object], names: str) -> None:
+    with pytest.raises(msgspec.ValidationError, match=names):
+        msgspec.convert({**KITTI_LIKE, "height_m": 1.65, **changes}, Camera)
+
+
+def test_undistortion_straightens_a_line() -> None:
+    """A vertical line of the world, seen through a lens with barrel distortion, is straight again afterwards."""
+    lens = camera(distortion=(-0.3, 0.1, 0.0, 0.0))
+    image = np.zeros((375, 1242), np.uint8)
+    y = (np.arange(-0.2, 0.25, 0.0005))[:, None]
+    x = np.full_like(y, 0.6)
+    r2 = x**2 + y**2
+    bent = np.hstack([x, y]) * (1 - 0.3 * r2 + 0.1 * r2**2)
+    columns = np.rint(bent[:, 0] * 721.5 + 609.6).astype(int)
+    rows = np.rint(bent[:, 1] * 721.5 + 172.9).astype(int)
+    for shift in (-1, 0, 1):
+        image[np.clip(rows, 0, 374), columns + shift] = 255
+    straight = Undistorter(lens)(image)
+    centres = [np.average(np.arange(1242), weights=row) for row in straight[60:300].astype(float) if row.sum() > 0]
+    assert len(centres) > 200
+    assert np.ptp(centres) < 1.5
+    with pytest.raises(ValueError, match="1241x375"):
+        Undistorter(lens)(image[:, :-1])

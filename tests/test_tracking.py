@@ -1,0 +1,116 @@
+"""Ids that last: vehicles of a known world through the tracker, with gaps, flicker and false alarms."""
+
+import math
+
+import numpy as np
+import pytest
+
+from birdslam import bev
+from birdslam.camera import Camera, GroundPlane
+from birdslam.localisation import LocalisationConfig, localise
+from birdslam.se2 import SE2, wrap
+from birdslam.tracking import Track, Tracker, TrackingConfig
+
+CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
+GROUND = GroundPlane(1.65)
+PERIOD_NS = 100_000_000
+
+
+def box_px(T_ego_vehicle: SE2) -> np.ndarray | None:
+    footprint = np.array([(sx * 2.0, sy * 0.85) for sx in (-1, 1) for sy in (-1, 1)])
+    on_road = T_ego_vehicle @ footprint
+    if on_road[:, 0].min() < 3.0:
+        return None
+    corners = np.vstack([np.column_stack([on_road, np.full(4, z)]) for z in (0.0, 1.5)])
+    px = bev.ego_to_pixel(CAMERA, GROUND, corners)
+    box = np.array([*px.min(axis=0), *px.max(axis=0)])
+    return box if box[0] > 0 and box[2] < CAMERA.width_px and box[3] < CAMERA.height_px else None
+
+
+class Drive:
+    """Runs a tracker over a world; `sees` may take boxes away or add some."""
+
+    def __init__(self, config: TrackingConfig | None = None, noise_px: float = 0.0) -> None:
+        self.tracker = Tracker(CAMERA, config or TrackingConfig())
+        self.rng = np.random.default_rng(1)
+        self.noise_px = noise_px
+        self.frame = 0
+
+    def step(self, T_world_ego: SE2, vehicles: list[SE2], labels: list[str] | None = None) -> list[Track]:
+        boxes = [box_px(T_world_ego.between(vehicle)) for vehicle in vehicles]
+        kept = [i for i, box in enumerate(boxes) if box is not None]
+        px = np.array([boxes[i] for i in kept]).reshape(-1, 4)
+        px = px + self.noise_px * self.rng.standard_normal(px.shape)
+        names = tuple((labels or ["car"] * len(vehicles))[i] for i in kept)
+        seen = localise(px, np.full(len(px), 0.9), names, CAMERA, GROUND, 0.002, LocalisationConfig())
+        out = self.tracker.step(seen, T_world_ego, GROUND, self.frame, self.frame * PERIOD_NS)
+        self.frame += 1
+        return out
+
+
+def test_parked_cars_keep_their_ids_and_places_as_the_ego_passes() -> None:
+    drive = Drive(noise_px=0.5)
+    parked = [SE2(15.0 + 7.0 * i, 3.5 if i % 2 else -3.5, 0.0) for i in range(6)]
+    place_of: dict[int, list[SE2]] = {}
+    for k in range(60):
+        for track in drive.step(SE2(0.8 * k, 0.0, 0.0), parked):
+            place_of.setdefault(track.vehicle, []).append(track.pose())
+    assert len(place_of) == len(parked)
+    for poses in place_of.values():
+        nearest = min(parked, key=lambda p: math.hypot(p.x_m - poses[-1].x_m, p.y_m - poses[-1].y_m))
+        assert math.hypot(nearest.x_m - poses[-1].x_m, nearest.y_m - poses[-1].y_m) < 0.5
+        assert abs(wrap(poses[-1].yaw_rad)) < 0.2  # it stands, so it keeps the road's direction
+
+
+def test_a_gap_shorter_than_forget_s_keeps_the_id() -> None:
+    drive = Drive(noise_px=0.3)
+    ids = set()
+    for k in range(40):
+        car = SE2(15.0 + 1.2 * k, 0.5, 0.0)
+        hidden = 15 <= k < 21
+        ids |= {t.vehicle for t in drive.step(SE2(1.0 * k, 0.0, 0.0), [] if hidden else [car])}
+    assert ids == {0}
+
+
+def test_a_gap_longer_than_forget_s_gives_a_new_id() -> None:
+    drive = Drive()
+    ids = set()
+    for k in range(40):
+        hidden = 10 <= k < 25
+        ids |= {t.vehicle for t in drive.step(SE2(), [] if hidden else [SE2(15.0, 0.0, 0.0)])}
+    assert ids == {0, 1}
+
+
+def test_an_oncoming_car_turns_to_where_it_goes() -> None:
+    drive = Drive(noise_px=0.3)
+    tracks: list[Track] = []
+    for k in range(15):
+        tracks = drive.step(SE2(), [SE2(45.0 - 1.0 * k, 3.5, math.pi)])
+    (track,) = tracks
+    assert abs(wrap(track.yaw_rad - math.pi)) < 0.15
+    assert track.state[2] == pytest.approx(-10.0, abs=1.5)
+    assert track.motion is not None
+    assert track.motion.T_from_to.x_m == pytest.approx(1.0, abs=0.2)  # VV: forward, in its own frame
+
+
+def test_crossing_cars_do_not_swap_ids() -> None:
+    drive = Drive(noise_px=0.3)
+    history: dict[int, list[float]] = {}
+    for k in range(45):
+        cars = [SE2(18.0, -8.0 + 0.4 * k, math.pi / 2), SE2(30.0, 8.0 - 0.4 * k, -math.pi / 2)]
+        for track in drive.step(SE2(), cars):
+            history.setdefault(track.vehicle, []).append(float(track.state[0]))
+    assert len(history) == 2
+    for depths in history.values():
+        assert np.ptp(depths) < 4.0
+
+
+def test_labels_are_voted_and_false_alarms_get_no_id() -> None:
+    drive = Drive()
+    for k in range(12):
+        tracks = drive.step(SE2(), [SE2(15.0, 0.0, 0.0)], ["truck" if k % 4 == 1 else "car"])
+        if k == 6:
+            drive.step(SE2(), [SE2(15.0, 0.0, 0.0), SE2(20.0, 6.0, 0.0)])
+    assert [t.label for t in tracks] == ["car"]
+    assert len(drive.tracker.tracks) == 1
+    assert tracks[0].vehicle == 0
