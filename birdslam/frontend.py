@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgspec
 import numpy as np
@@ -43,6 +43,9 @@ class StaticMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The parts of the front end; `sigma_pitch_start_rad` holds until the odometry has seen the road."""
+
+    sigma_pitch_start_rad: float = 0.015
     odometry: OdometryConfig = OdometryConfig()
     localisation: LocalisationConfig = LocalisationConfig()
     tracking: TrackingConfig = TrackingConfig()
@@ -55,23 +58,40 @@ class Pending(Protocol):
     def result(self) -> Perception: ...
 
 
+class EgoMotion(Protocol):
+    """What the front end asks of an odometry; `odometry.Odometry` measures it in the images."""
+
+    def track(self, image: NDArray[np.uint8]) -> Any: ...
+
+    def estimate(
+        self,
+        tracks: Any,
+        frame_id: int,
+        t_source_ns: int,
+        vehicle_boxes_px: NDArray[np.float64],
+        road_mask: NDArray[np.bool_] | None,
+    ) -> Motion | None: ...
+
+    @property
+    def road_tracks(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]: ...
+
+
 class FrontEnd:
     """step(): one frame in, its `Measurements` out. Deterministic; owns no thread."""
 
-    def __init__(self, camera: Camera, config: FrontEndConfig) -> None:
+    def __init__(self, camera: Camera, config: FrontEndConfig, odometry: EgoMotion | None = None) -> None:
         self.camera = camera
         self.config = config
-        self.odometry = Odometry(camera, config.odometry)
+        self.odometry: EgoMotion = odometry or Odometry(camera, config.odometry)
         self.tracker = Tracker(camera, config.tracking)
-        self._attitude = _AttitudeIntegrator(camera, config.static_map.attitude_memory_m)
-        self._T_world_ego = SE2()  # dead reckoning, for the tracker
+        self._reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
         self._last_frame: int | None = None
 
     def step(self, frame: Frame, pending: Pending) -> Measurements:
         """`pending` is waited for after the feature tracking, which runs beside the networks."""
         status = [*frame.status, *self._dropped(frame)]
         if frame.image is None:
-            return _measurements(frame, status, attitude=self._attitude.attitude)
+            return _measurements(frame, status, attitude=self._reckoning.attitude)
 
         # Ego motion and static map initialisation
         tracks = self.odometry.track(frame.image)
@@ -82,7 +102,7 @@ class FrontEnd:
         motion = self.odometry.estimate(tracks, frame.frame_id, frame.t_source_ns, boxes_px, road)
         cc = None if motion is None else self._advance(motion)
         ground = self.camera.ground if motion is None else motion.ground
-        sigma_pitch_rad = self.config.odometry.sigma_pitch_start_rad if motion is None else motion.pitch_sigma_rad
+        sigma_pitch_rad = self.config.sigma_pitch_start_rad if motion is None else motion.pitch_sigma_rad
 
         # Dynamic object localisation: only what the detector saw in this very frame
         observations = []
@@ -96,7 +116,7 @@ class FrontEnd:
                 sigma_pitch_rad,
                 self.config.localisation,
             )
-        seen = self.tracker.step(observations, self._T_world_ego, ground, frame.frame_id, frame.t_source_ns)
+        seen = self.tracker.step(observations, self._reckoning.T_world_ego, ground, frame.frame_id, frame.t_source_ns)
 
         return _measurements(
             frame,
@@ -106,7 +126,7 @@ class FrontEnd:
             vv=tuple(track.motion for track in seen if track.motion is not None),
             cp=self._landmarks(frame.frame_id, ground, sigma_pitch_rad),
             lanes=self._lanes(segmentation, perception.ages.get("segmenter", 0), boxes_px, ground),
-            attitude=self._attitude.attitude,
+            attitude=self._reckoning.attitude,
             ground=Ground(height_m=ground.height_m, pitch_rad=ground.pitch_rad, roll_rad=ground.roll_rad),
             scale_sigma_rel=0.0 if motion is None else motion.scale_sigma_rel,
             ages=dict(perception.ages),
@@ -118,8 +138,7 @@ class FrontEnd:
         return (Status.FRAMES_DROPPED,) if gap else ()
 
     def _advance(self, motion: Motion) -> EgoEdge:
-        self._T_world_ego = self._T_world_ego @ motion.T_prev_curr
-        self._attitude.advance(motion)
+        self._reckoning.advance(motion)
         return EgoEdge(
             from_frame=motion.from_frame,
             to_frame=motion.to_frame,
@@ -157,7 +176,13 @@ class FrontEnd:
             self.camera, ground, px[near], config.sigma_landmark_px, sigma_pitch_rad, config.sigma_height_rel
         )
         return tuple(
-            LandmarkEdge(int(ids[i]), frame_id, float(points[i, 0]), float(points[i, 1]), tuple(cov.ravel().tolist()))
+            LandmarkEdge(
+                landmark=int(ids[i]),
+                frame=frame_id,
+                x_m=float(points[i, 0]),
+                y_m=float(points[i, 1]),
+                cov=tuple(cov.ravel().tolist()),
+            )
             for i, cov in zip(near, covs, strict=True)
             if np.isfinite(cov).all()
         )
@@ -181,8 +206,12 @@ class FrontEnd:
         return tuple(LanePoint(float(x), float(y)) for x, y in points[first])
 
 
-class _AttitudeIntegrator:
-    """Height and tilt of the ego in the world, by chaining the camera's full motion (types.Attitude)."""
+class DeadReckoning:
+    """The odometry's motions chained: the ego on the road plane, for the tracker, and its height and tilt.
+
+    A motion starts at the frame that it names, which need not be the newest: one that coasted is superseded by the next
+    that was measured.
+    """
 
     def __init__(self, camera: Camera, memory_m: float) -> None:
         self._T_ego_cam = np.eye(4)
@@ -190,21 +219,30 @@ class _AttitudeIntegrator:
         self._T_ego_cam[2, 3] = camera.height_m
         self._T_cam_ego = np.linalg.inv(self._T_ego_cam)
         self._memory_m = memory_m
+        self.T_world_ego = SE2()
         self.attitude = Attitude()
+        self._from = (-1, self.T_world_ego, self.attitude)  # the frame that the last motion started from
+        self._to = self._from
 
     def advance(self, motion: Motion) -> None:
+        """To `motion.to_frame`, from the pose of `motion.from_frame` where that was the last motion's start or end."""
+        if motion.from_frame != self._from[0] or self._from[0] < 0:
+            self._from = (motion.from_frame, *self._to[1:])
+        _, T_world_ego, attitude = self._from
         T_prev_curr = np.eye(4)
         T_prev_curr[:3, :3] = motion.R_prev_curr
         T_prev_curr[:3, 3] = motion.t_prev_curr_m
         T_ego_prev_curr = self._T_ego_cam @ T_prev_curr @ self._T_cam_ego
-        R = _tilt(self.attitude) @ T_ego_prev_curr[:3, :3]
-        dz_m = float((_tilt(self.attitude) @ T_ego_prev_curr[:3, 3])[2])
+        R = _tilt(attitude) @ T_ego_prev_curr[:3, :3]
+        dz_m = float((_tilt(attitude) @ T_ego_prev_curr[:3, 3])[2])
         keep = math.exp(-float(np.linalg.norm(motion.t_prev_curr_m)) / self._memory_m)
+        self.T_world_ego = T_world_ego @ motion.T_prev_curr
         self.attitude = Attitude(
-            z_m=self.attitude.z_m + dz_m,
+            z_m=attitude.z_m + dz_m,
             pitch_rad=keep * math.asin(max(-1.0, min(1.0, -R[2, 0]))),
             roll_rad=keep * math.atan2(R[2, 1], R[2, 2]),
         )
+        self._to = (motion.to_frame, self.T_world_ego, self.attitude)
 
 
 def _tilt(attitude: Attitude) -> NDArray[np.float64]:

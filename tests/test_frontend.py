@@ -1,0 +1,165 @@
+"""The front end: motions chained, edges that name their frames, and what it says when there is nothing to say."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from birdslam.camera import Camera, GroundPlane
+from birdslam.frontend import DeadReckoning, FrontEnd, FrontEndConfig
+from birdslam.odometry import Motion
+from birdslam.perception import Detections, Perception, Ready, Segmentation
+from birdslam.se2 import SE2
+from birdslam.types import Frame, Measurements, Status
+
+CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65, pitch_rad=0.01)
+IMAGE = np.zeros((375, 1242), np.uint8)
+
+
+def rotation(pitch_rad: float, yaw_rad: float) -> np.ndarray:
+    """(3, 3) ego axes: Rz(yaw) Ry(pitch)."""
+    cp, sp, cy, sy = math.cos(pitch_rad), math.sin(pitch_rad), math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+
+
+def motion(frame: int, T: SE2, *, d_pitch_rad: float = 0.0, since: int = 1, **changes: Any) -> Motion:
+    """The motion of a camera over a road whose grade changes by `d_pitch_rad` under it."""
+    A = CAMERA.ground.R_ego_cam
+    T_ego_cam, T_ego = np.eye(4), np.eye(4)
+    T_ego_cam[:3, :3], T_ego_cam[2, 3] = A, CAMERA.height_m
+    T_ego[:3, :3], T_ego[:2, 3] = rotation(d_pitch_rad, T.yaw_rad), (T.x_m, T.y_m)
+    T_cam = np.linalg.inv(T_ego_cam) @ T_ego @ T_ego_cam
+    fields: dict[str, Any] = {
+        "from_frame": frame - since,
+        "to_frame": frame,
+        "R_prev_curr": T_cam[:3, :3],
+        "t_prev_curr_m": T_cam[:3, 3],
+        "T_prev_curr": T,
+        "cov": np.diag([1e-4, 1e-4, 1e-6]),
+        "scale_sigma_rel": 0.01,
+        "ground": CAMERA.ground,
+        "pitch_sigma_rad": 0.003,
+        "standstill": False,
+        "status": (),
+    }
+    return Motion(**{**fields, **changes})
+
+
+class ScriptedOdometry:
+    """Gives the motions of a script; the corners on the road are given too."""
+
+    def __init__(self, script: dict[int, Motion]) -> None:
+        self.script = script
+        self.road_tracks = (np.array([7, 9, 11]), np.array([[600.0, 300.0], [700.0, 220.0], [600.0, 100.0]]))
+        self.boxes: list[np.ndarray] = []
+
+    def track(self, image: np.ndarray) -> None:
+        assert image is IMAGE
+
+    def estimate(self, tracks: None, frame_id: int, t_ns: int, boxes: np.ndarray, road: Any) -> Motion | None:
+        self.boxes.append(boxes)
+        return self.script.get(frame_id)
+
+
+def frame(k: int, image: np.ndarray | None = IMAGE, status: tuple[Status, ...] = ()) -> Frame:
+    return Frame(k, k * 100_000_000, 5_000 + k, 9_000 + k, image, status)
+
+
+def seeing(*boxes: list[float], age: int = 0, lane: np.ndarray | None = None) -> Ready:
+    detections = Detections(np.array(boxes).reshape(-1, 4), np.full(len(boxes), 0.9), ("car",) * len(boxes))
+    segmentation = None if lane is None else Segmentation(road=lane, lane=lane)
+    return Ready(Perception(detections, segmentation, {"detector": age, "segmenter": 0}, ()))
+
+
+def run(script: dict[int, Motion], views: list[Ready], images: dict[int, None] | None = None) -> list[Measurements]:
+    front = FrontEnd(CAMERA, FrontEndConfig(), ScriptedOdometry(script))
+    return [front.step(frame(k, (images or {}).get(k, IMAGE)), view) for k, view in enumerate(views)]
+
+
+def test_a_constant_grade_is_the_world_and_a_changed_one_is_climbed() -> None:
+    reckoning = DeadReckoning(CAMERA, memory_m=1e9)
+    for k in range(1, 11):
+        reckoning.advance(motion(k, SE2(1.0, 0.0, 0.0)))
+    assert reckoning.attitude.z_m == pytest.approx(0.0, abs=1e-9)
+    reckoning.advance(motion(11, SE2(0.0, 0.0, 0.0), d_pitch_rad=-0.05))  # nose up
+    for k in range(12, 22):
+        reckoning.advance(motion(k, SE2(1.0, 0.0, 0.0)))
+    assert reckoning.attitude.z_m == pytest.approx(10.0 * math.sin(0.05), rel=1e-6)
+    assert reckoning.attitude.pitch_rad == pytest.approx(-0.05)
+
+
+def test_tilt_turns_with_the_road_when_the_ego_turns() -> None:
+    """A turn by 90 degrees on an inclined plane makes pitch to roll."""
+    reckoning = DeadReckoning(CAMERA, memory_m=1e9)
+    reckoning.advance(motion(1, SE2(0.0, 0.0, 0.0), d_pitch_rad=0.04))
+    reckoning.advance(motion(2, SE2(0.0, 0.0, math.pi / 2)))
+    assert reckoning.attitude.pitch_rad == pytest.approx(0.0, abs=1e-6)
+    assert abs(reckoning.attitude.roll_rad) == pytest.approx(0.04, abs=1e-4)
+
+
+def test_a_measured_motion_supersedes_the_coasted_ones() -> None:
+    reckoning = DeadReckoning(CAMERA, memory_m=1e9)
+    reckoning.advance(motion(1, SE2(1.0, 0.0, 0.0)))
+    reckoning.advance(motion(2, SE2(0.9, 0.0, 0.0)))
+    reckoning.advance(motion(3, SE2(1.9, 0.0, 0.0), since=2))  # from frame 1 again
+    assert reckoning.T_world_ego.x_m == pytest.approx(2.9)
+    reckoning.advance(motion(4, SE2(1.0, 0.0, 0.0)))
+    assert reckoning.T_world_ego.x_m == pytest.approx(3.9)
+
+
+def test_edges_name_their_frames_over_a_gap() -> None:
+    front = FrontEnd(CAMERA, FrontEndConfig(), ScriptedOdometry({4: motion(4, SE2(3.0, 0.0, 0.0), since=4)}))
+    front.step(frame(0), seeing())
+    after = front.step(frame(4), seeing())
+    assert after.cc is not None
+    assert (after.cc.from_frame, after.cc.to_frame) == (0, 4)
+    assert Status.FRAMES_DROPPED in after.status
+
+
+def test_an_unreadable_frame_has_a_status_and_no_edge() -> None:
+    out = run({2: motion(2, SE2(2.0, 0.0, 0.0), since=2)}, [seeing()] * 3, images={1: None})
+    assert out[1].cc is None
+    assert out[1].cv == out[1].cp == ()
+    assert out[2].cc is not None
+    assert Status.FRAMES_DROPPED not in out[2].status
+    assert [m.frame_id for m in out] == [0, 1, 2]
+    assert out[1].t_capture_ns == 5_001
+
+
+def test_vehicles_get_edges_when_confirmed_and_only_from_this_frames_boxes() -> None:
+    box = [550.0, 180.0, 650.0, 260.0]
+    script = {k: motion(k, SE2(0.0, 0.0, 0.0)) for k in range(1, 6)}
+    out = run(script, [seeing(box), seeing(box), seeing(box), seeing(box, age=1), seeing(box), seeing(box)])
+    assert [len(m.cv) for m in out] == [0, 0, 1, 0, 1, 1]
+    (edge,) = out[2].cv
+    assert edge.T_ego_vehicle.x_m == pytest.approx(
+        1.65 / math.tan(math.atan2(260.0 - 172.9, 721.5) + 0.01) + 2.0, rel=1e-3
+    )
+    assert edge.box_px == tuple(box)
+    (vv,) = out[4].vv
+    assert (vv.from_frame, vv.to_frame) == (2, 4)
+
+
+def test_landmarks_are_the_near_corners_on_the_road() -> None:
+    out = run({1: motion(1, SE2(1.0, 0.0, 0.0))}, [seeing(), seeing()])
+    (landmark,) = out[1].cp  # one corner lies past the depth threshold, one above the horizon
+    assert landmark.landmark == 7
+    assert 8.0 < landmark.x_m < 10.0
+
+
+def test_lane_points_leave_out_what_a_vehicle_covers() -> None:
+    lane = np.zeros((375, 1242), bool)
+    lane[230:350, 400:404] = lane[230:350, 800:804] = True
+    (covered,) = run({}, [seeing([780.0, 200.0, 900.0, 370.0], lane=lane)])
+    assert covered.lanes
+    assert all(point.y_m > 0 for point in covered.lanes)
+    assert len(covered.lanes) <= 64
+
+
+def test_the_first_frame_says_that_nothing_is_known() -> None:
+    (first,) = run({}, [seeing()])
+    assert first.cc is None
+    assert Status.NOT_INITIALISED in first.status
+    assert first.ground is not None
+    assert GroundPlane(first.ground.height_m, first.ground.pitch_rad, first.ground.roll_rad) == CAMERA.ground
