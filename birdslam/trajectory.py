@@ -1,0 +1,154 @@
+"""Trajectories on disk: KITTI rows and TUM lines, and the one passage between ego poses and camera poses.
+
+KITTI rows are `T_first_i` (3, 4) row-major, in the axes of the recording's camera at its first frame (x right, y
+down, z forward), the first row the identity. TUM lines are `t[s] x y z qx qy qz qw` in the world of `types.py`.
+
+The ego rides on the road and the camera over it, at a constant `mount` (the calibrated height, pitch and roll):
+
+    T_world_cam = T(x, y, z; Rz(yaw) Ry(pitch) Rx(roll)) @ T_ego_cam(mount)
+
+so a car's nodding is in the attitude, not in the mount. `ego_pose` and `split_pose` are inverse to each other: as long
+as one mount is used both ways, the camera's motion comes back exactly, whatever the mount. So a mount whose pitch is a
+little off tilts the world, in which a level road then seems to climb, but bends no camera trajectory.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from birdslam.camera import GroundPlane
+from birdslam.se2 import SE2
+from birdslam.types import Attitude
+
+Pose = NDArray[np.float64]  # (4, 4) homogeneous, metres
+NS_PER_S = 1_000_000_000
+
+
+def ego_pose(T_world_ego: SE2, attitude: Attitude) -> Pose:
+    """`T_world_ego` (4, 4) of a planar pose and what it leaves out."""
+    out = np.eye(4)
+    angles = [T_world_ego.yaw_rad, attitude.pitch_rad, attitude.roll_rad]
+    out[:3, :3] = Rotation.from_euler("ZYX", angles).as_matrix()
+    out[:3, 3] = T_world_ego.x_m, T_world_ego.y_m, attitude.z_m
+    return out
+
+
+def split_pose(T_world_ego: Pose) -> tuple[SE2, Attitude]:
+    """The inverse of `ego_pose`: pitch within a quarter turn."""
+    R, (x_m, y_m, z_m) = T_world_ego[:3, :3], T_world_ego[:3, 3]
+    yaw_rad = math.atan2(R[1, 0], R[0, 0])
+    pitch_rad = math.atan2(-R[2, 0], math.hypot(R[2, 1], R[2, 2]))
+    roll_rad = math.atan2(R[2, 1], R[2, 2])
+    return SE2(float(x_m), float(y_m), yaw_rad), Attitude(z_m=float(z_m), pitch_rad=pitch_rad, roll_rad=roll_rad)
+
+
+def mount_pose(mount: GroundPlane) -> Pose:
+    """`T_ego_cam` (4, 4) of a camera over the road."""
+    out = np.eye(4)
+    out[:3, :3] = mount.R_ego_cam
+    out[2, 3] = mount.height_m
+    return out
+
+
+def inverse(T_a_b: Pose) -> Pose:
+    """`T_b_a` of poses (..., 4, 4)."""
+    out = np.zeros_like(T_a_b)
+    Rt = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    out[..., :3, :3] = Rt
+    out[..., :3, 3] = -np.einsum("...ij,...j->...i", Rt, T_a_b[..., :3, 3])
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def as_poses(rows: NDArray[np.float64]) -> Pose:
+    """(N, 4, 4) of KITTI rows (N, 3, 4)."""
+    out = np.tile(np.eye(4), (len(rows), 1, 1))
+    out[:, :3] = rows
+    return out
+
+
+def kitti_row(T_first_i: Pose) -> str:
+    """One line of a KITTI pose file, without its end."""
+    return " ".join(f"{number:.9e}" for number in (T_first_i[:3] + 0.0).ravel())  # + 0.0: no negative zeros
+
+
+def tum_row(t_ns: int, T_world_i: Pose) -> str:
+    """One line of a TUM trajectory, without its end; the time is exact to the nanosecond, qw >= 0."""
+    qx, qy, qz, qw = Rotation.from_matrix(T_world_i[:3, :3]).as_quat(canonical=True)
+    numbers = " ".join(f"{number + 0.0:.9f}" for number in (*T_world_i[:3, 3], qx, qy, qz, qw))
+    sign, t_ns = ("-", -t_ns) if t_ns < 0 else ("", t_ns)
+    return f"{sign}{t_ns // NS_PER_S}.{t_ns % NS_PER_S:09d} {numbers}"
+
+
+def _read_numbers(path: Path, width: int, what: str) -> NDArray[np.float64]:
+    try:
+        lines = path.read_text(encoding="ascii").splitlines()
+    except OSError as error:
+        raise ValueError(f"{path}: can't be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: is no text file of {what}") from None
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            row = [float(word) for word in line.split()]
+        except ValueError:
+            row = []
+        if len(row) != width or not all(map(math.isfinite, row)):
+            raise ValueError(f"{path}: line {number} is no {what} ({width} finite numbers): {line[:60]!r}")
+        rows.append(row)
+    return np.array(rows, dtype=np.float64).reshape(len(rows), width)
+
+
+def read_kitti(path: Path) -> NDArray[np.float64]:
+    """Rows (N, 3, 4) of a KITTI pose file. Raises ValueError naming path and line."""
+    rows = _read_numbers(path, 12, "KITTI pose").reshape(-1, 3, 4)
+    R = rows[:, :, :3]
+    skewed = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-3
+    wrong = np.flatnonzero(skewed | (np.linalg.det(R) < 0.0))
+    if wrong.size:
+        raise ValueError(f"{path}: pose {wrong[0]} holds no rotation matrix")
+    return rows
+
+
+def read_tum(path: Path) -> tuple[NDArray[np.float64], Pose]:
+    """Times (N,) in seconds and poses (N, 4, 4) of a TUM file, comments skipped. Raises ValueError naming the line."""
+    rows = _read_numbers(path, 8, "TUM pose")
+    wrong = np.flatnonzero(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0) > 1e-3)
+    if wrong.size:
+        raise ValueError(f"{path}: pose {wrong[0]} holds no unit quaternion")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if len(rows):
+        poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+        poses[:, :3, 3] = rows[:, 1:4]
+    return rows[:, 0], poses
+
+
+class CameraTrajectory:
+    """Ego poses, frame by frame, to camera poses `T_first_i` in the axes of the first camera (KITTI).
+
+    A new epoch begins in a world of its own, and nothing says how the car moved in between: it is put where the last
+    one ended, so that the rows go on.
+    """
+
+    def __init__(self, mount: GroundPlane) -> None:
+        self._T_ego_cam = mount_pose(mount)
+        self._T_first_world: Pose | None = None
+        self._epoch = 0
+        self.last: Pose = np.eye(4)
+
+    def add(self, epoch: int, T_world_ego: Pose) -> Pose:
+        """`T_first_i` (4, 4) of the next frame's `ego_pose`."""
+        T_world_cam = T_world_ego @ self._T_ego_cam
+        if self._T_first_world is None or epoch != self._epoch:
+            self._T_first_world = self.last @ inverse(T_world_cam)
+            self._epoch = epoch
+        else:
+            self.last = self._T_first_world @ T_world_cam
+        return self.last
