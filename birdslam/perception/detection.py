@@ -1,0 +1,175 @@
+"""Detector outputs to boxes in the image: decoding, class-wise NMS, and the merging of tiles."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.perception.manifest import Input, Misfit, Yolox
+from birdslam.perception.views import View
+
+CUT_MARGIN = 0.015  # of a tile's width: a box that ends so near to a tile's inner edge is taken to go on behind it
+INSIDE = 0.6  # of a cut box's area inside a whole box: the same object
+MOST_CANDIDATES = 400  # of one run: a network gone wild must not cost memory and time without bound
+SAME_ROWS = 0.5  # overlap over union of the rows of two halves of one object
+
+
+@dataclass(frozen=True)
+class Detections:
+    """Boxes (N, 4) x1, y1, x2, y2 in pixels of the undistorted image, scores (N,) in [0, 1] falling, labels."""
+
+    boxes_px: NDArray[np.float64]
+    scores: NDArray[np.float64]
+    labels: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def only(self, labels: Collection[str]) -> Detections:
+        """Those with one of the labels."""
+        keep = [i for i, label in enumerate(self.labels) if label in labels]
+        return Detections(self.boxes_px[keep], self.scores[keep], tuple(self.labels[i] for i in keep))
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Boxes before NMS: image pixels, scores, class ids; `cut` (N, 2): goes on behind the view's left / right edge."""
+
+    boxes_px: NDArray[np.float64]
+    scores: NDArray[np.float64]
+    classes: NDArray[np.int64]
+    cut: NDArray[np.bool_]
+
+
+class YoloxDecoder:
+    """Reads YOLOX outputs (see `manifest.Yolox`)."""
+
+    def __init__(self, table: Yolox, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        """Raises Misfit where the output's shape isn't what the manifest makes of it."""
+        self.table = table
+        cells, strides = _grid(input.width_px, input.height_px, table.strides)
+        shape = shapes[table.output]
+        if len(shape) != 3 or shape[0] != 1:
+            raise Misfit("detector.output", f"{table.output} of shape (1, cells, 5 + classes)", shape)
+        if shape[1] != len(cells):
+            said = f"{list(table.strides)} over {input.width_px}x{input.height_px}, which are {len(cells)} cells"
+            raise Misfit("detector.strides", said, f"{shape[1]} cells in {table.output} {shape}")
+        if shape[2] != 5 + table.classes:
+            said = f"{table.classes}, so {5 + table.classes} channels"
+            raise Misfit("detector.classes", said, f"{shape[2]} channels in {table.output} {shape}")
+        self._cells, self._strides = cells, strides
+        group_of = {label: i for i, group in enumerate(table.rivals) for label in group}
+        # Classes that compete in NMS share a number; ids of others stay clear of the groups.
+        self._groups = np.arange(table.classes) + len(table.rivals)
+        for index, label in table.labels.items():
+            self._groups[index] = group_of.get(label, self._groups[index])
+        self._wanted = np.isin(np.arange(table.classes), list(table.labels))
+
+    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Candidates:
+        """The boxes of one run above the score threshold, in the image and cut to it."""
+        raw = tensors[self.table.output][0]
+        rows = np.flatnonzero(raw[:, 4] >= self.table.score_threshold)  # class scores are <= 1
+        chosen = raw[rows].astype(np.float64)
+        classes = np.argmax(chosen[:, 5:], axis=1)
+        scores = chosen[:, 4] * chosen[np.arange(len(rows)), 5 + classes]
+        good = (scores >= self.table.score_threshold) & self._wanted[classes]
+        best = np.flatnonzero(good)[np.argsort(-scores[good], kind="stable")[:MOST_CANDIDATES]]
+        rows, chosen, classes, scores = rows[best], chosen[best], classes[best], scores[best]
+        with np.errstate(over="ignore"):
+            half = np.exp(chosen[:, 2:4]) * self._strides[rows] / 2.0
+        centre = (chosen[:, :2] + self._cells[rows]) * self._strides[rows]
+        boxes = view.to_image(np.hstack([centre - half, centre + half]))
+        margin_px = CUT_MARGIN * (view.x1_px - view.x0_px)
+        cut = np.column_stack(
+            [
+                (boxes[:, 0] < view.x0_px + margin_px) & (view.x0_px > 0),
+                (boxes[:, 2] > view.x1_px - margin_px) & (view.x1_px < view.image_width_px),
+            ]
+        )
+        boxes[:, 0::2] = np.clip(boxes[:, 0::2], view.x0_px, view.x1_px)
+        boxes[:, 1::2] = np.clip(boxes[:, 1::2], 0.0, view.image_height_px)
+        solid = np.all(boxes[:, 2:] - boxes[:, :2] >= 1.0, axis=1)
+        return Candidates(boxes[solid], scores[solid], classes[solid], cut[solid])
+
+    def merge(self, parts: Sequence[Candidates], views: Sequence[View]) -> Detections:
+        """The boxes of all views of one image, each object once."""
+        boxes, scores, classes, cut = (
+            np.concatenate([getattr(part, field) for part in parts])
+            for field in ("boxes_px", "scores", "classes", "cut")
+        )
+        kept = suppress(boxes, scores, self._groups[classes], cut, self.table.nms_iou)
+        boxes, scores, classes, cut = boxes[kept], scores[kept], classes[kept], cut[kept]
+        slack_px = 2.0 * CUT_MARGIN * (views[0].x1_px - views[0].x0_px)
+        boxes, alive = join_halves(boxes, self._groups[classes], cut, slack_px)
+        order = alive[np.argsort(-scores[alive], kind="stable")]
+        return Detections(boxes[order], scores[order], tuple(self.table.labels[int(c)] for c in classes[order]))
+
+
+def _grid(width_px: int, height_px: int, strides: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Cells (N, 2) as x, y and their strides (N, 1), row by row, one stride after the other."""
+    cells, sizes = [], []
+    for stride in strides:
+        y, x = np.mgrid[0 : height_px // stride, 0 : width_px // stride]
+        cells.append(np.column_stack([x.ravel(), y.ravel()]))
+        sizes.append(np.full((x.size, 1), stride))
+    return np.vstack(cells).astype(np.float64), np.vstack(sizes).astype(np.float64)
+
+
+def intersections(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, N) areas that each two of the boxes (N, 4) share."""
+    low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
+    out: NDArray[np.float64] = np.prod(np.clip(high - low, 0.0, None), axis=-1)
+    return out
+
+
+def suppress(
+    boxes: NDArray[np.float64],
+    scores: NDArray[np.float64],
+    groups: NDArray[np.int64],
+    cut: NDArray[np.bool_],
+    nms_iou: float,
+) -> NDArray[np.int64]:
+    """Indices that survive NMS within each group, best first: whole boxes before cut ones, then by score (stable).
+
+    A cut box (N, 2: on its left, on its right) yields to one that covers it, since the overlap over union of a part
+    says little. The two halves of one object don't beat each other: `join_halves` makes one of them.
+    """
+    shared = intersections(boxes)
+    area = np.diagonal(shared)
+    partial = cut[:, 0] | cut[:, 1]
+    halves = np.outer(cut[:, 0], cut[:, 1]) | np.outer(cut[:, 1], cut[:, 0])
+    covers = (shared >= INSIDE * area[None, :]) & partial[None, :] & (area[:, None] > area[None, :])
+    beaten = covers | (shared > nms_iou * (area[:, None] + area[None, :] - shared))  # [i, j]: i beats j
+    beaten &= ~halves & (groups[:, None] == groups[None, :]) & ~np.eye(len(boxes), dtype=bool)
+    alive = np.ones(len(boxes), dtype=bool)
+    order = np.lexsort((-scores, partial))
+    for i in order:
+        if alive[i]:
+            alive &= ~beaten[i]
+    return order[alive[order]]
+
+
+def join_halves(
+    boxes: NDArray[np.float64], groups: NDArray[np.int64], cut: NDArray[np.bool_], slack_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """An object wider than the overlap leaves a half in two neighbouring tiles: they become one box, left to right.
+
+    Such halves both span the overlap, to `slack_px`. Returns the boxes and the indices of those that stand.
+    """
+    boxes = boxes.copy()
+    stands = np.ones(len(boxes), dtype=bool)
+    rightward = np.argsort(boxes[:, 0], kind="stable")
+    for i in rightward[cut[rightward, 1]]:
+        for j in rightward[cut[rightward, 0]]:
+            a, b = boxes[i], boxes[j]
+            rows = min(a[3], b[3]) - max(a[1], b[1])
+            same_rows = rows > SAME_ROWS * (max(a[3], b[3]) - min(a[1], b[1]))
+            meet = a[0] - slack_px <= b[0] <= a[2] <= b[2] + slack_px
+            if i != j and stands[i] and stands[j] and groups[i] == groups[j] and same_rows and meet:
+                boxes[i] = np.concatenate([np.minimum(a[:2], b[:2]), np.maximum(a[2:], b[2:])])
+                stands[j] = False
+    return boxes, np.flatnonzero(stands)

@@ -1,0 +1,228 @@
+"""One network: its file, its manifest, its session. The image goes in, findings come out."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Protocol, get_args
+
+import msgspec
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
+
+from birdslam.perception.detection import Detections, YoloxDecoder
+from birdslam.perception.manifest import (
+    ClassMaps,
+    Count,
+    Input,
+    Manifest,
+    Misfit,
+    ModelError,
+    Role,
+    Schedule,
+    Yolox,
+    find_manifest,
+)
+from birdslam.perception.segmentation import ClassMapsDecoder, Segmentation
+from birdslam.perception.subnormal import without_tiny_weights
+from birdslam.perception.views import Preparation, View, make_views
+
+_SESSION_ERRORS = tuple(
+    error for error in vars(ort_errors).values() if isinstance(error, type) and issubclass(error, Exception)
+)
+_PROVIDERS = ["CPUExecutionProvider"]
+_FLOAT32 = "tensor(float)"
+
+
+class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A network as the configuration names it. What is None is the manifest's to say (see `manifest.Schedule`)."""
+
+    path: str
+    manifest: str = ""
+    every: Count | None = None
+    threads: Annotated[int, msgspec.Meta(ge=1, le=64)] | None = None
+    awaited: bool | None = None
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What one network found in one image; None is what it doesn't look for."""
+
+    detections: Detections | None = None
+    segmentation: Segmentation | None = None
+
+
+class Decoder(Protocol):
+    """Makes the meaning of a network's outputs: `read` each view's, then `merge` those of one image."""
+
+    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Any: ...
+
+    def merge(self, parts: Any, views: Any) -> Any: ...
+
+
+# The decodings there are: a manifest's table -> (what reads it, the field of Findings that it fills, outputs it reads).
+# The reader is called with (table, input, shapes of the outputs) and raises Misfit. A new decoding is a row here, its
+# table in manifest.py and, for a new role, a field in Manifest and in Findings.
+DECODINGS: dict[type, tuple[Callable[..., Decoder], str, Callable[[Any], tuple[str, ...]]]] = {
+    Yolox: (YoloxDecoder, "detections", lambda table: (table.output,)),
+    ClassMaps: (ClassMapsDecoder, "segmentation", lambda table: tuple(dict.fromkeys(m.output for m in table.maps))),
+}
+
+
+class Network:
+    """A loaded and warmed-up network. One run at a time: the buffers are its own and made once.
+
+    Attributes: `name` of the head, `role`, `sha256` of the file, `manifest`, `schedule` in force, `decoder`.
+    """
+
+    def __init__(
+        self, name: str, path: Path, manifest: Manifest, sha256: str, content: bytes, schedule: Schedule
+    ) -> None:
+        """Raises Misfit where manifest and network contradict each other, an onnxruntime error where it can't run."""
+        self.name = name
+        self.role: Role = manifest.role
+        self.path = path
+        self.manifest = manifest
+        self.sha256 = sha256
+        self.schedule = schedule
+        table = getattr(manifest, manifest.role)
+        make_decoder, self._finding, outputs_of = DECODINGS[type(table)]
+        self._outputs = outputs_of(table)
+        self._preparation = Preparation(manifest.input)
+        self._session = _open_session(content, manifest.input, self._outputs, schedule.threads)
+        tensor = self._preparation.tensor
+        shapes = dict(zip(self._outputs, self._shapes(tensor), strict=True))  # the first run: what is really there
+        self._tensors = {output: np.empty(shape, dtype=np.float32) for output, shape in shapes.items()}
+        self._binding = self._session.io_binding()
+        self._binding.bind_input(manifest.input.name, "cpu", 0, np.float32, tensor.shape, tensor.ctypes.data)
+        for output, buffer in self._tensors.items():
+            self._binding.bind_output(output, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
+        self.decoder = make_decoder(table, manifest.input, shapes)
+        self._views: dict[tuple[int, int], tuple[View, ...]] = {}
+        self.infer()  # warm-up of the path that run() takes
+
+    def _shapes(self, tensor: NDArray[np.float32]) -> list[tuple[int, ...]]:
+        return [out.shape for out in self._session.run(self._outputs, {self.manifest.input.name: tensor})]
+
+    def views(self, image: NDArray[np.uint8]) -> tuple[View, ...]:
+        """The views in which an image is run, each a run of its own. Raises ValueError where it is no image."""
+        if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
+            raise ValueError(
+                f"{self.name}: needs a grey (H, W) or BGR (H, W, 3) uint8 image, got {image.dtype} {image.shape}"
+            )
+        height_px, width_px = image.shape[:2]
+        if (height_px, width_px) not in self._views:
+            if min(height_px, width_px) < 1:
+                raise ValueError(f"{self.name}: an image of {width_px}x{height_px} has no pixels")
+            self._views[height_px, width_px] = make_views(width_px, height_px, self.manifest.input, self.manifest.tiles)
+        return self._views[height_px, width_px]
+
+    def prepare(self, image: NDArray[np.uint8], view: View) -> None:
+        """Writes a view of the image into the network's input."""
+        self._preparation.fill(image, view)
+
+    def infer(self) -> bool:
+        """Runs the network on its input; False where an output holds a number that is not finite."""
+        self._session.run_with_iobinding(self._binding)
+        return all(np.isfinite(tensor).all() for tensor in self._tensors.values())
+
+    def read(self, view: View) -> Any:
+        """The meaning of the outputs as they are now, for `merge`."""
+        return self.decoder.read(self._tensors, view)
+
+    def run(self, image: NDArray[np.uint8]) -> Findings | None:
+        """The findings in a grey (H, W) or BGR (H, W, 3) image of any size; None where the network gave no numbers."""
+        views, parts = self.views(image), []
+        for view in views:
+            self.prepare(image, view)
+            if not self.infer():
+                return None
+            parts.append(self.read(view))
+        return Findings(**{self._finding: self.decoder.merge(parts, views)})
+
+    def describe(self) -> dict[str, Any]:
+        """What ran, for a summary: plain values."""
+        return {
+            "name": self.name,
+            "role": self.role,
+            "title": self.manifest.title,
+            "file": self.path.name,
+            "sha256": self.sha256,
+            "input_px": [self.manifest.input.width_px, self.manifest.input.height_px],
+            "tiles": self.manifest.tiles.columns if self.manifest.tiles else 1,
+            "every": self.schedule.every,
+            "threads": self.schedule.threads,
+            "awaited": self.schedule.awaited,
+            "onnxruntime": ort.__version__,
+        }
+
+
+def load_network(name: str, spec: ModelSpec) -> Network:
+    """Opens a network, checks its manifest against its real inputs and outputs, and warms it up.
+
+    A `name` that is a role's must be the manifest's. Raises ModelError naming the file, the key, what the manifest says
+    and what the network has.
+    """
+    path = Path(spec.path)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"{path}: the network can't be read: {error.strerror}") from error
+    sha256 = hashlib.sha256(content).hexdigest()
+    manifest, origin = find_manifest(path, sha256, spec.manifest)
+    if name in get_args(Role) and name != manifest.role:
+        raise ModelError(f"{path}: role: the manifest {origin} says {manifest.role}, it was given as the {name}")
+    said = {key: value for key in ("every", "threads", "awaited") if (value := getattr(spec, key)) is not None}
+    schedule = msgspec.structs.replace(manifest.schedule, **said)
+    try:
+        return Network(name, path, manifest, sha256, content, schedule)
+    except Misfit as error:
+        raise ModelError(f"{path}: {error} (manifest {origin})") from error
+    except _SESSION_ERRORS as error:
+        raise ModelError(f"{path}: no network that onnxruntime can run: {error}") from error
+
+
+def _options(threads: int) -> ort.SessionOptions:
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.add_session_config_entry("session.inter_op.allow_spinning", "0")
+    options.log_severity_level = 4  # what goes wrong is raised; its logger would write it to the terminal too
+    return options
+
+
+def _open_session(content: bytes, input: Input, outputs: tuple[str, ...], threads: int) -> ort.InferenceSession:
+    """A session with the input's shape fixed, after its inputs and outputs were compared with the manifest."""
+    probe_options = _options(1)
+    probe_options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+    probe = ort.InferenceSession(content, probe_options, providers=_PROVIDERS)
+    has_inputs = [i.name for i in probe.get_inputs()]
+    if has_inputs != [input.name]:
+        raise Misfit("input.name", repr(input.name), f"the inputs {has_inputs}")
+    (has,) = probe.get_inputs()
+    if has.type != _FLOAT32:
+        raise Misfit("input", f"{_FLOAT32} (all that manifests can say)", has.type)
+    axes = {"N": 1, "C": 3, "H": input.height_px, "W": input.width_px}
+    if len(has.shape) != 4:
+        raise Misfit("input.layout", input.layout, f"the shape {has.shape}")
+    options = _options(threads)
+    for axis, size in zip(input.layout, has.shape, strict=True):
+        key = {"H": "input.height_px", "W": "input.width_px"}.get(axis, "input.layout")
+        if isinstance(size, str):
+            options.add_free_dimension_override_by_name(size, axes[axis])
+        elif size is not None and size != axes[axis]:
+            raise Misfit(key, f"{axis} = {axes[axis]} in {input.layout}", f"{size} in {has.shape}")
+    has_outputs = {o.name: o.type for o in probe.get_outputs()}
+    for output in outputs:
+        if output not in has_outputs:
+            raise Misfit("output", repr(output), f"the outputs {list(has_outputs)}")
+        if has_outputs[output] != _FLOAT32:
+            raise Misfit("output", f"{output} as {_FLOAT32} (all that manifests can say)", has_outputs[output])
+    return ort.InferenceSession(without_tiny_weights(content), options, providers=_PROVIDERS)

@@ -1,0 +1,161 @@
+"""Which network runs on which frame, and what is known when the frame can wait no longer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.perception.detection import Detections
+from birdslam.perception.manifest import Role, Schedule
+from birdslam.perception.network import Findings
+from birdslam.perception.segmentation import Segmentation
+from birdslam.types import Status
+
+CARRIED: dict[Role, Status] = {
+    "detector": Status.DETECTIONS_CARRIED,
+    "segmenter": Status.SEGMENTATION_CARRIED,
+}
+
+
+@dataclass(frozen=True)
+class Perception:
+    """What the networks know at one frame.
+
+    `ages`: head name -> frames since the frame that its result in use was computed on, 0 is this one; a head without
+    any result yet is absent. A head whose result isn't this frame's says so in `status`.
+    """
+
+    detections: Detections | None = None
+    segmentation: Segmentation | None = None
+    ages: dict[str, int] = field(default_factory=dict)
+    status: tuple[Status, ...] = ()
+
+
+class Pending(Protocol):
+    """A perception that may still be under way."""
+
+    def result(self) -> Perception: ...
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A perception that is there already."""
+
+    perception: Perception
+
+    def result(self) -> Perception:
+        return self.perception
+
+
+class Head(Protocol):
+    """What `Networks` needs of a `Network`."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def role(self) -> Role: ...
+    @property
+    def schedule(self) -> Schedule: ...
+    def run(self, image: NDArray[np.uint8]) -> Findings | None: ...
+
+
+@dataclass
+class _Slot:
+    """One head's run and its last result."""
+
+    head: Head
+    running: Future[Findings | None] | None = None
+    started_frame: int | None = None
+    outdated: bool = False  # the run under way belongs to frames of before a restart of the source
+    findings: Findings = field(default_factory=Findings)
+    found_frame: int | None = None
+
+
+class Networks:
+    """Starts each head on the frames that it is due on and carries its last result in between.
+
+    A head is due when `every` frames have passed since the one it last started on, so that a dropped frame doesn't
+    starve it; while its last run is under way it isn't started again. `submit(run, image) -> Future` is the executor's
+    (birdslam has no threads of its own; it needs one for each head). `patience_s` None awaits every head that runs, so
+    that the results depend on the frames alone. Else `result()` waits that long in all, for the heads that started on
+    its frame and are `awaited`; what isn't there is carried and goes on in the background.
+    """
+
+    def __init__(
+        self,
+        heads: Sequence[Head],
+        submit: Callable[..., Future[Any]],
+        patience_s: float | None = None,
+    ) -> None:
+        for key in ("name", "role"):
+            values = [getattr(head, key) for head in heads]
+            if len(set(values)) != len(values):
+                raise ValueError(f"networks: each {key} once, got {', '.join(values)}")
+        if patience_s is not None and not patience_s >= 0.0:
+            raise ValueError(f"networks: patience_s must not be negative, got {patience_s}")
+        self.heads = tuple(heads)
+        self._submit = submit
+        self._patience_s = patience_s
+        self._slots = [_Slot(head) for head in heads]
+        self._last_frame = -1
+
+    def start(self, frame_id: int, image: NDArray[np.uint8] | None) -> Pending:
+        """Starts the heads that are due; `result()` of what is returned is to be asked for once, before the next start.
+
+        The image must stay as it is while a head may read it. None (no pixels in this frame) starts nothing. A frame_id
+        that doesn't grow is a source that began anew: what is known of the old frames is forgotten.
+        """
+        if frame_id <= self._last_frame:
+            self._slots = [_Slot(s.head, s.running, outdated=s.running is not None) for s in self._slots]
+        self._last_frame = frame_id
+        for slot in self._slots:
+            due = slot.started_frame is None or frame_id - slot.started_frame >= slot.head.schedule.every
+            if image is not None and due and slot.running is None:
+                slot.running = self._submit(slot.head.run, image)
+                slot.started_frame = frame_id
+        return _Started(self, frame_id)
+
+    def _collect(self, frame_id: int) -> Perception:
+        if self._patience_s is None:
+            wait([s.running for s in self._slots if s.running is not None])
+        else:
+            wait(
+                [
+                    s.running
+                    for s in self._slots
+                    if s.running is not None and s.started_frame == frame_id and s.head.schedule.awaited
+                ],
+                timeout=self._patience_s,
+            )
+        status = []
+        for slot in self._slots:
+            if slot.running is not None and slot.running.done():
+                findings = slot.running.result()  # a head's exception is a bug and surfaces here
+                slot.running = None
+                if slot.outdated:
+                    slot.outdated = False
+                elif findings is None:
+                    status.append(Status.NETWORK_FAILED)
+                else:
+                    slot.findings, slot.found_frame = findings, slot.started_frame
+            if slot.found_frame != frame_id:
+                status.append(CARRIED[slot.head.role])
+        found = {}
+        for slot in self._slots:
+            found.update({key: value for key, value in vars(slot.findings).items() if value is not None})
+        ages = {s.head.name: frame_id - s.found_frame for s in self._slots if s.found_frame is not None}
+        return Perception(**found, ages=ages, status=tuple(dict.fromkeys(status)))
+
+
+@dataclass(frozen=True)
+class _Started:
+    networks: Networks
+    frame_id: int
+
+    def result(self) -> Perception:
+        return self.networks._collect(self.frame_id)

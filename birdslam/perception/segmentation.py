@@ -1,0 +1,68 @@
+"""Segmentation outputs to masks of the image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.perception.manifest import ClassMap, ClassMaps, Input, Meaning, Misfit
+from birdslam.perception.views import View
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """Masks (H, W) bool of the undistorted image; all false where the network has no such meaning."""
+
+    road: NDArray[np.bool_]
+    lane: NDArray[np.bool_]
+
+
+class ClassMapsDecoder:
+    """Reads class channels (see `manifest.ClassMaps`)."""
+
+    def __init__(self, table: ClassMaps, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        """Raises Misfit where an output's shape isn't what the manifest makes of it."""
+        self.table, self.input = table, input
+        for index, entry in enumerate(table.maps):
+            shape = shapes[entry.output]
+            if len(shape) != 4 or shape[0] != 1:
+                said = f"{entry.output} of shape (1, channels, h, w)"
+                raise Misfit(f"segmenter.maps[{index}].output", said, shape)
+            if shape[1] != entry.channels:
+                has = f"{shape[1]} in {entry.output} {shape}"
+                raise Misfit(f"segmenter.maps[{index}].channels", entry.channels, has)
+
+    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Segmentation:
+        """The masks of one run over the whole image."""
+        masks = {entry.meaning: self._mask(tensors[entry.output][0], entry, view) for entry in self.table.maps}
+        meanings: tuple[Meaning, ...] = ("road", "lane")
+        empty = np.zeros((view.image_height_px, view.image_width_px), dtype=bool)
+        return Segmentation(**{meaning: masks.get(meaning, empty) for meaning in meanings})
+
+    def merge(self, parts: Sequence[Segmentation], views: Sequence[View]) -> Segmentation:
+        """A segmenter has one view."""
+        (part,) = parts
+        return part
+
+    def _mask(self, scores: NDArray[np.float32], entry: ClassMap, view: View) -> NDArray[np.bool_]:
+        """(H, W): the margin of the channel over its bar, resized to the image, above zero.
+
+        Resizing the margin and not the mask keeps the border smooth at the image's resolution.
+        """
+        channel = scores[entry.channel]
+        if entry.rule == "above":
+            margin = channel - np.float32(entry.threshold)
+        elif entry.channels == 2:
+            margin = channel - scores[1 - entry.channel]
+        else:
+            margin = channel - np.delete(scores, entry.channel, axis=0).max(axis=0)
+        # The view's rectangle in the map, which may be coarser than the input.
+        fy, fx = margin.shape[0] / self.input.height_px, margin.shape[1] / self.input.width_px
+        rows = slice(round(view.top_px * fy), max(round((view.top_px + view.height_px) * fy), 1))
+        columns = slice(round(view.left_px * fx), max(round((view.left_px + view.width_px) * fx), 1))
+        size = (view.image_width_px, view.image_height_px)
+        return cv2.resize(margin[rows, columns], size, interpolation=cv2.INTER_LINEAR) > 0.0
