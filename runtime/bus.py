@@ -1,0 +1,339 @@
+"""The bus: one node's zenoh session, with typed publishers, bounded subscribers and liveliness.
+
+    with Bus("car", "perceive") as bus:
+        frames, out = bus.subscriber("frame"), bus.publisher("measurements")
+        bus.declare_alive()
+        message = frames.recv(timeout_s=0.5)                       # Message | None
+        out.put(record, message.trace.after("perceive", message.t_received_ns, done_ns))
+
+Everything stays on this machine: unix sockets in a directory of the vehicle (0700), no TCP, no multicast, no shared
+memory of zenoh's. The hub (the supervisor) listens on `hub.sock`, every node of the topology on a socket of its own,
+and they find each other by gossip through the hub; all others (planners) only connect. Nobody needs to be the first.
+
+Never fork after a Bus was opened (spawn instead), and always close it: zenoh's threads live until then.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+import zenoh
+
+from runtime.presence import runtime_dir_of, socket_path
+from runtime.topology import NODES, TOPICS, Topic, alive_key, check_name, key_of
+from runtime.wire import MAX_TRACE_BYTES, Stage, Trace, WireError, decode, encode
+
+_URGENT_BATCHES = 16  # zenoh's largest
+_LEASE_MS = 1_000  # a stopped or unreachable peer is given up after this
+_RETRY = {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2}
+_MAX_ZENOH_BYTES = 1 << 20
+_FILTER_BYTES = 65_000  # payload and attachment together; zenoh drops what is larger, so wire.py refuses it before
+_LOSSLESS_DEPTH = 4_096
+_LOSSLESS_PATIENCE_US = 60_000_000  # how long a blocked put may wait before zenoh gives the link up
+
+log = logging.getLogger(__name__)
+
+
+class BusError(RuntimeError):
+    """The bus can't do what was asked; says why."""
+
+
+class BusClosed(BusError):
+    """The bus, or this end of it, was closed."""
+
+
+class MessagesLost(BusError):
+    """A queue of a lossless bus was full: the run is no longer what it promised to be."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """A record of the topic's type, where its time went, and when it came in (CLOCK_MONOTONIC)."""
+
+    record: Any
+    trace: Trace
+    t_received_ns: int
+
+
+class Publisher:
+    """Sends the records of one topic; made by Bus.publisher."""
+
+    def __init__(self, session: zenoh.Session, key: str, topic: Topic, node: str, lossless: bool) -> None:
+        self._topic, self._node = topic, node
+        self._changed = threading.Condition()
+        self._closed = False
+        self._matched: bool | None = None  # kept here: zenoh is never asked while the lock is held
+        self._publisher = session.declare_publisher(
+            key,
+            congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME if topic.urgent else zenoh.Priority.DATA_LOW,
+            express=True,
+        )
+        callback = zenoh.handlers.Callback(self._matching_changed, indirect=False)
+        self._listener = self._publisher.declare_matching_listener(callback)
+        at_first: zenoh.MatchingStatus = self._publisher.matching_status  # type: ignore[assignment]
+        with self._changed:
+            if self._matched is None:  # else a change has come already
+                self._matched = at_first.matching
+
+    def _matching_changed(self, status: zenoh.MatchingStatus) -> None:
+        with self._changed:
+            self._matched = status.matching
+            self._changed.notify_all()
+
+    @property
+    def matched(self) -> bool:
+        """Whether somebody subscribes to this topic now."""
+        return bool(self._matched) and not self._closed
+
+    def wait_matched(self, timeout_s: float) -> bool:
+        """Waits until somebody subscribes; False where nobody did in time. Raises BusClosed."""
+        with self._changed:
+            matched = self._changed.wait_for(lambda: self._closed or self.matched, timeout_s)
+        if self._closed:
+            raise BusClosed(f"{self._topic.name}: the bus is closed")
+        return matched
+
+    def put(self, record: msgspec.Struct, trace: Trace | None = None) -> None:
+        """Sends a record, and stamps its sending into the last stage of `trace` (None: it begins here and now).
+
+        A reader that is too slow costs messages, not time: the lossy bus waits 1 ms at the most for a full link.
+        Raises WireError (a record that is too large), BusClosed, and TypeError for a record of another type.
+        """
+        if type(record) is not self._topic.record:
+            raise TypeError(f"{self._topic.name} takes {self._topic.record.__name__}, not {type(record).__name__}")
+        data = encode(record)
+        now_ns = time.monotonic_ns()
+        sent = trace.sent(now_ns) if trace and trace.stages else Trace((Stage(self._node, now_ns, now_ns, now_ns),))
+        attachment = encode(sent)
+        try:
+            self._publisher.put(data, attachment=attachment)
+        except zenoh.ZError as error:
+            if self._closed:
+                raise BusClosed(f"{self._topic.name}: the bus is closed") from error
+            raise BusError(f"{self._topic.name}: {error}") from error
+
+    def _close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+
+class Subscriber:
+    """A bounded queue of one topic's messages; made by Bus.subscriber.
+
+    `newest` is the last message that came in, whether it was read or not. `dropped` counts the messages that a newer
+    one pushed out of the full queue, `malformed` those that were no valid record, or were sent to more keys than this.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str, topic: Topic, depth: int, lossless: bool) -> None:
+        self._topic, self._key, self._lossless = topic, key, lossless
+        self._queue: deque[Message] = deque(maxlen=depth)
+        self._arrived = threading.Condition()
+        self._closed = False
+        self.newest: Message | None = None
+        self.dropped = 0
+        self.malformed = 0
+        # Called on zenoh's own thread: one hop fewer, and the messages of a sender keep their order over all topics.
+        callback = zenoh.handlers.Callback(self._receive, indirect=False)
+        self._subscriber = session.declare_subscriber(key, callback)
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        t_received_ns = time.monotonic_ns()
+        try:
+            if str(sample.key_expr) != self._key or sample.kind != zenoh.SampleKind.PUT:
+                raise WireError(f"sent as {sample.kind} to {sample.key_expr}")
+            record = decode(bytes(sample.payload), self._topic.record)
+            attachment = sample.attachment
+            trace = Trace() if attachment is None else decode(bytes(attachment), Trace, MAX_TRACE_BYTES)
+        except WireError as error:
+            self.malformed += 1
+            if self.malformed == 1:
+                log.warning("%s: a malformed message is ignored, and all that follow: %s", self._key, error)
+            return
+        with self._arrived:
+            self.dropped += len(self._queue) == self._queue.maxlen
+            self.newest = Message(record, trace, t_received_ns)
+            self._queue.append(self.newest)
+            self._arrived.notify()
+
+    def recv(self, timeout_s: float | None = None) -> Message | None:
+        """The next message, as soon as there is one; None where none came within `timeout_s` (None: no limit).
+
+        Raises BusClosed once closed, from another thread too; on a lossless bus MessagesLost where the queue was full.
+        """
+        with self._arrived:
+            self._arrived.wait_for(lambda: self._closed or self._queue, timeout_s)
+            if self._closed:
+                raise BusClosed(f"{self._topic.name}: the bus is closed")
+            if self._lossless and self.dropped:
+                raise MessagesLost(
+                    f"{self._topic.name}: {self.dropped} messages lost behind {self._queue.maxlen} unread ones"
+                )
+            return self._queue.popleft() if self._queue else None
+
+    def close(self) -> None:
+        """Ends the subscription; whoever waits in recv gets BusClosed. A second call does nothing."""
+        with self._arrived:
+            if self._closed:
+                return
+            self._closed = True
+            self._arrived.notify_all()
+        self._subscriber.undeclare()
+
+
+class Bus:
+    """One node's session on its vehicle's bus. A context manager; `close` it always.
+
+    `hub` is the supervisor's: the socket that everybody connects to. `lossless` sends with back pressure and queues
+    deep, for runs in which every frame counts (`--rate max`): all nodes and readers of such a run must be lossless.
+    Raises ValueError for a bad vehicle or node name, BusError where the sockets can't be made.
+    """
+
+    def __init__(
+        self, vehicle: str, node: str, *, hub: bool = False, runtime_dir: Path | None = None, lossless: bool = False
+    ) -> None:
+        self.vehicle, self.node, self._lossless = check_name("vehicle", vehicle), check_name("node", node), lossless
+        self._publishers: list[Publisher] = []
+        self._subscribers: list[Subscriber] = []
+        self._alive: set[str] = set()
+        self._alive_changed = threading.Condition()
+        self._alive_callbacks: list[Callable[[str, bool], None]] = []
+        self._token: zenoh.LivelinessToken | None = None
+        self._closed = False
+
+        directory = runtime_dir_of(vehicle, runtime_dir)
+        hub_socket, own_socket = socket_path(directory, "hub"), socket_path(directory, node)
+        listen = [hub_socket] if hub else [own_socket] if node in NODES else []
+        try:
+            self._session = zenoh.open(_config(listen, [] if hub else [hub_socket], lossless))
+        except zenoh.ZError as error:
+            where = ", ".join(map(str, listen)) or hub_socket
+            raise BusError(f"{node} can't join the bus of vehicle {vehicle!r} ({where}): {error}") from error
+        callback = zenoh.handlers.Callback(self._liveliness_changed, indirect=False)
+        key = alive_key(vehicle, "*")
+        self._liveliness = self._session.liveliness().declare_subscriber(key, callback, history=True)
+
+    def publisher(self, topic: str) -> Publisher:
+        """A publisher of `topic`. Raises KeyError for a topic that the topology does not have."""
+        self._check_open()
+        key, spec = key_of(self.vehicle, topic), TOPICS[topic]
+        self._publishers.append(Publisher(self._session, key, spec, self.node, self._lossless))
+        return self._publishers[-1]
+
+    def subscriber(self, topic: str, depth: int | None = None) -> Subscriber:
+        """A subscriber of `topic`; `depth` replaces the topology's. Raises KeyError for an unknown topic."""
+        self._check_open()
+        key, spec = key_of(self.vehicle, topic), TOPICS[topic]
+        depth = spec.depth if depth is None else depth
+        depth = max(depth, _LOSSLESS_DEPTH) if self._lossless else depth
+        if depth < 1:
+            raise ValueError(f"{topic}: a queue needs a depth of at least 1, got {depth}")
+        self._subscribers.append(Subscriber(self._session, key, spec, depth, self._lossless))
+        return self._subscribers[-1]
+
+    def declare_alive(self) -> None:
+        """Says that this node is ready for work; taken back by close, or by the death of the process."""
+        self._check_open()
+        if self._token is None:
+            self._token = self._session.liveliness().declare_token(alive_key(self.vehicle, self.node))
+
+    @property
+    def alive(self) -> frozenset[str]:
+        """The nodes that are alive now, as far as this session has heard."""
+        with self._alive_changed:
+            return frozenset(self._alive)
+
+    def wait_alive(self, nodes: Iterable[str], timeout_s: float) -> set[str]:
+        """Waits until all of `nodes` are alive at once; gives those still missing. Raises BusClosed."""
+        wanted = set(nodes)
+        with self._alive_changed:
+            self._alive_changed.wait_for(lambda: self._closed or wanted <= self._alive, timeout_s)
+            self._check_open()
+            return wanted - self._alive
+
+    def on_alive(self, callback: Callable[[str, bool], None]) -> None:
+        """Calls `callback(node, alive)` at each change from now on, on zenoh's thread: it must be quick."""
+        with self._alive_changed:
+            self._alive_callbacks.append(callback)
+
+    def _liveliness_changed(self, sample: zenoh.Sample) -> None:
+        node, alive = str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT
+        with self._alive_changed:
+            (self._alive.add if alive else self._alive.discard)(node)
+            self._alive_changed.notify_all()
+            callbacks = tuple(self._alive_callbacks)
+        for callback in callbacks:
+            callback(node, alive)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise BusClosed(f"the bus of vehicle {self.vehicle!r} is closed")
+
+    def close(self) -> None:
+        """Leaves the bus and wakes whoever waits on it, with BusClosed; a second call does nothing."""
+        with self._alive_changed:
+            if self._closed:
+                return
+            self._closed = True
+            self._alive_changed.notify_all()
+        for publisher in self._publishers:
+            publisher._close()
+        for subscriber in self._subscribers:
+            subscriber.close()
+        self._session.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _config(listen: list[Path], connect: list[Path], lossless: bool) -> zenoh.Config:
+    """Local and bounded; DESIGN.md's measurements say why each of these is not zenoh's default."""
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        "listen/endpoints": [f"unixsock-stream/{path}" for path in listen],
+        "connect/endpoints": [f"unixsock-stream/{path}" for path in connect],
+        "connect/retry": _RETRY,
+        "connect/timeout_ms": -1,  # retry in the background for ever: the hub may come later, and again
+        "scouting/delay": 0,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "transport/link/protocols": ["unixsock-stream"],
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": _LEASE_MS,
+        # Express messages go in batches of their own: room for those of a few frames while the link's thread waits for
+        # the processor, else a burst of three is dropped.
+        "transport/link/tx/queue/size/real_time": _URGENT_BATCHES,
+        "transport/link/rx/max_message_size": _MAX_ZENOH_BYTES,
+        "adminspace/enabled": False,
+        "low_pass_filter": [
+            {
+                "id": "size",
+                "flows": ["ingress", "egress"],
+                "messages": ["put", "query", "reply"],
+                "key_exprs": ["**"],
+                "size_limit": _FILTER_BYTES,
+            }
+        ],
+    }
+    if lossless:
+        settings["transport/link/tx/queue/congestion_control/block/wait_before_close"] = _LOSSLESS_PATIENCE_US
+    config = zenoh.Config()
+    for name, value in settings.items():
+        config.insert_json5(name, json.dumps(value))
+    return config

@@ -1,0 +1,116 @@
+"""Records to bytes and back: plain MessagePack, so that a planner in any language can read it.
+
+What comes in is never trusted: sizes are limited before anything is built, then types, ranges and finite numbers are
+checked. Whatever is wrong with the bytes, the only exception is WireError.
+Versions: fields that a newer sender appended are ignored; a changed meaning is a new version in the topic's key.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, TypeVar
+
+import msgpack
+import msgspec
+import numpy as np
+
+# A message is a few kB. With its attachment it must pass zenoh's filter (bus.py, 65,000 B), which drops silently.
+MAX_MESSAGE_BYTES = 64_000
+MAX_TRACE_BYTES = 900
+_MAX_TEXT_BYTES = 1_000
+_MAX_ITEMS = 10_000
+
+_Record = TypeVar("_Record", bound=msgspec.Struct)
+_Count = Annotated[int, msgspec.Meta(ge=0)]
+_NodeName = Annotated[str, msgspec.Meta(max_length=32)]
+
+
+class WireError(ValueError):
+    """Bytes that are no valid record, or a record that can't become a message; says why."""
+
+
+class Stage(msgspec.Struct, frozen=True, array_like=True):
+    """What one node did with a message, on CLOCK_MONOTONIC: received it, finished its step, sent the result."""
+
+    node: _NodeName
+    received_ns: int
+    done_ns: int
+    sent_ns: int = 0  # stamped by Publisher.put
+
+
+class Trace(msgspec.Struct, frozen=True):
+    """Where a message's time went; travels as the attachment, so that the payload's bytes stay deterministic."""
+
+    stages: Annotated[tuple[Stage, ...], msgspec.Meta(max_length=8)] = ()
+
+    def after(self, node: str, received_ns: int, done_ns: int) -> Trace:
+        """The trace of what `node` made of this message: one stage more."""
+        return Trace((*self.stages, Stage(node, received_ns, done_ns)))
+
+    def sent(self, sent_ns: int) -> Trace:
+        """The trace with the sending of its last stage stamped."""
+        *earlier, last = self.stages
+        return Trace((*earlier, Stage(last.node, last.received_ns, last.done_ns, sent_ns)))
+
+
+class Health(msgspec.Struct, frozen=True, kw_only=True):
+    """A node -> supervisor and planners, about once a second: what it has done since it started."""
+
+    node: _NodeName
+    t_ns: int  # CLOCK_MONOTONIC
+    frames: _Count = 0  # records finished
+    dropped: _Count = 0  # records that were replaced or dropped before this node took them up
+    malformed: _Count = 0  # messages that were no records
+    torn: _Count = 0  # frames whose pixels were overwritten before they were read
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} has no place in a message")
+
+
+def _check_finite(plain: Any) -> None:
+    """Whatever a record itself checks, no NaN and no infinity passes the wire, in either direction."""
+    waiting = [plain]
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, float):
+            if not math.isfinite(item):
+                raise ValueError(f"numbers must be finite, got {item}")
+        elif isinstance(item, (list, tuple)):
+            waiting.extend(item)
+        elif isinstance(item, dict):
+            waiting.extend(item.values())
+
+
+def encode(record: msgspec.Struct) -> bytes:
+    """The record as one MessagePack map; the same record gives the same bytes. Raises WireError where it can't."""
+    try:
+        plain = msgspec.to_builtins(record, enc_hook=_plain)
+        _check_finite(plain)
+        data: bytes = msgpack.packb(plain)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise WireError(f"{type(record).__name__} can't be encoded: {error}") from error
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise WireError(f"{type(record).__name__} of {len(data)} B is over the {MAX_MESSAGE_BYTES} B of a message")
+    return data
+
+
+def decode(data: bytes, record: type[_Record], max_bytes: int = MAX_MESSAGE_BYTES) -> _Record:
+    """The record in `data`. Raises WireError, and nothing else, where `data` is not exactly one valid `record`."""
+    if len(data) > max_bytes:
+        raise WireError(f"{record.__name__}: {len(data)} B are over the limit of {max_bytes} B")
+    try:
+        plain = msgpack.unpackb(
+            data,
+            max_str_len=_MAX_TEXT_BYTES,
+            max_bin_len=0,
+            max_ext_len=0,
+            max_array_len=_MAX_ITEMS,
+            max_map_len=_MAX_ITEMS,
+        )
+        _check_finite(plain)
+        return msgspec.convert(plain, record)
+    except (ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        raise WireError(f"{record.__name__}: {str(error) or type(error).__name__}") from error

@@ -1,0 +1,389 @@
+"""The wire: the same bytes for ever, and nothing but WireError whatever comes in.
+
+Golden messages, one for each record type, lie in tests/golden. A new record type's is written, once, by
+`python -m tests.test_wire`; one that exists is never written again.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from birdslam.se2 import SE2
+from birdslam.types import (
+    Attitude,
+    EgoEdge,
+    Estimate,
+    FrameRef,
+    Ground,
+    LandmarkEdge,
+    LanePoint,
+    MapUpdate,
+    Measurements,
+    MotionEdge,
+    Status,
+    VehicleEdge,
+    VehicleEstimate,
+)
+from runtime.topology import NODES, TOPICS, alive_key, check_name, key_of
+from runtime.wire import MAX_MESSAGE_BYTES, MAX_TRACE_BYTES, Health, Stage, Trace, WireError, decode, encode
+
+GOLDEN = Path(__file__).parent / "golden"
+
+_COV3 = (0.04, 0.001, -0.002, 0.001, 0.09, 0.003, -0.002, 0.003, 0.0001)
+_COV2 = (0.25, 0.01, 0.01, 0.16)
+_TIMES = {
+    "frame_id": 4711,
+    "t_source_ns": 33_300_000_000,
+    "t_capture_ns": 1_234_567_890_123,
+    "t_utc_ns": 1_767_225_600_000_000_000,
+}
+_ATTITUDE = Attitude(z_m=-0.12, pitch_rad=0.011, roll_rad=-0.004)
+_GROUND = Ground(height_m=1.65, pitch_rad=0.009, roll_rad=0.002)
+# Every field holds something else than its default.
+EXAMPLES: tuple[msgspec.Struct, ...] = (
+    FrameRef(
+        **_TIMES,
+        slot=3,
+        sequence=1178,
+        ring_epoch=1_767_225_599_123_456_789,
+        width_px=1241,
+        height_px=376,
+        channels=3,
+        dropped=2,
+        status=(Status.FRAME_UNREADABLE, Status.END_OF_SOURCE),
+    ),
+    Measurements(
+        **_TIMES,
+        cc=EgoEdge(from_frame=4710, to_frame=4711, T_from_to=SE2(0.35, -0.002, 0.0013), cov=_COV3),
+        cv=(
+            VehicleEdge(
+                vehicle=7,
+                frame=4711,
+                T_ego_vehicle=SE2(22.5, -3.25, 0.02),
+                cov=_COV3,
+                label="truck",
+                score=0.875,
+                box_px=(601.5, 171.25, 690.0, 230.5),
+                length_m=7.5,
+                width_m=2.5,
+            ),
+        ),
+        vv=(MotionEdge(vehicle=7, from_frame=4710, to_frame=4711, T_from_to=SE2(0.3, 0.002, 0.001), cov=_COV3),),
+        cp=(LandmarkEdge(landmark=90_001, frame=4711, x_m=11.75, y_m=-2.5, cov=_COV2),),
+        lanes=(LanePoint(9.5, 1.75), LanePoint(14.25, 1.8)),
+        attitude=_ATTITUDE,
+        ground=_GROUND,
+        scale_sigma_rel=0.015,
+        ages={"detector": 1, "segmenter": 3},
+        status=(Status.DETECTIONS_CARRIED, Status.SCALE_CARRIED),
+    ),
+    Estimate(
+        **_TIMES,
+        epoch=2,
+        T_world_ego=SE2(92.25, -14.5, -1.25),
+        cov=_COV3,
+        valid=True,
+        vehicles=(
+            VehicleEstimate(
+                vehicle=7,
+                T_world_vehicle=SE2(114.5, -18.0, -1.2),
+                cov=_COV3,
+                velocity_mps=(3.5, -9.25),
+                velocity_cov=_COV2,
+                age_ns=30_000_000,
+                frames=41,
+                label="truck",
+                length_m=7.5,
+                width_m=2.5,
+            ),
+        ),
+        attitude=_ATTITUDE,
+        ground=_GROUND,
+        scale_sigma_rel=0.015,
+        status=(Status.STANDSTILL,),
+    ),
+    MapUpdate(epoch=2, frame_id=4711, landmarks_m=((80.5, -9.0),), lanes_m=((81.0, -7.25), (82.0, -7.5))),
+    Health(node="perceive", t_ns=1_234_567_890_123, frames=4700, dropped=11, malformed=1, torn=2),
+    Trace((Stage("capture", 1000, 2000, 2500), Stage("perceive", 3000, 25_000, 26_000))),
+)
+BY_NAME = {type(example).__name__: example for example in EXAMPLES}
+by_name = pytest.mark.parametrize("name", BY_NAME)
+
+
+def golden(name: str) -> bytes:
+    return (GOLDEN / f"{name}.msgpack").read_bytes()
+
+
+def test_every_record_of_a_topic_has_a_golden_message() -> None:
+    assert {topic.record.__name__ for topic in TOPICS.values()} | {"Trace"} == set(BY_NAME)
+    assert {path.stem for path in GOLDEN.iterdir()} == set(BY_NAME)
+
+
+@by_name
+def test_golden_bytes_decode_and_encode(name: str) -> None:
+    example = BY_NAME[name]
+    assert decode(golden(name), type(example)) == example
+    assert encode(example) == golden(name)
+
+
+@by_name
+def test_the_examples_leave_no_field_at_its_default(name: str) -> None:
+    """Else a golden message would not notice a renamed field."""
+
+    def check(record: msgspec.Struct) -> None:
+        for field in msgspec.structs.fields(record):
+            value = getattr(record, field.name)
+            assert value != field.default, f"{type(record).__name__}.{field.name}"
+            for item in value if isinstance(value, tuple) else (value,):
+                if isinstance(item, msgspec.Struct):
+                    check(item)
+
+    check(BY_NAME[name])
+
+
+@by_name
+def test_a_newer_sender_may_append_fields(name: str) -> None:
+    example = BY_NAME[name]
+    plain = msgpack.unpackb(golden(name))
+    plain["appended_later"] = {"deep": [1, 2.5, None, "x"]}
+    assert decode(msgpack.packb(plain), type(example)) == example
+
+
+@by_name
+def test_wrong_fields_are_refused(name: str) -> None:
+    record, plain = type(BY_NAME[name]), msgpack.unpackb(golden(name))
+    required = {field.name for field in msgspec.structs.fields(record) if field.required}
+    for field in plain:
+        others = {key: value for key, value in plain.items() if key != field}
+        for wrong in ([[[]]], b"bytes"):
+            with pytest.raises(WireError, match=record.__name__):
+                decode(msgpack.packb({**others, field: wrong}), record)
+        if field in required:
+            with pytest.raises(WireError, match=field):
+                decode(msgpack.packb(others), record)
+
+
+def with_each_float(plain: Any, value: float) -> Iterator[Any]:
+    """Copies of plain data, each with another one of its floats replaced."""
+    if isinstance(plain, float):
+        yield value
+    items = plain.items() if isinstance(plain, dict) else enumerate(plain) if isinstance(plain, list) else ()
+    for key, item in items:
+        for changed in with_each_float(item, value):
+            copy = plain.copy()
+            copy[key] = changed
+            yield copy
+
+
+@by_name
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_no_number_may_be_other_than_finite(name: str, value: float) -> None:
+    for plain in with_each_float(msgpack.unpackb(golden(name)), value):
+        with pytest.raises(WireError):
+            decode(msgpack.packb(plain), type(BY_NAME[name]))
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "incomplete"),
+        (b"\xc1", "FormatError"),
+        (b"\xc0", "null"),
+        (b"\x91" * 60_000, "StackError"),
+        (b"\x81\xa1x" * 20_000, "StackError"),
+        (bytes(MAX_MESSAGE_BYTES + 1), "limit"),
+        (b"\xdd\xff\xff\xff\xff", "max_array_len"),
+        (b"\xdf\xff\xff\xff\xff", "max_map_len"),
+        (b"\xda\x03\xe9" + b"x" * 1001, "max_str_len"),
+        (b"\xc4\x01x", "max_bin_len"),
+        (b"\xd7\xff" + bytes(8), "max_ext_len"),
+        (b"\x81\x01\x02", "int"),
+        (b"\x81\xa1\xff\x02", "utf-8"),
+        (encode(BY_NAME["Estimate"])[:-1], "incomplete"),
+        (encode(BY_NAME["Estimate"]) + b"\x00", "extra data"),
+    ],
+)
+def test_the_reason_is_said(data: bytes, reason: str) -> None:
+    with pytest.raises(WireError, match=reason) as caught:
+        decode(data, Estimate)
+    assert "Estimate" in str(caught.value)
+
+
+def test_what_is_not_finite_is_never_sent() -> None:
+    with pytest.raises(WireError, match="finite"):
+        encode(MapUpdate(epoch=0, frame_id=0, lanes_m=((1.0, math.nan),)))
+
+
+def test_a_message_that_is_too_large_is_never_sent() -> None:
+    points = tuple((float(i), 0.5) for i in range(5_000))
+    with pytest.raises(WireError, match=f"MapUpdate of .* {MAX_MESSAGE_BYTES}"):
+        encode(MapUpdate(epoch=0, frame_id=0, landmarks_m=points))
+
+
+def test_numpy_numbers_are_numbers_and_other_things_are_refused() -> None:
+    trace = Trace((Stage("capture", np.int64(1000), 2000, 2500), *BY_NAME["Trace"].stages[1:]))
+    assert encode(trace) == golden("Trace")
+    score = Ground(height_m=np.float64(1.65), pitch_rad=np.float32(0.5))
+    assert decode(encode(score), Ground) == Ground(height_m=1.65, pitch_rad=0.5)
+    with pytest.raises(WireError, match="ndarray"):
+        encode(Stage("capture", np.zeros(2), 2))  # type: ignore[arg-type]
+    with pytest.raises(WireError, match="Stage"):
+        encode(Stage("capture", 1 << 64, 2))
+
+
+def test_the_trace_grows_by_a_stage() -> None:
+    trace = Trace().after("capture", 1, 2).sent(3).after("perceive", 4, 5)
+    assert trace == Trace((Stage("capture", 1, 2, 3), Stage("perceive", 4, 5, 0)))
+    assert len(encode(Trace((Stage("n" * 32, 1 << 62, 1 << 62, 1 << 62),) * 8))) <= MAX_TRACE_BYTES
+    with pytest.raises(WireError, match="length <= 8"):
+        decode(encode(Trace((Stage("n", 1, 2, 3),) * 9)), Trace)
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False, width=64).filter(lambda x: abs(x) < 1e300)
+poses = st.builds(SE2, finite, finite, finite)
+variances = st.floats(0.0, 1e300)
+times = {name: st.integers(0, 2**63 - 1) for name in _TIMES}
+
+
+@st.composite
+def estimates(draw: st.DrawFn) -> Estimate:
+    cov = st.tuples(variances, finite, finite, finite, variances, finite, finite, finite, variances)
+    vehicle = st.builds(
+        VehicleEstimate,
+        vehicle=st.integers(0, 2**40),
+        T_world_vehicle=poses,
+        cov=cov,
+        velocity_mps=st.tuples(finite, finite),
+        velocity_cov=st.tuples(variances, finite, finite, variances),
+        age_ns=st.integers(-(2**63), 2**64 - 1),
+        frames=st.integers(0, 2**31),
+        label=st.text(max_size=20).filter(str.isprintable),
+    )
+    return Estimate(
+        epoch=draw(st.integers(0, 2**63)),
+        T_world_ego=draw(poses),
+        cov=draw(cov),
+        valid=draw(st.booleans()),
+        vehicles=tuple(draw(st.lists(vehicle, max_size=3))),
+        status=tuple(draw(st.lists(st.sampled_from(Status), max_size=4))),
+        **{name: draw(strategy) for name, strategy in times.items()},
+    )
+
+
+@settings(deadline=None)
+@given(estimates())
+def test_an_estimate_comes_back_as_it_was(estimate: Estimate) -> None:
+    data = encode(estimate)
+    again = decode(data, Estimate)
+    assert again == estimate
+    assert encode(again) == data
+
+
+def accepted_or_refused(data: bytes, record: type[msgspec.Struct]) -> None:
+    """Whatever decodes is a record that can be sent on; everything else is a WireError."""
+    try:
+        found = decode(data, record)
+    except WireError:
+        return
+    decode(encode(found), record)
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=400), st.sampled_from(EXAMPLES))
+def test_random_bytes_are_refused(data: bytes, example: msgspec.Struct) -> None:
+    accepted_or_refused(data, type(example))
+
+
+plain_data = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.binary(max_size=8),
+    lambda inner: st.lists(inner, max_size=10) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=30,
+)
+
+
+@settings(deadline=None)
+@given(st.data(), st.sampled_from(EXAMPLES))
+def test_fields_of_any_content_are_refused_or_valid(data: st.DataObject, example: msgspec.Struct) -> None:
+    plain = msgpack.unpackb(encode(example))
+    for field in data.draw(st.lists(st.sampled_from(sorted(plain)), min_size=1, max_size=3)):
+        plain[field] = data.draw(plain_data)
+    accepted_or_refused(msgpack.packb(plain), type(example))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.randoms(use_true_random=False), st.sampled_from(EXAMPLES), st.sampled_from(EXAMPLES))
+def test_mutated_messages_never_do_harm(chance: random.Random, example: msgspec.Struct, other: msgspec.Struct) -> None:
+    """Flipped, lost, doubled and foreign bytes; 50 mutants of each draw."""
+    good, donor = encode(example), encode(other)
+    for _ in range(50):
+        data = bytearray(good)
+        for _ in range(chance.randint(1, 4)):
+            place, length = chance.randrange(len(data) + 1), chance.randint(0, 12)
+            start = chance.randrange(len(donor))
+            change = chance.randrange(4)
+            if change == 0 and place < len(data):
+                data[place] = chance.randrange(256)
+            elif change == 1:
+                del data[place : place + length]
+            elif change == 2:
+                data[place:place] = donor[start : start + length]
+            else:
+                data[place : place + length] = donor[start : start + length]
+        accepted_or_refused(bytes(data), type(example))
+
+
+@pytest.mark.slow
+def test_a_million_mutants() -> None:
+    chance = random.Random(6)
+    goods = [(type(example), encode(example)) for example in EXAMPLES]
+    for _ in range(1_000_000):
+        record, good = chance.choice(goods)
+        data = bytearray(good)
+        for _ in range(chance.randint(1, 3)):
+            data[chance.randrange(len(data))] = chance.choice(
+                (0x00, 0x80, 0x90, 0xC0, 0xC1, 0xCB, 0xD9, 0xDD, 0xDF, 0xFF)
+            )
+        accepted_or_refused(bytes(data), record)
+
+
+def test_the_topology_is_closed() -> None:
+    """Each topic has the producer that sends it, and every node receives what some node sends."""
+    for node in NODES.values():
+        assert all(TOPICS[topic].producer == node.name for topic in node.sends)
+        assert all(TOPICS[topic].producer in NODES for topic in node.receives)
+    assert sorted(topic for node in NODES.values() for topic in node.sends) == sorted(TOPICS)
+    assert all(topic.depth == 1 for topic in TOPICS.values() if topic.hot)
+    assert key_of("car-1", "estimate") == "birdslam/car-1/v1/estimate"
+    assert key_of("car-1", "health/perceive") == "birdslam/car-1/v1/health/perceive"
+    assert alive_key("car-1", "*") == "birdslam/car-1/v1/alive/*"
+
+
+@pytest.mark.parametrize("name", ["", "a b", "a/b", "*", "**", "$*", "-a", "ä", "a" * 33, "a\n", "..", "a?", "a#"])
+def test_a_name_must_fit_keys_and_files(name: str) -> None:
+    with pytest.raises(ValueError, match="vehicle"):
+        check_name("vehicle", name)
+
+
+if __name__ == "__main__":
+    GOLDEN.mkdir(exist_ok=True)
+    for example in EXAMPLES:
+        file = GOLDEN / f"{type(example).__name__}.msgpack"
+        if not file.exists():
+            file.write_bytes(encode(example))
+            print(f"wrote {file}")
