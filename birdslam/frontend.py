@@ -83,7 +83,7 @@ class FrontEnd:
         self.camera = camera
         self.config = config
         self.odometry: EgoMotion = odometry or Odometry(camera, config.odometry)
-        self.tracker = Tracker(camera, config.tracking)
+        self.tracker = Tracker(camera, config.tracking, config.localisation)
         self._reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
         self._last_frame: int | None = None
 
@@ -147,15 +147,15 @@ class FrontEnd:
         )
 
     def _vehicle_edge(self, track: Track) -> VehicleEdge:
-        seen, tracking = track.observation, self.config.tracking
+        seen, place, tracking = track.observation, track.place, self.config.tracking
         yaw_rad = track.T_world_ego.between(track.pose()).yaw_rad
         cov = np.zeros((3, 3))
-        cov[:2, :2] = seen.cov
+        cov[:2, :2] = place.cov
         cov[2, 2] = (tracking.sigma_yaw_moving_rad if track.yaw_known else tracking.sigma_yaw_unknown_rad) ** 2
         return VehicleEdge(
             vehicle=track.vehicle,
             frame=track.seen_frame,
-            T_ego_vehicle=SE2(float(seen.centre_m[0]), float(seen.centre_m[1]), yaw_rad),
+            T_ego_vehicle=SE2(float(place.centre_m[0]), float(place.centre_m[1]), yaw_rad),
             cov=tuple(cov.ravel().tolist()),
             label=track.label,
             score=seen.score,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
@@ -17,9 +17,11 @@ from scipy.optimize import linear_sum_assignment
 
 from birdslam import bev
 from birdslam.camera import Camera, GroundPlane
-from birdslam.localisation import Observation, centre_of, iou
+from birdslam.localisation import LocalisationConfig, Observation, Outline, Place, iou, place
 from birdslam.se2 import SE2, wrap
 from birdslam.types import MotionEdge
+
+NEAREST_M, FAR_M = 1.0, 1e4  # a nearer box is out of the image; from there one looks at the horizon
 
 
 class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,7 +50,9 @@ class Track:
     state: NDArray[np.float64]
     cov: NDArray[np.float64]
     yaw_rad: float
-    observation: Observation  # the last one, in the ego of frame `seen_frame`
+    observation: Observation  # the last one
+    place: Place  # and where it put the vehicle, in the ego of frame `seen_frame`
+    outline: Outline
     seen_frame: int
     seen_ns: int
     T_world_ego: SE2  # of frame `seen_frame`
@@ -71,9 +75,10 @@ class Track:
 class Tracker:
     """step(): predict, associate, correct, begin and forget tracks; returns those seen in this frame."""
 
-    def __init__(self, camera: Camera, config: TrackingConfig) -> None:
+    def __init__(self, camera: Camera, config: TrackingConfig, localisation: LocalisationConfig) -> None:
         self.camera = camera
         self.config = config
+        self.localisation = localisation
         self.tracks: list[Track] = []
         self._next_id = 0
         self._t_ns: int | None = None
@@ -100,23 +105,28 @@ class Tracker:
     def predicted_boxes_px(self, T_world_ego: SE2, ground: GroundPlane) -> NDArray[np.float64]:
         """(N, 4): where each track's last box is expected in the current image; NaN behind the camera.
 
-        The foot of the box moves as the vehicle does over the road, its size with the depth; errors of the ground plane
-        cancel, since the same plane put the box into bird's-eye view.
+        The box's distance to the horizon and its size go with the inverse of the depth, whatever the ground plane.
         """
         boxes = np.full((len(self.tracks), 4), np.nan)
         T_ego_world = T_world_ego.inverse()
         for row, track in zip(boxes, self.tracks, strict=True):
-            last = track.observation
-            centre_then = track.T_world_ego.inverse() @ track.state[:2]
-            moved = (T_ego_world @ track.state[:2]) - centre_then
-            near = last.near_m + moved
-            if near[0] <= 1.0 or last.near_m[0] <= 0.0:
+            then, now = track.T_world_ego.inverse() @ track.state[:2], T_ego_world @ track.state[:2]
+            near = np.array([track.place.depth_m, track.place.depth_m * track.observation.bearing]) + now - then
+            if near[0] < NEAREST_M:
                 continue
-            foot_px = bev.ego_to_pixel(self.camera, ground, near)[0]
-            scale = last.near_m[0] / near[0]
-            width_px = (last.box_px[2] - last.box_px[0]) * scale
-            height_px = (last.box_px[3] - last.box_px[1]) * scale
-            row[:] = (foot_px[0] - width_px / 2, foot_px[1] - height_px, foot_px[0] + width_px / 2, foot_px[1])
+            x1, y1, x2, y2 = track.observation.box_px
+            scale = track.place.depth_m / near[0]
+            horizon_then, horizon_now = (
+                bev.ego_to_pixel(self.camera, ground, np.array([[FAR_M, FAR_M * bearing]]))[0]
+                for bearing in (track.observation.bearing, near[1] / near[0])
+            )
+            half_px = (x2 - x1) / 2.0 * scale
+            row[:] = (
+                horizon_now[0] - half_px,
+                horizon_now[1] + (y1 - horizon_then[1]) * scale,
+                horizon_now[0] + half_px,
+                horizon_now[1] + (y2 - horizon_then[1]) * scale,
+            )
         return boxes
 
     def _predict(self, t_source_ns: int) -> None:
@@ -139,31 +149,37 @@ class Tracker:
         overlap = iou(self.predicted_boxes_px(T_world_ego, ground), np.array([o.box_px for o in observations]))
         overlap = np.nan_to_num(overlap, nan=0.0)
         cost = 1.0 - overlap
-        R = T_world_ego.rotation()
         for i, track in enumerate(self.tracks):
             for j, observation in enumerate(observations):
-                gap = T_world_ego @ observation.centre_m - track.state[:2]
-                S = track.cov[:2, :2] + R @ observation.cov @ R.T
-                if overlap[i, j] < self.config.min_iou or gap @ np.linalg.solve(S, gap) > self.config.gate_sigma**2:
+                if overlap[i, j] < self.config.min_iou or not self._is_near(track, observation, T_world_ego):
                     cost[i, j] = 2.0
         rows, columns = linear_sum_assignment(cost)
         return [(self.tracks[i], observations[j]) for i, j in zip(rows, columns, strict=True) if cost[i, j] <= 1.0]
+
+    def _is_near(self, track: Track, observation: Observation, T_world_ego: SE2) -> bool:
+        seen, _ = self._place(track, observation, T_world_ego)
+        R = T_world_ego.rotation()
+        gap = T_world_ego @ seen.centre_m - track.state[:2]
+        S = track.cov[:2, :2] + R @ seen.cov @ R.T
+        return bool(gap @ np.linalg.solve(S, gap) <= self.config.gate_sigma**2)
+
+    def _place(self, track: Track, observation: Observation, T_world_ego: SE2) -> tuple[Place, Outline]:
+        yaw_ego_rad = wrap(track.yaw_rad - T_world_ego.yaw_rad)
+        return place(observation, track.outline, yaw_ego_rad, self.localisation)
 
     def _correct(
         self, track: Track, observation: Observation, T_world_ego: SE2, frame_id: int, t_source_ns: int
     ) -> None:
         track.motion = self._predicted_motion(track, frame_id, t_source_ns)
-        bearing = float(observation.near_m[1] / observation.near_m[0])
-        yaw_ego_rad = wrap(track.yaw_rad - T_world_ego.yaw_rad)
-        centre = centre_of(observation.near_m, bearing, observation.dimensions, yaw_ego_rad)
+        seen, outline = self._place(track, observation, T_world_ego)
         R = T_world_ego.rotation()
         H = np.eye(2, 4)
-        S = track.cov[:2, :2] + R @ observation.cov @ R.T
+        S = track.cov[:2, :2] + R @ seen.cov @ R.T
         gain = np.linalg.solve(S, H @ track.cov).T
-        track.state = track.state + gain @ (T_world_ego @ centre - track.state[:2])
+        track.state = track.state + gain @ (T_world_ego @ seen.centre_m - track.state[:2])
         keep = np.eye(4) - gain @ H
-        track.cov = keep @ track.cov @ keep.T + gain @ (R @ observation.cov @ R.T) @ gain.T
-        track.observation = replace(observation, centre_m=centre)
+        track.cov = keep @ track.cov @ keep.T + gain @ (R @ seen.cov @ R.T) @ gain.T
+        track.observation, track.place, track.outline = observation, seen, outline
         track.seen_frame, track.seen_ns, track.T_world_ego = frame_id, t_source_ns, T_world_ego
         track.hits += 1
         track.votes[observation.label] += 1
@@ -200,19 +216,23 @@ class Tracker:
         track.yaw_known = True
 
     def _begin(self, observation: Observation, T_world_ego: SE2, frame_id: int, t_source_ns: int) -> Track:
+        # Most traffic runs along the road: until it is seen to move otherwise, it is headed like the ego.
+        seen, outline = place(observation, Outline.of_class(observation.dimensions), 0.0, self.localisation)
         R = T_world_ego.rotation()
         cov = np.zeros((4, 4))
-        cov[:2, :2] = R @ observation.cov @ R.T
+        cov[:2, :2] = R @ seen.cov @ R.T
         cov[2:, 2:] = np.eye(2) * self.config.sigma_birth_mps**2
         return Track(
-            state=np.concatenate([T_world_ego @ observation.centre_m, np.zeros(2)]),
+            state=np.concatenate([T_world_ego @ seen.centre_m, np.zeros(2)]),
             cov=cov,
-            yaw_rad=T_world_ego.yaw_rad,  # most traffic runs along the road
+            yaw_rad=T_world_ego.yaw_rad,
             observation=observation,
+            place=seen,
+            outline=outline,
             seen_frame=frame_id,
             seen_ns=t_source_ns,
             T_world_ego=T_world_ego,
-            T_world_seen=T_world_ego @ SE2(float(observation.centre_m[0]), float(observation.centre_m[1])),
+            T_world_seen=T_world_ego @ SE2(float(seen.centre_m[0]), float(seen.centre_m[1])),
             votes=Counter({observation.label: 1}),
         )
 

@@ -31,7 +31,7 @@ class Drive:
     """Runs a tracker over a world; `sees` may take boxes away or add some."""
 
     def __init__(self, config: TrackingConfig | None = None, noise_px: float = 0.0) -> None:
-        self.tracker = Tracker(CAMERA, config or TrackingConfig())
+        self.tracker = Tracker(CAMERA, config or TrackingConfig(), LocalisationConfig())
         self.rng = np.random.default_rng(1)
         self.noise_px = noise_px
         self.frame = 0
