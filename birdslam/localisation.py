@@ -37,6 +37,7 @@ DIMENSIONS = {
     "bus": Dimensions(11.0, 2.5, 3.1, sigma_length_rel=0.2, sigma_height_rel=0.1),
     "motorcycle": Dimensions(2.1, 0.8, 1.6, sigma_height_rel=0.12),
 }
+NO_MEASUREMENT_REL = 1e3
 CENTRE_STEPS = 3  # each leaves about a tenth of the error
 
 
@@ -50,8 +51,9 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     sigma_road_rad: float = 0.003  # of the road under the vehicle against the road under the ego
     sigma_cut_rel: float = 1.0  # an edge cut by the image says nothing within the whole box
     cut_margin_px: float = 4.0
+    cut_margin_rel: float = 0.1  # of the box: detectors draw an edge that the image cuts off a little inside of it
     size_floor_rel: float = 0.03  # a learned size is never surer: it has the ground plane's common error in it
-    width_drift_rel: float = 0.03  # a frame: the outline turns with the line of sight
+    width_drift_rel: float = 0.01  # a frame: the outline turns with the line of sight
     same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
     max_range_m: float = 80.0
 
@@ -213,7 +215,7 @@ def _observe(
     config: LocalisationConfig,
 ) -> Observation | None:
     x1, y1, x2, y2 = (float(edge) for edge in box)
-    width_px, height_px, margin_px = x2 - x1, y2 - y1, config.cut_margin_px
+    width_px, height_px = x2 - x1, y2 - y1
     if width_px < 1.0 or height_px < 1.0:
         return None
     foot_px = np.array([[(x1 + x2) / 2.0, y2]])
@@ -221,14 +223,13 @@ def _observe(
     if not np.isfinite(near).all() or not 0.0 < near[0] < config.max_range_m:
         return None
     sigma_edge = np.array([width_px, height_px]) * config.sigma_box_rel + config.sigma_box_px
+    margin_px = config.cut_margin_px
     cut_side = x1 < margin_px or x2 > camera.width_px - margin_px
-    cut_bottom, cut_top = y2 > camera.height_px - margin_px, y1 < margin_px
-    sigma_v_px = config.sigma_cut_rel * height_px if cut_bottom else sigma_edge[1]
-    road_rad = math.hypot(sigma_pitch_rad, config.sigma_road_rad)
-    slope = near[0] ** 2 / ground.height_m  # of the depth over the angle below the horizon
-    sigma_depth_rel = math.hypot(
-        slope * math.hypot(sigma_v_px / camera.fy_px, road_rad) / near[0], config.sigma_camera_height_rel
-    )
+    cut_top = y1 < margin_px
+    cut_bottom = y2 > camera.height_px - margin_px - config.cut_margin_rel * height_px
+    road_rad = math.hypot(sigma_pitch_rad, config.sigma_road_rad, float(sigma_edge[1]) / camera.fy_px)
+    # d depth / d angle is depth^2 / height. A cut bottom is no measurement at all, only a bound.
+    sigma_depth_rel = math.hypot(near[0] / ground.height_m * road_rad, config.sigma_camera_height_rel)
     cut_rel = config.sigma_cut_rel
     return Observation(
         label=label,
@@ -237,7 +238,7 @@ def _observe(
         bearing=float(near[1] / near[0]),
         sigma_bearing=float(cut_rel * width_px if cut_side else sigma_edge[0]) / camera.fx_px,
         depth_m=float(near[0]),
-        sigma_depth_rel=sigma_depth_rel,
+        sigma_depth_rel=NO_MEASUREMENT_REL if cut_bottom else sigma_depth_rel,
         tan_height=height_px / camera.fy_px,
         sigma_height_rel=float(cut_rel if cut_bottom or cut_top else 1.4 * sigma_edge[1] / height_px),
         tan_width=width_px / camera.fx_px,
