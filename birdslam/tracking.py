@@ -37,6 +37,7 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_birth_mps: float = 8.0
     moving_mps: float = 2.0  # below it, or within moving_sigma of rest, a vehicle's motion says nothing of its yaw
     moving_sigma: float = 3.0
+    moving_of_ego: float = 0.3  # nor within this fraction of the ego's speed: an error of the ground plane moves all
     yaw_gain: float = 0.3  # of the direction of motion into the yaw, each time it is seen
     sigma_yaw_rate_radps: float = 0.5
     sigma_yaw_unknown_rad: float = 0.5
@@ -82,12 +83,14 @@ class Tracker:
         self.tracks: list[Track] = []
         self._next_id = 0
         self._t_ns: int | None = None
+        self._T_world_ego = SE2()
+        self._ego_speed_mps = 0.0
 
     def step(
         self, observations: list[Observation], T_world_ego: SE2, ground: GroundPlane, frame_id: int, t_source_ns: int
     ) -> list[Track]:
         """Confirmed tracks that were seen in this frame, each with its state corrected, ordered by id."""
-        self._predict(t_source_ns)
+        self._predict(t_source_ns, T_world_ego)
         pairs = self._associate(observations, T_world_ego, ground)
         for track, observation in pairs:
             self._correct(track, observation, T_world_ego, frame_id, t_source_ns)
@@ -129,9 +132,12 @@ class Tracker:
             )
         return boxes
 
-    def _predict(self, t_source_ns: int) -> None:
+    def _predict(self, t_source_ns: int, T_world_ego: SE2) -> None:
         dt_s = 0.0 if self._t_ns is None else max(0.0, (t_source_ns - self._t_ns) * 1e-9)
-        self._t_ns = t_source_ns
+        if dt_s > 0.0:
+            step = self._T_world_ego.between(T_world_ego)
+            self._ego_speed_mps = math.hypot(step.x_m, step.y_m) / dt_s
+        self._t_ns, self._T_world_ego = t_source_ns, T_world_ego
         F = np.eye(4)
         F[0, 2] = F[1, 3] = dt_s
         G = np.array([[dt_s**2 / 2, 0.0], [0.0, dt_s**2 / 2], [dt_s, 0.0], [0.0, dt_s]])
@@ -209,7 +215,8 @@ class Tracker:
         vx, vy = track.state[2:]
         speed = math.hypot(vx, vy)
         sigma = math.sqrt(max(float(np.trace(track.cov[2:, 2:])) / 2.0, 1e-12))
-        if speed < max(self.config.moving_mps, self.config.moving_sigma * sigma):
+        config = self.config
+        if speed < max(config.moving_mps, config.moving_sigma * sigma, config.moving_of_ego * self._ego_speed_mps):
             return
         turn = wrap(math.atan2(vy, vx) - track.yaw_rad)
         track.yaw_rad = wrap(track.yaw_rad + (self.config.yaw_gain if track.yaw_known else 1.0) * turn)
