@@ -1,0 +1,91 @@
+"""The command `birdslam`. What a user can mend is one line on standard error and exit status 2, never a traceback."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+# One thread for BLAS and OpenMP in every process: DESIGN.md measured 100 times the latency with more on busy cores.
+# In `evaluate` too, which must compute as the nodes do.
+THREAD_LIMITS = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
+)
+USER_ERROR_STATUS = 2  # of the program and of a node: what the user gave can't be used
+INTERRUPTED_STATUS = 130
+CLOSED_PIPE_STATUS = 141
+
+USAGE_NOTE = "Sources: kitti:DIR, video:FILE, v4l2:/dev/videoN, rtsp://HOST/PATH."
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point; gives the exit status."""
+    options = _parser().parse_args(arguments)
+    os.environ.update(THREAD_LIMITS)
+    try:
+        from runtime import commands  # only now: numpy's libraries read the environment when they are loaded
+
+        return commands.execute(options)
+    except KeyboardInterrupt:
+        return INTERRUPTED_STATUS
+    except BrokenPipeError:  # `| head` has seen enough; Python would complain once more when it flushes
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return CLOSED_PIPE_STATUS
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="birdslam", description="Monocular multibody SLAM in bird's-eye view.", epilog=USAGE_NOTE
+    )
+    parser.add_argument("--version", action="version", version=f"birdslam {version('birdslam')}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="capture, perceive and optimize a source, live", epilog=USAGE_NOTE)
+    run.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
+    run.add_argument("--source", metavar="URI", help="where frames come from")
+    run.add_argument("--rate", metavar="HZ|max", help='frames a second, or "max": every frame, as fast as can be')
+    run.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
+    _add_pipeline_options(run)
+    run.set_defaults(command="run")
+
+    listen = commands.add_parser("listen", help="print live estimates, as a planner gets them, until the source ends")
+    listen.add_argument("--vehicle", metavar="NAME", default="car")
+    listen.add_argument("--runtime-dir", metavar="DIR", type=Path, help="as runtime.runtime_dir of the run")
+    listen.add_argument("--json", action="store_true", help="one JSON object a line")
+    listen.add_argument("--count", metavar="N", type=int, help="end after N estimates")
+    listen.add_argument("--timeout", metavar="S", type=float, help="end, with status 1, when none comes for so long")
+    listen.set_defaults(command="listen")
+
+    evaluate = commands.add_parser("evaluate", help="compare with ground truth").add_subparsers(
+        required=True, metavar="WHAT"
+    )
+    odometry = evaluate.add_parser("odometry", help="ego trajectories against KITTI poses, in one process, repeatable")
+    ahead = evaluate.add_parser("car-ahead", help="distance to the car ahead against LiDAR; odometry's report too")
+    for command, what in (("evaluate odometry", odometry), ("evaluate car-ahead", ahead)):
+        what.add_argument("sequences", nargs="+", metavar="SEQUENCE_DIR", help="a KITTI directory, or a source's URI")
+        what.add_argument("--config", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
+        _add_pipeline_options(what)
+        what.set_defaults(command=command)
+    return parser
+
+
+def _add_pipeline_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--model",
+        action="append",
+        default=[],
+        metavar="ROLE=PATH",
+        help="an ONNX network for a role (detector, segmenter); may be repeated",
+    )
+    parser.add_argument("--camera", metavar="FILE", help="a camera file (TOML) instead of the recording's calibration")
+    parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame of a recording")
+    parser.add_argument("--output", metavar="DIR", help="where results go")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="any key, e.g. perceive.deadline_ms=25"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

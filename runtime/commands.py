@@ -1,0 +1,203 @@
+"""What the commands of `birdslam` do (runtime/cli.py parses them)."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+
+from birdslam import evaluation
+from birdslam.datasets import DatasetError, Recording, open_recording
+from birdslam.perception import ModelError
+from birdslam.results import ResultsError
+from birdslam.slam import BirdSLAM
+from birdslam.types import Estimate, MapUpdate, Measurements, Status
+from runtime import supervisor
+from runtime.bus import BusError
+from runtime.cli import USER_ERROR_STATUS
+from runtime.client import Planner
+from runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, load, parse_setting
+from runtime.inference import Inference
+from runtime.presence import VehicleBusy
+from runtime.sources import RecordedSource, SourceError, offline_frames
+
+USER_ERRORS = (
+    ConfigurationError,
+    DatasetError,
+    ModelError,
+    ResultsError,
+    SourceError,
+    BusError,
+    VehicleBusy,
+)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """The command that was parsed; gives the exit status."""
+    commands: dict[str, Callable[[argparse.Namespace], int]] = {
+        "run": run,
+        "listen": listen,
+        "evaluate odometry": evaluate_odometry,
+        "evaluate car-ahead": evaluate_car_ahead,
+    }
+    try:
+        return commands[options.command](options)
+    except USER_ERRORS as error:
+        print(f"birdslam: {' '.join(str(error).split())}", file=sys.stderr)
+        return USER_ERROR_STATUS
+
+
+def configuration_of(options: argparse.Namespace) -> Configuration:
+    """The configuration file with the options of the command line on top. Raises ConfigurationError."""
+    overrides: dict[str, Any] = dict(parse_setting(text) for text in options.set)
+    for text in options.model:
+        role, equals, path = text.partition("=")
+        if not (role and equals and path):
+            raise ConfigurationError(f"--model {text}: expected ROLE=PATH")
+        overrides[f"models.{role}.path"] = path
+    keys = {"source": "source.uri", "rate": "source.rate", "stride": "source.stride"}
+    for name in ("source", "rate", "stride", "camera", "vehicle", "output"):
+        value = getattr(options, name, None)
+        if value is not None:
+            overrides[keys.get(name, name)] = _number(value) if name == "rate" else value
+    return load(options.config, overrides)
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def run(options: argparse.Namespace) -> int:
+    """`birdslam run`: the three processes."""
+    return supervisor.run(configuration_of(options))
+
+
+def listen(options: argparse.Namespace) -> int:
+    """`birdslam listen`: estimates as they come; 1 where none came within the time-out."""
+    left, vehicle = options.count, options.vehicle
+    supervisor.check_runtime_dir(vehicle, options.runtime_dir)
+    with Planner(vehicle, options.runtime_dir) as planner:
+        while left is None or left > 0:
+            estimate = planner.wait(options.timeout)
+            if estimate is None:
+                print(f"birdslam: no estimate of vehicle {vehicle!r} in {options.timeout:g} s", file=sys.stderr)
+                return 1
+            print(_as_line(estimate, planner.latest().age_ms, options.json), flush=True)
+            left = None if left is None else left - 1
+            if Status.END_OF_SOURCE in estimate.status:
+                return 0
+    return 0
+
+
+def _as_line(estimate: Estimate, age_ms: float, as_json: bool) -> str:
+    if as_json:
+        return msgspec.json.encode(estimate).decode()
+    pose = estimate.T_world_ego
+    vehicles = "  ".join(
+        f"{v.label} {v.vehicle} at {v.T_world_vehicle.x_m:.1f} {v.T_world_vehicle.y_m:.1f} m" for v in estimate.vehicles
+    )
+    return (
+        f"frame {estimate.frame_id}  epoch {estimate.epoch}  x {pose.x_m:.2f} m  y {pose.y_m:.2f} m  "
+        f"yaw {pose.yaw_rad:.3f} rad  age {age_ms:.1f} ms  {'valid' if estimate.valid else 'NOT VALID'}  "
+        f"{' '.join(estimate.status)}  {vehicles}"
+    ).rstrip()
+
+
+Drive = Callable[[Recording], Iterator[Measurements | Estimate | MapUpdate]]
+
+
+def _uri(text: str) -> str:
+    return text if text.partition(":")[0] in FILE_SCHEMES else f"kitti:{text}"
+
+
+@contextlib.contextmanager
+def _pipeline(configuration: Configuration) -> Iterator[Drive]:
+    """The whole method in this process, on frames as capture makes them, awaiting every network.
+
+    Gives each frame's Measurements, its Estimate, and what the map gained.
+    """
+    configuration = msgspec.structs.replace(
+        configuration, source=msgspec.structs.replace(configuration.source, rate="max")
+    )
+    cv2.setNumThreads(configuration.perceive.opencv_threads)
+    with contextlib.ExitStack() as stack:
+
+        def drive(recording: Recording) -> Iterator[Measurements | Estimate | MapUpdate]:
+            networks = stack.enter_context(Inference(configuration)).networks
+            slam = BirdSLAM(recording.camera, networks, configuration.slam)
+            for frame in offline_frames(RecordedSource(recording, configuration.source)):
+                yield from slam.step(frame)
+                gained = slam.map_update()
+                if gained is not None:
+                    yield gained
+
+        yield drive
+
+
+def evaluate_odometry(options: argparse.Namespace) -> int:
+    """`birdslam evaluate odometry`: trajectories against the truth; writes report.json and prints a table."""
+    print(_odometry_table(_evaluate(options)))
+    return 0
+
+
+def evaluate_car_ahead(options: argparse.Namespace) -> int:
+    """`birdslam evaluate car-ahead`: the distance to the car ahead against the recording's LiDAR."""
+    for report in _evaluate(options):
+        ahead = report.car_ahead
+        if ahead is None:
+            raise ConfigurationError(f"{report.sequence}: has no LiDAR (lidar_cam0 beside its images) to compare with")
+        if ahead.error_median_rel is None or ahead.error_p90_rel is None or ahead.bias_median_rel is None:
+            print(f"{report.sequence}: no car ahead in {report.frames} frames")
+        else:
+            print(
+                f"{report.sequence}: {ahead.frames} frames with a car ahead, error of its distance: "
+                f"median {ahead.error_median_rel:.1%}, 90 % within {ahead.error_p90_rel:.1%}, "
+                f"bias {ahead.bias_median_rel:+.1%}"
+            )
+    return 0
+
+
+def _evaluate(options: argparse.Namespace) -> list[evaluation.OdometryReport]:
+    configuration = configuration_of(options)
+    source = configuration.source
+    if source.frames is not None or source.loop:
+        raise ConfigurationError("source.frames, source.loop: evaluate takes whole recordings, once")
+    recordings = [open_recording(_uri(text), configuration.camera, source.stride) for text in options.sequences]
+    twice = [name for name, n in Counter(recording.name for recording in recordings).items() if n > 1]
+    if twice:
+        raise ConfigurationError(f"two sequences are named {twice[0]}: their results would overwrite each other")
+    if not configuration.models.given():
+        print(supervisor.WITHOUT_MODELS)
+    with _pipeline(configuration) as drive:
+        reports = evaluation.evaluate_odometry(recordings, drive, Path(configuration.output))
+    print(f"results in {configuration.output}")
+    return reports
+
+
+def _odometry_table(reports: list[evaluation.OdometryReport]) -> str:
+    columns = (
+        ("frames", "frames", 0),
+        ("path m", "path_m", 1),
+        ("ATE m", "ate_m", 3),
+        ("ATE %", "ate_pct", 2),
+        ("ATE sim3 m", "ate_sim3_m", 3),
+        ("scale error", "scale_error", 4),
+        ("RPE m", "rpe_t_m", 4),
+        ("RPE deg", "rpe_r_deg", 4),
+    )
+    lines = [f"{'sequence':16}" + "".join(f"{title:>12}" for title, _, _ in columns)]
+    for report in reports:
+        values = [(getattr(report, field), digits) for _, field, digits in columns]
+        cells = "".join(f"{'-' if value is None else format(value, f'.{digits}f'):>12}" for value, digits in values)
+        lines.append(f"{report.sequence:16}{cells}")
+    return "\n".join(lines)

@@ -1,0 +1,73 @@
+"""The networks on threads of their own: side by side, never two runs of one at once, and awaited to a deadline."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+from birdslam.frontend import Pending
+from birdslam.perception import Networks, Perception, load_network
+from birdslam.types import Frame
+from runtime.configuration import Configuration
+
+Run = Callable[..., Any]
+
+
+class Inference:
+    """The configured networks, checked against their manifests and warm. A context manager.
+
+    At rate "max" every network is awaited, so that a run can be repeated. Else a frame waits for those that are worth
+    it (`ModelSpec.awaited`) until its deadline, which counts from its capture: a frame that comes late waits less, and
+    the delay does not grow. What is not there by then is carried, with its age. Raises perception.ModelError.
+    """
+
+    def __init__(self, configuration: Configuration) -> None:
+        heads = [load_network(role, spec) for role, spec in configuration.models.given().items()]
+        self._deadline_ns = configuration.deadline_ns
+        self._awaited: frozenset[Run] = frozenset(head.run for head in heads if head.schedule.awaited)
+        self._started: list[Future[Any]] = []  # for the frame at hand, and awaited
+        self._threads = ThreadPoolExecutor(max(1, len(heads)), thread_name_prefix="network")
+        self.networks = Networks(heads, self._submit, None if self._deadline_ns is None else 0.0)
+
+    def _submit(self, run: Run, *arguments: Any) -> Future[Any]:
+        future = self._threads.submit(run, *arguments)
+        if run in self._awaited:
+            self._started.append(future)
+        return future
+
+    def start(self, frame: Frame) -> Pending:
+        """Starts the networks that are due on a frame."""
+        self._started = []
+        pending = self.networks.start(frame.frame_id, frame.image)
+        if self._deadline_ns is None:
+            return pending
+        return _UntilDeadline(pending, self._started, frame.t_capture_ns + self._deadline_ns)
+
+    def close(self) -> None:
+        """Ends the threads, after the runs at hand."""
+        self._threads.shutdown(wait=True, cancel_futures=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+@dataclass(frozen=True)
+class _UntilDeadline:
+    """A pending perception that is awaited to a point in time, and then taken as it is."""
+
+    pending: Pending
+    awaited: list[Future[Any]]
+    deadline_ns: int  # CLOCK_MONOTONIC
+
+    def result(self) -> Perception:
+        wait(self.awaited, timeout=max(0.0, (self.deadline_ns - time.monotonic_ns()) / 1e9))
+        return self.pending.result()

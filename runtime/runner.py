@@ -1,0 +1,153 @@
+"""The one loop of every node: receive, step, send, measure, beat.
+
+`python -m runtime.runner NODE VITALS_FD PARENT_PID`, the configuration as JSON on standard input. Exit status: 0 at the
+end of the source or when told to end; 2 where what the user gave can't be used, with one ERROR line on stderr; 1 where
+the node fails at work: a camera that is gone, or a bug, with its traceback there.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import logging
+import os
+import select
+import signal
+import sys
+import time
+from types import FrameType
+
+import cv2
+import msgspec
+
+from birdslam.datasets import DatasetError
+from birdslam.perception import ModelError
+from birdslam.types import Estimate, FrameRef, Measurements, Status
+from runtime.bus import Bus, Publisher
+from runtime.cli import USER_ERROR_STATUS
+from runtime.configuration import Configuration, ConfigurationError
+from runtime.nodes import NODE_TYPES, Node
+from runtime.sources import SourceError
+from runtime.topology import NODES, TOPICS
+from runtime.vitals import Vitals
+from runtime.wire import Health
+
+log = logging.getLogger(__name__)
+
+LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
+USER_ERRORS = (ConfigurationError, DatasetError, ModelError, SourceError)
+DOWNSTREAM = {"capture": "perceive", "perceive": "optimize", "optimize": "supervisor"}  # who must be there to receive
+HEALTH_PERIOD_NS = 1_000_000_000
+_PR_SET_PDEATHSIG = 1
+
+
+class Stop:
+    """The signals of the supervisor. SIGTERM: end after the step at hand (at once while still building). SIGINT: drain,
+    the source ends here and all frames in flight are processed.
+    """
+
+    def __init__(self) -> None:
+        self.at_work = False
+        self.asked = False
+        self.draining = False
+        self._event = os.eventfd(0)
+        signal.signal(signal.SIGTERM, self._handle)
+        signal.signal(signal.SIGINT, self._handle)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if not self.at_work:
+            raise SystemExit(0)
+        self.draining = True
+        self.asked = self.asked or number == signal.SIGTERM
+        os.eventfd_write(self._event, 1)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Sleeps to a deadline (exact to some 50 us), or until a signal; says whether one has come."""
+        select.select([self._event], [], [], timeout_s)
+        return self.draining
+
+
+def run(name: str, configuration: Configuration, vitals: Vitals, stop: Stop) -> None:
+    """One node from its start to its end."""
+    runtime = configuration.runtime
+    with Bus(
+        configuration.vehicle, name, runtime_dir=configuration.runtime_dir, lossless=configuration.lossless
+    ) as bus:
+        node = NODE_TYPES[name](configuration, bus, stop.wait)
+        try:
+            publishers = {TOPICS[topic].record: bus.publisher(topic) for topic in NODES[name].sends}
+            _await_downstream(name, bus, publishers, runtime.ready_timeout_s)
+            gc.collect()
+            gc.freeze()  # what was built lives to the end: never walk it again
+            stop.at_work = True
+            vitals.count(ready=1)
+            vitals.beat()
+            bus.declare_alive()
+            _loop(name, node, publishers, vitals, stop, runtime.beat_s)
+        finally:
+            node.close()
+
+
+def _await_downstream(name: str, bus: Bus, publishers: dict[type, Publisher], timeout_s: float) -> None:
+    """Readiness goes upstream, supervisor to capture, so that the first frame finds everyone listening."""
+    until_s = time.monotonic() + timeout_s
+    missing = bus.wait_alive({DOWNSTREAM[name]}, timeout_s)
+    main = publishers[TOPICS[NODES[name].sends[0]].record]
+    if missing or not main.wait_matched(max(0.0, until_s - time.monotonic())):
+        raise TimeoutError(f"{DOWNSTREAM[name]} was not ready to receive within {timeout_s:g} s")
+
+
+def _is_frame(record: msgspec.Struct) -> bool:
+    return isinstance(record, FrameRef | Measurements | Estimate) and Status.END_OF_SOURCE not in record.status
+
+
+def _loop(name: str, node: Node, publishers: dict[type, Publisher], vitals: Vitals, stop: Stop, beat_s: float) -> None:
+    frames = 0
+    next_health_ns = time.monotonic_ns() + HEALTH_PERIOD_NS
+    while not (node.ended or stop.asked):
+        vitals.beat()
+        if stop.draining:
+            node.drain()
+        message = node.receive(beat_s)
+        if message is not None:
+            taken_ns = time.monotonic_ns()  # waiting in the queue belongs to the hop, not to the step
+            for record in node.step(message.record):
+                trace = message.trace.after(name, taken_ns, time.monotonic_ns())
+                publishers[type(record)].put(record, trace)
+                frames += _is_frame(record)
+        vitals.count(frames=frames, **node.counters())
+        now_ns = time.monotonic_ns()
+        if now_ns >= next_health_ns:
+            publishers[Health].put(Health(node=name, t_ns=now_ns, frames=frames, **node.counters()))
+            next_health_ns = now_ns + HEALTH_PERIOD_NS
+
+
+def _die_with(parent_pid: int) -> None:
+    """A supervisor that is killed takes its nodes along."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent_pid:
+        raise SystemExit(0)
+
+
+def main(arguments: list[str]) -> int:
+    """Entry point of a node's process."""
+    name, vitals_fd, parent_pid = arguments
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=LOG_FORMAT)
+    stop = Stop()
+    _die_with(int(parent_pid))
+    configuration = msgspec.json.decode(sys.stdin.buffer.read(), type=Configuration)
+    sys.setswitchinterval(configuration.runtime.switch_interval_s)
+    cv2.setNumThreads(1)  # perceive sets its own
+    try:
+        run(name, configuration, Vitals(int(vitals_fd)), stop)
+    except USER_ERRORS as error:
+        log.error("%s", error)
+        return 1 if stop.at_work else USER_ERROR_STATUS
+    except Exception:
+        log.exception("%s failed", name)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,91 @@
+"""The command line: what a user can mend is one line on standard error and exit status 2."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from birdslam.perception import ModelSpec
+from runtime.cli import _parser, main
+from runtime.commands import configuration_of
+from runtime.configuration import ConfigurationError
+
+NOWHERE = "kitti:/nowhere/at/all"
+
+
+def configuration(*arguments: str):  # type: ignore[no-untyped-def]
+    return configuration_of(_parser().parse_args(arguments))
+
+
+def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out.startswith("birdslam ")
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["run", "--speed", "3"], ["evaluate", "odometry"]])
+def test_a_wrong_command_shows_the_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2
+    assert "usage: birdslam" in capsys.readouterr().err
+
+
+def test_options_go_over_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text(
+        'vehicle = "van"\noutput = "there"\n[source]\nrate = 3\n[models.detector]\npath = "old"\nevery = 2\n'
+    )
+    made = configuration(
+        "run",
+        str(path),
+        *("--source", NOWHERE, "--rate", "max", "--stride", "2", "--output", "here", "--vehicle", "bus"),
+        *("--model", "detector=a.onnx", "--model", "segmenter=b.onnx"),
+        *("--set", "perceive.deadline_ms=15", "--set", "slam.graph.ego_nodes=6"),
+    )
+    assert (made.source.uri, made.source.rate, made.source.stride) == (NOWHERE, "max", 2)
+    assert (made.vehicle, made.output, made.perceive.deadline_ms) == ("bus", "here", 15.0)
+    assert made.slam.graph.ego_nodes == 6
+    assert made.models.given() == {"detector": ModelSpec("a.onnx", every=2), "segmenter": ModelSpec("b.onnx")}
+    assert configuration("run", str(path)).source.rate == 3.0
+    assert configuration("run", "--rate", "33").source.rate == 33.0
+    assert configuration("evaluate", "odometry", "00", "--config", str(path)).vehicle == "van"
+
+
+def test_a_model_needs_a_role() -> None:
+    with pytest.raises(ConfigurationError, match=r"--model a\.onnx: expected ROLE=PATH"):
+        configuration("run", "--model", "a.onnx")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["run"], "no source"),
+        (["run", "--source", NOWHERE], "/nowhere/at/all: no such directory"),
+        (["run", "--source", "radar:1"], "source 'radar:1'"),
+        (["run", "missing.toml"], "missing.toml: No such file"),
+        (["run", "--source", NOWHERE, "--rate", "fast"], "source.rate"),
+        (["run", "--source", NOWHERE, "--set", "slam.colour=1"], "slam.colour: there is no such key"),
+        (["run", "--source", NOWHERE, "--model", "nose=a.onnx"], "models.nose: there is no such key"),
+        (["run", "--source", NOWHERE, "--camera", "missing.toml"], "camera file missing.toml"),
+        (["run", "--source", NOWHERE, "--vehicle", "a b"], "vehicle"),
+        (["run", "--source", "v4l2:/dev/video77"], "v4l2:/dev/video77: a live camera needs a camera file"),
+        (["evaluate", "odometry", "/nowhere/at/all"], "/nowhere/at/all: no such directory"),
+        (["evaluate", "odometry", NOWHERE, "--set", "source.loop=true"], "source.loop"),
+        (["listen", "--vehicle", "a/b"], "vehicle"),
+    ],
+)
+def test_a_mistake_is_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert err.count("\n") == 1
+    assert err.startswith("birdslam: ")
+    assert said in err
+    assert out == ""
+
+
+def test_listening_to_nobody_ends_when_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["listen", "--vehicle", "nobody", "--runtime-dir", str(tmp_path), "--timeout", "0.2"]) == 1
+    assert "no estimate of vehicle 'nobody' in 0.2 s" in capsys.readouterr().err

@@ -1,0 +1,101 @@
+"""Networks on threads: what is awaited, until when, and what goes on in the background."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+
+import numpy as np
+import pytest
+
+from birdslam.perception import Detections, Findings, ModelSpec, Segmentation
+from birdslam.perception.manifest import Schedule
+from birdslam.types import Frame, Status
+from runtime import inference
+from runtime.configuration import Configuration, ModelsConfig, PerceiveConfig, SourceConfig
+from runtime.inference import Inference
+
+IMAGE = np.zeros((4, 4), dtype=np.uint8)
+
+
+class Head:
+    """A network that answers when it is let."""
+
+    def __init__(self, role: str, awaited: bool = True) -> None:
+        self.name = self.role = role
+        self.schedule = Schedule(awaited=awaited)
+        self.go = threading.Semaphore(0)
+        self.runs = 0
+
+    def run(self, image: np.ndarray) -> Findings:
+        self.go.acquire()
+        self.runs += 1
+        if self.role == "detector":
+            return Findings(detections=Detections(np.zeros((0, 4)), np.zeros(0), ()))
+        return Findings(segmentation=Segmentation(image > 0, image > 0))
+
+
+def frame(frame_id: int) -> Frame:
+    return Frame(frame_id, 0, time.monotonic_ns(), 0, IMAGE)
+
+
+Made = Callable[..., AbstractContextManager[Inference]]
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> Made:
+    @contextmanager
+    def make(detector: Head, segmenter: Head, deadline_ms: float, rate: object = None) -> Iterator[Inference]:
+        heads = {"detector": detector, "segmenter": segmenter}
+        monkeypatch.setattr(inference, "load_network", lambda role, spec: heads[role])
+        spec = ModelSpec("none.onnx")
+        configuration = Configuration(
+            source=SourceConfig(rate=rate),  # type: ignore[arg-type]
+            models=ModelsConfig(detector=spec, segmenter=spec),
+            perceive=PerceiveConfig(deadline_ms=deadline_ms),
+        )
+        with Inference(configuration) as made:
+            try:
+                yield made
+            finally:
+                for head in heads.values():
+                    head.go.release()
+
+    return make
+
+
+def test_a_frame_waits_until_its_deadline_and_no_longer(made: Made) -> None:
+    detector, segmenter = Head("detector"), Head("segmenter")
+    with made(detector, segmenter, deadline_ms=50.0) as networks:
+        segmenter.go.release()
+        seen = frame(0)
+        perception = networks.start(seen).result()
+        assert time.monotonic_ns() - seen.t_capture_ns >= 50_000_000
+        assert perception.ages == {"segmenter": 0}
+        assert perception.status == (Status.DETECTIONS_CARRIED,)
+        assert detector.runs == 0  # still under way
+
+        late = Frame(1, 0, time.monotonic_ns() - 10**9, 0, IMAGE)  # its deadline is over: it waits for nothing
+        assert networks.start(late).result().status[0] == Status.DETECTIONS_CARRIED
+
+
+def test_a_frame_goes_on_as_soon_as_what_it_awaits_is_there(made: Made) -> None:
+    detector, segmenter = Head("detector"), Head("segmenter", awaited=False)
+    with made(detector, segmenter, deadline_ms=60_000.0) as networks:
+        detector.go.release()
+        perception = networks.start(frame(0)).result()
+        assert perception.ages == {"detector": 0}
+        assert perception.status == (Status.SEGMENTATION_CARRIED,)
+
+
+def test_rate_max_awaits_all(made: Made) -> None:
+    detector, segmenter = Head("detector"), Head("segmenter", awaited=False)
+    with made(detector, segmenter, deadline_ms=0.001, rate="max") as networks:
+        pending = networks.start(frame(0))
+        threading.Timer(0.05, segmenter.go.release).start()
+        detector.go.release()
+        perception = pending.result()
+        assert perception.ages == {"detector": 0, "segmenter": 0}
+        assert perception.status == ()

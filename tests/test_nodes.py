@@ -1,0 +1,182 @@
+"""Capture and optimize on their own, on a bus that a test holds in its hand."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from birdslam.camera import Camera
+from birdslam.datasets import RecordedFrame
+from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
+from runtime import nodes
+from runtime.bus import Message
+from runtime.configuration import Configuration, RuntimeConfig, SourceConfig
+from runtime.frames import FrameReader
+from runtime.nodes import CaptureNode, OptimizeNode
+from runtime.presence import ring_path
+from runtime.sources import SourceError
+from runtime.wire import Trace
+
+CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
+
+
+class Inbox:
+    """A subscriber that a test fills."""
+
+    dropped = malformed = 0
+
+    def __init__(self) -> None:
+        self.messages: deque[Message] = deque()
+
+    def recv(self, timeout_s: float | None = None) -> Message | None:
+        return self.messages.popleft() if self.messages else None
+
+
+class FakeBus:
+    def __init__(self) -> None:
+        self.inbox = Inbox()
+
+    def subscriber(self, topic: str) -> Inbox:
+        return self.inbox
+
+
+class Source:
+    """A camera or a recording of `count` frames; a camera then falls silent."""
+
+    name, camera, rate_hz = "source", CAMERA, 10.0
+
+    def __init__(self, count: int, live: bool) -> None:
+        self.live = live
+        self._count = count
+        self.over = threading.Event()
+
+    def frames(self) -> Generator[RecordedFrame]:
+        for index in range(self._count):
+            pixels = None if index == 1 else np.full((32, 64, 3), index, dtype=np.uint8)
+            yield RecordedFrame(index, 1000 + index, pixels, "torn" if pixels is None else None)
+        if self.live:
+            self.over.wait(30.0)
+
+
+def make_capture(
+    monkeypatch: pytest.MonkeyPatch, place: Path, source: Source, rate: Any = "max", **limits: Any
+) -> tuple[CaptureNode, Inbox, FrameReader]:
+    monkeypatch.setattr(nodes, "open_source", lambda configuration: source)
+    configuration = Configuration(
+        vehicle="test",
+        camera=CAMERA,
+        source=SourceConfig(uri="kitti:none", rate=rate, camera_timeout_s=0.2),
+        runtime=RuntimeConfig(runtime_dir=str(place), **limits),
+    )
+    bus = FakeBus()
+    node = CaptureNode(configuration, bus, lambda timeout_s: None)  # type: ignore[arg-type]
+    return node, bus.inbox, FrameReader(ring_path("test", place))
+
+
+def receive(node: CaptureNode) -> Message:
+    until_s = time.monotonic() + 10.0
+    while time.monotonic() < until_s:
+        message = node.receive(0.1)
+        if message is not None:
+            return message
+    raise AssertionError("nothing came")
+
+
+def come_back(inbox: Inbox, ref: FrameRef) -> None:
+    """What optimize would send of this frame."""
+    estimate = Estimate(
+        epoch=0,
+        frame_id=ref.frame_id,
+        t_source_ns=0,
+        t_capture_ns=0,
+        t_utc_ns=0,
+        T_world_ego=msgspec.convert([0.0, 0.0, 0.0], nodes.SE2),
+        cov=(0.0,) * 9,
+        valid=False,
+        status=ref.status,
+    )
+    inbox.messages.append(Message(estimate, Trace(), 0))
+
+
+def test_rate_max_keeps_a_window_and_ends_last(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    node, inbox, reader = make_capture(monkeypatch, tmp_path, Source(3, live=False), in_flight_frames=2)
+    refs = [next(node.step(receive(node).record)) for _ in range(2)]
+    assert node.receive(0.01) is None  # two are in flight
+    come_back(inbox, refs[0])
+    refs.append(next(node.step(receive(node).record)))
+    assert [ref.frame_id for ref in refs] == [0, 1, 2]
+    assert [ref.t_source_ns for ref in refs] == [1000, 1001, 1002]
+    assert refs[1].slot == -1
+    assert refs[1].status == (Status.FRAME_UNREADABLE,)
+    pixels = reader.read(refs[2])
+    assert pixels is not None
+    assert pixels.shape == (32, 64, 3)
+    assert (pixels == 2).all()
+    come_back(inbox, refs[1])
+    assert node.receive(0.01) is None  # the last frame first, then the end
+    come_back(inbox, refs[2])
+    (end,) = node.step(receive(node).record)
+    assert (end.frame_id, end.status) == (3, (Status.END_OF_SOURCE,))
+    assert node.receive(0.01) is None
+    assert not node.ended  # the ring stays until all have read
+    come_back(inbox, end)
+    assert node.receive(0.01) is None
+    assert node.ended
+    node.close()
+    reader.close()
+
+
+def test_the_end_does_not_wait_for_ever_for_a_lost_frame(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    node, _, reader = make_capture(monkeypatch, tmp_path, Source(1, live=False), rate=1000.0, drain_timeout_s=0.05)
+    next(node.step(receive(node).record))
+    (end,) = node.step(receive(node).record)
+    assert end.status == (Status.END_OF_SOURCE,)
+    node.close()
+    reader.close()
+
+
+def test_draining_ends_a_source_that_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    source = Source(1, live=True)
+    node, inbox, reader = make_capture(monkeypatch, tmp_path, source, rate=None)
+    ref = next(node.step(receive(node).record))
+    assert ref.t_capture_ns == 1000  # a camera's own stamp
+    node.drain()
+    come_back(inbox, ref)
+    (end,) = node.step(receive(node).record)
+    assert (end.frame_id, end.status) == (1, (Status.END_OF_SOURCE,))
+    source.over.set()
+    node.close()
+    reader.close()
+
+
+def test_a_camera_that_falls_silent_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    source = Source(1, live=True)
+    node, _, reader = make_capture(monkeypatch, tmp_path, source, rate=None)
+    next(node.step(receive(node).record))
+    with pytest.raises(SourceError, match=r"source: has delivered no frame for 0\.2 s"):
+        receive(node)
+    source.over.set()
+    node.close()
+    reader.close()
+
+
+def test_optimize_completes_the_map_before_the_end() -> None:
+    node = OptimizeNode(Configuration(), FakeBus(), lambda timeout_s: None)  # type: ignore[arg-type]
+    stamps = {"t_source_ns": 5, "t_capture_ns": 6, "t_utc_ns": 7}
+    first, *_ = node.step(Measurements(frame_id=0, **stamps, status=(Status.NOT_INITIALISED,)))
+    assert isinstance(first, Estimate)
+    gained, end = node.step(Measurements(frame_id=1, **stamps, status=(Status.END_OF_SOURCE,)))
+    assert isinstance(gained, MapUpdate)
+    assert gained.frame_id == 1
+    assert isinstance(end, Estimate)
+    assert (end.frame_id, end.valid, end.status) == (1, False, (Status.END_OF_SOURCE,))
+    assert (end.epoch, end.T_world_ego) == (first.epoch, first.T_world_ego)
+    assert node.ended

@@ -1,0 +1,359 @@
+"""The whole system as a user starts it: real processes, real zenoh, real shared memory."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from birdslam.types import Status
+from runtime.client import Planner
+from runtime.presence import ring_path
+
+FRAMES, WIDTH, HEIGHT, F_PX, HEIGHT_M = 12, 480, 160, 260.0, 1.65
+LIMIT_S = 60.0
+
+
+def road_image(x_m: float) -> np.ndarray:
+    """A textured road under an empty sky, seen from `x_m` along the road; level camera."""
+    u, v = np.meshgrid(np.arange(WIDTH, dtype=np.float32), np.arange(HEIGHT, dtype=np.float32))
+    below = np.maximum(v - HEIGHT / 2, 0.5)
+    depth = F_PX * HEIGHT_M / below
+    side = (u - WIDTH / 2) * depth / F_PX
+    texture = cv2.GaussianBlur(np.random.default_rng(5).integers(0, 256, (2048, 2048), dtype=np.uint8), (0, 0), 2.0)
+    texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
+    scale = np.float32(24.0)  # texels a metre
+    road = cv2.remap(texture, side * scale + 1024, (depth + x_m) * scale, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return np.where(v > HEIGHT / 2 + 4, road, 200).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small KITTI drive with its truth: straight on, 0.8 m a frame at 10 Hz."""
+    sequence = tmp_path_factory.mktemp("kitti") / "sequences" / "77"
+    (sequence / "image_0").mkdir(parents=True)
+    for number in range(FRAMES):
+        assert cv2.imwrite(str(sequence / "image_0" / f"{number:06d}.png"), road_image(0.8 * number))
+    row = f"{F_PX} 0 {WIDTH / 2} 0 0 {F_PX} {HEIGHT / 2} 0 0 0 1 0"
+    (sequence / "calib.txt").write_text(f"P0: {row}\n")
+    (sequence / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(FRAMES)))
+    poses = sequence.parent.parent / "poses" / "77.txt"
+    poses.parent.mkdir()
+    poses.write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {0.8 * i}\n" for i in range(FRAMES)))
+    return sequence
+
+
+def torn(drive: Path, folder: Path, number: int) -> Path:
+    """The same drive with one image cut off."""
+    sequence = folder / "sequences" / "torn"
+    (sequence / "image_0").mkdir(parents=True)
+    for path in sorted((drive / "image_0").iterdir()):
+        data = path.read_bytes()
+        whole = int(path.stem) != number
+        (sequence / "image_0" / path.name).write_bytes(data if whole else data[: len(data) // 3])
+    for name in ("calib.txt", "times.txt"):
+        (sequence / name).write_text((drive / name).read_text())
+    return sequence
+
+
+class Run:
+    """`birdslam run` in a process of its own."""
+
+    def __init__(self, place: Path, *arguments: str, vehicle: str = "test") -> None:
+        self.place, self.vehicle = place, vehicle
+        self.runtime_dir, self.output = place / "rt", place / "out"
+        self.process = subprocess.Popen(
+            command(
+                *("run", "--vehicle", vehicle, "--output", str(self.output)),
+                *("--set", f"runtime.runtime_dir={self.runtime_dir}", *arguments),
+            ),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+
+    def end(self) -> tuple[int, str, str]:
+        """Exit status, standard output and standard error."""
+        out, err = self.process.communicate(timeout=LIMIT_S)
+        return self.process.returncode, out, err
+
+    def summary(self) -> dict:
+        return json.loads((self.output / "summary.json").read_text())
+
+    def node_pid(self, name: str) -> int:
+        """The process of a node, which is a child of the supervisor."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        for pid in children:
+            if name.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
+                return int(pid)
+        raise AssertionError(f"{name} does not run")
+
+    def left_behind(self) -> list[Path]:
+        """Sockets and rings that still exist."""
+        ring = ring_path(self.vehicle, self.runtime_dir)
+        return [*(self.runtime_dir / self.vehicle).glob("*.sock*"), *ring.parent.glob(f"{ring.name}*")]
+
+    def kill(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.communicate(timeout=LIMIT_S)
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-P", "-m", "runtime.cli", *arguments]
+
+
+def call(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=LIMIT_S, check=False)
+
+
+@pytest.fixture
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder whose path is short enough for sockets in it."""
+    return tmp_path_factory.mktemp("p")
+
+
+def wait_gone(pids: list[int]) -> None:
+    """Until none of the processes is left."""
+    for pid in pids:
+        try:
+            fd = os.pidfd_open(pid)
+        except ProcessLookupError:
+            continue
+        try:
+            assert select.select([fd], [], [], 10.0)[0], f"process {pid} is still there"
+        finally:
+            os.close(fd)
+
+
+def evaluate(sequence: Path, output: Path, *arguments: str) -> bytes:
+    done = call("evaluate", "odometry", str(sequence), "--output", str(output), *arguments)
+    assert done.returncode == 0, done.stderr
+    return (output / sequence.name / "ego.kitti.txt").read_bytes()
+
+
+def run_all(place: Path, sequence: Path, *arguments: str) -> Run:
+    run = Run(place, "--source", f"kitti:{sequence}", *arguments)
+    status, out, err = run.end()
+    assert (status, err) == (0, ""), out
+    return run
+
+
+def test_three_processes_give_the_bytes_of_one(drive: Path, place: Path) -> None:
+    offline = evaluate(drive, place / "a")
+    run = run_all(place, drive, "--rate", "max")
+    assert (run.output / "ego.kitti.txt").read_bytes() == offline
+    assert len(offline.splitlines()) == FRAMES
+    summary = run.summary()
+    assert (summary["frames_in"], summary["frames_processed"], summary["frames_dropped"]) == (FRAMES, FRAMES, 0)
+    assert summary["ended"] == "end of source"
+    assert set(summary["age_ms"]) == {"p50", "p99", "max"}
+    assert summary["configuration"]["camera"]["width_px"] == WIDTH
+    assert run.left_behind() == []
+    report = json.loads((place / "a" / "report.json").read_text())
+    assert [(row["sequence"], row["frames"]) for row in report] == [("77", FRAMES)]
+    assert report[0]["path_m"] == pytest.approx(0.8 * (FRAMES - 1))
+
+
+def test_real_frames_and_networks_too(data_dir: Path, models_dir: Path, place: Path) -> None:
+    networks = {"detector": "yolox_nano_416.onnx", "segmenter": "twinlitenet_640x360.onnx"}
+    options = ["--stride", "6", *(f"--model={role}={models_dir / file}" for role, file in networks.items())]
+    sequence = data_dir / "kitti_odometry" / "sequences" / "06"
+    offline = evaluate(sequence, place / "a", *options)
+    run = run_all(place, sequence, "--rate", "max", *options)
+    assert (run.output / "ego.kitti.txt").read_bytes() == offline
+    summary = run.summary()
+    assert {role: model["file"] for role, model in summary["models"].items()} == networks
+    assert all(len(model["sha256"]) == 64 for model in summary["models"].values())
+    assert (run.output / "bev.png").stat().st_size > 1000
+
+
+def test_a_torn_image_costs_one_frame_and_a_status(drive: Path, place: Path) -> None:
+    sequence = torn(drive, place, number=5)
+    run = Run(place, "--source", f"kitti:{sequence}", "--rate", "40")
+    status, out, err = run.end()
+    assert (status, err) == (0, "")
+    assert "000005.png" in out
+    assert "age at the planner" in out
+    summary = run.summary()
+    assert summary["frames_in"] == FRAMES
+    assert summary["statuses"]["frame_unreadable"] == 1
+    assert summary["frames_processed"] + summary["frames_dropped"] == FRAMES
+    assert "not_initialised" not in summary["statuses"] or summary["statuses"]["not_initialised"] <= 3
+    assert evaluate(sequence, place / "a") == evaluate(sequence, place / "b")
+
+
+def test_a_slow_reader_costs_dropped_frames_that_are_counted(drive: Path, place: Path) -> None:
+    run = run_all(place, drive, "--rate", "1000", "--set", "source.loop=true", "--set", "source.frames=300")
+    summary = run.summary()
+    assert summary["frames_in"] == 300
+    assert summary["frames_processed"] < 300
+    assert summary["dropped_by"]["perceive"] == 300 - summary["frames_processed"]
+    assert summary["statuses"]["frames_dropped"] > 0
+
+
+def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None:
+    run = Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true")
+    try:
+        with Planner(run.vehicle, run.runtime_dir) as planner:
+            first, second = planner.wait(LIMIT_S), planner.wait(LIMIT_S)
+            assert first is not None
+            assert second is not None
+            assert second.frame_id > first.frame_id
+            reading = planner.latest(max_age_ms=10_000.0)
+            assert reading.alive
+            assert reading.on_time
+            assert reading.estimate is not None
+
+            rival = call(
+                *("run", "--source", f"kitti:{drive}", "--vehicle", run.vehicle, "--output", str(place / "rival")),
+                *("--set", f"runtime.runtime_dir={run.runtime_dir}"),
+            )
+            assert rival.returncode == 2
+            assert rival.stderr.startswith(f"birdslam: vehicle '{run.vehicle}' already runs")
+            assert rival.stderr.count("\n") == 1
+            assert not (place / "rival").exists()
+
+            heard = call(
+                *("listen", "--vehicle", run.vehicle, "--runtime-dir", str(run.runtime_dir)),
+                *("--json", "--count", "2", "--timeout", "20"),
+            )
+            assert heard.returncode == 0, heard.stderr
+            assert [json.loads(line)["epoch"] for line in heard.stdout.splitlines()] == [first.epoch] * 2
+
+            nodes = [run.node_pid(name) for name in ("capture", "perceive", "optimize")]
+            run.process.send_signal(signal.SIGINT)
+            status, out, err = run.end()
+            for estimate in iter(lambda: planner.wait(5.0), None):
+                assert estimate is not None
+                if Status.END_OF_SOURCE in estimate.status:
+                    break
+            else:
+                raise AssertionError("the planner was not told of the end")
+        assert (status, err) == (130, ""), out
+        wait_gone(nodes)
+        assert run.left_behind() == []
+        summary = run.summary()
+        assert summary["ended"] == "SIGINT"
+        assert len((run.output / "ego.kitti.txt").read_text().splitlines()) == summary["frames_in"]
+    finally:
+        run.kill()
+
+
+def test_a_killed_node_ends_the_run_with_its_name(drive: Path, place: Path) -> None:
+    run = Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true")
+    try:
+        with Planner(run.vehicle, run.runtime_dir) as planner:
+            assert planner.wait(LIMIT_S) is not None
+        os.kill(run.node_pid("perceive"), signal.SIGKILL)
+        status, _, err = run.end()
+        assert status == 1
+        assert err.startswith("birdslam: perceive was killed by SIGKILL")
+        assert err.count("\n") == 1
+        assert run.summary()["frames_processed"] > 0
+    finally:
+        run.kill()
+
+
+def test_a_service_is_stopped_in_order(drive: Path, place: Path) -> None:
+    run = Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true")
+    try:
+        with Planner(run.vehicle, run.runtime_dir) as planner:
+            assert planner.wait(LIMIT_S) is not None
+        run.process.send_signal(signal.SIGTERM)
+        status, _, err = run.end()
+        assert (status, err) == (0, "")
+        summary = run.summary()
+        assert summary["ended"] == "SIGTERM"
+        assert summary["frames_processed"] + summary["frames_dropped"] == summary["frames_in"]
+        assert run.left_behind() == []
+    finally:
+        run.kill()
+
+
+def test_a_stalled_node_and_then_a_killed_supervisor(drive: Path, place: Path) -> None:
+    arguments = ("--source", f"kitti:{drive}", "--set", "source.loop=true", "--set", "runtime.watchdog_s=1.5")
+    run = Run(place, *arguments)
+    try:
+        with Planner(run.vehicle, run.runtime_dir) as planner:
+            assert planner.wait(LIMIT_S) is not None
+        os.kill(run.node_pid("optimize"), signal.SIGSTOP)
+        status, _, err = run.end()
+        assert status == 1
+        assert err.startswith("birdslam: optimize is stalled: its loop has shown no life for 1.5 s")
+    finally:
+        run.kill()
+
+    run = Run(place, *arguments)  # over what the killed node left behind
+    try:
+        with Planner(run.vehicle, run.runtime_dir) as planner:
+            assert planner.wait(LIMIT_S) is not None
+        nodes = [run.node_pid(name) for name in ("capture", "perceive", "optimize")]
+        run.kill()
+        wait_gone(nodes)
+    finally:
+        run.kill()
+    again = run_all(place, drive, "--rate", "max")
+    assert again.summary()["frames_processed"] == FRAMES
+    assert again.left_behind() == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--model", "detector={place}/no.onnx"], "no.onnx: the network can't be read"),
+        (["--camera", "{place}/camera.toml"], "camera.toml"),
+        (["--output", "{place}/file/out"], "file/out"),
+    ],
+)
+def test_what_a_user_has_to_mend_is_named_before_anything_starts(
+    drive: Path, place: Path, arguments: list[str], said: str
+) -> None:
+    (place / "file").touch()
+    (place / "camera.toml").write_text("width_px = 480\nheight_px = 161\nfx_px = -1.0\n")
+    run = Run(place, "--source", f"kitti:{drive}", *(text.format(place=place) for text in arguments))
+    status, out, err = run.end()
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert said in err
+    assert run.left_behind() == []
+
+
+def test_a_manifest_that_does_not_fit_its_network(drive: Path, models_dir: Path, place: Path) -> None:
+    manifest = place / "wrong.toml"
+    shipped = Path(__file__).parent.parent / "birdslam" / "perception" / "manifests" / "twinlitenet_640x360.toml"
+    manifest.write_text(shipped.read_text().replace("640", "320"))
+    path = models_dir / "twinlitenet_640x360.onnx"
+    run = Run(
+        place,
+        *("--source", f"kitti:{drive}", "--model", f"segmenter={path}"),
+        *("--set", f"models.segmenter.manifest={manifest}"),
+    )
+    status, out, err = run.end()
+    assert (status, out) == (2, "")
+    assert str(path) in err
+    assert "input.width_px" in err
+    assert err.count("\n") == 1
+
+
+def test_a_recording_keeps_its_own_time(drive: Path, place: Path) -> None:
+    """Its last frame leaves when its time stamp says, and each stage of the way is measured."""
+    begun_s = time.monotonic()
+    run = run_all(place, drive)
+    assert time.monotonic() - begun_s >= 0.1 * (FRAMES - 1)
+    summary = run.summary()
+    assert summary["frames_processed"] + summary["frames_dropped"] == summary["frames_in"] == FRAMES
+    parts = summary["stages_ms"]
+    assert set(parts) == {
+        *("capture", "capture -> perceive", "perceive", "perceive -> optimize", "optimize", "optimize -> planner")
+    }

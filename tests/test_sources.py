@@ -1,0 +1,219 @@
+"""Sources: pacing that does not drift, reading ahead, what a slow reader costs, and cameras that are not there."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Generator
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.camera import Camera, Undistorter
+from birdslam.datasets import DatasetError, RecordedFrame, Recording
+from birdslam.types import Status
+from runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
+from runtime.sources import (
+    EndOfSource,
+    Pacer,
+    ReadAhead,
+    RecordedSource,
+    SourceError,
+    offline_frames,
+    open_source,
+    to_frame,
+)
+
+CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
+PERIOD_NS = 100_000_000
+
+
+def image(value: int = 0) -> np.ndarray:
+    return np.full((32, 64), value, dtype=np.uint8)
+
+
+class Drive(Recording):
+    """Frames without a disk; number 2 is torn."""
+
+    name, camera, rate_hz = "drive", CAMERA, 10.0
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def frames(self) -> Generator[RecordedFrame]:
+        for index in range(self._count):
+            torn = index == 2
+            yield RecordedFrame(index, index * PERIOD_NS, None if torn else image(index), "torn" if torn else None)
+
+
+class Live:
+    """A camera that delivers when it is told to."""
+
+    name, camera, rate_hz, live = "camera", CAMERA, 10.0, True
+
+    def __init__(self, error: Exception | None = None) -> None:
+        self.tick = threading.Semaphore(0)
+        self.delivered = 0
+        self._error = error
+
+    def frames(self) -> Generator[RecordedFrame]:
+        while True:
+            self.tick.acquire()
+            if self._error is not None:
+                raise self._error
+            self.delivered += 1
+            yield RecordedFrame(self.delivered - 1, self.delivered, image())
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    """The reading thread can only be seen at work, not waited for."""
+    for _ in range(2000):
+        if condition():
+            return
+        threading.Event().wait(0.002)
+    raise AssertionError("never happened")
+
+
+@given(st.lists(st.integers(1, 10**9), max_size=30), st.integers(0, 10**18), st.integers(0, 10**15))
+def test_the_pace_of_the_time_stamps_does_not_drift(steps_ns: list[int], first_ns: int, now_ns: int) -> None:
+    pacer, t_ns = Pacer(None), first_ns
+    assert pacer.due_ns(0, first_ns, now_ns) == now_ns
+    for frame_id, step_ns in enumerate(steps_ns, start=1):
+        t_ns += step_ns
+        late_ns = now_ns + 17 * frame_id * step_ns  # however late it is asked
+        assert pacer.due_ns(frame_id, t_ns, late_ns) - now_ns == t_ns - first_ns
+
+
+@given(st.floats(1.0, 1000.0), st.integers(0, 100_000))
+def test_a_given_rate_does_not_drift_either(rate: float, frame_id: int) -> None:
+    pacer = Pacer(rate)
+    pacer.due_ns(0, 0, 5)
+    assert pacer.due_ns(frame_id, 123, 456) - 5 == pytest.approx(frame_id * 1e9 / rate, abs=1.0)
+
+
+def test_rate_max_is_always_due() -> None:
+    assert [Pacer("max").due_ns(i, 10**12 * i, 7) for i in range(3)] == [7, 7, 7]
+
+
+def test_a_recording_is_read_whole_whatever_the_reader_does() -> None:
+    reader = ReadAhead(RecordedSource(Drive(9), SourceConfig()), capacity=2)
+    seen = []
+    for _ in range(9):
+        item = reader.next(timeout_s=5.0)
+        assert item is not None
+        seen.append(item)
+        assert reader.read <= len(seen) + 3  # two wait, one is in hand
+    with pytest.raises(EndOfSource):
+        reader.next(timeout_s=5.0)
+    assert [frame_id for frame_id, _ in seen] == list(range(9))
+    assert [frame.error for _, frame in seen] == [None, None, "torn", *[None] * 6]
+    assert reader.dropped == 0
+    reader.close()
+
+
+def test_a_slow_reader_of_a_camera_gets_the_newest_frame_and_the_count() -> None:
+    camera = Live()
+    reader = ReadAhead(camera, capacity=1)
+    assert reader.next(timeout_s=0.01) is None
+    for _ in range(5):
+        camera.tick.release()
+    wait_for(lambda: reader.read == 5)
+    item = reader.next(timeout_s=5.0)
+    assert item is not None
+    assert (item[0], item[1].t_source_ns) == (4, 5)
+    assert reader.dropped == 4
+    camera.tick.release()
+    item = reader.next(timeout_s=5.0)
+    assert item is not None
+    assert item[0] == 5
+    reader.close(timeout_s=0.01)
+    camera.tick.release()
+
+
+def test_what_a_source_raises_reaches_the_reader() -> None:
+    camera = Live(SourceError("camera: gone"))
+    reader = ReadAhead(camera, capacity=1)
+    camera.tick.release()
+    with pytest.raises(SourceError, match="gone"):
+        reader.next(timeout_s=5.0)
+
+
+def test_closing_ends_a_reader_that_waits() -> None:
+    reader = ReadAhead(RecordedSource(Drive(100), SourceConfig()), capacity=1)
+    wait_for(lambda: reader.read == 2)
+    reader.close(timeout_s=5.0)
+    assert not any(thread.name == "read-ahead" and thread.is_alive() for thread in threading.enumerate())
+
+
+def test_a_loop_goes_on_in_time_and_ends_after_so_many_frames() -> None:
+    source = RecordedSource(Drive(4), SourceConfig(loop=True, frames=10))
+    times = [frame.t_source_ns for frame in source.frames()]
+    assert times == [PERIOD_NS * i for i in range(10)]
+    assert len(list(RecordedSource(Drive(4), SourceConfig(frames=3)).frames())) == 3
+    assert list(RecordedSource(Drive(0), SourceConfig(loop=True)).frames()) == []
+
+
+def test_offline_frames_keep_the_unreadable_one() -> None:
+    frames = list(offline_frames(RecordedSource(Drive(4), SourceConfig())))
+    assert [frame.frame_id for frame in frames] == [0, 1, 2, 3]
+    assert [frame.image is None for frame in frames] == [False, False, True, False]
+    assert frames[2].status == (Status.FRAME_UNREADABLE,)
+    assert all(frame.t_capture_ns == frame.t_source_ns for frame in frames)
+
+
+def test_an_image_of_another_size_costs_one_frame(caplog: pytest.LogCaptureFixture) -> None:
+    wrong = RecordedFrame(7, 0, np.zeros((30, 64), dtype=np.uint8))
+    frame = to_frame(Undistorter(CAMERA), 7, wrong, t_capture_ns=1)
+    assert (frame.image, frame.status) == (None, (Status.FRAME_UNREADABLE,))
+    assert "frame 7 is unreadable: image of 64x30 does not fit the camera of 64x32" in caplog.text
+
+
+def test_distortion_is_taken_out_on_the_way() -> None:
+    camera = msgspec.structs.replace(CAMERA, distortion=(-0.3, 0.1, 0.0, 0.0))
+    pixels = np.random.default_rng(3).integers(0, 256, (32, 64), dtype=np.uint8)
+    frame = to_frame(Undistorter(camera), 0, RecordedFrame(0, 0, pixels), t_capture_ns=0)
+    expected = cv2.undistort(pixels, camera.K, np.array(camera.distortion))
+    assert frame.image is not None
+    assert np.mean(np.abs(frame.image.astype(int) - expected) <= 2) > 0.99
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({}, "no source: give --source"),
+        ({"source.uri": "lidar:x"}, "source 'lidar:x': expected kitti:DIR"),
+        ({"source.uri": "v4l2:/dev/none"}, "needs a camera file"),
+    ],
+)
+def test_a_source_that_can_be_none(overrides: dict[str, str], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        open_source(load(None, overrides))
+
+
+def live(uri: str, **source: object) -> Configuration:
+    return Configuration(camera=CAMERA, source=SourceConfig(uri=uri, camera_timeout_s=1.0, **source))  # type: ignore[arg-type]
+
+
+def test_a_missing_recording_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="nowhere"):
+        open_source(live(f"kitti:{tmp_path / 'nowhere'}"))
+
+
+def test_a_camera_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"v4l2:/dev/no_such: there is no device /dev/no_such"):
+        open_source(live("v4l2:/dev/no_such"))
+    file = tmp_path / "video0"
+    file.write_bytes(b"no camera")
+    with pytest.raises(SourceError, match="video0: does not open as a camera"):
+        open_source(live(f"v4l2:{file}"))
+    with pytest.raises(SourceError, match=r"rtsp://127\.0\.0\.1:9/x: does not open"):
+        open_source(live("rtsp://127.0.0.1:9/x"))
+    with pytest.raises(ConfigurationError, match='rate "max" is for recordings'):
+        open_source(live("v4l2:/dev/no_such", rate="max"))
