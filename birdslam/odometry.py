@@ -1,0 +1,373 @@
+"""Ego-motion of one forward camera in metres.
+
+    corners followed (features.py) -> the pose among landmarks, adjusted over a window of key images (bundle.py)
+    -> the length of it from the road under the camera (roadscale.py) -> Motion
+
+The paper takes this from an off-the-shelf SLAM and scales it by road points and a moving median (Sec. 3.1,
+scale-unambiguous ego-motion initialisation). A standing car holds its pose exactly: the image that the car stopped in
+stays the one that all later ones are compared with until they differ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.bundle import SlidingWindow, two_view
+from birdslam.camera import Camera
+from birdslam.features import FeatureConfig, FeatureTracker, Tracks
+from birdslam.motion import Motion, MotionConfig, coasting_cov, measured_cov, planar, standing_cov
+from birdslam.pose import Pose, rotation_exp, rotation_log
+from birdslam.roadscale import MetricScale, RoadScaleConfig
+from birdslam.se2 import SE2
+from birdslam.types import Status
+
+__all__ = ["Motion", "Odometry", "OdometryConfig", "Tracks"]
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+_MIN_INTERVAL_S = 0.004
+_STILL = Pose(np.eye(3), np.zeros(3))
+
+
+class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One setting for every camera, road and frame rate."""
+
+    features: FeatureConfig = FeatureConfig()
+    road: RoadScaleConfig = RoadScaleConfig()
+    motion: MotionConfig = MotionConfig()
+    # the window
+    key_images: Annotated[int, msgspec.Meta(ge=3)] = 8
+    held_images: Count = 2  # the oldest of them, which the adjustment leaves alone: they carry the unit of length
+    adjusted_landmarks: Count = 160
+    adjust_iterations: Count = 2
+    key_parallax_px: Positive = 8.0  # a new key image when the median landmark has moved so far, rotation taken out
+    key_distance_m: Positive = 0.7
+    sigma_track_px: Positive = 0.35
+    reject_px: Positive = 2.2
+    two_view_px: Positive = 0.7
+    min_fitting: Count = 18  # landmarks that must agree before a pose counts as measured
+    min_fitting_fraction: Positive = 0.35
+    max_speed_mps: Positive = 70.0
+    max_coast_s: Positive = 1.0  # after that the window begins anew
+    # standstill
+    standstill_px: Positive = 0.35  # median displacement against the image that the car stopped in
+    standstill_m: Positive = 0.012
+    standstill_rad: Positive = 0.002
+
+
+@dataclass(frozen=True)
+class _Velocity:
+    """The last measured motion, as a rate."""
+
+    linear_mps: Floats  # (3,) camera axes
+    angular_radps: Floats  # (3,)
+
+
+class Odometry:
+    """From images of one undistorted, calibrated camera to metric motion, image by image.
+
+    `track` needs only the image and can run beside the networks; `estimate` then takes what they saw. Deterministic;
+    raises ValueError for an image of another size, never for what the image shows.
+    """
+
+    def __init__(self, camera: Camera, config: OdometryConfig | None = None) -> None:
+        self.camera = camera
+        self.config = config if config is not None else OdometryConfig()
+        self._focal_px = 0.5 * (camera.fx_px + camera.fy_px)
+        self._tracker = FeatureTracker(camera.width_px, camera.height_px, self.config.features)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets everything but the camera; track ids go on counting."""
+        self._tracker.reset()
+        self._scale = MetricScale(self.camera, self.config.road)
+        self._window = self._new_window()
+        self._provisional = False  # the window's newest image is no key image yet
+        self._pose = _STILL  # of the base image, in the window's frame
+        self._base_frame: int | None = None  # the last image whose motion was measured
+        self._base_t_ns = 0
+        self._velocity: _Velocity | None = None
+        self._interval_s = 0.1
+        self._road_tracks: tuple[Ints, Floats] = (np.zeros(0, np.int64), np.zeros((0, 2)))
+
+    @property
+    def road_tracks(self) -> tuple[Ints, Floats]:
+        """(ids (N,), px (N, 2)): followed corners of the present image that lie on the road (paper, Sec. 3.1)."""
+        return self._road_tracks
+
+    # --- feature tracking ---
+
+    def track(self, image: NDArray[np.uint8]) -> Tracks:
+        """Follows the corners into an image, (H, W) grey or (H, W, 3) BGR uint8, undistorted."""
+        return self._tracker.track(image, self._predict_px)
+
+    def _predict_px(self, base: Tracks) -> Floats:
+        if self._velocity is None:
+            return base.px
+        step = self._predicted_step(self._interval_s)
+        pose = self._pose @ step
+        out = self._default_prediction(base.px, step)
+        at = np.searchsorted(self._window.ids, base.ids)
+        at = np.minimum(at, max(len(self._window.ids) - 1, 0))
+        if len(self._window.ids):
+            known = self._window.ids[at] == base.ids
+            px = self._to_px(self._window.predict_xy(pose)[at])
+            known &= np.isfinite(px).all(axis=1)
+            out[known] = px[known]
+        return out
+
+    def _default_prediction(self, px: Floats, step: Pose) -> Floats:
+        """Where a corner of unknown depth goes: as if on the road below the horizon, as if endless above."""
+        rays = np.column_stack([self._to_xy(px), np.ones(len(px))])
+        rho = np.maximum(-(rays @ self._scale.ground.normal_cam) / self.camera.height_m, 0.0) * 0.5
+        q = (rays - rho[:, None] * step.p) @ step.R
+        out = self._to_px(q[:, :2] / np.maximum(q[:, 2:], 0.2))
+        lost = (q[:, 2] < 0.3) | (np.abs(out - px) > 0.4 * self.camera.width_px).any(axis=1)
+        out[lost] = px[lost]
+        return out
+
+    # --- motion ---
+
+    def estimate(
+        self, tracks: Tracks, frame_id: int, t_source_ns: int, vehicle_boxes_px: Floats, road_mask: Bools | None = None
+    ) -> Motion | None:
+        """The motion since the last measured image; None for the very first image, and before one could be used.
+
+        `vehicle_boxes_px` (N, 4) is x1, y1, x2, y2; `road_mask` (H, W) may be some images old.
+        """
+        boxes = np.asarray(vehicle_boxes_px, dtype=np.float64).reshape(-1, 4)
+        status: list[Status] = []
+        if tracks.dark:
+            status.append(Status.CAMERA_DARK)
+        if tracks.frozen:
+            status.append(Status.CAMERA_FROZEN)
+        if self._base_frame is None:
+            if not status:
+                self._begin(tracks, frame_id, t_source_ns, boxes)
+            return None
+        dt_s = (t_source_ns - self._base_t_ns) * 1e-9
+        if dt_s < _MIN_INTERVAL_S:  # a clock that stands or steps back must not make a speed
+            dt_s = self._interval_s
+        if status:
+            return self._coasting(frame_id, dt_s, status)
+
+        static = self._outside(tracks.px, boxes)
+        ids, xy = tracks.ids[static], self._to_xy(tracks.px[static])
+        displacement = self._displacement(tracks, static)
+        found = self._locate(ids, xy, dt_s, displacement)
+        if found is None:
+            status.append(Status.LOW_TEXTURE)
+            motion = self._coasting(frame_id, dt_s, status)
+            if dt_s > self.config.max_coast_s or len(displacement) < self.config.min_fitting:
+                # Nothing links this image to the base any more: the window begins anew here, at the coasted pose.
+                self._begin(tracks, frame_id, t_source_ns, boxes)
+            return motion
+        pose, info = found
+        if self._stands(self._pose.between(pose), displacement):
+            # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.
+            motion = self._standing(frame_id)
+            self._velocity = _Velocity(np.zeros(3), np.zeros(3))
+        else:
+            pose, info = self._extend_window(frame_id, pose, ids, xy, info)
+            step = self._pose.between(pose)
+            self._scale.moved(step)
+            factor = self._scale.compare(tracks.image, pose, boxes, road_mask)
+            self._window.rescale(factor)
+            self._pose = pose
+            self._tracker.accept(tracks)
+            step = Pose(step.R, step.p * factor)
+            motion = self._moving(frame_id, step, info)
+            self._velocity, self._interval_s = _Velocity(step.p / dt_s, rotation_log(step.R) / dt_s), dt_s
+        self._base_frame, self._base_t_ns = frame_id, t_source_ns
+        self._see_road_tracks(tracks, boxes, road_mask)
+        return motion
+
+    def _begin(self, tracks: Tracks, frame_id: int, t_source_ns: int, boxes: Floats) -> None:
+        """A new window that holds this image alone."""
+        self._tracker.accept(tracks)
+        self._window = self._new_window()
+        self._pose = _STILL
+        static = self._outside(tracks.px, boxes)
+        self._window.append(frame_id, self._pose, tracks.ids[static], self._to_xy(tracks.px[static]))
+        self._provisional = False
+        self._base_frame, self._base_t_ns = frame_id, t_source_ns
+        self._scale.restart(tracks.image, self._pose, 0.3)
+
+    def _locate(self, ids: Ints, xy: Floats, dt_s: float, displacement: Floats) -> tuple[Pose, Floats] | None:
+        """The present image's pose in the window's frame and its information (6, 6); None where it is not known."""
+        cfg, window = self.config, self._window
+        guesses = [self._pose @ self._predicted_step(dt_s), self._pose]
+        best: tuple[int, Pose, Bools, Floats] | None = None
+        known = np.isfinite(window.rho)
+        shared = int(np.isin(ids, window.ids[known]).sum())
+        if shared >= cfg.min_fitting:
+            for guess in guesses:
+                pose, fits, info = window.locate(guess, ids, xy)
+                if best is None or fits.sum() > best[0]:
+                    best = (int(fits.sum()), pose, fits, info)
+                if best[0] > 0.7 * shared:
+                    break
+        if best is not None and best[0] >= max(cfg.min_fitting, cfg.min_fitting_fraction * shared):
+            travelled_m = float(np.linalg.norm(best[1].p - self._pose.p))
+            if travelled_m <= cfg.max_speed_mps * dt_s + 0.1:
+                return best[1], best[3]
+        return self._locate_two_view(ids, xy, dt_s, displacement)
+
+    def _locate_two_view(self, ids: Ints, xy: Floats, dt_s: float, displacement: Floats) -> tuple[Pose, Floats] | None:
+        """Starts the window anew from the base image and this one."""
+        cfg = self.config
+        base = self._tracker.base
+        _, a, b = np.intersect1d(base.ids, ids, return_indices=True)
+        if len(a) < cfg.min_fitting:
+            return None
+        xy_a, xy_b = self._to_xy(base.px[a]), xy[b]
+        if float(np.median(displacement)) < cfg.standstill_px and float(np.quantile(displacement, 0.8)) < 1.5:
+            return self._pose, np.eye(6) * 1e4
+        found = two_view(xy_a, xy_b, self._focal_px, cfg.two_view_px)
+        if found is None or found[1].sum() < max(cfg.min_fitting, cfg.min_fitting_fraction * len(a)):
+            return None
+        step, _ = found
+        speed = float(np.linalg.norm(self._velocity.linear_mps)) if self._velocity is not None else 0.0
+        length = speed * dt_s if speed * dt_s > 0.05 else 0.5
+        frame = self._base_frame if self._base_frame is not None else 0
+        self._window = self._new_window()
+        self._window.append(frame, self._pose, base.ids[a], xy_a)
+        self._provisional = False
+        self._scale.restart(base.image, self._pose, 0.2 if speed * dt_s > 0.05 else 1.0)
+        return self._pose @ Pose(step.R, step.p * length), np.eye(6) * 1e4
+
+    def _extend_window(self, frame_id: int, pose: Pose, ids: Ints, xy: Floats, info: Floats) -> tuple[Pose, Floats]:
+        """Puts the present image into the window in place of a provisional one, and adjusts."""
+        cfg, window = self.config, self._window
+        if self._provisional:
+            newest = window.poses[-2].between(pose)
+            parallax = self._parallax_px(ids, xy, newest.R)
+            if parallax > cfg.key_parallax_px or float(np.linalg.norm(newest.p)) > cfg.key_distance_m:
+                # The provisional image becomes a key image only if it is itself far enough from the last.
+                held = window.poses[-2].between(window.poses[-1])
+                if float(np.linalg.norm(held.p)) < 0.5 * cfg.key_distance_m and parallax < 2.0 * cfg.key_parallax_px:
+                    window.drop(len(window.poses) - 1)
+            else:
+                window.drop(len(window.poses) - 1)
+        window.append(frame_id, pose, ids, xy)
+        self._provisional = True
+        while len(window.poses) > cfg.key_images + 1:
+            window.drop(0)
+        window.triangulate()
+        held_images = min(cfg.held_images, len(window.poses) - 1)
+        # The prior on steps: loose, but where a single image is held it alone carries the unit of length.
+        loose = 1.0 / 0.3**2
+        prior = np.array([loose, loose, loose, 1e2, 1e2, 1e2])
+        adjusted = window.adjust(held_images, cfg.adjust_iterations, cfg.adjusted_landmarks, prior)
+        if not np.isfinite(window.poses[-1].p).all():
+            window.poses[-1] = pose
+        elif adjusted.any():
+            info = adjusted
+        return window.poses[-1], info
+
+    def _parallax_px(self, ids: Ints, xy: Floats, R_key_curr: Floats) -> float:
+        window = self._window
+        at = np.minimum(np.searchsorted(window.ids, ids), max(len(window.ids) - 1, 0))
+        then = window.obs[len(window.poses) - 2, at]
+        both = (window.ids[at] == ids) & np.isfinite(then[:, 0])
+        if both.sum() < 10:
+            return np.inf
+        turned = np.column_stack([xy[both], np.ones(int(both.sum()))]) @ R_key_curr.T
+        return float(np.median(np.abs(turned[:, :2] / turned[:, 2:] - then[both]).max(axis=1))) * self._focal_px
+
+    # --- standing, coasting ---
+
+    def _displacement(self, tracks: Tracks, static: Bools) -> Floats:
+        """(N,) px: how far the corners outside vehicles have moved since the base image."""
+        base = self._tracker.base
+        _, a, b = np.intersect1d(base.ids, tracks.ids[static], return_indices=True)
+        out: Floats = np.sqrt(((tracks.px[static][b] - base.px[a]) ** 2).sum(axis=1))
+        return out
+
+    def _stands(self, step: Pose, displacement: Floats) -> bool:
+        cfg = self.config
+        if len(displacement) < cfg.min_fitting or float(np.median(displacement)) > cfg.standstill_px:
+            return False
+        turn = float(np.linalg.norm(rotation_log(step.R)))
+        return float(np.linalg.norm(step.p)) < cfg.standstill_m and turn < cfg.standstill_rad
+
+    def _predicted_step(self, dt_s: float) -> Pose:
+        if self._velocity is None:
+            return _STILL
+        return Pose(rotation_exp(self._velocity.angular_radps * dt_s), self._velocity.linear_mps * dt_s)
+
+    def _moving(self, frame_id: int, step: Pose, info: Floats) -> Motion:
+        T_prev_curr = planar(step, self._scale.ground)
+        cov = measured_cov(self.config.motion, info, T_prev_curr, self._scale.ground, self._scale.sigma_rel)
+        return self._motion(frame_id, step, T_prev_curr, cov, self._scale.status())
+
+    def _standing(self, frame_id: int) -> Motion:
+        return self._motion(frame_id, _STILL, SE2(), standing_cov(self.config.motion), [Status.STANDSTILL])
+
+    def _coasting(self, frame_id: int, dt_s: float, status: list[Status]) -> Motion:
+        """The last velocity goes on; the base image stays."""
+        step = self._predicted_step(dt_s)
+        T_prev_curr = planar(step, self._scale.ground)
+        cov = coasting_cov(
+            self.config.motion, T_prev_curr, dt_s, self._velocity is not None, self._scale.sigma_rel
+        )  # fmt: skip
+        return self._motion(frame_id, step, T_prev_curr, cov, [*status, Status.ODOMETRY_COASTING])
+
+    def _motion(self, frame_id: int, step: Pose, T_prev_curr: SE2, cov: Floats, status: list[Status]) -> Motion:
+        return Motion(
+            from_frame=self._base_frame if self._base_frame is not None else frame_id,
+            to_frame=frame_id,
+            R_prev_curr=step.R,
+            t_prev_curr_m=step.p,
+            T_prev_curr=T_prev_curr,
+            cov=cov,
+            scale_sigma_rel=self._scale.sigma_rel,
+            ground=self._scale.ground,
+            pitch_sigma_rad=self._scale.pitch_sigma_rad,
+            standstill=Status.STANDSTILL in status,
+            status=tuple(status),
+        )
+
+    def _see_road_tracks(self, tracks: Tracks, boxes: Floats, road_mask: Bools | None) -> None:
+        px = tracks.px
+        rays = np.column_stack([self._to_xy(px), np.ones(len(px))])
+        rho = -(rays @ self._scale.ground.normal_cam) / self.camera.height_m
+        keep = (tracks.age > 0) & (rho > 1.0 / 30.0) & self._outside(px, boxes)
+        if road_mask is not None:
+            at = np.round(px).astype(np.int64)
+            at = np.clip(at, 0, [road_mask.shape[1] - 1, road_mask.shape[0] - 1])
+            keep &= road_mask[at[:, 1], at[:, 0]]
+        else:
+            keep &= np.abs(rays[:, 0]) < self.config.road.align.half_width_m * rho
+        self._road_tracks = (tracks.ids[keep], px[keep])
+
+    # --- small geometry ---
+
+    def _new_window(self) -> SlidingWindow:
+        return SlidingWindow(self._focal_px, self.config.sigma_track_px, self.config.reject_px)
+
+    def _to_xy(self, px: Floats) -> Floats:
+        cam = self.camera
+        out: Floats = (px - [cam.cx_px, cam.cy_px]) / [cam.fx_px, cam.fy_px]
+        return out
+
+    def _to_px(self, xy: Floats) -> Floats:
+        cam = self.camera
+        out: Floats = xy * [cam.fx_px, cam.fy_px] + [cam.cx_px, cam.cy_px]
+        return out
+
+    @staticmethod
+    def _outside(px: Floats, boxes: Floats) -> Bools:
+        out = np.ones(len(px), bool)
+        for x1, y1, x2, y2 in boxes:
+            out &= ~((px[:, 0] > x1 - 3) & (px[:, 0] < x2 + 3) & (px[:, 1] > y1 - 3) & (px[:, 1] < y2 + 6))
+        return out

@@ -1,0 +1,252 @@
+"""The road of two images compared as a whole: what their difference says about length, pitch and roll.
+
+Points followed on the road by optical flow give a length that is always short: the tracker's window sees a strong
+change of perspective there. So the earlier image is warped by the homography of the road plane,
+K (R + lambda t n(pitch, roll)^T / H) K^-1, against the present one, over the length's factor lambda, the pitch and the
+roll together: in one pair of images the three are correlated, and a wrong pitch biases the length by several per cent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.camera import Camera
+from birdslam.pose import Pose, cross, rotation_exp
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Grey = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+
+_MARGIN_PX = 4  # from the image's edge, for the warp and the smoothing
+_PLANE = 3  # log lambda, pitch, roll; behind them a rotation error (3) and the brightness' bias and gain
+
+
+class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is compared on the road, and how much it is believed."""
+
+    near_m: Positive = 4.0
+    far_m: Positive = 22.0
+    half_width_m: Positive = 3.2  # of the strip in front of the car; past it come crown, kerb and parked cars
+    lane_half_width_m: Positive = 2.0  # of the strip where no road mask is given: the car's own lane
+    max_samples: Annotated[int, msgspec.Meta(ge=200)] = 2600
+    min_samples: Annotated[int, msgspec.Meta(ge=50)] = 250
+    contrast_window_px: Annotated[int, msgspec.Meta(ge=3)] = 13  # over which brightness and contrast are evened out
+    contrast_floor_grey: Positive = 2.0
+    effective_sample_fraction: Positive = 0.013  # neighbouring pixels, and the road's shape, err together
+    sigma_rotation_rad: Positive = 0.0005  # of the relative rotation that odometry hands over
+    max_iterations: Annotated[int, msgspec.Meta(ge=1)] = 7
+
+
+@dataclass(frozen=True)
+class RoadFit:
+    """What one comparison alone says: (log lambda, pitch_rad, roll_rad) and its covariance (3, 3)."""
+
+    state: Floats
+    cov: Floats
+    correlation: float
+    samples: int
+
+
+def plane_normal(pitch_rad: float, roll_rad: float) -> tuple[Floats, Floats, Floats]:
+    """The road's upward unit normal in camera axes and its derivatives by pitch and by roll, (3,) each."""
+    cp, sp, cr, sr = np.cos(pitch_rad), np.sin(pitch_rad), np.cos(roll_rad), np.sin(roll_rad)
+    return (
+        np.array([-cp * sr, -cp * cr, -sp]),
+        np.array([sp * sr, sp * cr, -cp]),
+        np.array([-cp * cr, cp * sr, 0.0]),
+    )
+
+
+def plane_tilt(normal: Floats) -> tuple[float, float]:
+    """(pitch_rad, roll_rad) of a unit normal in camera axes: the inverse of `plane_normal`."""
+    return float(-np.arcsin(np.clip(normal[2], -1.0, 1.0))), float(np.arctan2(-normal[0], -normal[1]))
+
+
+class RoadImage:
+    """The part of a grey image that can show road, its brightness and contrast evened out: made once for each image.
+
+    Without that the edges of shadows, and of the dark below other cars, which travels with them, outweigh the road's
+    own grain.
+    """
+
+    def __init__(self, grey: NDArray[np.uint8], top_px: int, config: RoadAlignConfig) -> None:
+        self.top_px = top_px
+        smooth = cv2.GaussianBlur(grey[top_px:], (5, 5), 1.0)
+        window = (config.contrast_window_px, config.contrast_window_px)
+        mean = cv2.boxFilter(smooth, cv2.CV_32F, window)
+        contrast = cv2.sqrBoxFilter(smooth, cv2.CV_32F, window) - mean * mean
+        contrast = np.sqrt(np.maximum(contrast, 0.0, out=contrast), out=contrast) + np.float32(
+            config.contrast_floor_grey
+        )
+        self.grey: Grey = (smooth - mean) / contrast * np.float32(10.0)
+        self._slopes: tuple[Grey, Grey] | None = None
+
+    @property
+    def slopes(self) -> tuple[Grey, Grey]:
+        """d grey / du and d grey / dv, grey levels per pixel."""
+        if self._slopes is None:
+            self._slopes = (
+                cv2.Scharr(self.grey, cv2.CV_32F, 1, 0, scale=1.0 / 32.0),
+                cv2.Scharr(self.grey, cv2.CV_32F, 0, 1, scale=1.0 / 32.0),
+            )  # type: ignore[assignment]
+        assert self._slopes is not None
+        return self._slopes
+
+
+class RoadAligner:
+    """Compares two images of the road of one camera."""
+
+    def __init__(self, camera: Camera, config: RoadAlignConfig) -> None:
+        self.camera, self.config = camera, config
+        # The nearest row that could show road at far_m with the nose up by 3 degrees.
+        horizon = camera.cy_px + camera.fy_px * (camera.height_m / config.far_m - 0.05)
+        self.top_px = int(np.clip(horizon, 0, camera.height_px - 32))
+        # Every second row and third column: below it lie rows of one another's blur.
+        v = np.arange(self.top_px + _MARGIN_PX, camera.height_px - _MARGIN_PX, 2)[:, None]
+        u = np.arange(_MARGIN_PX, camera.width_px - _MARGIN_PX, 3)[None, :]
+        self._grid = (u, v, (u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px)
+
+    def image(self, grey: NDArray[np.uint8]) -> RoadImage:
+        return RoadImage(grey, self.top_px, self.config)
+
+    def samples(self, tilt: tuple[float, float], boxes_px: Floats, road_mask: Bools | None) -> Ints:
+        """Pixels (N, 2) of the present image that show road: of the mask, else of a strip in front, less vehicles."""
+        cam, cfg = self.camera, self.config
+        normal, _, _ = plane_normal(*tilt)
+        u, v, x, y = self._grid
+        rho = -(normal[0] * x + (normal[1] * y + normal[2])) / cam.height_m  # Eq. 1 is X = ray / rho
+        half_width_m = cfg.half_width_m if road_mask is not None else cfg.lane_half_width_m
+        keep = (np.abs(x) < half_width_m * rho) & (rho > 1.0 / cfg.far_m) & (rho < 1.0 / cfg.near_m)
+        if road_mask is not None:
+            keep &= road_mask[v, u]
+        for x1, y1, x2, y2 in boxes_px:
+            grow_x, grow_y = 4.0 + 0.04 * (x2 - x1), 4.0 + 0.12 * (y2 - y1)  # a box ends above the shadow of its car
+            rows = slice(*np.searchsorted(v[:, 0], [y1 - grow_y, y2 + grow_y]))
+            cols = slice(*np.searchsorted(u[0], [x1 - grow_x, x2 + grow_x]))
+            keep[rows, cols] = False
+        at = np.flatnonzero(keep.ravel())
+        if len(at) > cfg.max_samples:
+            at = at[(np.arange(cfg.max_samples) * (len(at) / cfg.max_samples)).astype(np.int64)]
+        return np.column_stack([np.broadcast_to(u, keep.shape).ravel()[at], np.broadcast_to(v, keep.shape).ravel()[at]])
+
+    def align(
+        self, past: RoadImage, present: RoadImage, T_past_present: Pose, px: Ints, prior: Floats, prior_cov: Floats
+    ) -> RoadFit | None:  # fmt: skip
+        """Fits (log lambda, pitch, roll) of the present camera, joined with the prior; None where the road is no help.
+
+        `T_past_present` is the motion with its length in the odometry's own unit, lambda times it are metres.
+        """
+        cam, cfg = self.camera, self.config
+        if len(px) < cfg.min_samples:
+            return None
+        rays = np.column_stack(
+            [(px[:, 0] - cam.cx_px) / cam.fx_px, (px[:, 1] - cam.cy_px) / cam.fy_px, np.ones(len(px))]
+        )
+        here = present.grey[px[:, 1] - present.top_px, px[:, 0]].astype(np.float64)
+        slope_u, slope_v = past.slopes
+        state = np.concatenate([prior, np.zeros(3)])
+        weight_prior = np.zeros((6, 6))
+        weight_prior[:_PLANE, :_PLANE] = np.linalg.inv(prior_cov)
+        weight_prior[3:, 3:] = np.eye(3) / cfg.sigma_rotation_rad**2
+        mean = np.concatenate([prior, np.zeros(3)])
+        Rr0 = rays @ T_past_present.R.T
+        gain, bias, fitted = 1.0, 0.0, False
+        A = np.zeros((8, 8))
+        correlation = 0.0
+        rows, cols = past.grey.shape
+        for _ in range(cfg.max_iterations):
+            normal, by_pitch, by_roll = plane_normal(state[1], state[2])
+            dR = rotation_exp(state[3:])
+            Rr = Rr0 @ dR.T
+            t = np.exp(state[0]) * T_past_present.p
+            rho = -(rays @ normal) / cam.height_m  # Eq. 1 is X = rays / rho
+            q = Rr + rho[:, None] * t
+            z = np.maximum(q[:, 2], 1e-3)
+            x, y = q[:, 0] / z, q[:, 1] / z
+            u, v = cam.fx_px * x + cam.cx_px, cam.fy_px * y + cam.cy_px - past.top_px
+            seen = (u > 1) & (u < cols - 2) & (v > 1) & (v < rows - 2) & (q[:, 2] > 0.05)
+            if seen.sum() < cfg.min_samples:
+                return None
+            map_u, map_v = u.astype(np.float32), v.astype(np.float32)
+            there = cv2.remap(past.grey, map_u, map_v, cv2.INTER_LINEAR).ravel().astype(np.float64)
+            gu = cv2.remap(slope_u, map_u, map_v, cv2.INTER_LINEAR).ravel() * (cam.fx_px / z)
+            gv = cv2.remap(slope_v, map_u, map_v, cv2.INTER_LINEAR).ravel() * (cam.fy_px / z)
+            if not fitted:
+                a, b = there[seen], here[seen]
+                gain = float(np.clip(((a - a.mean()) * (b - b.mean())).mean() / max(b.var(), 1e-6), 0.5, 2.0))
+                bias = float(a.mean() - gain * b.mean())
+                fitted = True
+            r = there - gain * here - bias
+            gq = np.column_stack([gu, gv, -(gu * x + gv * y)])  # d grey / d q
+            along = gq @ t
+            J = np.column_stack(
+                [along * rho, along * (rays @ by_pitch) / -cam.height_m, along * (rays @ by_roll) / -cam.height_m,
+                 cross(Rr, gq), -np.ones(len(r)), -here]
+            )  # fmt: skip
+            sigma = 1.4826 * float(np.median(np.abs(r[seen]))) + 0.5
+            w = np.where(seen, 1.0 / np.maximum(1.0, np.abs(r) / (1.5 * sigma)), 0.0)
+            w *= cfg.effective_sample_fraction / sigma**2
+            A = (J * w[:, None]).T @ J
+            g = (J * w[:, None]).T @ r
+            A[:6, :6] += weight_prior
+            g[:6] += weight_prior @ (state - mean)
+            A[6, 6] += 1e-9
+            A[7, 7] += 1e-6
+            step = -np.linalg.solve(A, g)
+            step[:6] = np.clip(step[:6], -0.1, 0.1)
+            state += step[:6]
+            bias, gain = bias + step[6], gain + step[7]
+            if np.abs(step[:6]).max() < 5e-5:
+                break
+        ws = np.where(seen, w, 0.0)
+        ws /= ws.sum()
+        a, b = there - ws @ there, here - ws @ here
+        correlation = float((ws * a) @ b / np.sqrt(max(float((ws * a) @ a * ((ws * b) @ b)), 1e-12)))
+        # What the images alone say: the prior that guided the fit is taken out again. A direction that they do not see
+        # keeps a variance of about one, so that it is harmless.
+        data = A.copy()
+        data[:_PLANE, :_PLANE] -= weight_prior[:_PLANE, :_PLANE]
+        info = data[:3, :3] - data[:3, 3:] @ np.linalg.solve(data[3:, 3:], data[3:, :3]) + np.diag([1.0, 10.0, 10.0])
+        cov: NDArray[Any] = np.linalg.inv(0.5 * (info + info.T))
+        measured: NDArray[Any] = state[:_PLANE] + cov @ weight_prior[:_PLANE, :_PLANE] @ (state[:_PLANE] - prior)
+        return RoadFit(measured, cov, correlation, int(seen.sum()))
+
+    def search(
+        self, past: RoadImage, present: RoadImage, T_past_present: Pose, px: Ints, tilt: tuple[float, float],
+        lengths: Floats,
+    ) -> float:  # fmt: skip
+        """The one of `lengths` at which a motion of known direction fits best, over a few pitches about `tilt`."""
+        cam = self.camera
+        px = px[:: max(1, len(px) // 900)]
+        rays = np.column_stack(
+            [(px[:, 0] - cam.cx_px) / cam.fx_px, (px[:, 1] - cam.cy_px) / cam.fy_px, np.ones(len(px))]
+        )
+        here = present.grey[px[:, 1] - present.top_px, px[:, 0]].astype(np.float64)
+        direction = T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9)
+        turned = rays @ T_past_present.R.T
+        best = (float(lengths[0]), -1.0)
+        for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01):
+            rho = -(rays @ plane_normal(pitch_rad, tilt[1])[0]) / cam.height_m
+            q = turned[None] + (lengths[:, None] * rho[None])[:, :, None] * direction
+            z = np.maximum(q[..., 2], 1e-3)
+            u = (cam.fx_px * q[..., 0] / z + cam.cx_px).astype(np.float32)
+            v = (cam.fy_px * q[..., 1] / z + cam.cy_px - past.top_px).astype(np.float32)
+            there = cv2.remap(past.grey, u, v, cv2.INTER_LINEAR)
+            inside = (u > 0) & (u < past.grey.shape[1] - 1) & (v > 0) & (v < past.grey.shape[0] - 1)
+            count = np.maximum(inside.sum(axis=1), 1)
+            a = np.where(inside, there - (there * inside).sum(axis=1, keepdims=True) / count[:, None], 0.0)
+            b = np.where(inside, here - (here * inside).sum(axis=1, keepdims=True) / count[:, None], 0.0)
+            correlation = (a * b).sum(axis=1) / np.sqrt(np.maximum((a * a).sum(axis=1) * (b * b).sum(axis=1), 1e-9))
+            correlation[count < 0.5 * len(px)] = -1.0
+            k = int(correlation.argmax())
+            if correlation[k] > best[1]:
+                best = (float(lengths[k]), float(correlation[k]))
+        return best[0]

@@ -1,0 +1,339 @@
+"""Odometry: laws on a rendered street, and the figures on the real clips (README of the shared data)."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from birdslam.camera import Camera, GroundPlane
+from birdslam.datasets import open_recording
+from birdslam.motion import planar
+from birdslam.odometry import Motion, Odometry, OdometryConfig
+from birdslam.pose import Pose, rotation_exp, rotation_log
+from birdslam.types import Status
+
+WIDTH_PX, HEIGHT_PX = 620, 188
+CAMERA = Camera(WIDTH_PX, HEIGHT_PX, 360.0, 360.0, 305.0, 90.0, height_m=1.65)
+NO_BOXES = np.zeros((0, 4))
+PITCH_RAD = math.radians(0.8)  # of the rendered camera; CAMERA doesn't know it
+
+
+@functools.cache
+def _texture(seed: int) -> list[np.ndarray]:
+    """Blotches and tiles of all sizes, 2 cm a texel, halved again and again."""
+    rng = np.random.default_rng(seed)
+    image = np.zeros((1024, 1024), np.float32)
+    for octave in (2, 4, 8, 16, 32, 64):
+        coarse = rng.normal(size=(1024 // octave, 1024 // octave)).astype(np.float32)
+        for how in (cv2.INTER_LINEAR, cv2.INTER_NEAREST):
+            image += cv2.resize(coarse, (1024, 1024), interpolation=how)
+            coarse = coarse[::-1, ::-1]
+    levels = [120.0 + 25.0 * image / image.std()]
+    for _ in range(5):
+        levels.append(cv2.pyrDown(levels[-1]))
+    return levels
+
+
+def _sample(seed: int, a_m: np.ndarray, b_m: np.ndarray, footprint_m: np.ndarray) -> np.ndarray:
+    """The texture at (a, b), mirrored at its edges, from the level that suits the pixel's footprint."""
+    level = np.clip(np.log2(np.maximum(footprint_m / 0.02, 1.0)), 0.0, 4.99)
+    out = np.zeros(a_m.shape, np.float32)
+    for k, image in enumerate(_texture(seed)):
+        share = np.maximum(1.0 - np.abs(level - k), 0.0).astype(np.float32)
+        side, texel = image.shape[0] - 1, 0.02 * 2**k
+        u, v = ((side - np.abs(x / texel % (2 * side) - side)).astype(np.float32) for x in (a_m, b_m))
+        out += share * cv2.remap(image, u, v, cv2.INTER_LINEAR)
+    return out
+
+
+def render(pose: Pose, noise_seed: int = 0) -> np.ndarray:
+    """A street between two house fronts, seen from `pose` (camera axes; the road is the plane y = 1.65 m)."""
+    v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX].astype(np.float64)
+    rays = np.stack([(u - CAMERA.cx_px) / CAMERA.fx_px, (v - CAMERA.cy_px) / CAMERA.fy_px, np.ones_like(u)], -1)
+    d, p = rays @ pose.R.T, pose.p
+    with np.errstate(divide="ignore", invalid="ignore"):
+        road = np.where(d[..., 1] > 1e-4, (1.65 - p[1]) / d[..., 1], np.inf)
+        wall = np.where(d[..., 0] > 0, (7.0 - p[0]) / d[..., 0], (-6.0 - p[0]) / d[..., 0])
+    wall = np.where(np.isfinite(wall) & (wall > 0), wall, np.inf)
+    front = np.where(d[..., 2] > 1e-3, (90.0 - p[2]) / d[..., 2], np.inf)
+    depth = np.minimum(np.minimum(road, wall), front)
+    hit = p + depth[..., None] * d
+    hit[~np.isfinite(hit)] = 0.0
+    image = np.full(u.shape, 210.0, np.float32)  # sky
+    footprint = np.minimum(depth, 100.0) / CAMERA.fx_px
+    on_road, on_wall = depth == road, (depth == wall) & (hit[..., 1] > -5.0)
+    on_front = (depth == front) & (hit[..., 1] > -6.0)
+    image[on_front] = _sample(3, hit[..., 0], hit[..., 1], footprint)[on_front]
+    image[on_wall] = _sample(2, hit[..., 2], hit[..., 1], footprint * 2)[on_wall]
+    image[on_road] = 0.6 * _sample(1, hit[..., 0], hit[..., 2], footprint * 4)[on_road] + 30.0
+    image += np.random.default_rng(noise_seed).normal(0.0, 1.5, image.shape)
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def street(steps: Iterable[tuple[float, float]]) -> list[Pose]:
+    """Camera poses of a car that goes (forward_m, turn right rad) at each step, its camera pitched by PITCH_RAD."""
+    tilt = GroundPlane(1.65, PITCH_RAD)
+    R_level_cam = np.linalg.inv(GroundPlane(1.65).R_ego_cam) @ tilt.R_ego_cam
+    car, out = Pose(np.eye(3), np.zeros(3)), []
+    for forward_m, turn_rad in [(0.0, 0.0), *steps]:
+        car = car @ Pose(rotation_exp(np.array([0.0, turn_rad, 0.0])), np.array([0.0, 0.0, forward_m]))
+        out.append(car @ Pose(R_level_cam, np.zeros(3)))
+    return out
+
+
+Edit = Callable[[int, np.ndarray], np.ndarray | None]
+
+
+def drive(
+    poses: list[Pose],
+    rate_hz: float = 10.0,
+    edit: Edit = lambda k, image: image,
+    masks: Callable[[int], np.ndarray | None] = lambda k: None,
+    boxes: Callable[[int], np.ndarray] = lambda k: NO_BOXES,
+) -> tuple[dict[int, Pose], list[Motion]]:
+    """Poses by frame, chained from the motions as a reader of them must (from_frame to to_frame), and the motions."""
+    odometry, chained, motions = Odometry(CAMERA), {0: Pose(np.eye(3), np.zeros(3))}, []
+    for k, pose in enumerate(poses):
+        image = edit(k, render(pose, k))
+        if image is None:
+            continue
+        tracks = odometry.track(image)
+        motion = odometry.estimate(tracks, k, int(k * 1e9 / rate_hz), boxes(k), masks(k))
+        ids, px = odometry.road_tracks
+        assert len(ids) == len(px) == len(set(ids.tolist()))
+        if motion is not None:
+            assert motion.to_frame == k
+            check_sane(motion)
+            chained[k] = chained[motion.from_frame] @ Pose(motion.R_prev_curr, motion.t_prev_curr_m)
+            motions.append(motion)
+    return chained, motions
+
+
+def check_sane(motion: Motion) -> None:
+    for value in (motion.R_prev_curr, motion.t_prev_curr_m, motion.cov, motion.T_prev_curr.log()):
+        assert np.isfinite(value).all()
+    assert np.allclose(motion.R_prev_curr @ motion.R_prev_curr.T, np.eye(3), atol=1e-9)
+    assert np.linalg.eigvalsh(motion.cov).min() > 0.0
+    assert 0.0 < motion.scale_sigma_rel <= 1.01
+    assert motion.standstill == (Status.STANDSTILL in motion.status)
+
+
+def path_m(poses: Iterable[Pose]) -> float:
+    p = np.array([pose.p for pose in poses])
+    return float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum())
+
+
+STRAIGHT_10_HZ = [(0.7, 0.0)] * 24
+CURVE_10_HZ = [(0.8, 0.004)] * 10 + [(0.8, -0.006)] * 12
+
+
+@functools.cache
+def straight() -> tuple[dict[int, Pose], list[Motion]]:
+    return drive(street(STRAIGHT_10_HZ))
+
+
+@pytest.mark.parametrize("steps", [STRAIGHT_10_HZ, CURVE_10_HZ])
+def test_a_rendered_drive_has_its_length_its_course_and_the_cameras_pitch(steps: list[tuple[float, float]]) -> None:
+    truth = street(steps)
+    chained, motions = straight() if steps is STRAIGHT_10_HZ else drive(truth)
+    length = path_m(truth)
+    assert path_m(chained.values()) == pytest.approx(length, rel=0.04)
+    end = truth[0].between(truth[-1]).between(chained[len(steps)])
+    assert np.linalg.norm(end.p) < 0.04 * length
+    assert math.degrees(np.linalg.norm(rotation_log(end.R))) < 0.6
+    assert motions[-1].ground.pitch_rad == pytest.approx(PITCH_RAD, abs=math.radians(0.5))
+    assert motions[-1].status == ()
+
+
+def test_33_hz_gives_the_same_road_as_10_hz() -> None:
+    truth = street([(0.22, 0.0)] * 50)
+    chained, _ = drive(truth, rate_hz=33.0)
+    assert path_m(chained.values()) == pytest.approx(path_m(truth), rel=0.03)
+
+
+def test_the_motion_of_the_foot_is_planar() -> None:
+    ground = GroundPlane(1.65, 0.02, -0.01)
+    step = Pose(np.eye(3), np.zeros(3))
+    assert planar(step, ground).log() == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
+    R = ground.R_ego_cam
+    forward_left = np.array([[math.cos(0.1), -math.sin(0.1), 0], [math.sin(0.1), math.cos(0.1), 0], [0, 0, 1.0]])
+    motion = planar(Pose(R.T @ forward_left @ R, R.T @ np.array([2.0, 0.3, 0.0])), ground)
+    assert [motion.x_m, motion.y_m, motion.yaw_rad] == pytest.approx([2.0, 0.3, 0.1])
+
+
+def test_standing_holds_exactly_and_goes_on_afterwards() -> None:
+    steps = [(0.5, 0.0)] * 8 + [(0.0, 0.0)] * 10 + [(0.5, 0.0)] * 6
+    truth = street(steps)
+    chained, motions = drive(truth)
+    held = [chained[k].p for k in range(10, 19)]
+    assert all(np.array_equal(held[0], p) for p in held)
+    assert [Status.STANDSTILL in m.status for m in motions] == [False] * 8 + [True] * 10 + [False] * 6
+    assert path_m(chained.values()) == pytest.approx(path_m(truth), rel=0.04)
+
+
+def test_creeping_is_not_standing() -> None:
+    truth = street([(0.4, 0.0)] * 8 + [(0.006, 0.0)] * 40)
+    chained, _ = drive(truth, rate_hz=33.0)
+    crept = np.linalg.norm(chained[48].p - chained[8].p)
+    assert crept == pytest.approx(0.24, abs=0.04)
+
+
+def test_turning_on_the_spot_does_not_travel() -> None:
+    truth = street([(0.5, 0.0)] * 8 + [(0.0, 0.01)] * 12)
+    chained, _ = drive(truth)
+    assert np.linalg.norm(chained[20].p - chained[8].p) < 0.1
+    turned = rotation_log(chained[8].between(chained[20]).R)
+    assert np.linalg.norm(turned) == pytest.approx(0.12, abs=0.003)
+
+
+def test_dark_and_frozen_and_missing_frames_cost_those_frames_only() -> None:
+    truth = street([(0.7, 0.0)] * 24)
+    last: dict[int, np.ndarray] = {}
+
+    def edit(k: int, image: np.ndarray) -> np.ndarray | None:
+        if k in (8, 9):
+            return np.zeros_like(image)
+        if k == 14:
+            return last[13]
+        if k in (18, 19):
+            return None
+        last[k] = image
+        return image
+
+    chained, motions = drive(truth, edit=edit)
+    by_frame = {m.to_frame: m for m in motions}
+    for k in (8, 9):
+        assert {Status.CAMERA_DARK, Status.ODOMETRY_COASTING} <= set(by_frame[k].status)
+        assert by_frame[k].from_frame == 7
+    assert {Status.CAMERA_FROZEN, Status.ODOMETRY_COASTING} <= set(by_frame[14].status)
+    assert by_frame[10].from_frame == 7
+    assert by_frame[20].from_frame == 17
+    assert Status.ODOMETRY_COASTING not in by_frame[20].status
+    assert by_frame[9].cov[0, 0] > by_frame[8].cov[0, 0] > by_frame[7].cov[0, 0]
+    assert chained[9].p == pytest.approx(truth[0].between(truth[9]).p, abs=0.3)
+    assert np.linalg.norm(chained[24].p) == pytest.approx(path_m(truth), rel=0.04)
+
+
+def test_nothing_to_see_coasts_and_begins_anew() -> None:
+    truth = street([(0.7, 0.0)] * 30)
+
+    def edit(k: int, image: np.ndarray) -> np.ndarray:
+        return (
+            np.tile(np.linspace(60, 120, image.shape[1], dtype=np.uint8), (image.shape[0], 1)) if 8 <= k < 22 else image
+        )
+
+    chained, motions = drive(truth, edit=edit)
+    blind = [m for m in motions if 8 <= m.to_frame < 22]
+    assert all(Status.ODOMETRY_COASTING in m.status for m in blind)
+    assert Status.LOW_TEXTURE in blind[0].status
+    assert Status.ODOMETRY_COASTING not in motions[-1].status
+    assert np.linalg.norm(chained[30].p) == pytest.approx(path_m(truth), rel=0.1)
+
+
+def test_vehicles_everywhere_leave_nothing_to_measure() -> None:
+    everything = np.array([[-10.0, -10.0, WIDTH_PX + 10.0, HEIGHT_PX + 10.0]])
+    _, motions = drive(street([(0.7, 0.0)] * 9), boxes=lambda k: everything if k > 5 else NO_BOXES)
+    assert {Status.LOW_TEXTURE, Status.ODOMETRY_COASTING} <= set(motions[-1].status)
+
+
+def test_a_hidden_road_carries_the_scale_and_says_so() -> None:
+    truth = street([(0.7, 0.0)] * 34)
+    hidden = np.zeros((HEIGHT_PX, WIDTH_PX), bool)
+    chained, motions = drive(truth, masks=lambda k: hidden if 10 <= k < 26 else None)
+    sigma = [m.scale_sigma_rel for m in motions]
+    assert sigma[24] > sigma[12] + 0.002
+    assert [Status.SCALE_CARRIED in m.status for m in motions[6:]] == [False] * 11 + [True] * 8 + [False] * 9
+    assert sigma[-1] < sigma[24]
+    assert path_m(chained.values()) == pytest.approx(path_m(truth), rel=0.05)
+
+
+def test_first_images_that_show_nothing_give_no_motion() -> None:
+    odometry, black = Odometry(CAMERA), np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8)
+    for k in range(3):
+        assert odometry.estimate(odometry.track(black), k, k * 10**8, NO_BOXES, None) is None
+
+
+def test_an_image_of_another_size_is_an_error() -> None:
+    with pytest.raises(ValueError, match="does not fit"):
+        Odometry(CAMERA).track(np.zeros((10, 20), np.uint8))
+
+
+def test_settings_are_typed_and_closed() -> None:
+    config = msgspec.convert({"road": {"align": {"far_m": 30.0}}, "key_images": 5}, OdometryConfig)
+    assert config.road.align.far_m == 30.0
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert({"key_image": 5}, OdometryConfig)
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert({"reject_px": -1.0}, OdometryConfig)
+
+
+def test_twice_the_same_bytes() -> None:
+    _, again = drive(street(STRAIGHT_10_HZ))
+    _, once = straight()
+    assert [m.t_prev_curr_m.tobytes() + m.R_prev_curr.tobytes() + m.cov.tobytes() for m in once] == [
+        m.t_prev_curr_m.tobytes() + m.R_prev_curr.tobytes() + m.cov.tobytes() for m in again
+    ]
+
+
+def test_reset_starts_over_with_new_track_ids() -> None:
+    odometry, (first, second) = Odometry(CAMERA), street([(0.7, 0.0)])
+    before = odometry.track(render(first))
+    odometry.estimate(before, 0, 0, NO_BOXES, None)
+    odometry.reset()
+    after = odometry.track(render(second))
+    assert odometry.estimate(after, 1, 10**8, NO_BOXES, None) is None
+    assert after.ids.min() > before.ids.max()
+
+
+# --- real clips ---
+
+
+def _real(path: Path, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Estimated and true camera poses, (N, 4, 4), without any network."""
+    recording = open_recording(f"kitti:{path}", stride=stride)
+    odometry, estimated = Odometry(recording.camera), [np.eye(4)]
+    for k, frame in enumerate(recording.frames()):
+        motion = odometry.estimate(odometry.track(frame.image), k, frame.t_source_ns, NO_BOXES, None)
+        if motion is not None:
+            check_sane(motion)
+            step = np.eye(4)
+            step[:3, :3], step[:3, 3] = motion.R_prev_curr, motion.t_prev_curr_m
+            estimated.append(estimated[motion.from_frame] @ step)
+    truth = recording.truth_poses()
+    assert truth is not None
+    truth = np.concatenate([truth, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(truth), 1, 1))], axis=1)
+    return np.array(estimated), np.linalg.inv(truth[0]) @ truth
+
+
+def _figures(estimated: np.ndarray, truth: np.ndarray) -> tuple[float, float, float]:
+    """ATE over the path's length, signed scale error, and the root mean square turn error in degrees."""
+    length, own = (float(np.linalg.norm(np.diff(p[:, :3, 3], axis=0), axis=1).sum()) for p in (truth, estimated))
+    ate = float(np.sqrt(((estimated[:, :3, 3] - truth[:, :3, 3]) ** 2).sum(axis=1).mean()))
+    turns = [
+        np.linalg.norm(rotation_log((np.linalg.inv(a) @ b)[:3, :3].T @ (np.linalg.inv(c) @ d)[:3, :3]))
+        for a, b, c, d in zip(truth, truth[1:], estimated, estimated[1:], strict=False)
+    ]
+    return ate / length, own / length - 1.0, math.degrees(float(np.sqrt(np.mean(np.square(turns)))))
+
+
+@pytest.mark.parametrize(("sequence", "stride"), [("00", 1), ("06", 1), ("06", 2)])
+def test_kitti_odometry(data_dir: Path, sequence: str, stride: int) -> None:
+    ate, scale, turn_deg = _figures(*_real(data_dir / "kitti_odometry" / "sequences" / sequence, stride))
+    assert ate < 0.025 * (1.5 if stride > 1 else 1.0)
+    assert abs(scale) < 0.03
+    assert turn_deg < 0.1 * 1.5 * stride
+
+
+def test_the_raw_clip_keeps_its_length_and_stands_still(data_dir: Path) -> None:
+    estimated, truth = _real(data_dir / "kitti_raw_clip")
+    own = np.linalg.norm(np.diff(estimated[:, :3, 3], axis=0), axis=1).sum()
+    assert own == pytest.approx(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum(), rel=0.10)
+    standing = estimated[60:, :3, 3]
+    assert np.linalg.norm(standing - standing[0], axis=1).max() < 0.1
