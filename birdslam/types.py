@@ -58,6 +58,11 @@ class Status(enum.StrEnum):
     SEGMENTATION_CARRIED = "segmentation_carried"  # the segmenter did not run on this frame
     NETWORK_FAILED = "network_failed"  # a network gave no usable numbers on this frame
     INPUT_STALE = "input_stale"  # the record in front of this one came later than it should
+    DEGRADED_RATE = "degraded_rate"  # short of time: the networks run on fewer frames
+    DEGRADED_BOXES = "degraded_boxes"  # short of time: the detector alone runs, no road and no lanes
+    DEGRADED_ODOMETRY = "degraded_odometry"  # short of time: no network runs, the ego alone is followed
+    COASTING = "coasting"  # short of time: nobody looked at this frame; the last pose, its covariance grown
+    COASTED_TOO_LONG = "coasted_too_long"  # no frame has been looked at for too long
     GRAPH_RESET = "graph_reset"  # the optimizer began a new epoch on this frame
     NOT_INITIALISED = "not_initialised"  # no motion has been measured yet
 
@@ -69,6 +74,7 @@ INVALIDATING = frozenset(
         Status.CAMERA_FROZEN,
         Status.CAMERA_DARK,
         Status.SCALE_INVALID,
+        Status.COASTED_TOO_LONG,
         Status.NOT_INITIALISED,
     }
 )

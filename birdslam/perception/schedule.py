@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -104,18 +104,20 @@ class Networks:
         self._slots = [_Slot(head) for head in heads]
         self._last_frame = -1
 
-    def start(self, frame_id: int, image: NDArray[np.uint8] | None) -> Pending:
-        """Starts the heads that are due; `result()` of what is returned is to be asked for once, before the next start.
+    def start(self, frame_id: int, image: NDArray[np.uint8] | None, only: Collection[Role] | None = None) -> Pending:
+        """Starts the heads that are due, of the roles in `only` (None: all).
 
-        The image must stay as it is while a head may read it. None (no pixels in this frame) starts nothing. A frame_id
-        that doesn't grow is a source that began anew: what is known of the old frames is forgotten.
+        `result()` of what is returned is to be asked for once, before the next start. The image must stay as it is
+        while a head may read it. None (no pixels in this frame) starts nothing. A frame_id that doesn't grow is a
+        source that began anew: what is known of the old frames is forgotten.
         """
         if frame_id <= self._last_frame:
             self._slots = [_Slot(s.head, s.running, outdated=s.running is not None) for s in self._slots]
         self._last_frame = frame_id
         for slot in self._slots:
             due = slot.started_frame is None or frame_id - slot.started_frame >= slot.head.schedule.every
-            if image is not None and due and slot.running is None:
+            wanted = only is None or slot.head.role in only
+            if image is not None and due and wanted and slot.running is None:
                 slot.running = self._submit(slot.head.run, image)
                 slot.started_frame = frame_id
         return _Started(self, frame_id)

@@ -1,0 +1,269 @@
+"""The back end: the paper's incremental SE(2) pose graph (Eqs. 2-8), one update for each frame.
+
+`PoseGraph` keeps the books: which edges have both ends in the window, epochs and statuses. `window.Window` solves. The
+feedback of each result into the next step is the paper's "incremental approach".
+
+What the graph minimises is F of Eq. 8: CC, CV and VV edges (Eq. 6) and CP edges (Eq. 7), each with the covariance that
+its record states (`weights.weighted` says whose), and, with `constant_velocity`, one more factor on each three poses of
+a vehicle in a row: the twist (velocity in its own frame) changes little from one interval to the next.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.edges import PoseEdges, pose_edges
+from birdslam.landmarks import Landmarks, PendingMap, Sightings, sightings
+from birdslam.planar import log
+from birdslam.se2 import SE2
+from birdslam.traffic import Traffic
+from birdslam.types import INVALIDATING, Estimate, MapUpdate, Measurements, Status, VehicleEstimate
+from birdslam.weights import WeightsConfig, weighted
+from birdslam.window import KEY_NODE, Edges, Window
+
+Floats = NDArray[np.float64]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+_NO_PIXELS = frozenset({Status.END_OF_SOURCE, Status.FRAME_UNREADABLE, Status.COASTING})
+_SHORTEST_S = 1e-3  # source clocks that stand still or run backwards
+_NO_CP = np.zeros((2, 2))
+_NO_EDGES = np.zeros((0, 3)), np.zeros((0, 3, 3))
+
+
+class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The back end's own numbers."""
+
+    # Ego poses kept beside the newest. One frame in so many is a key frame: landmarks tie it to the key frame before
+    ego_nodes: Annotated[int, msgspec.Meta(ge=1, le=64)] = 4
+    # Vehicles
+    constant_velocity: bool = True  # False: only VV edges tie the poses of a vehicle, as in Eq. 6
+    change_forward_mps: Positive = 2.0  # 1-sigma by which a vehicle's velocity changes within a second
+    change_sideways_mps: Positive = 0.5
+    change_turn_radps: Positive = 0.3
+    birth_forward_mps: Positive = 12.0  # 1-sigma of the velocity of a vehicle seen for the first time
+    birth_sideways_mps: Positive = 2.0
+    birth_turn_radps: Positive = 0.5
+    forget_s: Positive = 1.0  # a vehicle out of sight is predicted on for so long
+    max_vehicles: Count = 32  # the longest out of sight go first
+    detection_gate_sigma: Positive = 4.0  # Mahalanobis distance past which a detection weighs less; twice it: nothing
+    detection_contradictions: Count = 5  # so many left out in a row begin the vehicle anew
+    # Static map
+    landmark_gate_sigma: Positive = 3.0
+    landmark_common_m: NotNegative = 0.15  # 1-sigma of what is common to all landmarks of a frame (scale, pitch)
+    landmark_least_frames: Count = 2  # key frames that a landmark was seen in, to be put on the map
+    max_landmarks: Count = 512
+    max_pending_landmarks: Count = 10_000  # waiting for `map_update`
+    max_pending_frames: Count = 1_000  # whose lane points wait for `map_update`
+    # Frames without a picture
+    blind_mps: Positive = 1.0  # 1-sigma by which the ego's velocity may differ from the last one measured
+    blind_radps: Positive = 0.1
+
+
+# The paper's own back end, together with WeightsConfig(mode="paper"): Eqs. 2-8 and nothing else
+PAPER = GraphConfig(
+    ego_nodes=1,
+    constant_velocity=False,
+    detection_gate_sigma=1e6,
+    landmark_gate_sigma=1e6,
+    landmark_common_m=0.0,
+)
+
+
+class PoseGraph:
+    """`update` is one step. Bounded in time and memory; deterministic; raises nothing for what a record may say."""
+
+    def __init__(self, config: GraphConfig, weights: WeightsConfig, epoch: int = 0) -> None:
+        self.config = config
+        self.weights = weights
+        self.epoch = epoch
+        self._map = PendingMap(config.max_pending_landmarks, config.max_pending_frames)
+        self._changes = np.square([config.change_forward_mps, config.change_sideways_mps, config.change_turn_radps])
+        self._birth = np.diag(np.square([config.birth_forward_mps, config.birth_sideways_mps, config.birth_turn_radps]))
+        self._window: Window | None = None
+
+    def update(self, measurements: Measurements) -> Estimate:
+        """One frame's edges in; the newest frame's poses, velocities and covariances out."""
+        m = weighted(measurements, self.weights)
+        if m.cc is None and not _NO_PIXELS.isdisjoint(m.status):
+            return self._repeat(m)
+        window, edges = self._window, pose_edges(m)
+        follows = window is not None and self._follows(m, window, edges)
+        reset = window is not None and not follows
+        if window is None or not follows:
+            window = self._begin(m, reset)
+        self._step(m, window, edges, follows)
+        if not math.isfinite(window.P.trace()):  # numbers that no road has: begin anew rather than publish them
+            window, reset = self._begin(m, True), True
+        status = (*m.status, Status.GRAPH_RESET) if reset else m.status
+        return self._record(m, status, window.P[:3, :3], self._vehicle_estimates(m, window))
+
+    def map_update(self) -> MapUpdate | None:
+        """What the map gained since the last call, in world; None where it gained nothing."""
+        return self._map.take()
+
+    # --- the life of the graph ---
+
+    def _begin(self, m: Measurements, reset: bool) -> Window:
+        config = self.config
+        self.epoch += int(reset)
+        self._window = Window(config.ego_nodes, m.frame_id)
+        self._traffic = Traffic(config.forget_s, config.max_vehicles, config.detection_contradictions)
+        self._landmarks = Landmarks(config.max_landmarks)
+        self._t_ns = self._t_before_ns = m.t_source_ns  # of the newest pose and of the one before
+        self._motion = SE2()  # between them
+        self._map.begin(self.epoch)
+        return self._window
+
+    def _follows(self, m: Measurements, window: Window, edges: PoseEdges) -> bool:
+        """Whether this frame's CC edge ties it to a pose of the window."""
+        cc = edges.cc
+        return (
+            cc is not None and cc.to_frame == m.frame_id and m.frame_id > window.frame and window.knows(cc.from_frame)
+        )
+
+    # --- one frame's edges ---
+
+    def _step(self, m: Measurements, window: Window, edges: PoseEdges, follows: bool) -> None:
+        """Moves the window on to this frame, if it follows another, and takes the frame's edges in."""
+        config, traffic = self.config, self._traffic
+        vehicles, row_of = traffic.vehicles, traffic.row_of
+        known = [k for k, e in enumerate(edges.cv) if e.vehicle in row_of]
+        linked = [k for k, e in enumerate(edges.vv) if self._links(e.vehicle, e.from_frame)]
+        vv_rows = np.array([row_of[edges.vv[k].vehicle] for k in linked], dtype=np.int64)
+        vv_poses, vv_covs = (edges.poses[edges.vv_at][linked], edges.covs[edges.vv_at][linked]) if linked else _NO_EDGES
+        hold = Status.STANDSTILL in m.status
+
+        # Every vehicle that an edge of this frame ties to its last pose gets a new one here
+        tied = set(vv_rows.tolist())
+        if config.constant_velocity:
+            tied.update(row_of[edges.cv[k].vehicle] for k in known)
+        else:
+            known = [k for k in known if row_of[edges.cv[k].vehicle] in tied]
+        dt_s = np.array(
+            [max((m.t_source_ns - v.node_ns) * 1e-9, _SHORTEST_S) if i in tied else 0.0 for i, v in enumerate(vehicles)]
+        )
+        vv_dt_s = dt_s[vv_rows]
+        growth = dt_s[:, None] * self._changes if config.constant_velocity else np.zeros((len(vehicles), 3))
+        if linked and not config.constant_velocity:  # the twist of this interval is what VV says, whatever it was
+            window.retwist(vv_rows, log(vv_poses) / vv_dt_s[:, None], vv_covs / np.square(vv_dt_s)[:, None, None])
+            vv_rows, vv_dt_s, (vv_poses, vv_covs) = vv_rows[:0], vv_dt_s[:0], _NO_EDGES
+        if follows and edges.cc is not None:
+            cov = np.zeros((3, 3)) if hold else edges.covs[0]
+            self._motion = window.predict(edges.cc.T_from_to, cov, edges.cc.from_frame, m.frame_id, dt_s, growth)
+            self._t_before_ns, self._t_ns = self._t_ns, m.t_source_ns
+
+        key_frame = window.next_node == KEY_NODE
+        seen = sightings(m.cp) if key_frame else None
+        cp_gap, cp_cov = (None, _NO_CP) if seen is None else self._cp(seen, window)
+        cv_poses, cv_covs = edges.poses[edges.cv_at], edges.covs[edges.cv_at]
+        some = slice(None) if len(known) == len(edges.cv) else known
+        now = Edges(
+            cv_rows=np.array([row_of[edges.cv[k].vehicle] for k in known], dtype=np.int64),
+            cv_poses=cv_poses[some],
+            cv_covs=cv_covs[some],
+            vv_rows=vv_rows,
+            vv_dt_s=vv_dt_s,
+            vv_motions=vv_poses,
+            vv_covs=vv_covs,
+            cp_gap=cp_gap,
+            cp_cov=cp_cov,
+        )
+        wild = window.correct(now, config.detection_gate_sigma**2, hold)
+
+        for row in tied:
+            vehicles[row].node_frame, vehicles[row].node_ns = m.frame_id, m.t_source_ns
+        rows, begun = traffic.see(edges.cv, known, [known[i] for i in wild], m.t_source_ns)
+        if rows is not None:
+            window.select(np.array(rows, dtype=np.int64))
+        if begun:
+            at = [traffic.begin(edges.cv[k].vehicle, m.frame_id, m.t_source_ns) for k in begun]
+            window.place(np.array(at, dtype=np.int64), cv_poses[begun], cv_covs[begun], self._birth)
+        settled = [] if seen is None else self._landmarks.see(seen, window, config.landmark_least_frames)
+        self._map.add(m.frame_id, settled, window.world, m.lanes)
+
+    def _links(self, vehicle: int, from_frame: int) -> bool:
+        """Whether a VV edge starts at the vehicle's newest pose."""
+        row = self._traffic.row_of.get(vehicle)
+        return row is not None and self._traffic.vehicles[row].node_frame == from_frame
+
+    def _cp(self, seen: Sightings, window: Window) -> tuple[Floats | None, Floats]:
+        """The sum of the CP edges (2,), (2, 2), with what the sum over a frame's landmarks does not average away."""
+        edge = self._landmarks.edge(seen, window, self.config.landmark_gate_sigma**2)
+        if edge is None:
+            return None, _NO_CP
+        gap, mean, d = edge
+        mean += self.config.landmark_common_m**2
+        return np.array([gap.real, gap.imag]), np.array([[mean + d.real, d.imag], [d.imag, mean - d.real]])
+
+    # --- the newest frame's estimates ---
+
+    def _repeat(self, m: Measurements) -> Estimate:
+        """A frame without a picture: the last pose, as uncertain as the time since then makes it."""
+        window, config = self._window, self.config
+        if window is None:
+            return self._record(m, (*m.status, Status.NOT_INITIALISED), np.zeros((3, 3)), ())
+        since_s = max((m.t_source_ns - self._t_ns) * 1e-9, 0.0)
+        rate = np.abs(self._motion.log()) / max((self._t_ns - self._t_before_ns) * 1e-9, _SHORTEST_S)
+        rate += np.array([config.blind_mps, config.blind_mps, config.blind_radps])
+        cov = window.P[:3, :3] + np.diag(np.square(rate * since_s))
+        return self._record(m, m.status, cov, self._vehicle_estimates(m, window))
+
+    def _record(
+        self, m: Measurements, status: tuple[Status, ...], cov: Floats, vehicles: tuple[VehicleEstimate, ...]
+    ) -> Estimate:
+        cov = cov.copy()
+        cov.reshape(9)[::4] = np.maximum(cov.diagonal(), 0.0)  # where all is known, rounding has either sign
+        return Estimate(
+            epoch=self.epoch,
+            frame_id=m.frame_id,
+            t_source_ns=m.t_source_ns,
+            t_capture_ns=m.t_capture_ns,
+            t_utc_ns=m.t_utc_ns,
+            T_world_ego=SE2() if self._window is None else self._window.world,
+            cov=tuple(cov.ravel().tolist()),
+            valid=INVALIDATING.isdisjoint(status),
+            vehicles=vehicles,
+            attitude=m.attitude,
+            ground=m.ground,
+            scale_sigma_rel=m.scale_sigma_rel,
+            status=tuple(dict.fromkeys(status)),
+        )
+
+    def _vehicle_estimates(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
+        vehicles, t_ns = self._traffic.vehicles, m.t_source_ns
+        if not vehicles:
+            return ()
+        ahead_s = [max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles]
+        poses, velocities, covs = window.in_world(np.array(ahead_s) if any(ahead_s) else None, self._changes)
+        numbers = zip(
+            vehicles,
+            poses.tolist(),
+            covs[:, :3, :3].reshape(-1, 9).tolist(),
+            velocities.tolist(),
+            covs[:, 3:, 3:].reshape(-1, 4).tolist(),
+            strict=True,
+        )
+        return tuple(
+            [
+                VehicleEstimate(
+                    vehicle=v.vehicle,
+                    T_world_vehicle=SE2(x_m, y_m, yaw_rad),
+                    cov=tuple(cov),
+                    velocity_mps=tuple(velocity),
+                    velocity_cov=tuple(velocity_cov),
+                    age_ns=max(t_ns - v.seen_ns, 0),
+                    frames=v.frames,
+                    label=v.label,
+                    length_m=v.length_m,
+                    width_m=v.width_m,
+                )
+                for v, (x_m, y_m, yaw_rad), cov, velocity, velocity_cov in numbers
+            ]
+        )

@@ -1,0 +1,75 @@
+"""What the edges of the pose graph weigh: their measured covariances, or the paper's numbers (Eq. 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec.structs import replace
+
+from birdslam.types import Cov2, Cov3, Measurements
+
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+EdgeType = Literal["cc", "cp", "cv", "vv"]
+
+
+class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`measured`: each edge keeps its own covariance; `paper`: an edge's information is `lambda` times the unit matrix.
+
+    `leave_out` names the edge types that do not enter the graph (the ablations of Table 3). None is the mode's own
+    choice: the paper leaves out nothing; `measured` leaves out VV, which the tracker predicts from the very detections
+    that the CV edges carry, since the graph has a constant-velocity factor of its own.
+    """
+
+    mode: Literal["measured", "paper"] = "measured"
+    cc: Positive = 10_000.0
+    cp: Positive = 10_000.0
+    cv_near: Positive = 1_000.0
+    cv_far: Positive = 10.0
+    cv_far_m: Positive = 60.0  # the paper says that CV weighs less with depth, not where it ends
+    vv: Positive = 1.0
+    depth_threshold_m: Positive | None = 20.0  # T of Table 4: landmarks past it are left out; None keeps all
+    leave_out: tuple[EdgeType, ...] | None = None
+
+    @property
+    def left_out(self) -> tuple[EdgeType, ...]:
+        """The edge types that do not enter the graph."""
+        if self.leave_out is not None:
+            return self.leave_out
+        return () if self.mode == "paper" else ("vv",)
+
+    def cv_at(self, depth_m: float) -> float:
+        """The CV weight: `cv_near` at the camera, `cv_far` from `cv_far_m` on, linear in the logarithm between."""
+        share = min(max(depth_m / self.cv_far_m, 0.0), 1.0)
+        return float(self.cv_near * (self.cv_far / self.cv_near) ** share)
+
+
+def weighted(measurements: Measurements, config: WeightsConfig) -> Measurements:
+    """The measurements with the covariances that the graph shall believe.
+
+    Without "cc" the ego's motion stays in the graph as the guess it starts from (weight 1): other edges alone can't
+    carry a frame that sees no vehicle.
+    """
+    out = config.left_out
+    threshold_m = config.depth_threshold_m
+    cp = () if "cp" in out else measurements.cp
+    if threshold_m is not None and cp:
+        cp = tuple([edge for edge in cp if edge.x_m <= threshold_m])
+    cv = () if "cv" in out else measurements.cv
+    vv = () if "vv" in out else measurements.vv
+    cc = measurements.cc
+    if config.mode == "paper":
+        cp = tuple(replace(edge, cov=_unit2(1.0 / config.cp)) for edge in cp)
+        cv = tuple(replace(edge, cov=_unit3(1.0 / config.cv_at(edge.T_ego_vehicle.x_m))) for edge in cv)
+        vv = tuple(replace(edge, cov=_unit3(1.0 / config.vv)) for edge in vv)
+        cc = cc and replace(cc, cov=_unit3(1.0 / config.cc))
+    if cc and "cc" in out:
+        cc = replace(cc, cov=_unit3(1.0))
+    if cc is measurements.cc and cv is measurements.cv and vv is measurements.vv and cp is measurements.cp:
+        return measurements
+    return replace(measurements, cc=cc, cv=cv, vv=vv, cp=cp)
+
+
+_unit3: Callable[[float], Cov3] = lambda v: (v, 0.0, 0.0, 0.0, v, 0.0, 0.0, 0.0, v)  # noqa: E731
+_unit2: Callable[[float], Cov2] = lambda v: (v, 0.0, 0.0, v)  # noqa: E731
