@@ -9,37 +9,22 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam import bev
 from birdslam.camera import Camera, GroundPlane
 from birdslam.localisation import LocalisationConfig, localise
 from birdslam.odometry import Motion, Odometry, OdometryConfig
-from birdslam.perception import Perception, Segmentation
+from birdslam.perception import Perception
 from birdslam.se2 import SE2
+from birdslam.static_map import LaneMapper, StaticMapConfig, landmark_edges
 from birdslam.tracking import Track, Tracker, TrackingConfig
 from birdslam.types import (
     Attitude,
     EgoEdge,
     Frame,
     Ground,
-    LandmarkEdge,
-    LanePoint,
     Measurements,
     Status,
     VehicleEdge,
 )
-
-
-class StaticMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Which points of the road become landmarks and lane points."""
-
-    max_landmarks: int = 40
-    landmark_range_m: float = 20.0  # the paper's depth threshold T
-    sigma_landmark_px: float = 1.0
-    sigma_height_rel: float = 0.02
-    max_lane_points: int = 64
-    lane_range_m: float = 20.0
-    lane_cell_m: float = 0.5  # one point for each cell
-    attitude_memory_m: float = 1000.0  # roads are level on average: tilt is forgotten over this distance
 
 
 class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -85,6 +70,7 @@ class FrontEnd:
         self.odometry: EgoMotion = odometry or Odometry(camera, config.odometry)
         self.tracker = Tracker(camera, config.tracking, config.localisation)
         self._reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
+        self._lanes = LaneMapper(camera, config.static_map)
         self._last_frame: int | None = None
 
     def step(self, frame: Frame, pending: Pending) -> Measurements:
@@ -124,8 +110,22 @@ class FrontEnd:
             cc=cc,
             cv=tuple(self._vehicle_edge(track) for track in seen),
             vv=tuple(track.motion for track in seen if track.motion is not None),
-            cp=self._landmarks(frame.frame_id, ground, sigma_pitch_rad),
-            lanes=self._lanes(segmentation, perception.ages.get("segmenter", 0), boxes_px, ground),
+            cp=landmark_edges(
+                *self.odometry.road_tracks,
+                frame.frame_id,
+                self.camera,
+                ground,
+                sigma_pitch_rad,
+                self.config.static_map,
+            ),
+            lanes=self._lanes.step(
+                frame.frame_id,
+                self._reckoning.T_world_ego,
+                ground,
+                segmentation,
+                frame.frame_id - perception.ages.get("segmenter", 0),
+                boxes_px,
+            ),
             attitude=self._reckoning.attitude,
             ground=Ground(height_m=ground.height_m, pitch_rad=ground.pitch_rad, roll_rad=ground.roll_rad),
             scale_sigma_rel=0.0 if motion is None else motion.scale_sigma_rel,
@@ -150,7 +150,8 @@ class FrontEnd:
         seen, place, tracking = track.observation, track.place, self.config.tracking
         yaw_rad = track.T_world_ego.between(track.pose()).yaw_rad
         cov = np.zeros((3, 3))
-        cov[:2, :2] = place.cov
+        R_vehicle_ego = SE2(yaw_rad=-yaw_rad).rotation()
+        cov[:2, :2] = R_vehicle_ego @ place.cov @ R_vehicle_ego.T  # the tangent at the vehicle's pose
         cov[2, 2] = (tracking.sigma_yaw_moving_rad if track.yaw_known else tracking.sigma_yaw_unknown_rad) ** 2
         return VehicleEdge(
             vehicle=track.vehicle,
@@ -163,47 +164,6 @@ class FrontEnd:
             length_m=seen.dimensions.length_m,
             width_m=seen.dimensions.width_m,
         )
-
-    def _landmarks(self, frame_id: int, ground: GroundPlane, sigma_pitch_rad: float) -> tuple[LandmarkEdge, ...]:
-        """CP: feature tracks on the road, the nearest first, back-projected by Eq. 1."""
-        config = self.config.static_map
-        ids, px = self.odometry.road_tracks
-        points = bev.pixel_to_ego(self.camera, ground, px)
-        with np.errstate(invalid="ignore"):
-            near = np.flatnonzero(points[:, 0] < config.landmark_range_m)
-        near = near[np.argsort(points[near, 0], kind="stable")][: config.max_landmarks]
-        covs = bev.road_point_cov(
-            self.camera, ground, px[near], config.sigma_landmark_px, sigma_pitch_rad, config.sigma_height_rel
-        )
-        return tuple(
-            LandmarkEdge(
-                landmark=int(ids[i]),
-                frame=frame_id,
-                x_m=float(points[i, 0]),
-                y_m=float(points[i, 1]),
-                cov=tuple(cov.ravel().tolist()),
-            )
-            for i, cov in zip(near, covs, strict=True)
-            if np.isfinite(cov).all()
-        )
-
-    def _lanes(
-        self, segmentation: Segmentation | None, age: int, boxes_px: NDArray[np.float64], ground: GroundPlane
-    ) -> tuple[LanePoint, ...]:
-        """Lane line pixels of this frame in bird's-eye view, one for each cell, none under a vehicle's box."""
-        if segmentation is None or age > 0:
-            return ()
-        config = self.config.static_map
-        lane = segmentation.lane.copy()
-        for x1, y1, x2, y2 in boxes_px:
-            lane[max(0, math.floor(y1)) : math.ceil(y2), max(0, math.floor(x1)) : math.ceil(x2)] = False
-        rows, columns = np.nonzero(lane)
-        points = bev.pixel_to_ego(self.camera, ground, np.column_stack([columns, rows]).astype(np.float64))
-        with np.errstate(invalid="ignore"):
-            points = points[points[:, 0] < config.lane_range_m]
-        _, first = np.unique(np.floor(points / config.lane_cell_m).astype(np.int64), axis=0, return_index=True)
-        first = first[np.argsort(points[first, 0], kind="stable")][: config.max_lane_points]
-        return tuple(LanePoint(float(x), float(y)) for x, y in points[first])
 
 
 class DeadReckoning:

@@ -156,6 +156,21 @@ def test_lane_points_leave_out_what_a_vehicle_covers() -> None:
     assert len(covered.lanes) <= 64
 
 
+def test_a_segmentation_that_comes_late_is_mapped_once_from_where_it_was_seen() -> None:
+    lane = np.zeros((375, 1242), bool)
+    lane[230:350, 400:404] = True
+    script = {k: motion(k, SE2(2.0, 0.0, 0.0)) for k in range(1, 4)}
+    now = run({}, [seeing(lane=lane)])[0].lanes
+    detections = Detections(np.zeros((0, 4)), np.zeros(0), ())
+    late = Ready(Perception(detections, Segmentation(lane, lane), {"detector": 0, "segmenter": 2}, ()))
+    later = Ready(Perception(detections, Segmentation(lane, lane), {"detector": 0, "segmenter": 3}, ()))
+    out = run(script, [seeing(), seeing(), late, later])
+    assert not out[0].lanes
+    assert not out[3].lanes
+    assert [p.y_m for p in out[2].lanes] == pytest.approx([p.y_m for p in now])
+    assert [p.x_m for p in out[2].lanes] == pytest.approx([p.x_m - 4.0 for p in now])
+
+
 def test_the_first_frame_says_that_nothing_is_known() -> None:
     (first,) = run({}, [seeing()])
     assert first.cc is None

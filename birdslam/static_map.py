@@ -1,0 +1,119 @@
+"""The static features of the road plane: landmarks from feature tracks, points of lane lines from a segmentation.
+
+Both are back-projected by Eq. 1 (paper, static map initialization).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam import bev
+from birdslam.camera import Camera, GroundPlane
+from birdslam.perception import Segmentation
+from birdslam.se2 import SE2
+from birdslam.types import LandmarkEdge, LanePoint
+
+REMEMBERED_FRAMES = 64  # a segmentation that is older than that is no news
+
+
+class StaticMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which points of the road become landmarks and lane points."""
+
+    max_landmarks: int = 40
+    landmark_range_m: float = 20.0  # the paper's depth threshold T
+    sigma_landmark_px: float = 1.0
+    sigma_height_rel: float = 0.02
+    max_lane_points: int = 64
+    lane_range_m: float = 20.0
+    lane_cell_m: float = 0.5  # one point for each cell
+    attitude_memory_m: float = 1000.0  # roads are level on average: tilt is forgotten over this distance
+
+
+def landmark_edges(
+    ids: NDArray[np.int64],
+    px: NDArray[np.float64],
+    frame_id: int,
+    camera: Camera,
+    ground: GroundPlane,
+    sigma_pitch_rad: float,
+    config: StaticMapConfig,
+) -> tuple[LandmarkEdge, ...]:
+    """CP edges of feature tracks (N,) at pixels (N, 2) that lie on the road: the nearest ones."""
+    points = bev.pixel_to_ego(camera, ground, px)  # Eq. 1
+    with np.errstate(invalid="ignore"):
+        near = np.flatnonzero(points[:, 0] < config.landmark_range_m)
+    near = near[np.argsort(points[near, 0], kind="stable")][: config.max_landmarks]
+    covs = bev.road_point_cov(
+        camera, ground, px[near], config.sigma_landmark_px, sigma_pitch_rad, config.sigma_height_rel
+    )
+    return tuple(
+        LandmarkEdge(
+            landmark=int(ids[i]),
+            frame=frame_id,
+            x_m=float(points[i, 0]),
+            y_m=float(points[i, 1]),
+            cov=tuple(cov.ravel().tolist()),
+        )
+        for i, cov in zip(near, covs, strict=True)
+        if np.isfinite(cov).all()
+    )
+
+
+class LaneMapper:
+    """Lane points of each segmentation, once, in the ego of the frame at hand.
+
+    A segmentation may come frames after its image. It is back-projected with the pose and the ground plane of its own
+    frame, which are kept until then.
+    """
+
+    def __init__(self, camera: Camera, config: StaticMapConfig) -> None:
+        self.camera = camera
+        self.config = config
+        self._frames: deque[tuple[int, SE2, GroundPlane]] = deque(maxlen=REMEMBERED_FRAMES)
+        self._used_frame = -1
+
+    def step(
+        self,
+        frame_id: int,
+        T_world_ego: SE2,
+        ground: GroundPlane,
+        segmentation: Segmentation | None,
+        segmented_frame: int,
+        boxes_px: NDArray[np.float64],
+    ) -> tuple[LanePoint, ...]:
+        """What the segmentation of `segmented_frame` adds, nothing where it was used before.
+
+        `boxes_px` (N, 4) are the vehicles' latest boxes, under which no line is believed.
+        """
+        self._frames.append((frame_id, T_world_ego, ground))
+        if segmentation is None or segmented_frame == self._used_frame:
+            return ()
+        then = next((f for f in self._frames if f[0] == segmented_frame), None)
+        if then is None:
+            return ()
+        self._used_frame = segmented_frame
+        _, T_world_then, ground_then = then
+        points = T_world_ego.between(T_world_then) @ self._points_m(segmentation, ground_then, boxes_px)
+        return tuple(LanePoint(float(x), float(y)) for x, y in points)
+
+    def _points_m(
+        self, segmentation: Segmentation, ground: GroundPlane, boxes_px: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(N, 2) in the ego of the segmentation's frame, one for each cell, nearest first."""
+        config = self.config
+        lane = segmentation.lane.copy()
+        for x1, y1, x2, y2 in boxes_px:
+            lane[max(0, math.floor(y1)) : math.ceil(y2), max(0, math.floor(x1)) : math.ceil(x2)] = False
+        rows, columns = np.nonzero(lane)
+        points = bev.pixel_to_ego(self.camera, ground, np.column_stack([columns, rows]).astype(np.float64))
+        with np.errstate(invalid="ignore"):
+            points = points[points[:, 0] < config.lane_range_m]
+        _, first = np.unique(np.floor(points / config.lane_cell_m).astype(np.int64), axis=0, return_index=True)
+        first = first[np.argsort(points[first, 0], kind="stable")][: config.max_lane_points]
+        out: NDArray[np.float64] = points[first]
+        return out
