@@ -23,6 +23,7 @@ from birdslam.results import Recorder, claim_directory
 from birdslam.trajectory import Pose, as_poses, inverse, read_kitti
 from birdslam.types import Estimate, MapUpdate, Measurements
 
+STANDING_RADIUS_M, STANDING_FRAMES = 0.05, 10  # a car whose truth stays within it for so long stands
 GROUND_AXES = (0, 2)  # x right and z forward of a camera: what is left of a position on the road
 
 
@@ -41,6 +42,7 @@ class OdometryReport(msgspec.Struct, frozen=True, kw_only=True):
     ate_pct: float | None = None  # ate_m in percent of path_m
     ate_se3_m: float | None = None  # after the best rigid motion, no scale: a truth whose first pose is off shows here
     path_estimated_m: float = 0.0
+    standing_drift_m: float | None = None  # how far the estimate strays while the truth stands; None: it never does
     statuses: dict[str, int] = {}  # how many frames carried each status
     car_ahead: CarAheadReport | None = None  # where the recording has LiDAR
 
@@ -92,6 +94,22 @@ def scale_error(truth: Pose, estimated: Pose) -> float | None:
     return path_length_m(estimated) / path_m - 1.0 if path_m > 0.0 else None
 
 
+def standing_drift_m(truth: Pose, estimated: Pose) -> float | None:
+    """The farthest that the estimate strays from where it was when the car came to stand; None: it never does."""
+    goal, points = truth[:, :3, 3], estimated[:, :3, 3]
+    drift, first = None, 0
+    while first < len(goal):
+        away = np.flatnonzero(np.linalg.norm(goal[first:] - goal[first], axis=1) > STANDING_RADIUS_M)
+        frames = int(away[0]) if len(away) else len(goal) - first
+        if frames >= STANDING_FRAMES:
+            strayed = np.linalg.norm(points[first : first + frames] - points[first], axis=1).max()
+            drift = max(drift or 0.0, float(strayed))
+            first += frames
+        else:
+            first += 1
+    return drift
+
+
 def rpe(truth: Pose, estimated: Pose) -> tuple[float, float]:
     """Relative pose error over steps of one frame: root mean squares of translation (m) and rotation angle (deg)."""
     if len(truth) < 2:
@@ -126,6 +144,7 @@ def compare(sequence: str, truth: Pose | None, estimated: Pose, statuses: dict[s
         ate_planar_m=ate_m(truth, estimated, GROUND_AXES),
         ate_pct=100.0 * error_m / path_m if path_m > 0.0 else None,
         path_estimated_m=path_estimated_m,
+        standing_drift_m=standing_drift_m(truth, estimated),
         statuses=statuses,
     )
 

@@ -65,6 +65,11 @@ class Status(enum.StrEnum):
     COASTED_TOO_LONG = "coasted_too_long"  # no frame has been looked at for too long
     GRAPH_RESET = "graph_reset"  # the optimizer began a new epoch on this frame
     NOT_INITIALISED = "not_initialised"  # no motion has been measured yet
+    UNKNOWN = "unknown"  # a status that a newer sender knows and this reader does not
+
+    @classmethod
+    def _missing_(cls, value: object) -> Status | None:
+        return cls.UNKNOWN if isinstance(value, str) else None
 
 
 INVALIDATING = frozenset(
@@ -83,17 +88,15 @@ INVALIDATING = frozenset(
 def _check_finite(record: msgspec.Struct, *fields: str) -> None:
     for name in fields:
         value = getattr(record, name)
-        for number in value if isinstance(value, tuple) else (value,):
-            if not math.isfinite(number):
-                raise ValueError(f"{type(record).__name__}.{name} needs finite numbers, got {number}")
+        if not math.isfinite(sum(value) if isinstance(value, tuple) else value):
+            raise ValueError(f"{type(record).__name__}.{name} needs finite numbers, got {value}")
 
 
 def _check_cov(record: msgspec.Struct, *fields: str) -> None:
     _check_finite(record, *fields)
     for name in fields:
         cov = getattr(record, name)
-        n = math.isqrt(len(cov))
-        if any(cov[i * n + i] < 0.0 for i in range(n)):
+        if min(cov[:: math.isqrt(len(cov)) + 1]) < 0.0:
             raise ValueError(f"{type(record).__name__}.{name} has a negative variance")
 
 
@@ -301,3 +304,8 @@ class MapUpdate(msgspec.Struct, frozen=True, kw_only=True):
     frame_id: FrameId
     landmarks_m: tuple[tuple[float, float], ...] = ()  # road points that left the window, settled
     lanes_m: tuple[tuple[float, float], ...] = ()  # points of lane lines
+
+    def __post_init__(self) -> None:
+        for x_m, y_m in (*self.landmarks_m, *self.lanes_m):
+            if not math.isfinite(x_m + y_m):
+                raise ValueError(f"MapUpdate needs finite points, got ({x_m}, {y_m})")

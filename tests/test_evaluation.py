@@ -28,6 +28,7 @@ from birdslam.evaluation import (
     path_length_m,
     rpe,
     scale_error,
+    standing_drift_m,
 )
 from birdslam.results import ResultsError
 from birdslam.se2 import SE2
@@ -124,6 +125,19 @@ def test_an_estimate_that_never_moved() -> None:
     assert report.ate_sim3_m is not None
     assert math.isfinite(report.ate_sim3_m)
     assert compare("x", still, still, {}).scale_error is None
+
+
+def test_drift_while_standing_is_seen_and_driving_is_not() -> None:
+    truth = np.tile(np.eye(4), (60, 1, 1))
+    truth[:30, 2, 3], truth[30:, 2, 3] = np.arange(30) * 0.5, 14.5
+    assert standing_drift_m(truth, truth) == 0.0
+    drifting = truth.copy()
+    drifting[45:, 0, 3] += 0.3
+    assert standing_drift_m(truth, drifting) == pytest.approx(0.3)
+    driving_badly = truth.copy()
+    driving_badly[:29, 0, 3] += np.arange(29) * 0.1
+    assert standing_drift_m(truth, driving_badly) == 0.0
+    assert standing_drift_m(truth[:30], truth[:30]) is None
 
 
 def test_one_pose_and_none() -> None:

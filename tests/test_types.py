@@ -1,0 +1,47 @@
+"""The records check themselves, and an older reader lives with a newer sender."""
+
+import math
+
+import msgspec
+import pytest
+
+from birdslam.se2 import SE2
+from birdslam.types import INVALIDATING, EgoEdge, Estimate, LandmarkEdge, MapUpdate, Status, VehicleEdge
+
+EYE3 = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def test_a_status_of_a_newer_sender_is_unknown_not_an_error() -> None:
+    assert msgspec.convert("quantum_fog", Status) is Status.UNKNOWN
+    assert msgspec.convert("standstill", Status) is Status.STANDSTILL
+    assert Status.UNKNOWN not in INVALIDATING  # `valid` was decided by the sender
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert(3, Status)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_numbers_that_are_none_are_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        EgoEdge(from_frame=0, to_frame=1, T_from_to=SE2(), cov=(*EYE3[:8], bad))
+    with pytest.raises(ValueError, match="finite"):
+        LandmarkEdge(landmark=0, frame=0, x_m=bad, y_m=0.0, cov=(1.0, 0.0, 0.0, 1.0))
+    with pytest.raises(ValueError, match="finite"):
+        MapUpdate(epoch=0, frame_id=0, lanes_m=((0.0, bad),))
+    with pytest.raises(ValueError, match="finite"):
+        VehicleEdge(vehicle=0, frame=0, T_ego_vehicle=SE2(), cov=EYE3, box_px=(0.0, bad, 1.0, 1.0))
+
+
+def test_opposite_infinities_do_not_cancel() -> None:
+    with pytest.raises(ValueError, match="finite"):
+        EgoEdge(from_frame=0, to_frame=1, T_from_to=SE2(), cov=(1.0, math.inf, 0.0, -math.inf, 1.0, 0.0, 0.0, 0.0, 1.0))
+
+
+def test_a_negative_variance_is_refused() -> None:
+    with pytest.raises(ValueError, match="negative variance"):
+        EgoEdge(from_frame=0, to_frame=1, T_from_to=SE2(), cov=(*EYE3[:4], -1.0, *EYE3[5:]))
+
+
+def test_a_covariance_of_the_wrong_size_is_refused_on_decoding() -> None:
+    stamps = {"epoch": 0, "frame_id": 0, "t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0, "valid": True}
+    with pytest.raises(msgspec.ValidationError, match=r"length >= 9.*cov"):
+        msgspec.convert({**stamps, "T_world_ego": [0, 0, 0], "cov": [1.0] * 4}, Estimate)
