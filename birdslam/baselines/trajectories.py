@@ -1,0 +1,54 @@
+"""What every method gives: where the ego and the vehicles were, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from birdslam.se2 import SE2
+from birdslam.types import Estimate, Measurements
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """`ego[frame]` and `vehicles[vehicle][frame]`, poses in world; a vehicle's only at frames in which it was seen."""
+
+    ego: dict[int, SE2] = field(default_factory=dict)
+    vehicles: dict[int, dict[int, SE2]] = field(default_factory=dict)
+
+    def put_vehicle(self, vehicle: int, frame: int, pose: SE2) -> None:
+        self.vehicles.setdefault(vehicle, {})[frame] = pose
+
+
+class LiveTrajectories:
+    """Collects the live estimates of a pose graph as they come; a new epoch goes on where the last one ended."""
+
+    def __init__(self) -> None:
+        self.result = Trajectories()
+        self._epoch: int | None = None
+        self._T_first_world = SE2()
+        self._last = SE2()
+
+    def add(self, estimate: Estimate) -> None:
+        if self._epoch != estimate.epoch:
+            self._T_first_world = self._last @ estimate.T_world_ego.inverse()
+            self._epoch = estimate.epoch
+        self._last = self._T_first_world @ estimate.T_world_ego
+        self.result.ego[estimate.frame_id] = self._last
+        for vehicle in estimate.vehicles:
+            if vehicle.age_ns == 0:
+                pose = self._T_first_world @ vehicle.T_world_vehicle
+                self.result.put_vehicle(vehicle.vehicle, estimate.frame_id, pose)
+
+
+def dead_reckoned(log: Sequence[Measurements]) -> Trajectories:
+    """CC edges chained and CV edges put on top: where every optimisation starts."""
+    out = Trajectories()
+    pose = SE2()
+    for m in log:
+        if m.cc is not None and m.cc.from_frame in out.ego:
+            pose = out.ego[m.cc.from_frame] @ m.cc.T_from_to
+        out.ego[m.frame_id] = pose
+        for edge in m.cv:
+            out.put_vehicle(edge.vehicle, edge.frame, pose @ edge.T_ego_vehicle)
+    return out

@@ -1,0 +1,238 @@
+"""Ego-motion without images: true camera poses, erring as our own image odometry errs on real clips.
+
+It takes the place of `odometry.Odometry` in the front end. Errors have a white part, new in every frame, and a slow
+part that lasts (AR(1)): a scale that is 3 % short stays so for a while. The numbers of `OdometryNoise` are fitted to
+KITTI odometry 00 and 06 and to a raw clip by `python -m perf odometry_noise`, which prints them anew.
+
+The ground under the camera is not simulated: no pose says how the camera leans over the road. It is reported as
+calibrated, so that vehicles get no help from it, and landmarks are seen over the ground that the front end came to
+believe, less the error that our odometry's tilt has.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from birdslam import bev
+from birdslam.camera import Camera, GroundPlane
+from birdslam.motion import Motion, planar
+from birdslam.pose import Pose as Step
+from birdslam.se2 import SE2
+from birdslam.static_map import StaticMapConfig, landmark_edges
+from birdslam.trajectory import Pose, inverse
+from birdslam.types import LandmarkEdge, Status
+
+Floats = NDArray[np.float64]
+NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+
+
+class Drift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Standard deviations of an error's white and slow part; the slow one is forgotten over `memory_frames`."""
+
+    white: NotNegative = 0.0
+    slow: NotNegative = 0.0
+    memory_frames: Annotated[float, msgspec.Meta(gt=0.0)] = 10.0
+
+    @property
+    def sigma(self) -> float:
+        """Of both together."""
+        return math.hypot(self.white, self.slow)
+
+
+class OdometryNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the image odometry does at 10 Hz, one motion between two frames (fitted, see the module)."""
+
+    tilt_rad: Drift = Drift(0.00055)  # rotation about the camera's x and z axes
+    turn_rad: Drift = Drift(0.00029, 0.000066, 31.0)  # rotation about its y axis: the yaw
+    turn_rel: NotNegative = 0.018  # ... and of the turn itself, the same for a whole drive (a focal length that is off)
+    rise_rad: Drift = Drift(0.0069, 0.0088, 23.0)  # direction of the translation, up and down
+    side_rad: Drift = Drift(0.009, 0.008, 46.0)  # ... and sideways, less what it has in common with the turn:
+    side_per_turn: float = -11.7  # a turn that is missed is taken for a sidestep
+    log_scale: Drift = Drift(0.023, 0.0125, 2.9)
+    ground_rad: Drift = Drift(0.0016, 0.0041, 6.6)  # pitch of the road as estimated from the images
+    landmarks: NotNegative = 20.0  # road tracks in sight of a frame
+    landmark_frames: Annotated[float, msgspec.Meta(ge=1.0)] = 6.3  # for how long one is followed
+    landmark_px: NotNegative = 0.37
+
+
+class SimulationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The numbers of the simulated odometry that are not fitted."""
+
+    noise: OdometryNoise = OdometryNoise()
+    standstill_m: NotNegative = 0.02  # GPS poses creep where the car stands
+    sigma_floor_m: NotNegative = 0.002
+    sigma_floor_rad: NotNegative = 0.0003
+    sigma_pitch_rad: NotNegative = 0.006  # of the reported ground: KITTI's roads against the calibrated plane
+    landmark_near_m: NotNegative = 5.0
+    landmark_far_m: NotNegative = 30.0
+    landmark_side_m: NotNegative = 4.0
+
+
+_NONE = Drift()  # what `--odometry truth` uses:
+EXACT = SimulationConfig(noise=OdometryNoise(_NONE, _NONE, 0.0, _NONE, _NONE, 0.0, _NONE, _NONE, landmark_px=0.0))
+
+
+class Walk:
+    """Draws of one Drift, frame by frame."""
+
+    def __init__(self, drift: Drift, size: int, rng: np.random.Generator) -> None:
+        self._drift, self._rng = drift, rng
+        self._keep = math.exp(-1.0 / drift.memory_frames)
+        self._slow = drift.slow * rng.standard_normal(size)
+
+    def draw(self) -> Floats:
+        fresh, white = self._rng.standard_normal((2, len(self._slow)))
+        self._slow = self._keep * self._slow + self._drift.slow * math.sqrt(1.0 - self._keep**2) * fresh
+        out: Floats = self._slow + self._drift.white * white
+        return out
+
+
+class SimulatedOdometry:
+    """An EgoMotion of the front end from `poses` (N, 4, 4): `T_first_i` of the camera; frame ids are their rows.
+
+    `true_poses`, where `poses` are already someone's odometry, say where the camera was when it saw the landmarks.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        poses: Pose,
+        config: SimulationConfig,
+        rng: np.random.Generator,
+        true_poses: Pose | None = None,
+    ) -> None:
+        self.camera = camera
+        self.config = config
+        self._poses = poses
+        self._rng = rng
+        noise = config.noise
+        self._turn_gain = noise.turn_rel * float(rng.standard_normal())
+        self._tilt, self._turn = Walk(noise.tilt_rad, 2, rng), Walk(noise.turn_rad, 1, rng)
+        self._rise, self._side = Walk(noise.rise_rad, 1, rng), Walk(noise.side_rad, 1, rng)
+        self._scale, self._ground = Walk(noise.log_scale, 1, rng), Walk(noise.ground_rad, 1, rng)
+        self._ego = _on_road(camera, poses if true_poses is None else true_poses)
+        self._landmarks: dict[int, Floats] = {}  # in world
+        self._next_landmark = 0
+        self._last_frame: int | None = None
+
+    @property
+    def road_tracks(self) -> tuple[NDArray[np.int64], Floats]:
+        """None: there is no image to follow corners in. `landmarks` gives what became of them."""
+        return np.zeros(0, np.int64), np.zeros((0, 2))
+
+    def track(self, image: NDArray[np.uint8]) -> None:
+        """Nothing: there is no image to look at."""
+
+    def estimate(
+        self,
+        tracks: None,
+        frame_id: int,
+        t_source_ns: int,
+        vehicle_boxes_px: Floats,
+        road_mask: NDArray[np.bool_] | None = None,
+    ) -> Motion | None:
+        """The motion since the last frame; None for the first one."""
+        last, self._last_frame = self._last_frame, frame_id
+        if last is None:
+            return None
+        config, noise = self.config, self.config.noise
+        step = inverse(self._poses[last]) @ self._poses[frame_id]
+        length_m = float(np.linalg.norm(step[:3, 3]))
+        (tilt_x, tilt_z), (turn,) = self._tilt.draw(), self._turn.draw()
+        (rise,), (side,), (log_scale,) = self._rise.draw(), self._side.draw(), self._scale.draw()
+        side += noise.side_per_turn * turn
+        turn += self._turn_gain * float(Rotation.from_matrix(step[:3, :3]).as_rotvec()[1])
+        standstill = length_m < config.standstill_m
+        if standstill:
+            step = np.eye(4)
+            length_m = 0.0
+        else:
+            step[:3, 3] = Rotation.from_rotvec([rise, side, 0.0]).apply(step[:3, 3]) * math.exp(log_scale)
+            step[:3, :3] = step[:3, :3] @ Rotation.from_rotvec([tilt_x, turn, tilt_z]).as_matrix()
+        sigma_side_rad = math.hypot(noise.side_rad.sigma, noise.side_per_turn * noise.turn_rad.sigma)
+        sigma_m = np.hypot(config.sigma_floor_m, length_m * np.array([noise.log_scale.sigma, sigma_side_rad]))
+        sigma_rad = math.hypot(config.sigma_floor_rad, noise.turn_rad.sigma)
+        return Motion(
+            from_frame=last,
+            to_frame=frame_id,
+            R_prev_curr=step[:3, :3],
+            t_prev_curr_m=step[:3, 3],
+            T_prev_curr=planar(Step(step[:3, :3], step[:3, 3]), self.camera.ground),
+            cov=np.diag([*np.square(sigma_m), sigma_rad**2]),
+            scale_sigma_rel=noise.log_scale.sigma,
+            ground=self.camera.ground,
+            pitch_sigma_rad=config.sigma_pitch_rad,
+            standstill=standstill,
+            status=(Status.STANDSTILL,) if standstill else (),
+        )
+
+    def landmarks(self, frame_id: int, ground: GroundPlane, config: StaticMapConfig) -> tuple[LandmarkEdge, ...]:
+        """CP edges of a frame, as the front end makes them of road tracks over the `ground` that it believes in."""
+        T_world_ego, noise = self._ego[frame_id], self.config.noise
+        points = self._follow(T_world_ego)
+        if not points:
+            return ()
+        tilt_rad = float(self._ground.draw()[0])
+        seen_over = GroundPlane(ground.height_m, ground.pitch_rad + tilt_rad, ground.roll_rad)
+        px = bev.ego_to_pixel(self.camera, seen_over, T_world_ego.inverse() @ np.array(list(points.values())))
+        px = px + noise.landmark_px * self._rng.standard_normal(px.shape)
+        inside = (px > 0.0).all(axis=1) & (px < [self.camera.width_px, self.camera.height_px]).all(axis=1)
+        ids = np.array(list(points), dtype=np.int64)[inside]
+        return landmark_edges(ids, px[inside], frame_id, self.camera, ground, noise.ground_rad.sigma, config)
+
+    def _follow(self, T_world_ego: SE2) -> dict[int, Floats]:
+        """Landmarks in world: each is followed for some frames, and new ones are taken up for those lost."""
+        config, noise, rng = self.config, self.config.noise, self._rng
+        T_ego_world = T_world_ego.inverse()
+        followed = {}
+        for landmark, point in self._landmarks.items():
+            x_m = float((T_ego_world @ point)[0])
+            if config.landmark_near_m < x_m and rng.uniform() > 1.0 / noise.landmark_frames:
+                followed[landmark] = point
+        while len(followed) < round(noise.landmarks):
+            # As dense in the image as tracks are: uniform in the row, which is 1 / depth
+            row = rng.uniform(1.0 / config.landmark_far_m, 1.0 / config.landmark_near_m)
+            left_m = rng.uniform(-config.landmark_side_m, config.landmark_side_m)
+            followed[self._next_landmark] = T_world_ego @ np.array([1.0 / row, left_m])
+            self._next_landmark += 1
+        self._landmarks = followed
+        return followed
+
+
+def _on_road(camera: Camera, poses: Pose) -> list[SE2]:
+    out = [SE2()]
+    for before, after in itertools.pairwise(poses):
+        step = inverse(before) @ after
+        out.append(out[-1] @ planar(Step(step[:3, :3], step[:3, 3]), camera.ground))
+    return out
+
+
+def fit_drift(errors: list[Floats], weights: list[Floats], lags: int = 8) -> Drift:
+    """The Drift of measured errors, one series (N,) for each clip, each with the weights (N,) of its errors.
+
+    The slow part is what errors of frames close by have in common (mean of the products over lags 1-3, about zero, so
+    that a clip's bias counts as slow); its memory is how that decays; what is left is white. Weighting by the distance
+    driven makes angles and scales those that displace most.
+    """
+
+    def product(lag: int) -> float:
+        pairs = [
+            (e[: len(e) - lag] * e[lag:], w[: len(e) - lag] * w[lag:]) for e, w in zip(errors, weights, strict=True)
+        ]
+        total = sum(float(w.sum()) for _, w in pairs)
+        return sum(float((e * w).sum()) for e, w in pairs) / max(total, 1e-12)
+
+    variance, shared = product(0), [product(lag) for lag in range(1, lags + 1)]
+    slow = min(max(float(np.mean(shared[:3])), 0.0), variance)
+    late = max(float(np.mean(shared[-3:])), 0.05 * slow)
+    decay = math.log(max(slow / late, 1.05)) if slow > 0.0 else 1.0
+    return Drift(
+        white=math.sqrt(max(variance - slow, 0.0)), slow=math.sqrt(slow), memory_frames=(lags - 1.0 - 2.0) / decay
+    )

@@ -1,0 +1,149 @@
+"""Each baseline recovers a world without noise, and does what sets it apart."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from birdslam.baselines import batch_se3, cubeslam, nair, namdev
+from birdslam.baselines.trajectories import LiveTrajectories, Trajectories, dead_reckoned
+from birdslam.camera import Camera
+from birdslam.se2 import SE2
+from birdslam.simulation.drive import Drive, DriveConfig, drive
+from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
+
+CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65)
+QUIET = DriveConfig(frames=40, rate_hz=10.0, vehicles=3, landmarks=8, lane_points=0, noise=0.0)
+HEIGHT_M = 1.5
+UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def boxed(log: list[Measurements]) -> list[Measurements]:
+    """The log with boxes of cars that are HEIGHT_M high and fill their outline."""
+
+    def with_box(edge: VehicleEdge) -> VehicleEdge:
+        T, half = edge.T_ego_vehicle, np.array([edge.length_m, edge.width_m]) / 2.0
+        corners = np.array([T @ np.array([sx * half[0], sy * half[1]]) for sx in (-1, 1) for sy in (-1, 1)])
+        near_m = float(corners[:, 0].min())
+        u = CAMERA.cx_px - CAMERA.fx_px * corners[:, 1] / corners[:, 0]
+        v = CAMERA.cy_px + CAMERA.fy_px * np.array([CAMERA.height_m - HEIGHT_M, CAMERA.height_m]) / near_m
+        return msgspec.structs.replace(edge, box_px=(float(u.min()), float(v.min()), float(u.max()), float(v.max())))
+
+    return [msgspec.structs.replace(m, cv=tuple(with_box(edge) for edge in m.cv)) for m in log]
+
+
+@pytest.fixture(scope="module")
+def world() -> Drive:
+    found = drive(QUIET, seed=4)
+    return replace(found, measurements=boxed(found.measurements))
+
+
+def worst_m(world: Drive, result: Trajectories) -> tuple[float, float]:
+    ego = max(math.hypot(*(world.ego[f, :2] - [p.x_m, p.y_m])) for f, p in result.ego.items())
+    cars = [
+        math.hypot(*(world.vehicles[vehicle][frame, :2] - [pose.x_m, pose.y_m]))
+        for vehicle, poses in result.vehicles.items()
+        for frame, pose in poses.items()
+    ]
+    return ego, max(cars)
+
+
+@pytest.mark.parametrize("method", [nair, batch_se3], ids=lambda module: module.__name__)
+def test_a_world_without_noise_is_recovered(world: Drive, method) -> None:  # type: ignore[no-untyped-def]
+    result = method.run(world.measurements, CAMERA)
+    assert set(result.ego) == set(range(QUIET.frames))
+    assert {(v, f) for v, poses in result.vehicles.items() for f in poses} == {
+        (edge.vehicle, edge.frame) for m in world.measurements for edge in m.cv
+    }
+    ego_m, car_m = worst_m(world, result)
+    assert ego_m < 0.05
+    assert car_m < 0.05
+
+
+def test_the_batch_finds_the_scale_by_itself(world: Drive) -> None:
+    """Whatever unit the odometry has, the answer is in metres."""
+    factor = 0.25
+    scaled = [
+        m
+        if m.cc is None
+        else msgspec.structs.replace(
+            m,
+            cc=msgspec.structs.replace(
+                m.cc,
+                T_from_to=SE2(m.cc.T_from_to.x_m * factor, m.cc.T_from_to.y_m * factor, m.cc.T_from_to.yaw_rad),
+            ),
+        )
+        for m in world.measurements
+    ]
+    ego_m, _ = worst_m(world, batch_se3.run(scaled, CAMERA))
+    assert ego_m < 0.05
+    assert worst_m(world, nair.run(scaled, CAMERA))[0] > 1.0  # which takes the odometry's word
+
+
+def test_lanes_can_be_left_out(world: Drive) -> None:
+    assert worst_m(world, batch_se3.run(world.measurements, CAMERA, lanes=False))[0] < 0.5
+
+
+def test_cuboids_are_recovered_from_boxes_of_known_size(world: Drive) -> None:
+    config = cubeslam.CuboidConfig(height_m=HEIGHT_M)
+    for edge in (edge for m in world.measurements for edge in m.cv):
+        turned = msgspec.structs.replace(edge, T_ego_vehicle=SE2(0.0, 0.0, edge.T_ego_vehicle.yaw_rad))
+        found = cubeslam.cuboid(turned, CAMERA, config).T_ego_vehicle
+        assert math.hypot(found.x_m - edge.T_ego_vehicle.x_m, found.y_m - edge.T_ego_vehicle.y_m) < 0.01
+    ego_m, car_m = worst_m(world, cubeslam.run(world.measurements, CAMERA, config))
+    assert ego_m < 0.2
+    assert car_m < 2.5  # a car that changes lanes without turning its nose is not in its motion model
+
+
+def test_namdev_finds_the_scale_of_a_car_that_stands() -> None:
+    """The ego speeds up: only one scale leaves the car where it is, whatever the prior on its size."""
+    steps = [SE2(0.5 + 0.03 * k, 0.0, 0.02 * math.sin(0.3 * k)) for k in range(40)]
+    ego, place, log = SE2(), SE2(45.0, 4.0), []
+    for k, step in enumerate(steps):
+        T = ego.between(place)
+        column_px, foot_px = CAMERA.cx_px - CAMERA.fx_px * T.y_m / T.x_m, CAMERA.fy_px * HEIGHT_M / T.x_m
+        box_px = (column_px - 5.0, 0.0, column_px + 5.0, foot_px)
+        seen = VehicleEdge(vehicle=1, frame=k, T_ego_vehicle=T, cov=UNIT, box_px=box_px)
+        moved = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=steps[k - 1], cov=UNIT) if k else None
+        log.append(Measurements(frame_id=k, t_source_ns=k, t_capture_ns=k, t_utc_ns=k, cc=moved, cv=(seen,)))
+        ego = ego @ step
+    config = namdev.NamdevConfig(start_height_m=2.5, sigma_height_m=1.0, sigma_depth_rel=0.001)
+    poses = namdev.run(log, CAMERA, config).vehicles[1]
+    assert max(math.hypot(p.x_m - place.x_m, p.y_m - place.y_m) for p in poses.values()) < 0.5
+
+
+def test_an_empty_log_gives_nothing() -> None:
+    for method in (nair, batch_se3, namdev, cubeslam):
+        assert method.run([], CAMERA) == Trajectories()
+        assert method.label
+
+
+def test_a_new_epoch_goes_on_where_the_last_one_ended() -> None:
+    live = LiveTrajectories()
+    cov = (0.0,) * 9
+
+    def estimate(frame: int, epoch: int, pose: SE2) -> Estimate:
+        return Estimate(
+            epoch=epoch,
+            frame_id=frame,
+            t_source_ns=0,
+            t_capture_ns=0,
+            t_utc_ns=0,
+            T_world_ego=pose,
+            cov=cov,
+            valid=True,
+        )
+
+    for frame, epoch, x_m in ((0, 0, 0.0), (1, 0, 2.0), (2, 1, 0.0), (3, 1, 1.5)):
+        live.add(estimate(frame, epoch, SE2(x_m)))
+    assert [live.result.ego[k].x_m for k in range(4)] == [0.0, 2.0, 2.0, 3.5]
+
+
+def test_dead_reckoning_is_the_chain(world: Drive) -> None:
+    ego_m, car_m = worst_m(world, dead_reckoned(world.measurements))
+    assert ego_m < 1e-6
+    assert car_m < 1e-6

@@ -1,0 +1,301 @@
+"""The benchmark on a small exact world: logs, matching, rows, ablations, tables and the command."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tracking_world
+
+from birdslam import ablation, tables
+from birdslam.camera import Camera
+from birdslam.datasets import DatasetError
+from birdslam.frontend import FrontEndConfig
+from birdslam.kitti_tracking import TrackingSequence, open_tracking, read_detections
+from birdslam.perception import Perception, Ready
+from birdslam.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig, Walk, fit_drift
+from birdslam.slam import SlamConfig
+from birdslam.tables import Published, read_published
+from birdslam.tracking_evaluation import EGO, PAPER, Row, Truth, make_log, methods, ours, run_trial, summarise
+from birdslam.types import Measurements
+from runtime.configuration import Configuration, ConfigurationError
+from runtime.evaluate_tracking import PUBLISHED, evaluate
+from runtime.tracking_job import frames_of
+from runtime.tracking_options import METHODS, add_commands
+
+FRAMES = range(40)
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> TrackingSequence:
+    return open_tracking(tracking_world.write(tmp_path_factory.mktemp("tracking")), "0002")
+
+
+@pytest.fixture(scope="module")
+def published() -> Published:
+    return read_published(PUBLISHED)
+
+
+def log_of(sequence: TrackingSequence, root: Path, config: SimulationConfig, seed: int = 0) -> list[Measurements]:
+    found = read_detections(root / "det_02_rrc", sequence.name, len(sequence))
+    odometry = SimulatedOdometry(sequence.camera, sequence.camera_poses, config, np.random.default_rng(seed))
+    return make_log(
+        sequence,
+        FRAMES,
+        odometry,
+        lambda frame, image: Ready(Perception(found[frame], None, {"detector": 0}, ())),
+        None,
+        FrontEndConfig(),
+    )
+
+
+@pytest.fixture(scope="module")
+def exact_log(sequence: TrackingSequence, tmp_path_factory: pytest.TempPathFactory) -> list[Measurements]:
+    return log_of(sequence, tracking_world.write(tmp_path_factory.mktemp("log")), EXACT)
+
+
+def test_an_exact_world_has_hardly_any_error(sequence: TrackingSequence, exact_log: list[Measurements]) -> None:
+    trial = run_trial(sequence, exact_log, methods(SlamConfig()))
+    assert set(trial.errors) == set(METHODS)
+    assert trial.frames_labelled[EGO] == len(FRAMES)
+    for name in ("birdslam", "nair", "cubeslam", "namdev"):
+        ego = trial.errors[name][EGO]
+        assert ego is not None
+        assert ego.ate_m < 0.05, name
+    for car in ("3", "7", "9"):
+        errors = trial.errors["birdslam"][car]
+        assert errors is not None
+        assert errors.ate_m < 0.8, car
+        assert errors.frames >= trial.frames_labelled[car] - 4  # a track is confirmed by its third sight
+    assert trial.hota is not None
+    assert trial.hota > 0.9
+    assert trial.idf1 is not None
+    assert trial.idf1 > 0.9
+
+
+def test_a_log_can_be_made_twice(sequence: TrackingSequence, tmp_path: Path) -> None:
+    root = tracking_world.write(tmp_path)
+    once, twice, other = (log_of(sequence, root, SimulationConfig(), seed) for seed in (1, 1, 2))
+    assert once == twice
+    assert once != other
+    assert sum(len(m.cp) for m in once) > len(FRAMES)
+
+
+def test_frames_may_start_anywhere(sequence: TrackingSequence, exact_log: list[Measurements]) -> None:
+    truth = Truth.of(sequence, exact_log[10:])
+    assert truth.ego[10].x_m == 0.0
+    assert min(truth.ego) == 10
+    with pytest.raises(ValueError, match="no frames"):
+        Truth.of(sequence, [])
+
+
+def test_rows_are_medians_over_seeds(sequence: TrackingSequence, tmp_path: Path) -> None:
+    root = tracking_world.write(tmp_path)
+    chosen = {"birdslam": ours(SlamConfig())}
+    trials = [run_trial(sequence, log_of(sequence, root, SimulationConfig(), seed), chosen) for seed in range(3)]
+    rows = summarise("0002", trials, ["1"], "simulate", "rrc")
+    ego = next(row for row in rows if row.body == EGO)
+    errors = [trial.errors["birdslam"][EGO] for trial in trials]
+    each = [e.ate_m for e in errors if e is not None]
+    assert ego.ate_m == pytest.approx(np.median(each))
+    assert ego.ate_m_spread == pytest.approx(np.std(each))
+    assert (ego.seeds, ego.odometry, ego.detections) == (3, "simulate", "rrc")
+    assert {row.body for row in rows} == {EGO, "3", "7", "9"}
+
+
+def test_ablations_run_on_both_graphs(sequence: TrackingSequence, exact_log: list[Measurements]) -> None:
+    for base in (PAPER, ours(SlamConfig())):
+        variants = ablation.constraint_variants(base) | ablation.landmark_variants(base)
+        assert tuple(variants) == tables.CONSTRAINTS + tables.LANDMARKS
+        trial = run_trial(sequence, exact_log, variants)
+        for name in variants:
+            assert trial.errors[name][EGO] is not None
+            assert trial.errors[name]["3"] is not None, name  # no row of the tables is left open
+    assert tuple(ablation.lane_variants()) == tables.LANES
+    assert ablation.landmark_variants(PAPER)["cp_medium"].weights.cp == PAPER.weights.cc
+
+
+# --- the simulated odometry ---
+
+
+@pytest.mark.parametrize("drift", [Drift(0.02, 0.0, 5.0), Drift(0.0, 0.02, 20.0), Drift(0.01, 0.015, 10.0)])
+def test_a_drift_is_fitted_back(drift: Drift) -> None:
+    walk = Walk(drift, 1, np.random.default_rng(5))
+    series = np.array([walk.draw()[0] for _ in range(40_000)])
+    found = fit_drift([series], [np.ones(len(series))])
+    assert found.sigma == pytest.approx(drift.sigma, rel=0.1)
+    assert found.slow == pytest.approx(drift.slow, abs=0.15 * drift.sigma)
+
+
+def test_the_simulated_odometry_errs_as_it_says() -> None:
+    camera = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65)
+    poses = np.tile(np.eye(4), (400, 1, 1))
+    poses[:, 2, 3] = 1.2 * np.arange(400)
+    config = SimulationConfig()
+    odometry = SimulatedOdometry(camera, poses, config, np.random.default_rng(0))
+    motions = [odometry.estimate(None, k, k, np.zeros((0, 4))) for k in range(400)]
+    assert motions[0] is None
+    steps = np.array([[m.T_prev_curr.x_m, m.T_prev_curr.y_m, m.T_prev_curr.yaw_rad] for m in motions if m])
+    sigma = np.sqrt(np.diag(motions[1].cov))  # type: ignore[union-attr]
+    ratio = (steps - [1.2, 0.0, 0.0]).std(axis=0) / sigma
+    assert (ratio > 0.6).all()
+    assert (ratio < 1.4).all()
+
+
+def test_a_standing_car_holds_its_pose() -> None:
+    camera = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65)
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 2, 3] = [0.0, 0.001, 0.0, 0.002, 0.001]
+    odometry = SimulatedOdometry(camera, poses, SimulationConfig(), np.random.default_rng(0))
+    for k in range(5):
+        motion = odometry.estimate(None, k, k, np.zeros((0, 4)))
+        if motion is not None:
+            assert motion.standstill
+            assert motion.T_prev_curr.x_m == 0.0
+
+
+# --- the paper's numbers ---
+
+
+def test_published_is_complete(published: Published) -> None:
+    def cells(table: tables.PublishedTable) -> list[int]:
+        return [sum(len(bodies) for bodies in column.values()) for column in table.ate_m.values()]
+
+    assert [len(paper.cars) for paper in published.sequences.values()] == [1, 2, 1, 1, 1, 3, 2]
+    assert [paper.frames for paper in published.sequences.values()] == [67, 123, 149, 101, 249, 141, 414]
+    assert list(published.table1.ate_m) == list(published.table2.ate_m) == list(tables.METHOD_TITLES)
+    assert cells(published.table1) == [11, 11, 11, 3, 11]
+    assert cells(published.table2) == [7, 7, 7, 1, 7]
+    assert tuple(published.table3.ate_m) == tables.CONSTRAINTS
+    assert tuple(published.table4.ate_m) == tables.LANDMARKS
+    assert set(cells(published.table3)) == set(cells(published.table4)) == {18}
+    assert tuple(published.table5.ate_m) == tables.LANES
+    assert cells(published.table5) == [9, 9]
+    for name, average in published.table5.average_m.items():
+        numbers = [n for bodies in published.table5.ate_m[name].values() for n in bodies.values()]
+        assert np.mean(numbers) == pytest.approx(average, abs=0.02)
+
+
+def test_table_1_and_table_3_agree_on_the_same_method(published: Published) -> None:
+    for sequence, cars in published.table1.ate_m["paper"].items():
+        for car, ate_m in cars.items():
+            assert published.table3.ate_m["all"][sequence][car] == ate_m
+            assert published.table4.ate_m["cp_medium"][sequence][car] == ate_m
+
+
+def test_a_broken_file_of_published_numbers_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "published.toml"
+    with pytest.raises(DatasetError, match=r"published\.toml: can't be read"):
+        read_published(path)
+    path.write_text("sequences = 3\n")
+    with pytest.raises(DatasetError, match=r"published\.toml: .*sequences"):
+        read_published(path)
+
+
+def test_tables_have_every_cell_of_the_paper(published: Published) -> None:
+    row = Row(
+        sequence="0002",
+        method="birdslam",
+        body="1",
+        frames=30,
+        frames_labelled=42,
+        seeds=2,
+        ate_m=1.234,
+        ate_m_spread=0.0,
+    )
+    text = tables.methods_table([row], published, ego=False)
+    assert "| 0002 | 1 | 30 of 42 | 5.01 | 6.35 | 6.02 | - | 2.09 | 1.23 ± 0.00 |" in text
+    assert "| 0020 | 122 |  | 12.86 |" in text
+    assert text.count("\n") == 2 + 11 + 1
+    ego = tables.methods_table([], published, ego=True)
+    assert ego.count("\n") == 2 + 7 + 1
+    for columns, table in ((tables.CONSTRAINTS, published.table3), (tables.LANDMARKS, published.table4)):
+        assert tables.variants_table([], published, table, columns).count("\n") == 2 + 18 + 1
+
+
+# --- the command ---
+
+
+def options(*arguments: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    add_commands(parser.add_subparsers())
+    return parser.parse_args(list(arguments))
+
+
+def test_the_command_writes_its_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root, out = tracking_world.write(tmp_path / "root"), tmp_path / "out"
+    asked = options(
+        "tracking", str(root), "--frames", "0:25", "--odometry", "truth", "--jobs", "1", "--output", str(out)
+    )
+    assert evaluate(asked, Configuration()) == 0
+    rows = json.loads((out / "report.json").read_text())
+    ours_ = {row["body"]: row for row in rows if row["method"] == "birdslam"}
+    assert ours_["ego"]["ate_m"] < 0.05
+    assert ours_["ego"]["frames"] == 25
+    assert ours_["3"]["sequence"] == "0002"
+    assert {row["method"] for row in rows} == set(METHODS)
+    report = (out / "report.md").read_text()
+    for number in range(1, 6):
+        assert f"## Table {number}" in report
+    assert "TRUTH" in report
+    assert (out / "bev_0002.png").stat().st_size > 1000
+    assert (out / "runtime.png").stat().st_size > 1000
+    assert json.loads((out / "ablation.json").read_text())
+    assert "sequence 0002: 25 frames" in capsys.readouterr().err
+
+
+def test_the_ablation_alone(tmp_path: Path) -> None:
+    root, out = tracking_world.write(tmp_path / "root"), tmp_path / "out"
+    asked = options("ablation", str(root), "--frames", "0:12", "--seeds", "1", "--jobs", "1", "--output", str(out))
+    assert evaluate(asked, Configuration()) == 0
+    report = (out / "report.md").read_text()
+    assert "## Table 1" not in report
+    assert "## Table 3" in report
+    assert "SIMULATED" in report
+    found = {row["method"] for row in json.loads((out / "report.json").read_text())}
+    assert found == {f"{m}/{v}" for m in ("paper", "birdslam") for v in tables.CONSTRAINTS + tables.LANDMARKS} | set(
+        tables.LANES
+    )
+
+
+def test_a_trajectory_file_is_an_odometry(tmp_path: Path) -> None:
+    root, out = tracking_world.write(tmp_path / "root"), tmp_path / "out"
+    rows = np.array([tracking_world.pose_row(k) for k in range(40)])
+    rows[:, 2, 3] *= 1.1
+    path = tmp_path / "mine.txt"
+    path.write_text("".join(" ".join(map(str, row.ravel())) + "\n" for row in rows))
+    asked = options(
+        *("tracking", str(root), "--methods", "nair", "--odometry", str(path), "--jobs", "1", "--output", str(out))
+    )
+    assert evaluate(asked, Configuration()) == 0
+    ego = next(row for row in json.loads((out / "report.json").read_text()) if row["body"] == "ego")
+    assert ego["ate_m"] == pytest.approx(0.1 * 0.8 * np.sqrt(np.mean(np.arange(40) ** 2)), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--sequences", "0007"], "no 0007"),
+        (["--methods", "orb"], "there is no orb"),
+        (["--odometry", "images"], "no image_02"),
+        (["--detections", "network"], "no image_02"),
+        (["--frames", "30:10"], "expected all, paper or A:B"),
+        (["--frames", "x"], "expected all, paper or A:B"),
+        (["--seeds", "0"], "--seeds 0"),
+        (["--odometry", "/nowhere.txt"], r"/nowhere\.txt: can't be read"),
+        (["--detections", "/nowhere"], r"/nowhere: has no detections"),
+    ],
+)
+def test_a_mistake_is_named(tmp_path: Path, arguments: list[str], said: str) -> None:
+    root = tracking_world.write(tmp_path / "root")
+    asked = options("tracking", str(root), *arguments, "--jobs", "1", "--output", str(tmp_path / "out"))
+    with pytest.raises((ConfigurationError, DatasetError), match=said):
+        evaluate(asked, Configuration())
+
+
+def test_the_papers_frames_are_the_first(sequence: TrackingSequence, published: Published) -> None:
+    assert frames_of("paper", sequence, published) == range(40)  # as many as there are of its 67
+    assert frames_of("5:", sequence, published) == range(5, 40)
