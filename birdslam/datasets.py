@@ -67,8 +67,8 @@ class Recording(ABC):
         """Frames in the recording, unreadable ones counted."""
 
     @abstractmethod
-    def frames(self) -> Iterator[RecordedFrame]:
-        """Every frame in order; an unreadable one is a frame without image, and the iteration goes on."""
+    def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
+        """Every frame in order, from index `start` on; an unreadable one has no image, and the iteration goes on."""
 
     def truth_poses(self) -> NDArray[np.float64] | None:
         """(N, 3, 4) poses of camera 0 as KITTI rows in metres, one a frame; None where there are none."""
@@ -151,9 +151,9 @@ class KittiRecording(Recording):
     def __len__(self) -> int:
         return len(self.numbers)
 
-    def frames(self) -> Iterator[RecordedFrame]:
+    def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
         """Every frame in order, read when asked for."""
-        for index, number in enumerate(self.numbers):
+        for index, number in enumerate(self.numbers[start:], start):
             t_ns = self._t_ns[index] if self._t_ns else round(number / KITTI_RATE_HZ * NS_PER_S)
             try:
                 yield RecordedFrame(index, t_ns, self._read(number))
@@ -237,7 +237,7 @@ class VideoRecording(Recording):
     def __len__(self) -> int:
         return -(-self._declared // self._stride)
 
-    def frames(self) -> Iterator[RecordedFrame]:
+    def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
         """Every frame in order, its time from the container; a file cut off ends with one unreadable frame."""
         capture = self._open()
         try:
@@ -245,7 +245,9 @@ class VideoRecording(Recording):
             while capture.grab():
                 stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
                 t_ns = stamp_ns if stamp_ns > t_ns else t_ns + self._period_ns  # containers without times give zeros
-                if position % self._stride == 0:
+                if position % self._stride == 0 and index < start:
+                    index += 1
+                elif position % self._stride == 0:
                     ok, image = capture.retrieve()
                     error = None if ok else f"{self._path}: frame {position} can't be decoded"
                     yield RecordedFrame(index, t_ns, image if ok else None, error)  # type: ignore[arg-type]

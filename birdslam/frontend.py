@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.camera import Camera, GroundPlane
+from birdslam.horizon import Horizon, HorizonConfig
 from birdslam.localisation import LocalisationConfig, localise
 from birdslam.odometry import Motion, Odometry, OdometryConfig
 from birdslam.perception import Perception
@@ -28,11 +29,11 @@ from birdslam.types import (
 
 
 class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The parts of the front end; `sigma_pitch_start_rad` holds until the odometry has seen the road."""
+    """The parts of the front end."""
 
-    sigma_pitch_start_rad: float = 0.015
     odometry: OdometryConfig = OdometryConfig()
     localisation: LocalisationConfig = LocalisationConfig()
+    horizon: HorizonConfig = HorizonConfig()
     tracking: TrackingConfig = TrackingConfig()
     static_map: StaticMapConfig = StaticMapConfig()
 
@@ -69,9 +70,11 @@ class FrontEnd:
         self.config = config
         self.odometry: EgoMotion = odometry or Odometry(camera, config.odometry)
         self.tracker = Tracker(camera, config.tracking, config.localisation)
+        self.horizon = Horizon(camera, config.horizon)
         self._reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
         self._lanes = LaneMapper(camera, config.static_map)
         self._last_frame: int | None = None
+        self._last_pitch = (0, 0.0)  # when, and the camera's against the level
 
     def step(self, frame: Frame, pending: Pending) -> Measurements:
         """`pending` is waited for after the feature tracking, which runs beside the networks."""
@@ -87,8 +90,7 @@ class FrontEnd:
         road = None if segmentation is None else segmentation.road
         motion = self.odometry.estimate(tracks, frame.frame_id, frame.t_source_ns, boxes_px, road)
         cc = None if motion is None else self._advance(motion)
-        ground = self.camera.ground if motion is None else motion.ground
-        sigma_pitch_rad = self.config.sigma_pitch_start_rad if motion is None else motion.pitch_sigma_rad
+        self._expect_road(frame.t_source_ns, motion)
 
         # Dynamic object localisation: only what the detector saw in this very frame
         observations = []
@@ -98,11 +100,12 @@ class FrontEnd:
                 detections.scores,
                 detections.labels,
                 self.camera,
-                ground,
-                sigma_pitch_rad,
+                self.horizon.ground,
                 self.config.localisation,
             )
-        seen = self.tracker.step(observations, self._reckoning.T_world_ego, ground, frame.frame_id, frame.t_source_ns)
+        T_world_ego = self._reckoning.T_world_ego
+        seen = self.tracker.step(observations, T_world_ego, self.horizon, frame.frame_id, frame.t_source_ns)
+        ground, sigma_pitch_rad = self.horizon.ground, self.horizon.sigma_pitch_rad
 
         return _measurements(
             frame,
@@ -137,6 +140,16 @@ class FrontEnd:
         self._last_frame = frame.frame_id
         return (Status.FRAMES_DROPPED,) if gap else ()
 
+    def _expect_road(self, t_source_ns: int, motion: Motion | None) -> None:
+        """The road as this frame's image and the camera's own pitching since the last frame give it."""
+        pitch_rad = self._reckoning.attitude.pitch_rad
+        (last_ns, last_rad), self._last_pitch = self._last_pitch, (t_source_ns, pitch_rad)
+        dt_s = max(0.0, (t_source_ns - last_ns) * 1e-9)
+        if motion is None:
+            self.horizon.predict(dt_s, None, None, 0.0)
+        else:
+            self.horizon.predict(dt_s, pitch_rad - last_rad, motion.ground, motion.pitch_sigma_rad)
+
     def _advance(self, motion: Motion) -> EgoEdge:
         self._reckoning.advance(motion)
         return EgoEdge(
@@ -152,7 +165,8 @@ class FrontEnd:
         cov = np.zeros((3, 3))
         R_vehicle_ego = SE2(yaw_rad=-yaw_rad).rotation()
         cov[:2, :2] = R_vehicle_ego @ place.cov @ R_vehicle_ego.T  # the tangent at the vehicle's pose
-        cov[2, 2] = (tracking.sigma_yaw_moving_rad if track.yaw_known else tracking.sigma_yaw_unknown_rad) ** 2
+        sigma_yaw_rad = math.hypot(tracking.sigma_yaw_moving_rad, track.sigma_yaw_rad)
+        cov[2, 2] = (sigma_yaw_rad if track.yaw_known else tracking.sigma_yaw_unknown_rad) ** 2
         return VehicleEdge(
             vehicle=track.vehicle,
             frame=track.seen_frame,

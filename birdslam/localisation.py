@@ -1,9 +1,8 @@
 """Vehicles in bird's-eye view from their boxes (paper, dynamic object localization).
 
-The paper's Eq. 1 on the bottom edge gives the depth of a vehicle's nearest face. The size of the box gives it too, from
-what the vehicle measures: a prior of its class at first, then what was learned while the road under it was in view. The
-two are fused by their variances, so that a box whose bottom the image cuts off still has an honest depth. The centre of
-the footprint lies half of the vehicle's extent along the line of sight further on.
+A box becomes an `Observation`: slopes and bearings against the road as it is known, with honest sigmas. An edge that
+the image cuts off is no measurement, one that a nearer vehicle hides a poor one. Depths come of all boxes of a frame
+together (horizon.py); `place` then puts the footprint's centre where the box's edges and the vehicle's yaw want it.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam import bev
 from birdslam.camera import Camera, GroundPlane
 
 
@@ -26,19 +24,19 @@ class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     width_m: float
     height_m: float
     sigma_length_rel: float = 0.12
-    sigma_width_rel: float = 0.3  # of the outline across the line of sight: the length shows too where it is oblique
+    sigma_width_rel: float = 0.2  # of the outline across the line of sight: the length shows too where it is oblique
     sigma_height_rel: float = 0.08
 
 
 DIMENSIONS = {
-    "car": Dimensions(4.0, 1.7, 1.53),
+    "car": Dimensions(3.9, 1.63, 1.53),
     "van": Dimensions(5.0, 1.9, 2.1, sigma_height_rel=0.12),
     "truck": Dimensions(7.0, 2.4, 3.0, sigma_length_rel=0.3, sigma_height_rel=0.2),
     "bus": Dimensions(11.0, 2.5, 3.1, sigma_length_rel=0.2, sigma_height_rel=0.1),
     "motorcycle": Dimensions(2.1, 0.8, 1.6, sigma_height_rel=0.12),
 }
-NO_MEASUREMENT_REL = 1e3
 CENTRE_STEPS = 3  # each leaves about a tenth of the error
+HIDING_FRACTION = 0.1  # of a box's side: a nearer box that covers less hides nothing
 
 
 class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -46,58 +44,60 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     vehicles: dict[str, Dimensions] = msgspec.field(default_factory=lambda: dict(DIMENSIONS))
     sigma_box_rel: float = 0.02  # a detector's edges scatter with the size of the box
-    sigma_box_px: float = 1.5
-    sigma_camera_height_rel: float = 0.02
-    sigma_road_rad: float = 0.003  # of the road under the vehicle against the road under the ego
+    sigma_box_px: float = 1.0
+    reach_rel: float = 1.0  # of the way from the nearest face to the centre; the paper stays at the face (0)
     sigma_cut_rel: float = 1.0  # an edge cut by the image says nothing within the whole box
+    sigma_hidden_rel: float = 0.05  # an edge behind a nearer vehicle is the detector's guess
     cut_margin_px: float = 4.0
-    cut_margin_rel: float = 0.1  # of the box: detectors draw an edge that the image cuts off a little inside of it
-    size_floor_rel: float = 0.03  # a learned size is never surer: it has the ground plane's common error in it
-    width_drift_rel: float = 0.01  # a frame: the outline turns with the line of sight
+    cut_margin_rel: float = 0.1  # of the box's height, at the image's bottom: detectors draw an edge that the image
+    cut_margin_side_rel: float = 0.05  # cuts off a little inside of it; and of its width, at the sides
+    size_floor_rel: float = 0.02  # of a depth: vehicles are no cuboids
+    max_above_road_rad: float = 0.06  # a box whose bottom lies so far above where its height puts it hangs in the air
     same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
-    max_range_m: float = 80.0
+    max_range_m: float = 100.0  # by the height of its class
 
 
 @dataclass(frozen=True)
 class Observation:
     """One vehicle's box in one frame.
 
-    `bearing` is y/x in ego of its middle column; `depth_m` (ego's x of the nearest face) is Eq. 1 on its bottom edge;
-    `tan_height` and `tan_width` are its size at a depth of 1. Sigmas of depths and sizes are fractions.
+    `left` and `right` are the bearings (y/x in ego) of its edges; slopes fall from the plane of the road, so that Eq. 1
+    is H / slope_bottom. All sigmas are of these numbers.
     """
 
     label: str
     score: float
     box_px: tuple[float, float, float, float]
-    bearing: float
-    sigma_bearing: float
-    depth_m: float
-    sigma_depth_rel: float
-    tan_height: float
-    sigma_height_rel: float
-    tan_width: float
-    sigma_width_rel: float
+    left: float
+    sigma_left: float
+    right: float
+    sigma_right: float
+    slope_bottom: float
+    sigma_bottom: float
+    slope_top: float
+    sigma_top: float
+    cut_side: bool
     dimensions: Dimensions
 
+    @property
+    def bearing(self) -> float:
+        """Of its middle column."""
+        return (self.left + self.right) / 2.0
 
-@dataclass(frozen=True)
-class Outline:
-    """A vehicle's height and width across the line of sight, as logarithms of metres with variances."""
+    @property
+    def tan_width(self) -> float:
+        """Its width at a depth of 1."""
+        return self.left - self.right
 
-    log_height: float
-    var_height: float
-    log_width: float
-    var_width: float
+    @property
+    def tan_height(self) -> float:
+        """Its height at a depth of 1."""
+        return self.slope_bottom - self.slope_top
 
-    @staticmethod
-    def of_class(dimensions: Dimensions) -> Outline:
-        """What is known of a vehicle before it was measured."""
-        return Outline(
-            math.log(dimensions.height_m),
-            dimensions.sigma_height_rel**2,
-            math.log(dimensions.width_m),
-            dimensions.sigma_width_rel**2,
-        )
+    @property
+    def depth_by_height_m(self) -> float:
+        """Of a vehicle as tall as its class."""
+        return self.dimensions.height_m / max(self.tan_height, 1e-3)
 
 
 @dataclass(frozen=True)
@@ -120,62 +120,50 @@ def iou(a_px: NDArray[np.float64], b_px: NDArray[np.float64]) -> NDArray[np.floa
     return out
 
 
-def centre_of(depth_m: float, bearing: float, dimensions: Dimensions, yaw_rad: float) -> NDArray[np.float64]:
-    """The footprint's centre (2,) in ego from its nearest depth and the bearing (y/x) of the box's middle column.
+def corners_of(dimensions: Dimensions, yaw_rad: float) -> list[tuple[float, float]]:
+    """The footprint's corners about its centre, in ego's axes; `yaw_rad` is the vehicle's against the ego."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    half_l, half_w = dimensions.length_m / 2.0, dimensions.width_m / 2.0
+    return [(sl * half_l * c - sw * half_w * s, sl * half_l * s + sw * half_w * c) for sl in (-1, 1) for sw in (-1, 1)]
 
-    `yaw_rad` is the vehicle's against the ego. The middle of an oblique vehicle's outline is not the column of its
-    centre: the centre is moved sideways until the bearings of its outermost corners have the box's middle.
+
+def extent_m(dimensions: Dimensions, yaw_rad: float, depth_m: float, bearing: float) -> tuple[float, float]:
+    """What a vehicle measures along ego's x, and how wide its outline is where it is as far as its nearest face."""
+    corners = corners_of(dimensions, yaw_rad)
+    reach_m = -min(x for x, _ in corners)
+    x_m = depth_m + reach_m
+    y_m = bearing * x_m
+    outline = [(y_m + y) / max(x_m + x, 0.1) for x, y in corners]
+    return 2.0 * reach_m, (max(outline) - min(outline)) * depth_m
+
+
+def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float, config: LocalisationConfig) -> Place:
+    """The observation's place in ego at a depth with its variance, both of the logarithm; yaw against the ego.
+
+    The middle of an oblique vehicle's outline is not the column of its centre: the centre is moved sideways until the
+    bearings of its outermost corners have those of the box's edges, each weighted by its information.
     """
-    forward, left = np.array([math.cos(yaw_rad), math.sin(yaw_rad)]), np.array([-math.sin(yaw_rad), math.cos(yaw_rad)])
-    halves = dimensions.length_m / 2.0 * forward, dimensions.width_m / 2.0 * left
-    corners = np.array([sl * halves[0] + sw * halves[1] for sl in (-1, 1) for sw in (-1, 1)])
-    centre = np.array([depth_m - corners[:, 0].min(), 0.0])
-    centre[1] = bearing * centre[0]
-    for _ in range(CENTRE_STEPS):
-        x, y = (centre + corners).T
-        outline = y / np.maximum(x, 0.1)
-        centre[1] += (bearing - (outline.max() + outline.min()) / 2.0) * centre[0]
-    return centre
-
-
-def place(seen: Observation, outline: Outline, yaw_rad: float, config: LocalisationConfig) -> tuple[Place, Outline]:
-    """The observation's place in ego by Eq. 1 and by the size of the box, and the outline with what was learned.
-
-    In logarithms a depth is the difference of a size and its angle, so that the cues are fused as they are:
-    log depth = log height - log tan_height = log width - log tan_width = log of Eq. 1.
-    """
-    road = (math.log(seen.depth_m), seen.sigma_depth_rel**2)
-    var_height, var_width = seen.sigma_height_rel**2, seen.sigma_width_rel**2
-    log_tan_height, log_tan_width = math.log(seen.tan_height), math.log(seen.tan_width)
-    by_height = (outline.log_height - log_tan_height, outline.var_height + var_height)
-    by_width = (outline.log_width - log_tan_width, outline.var_width + var_width)
-    log_depth, var_depth = fuse(road, by_height, by_width)
-
-    # What the road says of the size, and only it: a prior that comes back through another cue would be counted twice.
-    log_height, learned_height = fuse(
-        (outline.log_height, outline.var_height), (road[0] + log_tan_height, road[1] + var_height)
-    )
-    log_width, learned_width = fuse(
-        (outline.log_width, outline.var_width), (road[0] + log_tan_width, road[1] + var_width)
-    )
-    floor = config.size_floor_rel**2
-    learned = Outline(
-        log_height, max(learned_height, floor), log_width, max(learned_width, floor) + config.width_drift_rel**2
-    )
-
     depth_m = math.exp(log_depth)
-    centre = centre_of(depth_m, seen.bearing, seen.dimensions, yaw_rad)
-    along, across = np.array([1.0, seen.bearing]), np.array([0.0, 1.0])
-    sigma_reach_m = seen.dimensions.sigma_length_rel * (centre[0] - depth_m)
-    cov = (depth_m**2 * var_depth + sigma_reach_m**2) * np.outer(along, along)
-    cov += (centre[0] * seen.sigma_bearing) ** 2 * np.outer(across, across)
-    return Place(depth_m, centre, cov), learned
+    corners = [(config.reach_rel * x, config.reach_rel * y) for x, y in corners_of(seen.dimensions, yaw_rad)]
+    reach_m = -min(x for x, _ in corners)
+    x_m = depth_m + reach_m
+    y_m = seen.bearing * x_m
+    of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
+    for _ in range(CENTRE_STEPS):
+        outline = [(y_m + y) / max(x_m + x, 0.1) for x, y in corners]
+        error = (seen.left - max(outline)) * of_left + (seen.right - min(outline)) * of_right
+        y_m += error / (of_left + of_right) * x_m
 
-
-def fuse(*estimates: tuple[float, float]) -> tuple[float, float]:
-    """Mean and variance of independent (mean, variance) of the same number, weighted by their information."""
-    information = sum(1.0 / variance for _, variance in estimates)
-    return sum(mean / variance for mean, variance in estimates) / information, 1.0 / information
+    # An edge alone gives the centre as well as half of the outline is known; of a vehicle that leaves the image at its
+    # side the nearest face is not seen
+    lopsided = (of_left - of_right) / (of_left + of_right)
+    sigma_half = seen.dimensions.sigma_width_rel * seen.tan_width / 2.0
+    sigma_across = math.hypot(1.0 / math.sqrt(of_left + of_right), lopsided * sigma_half)
+    sigma_reach_m = reach_m * (1.0 if seen.cut_side else seen.dimensions.sigma_length_rel)
+    along = x_m**2 * (var_depth + config.size_floor_rel**2) + sigma_reach_m**2
+    across, slope = (x_m * sigma_across) ** 2, y_m / x_m
+    cov = np.array([[along, along * slope], [along * slope, along * slope**2 + across]])
+    return Place(depth_m, np.array([x_m, y_m]), cov)
 
 
 def localise(
@@ -184,64 +172,95 @@ def localise(
     labels: tuple[str, ...],
     camera: Camera,
     ground: GroundPlane,
-    sigma_pitch_rad: float,
     config: LocalisationConfig,
 ) -> list[Observation]:
     """The vehicles among the boxes (N, 4), best score first.
 
-    A box whose bottom lies above the horizon or past `max_range_m` has no place on the road and is left out.
+    A box that hangs over the road or lies past `max_range_m` is no vehicle on it and is left out.
     """
-    found: list[Observation] = []
-    taken: list[NDArray[np.float64]] = []
-    for i in np.argsort(-scores, kind="stable"):
-        dimensions, box = config.vehicles.get(labels[i]), boxes_px[i]
-        if dimensions is None or (taken and iou(box, np.array(taken)).max() > config.same_vehicle_iou):
-            continue
-        observation = _observe(box, float(scores[i]), labels[i], dimensions, camera, ground, sigma_pitch_rad, config)
-        if observation is not None:
-            taken.append(box)
-            found.append(observation)
-    return found
+    vehicles = np.array([label in config.vehicles for label in labels], dtype=np.bool_).reshape(-1)
+    sizes = boxes_px[:, 2:] - boxes_px[:, :2]
+    candidates = np.flatnonzero(vehicles & (sizes >= 1.0).all(axis=1))
+    candidates = candidates[np.argsort(-scores[candidates], kind="stable")]
+    overlap = iou(boxes_px[candidates], boxes_px[candidates])
+    kept: list[int] = []  # rows of `overlap`
+    for row in range(len(candidates)):
+        if not kept or overlap[row, kept].max() <= config.same_vehicle_iou:
+            kept.append(row)
+    chosen = candidates[kept]
+    boxes = boxes_px[chosen]
+    hidden = hidden_edges(boxes)
+    slopes = _slopes(camera, ground, boxes)
+    found = (
+        _observe(box, float(scores[i]), labels[i], camera, slope, edges, config)
+        for i, box, slope, edges in zip(chosen, boxes.tolist(), slopes.tolist(), hidden.tolist(), strict=True)
+    )
+    return [seen for seen in found if _is_on_road(seen, camera, ground, config)]
+
+
+def hidden_edges(boxes_px: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N, 3): whether the left, right and bottom edge of each box lie behind a nearer one, whose bottom is lower."""
+    x1, y1, x2, y2 = (boxes_px[:, k, None] for k in range(4))
+    n1, m1, n2, m2 = (boxes_px[None, :, k] for k in range(4))
+    nearer = m2 > y2
+    rows = np.clip(np.minimum(y2, m2) - np.maximum(y1, m1), 0.0, None) > HIDING_FRACTION * (y2 - y1)
+    columns = np.clip(np.minimum(x2, n2) - np.maximum(x1, n1), 0.0, None) > HIDING_FRACTION * (x2 - x1)
+    left = nearer & rows & (n1 < x1) & (n2 > x1)
+    right = nearer & rows & (n1 < x2) & (n2 > x2)
+    bottom = nearer & columns & (m1 < y2)
+    out: NDArray[np.bool_] = np.column_stack([edge.any(axis=1) for edge in (left, right, bottom)])
+    return out
+
+
+def _slopes(camera: Camera, ground: GroundPlane, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 4): bearings of the left and right edge at the bottom, slopes of bottom and top (the rays Eq. 1 scales)."""
+    px = np.concatenate([boxes_px[:, [0, 3]], boxes_px[:, [2, 3]], boxes_px[:, [0, 1]]])
+    rays = np.column_stack([(px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px], np.ones(len(px))])
+    x, y, z = (rays @ ground.R_ego_cam.T).T
+    bearing, slope = (y / x).reshape(3, -1), (-z / x).reshape(3, -1)
+    return np.column_stack([bearing[0], bearing[1], slope[0], slope[2]])
 
 
 def _observe(
-    box: NDArray[np.float64],
+    box: list[float],
     score: float,
     label: str,
-    dimensions: Dimensions,
     camera: Camera,
-    ground: GroundPlane,
-    sigma_pitch_rad: float,
+    slopes: list[float],
+    hidden: list[bool],
     config: LocalisationConfig,
-) -> Observation | None:
-    x1, y1, x2, y2 = (float(edge) for edge in box)
+) -> Observation:
+    x1, y1, x2, y2 = box
     width_px, height_px = x2 - x1, y2 - y1
-    if width_px < 1.0 or height_px < 1.0:
-        return None
-    foot_px = np.array([[(x1 + x2) / 2.0, y2]])
-    near = bev.pixel_to_ego(camera, ground, foot_px)[0]  # Eq. 1
-    if not np.isfinite(near).all() or not 0.0 < near[0] < config.max_range_m:
-        return None
-    sigma_edge = np.array([width_px, height_px]) * config.sigma_box_rel + config.sigma_box_px
-    margin_px = config.cut_margin_px
-    cut_side = x1 < margin_px or x2 > camera.width_px - margin_px
+    margin_px, cut_rel = config.cut_margin_px, config.sigma_cut_rel
+    side_margin_px = margin_px + config.cut_margin_side_rel * width_px
+    cut_left, cut_right = x1 < side_margin_px, x2 > camera.width_px - side_margin_px
     cut_top = y1 < margin_px
     cut_bottom = y2 > camera.height_px - margin_px - config.cut_margin_rel * height_px
-    road_rad = math.hypot(sigma_pitch_rad, config.sigma_road_rad, float(sigma_edge[1]) / camera.fy_px)
-    # d depth / d angle is depth^2 / height. A cut bottom is no measurement at all, only a bound.
-    sigma_depth_rel = math.hypot(near[0] / ground.height_m * road_rad, config.sigma_camera_height_rel)
-    cut_rel = config.sigma_cut_rel
+    hidden_left, hidden_right, hidden_bottom = hidden
+
+    def sigma_px(size_px: float, cut: bool, covered: bool) -> float:
+        rel = cut_rel if cut else config.sigma_hidden_rel if covered else 0.0
+        return math.hypot(size_px * config.sigma_box_rel + config.sigma_box_px, size_px * rel)
+
     return Observation(
         label=label,
         score=score,
         box_px=(x1, y1, x2, y2),
-        bearing=float(near[1] / near[0]),
-        sigma_bearing=float(cut_rel * width_px if cut_side else sigma_edge[0]) / camera.fx_px,
-        depth_m=float(near[0]),
-        sigma_depth_rel=NO_MEASUREMENT_REL if cut_bottom else sigma_depth_rel,
-        tan_height=height_px / camera.fy_px,
-        sigma_height_rel=float(cut_rel if cut_bottom or cut_top else 1.4 * sigma_edge[1] / height_px),
-        tan_width=width_px / camera.fx_px,
-        sigma_width_rel=float(cut_rel if cut_side else 1.4 * sigma_edge[0] / width_px),
-        dimensions=dimensions,
+        left=slopes[0],
+        sigma_left=sigma_px(width_px, cut_left, hidden_left) / camera.fx_px,
+        right=slopes[1],
+        sigma_right=sigma_px(width_px, cut_right, hidden_right) / camera.fx_px,
+        slope_bottom=slopes[2],
+        sigma_bottom=sigma_px(height_px, cut_bottom, hidden_bottom) / camera.fy_px,
+        slope_top=slopes[3],
+        sigma_top=sigma_px(height_px, cut_top, False) / camera.fy_px,
+        cut_side=cut_left or cut_right,
+        dimensions=config.vehicles[label],
     )
+
+
+def _is_on_road(seen: Observation, camera: Camera, ground: GroundPlane, config: LocalisationConfig) -> bool:
+    depth_m = seen.depth_by_height_m
+    hangs = seen.slope_bottom < ground.height_m / depth_m - config.max_above_road_rad - 3.0 * seen.sigma_bottom
+    return depth_m < config.max_range_m and not hangs

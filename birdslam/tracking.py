@@ -15,20 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from birdslam import bev
+from birdslam.association import NEAREST_M, in_ego, predicted_boxes_px, within_gate
 from birdslam.camera import Camera, GroundPlane
-from birdslam.localisation import LocalisationConfig, Observation, Outline, Place, iou, place
+from birdslam.horizon import Horizon
+from birdslam.localisation import LocalisationConfig, Observation, Place, extent_m, iou, place
 from birdslam.se2 import SE2, wrap
 from birdslam.types import MotionEdge
-
-NEAREST_M, FAR_M = 1.0, 1e4  # a nearer box is out of the image; from there one looks at the horizon
 
 
 class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """When boxes are the same vehicle, and how vehicles move."""
 
     min_iou: float = 0.15  # of a box with the one predicted from bird's-eye view
-    gate_sigma: float = 4.0  # Mahalanobis distance in bird's-eye view past which boxes are never the same vehicle
+    gate_sigma: float = 3.0  # Mahalanobis distance in bird's-eye view past which boxes are never the same vehicle
     birth_score: float = 0.5
     confirm_hits: int = 3  # a track gets its id when it has been seen so often
     forget_unconfirmed_s: float = 0.25
@@ -38,8 +37,10 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     moving_mps: float = 2.0  # below it, or within moving_sigma of rest, a vehicle's motion says nothing of its yaw
     moving_sigma: float = 3.0
     moving_of_ego: float = 0.3  # nor within this fraction of the ego's speed: an error of the ground plane moves all
-    yaw_gain: float = 0.3  # of the direction of motion into the yaw, each time it is seen
+    moved_along_rel: float = 0.15  # nor until it has come so far from where it was first seen, as fractions of its
+    moved_across_rel: float = 0.05  # distance then: along the line of sight, and across it
     sigma_yaw_rate_radps: float = 0.5
+    direction_inflation: float = 3.0  # of the motion's direction: its errors last for many frames
     sigma_yaw_unknown_rad: float = 0.5
     sigma_yaw_moving_rad: float = 0.1
 
@@ -53,7 +54,9 @@ class Track:
     yaw_rad: float
     observation: Observation  # the last one
     place: Place  # and where it put the vehicle, in the ego of frame `seen_frame`
-    outline: Outline
+    serial: int  # known to the horizon by it
+    first_m: NDArray[np.float64]  # (2,) where it was first seen, in the odometry's world
+    first_sight_m: NDArray[np.float64]  # (2,) from the ego to there, along world's axes
     seen_frame: int
     seen_ns: int
     T_world_ego: SE2  # of frame `seen_frame`
@@ -61,6 +64,7 @@ class Track:
     vehicle: int = -1  # the persistent id, once confirmed
     hits: int = 1
     votes: Counter[str] = field(default_factory=Counter)
+    sigma_yaw_rad: float = 0.0  # of a yaw that motion has shown
     yaw_known: bool = False
     motion: MotionEdge | None = None  # VV: from when it was last seen to now, as predicted before it was seen again
 
@@ -82,62 +86,79 @@ class Tracker:
         self.localisation = localisation
         self.tracks: list[Track] = []
         self._next_id = 0
+        self._next_serial = 0
         self._t_ns: int | None = None
+        self._dt_s = 0.0
         self._T_world_ego = SE2()
         self._ego_speed_mps = 0.0
 
     def step(
-        self, observations: list[Observation], T_world_ego: SE2, ground: GroundPlane, frame_id: int, t_source_ns: int
+        self, observations: list[Observation], T_world_ego: SE2, horizon: Horizon, frame_id: int, t_source_ns: int
     ) -> list[Track]:
-        """Confirmed tracks that were seen in this frame, each with its state corrected, ordered by id."""
+        """Confirmed tracks that were seen in this frame, each with its state corrected, ordered by id.
+
+        Depths come of all of them together (`horizon`), which learns the road's tilt and their sizes from it.
+        """
         self._predict(t_source_ns, T_world_ego)
-        pairs = self._associate(observations, T_world_ego, ground)
-        for track, observation in pairs:
-            self._correct(track, observation, T_world_ego, frame_id, t_source_ns)
+        pairs: list[tuple[Track | None, Observation]] = [*self._associate(observations, T_world_ego, horizon.ground)]
         matched = {id(observation) for _, observation in pairs}
-        for observation in observations:
-            if id(observation) not in matched and observation.score >= self.config.birth_score:
-                self.tracks.append(self._begin(observation, T_world_ego, frame_id, t_source_ns))
+        pairs += [
+            (None, observation)
+            for observation in observations
+            if id(observation) not in matched and observation.score >= self.config.birth_score
+        ]
+        for track, seen, where in self._localise(pairs, T_world_ego, horizon):
+            if isinstance(track, Track):
+                self._correct(track, seen, where, T_world_ego, horizon, frame_id, t_source_ns)
+            else:
+                self.tracks.append(self._begin(track, seen, where, T_world_ego, frame_id, t_source_ns))
         self.tracks = [track for track in self.tracks if not self._is_lost(track, t_source_ns)]
-        seen = [t for t in self.tracks if t.seen_frame == frame_id and t.hits >= self.config.confirm_hits]
-        for track in seen:
+        horizon.keep_only(track.serial for track in self.tracks)
+        seen_now = [t for t in self.tracks if t.seen_frame == frame_id and t.hits >= self.config.confirm_hits]
+        for track in seen_now:
             if track.vehicle < 0:
                 track.vehicle, self._next_id = self._next_id, self._next_id + 1
-        return sorted(seen, key=lambda track: track.vehicle)
+        return sorted(seen_now, key=lambda track: track.vehicle)
 
-    def predicted_boxes_px(self, T_world_ego: SE2, ground: GroundPlane) -> NDArray[np.float64]:
-        """(N, 4): where each track's last box is expected in the current image; NaN behind the camera.
+    def _localise(
+        self, pairs: list[tuple[Track | None, Observation]], T_world_ego: SE2, horizon: Horizon
+    ) -> list[tuple[Track | int, Observation, Place]]:
+        """Each pair's place; a new vehicle has its serial number instead of a track, and is headed like the ego."""
+        bodies: list[Track | int] = []
+        for track, _ in pairs:
+            bodies.append(self._next_serial if track is None else track)
+            self._next_serial += track is None
+        yaws = [wrap(body.yaw_rad - T_world_ego.yaw_rad) if isinstance(body, Track) else 0.0 for body in bodies]
+        serials = [body.serial if isinstance(body, Track) else body for body in bodies]
+        seen = [observation for _, observation in pairs]
+        turned = np.array([_turned_rad(body, o, T_world_ego) for body, o in zip(bodies, seen, strict=True)])
+        extents = np.array(
+            [
+                extent_m(o.dimensions, yaw, self._expected_depth_m(body, o, T_world_ego), o.bearing)
+                for body, o, yaw in zip(bodies, seen, yaws, strict=True)
+            ]
+        ).reshape(-1, 2)
+        log_depths, variances = horizon.update(serials, seen, extents[:, 1], extents[:, 0], turned)
+        places = [
+            place(o, log_depth, variance, yaw, self.localisation)
+            for o, log_depth, variance, yaw in zip(seen, log_depths.tolist(), variances.tolist(), yaws, strict=True)
+        ]
+        return list(zip(bodies, seen, places, strict=True))
 
-        The box's distance to the horizon and its size go with the inverse of the depth, whatever the ground plane.
-        """
-        boxes = np.full((len(self.tracks), 4), np.nan)
-        T_ego_world = T_world_ego.inverse()
-        for row, track in zip(boxes, self.tracks, strict=True):
-            then, now = track.T_world_ego.inverse() @ track.state[:2], T_ego_world @ track.state[:2]
-            near = np.array([track.place.depth_m, track.place.depth_m * track.observation.bearing]) + now - then
-            if near[0] < NEAREST_M:
-                continue
-            x1, y1, x2, y2 = track.observation.box_px
-            scale = track.place.depth_m / near[0]
-            horizon_then, horizon_now = (
-                bev.ego_to_pixel(self.camera, ground, np.array([[FAR_M, FAR_M * bearing]]))[0]
-                for bearing in (track.observation.bearing, near[1] / near[0])
-            )
-            half_px = (x2 - x1) / 2.0 * scale
-            row[:] = (
-                horizon_now[0] - half_px,
-                horizon_now[1] + (y1 - horizon_then[1]) * scale,
-                horizon_now[0] + half_px,
-                horizon_now[1] + (y2 - horizon_then[1]) * scale,
-            )
-        return boxes
+    @staticmethod
+    def _expected_depth_m(body: Track | int, seen: Observation, T_world_ego: SE2) -> float:
+        """Of the nearest face, before it is measured: as the track predicts it, or by the height of its class."""
+        if not isinstance(body, Track):
+            return seen.depth_by_height_m
+        reach_m = body.place.centre_m[0] - body.place.depth_m
+        return max(NEAREST_M, in_ego(T_world_ego, body.state[:2])[0] - reach_m)
 
     def _predict(self, t_source_ns: int, T_world_ego: SE2) -> None:
         dt_s = 0.0 if self._t_ns is None else max(0.0, (t_source_ns - self._t_ns) * 1e-9)
         if dt_s > 0.0:
             step = self._T_world_ego.between(T_world_ego)
             self._ego_speed_mps = math.hypot(step.x_m, step.y_m) / dt_s
-        self._t_ns, self._T_world_ego = t_source_ns, T_world_ego
+        self._t_ns, self._T_world_ego, self._dt_s = t_source_ns, T_world_ego, dt_s
         F = np.eye(4)
         F[0, 2] = F[1, 3] = dt_s
         G = np.array([[dt_s**2 / 2, 0.0], [0.0, dt_s**2 / 2], [dt_s, 0.0], [0.0, dt_s]])
@@ -152,44 +173,39 @@ class Tracker:
         """The pairs of least cost (1 - IoU of the predicted and the seen box) within the gates."""
         if not self.tracks or not observations:
             return []
-        overlap = iou(self.predicted_boxes_px(T_world_ego, ground), np.array([o.box_px for o in observations]))
+        overlap = iou(
+            predicted_boxes_px(self.tracks, self.camera, T_world_ego, ground),
+            np.array([o.box_px for o in observations]),
+        )
         overlap = np.nan_to_num(overlap, nan=0.0)
-        cost = 1.0 - overlap
-        for i, track in enumerate(self.tracks):
-            for j, observation in enumerate(observations):
-                if overlap[i, j] < self.config.min_iou or not self._is_near(track, observation, T_world_ego):
-                    cost[i, j] = 2.0
-        rows, columns = linear_sum_assignment(cost)
-        return [(self.tracks[i], observations[j]) for i, j in zip(rows, columns, strict=True) if cost[i, j] <= 1.0]
-
-    def _is_near(self, track: Track, observation: Observation, T_world_ego: SE2) -> bool:
-        seen, _ = self._place(track, observation, T_world_ego)
-        R = T_world_ego.rotation()
-        gap = T_world_ego @ seen.centre_m - track.state[:2]
-        S = track.cov[:2, :2] + R @ seen.cov @ R.T
-        return bool(gap @ np.linalg.solve(S, gap) <= self.config.gate_sigma**2)
-
-    def _place(self, track: Track, observation: Observation, T_world_ego: SE2) -> tuple[Place, Outline]:
-        yaw_ego_rad = wrap(track.yaw_rad - T_world_ego.yaw_rad)
-        return place(observation, track.outline, yaw_ego_rad, self.localisation)
+        possible = (overlap >= self.config.min_iou) & within_gate(
+            self.tracks, observations, T_world_ego, self.config.gate_sigma
+        )
+        rows, columns = linear_sum_assignment(np.where(possible, 1.0 - overlap, 2.0))
+        return [(self.tracks[i], observations[j]) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
 
     def _correct(
-        self, track: Track, observation: Observation, T_world_ego: SE2, frame_id: int, t_source_ns: int
+        self,
+        track: Track,
+        observation: Observation,
+        seen: Place,
+        T_world_ego: SE2,
+        horizon: Horizon,
+        frame_id: int,
+        t_source_ns: int,
     ) -> None:
         track.motion = self._predicted_motion(track, frame_id, t_source_ns)
-        seen, outline = self._place(track, observation, T_world_ego)
         R = T_world_ego.rotation()
-        H = np.eye(2, 4)
         S = track.cov[:2, :2] + R @ seen.cov @ R.T
-        gain = np.linalg.solve(S, H @ track.cov).T
+        gain = track.cov[:, :2] @ np.linalg.inv(S)
         track.state = track.state + gain @ (T_world_ego @ seen.centre_m - track.state[:2])
-        keep = np.eye(4) - gain @ H
-        track.cov = keep @ track.cov @ keep.T + gain @ (R @ seen.cov @ R.T) @ gain.T
-        track.observation, track.place, track.outline = observation, seen, outline
+        track.cov = track.cov - gain @ S @ gain.T
+        track.observation, track.place = observation, seen
         track.seen_frame, track.seen_ns, track.T_world_ego = frame_id, t_source_ns, T_world_ego
         track.hits += 1
         track.votes[observation.label] += 1
-        self._turn(track)
+        if not observation.cut_side:
+            self._turn(track, T_world_ego, horizon)
         track.T_world_seen = track.pose()
 
     def _predicted_motion(self, track: Track, frame_id: int, t_source_ns: int) -> MotionEdge | None:
@@ -210,21 +226,50 @@ class Tracker:
             cov=tuple(cov.ravel().tolist()),
         )
 
-    def _turn(self, track: Track) -> None:
-        """A vehicle that surely moves heads where it moves; one that may stand keeps its yaw."""
-        vx, vy = track.state[2:]
+    def _turn(self, track: Track, T_world_ego: SE2, horizon: Horizon) -> None:
+        """A vehicle that surely moves heads where it moves; one that may stand keeps its yaw.
+
+        It turns about what was seen of it: that its centre lies elsewhere than was thought is no motion.
+        """
+        vx, vy = track.state[2:].tolist()
         speed = math.hypot(vx, vy)
         sigma = math.sqrt(max(float(np.trace(track.cov[2:, 2:])) / 2.0, 1e-12))
         config = self.config
-        if speed < max(config.moving_mps, config.moving_sigma * sigma, config.moving_of_ego * self._ego_speed_mps):
+        slowest = max(config.moving_mps, config.moving_sigma * sigma, config.moving_of_ego * self._ego_speed_mps)
+        if speed < slowest or not self._has_moved(track):
             return
         turn = wrap(math.atan2(vy, vx) - track.yaw_rad)
-        track.yaw_rad = wrap(track.yaw_rad + (self.config.yaw_gain if track.yaw_known else 1.0) * turn)
+        noise = (config.direction_inflation * sigma / speed) ** 2
+        before = track.sigma_yaw_rad**2 + (config.sigma_yaw_rate_radps * self._dt_s) ** 2
+        gain = before / (before + noise) if track.yaw_known else 1.0
+        track.sigma_yaw_rad = math.sqrt((1.0 - gain) * before if track.yaw_known else noise)
+        track.yaw_rad = wrap(track.yaw_rad + gain * turn)
         track.yaw_known = True
+        seen, depth_m = track.observation, track.place.depth_m
+        yaw_ego_rad = wrap(track.yaw_rad - T_world_ego.yaw_rad)
+        outlines = [
+            extent_m(seen.dimensions, yaw_rad, depth_m, seen.bearing)[1]
+            for yaw_rad in (yaw_ego_rad, yaw_ego_rad - gain * turn)
+        ]
+        horizon.turn(track.serial, math.log(outlines[0] / outlines[1]))
+        turned = place(seen, math.log(depth_m), 0.0, yaw_ego_rad, self.localisation)
+        shift_m = T_world_ego.rotation() @ (turned.centre_m - track.place.centre_m)
+        track.state[:2] += shift_m
+        track.first_m = track.first_m + shift_m
+        track.place = Place(depth_m, turned.centre_m, track.place.cov)
 
-    def _begin(self, observation: Observation, T_world_ego: SE2, frame_id: int, t_source_ns: int) -> Track:
+    def _has_moved(self, track: Track) -> bool:
+        """Whether it left where it was first seen by more than a parked car seems to that is seen better and better."""
+        x, y = track.first_sight_m.tolist()
+        dx, dy = (track.state[:2] - track.first_m).tolist()
+        distance2 = x * x + y * y
+        along, across = (x * dx + y * dy) / distance2, (x * dy - y * dx) / distance2
+        return math.hypot(along / self.config.moved_along_rel, across / self.config.moved_across_rel) > 1.0
+
+    def _begin(
+        self, serial: int, observation: Observation, seen: Place, T_world_ego: SE2, frame_id: int, t_source_ns: int
+    ) -> Track:
         # Most traffic runs along the road: until it is seen to move otherwise, it is headed like the ego.
-        seen, outline = place(observation, Outline.of_class(observation.dimensions), 0.0, self.localisation)
         R = T_world_ego.rotation()
         cov = np.zeros((4, 4))
         cov[:2, :2] = R @ seen.cov @ R.T
@@ -235,7 +280,9 @@ class Tracker:
             yaw_rad=T_world_ego.yaw_rad,
             observation=observation,
             place=seen,
-            outline=outline,
+            serial=serial,
+            first_m=T_world_ego @ seen.centre_m,
+            first_sight_m=R @ seen.centre_m,
             seen_frame=frame_id,
             seen_ns=t_source_ns,
             T_world_ego=T_world_ego,
@@ -247,3 +294,11 @@ class Tracker:
         confirmed = track.hits >= self.config.confirm_hits
         patience_s = self.config.forget_s if confirmed else self.config.forget_unconfirmed_s
         return (t_source_ns - track.seen_ns) * 1e-9 > patience_s
+
+
+def _turned_rad(body: Track | int, seen: Observation, T_world_ego: SE2) -> float:
+    """By how much the line of sight to a vehicle turned over the ground since it was last seen."""
+    if not isinstance(body, Track):
+        return 0.0
+    before = math.atan(body.observation.bearing) + body.T_world_ego.yaw_rad
+    return wrap(math.atan(seen.bearing) + T_world_ego.yaw_rad - before)

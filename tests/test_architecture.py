@@ -12,7 +12,11 @@ LAYERS = (  # each imports only from itself and from what stands before it
     ("types",),
     ("camera", "bev"),
 )
-ON_TOP = ("frontend", "slam", "baselines", "evaluation")
+ON_TOP = (
+    *("frontend", "slam", "baselines", "evaluation"),
+    *("localisation_evaluation",),
+    *("tracking_metrics", "tracking_evaluation", "tracking_picture", "tracking_report", "ablation", "tables"),
+)
 
 
 def imports(path: Path) -> set[str]:

@@ -7,6 +7,7 @@ import pytest
 
 from birdslam import bev
 from birdslam.camera import Camera, GroundPlane
+from birdslam.horizon import Horizon, HorizonConfig
 from birdslam.localisation import LocalisationConfig, localise
 from birdslam.se2 import SE2, wrap
 from birdslam.tracking import Track, Tracker, TrackingConfig
@@ -31,6 +32,7 @@ class Drive:
     """Runs a tracker over a world; `sees` may take boxes away or add some."""
 
     def __init__(self, config: TrackingConfig | None = None, noise_px: float = 0.0) -> None:
+        self.horizon = Horizon(CAMERA, HorizonConfig())
         self.tracker = Tracker(CAMERA, config or TrackingConfig(), LocalisationConfig())
         self.rng = np.random.default_rng(1)
         self.noise_px = noise_px
@@ -42,8 +44,9 @@ class Drive:
         px = np.array([boxes[i] for i in kept]).reshape(-1, 4)
         px = px + self.noise_px * self.rng.standard_normal(px.shape)
         names = tuple((labels or ["car"] * len(vehicles))[i] for i in kept)
-        seen = localise(px, np.full(len(px), 0.9), names, CAMERA, GROUND, 0.002, LocalisationConfig())
-        out = self.tracker.step(seen, T_world_ego, GROUND, self.frame, self.frame * PERIOD_NS)
+        seen = localise(px, np.full(len(px), 0.9), names, CAMERA, self.horizon.ground, LocalisationConfig())
+        self.horizon.predict(0.1, 0.0, None, 0.0)
+        out = self.tracker.step(seen, T_world_ego, self.horizon, self.frame, self.frame * PERIOD_NS)
         self.frame += 1
         return out
 

@@ -1,0 +1,162 @@
+"""The road's tilt and vehicles' sizes from boxes that a known world projects."""
+
+import math
+
+import numpy as np
+import pytest
+
+from birdslam import bev
+from birdslam.camera import Camera, GroundPlane
+from birdslam.horizon import Horizon, HorizonConfig
+from birdslam.localisation import DIMENSIONS, LocalisationConfig, Observation, extent_m, localise
+
+CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
+CAR = DIMENSIONS["car"]
+LOCALISATION = LocalisationConfig()
+CONFIG = HorizonConfig(roof_reach_rel=1.0)  # the world here is made of cuboids
+
+
+class Road:
+    """Cars on a road that the camera leans over by `pitch_rad` and `roll_rad`, and a horizon that does not know it."""
+
+    def __init__(self, pitch_rad: float = 0.0, roll_rad: float = 0.0, config: HorizonConfig = CONFIG) -> None:
+        self.truth = GroundPlane(CAMERA.height_m, pitch_rad, roll_rad)
+        self.horizon = Horizon(CAMERA, config)
+        self.rng = np.random.default_rng(3)
+
+    def box(self, x_m: float, y_m: float, height_m: float, lift_m: float = 0.0) -> np.ndarray:
+        half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
+        corners = [(x_m + x, y_m + y, z + lift_m) for x, y in half for z in (0.0, height_m)]
+        px = bev.ego_to_pixel(CAMERA, self.truth, np.array(corners))
+        return np.array([*px.min(axis=0), *px.max(axis=0)])
+
+    def see(self, boxes: dict[int, np.ndarray]) -> tuple[dict[int, float], dict[int, float]]:
+        """Nearest depths in metres and the sigmas of their logarithms."""
+        self.horizon.predict(0.1, 0.0, None, 0.0)
+        seen: list[Observation] = []
+        for box in boxes.values():
+            seen += localise(box[None], np.ones(1), ("car",), CAMERA, self.horizon.ground, LOCALISATION)
+        extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
+        log_z, var = self.horizon.update(list(boxes), seen, extents[:, 1], extents[:, 0], np.zeros(len(seen)))
+        return dict(zip(boxes, np.exp(log_z), strict=True)), dict(zip(boxes, np.sqrt(var), strict=True))
+
+
+def traffic(road: Road, frames: int, heights_m: list[float], noise_px: float = 0.5) -> dict[int, float]:
+    """The ego closes in on cars, row by row; the last frame's relative depth errors."""
+    errors: dict[int, float] = {}
+    for k in range(frames):
+        boxes = {}
+        for i, height_m in enumerate(heights_m):
+            x_m, y_m = 14.0 + 6.0 * i - 0.25 * k, (-4.0, 0.0, 4.0)[i % 3]
+            boxes[i] = road.box(x_m, y_m, height_m) + noise_px * road.rng.standard_normal(4)
+        depths, _ = road.see(boxes)
+        errors = {i: depths[i] / (14.0 + 6.0 * i - 0.25 * k - CAR.length_m / 2.0) - 1.0 for i in boxes}
+    return errors
+
+
+@pytest.mark.parametrize("pitch_rad", [-0.012, 0.0, 0.02])
+def test_boxes_alone_give_the_pitch_and_the_depths(pitch_rad: float) -> None:
+    road = Road(pitch_rad)
+    errors = traffic(road, 20, [1.4, 1.6, 1.5, 1.45, 1.62])
+    assert road.horizon.ground.pitch_rad == pytest.approx(pitch_rad, abs=3.0 * road.horizon.sigma_pitch_rad)
+    assert abs(road.horizon.ground.pitch_rad - pitch_rad) < 0.004
+    assert np.median(np.abs(list(errors.values()))) < 0.04
+    level = [CAMERA.height_m / (1.65 / z - pitch_rad) / z - 1.0 for z in (20.0, 30.0)]  # Eq. 1 on level ground
+    if pitch_rad:
+        assert max(map(abs, level)) > 0.15
+
+
+def test_roll_shows_in_the_cars_left_and_right() -> None:
+    road = Road(0.0, 0.02)
+    traffic(road, 30, [1.5, 1.55, 1.5, 1.5, 1.55, 1.5])
+    assert road.horizon.ground.roll_rad > 0.003  # a kerb under each of them would do as well
+
+
+def test_the_tilt_and_the_sizes_are_as_sure_as_they_say() -> None:
+    """Over seeds, errors of the pitch against its sigma."""
+    ratios = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        road = Road(float(0.01 * rng.standard_normal()))
+        road.rng = rng
+        traffic(road, 10, [float(1.53 * math.exp(0.08 * e)) for e in rng.standard_normal(4)], noise_px=1.5)
+        ratios.append((road.horizon.ground.pitch_rad - road.truth.pitch_rad) / road.horizon.sigma_pitch_rad)
+    assert np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+def test_a_box_cut_at_the_bottom_is_placed_by_what_was_learned() -> None:
+    road = Road()
+    for x_m in np.arange(14.0, 8.4, -0.2):
+        road.see({0: road.box(x_m, 0.5, 1.45), 1: road.box(x_m + 9.0, -3.0, 1.55)})
+    box = road.box(6.0, 0.5, 1.45)
+    assert box[3] > CAMERA.height_px
+    box[3] = CAMERA.height_px - 1.0
+    depths, sigmas = road.see({0: box, 1: road.box(15.0, -3.0, 1.55)})
+    near_m = 6.0 - CAR.length_m / 2.0
+    assert CAMERA.height_m / ((box[3] - CAMERA.cy_px) / CAMERA.fy_px) > 1.25 * near_m  # Eq. 1 alone is fooled
+    assert depths[0] == pytest.approx(near_m, rel=0.1)
+    assert abs(math.log(depths[0] / near_m)) < 3.0 * sigmas[0]
+
+
+def test_one_wild_bottom_moves_neither_the_road_nor_the_size() -> None:
+    road = Road()
+    cars = {0: (14.0, 0.0, 1.5), 1: (22.0, 3.5, 1.45), 2: (30.0, -3.5, 1.55)}
+    for _ in range(15):
+        road.see({i: road.box(*car) for i, car in cars.items()})
+    pitch_rad, (height_m, _) = road.horizon.ground.pitch_rad, road.horizon.size(0)
+    boxes = {i: road.box(*car) for i, car in cars.items()}
+    boxes[0][3] -= 25.0
+    depths, _ = road.see(boxes)
+    assert road.horizon.ground.pitch_rad == pytest.approx(pitch_rad, abs=0.002)
+    assert road.horizon.size(0)[0] == pytest.approx(height_m, rel=0.05)
+    assert depths[0] == pytest.approx(14.0 - CAR.length_m / 2.0, rel=0.12)  # Eq. 1 says 30 % farther
+
+
+def test_the_camera_s_own_pitching_carries_the_horizon_through_a_bump() -> None:
+    still, told = Horizon(CAMERA, CONFIG), Horizon(CAMERA, CONFIG)
+    still.predict(0.1, 0.0, None, 0.0)
+    told.predict(0.1, 0.01, None, 0.0)
+    assert told.ground.pitch_rad - still.ground.pitch_rad == pytest.approx(0.01, rel=0.05)
+    for _ in range(300):
+        told.predict(0.1, 0.0, None, 0.0)
+    assert abs(told.ground.pitch_rad) < 0.001  # it lasts: then the road has turned as well
+
+
+def test_the_images_pitch_is_taken_when_it_is_new() -> None:
+    horizon = Horizon(CAMERA, CONFIG)
+    before = horizon.sigma_pitch_rad
+    horizon.predict(0.1, 0.0, CAMERA.ground, 0.001)  # the calibration says nothing new
+    assert horizon.sigma_pitch_rad >= before * 0.99
+    horizon.predict(0.1, 0.0, GroundPlane(CAMERA.height_m, 0.015), 0.001)
+    assert horizon.ground.pitch_rad == pytest.approx(0.015, abs=0.002)
+    assert horizon.sigma_pitch_rad < 0.5 * before
+
+
+def test_forgotten_vehicles_leave_what_they_said_of_the_road() -> None:
+    road = Road(0.015)
+    traffic(road, 12, [1.5, 1.55, 1.5])
+    pitch_rad, sigma_rad = road.horizon.ground.pitch_rad, road.horizon.sigma_pitch_rad
+    height = road.horizon.size(1)
+    road.horizon.keep_only([1])
+    assert (road.horizon.ground.pitch_rad, road.horizon.sigma_pitch_rad) == (pitch_rad, sigma_rad)
+    assert road.horizon.size(1) == height
+
+
+def test_nothing_seen_is_nothing_learned() -> None:
+    horizon = Horizon(CAMERA, CONFIG)
+    ground = horizon.ground
+    log_z, var = horizon.update([], [], np.zeros(0), np.zeros(0), np.zeros(0))
+    assert len(log_z) == len(var) == 0
+    assert horizon.ground == ground
+
+
+def test_parked_cars_are_seen_from_a_passing_ego_without_drift() -> None:
+    """The filter's covariance stays positive over thousands of frames and vehicles that come and go."""
+    road = Road(0.005)
+    for k in range(1500):
+        first = k // 10
+        boxes = {i: road.box(*(15.0 + 7.0 * (i - k / 10.0), 3.5), 1.5) for i in range(first, first + 5)}
+        road.see(boxes)
+        road.horizon.keep_only(boxes)
+    assert np.linalg.eigvalsh(road.horizon._P).min() > 0.0
+    assert road.horizon.ground.pitch_rad == pytest.approx(0.005, abs=0.004)

@@ -1,0 +1,99 @@
+"""Cars placed by the front end against labels: of a world made here, and of KITTI tracking where it is at hand."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from birdslam.camera import Camera
+from birdslam.frontend import FrontEndConfig
+from birdslam.kitti_tracking import Label, TrackingSequence, open_tracking, read_detections
+from birdslam.localisation_evaluation import (
+    INSIDE_1_SIGMA,
+    INSIDE_2_SIGMA,
+    PAPER,
+    CarError,
+    LocalisationRow,
+    compare,
+    drive,
+    report,
+)
+from birdslam.perception import Detections
+
+CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
+HEIGHT_M, WIDTH_M, LENGTH_M = 1.5, 1.6, 4.0
+PITCH_RAD = 0.015  # of the camera against the road, which nobody tells the front end
+
+
+def label(frame: int, track: int, x_m: float, y_m: float, truncated: float = 0.0) -> Label:
+    """A car headed like the ego, in camera axes (x right, y down, z ahead) over a road that the camera leans to."""
+    half = [(sx * WIDTH_M / 2, sz * LENGTH_M / 2) for sx in (-1, 1) for sz in (-1, 1)]
+    down_m = 1.65 - math.tan(PITCH_RAD) * x_m
+    corners = np.array([[-y_m + dx, down_m - h, x_m + dz] for dx, dz in half for h in (0.0, HEIGHT_M)])
+    px = corners[:, :2] / corners[:, 2:] * 721.5 + [609.6, 172.9]
+    box_px = (*px.min(axis=0).tolist(), *px.max(axis=0).tolist())
+    return Label(
+        frame, track, "Car", truncated, 0, box_px, HEIGHT_M, WIDTH_M, LENGTH_M, (-y_m, down_m, x_m), -math.pi / 2
+    )
+
+
+def world(frames: int) -> tuple[TrackingSequence, list[Detections]]:
+    """The ego closes in on three cars at 0.4 m a frame."""
+    cars = [(18.0, 0.0), (30.0, 4.0), (42.0, -4.0)]
+    labels = [label(k, i, x - 0.4 * k, y, float(i == 0)) for k in range(frames) for i, (x, y) in enumerate(cars)]
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 2, 3] = 0.4 * np.arange(frames)
+    sequence = TrackingSequence("9999", CAMERA, np.eye(4), poses, tuple(labels), None)
+    boxes = [np.array([one.box_px for one in labels if one.frame == k]) for k in range(frames)]
+    return sequence, [Detections(box, np.full(3, 0.9), ("car",) * 3) for box in boxes]
+
+
+def depth_error(errors: list[CarError], span: str) -> float:
+    """The median of a range over all sequences."""
+    (row,) = [row for row in report(errors) if row.sequence == "all" and row.range == span]
+    assert row.depth_error_median_rel is not None
+    return row.depth_error_median_rel
+
+
+def test_untruncated_cars_are_compared_and_a_tilted_road_is_found_out() -> None:
+    sequence, detections = world(12)
+    errors, paper = (compare(sequence, drive(sequence, detections, config)) for config in (FrontEndConfig(), PAPER))
+    assert {error.label for error in errors} == {1, 2}  # the first is truncated
+    assert {error.frame for error in errors} == set(range(2, 12))  # a track is confirmed in its third frame
+    assert depth_error(errors, "15-30") < 0.05
+    assert depth_error(paper, "15-30") > 0.15
+    # Eq. 1 on level ground, on the nearest face
+    slope = (1.65 - math.tan(PITCH_RAD) * paper[0].depth_m) / (paper[0].depth_m - LENGTH_M / 2)
+    assert paper[0].depth_m + paper[0].error_m[0] == pytest.approx(1.65 / slope, rel=1e-3)
+
+
+def test_rows_are_medians_by_range_and_shares_inside_the_right_ellipses() -> None:
+    rng = np.random.default_rng(0)
+    z = rng.standard_normal((20000, 2))
+    errors = [CarError("a", k, 0, 20.0, e, float(e @ e), 0.0) for k, e in enumerate(z)]
+    errors.append(CarError("b", 0, 0, 45.0, np.array([-4.5, 0.2]), 9.0, math.pi))
+    rows = {(row.sequence, row.range): row for row in report(errors)}
+    assert list(rows) == [(s, r) for s in ("a", "b", "all") for r in ("0-15", "15-30", "30-50")]
+    assert rows["a", "0-15"] == LocalisationRow(sequence="a", range="0-15", n=0)
+    gauss = rows["a", "15-30"]
+    assert gauss.inside_1_sigma == pytest.approx(0.683, abs=0.01)
+    assert gauss.inside_2_sigma == pytest.approx(0.954, abs=0.01)
+    far = rows["all", "30-50"]
+    assert (far.n, far.depth_error_median_rel, far.lateral_error_median_m) == (
+        1,
+        pytest.approx(0.1),
+        pytest.approx(0.2),
+    )
+    assert far.depth_bias_median_rel == pytest.approx(-0.1)
+    assert far.yaw_error_median_deg == pytest.approx(0.0, abs=1e-6)
+    assert pytest.approx((2.2957, 6.1801), abs=1e-3) == (INSIDE_1_SIGMA, INSIDE_2_SIGMA)
+
+
+def test_real_boxes_of_cars_beat_the_level_ground(data_dir: Path) -> None:
+    root = data_dir / "kitti_tracking" / "training"
+    sequence = open_tracking(root, "0003")
+    detections = read_detections(root / "det_02_rrc", "0003", len(sequence))
+    ours, paper = (compare(sequence, drive(sequence, detections, config)) for config in (FrontEndConfig(), PAPER))
+    for span in ("15-30", "30-50"):
+        assert depth_error(ours, span) < min(0.08, 0.5 * depth_error(paper, span))
