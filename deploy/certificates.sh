@@ -1,0 +1,81 @@
+#!/bin/sh
+# Certificates for the gate: an authority of your own, the vehicle's certificate, and one for each planner.
+#
+#   certificates.sh DIR vehicle ADDRESS...   ca.pem, vehicle.pem, vehicle.key; ADDRESS: names and IPs planners connect to
+#   certificates.sh DIR planner NAME         NAME.pem, NAME.key; NAME must stand in gate.json5 (cert_common_names)
+#
+# What exists is kept: remove a file to make it anew. ca.key can sign whatever the vehicle believes: keep it elsewhere.
+set -eu
+umask 077
+days=${BIRDSLAM_CERTIFICATE_DAYS:-825}
+
+fail() {
+    echo "certificates.sh: $*" >&2
+    exit 2
+}
+
+new_key() { # -newkey's arguments
+    openssl req -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes "$@" 2>"$work/openssl" || fail "$(cat "$work/openssl")"
+}
+
+authority() {
+    [ ! -e "$dir/ca.pem" ] || return 0
+    new_key -x509 -keyout "$work/ca.key" -out "$work/ca.pem" -days "$days" -subj "/CN=BirdSLAM authority" \
+        -addext basicConstraints=critical,CA:TRUE,pathlen:0 -addext keyUsage=critical,keyCertSign,cRLSign
+    mv "$work/ca.key" "$work/ca.pem" "$dir"
+}
+
+certificate() { # FILE COMMON_NAME ALTERNATIVE_NAMES USAGE
+    if [ -e "$dir/$1.pem" ]; then
+        echo "$dir/$1.pem is kept"
+        return 0
+    fi
+    [ -e "$dir/ca.key" ] || fail "$dir/ca.key is not here: bring the authority's key to sign with"
+    new_key -keyout "$work/$1.key" -out "$work/csr" -subj "/CN=$2"
+    printf '%s\n' basicConstraints=critical,CA:FALSE keyUsage=critical,digitalSignature \
+        "extendedKeyUsage=$4" "subjectAltName=$3" >"$work/extensions"
+    openssl x509 -req -in "$work/csr" -CA "$dir/ca.pem" -CAkey "$dir/ca.key" -set_serial "0x$(openssl rand -hex 16)" \
+        -days "$days" -extfile "$work/extensions" -out "$work/$1.pem" 2>"$work/openssl" || fail "$(cat "$work/openssl")"
+    mv "$work/$1.key" "$work/$1.pem" "$dir"
+    echo "$dir/$1.pem and its key are made"
+}
+
+[ $# -ge 3 ] || fail "usage: certificates.sh DIR vehicle ADDRESS... | certificates.sh DIR planner NAME"
+dir=$1 what=$2
+shift 2
+mkdir -p "$dir"
+work=$(mktemp -d "$dir/.new.XXXXXX")
+trap 'rm -rf "$work"' EXIT
+
+case $what in
+vehicle)
+    names=
+    for address in "$@"; do
+        case $address in
+        *[!A-Za-z0-9.:-]*) fail "$address is no host name and no IP address" ;;
+        *:*) kind=IP ;;
+        *[!0-9.]*) kind=DNS ;;
+        *) kind=IP ;;
+        esac
+        names="$names${names:+,}$kind:$address"
+    done
+    authority
+    certificate vehicle vehicle "$names" serverAuth
+    ;;
+planner)
+    case $1 in
+    *[!A-Za-z0-9_-]* | ca | vehicle) fail "a planner's name has letters, digits, '_' and '-', and is not $1" ;;
+    esac
+    authority
+    certificate "$1" "$1" "DNS:$1" clientAuth
+    ;;
+*) fail "$what: expected vehicle or planner" ;;
+esac
+
+chmod 644 "$dir"/*.pem
+# The service's user reads the vehicle's key, and no other.
+if [ "$(id -u)" = 0 ] && getent group birdslam >/dev/null && [ -e "$dir/vehicle.key" ]; then
+    chgrp birdslam "$dir" "$dir/vehicle.key"
+    chmod 750 "$dir"
+    chmod 640 "$dir/vehicle.key"
+fi

@@ -1,0 +1,133 @@
+#!/bin/sh
+# Installs BirdSLAM as a service of systemd, or brings an installation up to date; the configuration is never touched.
+#
+#   sudo deploy/install.sh                       install or upgrade, from this checkout
+#   sudo deploy/install.sh uninstall [--purge]   remove it; --purge: configuration, certificates, results and user too
+#
+# PYTHON (default /usr/bin/python3, 3.11 or newer) makes the virtual environment; BIRDSLAM_PACKAGE, a wheel, takes the
+# checkout's place. pip's own variables (PIP_INDEX_URL, PIP_FIND_LINKS, ...) hold. Run it as often as you like.
+set -eu
+
+prefix=/opt/birdslam
+etc=/etc/birdslam
+units=/etc/systemd/system
+services="birdslam.service birdslam-gate.service"
+source=$(cd "$(dirname "$0")/.." && pwd)
+python=${PYTHON:-/usr/bin/python3}
+
+say() { echo "birdslam: $*"; }
+
+fail() {
+    echo "install.sh: $*" >&2
+    exit 2
+}
+
+systemd_runs() { [ -d /run/systemd/system ]; }
+
+check() {
+    command -v systemd-sysusers >/dev/null || fail "systemd is missing: apt-get install systemd"
+    "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null ||
+        fail "$python is no Python 3.11 or newer; set PYTHON=..."
+    "$python" -c 'import ensurepip' 2>/dev/null || fail "$python has no venv module: apt-get install python3-venv"
+    path=$("$python" -c 'import os, sys; print(os.path.realpath(sys.executable).lstrip("/"))')
+    case ${path%%/*} in
+    home | root) fail "$python lies in a home directory, which the service can't see; set PYTHON=..." ;;
+    esac
+}
+
+# A release is a directory of its own and `current` points to one: an upgrade that fails changes nothing.
+new_release() {
+    mkdir -p "$prefix/releases"
+    chmod 755 "$prefix" "$prefix/releases"
+    release=$(mktemp -d "$prefix/releases/$(date -u +%Y%m%d-%H%M%S)-XXXX")
+    chmod 755 "$release"
+    trap 'rm -rf "$release"' EXIT
+    "$python" -m venv "$release"
+    package=${BIRDSLAM_PACKAGE:-$release/source}
+    if [ "$package" = "$release/source" ]; then # built from a copy: nothing of root's is left in the checkout
+        mkdir "$package"
+        (cd "$source" && cp -R pyproject.toml README.md LICENSE birdslam runtime "$package")
+    fi
+    "$release/bin/python" -m pip install --quiet --disable-pip-version-check "$package"
+    rm -rf "$release/source"
+    "$release/bin/birdslam" --version
+    cp -R "$source/deploy" "$release/deploy" # certificates.sh, and this script to uninstall with
+    trap - EXIT
+    previous=$(readlink "$prefix/current" || true)
+    ln -s "$release" "$prefix/current.new"
+    mv -T "$prefix/current.new" "$prefix/current"
+    for old in "$prefix"/releases/*; do # one release stays to go back to
+        [ "$old" = "$release" ] || [ "$old" = "$previous" ] || rm -rf "$old"
+    done
+}
+
+keep_or_copy() { # FILE TARGET: a file of the user's stays as it is; ours lies beside it, where it differs
+    if [ ! -e "$2" ]; then
+        install -m 644 "$1" "$2"
+    elif cmp -s "$1" "$2"; then
+        rm -f "$2.new"
+    else
+        install -m 644 "$1" "$2.new"
+        say "$2 is kept; this version's own is $2.new"
+    fi
+}
+
+configuration() {
+    install -d -m 755 "$etc"
+    template=$(mktemp)
+    grep -v '^output = ' "$source/configs/vehicle.toml" >"$template" # the unit says where results go
+    keep_or_copy "$template" "$etc/vehicle.toml"
+    rm -f "$template"
+    keep_or_copy "$source/deploy/gate.json5" "$etc/gate.json5"
+}
+
+install_or_upgrade() {
+    check
+    new_release
+    install -D -m 644 "$source/deploy/birdslam.sysusers" /usr/lib/sysusers.d/birdslam.conf
+    systemd-sysusers /usr/lib/sysusers.d/birdslam.conf
+    configuration
+    for unit in $services; do
+        install -D -m 644 "$source/deploy/$unit" "$units/$unit"
+    done
+    if systemd_runs; then
+        systemctl daemon-reload
+        systemctl enable --quiet birdslam.service
+        for unit in $services; do
+            systemctl try-restart "$unit"
+        done
+    else
+        say "systemd does not run here: the service is not enabled"
+    fi
+    say "installed in $prefix; configure $etc/vehicle.toml, then: systemctl start birdslam"
+}
+
+uninstall() {
+    if systemd_runs; then
+        for unit in $services; do
+            [ ! -e "$units/$unit" ] || systemctl disable --quiet --now "$unit"
+        done
+    fi
+    for unit in $services; do
+        rm -f "$units/$unit"
+    done
+    rm -f /usr/lib/sysusers.d/birdslam.conf
+    rm -rf "$prefix" /var/cache/birdslam
+    ! systemd_runs || systemctl daemon-reload
+    if [ "${1:-}" = --purge ]; then
+        rm -rf "$etc" /var/lib/birdslam "$units/birdslam.service.d" "$units/birdslam-gate.service.d"
+        ! getent passwd birdslam >/dev/null || userdel birdslam
+        ! getent group birdslam >/dev/null || groupdel birdslam
+        say "removed, with its configuration, results and user"
+    else
+        say "removed; $etc and /var/lib/birdslam are kept (uninstall --purge removes them too)"
+    fi
+}
+
+[ "$(id -u)" = 0 ] || fail "needs root"
+umask 022
+case ${1:-install} in
+install | upgrade) install_or_upgrade ;;
+uninstall) uninstall "${2:-}" ;;
+*) fail "$1: expected install, upgrade or uninstall [--purge]" ;;
+esac

@@ -1,0 +1,151 @@
+"""The gate: planners outside the vehicle's own user read its estimates here, by mutual TLS, and write nothing.
+
+    python -m runtime.gate /etc/birdslam/vehicle.toml /etc/birdslam/gate.json5 --runtime-dir /run/birdslam
+
+A process of its own, so that what comes in from outside never touches one of the vehicle's. It is one zenoh session
+that forwards what its file allows (deploy/gate.json5: listening address, certificates, access control), with the
+sockets of the vehicle's nodes put in. It sends and decodes nothing itself. Exit status: 0 after SIGTERM; 2, with one
+line on standard error, where it can't be what a gate must be.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from runtime.cli import USER_ERROR_STATUS
+from runtime.configuration import ConfigurationError, load
+from runtime.notify import Notifier
+from runtime.presence import runtime_dir_of, socket_path
+from runtime.topology import NODES
+from runtime.wire import MAX_MESSAGE_BYTES
+
+_LOOK_S = 1.0
+_RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2}
+_MUST_BE = {  # key -> its only value
+    "mode": "peer",
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "transport/link/tls/enable_mtls": True,
+    "transport/shared_memory/enabled": False,
+    "adminspace/enabled": False,
+    "access_control/enabled": True,
+    "access_control/default_permission": "deny",
+}
+_WRITING = {"put", "delete", "declare_queryable", "reply", "liveliness_token"}  # as messages that come in
+_MAX_ZENOH_BYTES = 2 * MAX_MESSAGE_BYTES + 4096
+
+
+class GateError(ConfigurationError):
+    """A gate that would be open, or can't be opened; names the file, the key and the reason."""
+
+
+def gate_config(path: Path, vehicle: str, runtime_dir: Path | None = None) -> zenoh.Config:
+    """The session's configuration: the file, checked, with the sockets of the vehicle's nodes. Raises GateError."""
+    try:
+        config = zenoh.Config.from_file(str(path))
+    except zenoh.ZError as error:
+        raise GateError(f"{path}: {error}") from error
+    for key, wanted in _MUST_BE.items():
+        if (found := _get(config, key)) != wanted:
+            raise GateError(f"{path}: {key}: a gate needs {json.dumps(wanted)}, got {json.dumps(found)}")
+    _check_endpoints(path, config)
+    _check_rules(path, config)
+    try:
+        directory = runtime_dir_of(vehicle, runtime_dir)
+        endpoints = [f"unixsock-stream/{socket_path(directory, node)}" for node in NODES]
+    except (ValueError, OSError) as error:
+        raise GateError(f"vehicle {vehicle!r}, runtime directory: {error}") from error
+    for key, value in (
+        ("connect/endpoints", endpoints),
+        ("connect/retry", _RETRY),
+        ("connect/timeout_ms", -1),  # the vehicle may start later, and again
+    ):
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _get(config: zenoh.Config, key: str) -> Any:
+    try:
+        return json.loads(config.get_json(key))
+    except zenoh.ZError:  # not in the file
+        return None
+
+
+def _check_endpoints(path: Path, config: zenoh.Config) -> None:
+    listen = _get(config, "listen/endpoints")
+    if not (isinstance(listen, list) and listen and all(str(end).startswith("tls/") for end in listen)):
+        raise GateError(f"{path}: listen/endpoints: a gate listens on tls/... alone, got {json.dumps(listen)}")
+    if set(_get(config, "transport/link/protocols") or ()) != {"tls", "unixsock-stream"}:
+        raise GateError(f'{path}: transport/link/protocols: a gate needs ["tls", "unixsock-stream"]')
+    size = _get(config, "transport/link/rx/max_message_size")
+    if not size or size > _MAX_ZENOH_BYTES:
+        raise GateError(f"{path}: transport/link/rx/max_message_size: at most {_MAX_ZENOH_BYTES} B, got {size}")
+    for key in ("root_ca_certificate", "listen_certificate", "listen_private_key"):
+        file = _get(config, f"transport/link/tls/{key}")
+        if not file or not os.access(file, os.R_OK):
+            raise GateError(f"{path}: transport/link/tls/{key}: {file or 'nothing'} can't be read")
+
+
+def _check_rules(path: Path, config: zenoh.Config) -> None:
+    """No policy for others than the vehicle's own sockets lets something be written."""
+    access = _get(config, "access_control")
+    rules = {rule["id"]: rule for rule in access["rules"] or ()}
+    inside = {s["id"] for s in access["subjects"] or () if s.get("link_protocols") == ["unixsock-stream"]}
+    for policy in access["policies"] or ():
+        if inside.issuperset(policy["subjects"]):
+            continue
+        for subject in access["subjects"]:
+            if subject["id"] in policy["subjects"] and not subject.get("cert_common_names"):
+                raise GateError(f"{path}: access_control: subject {subject['id']!r} names no certificate")
+        for rule in (rules[name] for name in policy["rules"] if name in rules):
+            writes = _WRITING.intersection(rule["messages"])
+            if rule["permission"] == "allow" and writes and "ingress" in (rule.get("flows") or ("ingress",)):
+                raise GateError(f"{path}: access_control: rule {rule['id']!r} lets {', '.join(sorted(writes))} in")
+
+
+def run(path: Path, vehicle: str, runtime_dir: Path | None) -> None:
+    """Opens the gate, until SIGTERM or SIGINT. Raises GateError."""
+    signals = {signal.SIGTERM, signal.SIGINT}
+    signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # before zenoh's threads, which inherit it
+    config = gate_config(path, vehicle, runtime_dir)
+    zenoh.init_log_from_env_or("error,zenoh_link_tls=warn")  # why somebody was refused; RUST_LOG says otherwise
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        raise GateError(f"{path}: the gate can't be opened: {error}") from error
+    notifier = Notifier()
+    with session:
+        listen = ", ".join(json.loads(config.get_json("listen/endpoints")))
+        print(f"the gate of vehicle {vehicle!r} is open: {listen}", flush=True)
+        notifier.once("READY=1")
+        while signal.sigtimedwait(signals, notifier.period_s or _LOOK_S) is None:
+            notifier.alive(f"{len(session.info.peers_zid())} nodes of the vehicle reached, open at {listen}")
+        notifier.once("STOPPING=1")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point of the gate's process."""
+    parser = argparse.ArgumentParser(prog="runtime.gate", description="Lets planners beyond this machine read.")
+    parser.add_argument("config", type=Path, metavar="CONFIG.toml", help="of the vehicle")
+    parser.add_argument("gate", type=Path, metavar="GATE.json5", help="zenoh's: addresses, certificates, access")
+    parser.add_argument("--runtime-dir", type=Path, metavar="DIR", help="as runtime.runtime_dir of the run")
+    options = parser.parse_args(arguments)
+    try:
+        configuration = load(options.config)
+        run(options.gate, configuration.vehicle, options.runtime_dir or configuration.runtime_dir)
+    except ConfigurationError as error:
+        print(f"birdslam-gate: {' '.join(str(error).split())}", file=sys.stderr)
+        return USER_ERROR_STATUS
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,364 @@
+"""Mutated bytes at every door: `make fuzz`, or `python -m tests.fuzz --cases 1000000 --seed 6`.
+
+Doors are the messages of the bus, what a subscriber, a planner and the optimizer make of them, references to frames in
+shared memory, and the files that a user gives: configuration, camera, manifest. Whatever comes in is either accepted,
+and then is a whole valid record that can be sent on, or refused with the one exception that the door is there to raise.
+Anything else ends the run with status 1 and the case that did it. The same seed gives the same cases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import msgpack
+import msgspec
+import numpy as np
+import zenoh
+
+from birdslam.camera import Camera
+from birdslam.datasets import DatasetError, load_camera
+from birdslam.graph import PoseGraph
+from birdslam.kitti import read_image, read_projection, read_times
+from birdslam.perception.manifest import Manifest, ModelError, read_manifest, shipped_manifests
+from birdslam.slam import SlamConfig
+from birdslam.types import INVALIDATING, FrameRef, Measurements
+from runtime.bus import Subscriber
+from runtime.client import Planner
+from runtime.configuration import Configuration, ConfigurationError, dump, load
+from runtime.frames import FrameError, FrameReader, FrameRing
+from runtime.topology import TOPICS, key_of
+from runtime.wire import MAX_TRACE_BYTES, Trace, WireError, decode, encode
+from tests.mutations import Chance, mutated, mutated_text, with_other_fields
+from tests.test_wire import BY_NAME, EXAMPLES
+
+ROOT = Path(__file__).resolve().parent.parent
+Door = Callable[[Chance], bool]  # makes a case and tries it; whether it was let in
+
+
+def sendable(data: bytes, record: type[msgspec.Struct], max_bytes: int) -> bool:
+    """Whether it decodes; if so, it must be a record that can be sent on."""
+    try:
+        found = decode(data, record, max_bytes)
+    except WireError:
+        return False
+    decode(encode(found), record)
+    return True
+
+
+def bytes_of_messages() -> Door:
+    """wire.decode on mutated bytes of each record."""
+    goods = [(type(example), encode(example)) for example in EXAMPLES]
+
+    def door(chance: Chance) -> bool:
+        (record, good), (_, donor) = chance.choice(goods), chance.choice(goods)
+        return sendable(mutated(chance, good, donor), record, 64_000)
+
+    return door
+
+
+def fields_of_messages() -> Door:
+    """wire.decode on whole MessagePack with other contents."""
+    goods = [(type(example), msgpack.unpackb(encode(example))) for example in EXAMPLES]
+
+    def door(chance: Chance) -> bool:
+        record, plain = chance.choice(goods)
+        limit = MAX_TRACE_BYTES if record is Trace else 64_000
+        return sendable(msgpack.packb(with_other_fields(chance, plain)), record, limit)
+
+    return door
+
+
+@dataclass
+class Sample:
+    """What zenoh hands to a subscriber."""
+
+    key_expr: str
+    payload: bytes
+    attachment: bytes | None
+    kind: zenoh.SampleKind
+
+
+class Undeclared:
+    """A session without a network: the samples are handed to the subscriber by hand, on this thread."""
+
+    def declare_subscriber(self, key: str, callback: object) -> Undeclared:
+        return self
+
+    def undeclare(self) -> None:
+        """As zenoh's."""
+
+
+@contextmanager
+def subscribers() -> Iterator[Door]:
+    """bus.Subscriber of every topic on mutated payloads, attachments, keys and kinds; a planner reads the estimates."""
+    session, ends, readings = Undeclared(), {}, {}
+    goods = {type(example): encode(example) for example in EXAMPLES}
+    for name, topic in TOPICS.items():
+        ends[name] = Subscriber(session, key_of("car", name), topic, 2, False)  # type: ignore[arg-type]
+    planner = object.__new__(Planner)  # without a bus of its own
+    planner._subscriber = ends["estimate"]
+    planner._bus = type("Bus", (), {"alive": frozenset({"optimize"}), "close": lambda self: None})()
+    readings["planner"] = planner
+
+    def door(chance: Chance) -> bool:
+        name = chance.choice(sorted(TOPICS))
+        subscriber, key, good = ends[name], key_of("car", name), goods[TOPICS[name].record]
+        donor = goods[chance.choice(sorted(goods, key=lambda record: record.__name__))]
+        payload = mutated(chance, good, donor) if chance.random() < 0.8 else good
+        attachment = mutated(chance, goods[Trace], donor) if chance.random() < 0.5 else goods[Trace]
+        if chance.random() < 0.05:
+            key = chance.choice(("birdslam/**", "**", "birdslam/car/v1/*", "x"))
+        kind = zenoh.SampleKind.DELETE if chance.random() < 0.05 else zenoh.SampleKind.PUT
+        before = subscriber.malformed, subscriber.newest
+        subscriber._receive(Sample(key, payload, attachment if chance.random() < 0.9 else None, kind))  # type: ignore[arg-type]
+        if subscriber.malformed > before[0]:
+            assert subscriber.newest is before[1], "a refused message was kept"
+            return False
+        assert subscriber.newest is not None
+        record = subscriber.newest.record
+        encode(record)
+        if name == "estimate":
+            reading = planner.latest(max_age_ms=1e9)
+            assert reading.estimate is record
+            assert not reading.valid or (record.valid and INVALIDATING.isdisjoint(record.status))
+        return True
+
+    yield door
+    for end in ends.values():
+        end.close()
+
+
+@contextmanager
+def references() -> Iterator[Door]:
+    """frames.FrameReader on references that lead anywhere, and on rings whose head was overwritten."""
+    with tempfile.TemporaryDirectory() as folder:
+        path, broken = Path(folder, "ring"), Path(folder, "broken")
+        image = np.arange(24 * 32, dtype=np.uint8).reshape(24, 32)
+        with FrameRing(path, 24, 32, channels=1, slots=2) as ring:
+            slot, sequence = ring.write(image)
+            data = path.read_bytes()
+            good = {
+                **{"frame_id": 0, "t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0, "slot": slot},
+                **{"sequence": sequence, "ring_epoch": ring.epoch, "width_px": 32, "height_px": 24, "channels": 1},
+            }
+
+            def door(chance: Chance) -> bool:
+                plain, where = dict(good), path
+                if chance.random() < 0.9:
+                    for _ in range(chance.randint(1, 2)):
+                        field = chance.choice(("slot", "sequence", "ring_epoch", "width_px", "height_px", "channels"))
+                        plain[field] = chance.choice((0, 1, 2, 3, 24, 32, -1, 2**31, 2**62, -(2**63)))
+                else:
+                    where = broken
+                    head = bytearray(data)
+                    place = 8 * chance.randrange(8)
+                    head[place : place + 8] = chance.choice((bytes(8), b"\xff" * 8, chance.randbytes(8)))
+                    broken.write_bytes(bytes(head[: chance.choice((len(head), 64, 8, 0))]))
+                try:
+                    ref = msgspec.convert(plain, FrameRef)
+                except msgspec.ValidationError:
+                    return False
+                with FrameReader(where) as reader:
+                    try:
+                        pixels = reader.read(ref)
+                    except FrameError:
+                        return False
+                assert pixels is None or np.array_equal(pixels, image), "pixels that were never written"
+                return pixels is not None
+
+            yield door
+
+
+def optimizer() -> Door:
+    """graph.PoseGraph on Measurements that passed the wire and say anything; what it makes of them can be sent."""
+    config, good = SlamConfig(), msgpack.unpackb(encode(BY_NAME["Measurements"]))
+    graph, frame = PoseGraph(config.graph, config.weights), 0
+
+    def door(chance: Chance) -> bool:
+        nonlocal graph, frame
+        if chance.random() < 0.1:
+            graph = PoseGraph(config.graph, config.weights)
+        frame += 1
+        edge = {"from_frame": frame - 1, "to_frame": frame}
+        landmark, _, *rest = good["cp"][0]
+        plain = {
+            **good,
+            **{"frame_id": frame, "t_source_ns": 33_000_000 * frame, "cc": {**good["cc"], **edge}},
+            **{"cv": [{**good["cv"][0], "frame": frame}], "vv": [{**good["vv"][0], **edge}]},
+            **{"cp": [[landmark, frame, *rest]]},
+        }
+        if chance.random() < 0.6:
+            plain = with_other_fields(chance, plain)  # type: ignore[assignment]
+        try:
+            measurements = decode(msgpack.packb(plain), Measurements)
+        except WireError:
+            return False
+        encode(graph.update(measurements))
+        return True
+
+    return door
+
+
+def files(goods: list[str], read: Callable[[Path], object], refusal: type[Exception]) -> Callable[[Path], Door]:
+    """Files that a user gives; `read` raises `refusal` or gives something whole."""
+
+    def make(folder: Path) -> Door:
+        path = folder / "file.toml"
+
+        def door(chance: Chance) -> bool:
+            path.write_bytes(mutated_text(chance, chance.choice(goods)))
+            try:
+                read(path)
+            except refusal:
+                return False
+            return True
+
+        return door
+
+    return make
+
+
+def _read_configuration(path: Path) -> None:
+    configuration = load(path)
+    assert msgspec.convert(dump(configuration), Configuration) == configuration
+
+
+def _read_camera(path: Path) -> None:
+    camera = load_camera(path)
+    assert msgspec.convert(msgspec.to_builtins(camera), Camera) == camera
+
+
+def _read_manifest(path: Path) -> None:
+    assert isinstance(read_manifest(path), Manifest)
+
+
+def _read_recording(path: Path) -> None:
+    if path.read_bytes()[:1] == b"P":
+        assert np.isfinite(read_projection(path, "P0")).all()
+    else:
+        assert all(later > earlier for earlier, later in pairwise(read_times(path)))
+
+
+@contextmanager
+def images(folder: Path) -> Iterator[Door]:
+    """kitti.read_image on mutated PNGs and JPEGs: an image of a known kind, or ValueError."""
+    grey = np.random.default_rng(6).integers(0, 256, (12, 16), dtype=np.uint8)
+    goods = [
+        (suffix, cv2.imencode(suffix, image)[1].tobytes())
+        for suffix in (".png", ".jpg")
+        for image in (grey, np.dstack([grey, grey, grey]))
+    ]
+
+    def door(chance: Chance) -> bool:
+        suffix, good = chance.choice(goods)
+        path = folder / f"image{suffix}"
+        path.write_bytes(mutated(chance, good, chance.choice(goods)[1]))
+        try:
+            image = read_image(path)
+        except ValueError:
+            return False
+        assert image.dtype == np.uint8
+        assert image.ndim in (2, 3)
+        return True
+
+    spoken, quiet = os.dup(2), os.open(os.devnull, os.O_WRONLY)  # the decoders complain there of each
+    try:
+        os.dup2(quiet, 2)
+        yield door
+    finally:
+        os.dup2(spoken, 2)
+        os.close(spoken)
+        os.close(quiet)
+
+
+def _configurations() -> list[str]:
+    texts = [path.read_text() for path in sorted((ROOT / "configs").glob("*.toml"))]
+    return [*texts, "[runtime]\nring_slots = 8\n[perceive]\ndeadline_ms = 20.0\n[source]\nrate = 33\nloop = true\n"]
+
+
+def _cameras() -> list[str]:
+    camera = tomllib.loads((ROOT / "configs" / "vehicle.toml").read_text())["camera"]
+    return ["".join(f"{key} = {value}\n" for key, value in camera.items())]
+
+
+def doors(folder: Path) -> Iterator[tuple[str, float, Callable[[], object]]]:
+    """Name, share of all cases, and what makes the door."""
+    yield "bytes of messages", 0.585, bytes_of_messages
+    yield "fields of messages", 0.17, fields_of_messages
+    yield "optimizer", 0.02, optimizer
+    yield "subscribers and planner", 0.13, subscribers
+    yield "references to frames", 0.02, references
+    manifests = [path.read_text() for path in shipped_manifests().values()]
+    yield "images", 0.005, lambda: images(folder)
+    times = "".join(f"{0.1 * i:e}\n" for i in range(8))
+    projections = "".join(f"P{i}: 700 0 300 {-i} 0 700 100 0 0 0 1 0\n" for i in range(2))
+    for name, share, goods, read, refusal in (
+        ("recordings' text files", 0.01, [times, projections], _read_recording, DatasetError),
+        ("configuration files", 0.02, _configurations(), _read_configuration, ConfigurationError),
+        ("camera files", 0.02, _cameras(), _read_camera, DatasetError),
+        ("manifest files", 0.02, manifests, _read_manifest, ModelError),
+    ):
+        make = files(goods, read, refusal)
+        yield name, share, lambda make=make: make(folder)  # type: ignore[misc]
+
+
+@dataclass(frozen=True)
+class Count:
+    """What one door did."""
+
+    name: str
+    cases: int
+    let_in: int
+    seconds: float
+
+
+def run(cases: int, seed: int) -> Iterator[Count]:
+    """All doors; raises what a door should not have raised, with the case's number in a note."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, share, make in doors(Path(folder)):
+            chance, begun_s, let_in = Chance(f"{seed} {name}"), time.monotonic(), 0
+            number = round(cases * share)
+            made = make()
+            with made if hasattr(made, "__enter__") else _open(made) as door:  # type: ignore[attr-defined]
+                for case in range(number):
+                    try:
+                        let_in += door(chance)
+                    except Exception as error:
+                        error.add_note(f"case {case} of {name!r}, seed {seed}")
+                        raise
+            yield Count(name, number, let_in, time.monotonic() - begun_s)
+
+
+@contextmanager
+def _open(door: object) -> Iterator[object]:
+    yield door
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point."""
+    parser = argparse.ArgumentParser(prog="tests.fuzz", description="Mutated bytes at every door.")
+    parser.add_argument("--cases", type=int, default=1_000_000, metavar="N")
+    parser.add_argument("--seed", type=int, default=6, metavar="N")
+    options = parser.parse_args(arguments)
+    total = 0
+    for count in run(options.cases, options.seed):
+        total += count.cases
+        let_in = f"{count.cases - count.let_in:>9} refused  {count.let_in:>9} valid"
+        print(f"{count.name:26}{count.cases:>9} cases  {let_in}  {count.seconds:6.1f} s", flush=True)
+    print(f"{'all':26}{total:>9} cases, none did harm (seed {options.seed})")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

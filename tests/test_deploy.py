@@ -1,0 +1,292 @@
+"""deploy/ as it is: the units' rules, the scripts, and the service in a real systemd on a machine of its own."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.systemd_machine import ROOT, Machine, why_not
+from tests.test_pipeline import drive
+
+__all__ = ["drive"]  # a fixture
+
+DEPLOY = ROOT / "deploy"
+UNITS = ("birdslam.service", "birdslam-gate.service")
+EXPOSURE_AT_MOST = 2.0
+SYSTEMD_ANALYZE, SHELLCHECK = shutil.which("systemd-analyze"), shutil.which("shellcheck")
+UNIT_TEXT = (DEPLOY / "birdslam.service").read_text()
+NODES = ("capture", "perceive", "optimize")
+
+
+@pytest.mark.skipif(SYSTEMD_ANALYZE is None, reason="systemd-analyze is not installed")
+@pytest.mark.parametrize("unit", [*UNITS, "birdslam.service+network.conf"])
+def test_the_sandbox_is_tight(unit: str, tmp_path: Path) -> None:
+    base, _, drop_in = unit.partition("+")
+    text = (DEPLOY / base).read_text()
+    if drop_in:
+        text = text.replace("[Install]", (DEPLOY / drop_in).read_text() + "\n[Install]")
+    (tmp_path / base).write_text(text)
+    report = subprocess.run(
+        ["systemd-analyze", "security", "--offline=yes", "--no-pager", str(tmp_path / base)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    level = re.search(r"Overall exposure level for \S+: ([0-9.]+)", report.stdout)
+    assert level is not None, report.stderr
+    assert float(level[1]) <= EXPOSURE_AT_MOST, report.stdout
+
+
+@pytest.mark.skipif(SYSTEMD_ANALYZE is None, reason="systemd-analyze is not installed")
+@pytest.mark.parametrize("unit", UNITS)
+def test_systemd_knows_every_key(unit: str) -> None:
+    report = subprocess.run(
+        ["systemd-analyze", "verify", "--recursive-errors=no", "--man=no", str(DEPLOY / unit)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    wrong = [line for line in report.stderr.splitlines() if "/opt/birdslam/" not in line and unit in line]
+    assert not wrong, report.stderr
+
+
+def test_cameras_are_the_only_devices_and_limits_are_set() -> None:
+    lines = (DEPLOY / "birdslam.service").read_text().splitlines()
+    keys = dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("#"))
+    assert [line for line in lines if line.startswith("DeviceAllow=")] == ["DeviceAllow=char-video4linux rw"]
+    assert (keys["DevicePolicy"], keys["Type"], keys["Restart"]) == ("closed", "notify", "on-failure")
+    assert {"MemoryMax", "CPUQuota", "TasksMax", "LimitRTPRIO", "WatchdogSec", "StartLimitBurst"} <= keys.keys()
+    assert int(keys["LimitRTPRIO"]) > 0
+    assert keys["RestrictRealtime"] == "no"
+
+
+@pytest.mark.skipif(SHELLCHECK is None, reason="shellcheck is not installed")
+@pytest.mark.parametrize("script", ["install.sh", "certificates.sh"])
+def test_the_scripts_are_clean(script: str) -> None:
+    report = subprocess.run(["shellcheck", str(DEPLOY / script)], capture_output=True, text=True, check=False)
+    assert report.returncode == 0, report.stdout
+
+
+def wheel(folder: Path) -> Path:
+    """The checkout as a wheel without dependencies: they come from the packages that this Python has."""
+    path, info = folder / "birdslam-0.1.0-py3-none-any.whl", "birdslam-0.1.0.dist-info"
+    with zipfile.ZipFile(path, "w") as archive:
+        for package in ("birdslam", "runtime"):
+            for file in sorted((ROOT / package).rglob("*")):
+                if file.suffix in {".py", ".toml"}:
+                    archive.write(file, file.relative_to(ROOT))
+        archive.writestr("packages.pth", "/srv/packages\n")
+        archive.writestr(f"{info}/METADATA", "Metadata-Version: 2.1\nName: birdslam\nVersion: 0.1.0\n")
+        archive.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        archive.writestr(f"{info}/entry_points.txt", "[console_scripts]\nbirdslam = runtime.cli:main\n")
+        archive.writestr(f"{info}/RECORD", "")
+    return path
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory, drive: Path) -> Iterator[Machine]:
+    """A machine on which install.sh has run, and the service looks at a recording in a loop."""
+    reason = why_not()
+    if reason:
+        pytest.skip(reason)
+    folder = tmp_path_factory.mktemp("machine")
+    (folder / "m").mkdir()
+    with Machine(folder / "m") as machine:
+        machine.copy(drive, "/srv/drive")
+        machine.copy(wheel(folder), "/srv/birdslam-0.1.0-py3-none-any.whl")
+        yield machine
+
+
+def install(machine: Machine, *arguments: str) -> str:
+    package = {"BIRDSLAM_PACKAGE": "/srv/birdslam-0.1.0-py3-none-any.whl", "PIP_NO_INDEX": "1"}
+    return machine("/srv/birdslam/deploy/install.sh", *arguments, env=package)
+
+
+LOOP = """
+[source]
+uri = "kitti:/srv/drive"
+loop = true
+[runtime]
+stop_timeout_s = 8.0
+"""
+
+
+def estimates(machine: Machine, count: int = 1) -> list[dict]:
+    """What a planner of the service's own user gets."""
+    lines = machine(
+        *("/opt/birdslam/current/bin/birdslam", "listen", "--runtime-dir", "/run/birdslam", "--json"),
+        *("--count", str(count), "--timeout", "30"),
+        user="birdslam",
+    )
+    return [json.loads(line) for line in lines.splitlines()]
+
+
+def node(machine: Machine, name: str) -> int:
+    """The process of a node; 0 where there is none."""
+    found = [pid for line, pid in machine.pids("birdslam").items() if f" runtime.runner {name} " in line]
+    return found[0] if found else 0
+
+
+PROBE = """
+import ctypes, json, mmap, os, pathlib, socket, time
+
+def refused(attempt):
+    try:
+        return not attempt()
+    except OSError:
+        return True
+
+libc = ctypes.CDLL(None, use_errno=True)
+print(json.dumps({
+    "internet": refused(lambda: socket.socket(socket.AF_INET)),
+    "packets": refused(lambda: socket.socket(socket.AF_PACKET)),
+    "other devices": refused(lambda: open("/dev/loop-control")) and refused(lambda: open("/dev/kmsg")),
+    "system files": refused(lambda: open("/etc/birdslam-probe", "w")) and refused(lambda: open("/usr/probe", "w")),
+    "homes": refused(lambda: os.listdir("/root")),
+    "shared /tmp": not os.path.exists("/tmp/of-others"),
+    "namespaces": refused(lambda: libc.unshare(0x10000000) == 0),
+    "mounts": refused(lambda: libc.mount(b"none", b"/mnt", b"tmpfs", 0, None) == 0),
+    "writable code": refused(lambda: mmap.mmap(-1, 4096, prot=mmap.PROT_WRITE | mmap.PROT_EXEC)),
+    "the clock": refused(lambda: time.clock_settime(time.CLOCK_REALTIME, time.time()) is None),
+    "other processes": not os.path.exists("/proc/1"),
+    "kernel settings": refused(lambda: open("/proc/sys/kernel/printk", "w")),
+    "other users": refused(lambda: os.setuid(0) is None),
+}))
+for path in ("/run/birdslam", "/var/lib/birdslam", "/var/cache/birdslam", "/dev/shm"):
+    pathlib.Path(path, "probe").touch()
+    pathlib.Path(path, "probe").unlink()
+socket.socketpair(socket.AF_UNIX)
+"""
+
+
+def test_the_sandbox_from_inside(machine: Machine) -> None:
+    """A program under the unit's own rules tries what it must not, and what it needs."""
+    machine("systemd-sysusers", "/srv/birdslam/deploy/birdslam.sysusers")
+    unit = re.sub(r"ExecStart=.*?(?<!\\\\)\n", "ExecStart=/usr/bin/python3 /srv/probe.py\n", UNIT_TEXT, flags=re.DOTALL)
+    unit = unit.replace("Type=notify", "Type=oneshot").replace("Restart=on-failure", "Restart=no")
+    machine.write("/srv/probe.py", PROBE)
+    machine.write("/tmp/of-others", "")
+    machine.write("/etc/systemd/system/probe.service", unit)
+    machine("systemctl", "daemon-reload")
+    machine("sh", "-c", "systemctl start probe || { journalctl -u probe --output=cat --no-pager; exit 1; }")
+    said = next(line for line in machine.journal("-u", "probe").splitlines() if line.startswith("{"))
+    assert {what for what, refused in json.loads(said).items() if not refused} == set()
+
+
+def test_install_start_break_and_remove(machine: Machine) -> None:
+    """One long story, since each step needs the one before it."""
+    # Installed: a user, a virtual environment, a configuration; a second run changes nothing.
+    install(machine)
+    assert machine("stat", "-c", "%U %a", "/opt/birdslam/current/bin/birdslam") == "root 755"
+    assert machine("systemctl", "is-enabled", "birdslam") == "enabled"
+    assert "video" in machine("id", "-nG", "birdslam").split()
+    machine.write("/etc/birdslam/vehicle.toml", LOOP)
+    before = machine("readlink", "/opt/birdslam/current")
+    assert "vehicle.toml is kept" in install(machine)
+    assert machine("cat", "/etc/birdslam/vehicle.toml") == LOOP.strip()
+    assert machine("readlink", "/opt/birdslam/current") != before
+    assert len(machine("ls", "/opt/birdslam/releases").split()) == 2
+
+    # What is wrong is said by the start, in one line; after some more of them systemd gives up.
+    machine.write("/etc/birdslam/vehicle.toml", "no_such_key = 1\n")
+    machine.write("/etc/systemd/system/birdslam.service.d/limit.conf", "[Unit]\nStartLimitBurst=3\n")
+    machine("systemctl", "daemon-reload")
+    assert machine("sh", "-c", "systemctl start birdslam 2>/dev/null || echo failed") == "failed"
+    assert "birdslam: /etc/birdslam/vehicle.toml: no_such_key: there is no such key" in machine.journal(
+        "-u", "birdslam"
+    )
+    machine.until(lambda: machine("systemctl", "is-failed", "birdslam", check=False) == "failed", "it is given up")
+    machine("rm", "/etc/systemd/system/birdslam.service.d/limit.conf")
+    machine("systemctl", "daemon-reload")
+    machine("systemctl", "reset-failed", "birdslam")
+    machine.write("/etc/birdslam/vehicle.toml", LOOP)
+
+    # Started: systemctl start returns once the supervisor has said READY; a planner then gets estimates.
+    machine("systemctl", "start", "birdslam")
+    assert machine("systemctl", "is-active", "birdslam") == "active"
+    assert len(estimates(machine, 3)) == 3
+    main = int(machine.show("birdslam", "MainPID"))
+    status = machine("cat", f"/proc/{main}/status")
+    assert machine("stat", "-c", "%U", f"/proc/{main}") == "birdslam"
+    assert re.search(r"^CapEff:\s+0+$", status, re.MULTILINE)
+    assert re.search(r"^NoNewPrivs:\s+1$", status, re.MULTILINE)
+    assert re.search(r"^Seccomp:\s+2$", status, re.MULTILINE)
+
+    # A node is killed, then another stalls: the supervisor's to mend. systemd sees no restart.
+    for name, number in (("optimize", signal.SIGKILL), ("perceive", signal.SIGSTOP)):
+        killed = node(machine, name)
+        machine("kill", f"-{number}", str(killed))
+        machine.until(lambda: node(machine, name) not in (0, killed), f"{name} is back")  # noqa: B023
+        assert estimates(machine)
+    assert (int(machine.show("birdslam", "MainPID")), machine.show("birdslam", "NRestarts")) == (main, "0")
+
+    # The supervisor stalls: systemd's watchdog ends it and starts it anew. Then it is killed outright.
+    for restarts, number in enumerate((signal.SIGSTOP, signal.SIGKILL), 1):
+        nodes = [node(machine, name) for name in NODES]
+        machine("kill", f"-{number}", machine.show("birdslam", "MainPID"))
+        machine.until(lambda: machine.show("birdslam", "NRestarts") == str(restarts), "a restart")  # noqa: B023
+        machine.until(lambda: machine("systemctl", "is-active", "birdslam", check=False) == "active", "active again")
+        assert estimates(machine)
+        assert not set(nodes) & {node(machine, name) for name in NODES}
+    assert "Watchdog timeout" in machine.journal("-u", "birdslam")
+
+    # Its journal: what a node's end was is a warning of that node.
+    warnings = machine.journal("-u", "birdslam", "BIRDSLAM_NODE=optimize", "PRIORITY=4", "SYSLOG_IDENTIFIER=birdslam")
+    assert "SIGKILL" in warnings
+    assert machine.journal("-u", "birdslam", "BIRDSLAM_EVENT=status", "PRIORITY=6")
+    assert "frame" in machine.show("birdslam", "StatusText")
+
+    # The gate: off until there are certificates; then a planner of another user reads through it.
+    assert machine("systemctl", "is-active", "birdslam-gate", check=False) == "inactive"
+    tls, current = "/etc/birdslam/tls", "/opt/birdslam/current"
+    machine(f"{current}/deploy/certificates.sh", tls, "vehicle", "127.0.0.1")
+    machine(f"{current}/deploy/certificates.sh", tls, "planner", "planner")
+    assert machine("stat", "-c", "%U %G %a", f"{tls}/vehicle.key") == "root birdslam 640"
+    machine("systemctl", "enable", "--now", "birdslam-gate")
+    machine("sh", "-c", f"install -d -o nobody /srv/p; install -o nobody -m 600 {tls}/ca.pem {tls}/planner.* /srv/p")
+    machine("cp", f"{current}/deploy/planner.json5", f"{current}/deploy/listen.py", "/srv/p")
+    planner = f"cd /srv/p; timeout 60 {current}/bin/python listen.py planner.json5 | head -n 2"
+    heard = machine("sh", "-c", planner, user="nobody").splitlines()
+    assert len(heard) == 2
+    assert all(line.startswith("frame ") for line in heard)
+    for secret in (f"{tls}/vehicle.key", f"{tls}/ca.key", "/run/birdslam/car/lock", "/var/lib/birdslam/drive"):
+        assert machine("sh", "-c", f"test -r {secret} || echo refused", user="nobody") == "refused"
+    machine("systemctl", "stop", "birdslam-gate")
+
+    # An upgrade that fails changes nothing; one that succeeds restarts the service, on the configuration that was.
+    main = machine.show("birdslam", "MainPID")
+    before = machine("readlink", "/opt/birdslam/current")
+    machine(
+        "/srv/birdslam/deploy/install.sh", check=False, env={"BIRDSLAM_PACKAGE": "/srv/none.whl", "PIP_NO_INDEX": "1"}
+    )
+    assert machine("readlink", "/opt/birdslam/current") == before
+    assert len(machine("ls", "/opt/birdslam/releases").split()) == 2
+    assert machine.show("birdslam", "MainPID") == main
+    install(machine)
+    assert machine.show("birdslam", "MainPID") != main
+    assert estimates(machine)
+
+    # Stopped: in order, with its results written and nothing left behind.
+    machine("systemctl", "stop", "birdslam")
+    assert machine.show("birdslam", "Result") == "success"
+    summary = json.loads(machine("cat", "/var/lib/birdslam/drive/summary.json"))
+    assert summary["ended"] == "SIGTERM"
+    assert machine("find", "/var/cache/birdslam", "-name", "onnxruntime.db") == ""  # its telemetry
+    assert summary["frames_processed"] > 0
+    assert machine("ls", "-A", "/run/birdslam", "/dev/shm", check=False).split() in ([], ["/dev/shm:"])
+
+    # Removed: the configuration stays, until it is purged.
+    install(machine, "uninstall")
+    assert machine("ls", "/opt/birdslam", check=False) == ""
+    assert machine("cat", "/etc/birdslam/vehicle.toml") == LOOP.strip()
+    install(machine, "uninstall", "--purge")
+    assert machine("sh", "-c", "ls -d /etc/birdslam /var/lib/birdslam; id birdslam", check=False) == ""
+    install(machine, "uninstall", "--purge")

@@ -1,0 +1,61 @@
+"""A short run of `make fuzz`, and what no file of a user's may do: run code."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from birdslam.perception import ModelError, ModelSpec, load_network
+from birdslam.perception.manifest import shipped_manifests
+from tests import fuzz
+
+ROOT = Path(__file__).resolve().parent.parent
+CASES, SEED = 20_000, 6
+RUNS_CODE = {"eval", "exec", "compile", "__import__"}
+READS_CODE = {"pickle", "marshal", "shelve", "dill", "joblib", "yaml", "runpy", "imp", "code"}
+
+
+def test_every_door_holds() -> None:
+    counts = {count.name: count for count in fuzz.run(CASES, SEED)}
+    assert abs(sum(count.cases for count in counts.values()) - CASES) < len(counts)
+    for count in counts.values():  # a door that lets all or nothing in was not tried
+        assert 0 < count.let_in < count.cases, count
+
+
+def test_the_same_seed_gives_the_same_cases() -> None:
+    first, again, other = (
+        [(count.name, count.let_in) for count in fuzz.run(2_000, seed)] for seed in (SEED, SEED, SEED + 1)
+    )
+    assert first == again
+    assert first != other
+
+
+@pytest.mark.parametrize("package", ["birdslam", "runtime"])
+def test_nothing_that_is_read_is_run(package: str) -> None:
+    """Files and messages are data: no module evaluates, imports by name, or unpickles."""
+    for path in (ROOT / package).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call):
+                called = node.func.id if isinstance(node.func, ast.Name) else ""
+                assert called not in RUNS_CODE, f"{path}: {called}"
+                keywords = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+                assert keywords.get("allow_pickle", "False") == "False", path
+                assert keywords.get("shell", "False") == "False", path
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not {name.split(".")[0] for name in names} & READS_CODE, path
+
+
+def test_a_network_is_parsed_only_after_its_hash_was_checked(tmp_path: Path) -> None:
+    """A pinned network with one flipped byte is refused by its hash; onnxruntime never sees it."""
+    name, manifest = next(iter(shipped_manifests().items()))
+    text = manifest.read_text()
+    network = tmp_path / f"{name}.onnx"
+    network.write_bytes(b"not a network at all")
+    network.with_suffix(".toml").write_text(text)
+    with pytest.raises(ModelError, match="sha256") as caught:
+        load_network("detector", ModelSpec(path=str(network)))
+    assert hashlib.sha256(network.read_bytes()).hexdigest() in str(caught.value)

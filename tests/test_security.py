@@ -1,0 +1,504 @@
+"""Who may read and who may write: real sessions at the gate and at the vehicle's sockets, let in or refused.
+
+Certificates come from deploy/certificates.sh, the gate's file is the one that is installed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import select
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from birdslam.types import MapUpdate
+from runtime.bus import Bus, Publisher, Subscriber
+from runtime.client import Planner
+from runtime.gate import GateError, gate_config
+from runtime.presence import runtime_dir_of, socket_path
+from runtime.topology import NODES, TOPICS, alive_key, key_of
+from runtime.wire import Health, encode
+from tests.mutations import Chance, mutated
+from tests.test_bus import estimate, measurements, until
+
+ROOT = Path(__file__).resolve().parent.parent
+DEPLOY = ROOT / "deploy"
+LIMIT_S = 20.0
+READABLE = {"estimate", "map", *(f"health/{node}" for node in NODES)}
+
+needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+
+
+def certificate(folder: Path, *what: str) -> None:
+    subprocess.run([str(DEPLOY / "certificates.sh"), str(folder), *what], check=True, capture_output=True)
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`planner` and `stranger` of the vehicle's authority; in `other`, a planner and a vehicle of another one."""
+    folder = tmp_path_factory.mktemp("tls")
+    for place in (folder, folder / "other"):
+        certificate(place, "vehicle", "127.0.0.1", "localhost")
+        certificate(place, "planner", "planner")
+    certificate(folder, "planner", "stranger")
+    return folder
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def gate_file(folder: Path, certificates: Path, port: int, change: Callable[[str], str] = lambda text: text) -> Path:
+    """The installed file with another port, and certificates of the test."""
+    text = (DEPLOY / "gate.json5").read_text()
+    text = text.replace("/etc/birdslam/tls", str(certificates)).replace("127.0.0.1:7447", f"127.0.0.1:{port}")
+    path = folder / "gate.json5"
+    path.write_text(change(text))
+    return path
+
+
+def outside(
+    certificates: Path,
+    port: int,
+    name: str = "planner",
+    *,
+    mode: str = "client",
+    authority: str = "ca.pem",
+    retry: bool = False,
+) -> zenoh.Session:
+    """A session from outside, by the planner's file that is installed. Raises ZError where it is not let in."""
+    config = zenoh.Config.from_file(str(DEPLOY / "planner.json5"))
+    tls = {
+        "enable_mtls": bool(name),
+        "verify_name_on_connect": True,
+        "root_ca_certificate": str(certificates / authority),
+        "connect_certificate": str(certificates / f"{name}.pem") if name else None,
+        "connect_private_key": str(certificates / f"{name}.key") if name else None,
+    }
+    for key, value in (
+        ("mode", mode),
+        ("listen/endpoints", []),
+        ("transport/link/protocols", ["tls", "unixsock-stream"]),  # as one who would go past the gate
+        ("connect/endpoints", [f"tls/127.0.0.1:{port}"]),
+        ("connect/timeout_ms", 20_000 if retry else 1500),
+        ("connect/exit_on_failure", True),
+        ("transport/link/tls", tls),
+    ):
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+@dataclass
+class Vehicle:
+    """The vehicle's side: its three nodes, and all that anybody could write to."""
+
+    base: Path
+    port: int
+    nodes: dict[str, Bus]
+    publishers: dict[str, Publisher]
+    listeners: dict[str, Subscriber]
+
+    def say_all(self, number: int) -> None:
+        """One message of every topic."""
+        update = MapUpdate(epoch=0, frame_id=number, lanes_m=((1.0, 2.0),))
+        records = {"estimate": estimate(number), "measurements": measurements(number), "map": update}
+        for topic, publisher in self.publishers.items():
+            publisher.put(records.get(topic) or Health(node=TOPICS[topic].producer, t_ns=number))
+
+
+@dataclass
+class Heard:
+    """What a session from outside reads of all that it asks for."""
+
+    keys: set[str] = field(default_factory=set)
+    alive: set[str] = field(default_factory=set)
+    ends: list[Any] = field(default_factory=list)
+
+    def listen(self, session: zenoh.Session) -> None:
+        for key in ("**", "birdslam/**", *(key_of("car", topic) for topic in TOPICS)):
+            self.ends.append(session.declare_subscriber(key, lambda sample: self.keys.add(str(sample.key_expr))))
+        tokens = session.liveliness().declare_subscriber(
+            alive_key("car", "*"), lambda sample: self.alive.add(str(sample.key_expr)), history=True
+        )
+        self.ends.append(tokens)
+
+
+@pytest.fixture
+def vehicle(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Iterator[Vehicle]:
+    """The nodes on the bus, and the gate in a process of its own."""
+    base, port = tmp_path_factory.mktemp("run"), free_port()
+    (base / "car.toml").write_text('vehicle = "car"\n')
+    path = gate_file(base, certificates, port)
+    with ExitStack() as stack:
+        stack.enter_context(Bus("car", "supervisor", hub=True, runtime_dir=base))
+        nodes = {name: stack.enter_context(Bus("car", name, runtime_dir=base)) for name in NODES}
+        for node in nodes.values():
+            node.declare_alive()
+        publishers = {t: nodes[TOPICS[t].producer].publisher(t) for t in TOPICS if t != "frame"}
+        gate = subprocess.Popen(
+            [
+                *(sys.executable, "-P", "-m", "runtime.gate", str(base / "car.toml"), str(path)),
+                *("--runtime-dir", str(base)),
+            ],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+        def end() -> None:
+            gate.kill()
+            gate.communicate()
+
+        stack.callback(end)
+        assert gate.stdout is not None
+        assert "is open" in gate.stdout.readline()
+        listeners = {topic: nodes["capture"].subscriber(topic, depth=256) for topic in TOPICS}
+        yield Vehicle(base, port, nodes, publishers, listeners)
+        gate.terminate()
+        assert gate.wait(LIMIT_S) == 0
+
+
+def hear(vehicle: Vehicle, session: zenoh.Session, enough: set[str], limit_s: float = LIMIT_S) -> Heard:
+    """What it hears of messages of every topic, until all of `enough`, or the limit."""
+    heard, number, end_s = Heard(), 0, time.monotonic() + limit_s
+    heard.listen(session)
+    while time.monotonic() < end_s and not (heard.keys >= enough and enough):
+        vehicle.say_all(number := number + 1)
+        until_heard(vehicle.listeners["estimate"], number)
+    return heard
+
+
+def until_heard(listener: Subscriber, number: int) -> None:
+    """The vehicle's own listener has that estimate: whoever may have it, has had its chance."""
+    until(lambda: (m := listener.recv(LIMIT_S)) is not None and m.record.frame_id == number, f"estimate {number}")
+    time.sleep(0.02)  # the hop more that the gate is
+
+
+def keys(topics: set[str]) -> set[str]:
+    return {key_of("car", topic) for topic in topics}
+
+
+def test_the_gates_file_speaks_of_the_topology_and_of_nothing_else() -> None:
+    config = zenoh.Config.from_file(str(DEPLOY / "gate.json5"))
+    access = json.loads(config.get_json("access_control"))
+    alive = zenoh.KeyExpr(alive_key("car", "optimize"))
+    for rule in access["rules"]:
+        allowed = [zenoh.KeyExpr(key) for key in rule["key_exprs"]]
+        readable = {t for t in TOPICS if any(key.includes(zenoh.KeyExpr(key_of("car", t))) for key in allowed)}
+        assert readable == READABLE, rule["id"]
+        assert any(key.includes(alive) for key in allowed)
+        assert not any(key.intersects(zenoh.KeyExpr("@/**")) for key in allowed)  # zenoh's own administration
+    assert access["default_permission"] == "deny"
+
+
+@needs_openssl
+def test_a_planner_reads_what_it_may_and_no_more(vehicle: Vehicle, certificates: Path) -> None:
+    with outside(certificates, vehicle.port) as session:
+        heard = hear(vehicle, session, keys(READABLE))
+        until(lambda: len(heard.alive) == len(NODES), "all nodes are alive")
+        assert heard.keys == keys(READABLE)  # no measurements, no frames
+        assert heard.alive == {alive_key("car", node) for node in NODES}
+
+
+@needs_openssl
+def test_nobody_outside_writes(vehicle: Vehicle, certificates: Path) -> None:
+    """A planner with all its rights sends valid messages of every topic, tokens and answers: none comes in."""
+    with outside(certificates, vehicle.port) as session, outside(certificates, vehicle.port) as other:
+        heard = hear(vehicle, other, keys(READABLE))
+        for listener in vehicle.listeners.values():
+            while listener.recv(0.0):
+                pass
+        valid = {"estimate": estimate(9_999), "measurements": measurements(9_999)}
+        publishers = {topic: session.declare_publisher(key_of("car", topic)) for topic in TOPICS}
+        token = session.liveliness().declare_token(alive_key("car", "impostor"))
+        queryable = session.declare_queryable("birdslam/car/v1/**", lambda query: query.reply(query.key_expr, b"lie"))
+        for _ in range(20):
+            for topic, publisher in publishers.items():
+                publisher.put(encode(valid.get(topic) or Health(node="capture", t_ns=9_999)))
+                session.delete(key_of("car", topic))
+            session.put("birdslam/**", b"wide")
+        vehicle.say_all(77)
+        until_heard(vehicle.listeners["estimate"], 77)
+        lies = [
+            (topic, message.record)
+            for topic, listener in vehicle.listeners.items()
+            for message in iter(lambda listener=listener: listener.recv(0.0), None)  # type: ignore[misc]
+            if getattr(message.record, "frame_id", getattr(message.record, "t_ns", 0)) == 9_999
+        ]
+        assert not lies
+        assert all(listener.malformed == 0 for listener in vehicle.listeners.values())
+        assert "impostor" not in vehicle.nodes["capture"].alive
+        assert alive_key("car", "impostor") not in heard.alive
+        answers = list(vehicle.nodes["capture"]._session.get("birdslam/car/v1/map", timeout=1.0))
+        assert not [a for a in answers if a.ok is not None]
+        queryable.undeclare()
+        token.undeclare()
+
+
+@needs_openssl
+def test_a_certificate_that_is_not_on_the_list_reads_nothing(vehicle: Vehicle, certificates: Path) -> None:
+    with outside(certificates, vehicle.port, "stranger") as stranger, outside(certificates, vehicle.port) as planner:
+        heard = Heard()
+        heard.listen(stranger)
+        assert hear(vehicle, planner, keys(READABLE)).keys == keys(READABLE)
+        assert not heard.keys
+        assert not heard.alive
+
+
+@needs_openssl
+@pytest.mark.parametrize(
+    ("who", "authority"),
+    [("other/planner", "ca.pem"), ("", "ca.pem"), ("vehicle", "ca.pem"), ("planner", "other/ca.pem")],
+    ids=["of another authority", "without a certificate", "with the vehicle's own", "that trusts another authority"],
+)
+def test_a_planner_is_refused(vehicle: Vehicle, certificates: Path, who: str, authority: str) -> None:
+    """The last of them refuses the gate: it is mutual."""
+    with pytest.raises(zenoh.ZError):
+        outside(certificates, vehicle.port, who, authority=authority)
+
+
+@needs_openssl
+def test_the_gate_speaks_nothing_but_tls(vehicle: Vehicle) -> None:
+    config = zenoh.Config()
+    for key, value in (
+        ("mode", "client"),
+        ("connect/endpoints", [f"tcp/127.0.0.1:{vehicle.port}"]),
+        ("connect/timeout_ms", 1500),
+        ("scouting/multicast/enabled", False),
+    ):
+        config.insert_json5(key, json.dumps(value))
+    with pytest.raises(zenoh.ZError):
+        zenoh.open(config)
+
+
+@needs_openssl
+def test_a_peer_learns_no_way_around_the_gate(vehicle: Vehicle, certificates: Path) -> None:
+    """On this machine and as this user it could use the sockets, if it were told of them."""
+    with outside(certificates, vehicle.port, mode="peer") as peer, outside(certificates, vehicle.port) as planner:
+        heard = Heard()
+        heard.listen(peer)
+        assert hear(vehicle, planner, keys(READABLE)).keys == keys(READABLE)
+        assert heard.keys <= keys(READABLE)
+        peer.put(key_of("car", "estimate"), encode(estimate(9_999)))
+        vehicle.say_all(78)
+        until_heard(vehicle.listeners["estimate"], 78)
+        assert len(peer.info.peers_zid()) == 1  # the gate
+
+
+@needs_openssl
+def test_noise_and_giants_leave_the_gate_standing(vehicle: Vehicle, certificates: Path) -> None:
+    """Who is in goes on reading meanwhile; who comes anew may knock twice (zenoh pauses after a bad handshake)."""
+    with outside(certificates, vehicle.port) as session:
+        silent = [socket.create_connection(("127.0.0.1", vehicle.port)) for _ in range(8)]
+        for number in range(20):
+            with socket.create_connection(("127.0.0.1", vehicle.port)) as noise:
+                noise.sendall(os.urandom(1 + 37 * number))
+        for size in (70_000, 200_000, 4_000_000):
+            session.put(key_of("car", "estimate"), bytes(size))
+            session.get("birdslam/car/v1/map", payload=bytes(size), timeout=0.1)
+    with outside(certificates, vehicle.port, retry=True) as session:
+        assert hear(vehicle, session, keys(READABLE)).keys == keys(READABLE)
+        for number in range(20):
+            with socket.create_connection(("127.0.0.1", vehicle.port)) as noise:
+                noise.sendall(os.urandom(1 + 37 * number))
+        assert hear(vehicle, session, keys(READABLE)).keys == keys(READABLE)
+    for one in silent:
+        one.close()
+
+
+@needs_openssl
+def test_a_planner_lives_through_a_restart_of_the_vehicle(vehicle: Vehicle, certificates: Path) -> None:
+    with outside(certificates, vehicle.port) as session:
+        heard = hear(vehicle, session, keys({"estimate"}))
+        vehicle.nodes["optimize"].close()
+        with Bus("car", "optimize", runtime_dir=vehicle.base) as again:
+            publisher = again.publisher("estimate")
+            heard.keys.clear()
+
+            def comes_back() -> bool:
+                publisher.put(estimate(1))
+                return key_of("car", "estimate") in heard.keys
+
+            until(comes_back, "an estimate of the new process")
+
+
+@needs_openssl
+def test_the_example_of_a_planner_elsewhere(vehicle: Vehicle, certificates: Path, tmp_path: Path) -> None:
+    text = (DEPLOY / "planner.json5").read_text().replace(":7447", f":{vehicle.port}")
+    text = re.sub(r'"(ca|planner)\.(pem|key)"', lambda m: json.dumps(str(certificates / m[0].strip('"'))), text)
+    (tmp_path / "planner.json5").write_text(text)
+    listen = subprocess.Popen(
+        [sys.executable, str(DEPLOY / "listen.py"), str(tmp_path / "planner.json5")],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert listen.stdout is not None
+        line = ""
+
+        def printed() -> bool:
+            nonlocal line
+            vehicle.say_all(5)
+            if listen.stdout and select.select([listen.stdout], [], [], 0.1)[0]:
+                line = listen.stdout.readline()
+            return bool(line)
+
+        until(printed, "a line of listen.py")
+        assert line.startswith("frame 5 ")
+        assert line.rstrip().endswith("DO NOT USE")  # its t_utc_ns is of 1970
+    finally:
+        listen.kill()
+        listen.communicate()
+
+
+@needs_openssl
+def test_certificates_are_kept_and_made_only_by_the_authority(certificates: Path, tmp_path: Path) -> None:
+    def attempt(*what: str) -> subprocess.CompletedProcess[str]:
+        script = [str(DEPLOY / "certificates.sh"), str(tmp_path / "tls"), *what]
+        return subprocess.run(script, capture_output=True, text=True, check=False)
+
+    assert attempt("vehicle", "car.local", "10.0.0.5", "fd00::5").returncode == 0
+    before = {path.name: path.read_bytes() for path in (tmp_path / "tls").iterdir()}
+    assert "kept" in attempt("vehicle", "car.local").stdout
+    assert {path.name: path.read_bytes() for path in (tmp_path / "tls").iterdir()} == before
+    assert all(path.stat().st_mode & 0o077 == 0 for path in (tmp_path / "tls").glob("*.key"))
+    for wrong in (
+        ("planner", "../up"),
+        ("planner", "ca"),
+        ("planner", "vehicle"),
+        ("vehicle", "a,b"),
+        ("other", "x"),
+        (),
+    ):
+        done = attempt(*wrong)
+        assert done.returncode == 2, wrong
+        assert done.stderr.startswith("certificates.sh: ")
+    (tmp_path / "tls" / "ca.key").unlink()
+    assert "authority" in attempt("planner", "late").stderr
+    assert not list((tmp_path / "tls").glob(".new*"))
+
+
+@needs_openssl
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("enable_mtls: true", "enable_mtls: false", "enable_mtls"),
+        ('default_permission: "deny"', 'default_permission: "allow"', "default_permission"),
+        ("access_control: {\n    enabled: true", "access_control: {\n    enabled: false", "access_control/enabled"),
+        ("gossip: { enabled: false }", "gossip: { enabled: true }", "gossip"),
+        ('mode: "peer"', 'mode: "router"', "mode"),
+        ('["tls/127.0.0.1', '["tcp/127.0.0.1', "listen/endpoints"),
+        ('protocols: ["tls", "unixsock-stream"]', 'protocols: ["tls", "tcp", "unixsock-stream"]', "protocols"),
+        ("max_message_size: 131072", "max_message_size: 1073741824", "max_message_size"),
+        ("vehicle.key", "missing.key", "missing.key"),
+        ('link_protocols: ["tls"], cert_common_names: ["planner"]', 'link_protocols: ["tls"]', "certificate"),
+        ('"declare_subscriber", "query"', '"declare_subscriber", "put", "query"', "lets put in"),
+        ("adminspace: {", "adminspaced: {", "gate.json5"),
+        ("{\n", "", "gate.json5"),
+    ],
+)
+def test_a_gate_that_would_be_open_does_not_start(
+    tmp_path: Path, certificates: Path, old: str, new: str, reason: str
+) -> None:
+    gate_config(gate_file(tmp_path, certificates, 1), "car", tmp_path / "rt")
+
+    def change(text: str) -> str:
+        assert old in text
+        return text.replace(old, new, 1)
+
+    with pytest.raises(GateError, match=re.escape(reason)) as caught:
+        gate_config(gate_file(tmp_path, certificates, 1, change), "car", tmp_path / "rt")
+    assert "gate.json5" in str(caught.value)
+
+
+def test_a_gate_says_what_is_wrong_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "car.toml").write_text("")
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "runtime.gate", str(tmp_path / "car.toml"), str(tmp_path / "none.json5")],
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "none.json5" in done.stderr
+
+
+def test_a_message_over_the_limit_is_never_put_together(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """From a process of the vehicle's own user, past the checks of our own sender."""
+    base = tmp_path_factory.mktemp("run")
+    with Bus("car", "supervisor", hub=True, runtime_dir=base) as hub:
+        listener = hub.subscriber("estimate")
+        config = zenoh.Config()
+        hub_socket = socket_path(runtime_dir_of("car", base), "hub")
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", json.dumps([f"unixsock-stream/{hub_socket}"]))
+        config.insert_json5("scouting/multicast/enabled", "false")
+        with zenoh.open(config) as rough:
+            for size in (66_000, 140_000, 3_000_000):
+                rough.put(key_of("car", "estimate"), bytes(size))
+        with zenoh.open(config) as rough:
+
+            def comes() -> bool:
+                rough.put(key_of("car", "estimate"), encode(estimate(3)))
+                return listener.recv(0.1) is not None
+
+            until(comes, "an estimate after the giants")
+        assert listener.malformed == 0
+
+
+def test_a_flood_of_mutants_reaches_no_planner(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """On the vehicle's own bus: among 3,000 mutated messages, what is handed out is valid."""
+    base, chance = tmp_path_factory.mktemp("run"), Chance(6)
+    good = encode(estimate(3))
+    with Bus("car", "optimize", hub=True, runtime_dir=base) as bus, Planner("car", base) as planner:
+        publisher = bus.publisher("estimate")
+        assert publisher.wait_matched(LIMIT_S)
+        rough = bus._session.declare_publisher(key_of("car", "estimate"))
+        for _ in range(3_000):
+            attachment = mutated(chance, good, good) if chance.random() < 0.5 else None
+            rough.put(mutated(chance, good, good), attachment=attachment)
+
+        def comes() -> bool:
+            publisher.put(estimate(77))
+            found = planner.wait(0.1)
+            assert found is None or encode(found)
+            return found is not None and found.frame_id == 77
+
+        until(comes, "an estimate after the flood")
+        assert planner._subscriber.malformed > 1_000
+        assert planner.latest(1e6).estimate is not None
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="acting as another user needs root")
+def test_another_user_does_not_reach_the_sockets(tmp_path_factory: pytest.TempPathFactory) -> None:
+    base = tmp_path_factory.mktemp("run")
+    for parent in (base, *base.parents):
+        if parent.stat().st_uid == os.getuid() and not parent.stat().st_mode & 0o001:
+            parent.chmod(parent.stat().st_mode | 0o011)
+    with Bus("car", "supervisor", hub=True, runtime_dir=base):
+        attempt = (
+            "import os, socket, sys; os.setgroups([]); os.setgid(65534); os.setuid(65534); "
+            "socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", attempt, str(socket_path(base / "car", "hub"))],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert "PermissionError" in done.stderr
