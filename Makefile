@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA := $(or $(BIRDSLAM_DATA),../shared/data)
 MODELS := $(or $(BIRDSLAM_MODELS),../shared/models)
 
-.PHONY: setup test test-slow lint demo clean
+.PHONY: setup test test-slow fuzz faults onroad perf lint demo clean
 
 setup: $(VENV)/.ready
 
@@ -18,10 +18,27 @@ $(VENV)/.ready: pyproject.toml
 	@touch $@
 
 test: setup
-	$(BIN)/python -m pytest -m 'not slow'
+	$(BIN)/python -m pytest -m 'not slow and not faults and not onroad'
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow
+
+# A million mutated messages, references and files; FUZZ_SEED=N gives others.
+fuzz: setup
+	$(BIN)/python -m tests.fuzz --cases 1000000 --seed $(or $(FUZZ_SEED),6)
+
+# Every fault on a running vehicle; its table also as out/faults.md
+faults: setup
+	@mkdir -p out
+	$(BIN)/python -m perf.faults --models $(MODELS) --markdown out/faults.md
+
+# The budgets of the running system, on a machine that does nothing else
+onroad: setup
+	$(BIN)/python -m pytest -m onroad
+
+# What the system does on this machine: out/perf/report.md
+perf: setup
+	$(BIN)/python -m perf all --output out/perf
 
 lint: setup
 	$(BIN)/ruff check .

@@ -151,11 +151,17 @@ class FrontEnd:
             self.horizon.predict(dt_s, pitch_rad - last_rad, motion.ground, motion.pitch_sigma_rad)
 
     def _advance(self, motion: Motion) -> EgoEdge:
+        """CC, from the frame of the last one: a coasted frame has a pose of its own, which the next edge starts from.
+
+        So a long blindness is a chain of edges, none of which reaches back to a frame that the graph has let go.
+        """
+        last_frame, T_world_last = self._reckoning.frame, self._reckoning.T_world_ego
         self._reckoning.advance(motion)
+        chained = last_frame not in (-1, motion.from_frame)
         return EgoEdge(
-            from_frame=motion.from_frame,
+            from_frame=last_frame if chained else motion.from_frame,
             to_frame=motion.to_frame,
-            T_from_to=motion.T_prev_curr,
+            T_from_to=T_world_last.between(self._reckoning.T_world_ego) if chained else motion.T_prev_curr,
             cov=tuple(np.ravel(motion.cov).tolist()),
         )
 
@@ -197,6 +203,11 @@ class DeadReckoning:
         self.attitude = Attitude()
         self._from = (-1, self.T_world_ego, self.attitude)  # the frame that the last motion started from
         self._to = self._from
+
+    @property
+    def frame(self) -> int:
+        """The frame that `T_world_ego` is of; -1 before the first motion."""
+        return self._to[0]
 
     def advance(self, motion: Motion) -> None:
         """To `motion.to_frame`, from the pose of `motion.from_frame` where that was the last motion's start or end."""

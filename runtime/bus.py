@@ -36,7 +36,7 @@ from runtime.wire import MAX_TRACE_BYTES, Stage, Trace, WireError, decode, encod
 _URGENT_BATCHES = 16  # zenoh's largest
 _LEASE_MS = 1_000  # a stopped or unreachable peer is given up after this
 _RETRY = {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2}
-_MAX_ZENOH_BYTES = 1 << 20
+_MAX_ZENOH_BYTES = 1 << 17  # zenoh would put together 1 GiB; room for two of our largest messages
 _FILTER_BYTES = 65_000  # payload and attachment together; zenoh drops what is larger, so wire.py refuses it before
 _LOSSLESS_DEPTH = 4_096
 _LOSSLESS_PATIENCE_US = 60_000_000  # how long a blocked put may wait before zenoh gives the link up

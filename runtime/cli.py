@@ -8,11 +8,14 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+from runtime import localisation_options, tracking_options
+
 # One thread for BLAS and OpenMP in every process: DESIGN.md measured 100 times the latency with more on busy cores.
 # In `evaluate` too, which must compute as the nodes do.
-THREAD_LIMITS = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
-)
+ENVIRONMENT = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
+    "ORT_DISABLE_TELEMETRY": "1",  # onnxruntime's wheels come with it on
+}
 USER_ERROR_STATUS = 2  # of the program and of a node: what the user gave can't be used
 INTERRUPTED_STATUS = 130
 CLOSED_PIPE_STATUS = 141
@@ -23,7 +26,7 @@ USAGE_NOTE = "Sources: kitti:DIR, video:FILE, v4l2:/dev/videoN, rtsp://HOST/PATH
 def main(arguments: list[str] | None = None) -> int:
     """Entry point; gives the exit status."""
     options = _parser().parse_args(arguments)
-    os.environ.update(THREAD_LIMITS)
+    os.environ.update(ENVIRONMENT)
     try:
         from runtime import commands  # only now: numpy's libraries read the environment when they are loaded
 
@@ -58,6 +61,13 @@ def _parser() -> argparse.ArgumentParser:
     listen.add_argument("--timeout", metavar="S", type=float, help="end, with status 1, when none comes for so long")
     listen.set_defaults(command="listen")
 
+    doctor = commands.add_parser("doctor", help="check this machine: cores, permissions, memory, camera, models, clock")
+    doctor.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help="of the run to come")
+    doctor.add_argument("--source", metavar="URI", help="where frames will come from")
+    doctor.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
+    _add_pipeline_options(doctor)
+    doctor.set_defaults(command="doctor")
+
     evaluate = commands.add_parser("evaluate", help="compare with ground truth").add_subparsers(
         required=True, metavar="WHAT"
     )
@@ -68,6 +78,8 @@ def _parser() -> argparse.ArgumentParser:
         what.add_argument("--config", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
         _add_pipeline_options(what)
         what.set_defaults(command=command)
+    tracking_options.add_commands(evaluate)
+    localisation_options.add_command(evaluate)
     return parser
 
 

@@ -45,6 +45,7 @@ class Reading:
     on_time: bool
     valid: bool
     age_ms: float
+    left_ms: float | None = None  # of its latency budget when it was sent; negative: it is late
 
     @property
     def usable(self) -> bool:
@@ -71,7 +72,9 @@ class Planner:
             return Reading(None, alive, on_time=False, valid=False, age_ms=float("inf"))
         age_ms = (time.monotonic_ns() - estimate.t_capture_ns) / 1e6
         valid = estimate.valid and INVALIDATING.isdisjoint(estimate.status)
-        return Reading(estimate, alive, on_time=0.0 <= age_ms <= max_age_ms, valid=valid, age_ms=age_ms)
+        left_ns = newest.trace.left_ns if newest else None
+        left_ms = None if left_ns is None else left_ns / 1e6
+        return Reading(estimate, alive, 0.0 <= age_ms <= max_age_ms, valid, age_ms, left_ms)
 
     def wait(self, timeout_s: float | None = None) -> Estimate | None:
         """The next estimate, as soon as there is one; None where none came in time. Raises BusClosed once closed.

@@ -19,7 +19,7 @@ from birdslam.perception import ModelError
 from birdslam.results import ResultsError
 from birdslam.slam import BirdSLAM
 from birdslam.types import Estimate, MapUpdate, Measurements, Status
-from runtime import supervisor
+from runtime import doctor, evaluate_localisation, evaluate_tracking, supervisor
 from runtime.bus import BusError
 from runtime.cli import USER_ERROR_STATUS
 from runtime.client import Planner
@@ -44,8 +44,12 @@ def execute(options: argparse.Namespace) -> int:
     commands: dict[str, Callable[[argparse.Namespace], int]] = {
         "run": run,
         "listen": listen,
+        "doctor": examine,
         "evaluate odometry": evaluate_odometry,
         "evaluate car-ahead": evaluate_car_ahead,
+        "evaluate localisation": evaluate_vehicles,
+        "evaluate tracking": evaluate_benchmark,
+        "evaluate ablation": evaluate_benchmark,
     }
     try:
         return commands[options.command](options)
@@ -80,6 +84,13 @@ def _number(text: str) -> float | str:
 def run(options: argparse.Namespace) -> int:
     """`birdslam run`: the three processes."""
     return supervisor.run(configuration_of(options))
+
+
+def examine(options: argparse.Namespace) -> int:
+    """`birdslam doctor`: a row for each check; 1 where one has failed."""
+    findings = list(doctor.examine(configuration_of(options)))
+    print(doctor.table(findings))
+    return int(any(finding.verdict == "failed" for finding in findings))
 
 
 def listen(options: argparse.Namespace) -> int:
@@ -167,6 +178,16 @@ def evaluate_car_ahead(options: argparse.Namespace) -> int:
     return 0
 
 
+def evaluate_benchmark(options: argparse.Namespace) -> int:
+    """`birdslam evaluate tracking` and `ablation`: the paper's tables on KITTI tracking."""
+    return evaluate_tracking.evaluate(options, configuration_of(options))
+
+
+def evaluate_vehicles(options: argparse.Namespace) -> int:
+    """`birdslam evaluate localisation`: vehicles' places against labels."""
+    return evaluate_localisation.evaluate(options, configuration_of(options))
+
+
 def _evaluate(options: argparse.Namespace) -> list[evaluation.OdometryReport]:
     configuration = configuration_of(options)
     source = configuration.source
@@ -194,6 +215,7 @@ def _odometry_table(reports: list[evaluation.OdometryReport]) -> str:
         ("scale error", "scale_error", 4),
         ("RPE m", "rpe_t_m", 4),
         ("RPE deg", "rpe_r_deg", 4),
+        ("standing m", "standing_drift_m", 3),
     )
     lines = [f"{'sequence':16}" + "".join(f"{title:>12}" for title, _, _ in columns)]
     for report in reports:

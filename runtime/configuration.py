@@ -38,6 +38,7 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     frames: PositiveInt | None = None  # end after so many; None: all
     loop: bool = False  # a recording begins anew at its end
     prefetch_frames: PositiveInt = 4  # decoded ahead of their time, so that a slow file is not a late frame
+    reopen_ms: Positive = 100.0  # between tries to open a camera that is gone; each is a frame without an image
     camera_timeout_s: Positive = 5.0  # a camera or stream that delivers nothing for so long has failed
 
 
@@ -72,8 +73,94 @@ class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     drain_timeout_s: Positive = 2.0  # for the last frame's estimate to come back before the end is announced
     stop_timeout_s: Positive = 10.0  # for all nodes to end
     beat_s: Positive = 0.1  # a node's loop shows life at least so often
-    watchdog_s: Positive = 10.0  # a ready node without a beat for so long has failed
+    watchdog_ms: Annotated[float, msgspec.Meta(ge=200.0)] = 2000.0  # a ready node without a beat for so long is stalled
+    term_grace_ms: Positive = 200.0  # between a stalled node's SIGTERM and its SIGKILL
     switch_interval_s: Positive = 5e-4  # of the GIL, for the threads that wait beside a busy one
+    # A node that died or stalled is begun anew; None: "always", but "never" at rate "max", which may lose no frame
+    restart: Literal["always", "never"] | None = None
+    restarts_max: PositiveInt = 5  # of one node within the window: one more ends the run
+    restart_window_s: Positive = 60.0
+    restart_backoff_ms: Positive = 100.0  # before the second restart within the window; then twice as long each time
+    restart_backoff_max_ms: Positive = 2000.0
+    stale_ms: Positive = 500.0  # a node that has received nothing for so long says so in its health
+    spares: bool = True  # a process of each node stands by, loaded and warm, for the next restart
+
+
+class BudgetsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How long each node, each hop and the whole may take, from a frame's capture on, at `percentile` of the frames.
+
+    Raises ValueError where the parts exceed the whole.
+    """
+
+    percentile: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)] = 99.0
+    capture_ms: Positive = 10.0
+    capture_to_perceive_ms: Positive = 10.0
+    perceive_ms: Positive = 100.0
+    perceive_to_optimize_ms: Positive = 10.0
+    optimize_ms: Positive = 10.0
+    optimize_to_planner_ms: Positive = 10.0
+    end_to_end_ms: Positive = 150.0
+
+    def __post_init__(self) -> None:
+        parts = [name for name in self.__struct_fields__ if name not in ("percentile", "end_to_end_ms")]
+        total_ms = sum(getattr(self, name) for name in parts)
+        if total_ms > self.end_to_end_ms:
+            raise ValueError(f"{' + '.join(parts)} = {total_ms:g} is over end_to_end_ms = {self.end_to_end_ms:g}")
+
+    def step_ms(self, node: str) -> float:
+        """What one node may take for a frame."""
+        limit_ms: float = getattr(self, f"{node}_ms")
+        return limit_ms
+
+    def hop_ms(self, node: str) -> float | None:
+        """What a record may take on its way to a node; None for capture, to which none comes."""
+        hops = {"perceive": self.capture_to_perceive_ms, "optimize": self.perceive_to_optimize_ms}
+        return hops.get(node)
+
+    @property
+    def perceived_ms(self) -> float:
+        """The age by which perceive must have sent its measurements."""
+        return self.capture_ms + self.capture_to_perceive_ms + self.perceive_ms
+
+    @property
+    def received_ms(self) -> float:
+        """The age by which a frame must have come to perceive."""
+        return self.capture_ms + self.capture_to_perceive_ms
+
+
+class DegradationConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """When perceive does less, to keep its budget, and when it does more again (runtime/degradation.py)."""
+
+    enabled: bool = True  # never at rate "max"
+    window_frames: PositiveInt = 10  # judged together
+    late_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5  # so many of them late: one mode less
+    calm_frames: PositiveInt = 50  # in a row within `calm_share` of the budget: one mode more
+    calm_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.7
+    rate_divisor: PositiveInt = 3  # in mode "rate" the networks run on every so-manieth frame at the most
+    coast_divisor: PositiveInt = 3  # in mode "coasting" every so-manieth frame is looked at
+    coast_max_ms: Positive = 500.0  # of source time without a look: what comes then is invalid
+
+
+class NodeScheduling(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Of one node."""
+
+    priority: Annotated[int, msgspec.Meta(ge=1, le=98)] = 10  # under SCHED_FIFO
+    cpus: tuple[Annotated[int, msgspec.Meta(ge=0)], ...] = ()  # the cores it may run on; none: all
+
+
+class RealtimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The scheduling of the nodes, where the system permits it (runtime/realtime.py); a line in the log where not."""
+
+    fifo: Literal["auto", "on", "off"] = "auto"  # SCHED_FIFO; "auto": with a live camera
+    lock_memory: Literal["auto", "on", "off"] = "auto"  # nothing is paged out; "auto": with a live camera
+    capture: NodeScheduling = NodeScheduling(priority=30)
+    perceive: NodeScheduling = NodeScheduling(priority=10)
+    optimize: NodeScheduling = NodeScheduling(priority=20)
+
+    def of(self, node: str) -> NodeScheduling:
+        """The scheduling of one node."""
+        scheduling: NodeScheduling = getattr(self, node)
+        return scheduling
 
 
 class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -86,12 +173,31 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     perceive: PerceiveConfig = PerceiveConfig()
     slam: SlamConfig = SlamConfig()
     runtime: RuntimeConfig = RuntimeConfig()
+    budgets: BudgetsConfig = BudgetsConfig()
+    degradation: DegradationConfig = DegradationConfig()
+    realtime: RealtimeConfig = RealtimeConfig()
     output: str = "out"
 
     @property
     def lossless(self) -> bool:
         """Every frame is processed, as fast as it can be."""
         return self.source.rate == "max"
+
+    @property
+    def restarts(self) -> bool:
+        """Whether a node that died is begun anew."""
+        restart = self.runtime.restart
+        return not self.lossless if restart is None else restart == "always"
+
+    @property
+    def live(self) -> bool:
+        """Frames come from a camera, not from a file."""
+        return self.source.uri.partition(":")[0] not in FILE_SCHEMES
+
+    @property
+    def spares(self) -> bool:
+        """Whether processes stand by."""
+        return self.runtime.spares and self.restarts
 
     @property
     def runtime_dir(self) -> Path | None:
@@ -124,10 +230,16 @@ def load(path: Path | None, overrides: Mapping[str, Any] | None = None) -> Confi
         _put(tree, key, value)
     _read_camera_file(tree)
     try:
-        return msgspec.convert(tree, Configuration)
+        configuration = msgspec.convert(tree, Configuration)
     except msgspec.ValidationError as error:
         key, reason = _explain(str(error))
         raise ConfigurationError(f"{_origin(key, path, overrides)}: {key}: {reason}") from error
+    key, deadline_ms = "perceive.deadline_ms", configuration.perceive.deadline_ms
+    if deadline_ms is not None and deadline_ms > configuration.budgets.perceived_ms:
+        limit = "budgets.capture_ms + capture_to_perceive_ms + perceive_ms"
+        reason = f"{deadline_ms:g} is over {limit} = {configuration.budgets.perceived_ms:g}"
+        raise ConfigurationError(f"{_origin(key, path, overrides)}: {key}: {reason}")
+    return configuration
 
 
 def complete(configuration: Configuration, camera: Camera, rate_hz: float) -> Configuration:
@@ -135,7 +247,8 @@ def complete(configuration: Configuration, camera: Camera, rate_hz: float) -> Co
     rate, perceive = configuration.source.rate, configuration.perceive
     if perceive.deadline_ms is None:
         hz = rate if isinstance(rate, float) else rate_hz
-        perceive = msgspec.structs.replace(perceive, deadline_ms=perceive.deadline_periods * 1e3 / hz)
+        deadline_ms = min(perceive.deadline_periods * 1e3 / hz, configuration.budgets.perceived_ms)
+        perceive = msgspec.structs.replace(perceive, deadline_ms=deadline_ms)
     return msgspec.structs.replace(configuration, camera=camera, perceive=perceive)
 
 

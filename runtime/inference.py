@@ -5,14 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Self
 
 from birdslam.frontend import Pending
-from birdslam.perception import Networks, Perception, load_network
+from birdslam.perception import Networks, Perception, Ready, load_network
+from birdslam.perception.manifest import Role
 from birdslam.types import Frame
 from runtime.configuration import Configuration
+from runtime.degradation import Mode
 
 Run = Callable[..., Any]
 
@@ -29,6 +31,8 @@ class Inference:
         heads = [load_network(role, spec) for role, spec in configuration.models.given().items()]
         self._deadline_ns = configuration.deadline_ns
         self._awaited: frozenset[Run] = frozenset(head.run for head in heads if head.schedule.awaited)
+        self._rate_divisor = configuration.degradation.rate_divisor
+        self._ran_frame = -self._rate_divisor  # the last frame that networks were offered
         self._started: list[Future[Any]] = []  # for the frame at hand, and awaited
         self._threads = ThreadPoolExecutor(max(1, len(heads)), thread_name_prefix="network")
         self.networks = Networks(heads, self._submit, None if self._deadline_ns is None else 0.0)
@@ -39,10 +43,27 @@ class Inference:
             self._started.append(future)
         return future
 
-    def start(self, frame: Frame) -> Pending:
-        """Starts the networks that are due on a frame."""
+    @property
+    def roles(self) -> frozenset[str]:
+        """Those that a network fills."""
+        return frozenset(head.role for head in self.networks.heads)
+
+    def start(self, frame: Frame, mode: Mode = Mode.FULL) -> Pending:
+        """Starts the networks that are due on a frame, and that the mode allows."""
         self._started = []
-        pending = self.networks.start(frame.frame_id, frame.image)
+        if mode in (Mode.ODOMETRY, Mode.COASTING):
+            return Ready(Perception())
+        image = frame.image
+        only: tuple[Role, ...] | None = None
+        if mode is Mode.RATE and frame.frame_id - self._ran_frame < self._rate_divisor:
+            image = None
+        elif mode is Mode.BOXES:
+            only = ("detector",)
+        pending = self.networks.start(frame.frame_id, image, only)
+        if image is not None:
+            self._ran_frame = frame.frame_id
+        if mode is Mode.BOXES:
+            pending = _BoxesOnly(pending)
         if self._deadline_ns is None:
             return pending
         return _UntilDeadline(pending, self._started, frame.t_capture_ns + self._deadline_ns)
@@ -58,6 +79,18 @@ class Inference:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+@dataclass(frozen=True)
+class _BoxesOnly:
+    """A pending perception whose road and lanes are too old to be used."""
+
+    pending: Pending
+
+    def result(self) -> Perception:
+        perception = self.pending.result()
+        ages = {name: age for name, age in perception.ages.items() if name != "segmenter"}
+        return replace(perception, segmentation=None, ages=ages)
 
 
 @dataclass(frozen=True)

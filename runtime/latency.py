@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from runtime.wire import Trace
+from runtime.wire import Spread, Trace
 
 _LOWEST_MS = 1e-3
 _BINS_PER_FACTOR = 100  # within one factor e: a percentile is exact to 1 %
@@ -28,6 +28,13 @@ class Distribution:
         self.count += 1
         self.max_ms = max(self.max_ms, ms)
 
+    def joined(self, other: Distribution) -> Distribution:
+        """Both together, anew."""
+        out = Distribution()
+        out.count, out.max_ms = self.count + other.count, max(self.max_ms, other.max_ms)
+        out._bins = self._bins + other._bins
+        return out
+
     def percentile(self, percent: float) -> float:
         """In ms; NaN where nothing was added."""
         if not self.count:
@@ -42,6 +49,33 @@ class Distribution:
             return {}
         figures = {"p50": self.percentile(50.0), "p99": self.percentile(99.0), "max": self.max_ms}
         return {name: round(value, 3) for name, value in figures.items()}
+
+
+class Recent:
+    """The distribution of the last `span_s` to twice that; of fixed size too."""
+
+    def __init__(self, span_s: float = 5.0) -> None:
+        self._span_ns = round(span_s * 1e9)
+        self._older, self._newer = Distribution(), Distribution()
+        self._turn_ns = 0
+
+    def add(self, ms: float, now_ns: int) -> None:
+        self._turn(now_ns)
+        self._newer.add(ms)
+
+    def _turn(self, now_ns: int) -> None:
+        if now_ns - self._turn_ns > self._span_ns:
+            late = now_ns - self._turn_ns > 2 * self._span_ns
+            self._older, self._newer = Distribution() if late else self._newer, Distribution()
+            self._turn_ns = now_ns
+
+    def spread(self, now_ns: int) -> Spread:
+        """What there was of late."""
+        self._turn(now_ns)
+        both = self._older.joined(self._newer)
+        if not both.count:
+            return Spread()
+        return Spread(both.percentile(50.0), both.percentile(95.0), both.percentile(99.0), both.max_ms)
 
 
 def stages(trace: Trace, t_received_ns: int) -> Iterator[tuple[str, float]]:

@@ -6,7 +6,8 @@ import os
 import threading
 import time
 from collections import Counter, deque
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
 
 from birdslam.types import Estimate, MapUpdate, Status
 from runtime.bus import Bus, BusClosed, Message
@@ -15,6 +16,9 @@ from runtime.latency import Distribution, stages
 QUEUE_FRAMES = 1024  # a disk that stalls for half a minute costs no row
 MAP_WAIT_S = 2.0  # for the last of the map, which optimize sends before the end
 RECENT_FRAMES = 32
+
+
+_Record = TypeVar("_Record", Estimate, MapUpdate)
 
 
 class Results(Protocol):
@@ -27,13 +31,16 @@ class Results(Protocol):
 class Logbook:
     """Listens in a thread of its own from construction on; stands at a planner's place, so its ages are a planner's.
 
-    `event_fd` becomes readable when END_OF_SOURCE came back (`ended`), or recording failed (`error`).
+    `event_fd` becomes readable when END_OF_SOURCE came back (`ended`), or recording failed (`error`). A `tolerant` one
+    goes on without recording where the disk fails it (`unwritten` says why): the vehicle drives on.
     """
 
-    def __init__(self, bus: Bus, results: Results) -> None:
+    def __init__(self, bus: Bus, results: Results, tolerant: bool = False) -> None:
         self.event_fd = os.eventfd(0)
         self.ended = False
         self.error: Exception | None = None
+        self.unwritten: OSError | None = None
+        self._tolerant = tolerant
         self.recorded = 0
         self.age = Distribution()
         self.stages: dict[str, Distribution] = {}
@@ -68,7 +75,7 @@ class Logbook:
             self._take_map(until_frame=estimate.frame_id)
             self.ended = True
             return
-        self._results.add(estimate)
+        self._write(self._results.add, estimate)
         self._take_map()
         age_ms = (message.t_received_ns - estimate.t_capture_ns) / 1e6
         self.age.add(age_ms)
@@ -81,6 +88,16 @@ class Logbook:
         self._latest = estimate
         self.recorded += 1
 
+    def _write(self, add: Callable[[_Record], None], record: _Record) -> None:
+        if self.unwritten is not None:
+            return
+        try:
+            add(record)
+        except OSError as error:
+            if not self._tolerant:
+                raise
+            self.unwritten = error
+
     def _take_map(self, until_frame: int | None = None) -> None:
         """What has arrived of the map; with `until_frame`, all up to the update of that frame."""
         until_s = time.monotonic() + (MAP_WAIT_S if until_frame is not None else 0.0)
@@ -88,7 +105,7 @@ class Logbook:
             message = self._map.recv(max(0.0, until_s - time.monotonic()))
             if message is None:
                 return
-            self._results.add_map(message.record)
+            self._write(self._results.add_map, message.record)
             self._map_frame = message.record.frame_id
 
     @property

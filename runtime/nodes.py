@@ -6,33 +6,41 @@ sends each as soon as it is there). It has `ended` once END_OF_SOURCE went throu
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import cv2
 import msgspec
 
-from birdslam.camera import Camera, Undistorter
-from birdslam.datasets import RecordedFrame
+from birdslam.camera import Camera
 from birdslam.frontend import FrontEnd
 from birdslam.graph import PoseGraph
 from birdslam.se2 import SE2
 from birdslam.types import Estimate, Frame, FrameRef, MapUpdate, Measurements, Status
 from runtime.bus import Bus, Message
+from runtime.capture import CaptureNode, stamps
 from runtime.configuration import Configuration, ConfigurationError
-from runtime.frames import FrameReader, FrameRing
+from runtime.degradation import STATUS, Degradation, Mode
+from runtime.frames import FrameReader
 from runtime.inference import Inference
-from runtime.presence import ring_path
-from runtime.sources import EndOfSource, Pacer, ReadAhead, SourceError, open_source, to_frame
-from runtime.wire import Trace
+from runtime.presence import ring_path, runtime_dir_of
+from runtime.restarts import FIRST, Assignment, EpochFile
+
+STALE_BUDGETS = 3.0  # a frame that comes to perceive this many times later than budgeted bears INPUT_STALE
+
+log = logging.getLogger(__name__)
 
 
 class Node(Protocol):
     """What the runner drives."""
 
     ended: bool
+
+    @property
+    def mode(self) -> str:
+        """For its health."""
 
     def receive(self, timeout_s: float) -> Message | None: ...
 
@@ -54,160 +62,33 @@ def calibrated(configuration: Configuration) -> Camera:
     return configuration.camera
 
 
-@dataclass(frozen=True)
-class Captured:
-    """A frame of the source at its time, not yet undistorted."""
-
-    frame_id: int
-    recorded: RecordedFrame
-    t_capture_ns: int
-
-
-class CaptureNode:
-    """camera -> FrameRef: paces, stamps and undistorts frames, and lays their pixels into the ring."""
-
-    def __init__(self, configuration: Configuration, bus: Bus, wait: Callable[[float], object]) -> None:
-        self.ended = False
-        self._config = configuration
-        self._wait = wait
-        self._source = open_source(configuration)
-        camera = self._source.camera
-        self._undistort = Undistorter(camera)
-        path = ring_path(configuration.vehicle, configuration.runtime_dir)
-        self._ring = FrameRing(path, camera.height_px, camera.width_px, slots=configuration.runtime.ring_slots)
-        self._pacer = Pacer(configuration.source.rate)
-        self._estimates = bus.subscriber("estimate")
-        self._reader: ReadAhead | None = None
-        self._next: tuple[int, RecordedFrame] | None = None
-        self._quiet_since_s = 0.0
-        self._sent = 0  # frame_id of the next frame to send
-        self._returned = -1  # frame_id of the newest estimate that came back
-        self._t_source_ns = 0
-        self._over_since_s: float | None = None
-        self._end_sent = False
-
-    def receive(self, timeout_s: float) -> Message | None:
-        """The next frame when it is due; at rate "max" when few enough are in flight; END_OF_SOURCE at the end."""
-        until_s = time.monotonic() + timeout_s
-        if self._reader is None:
-            self._reader = ReadAhead(self._source, 1 if self._source.live else self._config.source.prefetch_frames)
-            self._quiet_since_s = time.monotonic()
-        while self._must_wait():
-            back = self._estimates.recv(max(0.0, until_s - time.monotonic()))
-            if back is None:
-                return None
-            self._returned = back.record.frame_id
-            if Status.END_OF_SOURCE in back.record.status:  # all pixels are read: the ring may go
-                self.ended = True
-                return None
-        if self._over_since_s is not None:
-            return self._end()
-        try:
-            self._next = self._next or self._reader.next(max(0.0, until_s - time.monotonic()))
-        except EndOfSource:
-            self.drain()
-            return None
-        if self._next is None:
-            self._check_camera()
-            return None
-        frame_id, recorded = self._next
-        t_capture_ns = self._due(frame_id, recorded, until_s)
-        if t_capture_ns is None:
-            return None
-        self._next = None
-        self._quiet_since_s = time.monotonic()
-        return Message(Captured(frame_id, recorded, t_capture_ns), Trace(), t_capture_ns)
-
-    def _must_wait(self) -> bool:
-        """For an estimate to come back: all at the end, so that END_OF_SOURCE pushes no frame out of a queue of one."""
-        runtime, in_flight = self._config.runtime, self._sent - 1 - self._returned
-        if self._end_sent:
-            return True
-        if self._over_since_s is not None:
-            return in_flight > 0 and time.monotonic() - self._over_since_s < runtime.drain_timeout_s
-        return self._config.lossless and in_flight >= runtime.in_flight_frames
-
-    def _due(self, frame_id: int, recorded: RecordedFrame, until_s: float) -> int | None:
-        """When the frame is captured; None where that is after `until_s`."""
-        if self._source.live:
-            return recorded.t_source_ns
-        now_ns = time.monotonic_ns()
-        due_ns = self._pacer.due_ns(frame_id, recorded.t_source_ns, now_ns)
-        if due_ns > now_ns:
-            self._wait(max(0.0, min((due_ns - now_ns) / 1e9, until_s - time.monotonic())))
-            now_ns = time.monotonic_ns()
-        return now_ns if now_ns >= due_ns else None
-
-    def _check_camera(self) -> None:
-        limit_s = self._config.source.camera_timeout_s
-        if self._source.live and time.monotonic() - self._quiet_since_s > limit_s:
-            raise SourceError(f"{self._source.name}: has delivered no frame for {limit_s:g} s")
-
-    def step(self, captured: Captured | FrameRef) -> Iterator[FrameRef]:
-        if isinstance(captured, FrameRef):
-            self._end_sent = True
-            yield captured
-            return
-        t_capture_ns = captured.t_capture_ns
-        frame = to_frame(self._undistort, captured.frame_id, captured.recorded, t_capture_ns, _utc_ns(t_capture_ns))
-        self._sent = frame.frame_id + 1
-        self._t_source_ns = frame.t_source_ns
-        yield self._reference(frame)
-
-    def _reference(self, frame: Frame) -> FrameRef:
-        dropped = self.counters()["dropped"]
-        if frame.image is None:
-            return FrameRef(**_stamps(frame), status=frame.status, dropped=dropped)
-        slot, sequence = self._ring.write(frame.image)
-        height_px, width_px = frame.image.shape[:2]
-        return FrameRef(
-            **_stamps(frame),
-            slot=slot,
-            sequence=sequence,
-            ring_epoch=self._ring.epoch,
-            width_px=width_px,
-            height_px=height_px,
-            channels=1 if frame.image.ndim == 2 else frame.image.shape[2],
-            dropped=dropped,
-            status=frame.status,
-        )
-
-    def _end(self) -> Message:
-        now_ns = time.monotonic_ns()
-        end = FrameRef(
-            frame_id=self._sent,
-            t_source_ns=self._t_source_ns,
-            t_capture_ns=now_ns,
-            t_utc_ns=_utc_ns(now_ns),
-            dropped=self.counters()["dropped"],
-            status=(Status.END_OF_SOURCE,),
-        )
-        return Message(end, Trace(), now_ns)
-
-    def drain(self) -> None:
-        if self._over_since_s is None:
-            self._over_since_s = time.monotonic()
-
-    def counters(self) -> dict[str, int]:
-        return {"dropped": self._reader.dropped if self._reader else 0}
-
-    def close(self) -> None:
-        if self._reader is not None:
-            self._reader.close()
-        self._ring.close()
-
-
 class PerceiveNode:
     """FrameRef -> Measurements: the networks and the front end."""
 
-    def __init__(self, configuration: Configuration, bus: Bus, wait: Callable[[float], object]) -> None:
+    def __init__(
+        self, configuration: Configuration, inference: Inference, frontend: FrontEnd, bus: Bus, assignment: Assignment
+    ) -> None:
         self.ended = False
-        cv2.setNumThreads(configuration.perceive.opencv_threads)
         self._frames = bus.subscriber("frame")
         self._ring = FrameReader(ring_path(configuration.vehicle, configuration.runtime_dir))
-        self._inference = Inference(configuration)
-        self._frontend = FrontEnd(calibrated(configuration), configuration.slam.frontend)
+        self._inference = inference
+        self._frontend = frontend
         self._torn = 0
+        self._degradation: Degradation | None = None
+        if configuration.degradation.enabled and not configuration.lossless:
+            budget_ms = configuration.budgets.perceived_ms
+            self._degradation = Degradation(configuration.degradation, inference.roles, budget_ms)
+        self._coast_divisor = configuration.degradation.coast_divisor
+        self._coast_max_ns = round(configuration.degradation.coast_max_ms * 1e6)
+        self._stale_ns = round(configuration.budgets.received_ms * STALE_BUDGETS * 1e6)
+        self._looked_frame, self._looked_ns = (
+            -1,
+            0,
+        )  # the last frame with pixels that was looked at, and its source time
+
+    @property
+    def mode(self) -> str:
+        return Mode.FULL if self._degradation is None else self._degradation.mode
 
     def receive(self, timeout_s: float) -> Message | None:
         return self._frames.recv(timeout_s)
@@ -215,7 +96,7 @@ class PerceiveNode:
     def step(self, ref: FrameRef) -> Iterator[Measurements]:
         if Status.END_OF_SOURCE in ref.status:
             self.ended = True
-            yield Measurements(**_stamps(ref), status=ref.status)
+            yield Measurements(**stamps(ref), status=ref.status)
             return
         image = None
         if ref.slot >= 0:
@@ -224,7 +105,31 @@ class PerceiveNode:
                 self._torn += 1
                 return
         frame = Frame(ref.frame_id, ref.t_source_ns, ref.t_capture_ns, ref.t_utc_ns, image, ref.status)
-        yield self._frontend.step(frame, self._inference.start(frame))
+        if self._degradation is None:
+            yield self._frontend.step(frame, self._inference.start(frame))
+            return
+        mode = self._degradation.mode
+        yield self._coast(ref) if self._coasts(ref, mode) else self._look(frame, mode)
+        age_ms = (time.monotonic_ns() - ref.t_capture_ns) / 1e6
+        if self._degradation.judge(age_ms):
+            log.warning("frame %d: mode %s after %s", ref.frame_id, self._degradation.mode, mode)
+
+    def _look(self, frame: Frame, mode: Mode) -> Measurements:
+        stale = time.monotonic_ns() - frame.t_capture_ns > self._stale_ns
+        if frame.image is not None:
+            self._looked_frame, self._looked_ns = frame.frame_id, frame.t_source_ns
+        measurements = self._frontend.step(frame, self._inference.start(frame, mode))
+        status = (*measurements.status, *STATUS[mode], *((Status.INPUT_STALE,) if stale else ()))
+        return msgspec.structs.replace(measurements, status=tuple(dict.fromkeys(status)))
+
+    def _coasts(self, ref: FrameRef, mode: Mode) -> bool:
+        """Whether there is no time to look at this frame."""
+        return mode is Mode.COASTING and ref.slot >= 0 and ref.frame_id - self._looked_frame < self._coast_divisor
+
+    def _coast(self, ref: FrameRef) -> Measurements:
+        too_long = ref.t_source_ns - self._looked_ns > self._coast_max_ns
+        status = (*ref.status, Status.COASTING, *((Status.COASTED_TOO_LONG,) if too_long else ()))
+        return Measurements(**stamps(ref), status=status)
 
     def drain(self) -> None:
         """Ends with END_OF_SOURCE, as ever."""
@@ -240,10 +145,17 @@ class PerceiveNode:
 class OptimizeNode:
     """Measurements -> Estimate, MapUpdate: the pose graph."""
 
-    def __init__(self, configuration: Configuration, bus: Bus, wait: Callable[[float], object]) -> None:
+    mode: str = Mode.FULL
+
+    def __init__(self, configuration: Configuration, bus: Bus, assignment: Assignment = FIRST) -> None:
         self.ended = False
         self._measurements = bus.subscriber("measurements")
-        self._graph = PoseGraph(configuration.slam.graph, configuration.slam.weights)
+        self._epochs: EpochFile | None = None
+        if not configuration.lossless:  # a run at rate "max" gives the same bytes each time
+            self._epochs = EpochFile(runtime_dir_of(configuration.vehicle, configuration.runtime_dir) / "epoch")
+        epoch = 0 if self._epochs is None else self._epochs.last + 1
+        self._graph = PoseGraph(configuration.slam.graph, configuration.slam.weights, epoch)
+        self._first_status = (Status.GRAPH_RESET,) if epoch else ()  # planners may know an older world
         self._last: Estimate | None = None
 
     def receive(self, timeout_s: float) -> Message | None:
@@ -254,19 +166,25 @@ class OptimizeNode:
             self.ended = True
             yield from self._end(measurements)
             return
-        self._last = self._graph.update(measurements)
-        yield self._last
+        estimate = self._graph.update(measurements)
+        if self._last is None and self._first_status:
+            status = tuple(dict.fromkeys((*estimate.status, *self._first_status)))
+            estimate = msgspec.structs.replace(estimate, status=status)
+        self._last = estimate
+        if self._epochs is not None:
+            self._epochs.store(estimate.epoch)
+        yield estimate
         gained = self._graph.map_update()
         if gained is not None:
             yield gained
 
     def _end(self, measurements: Measurements) -> Iterator[Estimate | MapUpdate]:
         """The map is complete before the estimate that ends the run; its update bears the number of the end."""
-        epoch = self._last.epoch if self._last else 0
+        epoch = self._graph.epoch
         gained = self._graph.map_update() or MapUpdate(epoch=epoch, frame_id=measurements.frame_id)
         yield msgspec.structs.replace(gained, frame_id=measurements.frame_id)
         yield Estimate(
-            **_stamps(measurements),
+            **stamps(measurements),
             epoch=epoch,
             T_world_ego=self._last.T_world_ego if self._last else SE2(),
             cov=self._last.cov if self._last else (0.0,) * 9,
@@ -284,21 +202,13 @@ class OptimizeNode:
         """Holds nothing open."""
 
 
-NODE_TYPES: dict[str, Callable[[Configuration, Bus, Callable[[float], object]], Node]] = {
-    "capture": CaptureNode,
-    "perceive": PerceiveNode,
-    "optimize": OptimizeNode,
-}
-
-
-def _utc_ns(t_monotonic_ns: int) -> int:
-    return time.time_ns() - (time.monotonic_ns() - t_monotonic_ns)
-
-
-def _stamps(record: Frame | FrameRef | Measurements) -> dict[str, Any]:
-    return {
-        "frame_id": record.frame_id,
-        "t_source_ns": record.t_source_ns,
-        "t_capture_ns": record.t_capture_ns,
-        "t_utc_ns": record.t_utc_ns,
-    }
+def prepare(name: str, configuration: Configuration) -> Callable[[Bus, Callable[[float], object], Assignment], Node]:
+    """Does what takes long and what several processes may do at once; the result makes the node without delay."""
+    if name == "perceive":
+        cv2.setNumThreads(configuration.perceive.opencv_threads)
+        inference = Inference(configuration)
+        frontend = FrontEnd(calibrated(configuration), configuration.slam.frontend)
+        return lambda bus, wait, assignment: PerceiveNode(configuration, inference, frontend, bus, assignment)
+    if name == "optimize":
+        return lambda bus, wait, assignment: OptimizeNode(configuration, bus, assignment)
+    return lambda bus, wait, assignment: CaptureNode(configuration, bus, wait, assignment)

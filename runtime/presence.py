@@ -91,12 +91,17 @@ class VehicleLock:
             raise VehicleBusy(f"vehicle {vehicle!r} already runs: process {holder}, lock file {self.path}") from error
         os.ftruncate(self._fd, 0)
         os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
-        _remove_dead_sockets(directory)
-        ring_path(vehicle, runtime_dir).unlink(missing_ok=True)
+        self._directory, self._ring = directory, ring_path(vehicle, runtime_dir)
+        self._clean()
+
+    def _clean(self) -> None:
+        _remove_dead_sockets(self._directory)
+        self._ring.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Frees the name; a second call does nothing."""
+        """Removes what nodes that had to be killed left behind, and frees the name; a second call does nothing."""
         if self._fd >= 0:
+            self._clean()
             os.ftruncate(self._fd, 0)
             os.close(self._fd)
             self._fd = -1
@@ -117,5 +122,14 @@ def _remove_dead_sockets(directory: Path) -> None:
             try:
                 probe.connect(os.fsencode(path))
             except (ConnectionRefusedError, FileNotFoundError):
-                path.unlink(missing_ok=True)
-                path.with_name(path.name + ".lock").unlink(missing_ok=True)
+                _remove_socket(path)
+
+
+def remove_socket(directory: Path, name: str) -> None:
+    """Removes the socket of a process that is known to be dead."""
+    _remove_socket(socket_path(directory, name))
+
+
+def _remove_socket(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.with_name(path.name + ".lock").unlink(missing_ok=True)

@@ -11,36 +11,78 @@ from pathlib import Path
 
 import msgspec
 
-from runtime.cli import THREAD_LIMITS, USER_ERROR_STATUS
+from runtime.cli import ENVIRONMENT, USER_ERROR_STATUS
 from runtime.configuration import Configuration
+from runtime.restarts import Assignment
 from runtime.vitals import Vitals
 
 _SHOWN_LEVELS = (" WARNING ", " ERROR ", " CRITICAL ")
 
 
-class NodeProcess:
-    """One node, started at once. Its standard output and error go to `logs/<node>.log` in the output folder."""
+class NodeLog:
+    """`logs/<node>.log`: what all processes of a node print, one after the other."""
 
-    def __init__(self, name: str, configuration: Configuration, directory: Path) -> None:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._read = 0
+        path.write_bytes(b"")
+
+    def new_warnings(self) -> list[str]:
+        """Lines that were logged as warnings or worse since the last call."""
+        with self.path.open("rb") as log:
+            log.seek(self._read)
+            whole, newline, _ = log.read().rpartition(b"\n")
+        self._read += len(whole) + len(newline)
+        lines = whole.decode(errors="replace").splitlines()
+        return [_message(line) for line in lines if any(level in line for level in _SHOWN_LEVELS)]
+
+    def size(self) -> int:
+        """In bytes, now."""
+        return self.path.stat().st_size
+
+    def lines(self, start: int) -> list[str]:
+        """The lines from byte `start` on, without empty ones."""
+        with self.path.open("rb") as log:
+            log.seek(start)
+            return [line for line in log.read().decode(errors="replace").splitlines() if line.strip()]
+
+
+class NodeProcess:
+    """One process of a node: it loads what it needs at once, and waits for `begin`."""
+
+    def __init__(self, name: str, configuration: Configuration, log: NodeLog) -> None:
         self.name = name
         self.vitals = Vitals()
-        self.log_path = directory / f"{name}.log"
-        self._log_read = 0
-        with self.log_path.open("wb") as log:
+        self.begun_s: float | None = None
+        self._log, self._log_start = log, log.size()
+        with log.path.open("ab") as output:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "runtime.runner", name, str(self.vitals.fd), str(os.getpid())],
                 stdin=subprocess.PIPE,
-                stdout=log,
+                stdout=output,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, **THREAD_LIMITS},
+                env={**os.environ, **ENVIRONMENT},
                 pass_fds=(self.vitals.fd,),
                 start_new_session=True,  # Ctrl-C at the terminal goes to the supervisor alone, which relays it
             )
         self.pidfd = os.pidfd_open(self._process.pid)
+        self._tell(configuration)
+
+    def begin(self, assignment: Assignment) -> None:
+        """Its work begins, with nothing more to be told."""
+        self.begun_s = time.monotonic()
+        self._tell(assignment)
         assert self._process.stdin is not None
         try:
-            with self._process.stdin as stdin:
-                stdin.write(msgspec.json.encode(configuration))
+            self._process.stdin.close()
+        except BrokenPipeError:
+            return  # it died at once: its pidfd says so
+
+    def _tell(self, what: msgspec.Struct) -> None:
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(msgspec.json.encode(what) + b"\n")
+            self._process.stdin.flush()
         except BrokenPipeError:
             return  # it died at once: its pidfd says so
 
@@ -67,33 +109,28 @@ class NodeProcess:
         if self.exit_status is None:
             self._process.send_signal(number)
 
-    def new_warnings(self) -> list[str]:
-        """Lines that it has logged as warnings or worse since the last call."""
-        with self.log_path.open("rb") as log:
-            log.seek(self._log_read)
-            whole, newline, _ = log.read().rpartition(b"\n")
-        self._log_read += len(whole) + len(newline)
-        lines = whole.decode(errors="replace").splitlines()
-        return [_message(line) for line in lines if any(level in line for level in _SHOWN_LEVELS)]
+    def how(self) -> str:
+        """How it ended."""
+        status = self.exit_status
+        if status is not None and status < 0:
+            return f"was killed by {signal.Signals(-status).name}"
+        return f"failed with exit status {status}" if status else "ended before its source did"
 
     def failure(self) -> str:
         """Why it ended, for a person: exit status or signal, and its last words."""
-        status = self.exit_status
-        lines = [line for line in self.log_path.read_text(errors="replace").splitlines() if line.strip()]
-        if status == USER_ERROR_STATUS:
+        lines = self._log.lines(self._log_start)
+        if self.exit_status == USER_ERROR_STATUS:
             errors = [line for line in lines if " ERROR " in line]
             return _message(errors[-1]) if errors else f"{self.name} can't use its configuration"
-        if status is not None and status < 0:
-            how = f"was killed by {signal.Signals(-status).name}"
-        else:
-            how = f"failed with exit status {status}"
         last = f"; its last line: {_message(lines[-1].strip())}" if lines else ""
-        return f"{self.name} {how}{last} (log: {self.log_path})"
+        return f"{self.name} {self.how()}{last} (log: {self._log.path})"
 
     def close(self) -> None:
         """Kills what still runs, and lets go of it."""
         self.send(signal.SIGKILL)
         self._process.wait()
+        if self.begun_s is None and self._process.stdin is not None:
+            self._process.stdin.close()
         os.close(self.pidfd)
         self.vitals.close()
 

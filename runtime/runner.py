@@ -1,7 +1,8 @@
 """The one loop of every node: receive, step, send, measure, beat.
 
-`python -m runtime.runner NODE VITALS_FD PARENT_PID`, the configuration as JSON on standard input. Exit status: 0 at the
-end of the source or when told to end; 2 where what the user gave can't be used, with one ERROR line on stderr; 1 where
+`python -m runtime.runner NODE VITALS_FD PARENT_PID`, on standard input the configuration as a line of JSON, and then,
+when its work is to begin, its assignment as another: until then it is a spare. Exit status: 0 at the end of the source
+or when told to end; 2 where what the user gave can't be used, with one ERROR line on stderr; 1 where
 the node fails at work: a camera that is gone, or a bug, with its traceback there.
 """
 
@@ -15,7 +16,9 @@ import select
 import signal
 import sys
 import time
+from collections.abc import Callable
 from types import FrameType
+from typing import TypeGuard
 
 import cv2
 import msgspec
@@ -23,10 +26,13 @@ import msgspec
 from birdslam.datasets import DatasetError
 from birdslam.perception import ModelError
 from birdslam.types import Estimate, FrameRef, Measurements, Status
+from runtime import realtime
 from runtime.bus import Bus, Publisher
 from runtime.cli import USER_ERROR_STATUS
 from runtime.configuration import Configuration, ConfigurationError
-from runtime.nodes import NODE_TYPES, Node
+from runtime.meter import Meter
+from runtime.nodes import Node, prepare
+from runtime.restarts import Assignment
 from runtime.sources import SourceError
 from runtime.topology import NODES, TOPICS
 from runtime.vitals import Vitals
@@ -37,7 +43,6 @@ log = logging.getLogger(__name__)
 LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
 USER_ERRORS = (ConfigurationError, DatasetError, ModelError, SourceError)
 DOWNSTREAM = {"capture": "perceive", "perceive": "optimize", "optimize": "supervisor"}  # who must be there to receive
-HEALTH_PERIOD_NS = 1_000_000_000
 _PR_SET_PDEATHSIG = 1
 
 
@@ -67,13 +72,20 @@ class Stop:
         return self.draining
 
 
-def run(name: str, configuration: Configuration, vitals: Vitals, stop: Stop) -> None:
-    """One node from its start to its end."""
+def run(
+    name: str,
+    configuration: Configuration,
+    make: Callable[[Bus, Callable[[float], object], Assignment], Node],
+    assignment: Assignment,
+    vitals: Vitals,
+    stop: Stop,
+) -> None:
+    """One node from the beginning of its work to its end."""
     runtime = configuration.runtime
     with Bus(
         configuration.vehicle, name, runtime_dir=configuration.runtime_dir, lossless=configuration.lossless
     ) as bus:
-        node = NODE_TYPES[name](configuration, bus, stop.wait)
+        node = make(bus, stop.wait, assignment)
         try:
             publishers = {TOPICS[topic].record: bus.publisher(topic) for topic in NODES[name].sends}
             _await_downstream(name, bus, publishers, runtime.ready_timeout_s)
@@ -83,7 +95,7 @@ def run(name: str, configuration: Configuration, vitals: Vitals, stop: Stop) -> 
             vitals.count(ready=1)
             vitals.beat()
             bus.declare_alive()
-            _loop(name, node, publishers, vitals, stop, runtime.beat_s)
+            _loop(node, publishers, Meter(name, configuration, assignment), vitals, stop, configuration)
         finally:
             node.close()
 
@@ -97,29 +109,45 @@ def _await_downstream(name: str, bus: Bus, publishers: dict[type, Publisher], ti
         raise TimeoutError(f"{DOWNSTREAM[name]} was not ready to receive within {timeout_s:g} s")
 
 
-def _is_frame(record: msgspec.Struct) -> bool:
+def _is_frame(record: msgspec.Struct) -> TypeGuard[FrameRef | Measurements | Estimate]:
     return isinstance(record, FrameRef | Measurements | Estimate) and Status.END_OF_SOURCE not in record.status
 
 
-def _loop(name: str, node: Node, publishers: dict[type, Publisher], vitals: Vitals, stop: Stop, beat_s: float) -> None:
-    frames = 0
-    next_health_ns = time.monotonic_ns() + HEALTH_PERIOD_NS
+def _loop(
+    node: Node,
+    publishers: dict[type, Publisher],
+    meter: Meter,
+    vitals: Vitals,
+    stop: Stop,
+    configuration: Configuration,
+) -> None:
+    name, beat_s = meter.node, configuration.runtime.beat_s
+    budget_ns = round(configuration.budgets.end_to_end_ms * 1e6)
     while not (node.ended or stop.asked):
         vitals.beat()
         if stop.draining:
             node.drain()
         message = node.receive(beat_s)
-        if message is not None:
-            taken_ns = time.monotonic_ns()  # waiting in the queue belongs to the hop, not to the step
-            for record in node.step(message.record):
-                trace = message.trace.after(name, taken_ns, time.monotonic_ns())
-                publishers[type(record)].put(record, trace)
-                frames += _is_frame(record)
-        vitals.count(frames=frames, **node.counters())
         now_ns = time.monotonic_ns()
-        if now_ns >= next_health_ns:
-            publishers[Health].put(Health(node=name, t_ns=now_ns, frames=frames, **node.counters()))
-            next_health_ns = now_ns + HEALTH_PERIOD_NS
+        if message is not None:
+            taken_ns = now_ns  # waiting in the queue belongs to the hop, not to the step
+            meter.heard(taken_ns)
+            for record in node.step(message.record):
+                now_ns = time.monotonic_ns()
+                trace = message.trace.after(name, taken_ns, now_ns)
+                if _is_frame(record):
+                    vitals.count(
+                        next_frame=record.frame_id + 1,
+                        t_source_ns=record.t_source_ns,
+                        t_capture_ns=record.t_capture_ns,
+                    )
+                    meter.frame(record.t_capture_ns, message.trace, taken_ns, now_ns)
+                    if isinstance(record, Estimate):
+                        trace = msgspec.structs.replace(trace, left_ns=record.t_capture_ns + budget_ns - now_ns)
+                publishers[type(record)].put(record, trace)
+        vitals.count(frames=meter.frames, ended=node.ended, **node.counters())
+        if meter.due(now_ns):
+            publishers[Health].put(meter.health(now_ns, node.mode, node.counters()))
 
 
 def _die_with(parent_pid: int) -> None:
@@ -135,11 +163,18 @@ def main(arguments: list[str]) -> int:
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=LOG_FORMAT)
     stop = Stop()
     _die_with(int(parent_pid))
-    configuration = msgspec.json.decode(sys.stdin.buffer.read(), type=Configuration)
+    configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
     sys.setswitchinterval(configuration.runtime.switch_interval_s)
     cv2.setNumThreads(1)  # perceive sets its own
+    vitals = Vitals(int(vitals_fd))
     try:
-        run(name, configuration, Vitals(int(vitals_fd)), stop)
+        make = prepare(name, configuration)
+        vitals.count(prepared=1)
+        line = sys.stdin.buffer.readline()
+        if line:  # else this spare is needed no more
+            for refused in realtime.apply(name, configuration):
+                log.warning("%s", refused)
+            run(name, configuration, make, msgspec.json.decode(line, type=Assignment), vitals, stop)
     except USER_ERRORS as error:
         log.error("%s", error)
         return 1 if stop.at_work else USER_ERROR_STATUS

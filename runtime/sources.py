@@ -41,9 +41,12 @@ class Source(Protocol):
 
     def frames(self) -> Generator[RecordedFrame]: ...
 
+    def resume(self, frame_id: int, t_source_ns: int) -> None:
+        """Told before `frames` is asked for: a capture before this one died, and the next frame is `frame_id`."""
 
-def open_source(configuration: Configuration) -> Source:
-    """The source that the configuration names.
+
+def open_source(configuration: Configuration, must_open: bool = True) -> Source:
+    """The source that the configuration names; without `must_open` a camera may be gone for now.
 
     Raises ConfigurationError or datasets.DatasetError where it can't be one, SourceError where a camera does not open.
     """
@@ -56,7 +59,7 @@ def open_source(configuration: Configuration) -> Source:
             raise ConfigurationError(f"{source.uri}: a live camera needs a camera file (--camera FILE)")
         if source.rate == "max":
             raise ConfigurationError(f'{source.uri}: rate "max" is for recordings; a live camera has its own')
-        return CameraSource(source, configuration.camera)
+        return CameraSource(source, configuration.camera, must_open)
     if not source.uri:
         raise ConfigurationError("no source: give --source kitti:DIR, video:FILE, v4l2:/dev/videoN or rtsp://...")
     raise ConfigurationError(
@@ -75,22 +78,36 @@ class RecordedSource:
         self.camera = recording.camera
         self.rate_hz = recording.rate_hz
         self._config = config
+        self._start = 0
+        self._resume_ns = 0
+
+    def resume(self, frame_id: int, t_source_ns: int) -> None:
+        """A recording goes on at its frame of that number; in a loop its time goes on too."""
+        self._start, self._resume_ns = frame_id, t_source_ns
 
     def frames(self) -> Generator[RecordedFrame]:
         """Every frame in order, with growing time stamps."""
+        left = self._config.frames
         with contextlib.closing(self._passes()) as passes:
-            yield from islice(passes, self._config.frames)
+            yield from islice(passes, left if left is None else max(0, left - self._start))
 
     def _passes(self) -> Generator[RecordedFrame]:
-        shift_ns = 0
+        loops, start = (
+            divmod(self._start, len(self.recording)) if self._config.loop and self._start else (0, self._start)
+        )
+        shift_ns: int | None = None if loops else 0
         while True:
             first_ns = last_ns = None
-            for frame in self.recording.frames():
+            for frame in self.recording.frames(start) if start else self.recording.frames():
+                if shift_ns is None:
+                    shift_ns = self._resume_ns - frame.t_source_ns
                 first_ns = frame.t_source_ns if first_ns is None else first_ns
                 last_ns = frame.t_source_ns
                 yield replace(frame, t_source_ns=frame.t_source_ns + shift_ns)
-            if not self._config.loop or first_ns is None or last_ns is None:
+            if not self._config.loop or first_ns is None or last_ns is None or shift_ns is None:
                 return
+            if start:  # the next pass begins at frame 0, whose time lies before this pass's first
+                first_ns, start = next(iter(self.recording.frames())).t_source_ns, 0
             shift_ns += last_ns - first_ns + round(1e9 / self.rate_hz)
 
 
@@ -99,19 +116,19 @@ class CameraSource:
 
     live = True
 
-    def __init__(self, config: SourceConfig, camera: Camera) -> None:
+    def __init__(self, config: SourceConfig, camera: Camera, must_open: bool = True) -> None:
+        """Raises SourceError where it does not open; without `must_open` that is a camera that is gone for now."""
         self.name = self._uri = config.uri
         self.camera = camera
+        self.rate_hz = config.rate if isinstance(config.rate, float) else LIVE_RATE_HZ
         self._config = config
-        self._capture = self._open()
-        size = tuple(int(self._capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        if size != (camera.width_px, camera.height_px):
-            self._capture.release()
-            raise SourceError(
-                f"{self._uri}: delivers {size[0]}x{size[1]} px, the camera file is for "
-                f"{camera.width_px}x{camera.height_px}"
-            )
-        self.rate_hz = self._capture.get(cv2.CAP_PROP_FPS) or LIVE_RATE_HZ
+        self._closing = threading.Event()
+        self._capture: cv2.VideoCapture | None = None
+        try:
+            self._capture = self._open()
+        except SourceError:
+            if must_open:
+                raise
 
     def _open(self) -> cv2.VideoCapture:
         scheme, _, address = self._uri.partition(":")
@@ -131,14 +148,24 @@ class CameraSource:
             capture = cv2.VideoCapture(self._uri, cv2.CAP_FFMPEG, limits)
         if not capture.isOpened():
             raise SourceError(f"{self._uri}: does not open as a camera or video stream")
+        size = tuple(int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if size != (self.camera.width_px, self.camera.height_px):
+            capture.release()
+            raise SourceError(
+                f"{self._uri}: delivers {size[0]}x{size[1]} px, the camera file is for "
+                f"{self.camera.width_px}x{self.camera.height_px}"
+            )
+        self.rate_hz = capture.get(cv2.CAP_PROP_FPS) or self.rate_hz
         return capture
 
     def frames(self) -> Generator[RecordedFrame]:
-        """Frames by CLOCK_MONOTONIC. Raises SourceError where the camera stops to deliver."""
+        """Frames by CLOCK_MONOTONIC; while the camera is gone, frames without an image, until it opens again."""
         try:
             for index in islice(count(), self._config.frames):
-                if not self._capture.grab():
-                    raise SourceError(f"{self._uri}: delivers no frame{' any more' if index else ''}")
+                if self._capture is None or not self._capture.grab():
+                    self._reopen()
+                    yield RecordedFrame(index, time.monotonic_ns(), None, f"{self._uri}: delivers no frame")
+                    continue
                 t_ns = time.monotonic_ns()
                 ok, image = self._capture.retrieve()
                 if ok:
@@ -148,9 +175,24 @@ class CameraSource:
         finally:
             self.close()
 
+    def _reopen(self) -> None:
+        """One try; where it fails, a pause, so that planners hear of the loss at a fitting rate."""
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+        try:
+            self._capture = self._open()
+        except SourceError:
+            self._closing.wait(self._config.reopen_ms / 1e3)
+
+    def resume(self, frame_id: int, t_source_ns: int) -> None:
+        """A camera just goes on."""
+
     def close(self) -> None:
         """Lets the camera go."""
-        self._capture.release()
+        self._closing.set()
+        if self._capture is not None:
+            self._capture.release()
 
 
 def to_frame(
@@ -200,11 +242,12 @@ class ReadAhead:
     """Reads a source in a thread of its own, so that neither decoding nor a slow reader holds up the other.
 
     `capacity` frames wait. Of a live source the oldest gives way to a new one and is counted in `dropped`; a recording
-    waits instead. Numbers the frames, the dropped ones too.
+    waits instead. Numbers the frames from `first_frame` on, the dropped ones too.
     """
 
-    def __init__(self, source: Source, capacity: int) -> None:
+    def __init__(self, source: Source, capacity: int, first_frame: int = 0) -> None:
         self.dropped = 0
+        self._first_frame = first_frame
         self.read = 0
         self._source = source
         self._capacity = capacity
@@ -219,7 +262,7 @@ class ReadAhead:
     def _run(self) -> None:
         try:
             with contextlib.closing(self._source.frames()) as frames:
-                for frame_id, recorded in enumerate(frames):
+                for frame_id, recorded in enumerate(frames, self._first_frame):
                     with self._changed:
                         self.read += 1
                         if self._source.live and len(self._waiting) == self._capacity:

@@ -7,8 +7,6 @@ can't be used; the reason is one line on standard error. Everything here waits b
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
 import selectors
 import signal
 import socket
@@ -24,18 +22,21 @@ from birdslam.perception import load_network
 from birdslam.results import Recorder, claim_directory
 from runtime.bus import Bus
 from runtime.cli import INTERRUPTED_STATUS, USER_ERROR_STATUS
-from runtime.configuration import Configuration, ConfigurationError, complete, dump
+from runtime.configuration import Configuration, ConfigurationError, complete
 from runtime.live import LiveLine
 from runtime.logbook import Logbook
+from runtime.notify import Notifier
 from runtime.presence import VehicleLock, runtime_dir_of, socket_path
-from runtime.processes import NodeProcess
+from runtime.report import summarise, table
 from runtime.sources import CameraSource, open_source
+from runtime.stations import Station
 from runtime.topology import NODES
 
 START_ORDER = ("optimize", "perceive", "capture")  # each awaits the one before it (runner.py)
-LIBRARIES = ("birdslam", "numpy", "opencv-python-headless", "onnxruntime", "gtsam", "eclipse-zenoh")
+BEFORE = {"perceive": "capture", "optimize": "perceive"}  # who sends to whom
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 WITHOUT_MODELS = "no --model given: odometry only, without vehicles and lanes"
+CHECK_S = 0.1  # watchdogs are looked after at least so often
 WARNINGS_SHOWN = 5  # at a time; the log has all of them
 
 
@@ -60,17 +61,19 @@ def run(configuration: Configuration) -> int:
                 lossless=configuration.lossless,
             )
         )
-        logbook = Logbook(bus, recorder)
+        logbook = Logbook(bus, recorder, tolerant=configuration.restarts)
         stack.callback(logbook.close)
         bus.declare_alive()
         supervisor = Supervisor(configuration, logbook, live)
         supervisor.run(output / "logs")
     live.clear()
-    summary = supervisor.summary(models)
+    summary = summarise(configuration, supervisor.stations, logbook, models, supervisor.ended)
     try:
         recorder.finish(summary)
     except OSError as error:
         supervisor.fail(f"results can't be written: {error}", 1)
+    if logbook.unwritten is not None:
+        supervisor.fail(f"results are incomplete: {logbook.unwritten}", 1)
     live.say(table(summary, output))
     if supervisor.failure:
         print(f"birdslam: {supervisor.failure}", file=sys.stderr)
@@ -112,7 +115,9 @@ class Supervisor:
         self._config = configuration
         self._logbook = logbook
         self._live = live
-        self._nodes: dict[str, NodeProcess] = {}
+        self._notifier = Notifier()
+        self._disk_said = False
+        self.stations: dict[str, Station] = {}
         self._stopped_by: signal.Signals | None = None
         self._deadline_s: float | None = None  # of a stop that was asked for
         self._selector = selectors.DefaultSelector()
@@ -123,17 +128,18 @@ class Supervisor:
             self._selector.register(signals, selectors.EVENT_READ, self._signal)
             self._selector.register(self._logbook.event_fd, selectors.EVENT_READ, self._logbook_event)
             for name in START_ORDER:
-                node = self._nodes[name] = NodeProcess(name, self._config, logs)
-                stack.callback(node.close)
-                self._selector.register(node.pidfd, selectors.EVENT_READ, self._node_ended)
-            while any(node.exit_status is None for node in self._nodes.values()):
-                for key, _ in self._selector.select(self._live.period_s):
+                station = self.stations[name] = Station(name, self._config, logs)
+                stack.callback(station.close)
+                self._selector.register(station.process.pidfd, selectors.EVENT_READ, self._node_ended)
+            while any(station.working for station in self.stations.values()):
+                for key, _ in self._selector.select(min(self._live.period_s, CHECK_S)):
                     key.data(key.fileobj)
                 self._watch()
                 self._show()
-            if not self.failure and self._nodes["capture"].ready:
+            if not self.failure and self.stations["capture"].process.ready:
                 self._logbook.wait_over(self._config.runtime.drain_timeout_s)
             self._show()
+            self._notifier.once("STOPPING=1")
         if not self.failure and not self._logbook.ended and self._stopped_by is None:
             self.fail("all nodes ended, but the end of the source never came back", 1)
 
@@ -143,37 +149,70 @@ class Supervisor:
                 self._send_all(signal.SIGTERM)
                 continue
             self._stopped_by = signal.Signals(number)
+            self._notifier.once("STOPPING=1")
             self.exit_status = self.exit_status or (INTERRUPTED_STATUS if number == signal.SIGINT else 0)
-            capture = self._nodes.get("capture")
-            if capture is not None and capture.ready:  # END_OF_SOURCE then runs through all
-                capture.send(signal.SIGINT)
+            capture = self.stations.get("capture")
+            if capture is not None and capture.process.ready and capture.process.exit_status is None:
+                capture.process.send(signal.SIGINT)  # END_OF_SOURCE then runs through all
             else:
                 self._send_all(signal.SIGTERM)
-            self._deadline_s = time.monotonic() + self._config.runtime.stop_timeout_s
+            self._stop_by(self._config.runtime.stop_timeout_s)
+
+    def _stop_by(self, timeout_s: float) -> None:
+        self._deadline_s = time.monotonic() + timeout_s
+        for station in self.stations.values():
+            station.due_s = None  # none is begun anew
 
     def _logbook_event(self, event_fd: int) -> None:
         self._selector.unregister(event_fd)
         if self._logbook.error is not None:
             self.fail(f"recording failed: {self._logbook.error}", 1)
         elif self._deadline_s is None:
-            self._deadline_s = time.monotonic() + self._config.runtime.stop_timeout_s
+            self._stop_by(self._config.runtime.stop_timeout_s)
 
     def _node_ended(self, pidfd: int) -> None:
         self._selector.unregister(pidfd)
-        node = next(node for node in self._nodes.values() if node.pidfd == pidfd)
-        status = node.exit_status
-        told = self._deadline_s is not None and status == -signal.SIGTERM  # before it could handle the signal
-        if status not in (0, None) and not told:
-            self.fail(node.failure(), USER_ERROR_STATUS if status == USER_ERROR_STATUS else 1)
+        station = next(station for station in self.stations.values() if station.process.pidfd == pidfd)
+        process = station.process
+        status, at_first = process.exit_status, not process.ready and not station.restarts.count
+        if self._deadline_s is not None or (status == 0 and process.vitals["ended"]):
+            told = status == -signal.SIGTERM  # before it could handle the signal
+            if status not in (0, None) and not told:
+                self.fail(process.failure(), 1)
+        elif at_first or not self._config.restarts:
+            self.fail(process.failure(), USER_ERROR_STATUS if status == USER_ERROR_STATUS else 1)
+        elif station.died(station.stall or process.how()):
+            self._live.say(f"{process.failure()}; it is begun anew")
+            if station.due_s is not None and station.due_s <= time.monotonic():
+                self._begin_again(station)
+        else:
+            window_s = self._config.runtime.restart_window_s
+            again = f"{self._config.runtime.restarts_max + 1} times in {window_s:g} s: it is not begun anew"
+            self.fail(f"{process.failure()}, {again}", 1)
+
+    def _begin_again(self, station: Station) -> None:
+        station.begin_again()
+        self._selector.register(station.process.pidfd, selectors.EVENT_READ, self._node_ended)
 
     def _watch(self) -> None:
-        now_s, limit_s = time.monotonic(), self._config.runtime.watchdog_s
-        for node in self._nodes.values():
-            if node.exit_status is None and node.silent_s() > limit_s and not self.failure:
-                self.fail(f"{node.name} is stalled: its loop has shown no life for {limit_s:g} s", 1)
-                node.send(signal.SIGKILL)
+        now_s = time.monotonic()
+        stations = self.stations.values()
+        for station in stations:
+            before = self.stations.get(BEFORE.get(station.name, ""))
+            stall = "" if self.failure else station.stalled(before)
+            if stall and not self._config.restarts:
+                self.fail(f"{station.name} {stall}", 1)
+            if stall:
+                station.end(stall)
+            station.enforce()
+            if station.due_s is not None and station.due_s <= now_s:
+                self._begin_again(station)
+        if self._deadline_s is None and all(station.process.ready for station in stations):
+            self._notifier.once("READY=1")
+            if self._config.spares:  # one after the other, so that loading them takes one core at the most
+                all(station.keep_spare() for station in stations)
         if self._deadline_s is not None and now_s > self._deadline_s:
-            still = [node.name for node in self._nodes.values() if node.exit_status is None]
+            still = [station.name for station in stations if station.process.exit_status is None]
             if still:
                 limit_s = self._config.runtime.stop_timeout_s
                 self.fail(f"{', '.join(still)} did not end within {limit_s:g} s of being told to", 1)
@@ -184,49 +223,36 @@ class Supervisor:
         if self.failure:
             return
         self.failure, self.exit_status = reason, exit_status
-        self._deadline_s = time.monotonic() + self._config.runtime.stop_timeout_s
+        self._notifier.once("STOPPING=1")
+        self._stop_by(self._config.runtime.stop_timeout_s)
         self._send_all(signal.SIGTERM)
 
     def _send_all(self, number: signal.Signals) -> None:
-        for node in self._nodes.values():
-            node.send(number)
+        for station in self.stations.values():
+            station.process.send(number)
 
     def _show(self) -> None:
-        for node in self._nodes.values():
-            warnings = node.new_warnings()
+        for station in self.stations.values():
+            warnings = station.log.new_warnings()
             for line in warnings[:WARNINGS_SHOWN]:
-                self._live.say(f"{node.name}: {line}")
+                self._live.say(f"{station.name}: {line}")
             if len(warnings) > WARNINGS_SHOWN:
-                self._live.say(f"{node.name}: {len(warnings) - WARNINGS_SHOWN} more warnings in {node.log_path}")
-        self._live.update(self._logbook.status_line())
+                self._live.say(f"{station.name}: {len(warnings) - WARNINGS_SHOWN} more warnings in {station.log.path}")
+        if self._logbook.unwritten is not None and not self._disk_said:
+            self._disk_said = True
+            self._live.say(f"results are not written any more: {self._logbook.unwritten}")
+        status = self._logbook.status_line()
+        self._live.update(status)
+        self._notifier.alive(status)
 
-    def summary(self, models: dict[str, Any]) -> dict[str, Any]:
-        """What summary.json says of the run, beside the recorder's counts."""
-        vitals = {name: node.vitals for name, node in self._nodes.items()}
-        sent = {name: vitals[name]["frames"] for name in NODES}
-        by = {
-            "capture": vitals["capture"]["dropped"],
-            "perceive": sent["capture"] - sent["perceive"],
-            "optimize": sent["perceive"] - sent["optimize"],
-            "supervisor": sent["optimize"] - self._logbook.recorded,
-        }
-        ended = "end of source" if self._logbook.ended else "cut short"
+    @property
+    def ended(self) -> str:
+        """How the run ended, for the summary."""
+        if self.failure:
+            return self.failure
         if self._stopped_by is not None:
-            ended = self._stopped_by.name
-        return {
-            "ended": self.failure or ended,
-            "source": self._config.source.uri,
-            "frames_in": sent["capture"] + by["capture"],
-            "frames_processed": self._logbook.recorded,
-            "frames_dropped": sum(by.values()),
-            "dropped_by": by,
-            "torn": vitals["perceive"]["torn"],
-            "malformed": sum(v["malformed"] for v in vitals.values()),
-            **self._logbook.figures(),
-            "models": models,
-            "configuration": dump(self._config),
-            "versions": {"python": platform.python_version(), **{n: importlib.metadata.version(n) for n in LIBRARIES}},
-        }
+            return self._stopped_by.name
+        return "end of source" if self._logbook.ended else "cut short"
 
 
 @contextmanager
@@ -247,29 +273,3 @@ def _signals() -> Iterator[socket.socket]:
 
 def _ignore(number: int, frame: FrameType | None) -> None:
     """The wake-up socket has it."""
-
-
-def table(summary: dict[str, Any], output: Path) -> str:
-    """The figures of a run for a person."""
-
-    def spread(figures: dict[str, float]) -> str:
-        if not figures:
-            return "-"
-        return f"p50 {figures['p50']:.1f}  p99 {figures['p99']:.1f}  max {figures['max']:.1f} ms"
-
-    dropped = {name: n for name, n in summary["dropped_by"].items() if n}
-    by = f" ({', '.join(f'{n} by {name}' for name, n in dropped.items())})" if dropped else ""
-    rows = [
-        ("ended", summary["ended"]),
-        (
-            "frames",
-            f"{summary['frames_in']} in, {summary['frames_processed']} processed, "
-            f"{summary['frames_dropped']} dropped{by}",
-        ),
-        ("rate", f"{summary['rate_hz']:.2f} Hz"),
-        ("age at the planner", spread(summary["age_ms"])),
-        *((f"  {name}", spread(figures)) for name, figures in summary["stages_ms"].items()),
-        *((f"  {status}", f"{n} frames") for status, n in summary["statuses"].items()),
-        ("results in", str(output)),
-    ]
-    return "\n".join(f"{name:24}{value}" for name, value in rows)

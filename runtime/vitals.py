@@ -12,11 +12,20 @@ import time
 
 import numpy as np
 
-COUNTERS = ("beat_ns", "ready", "frames", "dropped", "malformed", "torn")
+COUNTERS = (
+    *("beat_ns", "prepared", "ready", "ended"),
+    *("frames", "dropped", "malformed", "torn"),
+    *("next_frame", "t_source_ns", "t_capture_ns"),
+)
 
 
 class Vitals:
-    """Counters of one node: `beat_ns` is CLOCK_MONOTONIC of its loop's last turn, `ready` is 1 once it is at work."""
+    """Counters of one node, all from zero.
+
+    `beat_ns` is CLOCK_MONOTONIC of its loop's last turn. `prepared` turns 1 when all that takes long is loaded, `ready`
+    when it is at work, `ended` when the end of the source went through. `next_frame` is one more than the last frame
+    that it sent, stored before it was sent, with that frame's times.
+    """
 
     def __init__(self, fd: int | None = None) -> None:
         """Maps what the supervisor handed down; without `fd`, makes new memory."""
@@ -24,7 +33,7 @@ class Vitals:
         self.fd = os.memfd_create("birdslam-vitals") if fd is None else fd
         if fd is None:
             os.ftruncate(self.fd, size)
-        self._counters = np.frombuffer(mmap.mmap(self.fd, size), dtype=np.uint64)
+        self._counters = np.frombuffer(mmap.mmap(self.fd, size), dtype=np.int64)
 
     def beat(self) -> None:
         """The loop is alive."""

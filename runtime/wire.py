@@ -14,6 +14,8 @@ import msgpack
 import msgspec
 import numpy as np
 
+from birdslam.types import Status
+
 # A message is a few kB. With its attachment it must pass zenoh's filter (bus.py, 65,000 B), which drops silently.
 MAX_MESSAGE_BYTES = 64_000
 MAX_TRACE_BYTES = 900
@@ -42,6 +44,7 @@ class Trace(msgspec.Struct, frozen=True):
     """Where a message's time went; travels as the attachment, so that the payload's bytes stay deterministic."""
 
     stages: Annotated[tuple[Stage, ...], msgspec.Meta(max_length=8)] = ()
+    left_ns: int | None = None  # of the budget end to end when an estimate was done; negative: it is late
 
     def after(self, node: str, received_ns: int, done_ns: int) -> Trace:
         """The trace of what `node` made of this message: one stage more."""
@@ -50,7 +53,16 @@ class Trace(msgspec.Struct, frozen=True):
     def sent(self, sent_ns: int) -> Trace:
         """The trace with the sending of its last stage stamped."""
         *earlier, last = self.stages
-        return Trace((*earlier, Stage(last.node, last.received_ns, last.done_ns, sent_ns)))
+        return Trace((*earlier, Stage(last.node, last.received_ns, last.done_ns, sent_ns)), self.left_ns)
+
+
+class Spread(msgspec.Struct, frozen=True, array_like=True):
+    """Of durations in the last seconds, in ms; all zero where there were none."""
+
+    p50_ms: float = 0.0
+    p95_ms: float = 0.0
+    p99_ms: float = 0.0
+    max_ms: float = 0.0
 
 
 class Health(msgspec.Struct, frozen=True, kw_only=True):
@@ -62,6 +74,18 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     dropped: _Count = 0  # records that were replaced or dropped before this node took them up
     malformed: _Count = 0  # messages that were no records
     torn: _Count = 0  # frames whose pixels were overwritten before they were read
+    rate_hz: float = 0.0  # of `frames`, since the last Health
+    wait: Spread = Spread()  # from sent to taken up; capture: from its due time
+    step: Spread = Spread()  # from taken up to done
+    age: Spread = Spread()  # from the frame's capture to done
+    overruns: _Count = 0  # steps over this node's budget
+    late: _Count = 0  # records that took longer than the budget of their hop to come here
+    rss_bytes: _Count = 0
+    cpu_percent: float = 0.0  # of one core, since the last Health
+    mode: str = "full"  # of perceive: full, rate, boxes, odometry or coasting
+    restarts: _Count = 0  # of this node in this run
+    cause: Annotated[str, msgspec.Meta(max_length=200)] = ""  # of the last restart
+    status: tuple[Status, ...] = ()  # INPUT_STALE: this node has received nothing for too long
 
 
 def _plain(value: Any) -> Any:

@@ -108,6 +108,15 @@ def test_a_measured_motion_supersedes_the_coasted_ones() -> None:
     assert reckoning.T_world_ego.x_m == pytest.approx(3.9)
 
 
+def test_a_blind_camera_makes_a_chain_of_edges_that_ends_where_it_sees_again() -> None:
+    script = {1: motion(1, SE2(1.0, 0.0, 0.0))}
+    script |= {k: motion(k, SE2(1.1 * (k - 1), 0.0, 0.0), since=k - 1) for k in range(2, 9)}  # coasted, all from 1
+    script |= {9: motion(9, SE2(8.0, 0.0, 0.0), since=8), 10: motion(10, SE2(1.0, 0.0, 0.0))}
+    edges = [m.cc for m in run(script, [seeing()] * 11)[1:]]
+    assert [(e.from_frame, e.to_frame) for e in edges if e] == [(k, k + 1) for k in range(10)]
+    assert sum(e.T_from_to.x_m for e in edges if e) == pytest.approx(10.0)
+
+
 def test_edges_name_their_frames_over_a_gap() -> None:
     front = FrontEnd(CAMERA, FrontEndConfig(), ScriptedOdometry({4: motion(4, SE2(3.0, 0.0, 0.0), since=4)}))
     front.step(frame(0), seeing())

@@ -16,12 +16,14 @@ import pytest
 from birdslam.camera import Camera
 from birdslam.datasets import RecordedFrame
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
-from runtime import nodes
+from runtime import capture, nodes
 from runtime.bus import Message
+from runtime.capture import CaptureNode
 from runtime.configuration import Configuration, RuntimeConfig, SourceConfig
 from runtime.frames import FrameReader
-from runtime.nodes import CaptureNode, OptimizeNode
+from runtime.nodes import OptimizeNode
 from runtime.presence import ring_path
+from runtime.restarts import FIRST, Assignment, Resume
 from runtime.sources import SourceError
 from runtime.wire import Trace
 
@@ -67,9 +69,14 @@ class Source:
 
 
 def make_capture(
-    monkeypatch: pytest.MonkeyPatch, place: Path, source: Source, rate: Any = "max", **limits: Any
+    monkeypatch: pytest.MonkeyPatch,
+    place: Path,
+    source: Source,
+    rate: Any = "max",
+    assignment: Assignment = FIRST,
+    **limits: Any,
 ) -> tuple[CaptureNode, Inbox, FrameReader]:
-    monkeypatch.setattr(nodes, "open_source", lambda configuration: source)
+    monkeypatch.setattr(capture, "open_source", lambda configuration, must_open: source)
     configuration = Configuration(
         vehicle="test",
         camera=CAMERA,
@@ -77,7 +84,7 @@ def make_capture(
         runtime=RuntimeConfig(runtime_dir=str(place), **limits),
     )
     bus = FakeBus()
-    node = CaptureNode(configuration, bus, lambda timeout_s: None)  # type: ignore[arg-type]
+    node = CaptureNode(configuration, bus, lambda timeout_s: None, assignment)  # type: ignore[arg-type]
     return node, bus.inbox, FrameReader(ring_path("test", place))
 
 
@@ -168,8 +175,38 @@ def test_a_camera_that_falls_silent_is_named(monkeypatch: pytest.MonkeyPatch, tm
     reader.close()
 
 
+def test_a_resumed_capture_leaves_a_gap_and_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    source = Source(3, live=True)
+    resumed: list[tuple[int, int]] = []
+    monkeypatch.setattr(source, "resume", lambda *told: resumed.append(told), raising=False)
+    assignment = Assignment(1, "was killed by SIGKILL", Resume(41, 700, time.monotonic_ns() - 350_000_000))
+    node, _, reader = make_capture(monkeypatch, tmp_path, source, rate=None, assignment=assignment)
+    ref = next(node.step(receive(node).record))
+    assert ref.frame_id >= 41 + 3  # 0.35 s at 10 Hz
+    assert [told[0] for told in resumed] == [ref.frame_id - ref.dropped]
+    source.over.set()
+    node.close()
+    reader.close()
+
+
+def test_a_new_optimizer_says_that_the_world_began_anew(tmp_path: Path) -> None:
+    configuration = Configuration(vehicle="test", runtime=RuntimeConfig(runtime_dir=str(tmp_path)))
+    stamps = {"t_source_ns": 5, "t_capture_ns": 6, "t_utc_ns": 7}
+    epochs, told = [], []
+    for number in range(3):  # each was killed
+        node = OptimizeNode(configuration, FakeBus())  # type: ignore[arg-type]
+        for frame_id in (2 * number, 2 * number + 1):
+            estimate, *_ = node.step(Measurements(frame_id=frame_id, **stamps))
+            assert isinstance(estimate, Estimate)
+            told.append(Status.GRAPH_RESET in estimate.status)
+            epochs.append(estimate.epoch)
+    assert epochs == sorted(epochs)
+    assert len(set(epochs[::2])) == 3
+    assert told[2::2] == [True, True]
+
+
 def test_optimize_completes_the_map_before_the_end() -> None:
-    node = OptimizeNode(Configuration(), FakeBus(), lambda timeout_s: None)  # type: ignore[arg-type]
+    node = OptimizeNode(Configuration(source=SourceConfig(rate="max")), FakeBus())  # type: ignore[arg-type]
     stamps = {"t_source_ns": 5, "t_capture_ns": 6, "t_utc_ns": 7}
     first, *_ = node.step(Measurements(frame_id=0, **stamps, status=(Status.NOT_INITIALISED,)))
     assert isinstance(first, Estimate)

@@ -217,3 +217,70 @@ def test_a_camera_that_is_not_there_is_named(tmp_path: Path) -> None:
         open_source(live("rtsp://127.0.0.1:9/x"))
     with pytest.raises(ConfigurationError, match='rate "max" is for recordings'):
         open_source(live("v4l2:/dev/no_such", rate="max"))
+
+
+class Unplugged:
+    """cv2.VideoCapture of a camera that is gone at its 3rd frame, and opens on the second try."""
+
+    grabs = opens = 0
+
+    def __init__(self, *arguments: object) -> None:
+        Unplugged.opens += 1
+        self._open = Unplugged.opens != 2
+
+    def isOpened(self) -> bool:
+        return self._open
+
+    def set(self, what: int, value: float) -> bool:
+        return True
+
+    def get(self, what: int) -> float:
+        return {cv2.CAP_PROP_FRAME_WIDTH: 64.0, cv2.CAP_PROP_FRAME_HEIGHT: 32.0}.get(what, 30.0)
+
+    def grab(self) -> bool:
+        Unplugged.grabs += 1
+        return Unplugged.grabs != 3
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, image(Unplugged.grabs)
+
+    def release(self) -> None:
+        self._open = False
+
+
+def test_a_camera_that_comes_back_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    device = tmp_path / "video0"
+    device.touch()
+    monkeypatch.setattr(cv2, "VideoCapture", Unplugged)
+    source = open_source(live(f"v4l2:{device}", frames=6, reopen_ms=1.0))
+    source.resume(7, 0)  # nothing to a camera
+    frames = list(source.frames())
+    assert [frame.image is not None for frame in frames] == [True, True, False, False, True, True]
+    assert {frame.error for frame in frames} == {None, f"v4l2:{device}: delivers no frame"}
+    stamps = [frame.t_source_ns for frame in frames]
+    assert stamps == sorted(stamps)
+    assert Unplugged.opens == 3
+
+    gone = open_source(live(f"v4l2:{tmp_path / 'gone'}", frames=2, reopen_ms=1.0), must_open=False)
+    assert [frame.image for frame in gone.frames()] == [None, None]
+
+
+@given(st.integers(0, 40), st.booleans(), st.one_of(st.none(), st.integers(1, 40)))
+def test_a_resumed_recording_goes_on_where_it_was(start: int, loop: bool, frames: int | None) -> None:
+    if loop and frames is None:
+        frames = 40
+
+    def source() -> RecordedSource:
+        return RecordedSource(Counted(9), SourceConfig(loop=loop, frames=frames))
+
+    whole = list(source().frames())
+    resumed = source()
+    resumed.resume(start, start * PERIOD_NS)
+    rest = list(resumed.frames())
+    assert [frame.t_source_ns for frame in rest] == [frame.t_source_ns for frame in whole[start:]]
+    assert [frame.index for frame in rest] == [frame.index for frame in whole[start:]]
+
+
+class Counted(Drive):
+    def frames(self, start: int = 0) -> Generator[RecordedFrame]:
+        yield from list(super().frames())[start:]

@@ -126,6 +126,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         step=Spread(20.5, 22.5, 24.5, 26.5),
         age=Spread(30.5, 32.5, 34.5, 36.5),
         overruns=3,
+        late=4,
         rss_bytes=180_000_000,
         cpu_percent=62.5,
         mode="boxes",

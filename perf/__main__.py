@@ -1,0 +1,39 @@
+"""`python -m perf NAME ...` runs one benchmark, `python -m perf` lists them: modules with a `label` and one `run`."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import sys
+
+import perf
+from runtime.cli import ENVIRONMENT, INTERRUPTED_STATUS, USER_ERROR_STATUS
+
+
+def main(arguments: list[str]) -> int:
+    os.environ.update(ENVIRONMENT)  # before numpy is loaded: computes as the nodes do
+    from perf.errors import PerfError  # and what loads numpy only now
+
+    names = [module.name for module in pkgutil.iter_modules(perf.__path__) if module.name[0] != "_"]
+    wanted = arguments[:1] if arguments and arguments[0] in names else names  # one that is named needs no other
+    modules = [importlib.import_module(f"perf.{name}") for name in wanted]
+    benchmarks = {module.__name__.removeprefix("perf."): module for module in modules if hasattr(module, "label")}
+    if arguments and arguments[0] in benchmarks:
+        try:
+            status: int | None = benchmarks[arguments[0]].run(arguments[1:])
+        except PerfError as error:
+            print(f"perf {arguments[0]}: {error}", file=sys.stderr)
+            return USER_ERROR_STATUS
+        except KeyboardInterrupt:
+            return INTERRUPTED_STATUS
+        return status or 0
+    for name, module in benchmarks.items():
+        print(f"{name:16} {module.label}")
+    if arguments:
+        print(f"perf: there is no benchmark {arguments[0]!r}", file=sys.stderr)
+    return USER_ERROR_STATUS if arguments else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

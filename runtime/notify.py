@@ -1,0 +1,47 @@
+"""What systemd is told (sd_notify(3)): ready, alive, what goes on, and that the end has begun."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Mapping
+
+
+class Notifier:
+    """Speaks to the socket that systemd names in the environment; says nothing where there is none.
+
+    A message that can't be delivered is lost: systemd then misses the watchdog's, and acts.
+    """
+
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        address = environment.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + address[1:] if address.startswith("@") else address
+        for_us = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        watchdog_us = int(environment.get("WATCHDOG_USEC") or 0) if for_us else 0
+        self.period_s = watchdog_us / 1e6 / 3 if watchdog_us else None  # of `alive`; None: nobody watches
+        self._due_s = 0.0
+        self._said: set[str] = set()
+
+    def once(self, state: str) -> None:
+        """READY=1 or STOPPING=1, the first time."""
+        if state not in self._said:
+            self._said.add(state)
+            self._send(state)
+
+    def alive(self, status: str) -> None:
+        """The watchdog's sign of life and the status line, when they are due."""
+        now_s = time.monotonic()
+        if self._address and now_s >= self._due_s:
+            self._due_s = now_s + min(1.0, self.period_s or 1.0)
+            self._send(f"WATCHDOG=1\nSTATUS={status}" if self.period_s else f"STATUS={status}")
+
+    def _send(self, message: str) -> None:
+        if not self._address:
+            return
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as out:
+            out.setblocking(False)
+            try:
+                out.sendto(message.encode(), self._address)
+            except (BlockingIOError, ConnectionError, FileNotFoundError):
+                return

@@ -1,0 +1,58 @@
+"""Scheduling and memory of a node's process, as far as the system permits; called when its work begins.
+
+It holds for the threads that exist (the networks', OpenCV's), and later ones inherit it (zenoh's): a spare that still
+loads must not go before the nodes at work.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+from collections.abc import Iterator
+
+from runtime.configuration import Configuration
+
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_CAP_IPC_LOCK = 14
+
+
+def apply(node: str, configuration: Configuration) -> Iterator[str]:
+    """Sets what is configured, and gives a line for each thing that was not to be had."""
+    realtime, live = configuration.realtime, configuration.live
+    scheduling = realtime.of(node)
+    if scheduling.cpus:
+        try:
+            for thread in _threads():
+                os.sched_setaffinity(thread, scheduling.cpus)
+        except OSError as error:
+            cpus = ", ".join(map(str, scheduling.cpus))
+            yield f"realtime.{node}.cpus: can't run on cores {cpus} ({error.strerror}): runs on any"
+    if realtime.fifo == "on" or (realtime.fifo == "auto" and live):
+        try:
+            for thread in _threads():
+                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(scheduling.priority))
+        except PermissionError:
+            yield "realtime.fifo: SCHED_FIFO is not permitted (LimitRTPRIO=, CAP_SYS_NICE): runs at normal priority"
+    if realtime.lock_memory == "on" or (realtime.lock_memory == "auto" and live):
+        if not may_lock_memory():
+            yield "realtime.lock_memory: locking memory is not permitted (LimitMEMLOCK=infinity): it may be paged out"
+        elif ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
+            yield f"realtime.lock_memory: {os.strerror(ctypes.get_errno())}: memory may be paged out"
+
+
+def _threads() -> list[int]:
+    return [int(name) for name in os.listdir("/proc/self/task")]
+
+
+def may_lock_memory() -> bool:
+    """Without a limit: under one, a locked process would fail where it first needs more."""
+    return resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or _has(_CAP_IPC_LOCK)
+
+
+def _has(capability: int) -> bool:
+    with open("/proc/self/status") as status:
+        for line in status:
+            if line.startswith("CapEff:"):
+                return bool(int(line.split()[1], 16) >> capability & 1)
+    return False

@@ -1,0 +1,144 @@
+"""Short of time: what is left out, and that it comes back only when there is time to spare."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.frontend import FrontEnd
+from birdslam.perception import Detections, Findings, ModelSpec, Segmentation
+from birdslam.perception.manifest import Schedule
+from birdslam.types import INVALIDATING, Frame, FrameRef, Measurements, Status
+from runtime import inference
+from runtime.configuration import Configuration, DegradationConfig, ModelsConfig, SourceConfig
+from runtime.degradation import Degradation, Mode, modes
+from runtime.inference import Inference
+from runtime.nodes import PerceiveNode
+from runtime.restarts import FIRST
+
+CONFIG = DegradationConfig(window_frames=4, late_share=0.5, calm_frames=6, calm_share=0.5)
+BOTH = ("detector", "segmenter")
+
+
+def test_the_modes_that_make_a_difference() -> None:
+    assert modes(BOTH) == tuple(Mode)
+    assert modes(("detector",)) == (Mode.FULL, Mode.RATE, Mode.ODOMETRY, Mode.COASTING)
+    assert modes(()) == (Mode.FULL, Mode.COASTING)
+
+
+def test_down_step_by_step_and_up_again() -> None:
+    degradation = Degradation(CONFIG, BOTH, budget_ms=100.0)
+    down = [degradation.mode for _ in range(4 * 6) if degradation.judge(150.0)]
+    assert down == list(Mode)[1:]
+    up = [degradation.mode for _ in range(5 * 6) if degradation.judge(20.0)]
+    assert up == list(Mode)[-2::-1]
+
+
+def test_between_calm_and_late_nothing_changes() -> None:
+    degradation = Degradation(CONFIG, BOTH, budget_ms=100.0)
+    for _ in range(4):
+        degradation.judge(150.0)
+    assert degradation.mode is Mode.RATE
+    assert not any(degradation.judge(75.0) for _ in range(100))
+
+
+@given(st.lists(st.floats(0.0, 300.0), max_size=200))
+def test_one_step_at_a_time_and_never_sooner_than_a_window(ages_ms: list[float]) -> None:
+    degradation = Degradation(CONFIG, BOTH, budget_ms=100.0)
+    order = list(Mode)
+    last = 0
+    for number, age_ms in enumerate(ages_ms, start=1):
+        before = order.index(degradation.mode)
+        if degradation.judge(age_ms):
+            assert abs(order.index(degradation.mode) - before) == 1
+            assert number - last >= CONFIG.window_frames
+            last = number
+
+
+class Head:
+    """A network that counts its runs."""
+
+    def __init__(self, role: str) -> None:
+        self.name = self.role = role
+        self.schedule = Schedule()
+        self.runs = 0
+
+    def run(self, image: np.ndarray) -> Findings:
+        self.runs += 1
+        if self.role == "detector":
+            return Findings(detections=Detections(np.zeros((0, 4)), np.zeros(0), ()))
+        return Findings(segmentation=Segmentation(image > 0, image > 0))
+
+
+@pytest.mark.parametrize(
+    ("mode", "runs", "road"),
+    [
+        (Mode.FULL, {"detector": 9, "segmenter": 9}, True),
+        (Mode.RATE, {"detector": 3, "segmenter": 3}, True),
+        (Mode.BOXES, {"detector": 9, "segmenter": 0}, False),
+        (Mode.ODOMETRY, {"detector": 0, "segmenter": 0}, False),
+    ],
+)
+def test_what_runs_in_each_mode(monkeypatch: pytest.MonkeyPatch, mode: Mode, runs: dict[str, int], road: bool) -> None:
+    heads = {role: Head(role) for role in BOTH}
+    monkeypatch.setattr(inference, "load_network", lambda role, spec: heads[role])
+    spec = ModelSpec("none.onnx")
+    configuration = Configuration(
+        source=SourceConfig(rate="max"), models=ModelsConfig(detector=spec, segmenter=spec)
+    )  # at rate "max" each is awaited, so that they can be counted
+    image = np.zeros((4, 4), dtype=np.uint8)
+    with Inference(configuration) as networks:
+        assert networks.roles == frozenset(BOTH)
+        for number in range(9):
+            perception = networks.start(Frame(number, 0, 0, 0, image), mode).result()
+            assert (perception.segmentation is not None) == road
+    assert {role: head.runs for role, head in heads.items()} == runs
+
+
+class Bus:
+    def subscriber(self, topic: str) -> Any:
+        return None
+
+
+class Blind(FrontEnd):
+    """Counts what it is shown."""
+
+    def __init__(self) -> None:
+        self.shown: list[int] = []
+
+    def step(self, frame: Frame, pending: Any) -> Measurements:
+        self.shown.append(frame.frame_id)
+        pending.result()
+        return Measurements(frame_id=frame.frame_id, t_source_ns=frame.t_source_ns, t_capture_ns=0, t_utc_ns=0)
+
+
+class Ring:
+    def read(self, ref: FrameRef) -> np.ndarray:
+        return np.zeros((4, 4), dtype=np.uint8)
+
+
+def test_coasting_looks_at_few_frames_and_says_so() -> None:
+    configuration = Configuration(
+        vehicle="test",
+        degradation=DegradationConfig(window_frames=1, late_share=1.0, coast_divisor=5, coast_max_ms=250.0),
+    )
+    frontend = Blind()
+    with Inference(configuration) as networks:
+        node = PerceiveNode(configuration, networks, frontend, Bus(), FIRST)  # type: ignore[arg-type]
+        node._ring = Ring()  # type: ignore[assignment]
+        records: list[Measurements] = []
+        for number in range(12):  # each a second old when it is done
+            stamps = {"t_source_ns": number * 100_000_000, "t_capture_ns": 0, "t_utc_ns": 0}
+            records += node.step(FrameRef(frame_id=number, slot=0, **stamps))
+        assert node.mode == Mode.COASTING
+    assert frontend.shown == [0, 5, 10]
+    coasted = [r for r in records if Status.COASTING in r.status]
+    assert [r.frame_id for r in coasted] == [1, 2, 3, 4, 6, 7, 8, 9, 11]
+    assert [r.frame_id for r in coasted if not INVALIDATING.isdisjoint(r.status)] == [3, 4, 8, 9]
+    assert all(r.cc is None for r in coasted)
+    assert Status.DEGRADED_ODOMETRY in records[5].status
+    assert all(Status.INPUT_STALE in r.status for r in records if r.frame_id in frontend.shown)

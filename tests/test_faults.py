@@ -1,0 +1,127 @@
+"""A vehicle under faults: perf/faults.py has them; a short form here, the whole by `make faults`."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from perf.faults import FAULTS, Vehicle, inflict, markdown, model_options, survived
+from runtime.presence import ring_path
+from runtime.topology import NODES
+
+SHORT = (
+    *("kill -9 perceive", "camera gone 1.5 s capture", "malformed messages all"),
+    "kill -9 of everything, second start all",
+)
+BUSY_MACHINE = 10.0  # so many times its promise may a restart take here; `make faults` holds it to 3
+SEVERE = 3.0
+
+
+@pytest.fixture
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder whose path is short enough for sockets in it."""
+    return tmp_path_factory.mktemp("f")
+
+
+@pytest.fixture
+def models_dir_if_any() -> Path | None:
+    folder = Path(os.environ.get("BIRDSLAM_MODELS") or Path(__file__).resolve().parents[2] / "shared" / "models")
+    return folder if folder.is_dir() else None
+
+
+def test_faults_in_short(place: Path) -> None:
+    with Vehicle(place) as vehicle:
+        for fault in FAULTS:
+            if f"{fault.name} {fault.node}" not in SHORT:
+                continue
+            vehicle.settle(0.5)
+            row = inflict(vehicle, fault)
+            assert survived(row, BUSY_MACHINE), row
+        vehicle.settle(0.5)
+        assert vehicle.stop() == 0
+    assert left_behind(vehicle) == []
+
+
+def left_behind(vehicle: Vehicle) -> list[Path]:
+    """Sockets and rings that still exist."""
+    ring = ring_path(vehicle.vehicle, vehicle.runtime_dir)
+    return [*(vehicle.runtime_dir / vehicle.vehicle).glob("*.sock*"), *ring.parent.glob(f"{ring.name}*")]
+
+
+@pytest.mark.slow
+@pytest.mark.faults
+@pytest.mark.timeout(900)
+def test_every_fault(place: Path, models_dir_if_any: Path | None, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = []
+    with Vehicle(place, *model_options(models_dir_if_any)) as vehicle:
+        for fault in FAULTS:
+            vehicle.settle()
+            rows.append(inflict(vehicle, fault))
+            with capsys.disabled():
+                print(markdown(rows[-1:]).splitlines()[-1], flush=True)
+    assert [row for row in rows if not survived(row, SEVERE)] == []
+
+
+def held(vehicle: Vehicle) -> dict[str, int]:
+    """What a leak would add to."""
+    supervisor = psutil.Process(vehicle.process.pid)
+    return {
+        "descriptors of the supervisor": supervisor.num_fds(),
+        "threads of the supervisor": supervisor.num_threads(),
+        "processes": len(supervisor.children()),
+        "files in the runtime directory": sum(1 for _ in vehicle.runtime_dir.rglob("*")),
+        "rings": len(list(Path("/dev/shm").glob(f"birdslam-{os.getuid()}-{vehicle.vehicle}-*"))),
+        "descriptors of the planner": psutil.Process().num_fds(),
+    }
+
+
+def restarted(vehicle: Vehicle, times: int) -> Iterator[str]:
+    """Kills the nodes in turn, so many times in all."""
+    for number in range(times):
+        name = tuple(NODES)[number % len(NODES)]
+        vehicle.node(name).kill()
+        vehicle.settle(0.3)
+        yield name
+
+
+def nothing_leaks(place: Path, times: int) -> None:
+    with Vehicle(place) as vehicle:
+        for _ in restarted(vehicle, len(NODES)):  # once round, so that all is there that ever will be
+            continue
+        before = held(vehicle)
+        epochs = [vehicle.planner.latest().estimate.epoch for _ in restarted(vehicle, times)]  # type: ignore[union-attr]
+        until_s = time.monotonic() + 10.0
+        while any(after > before[what] for what, after in held(vehicle).items()) and time.monotonic() < until_s:
+            vehicle.planner.wait(0.1)  # a dead peer's link is given up after its lease
+        after = held(vehicle)
+        assert {what: n for what, n in after.items() if n > before[what]} == {}
+        assert epochs == sorted(epochs)
+        assert vehicle.stop() == 0
+    assert left_behind(vehicle) == []
+
+
+def test_nothing_leaks_over_a_few_restarts(place: Path) -> None:
+    nothing_leaks(place, 5)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_nothing_leaks_over_a_hundred_restarts(place: Path) -> None:
+    nothing_leaks(place, 100)
+
+
+def test_a_node_that_keeps_dying_ends_the_run_with_its_name(place: Path) -> None:
+    with Vehicle(place, "--set", "runtime.restarts_max=1") as vehicle:
+        vehicle.node("optimize").send_signal(signal.SIGKILL)
+        vehicle.settle(0.3)
+        vehicle.node("optimize").send_signal(signal.SIGKILL)
+        assert vehicle.process.wait(30.0) == 1
+        last = (place / "run.log").read_text().splitlines()[-1]
+        assert last.startswith("birdslam: optimize was killed by SIGKILL")
+        assert "2 times in 60 s: it is not begun anew" in last

@@ -1,0 +1,226 @@
+"""Budgets, what a node measures of itself, its scheduling, and the check of the machine."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.camera import Camera
+from birdslam.se2 import SE2
+from birdslam.types import Estimate, MapUpdate, Status
+from runtime import doctor, realtime
+from runtime.bus import Bus
+from runtime.cli import main
+from runtime.configuration import (
+    BudgetsConfig,
+    Configuration,
+    ConfigurationError,
+    NodeScheduling,
+    RealtimeConfig,
+    RuntimeConfig,
+    SourceConfig,
+    complete,
+    load,
+)
+from runtime.latency import Recent
+from runtime.live import LiveLine
+from runtime.logbook import Logbook
+from runtime.meter import PERIOD_NS, Meter
+from runtime.restarts import Assignment
+from runtime.topology import NODES
+from runtime.wire import Health, Spread, Stage, Trace, decode, encode
+
+CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
+MS = 1_000_000
+
+
+def test_parts_over_the_whole_are_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("[budgets]\nperceive_ms = 120\n")
+    with pytest.raises(ConfigurationError, match=r"budgets: capture_ms .* perceive_ms .* = 170 is over end_to_end_ms"):
+        load(path)
+    with pytest.raises(ConfigurationError, match=r"command line: budgets: .* is over end_to_end_ms = 20"):
+        load(None, {"budgets.end_to_end_ms": 20})
+
+
+def test_no_frame_waits_longer_for_networks_than_perceive_may_take() -> None:
+    with pytest.raises(ConfigurationError, match=r"command line: perceive.deadline_ms: 130 is over budgets.*= 120"):
+        load(None, {"perceive.deadline_ms": 130})
+    slow = complete(load(None), CAMERA, rate_hz=1.0)
+    assert slow.perceive.deadline_ms == slow.budgets.perceived_ms
+    assert complete(load(None), CAMERA, rate_hz=10.0).perceive.deadline_ms == pytest.approx(75.0)
+
+
+@given(st.lists(st.floats(1.0, 60.0), min_size=6, max_size=6), st.floats(1.0, 300.0))
+def test_budgets_load_exactly_where_they_add_up(parts: list[float], whole: float) -> None:
+    names = [name for name in BudgetsConfig.__struct_fields__ if name not in ("percentile", "end_to_end_ms")]
+    tree = {f"budgets.{name}": value for name, value in zip(names, parts, strict=True)}
+    tree |= {"budgets.end_to_end_ms": whole, "perceive.deadline_ms": 1.0}
+    if sum(parts) <= whole:
+        assert load(None, tree).budgets.end_to_end_ms == whole
+    else:
+        with pytest.raises(ConfigurationError, match="end_to_end_ms"):
+            load(None, tree)
+
+
+def test_every_node_has_a_budget_and_a_scheduling() -> None:
+    for node in NODES:
+        assert BudgetsConfig().step_ms(node) > 0.0
+        assert RealtimeConfig().of(node).priority > 0
+
+
+def test_what_is_recent_is_forgotten_in_time() -> None:
+    recent = Recent(span_s=1.0)
+    for number in range(100):
+        recent.add(100.0, number * 10 * MS)
+    assert recent.spread(1000 * MS).p50_ms == pytest.approx(100.0, rel=0.02)
+    for number in range(100, 400):
+        recent.add(1.0, number * 10 * MS)
+    assert recent.spread(4000 * MS) == Spread(*[pytest.approx(1.0, rel=0.02)] * 4)
+    assert recent.spread(9000 * MS) == Spread()
+
+
+def test_a_node_s_health() -> None:
+    configuration = Configuration(budgets=BudgetsConfig(optimize_ms=5.0, perceive_to_optimize_ms=3.5))
+    meter = Meter("optimize", configuration, Assignment(restarts=2, cause="was killed by SIGKILL"))
+    begun_ns = time.monotonic_ns()
+    for number in range(20):
+        taken_ns = begun_ns + number * 50 * MS
+        trace = Trace((Stage("capture", 0, 0, 0), Stage("perceive", 0, 0, taken_ns - 3 * MS)))
+        meter.heard(taken_ns)
+        meter.frame(taken_ns - 40 * MS, trace, taken_ns, taken_ns + (7 if number % 4 == 0 else 2) * MS)
+    assert not meter.due(begun_ns)
+    now_ns = begun_ns + PERIOD_NS + 50 * MS
+    assert meter.due(now_ns)
+    health = meter.health(now_ns, "full", {"dropped": 1, "malformed": 2, "torn": 3})
+    assert (health.frames, health.overruns, health.late, health.restarts) == (20, 5, 0, 2)
+    assert health.rate_hz == pytest.approx(20.0, rel=0.1)
+    assert health.wait.p50_ms == pytest.approx(3.0, rel=0.02)
+    assert (health.step.p50_ms, health.step.max_ms) == (pytest.approx(2.0, rel=0.02), pytest.approx(7.0))
+    assert health.age.p99_ms == pytest.approx(47.0, rel=0.02)
+    assert health.rss_bytes > 1 << 20
+    assert health.status == ()
+    assert not meter.due(now_ns)
+    assert decode(encode(health), Health) == health
+    stale = meter.health(now_ns + 2 * PERIOD_NS, "full", {})
+    assert stale.status == (Status.INPUT_STALE,)
+    assert stale.rate_hz == 0.0
+
+
+def test_what_is_left_of_the_budget_stays_with_the_trace() -> None:
+    trace = Trace((Stage("optimize", 1, 2),), left_ns=-5).sent(9)
+    assert trace == Trace((Stage("optimize", 1, 2, 9),), left_ns=-5)
+    assert decode(encode(Trace((Stage("n", 1, 2, 3),))), Trace).left_ns is None
+
+
+def scheduled(**settings: object) -> Configuration:
+    return Configuration(source=SourceConfig(uri="kitti:x"), realtime=RealtimeConfig(**settings))  # type: ignore[arg-type]
+
+
+def test_a_recording_asks_for_nothing() -> None:
+    assert list(realtime.apply("perceive", scheduled())) == []
+    assert Configuration(source=SourceConfig(uri="v4l2:/dev/video0")).live
+
+
+def test_what_is_not_permitted_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    monkeypatch.setattr(realtime, "may_lock_memory", lambda: False)
+    configuration = scheduled(fifo="on", lock_memory="on", optimize=NodeScheduling(cpus=(0,)))
+    said = list(realtime.apply("optimize", configuration))
+    assert [line.partition(":")[0] for line in said] == [
+        "realtime.optimize.cpus",
+        "realtime.fifo",
+        "realtime.lock_memory",
+    ]
+
+
+def test_a_node_runs_where_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, tuple[int, ...]]] = []
+    monkeypatch.setattr(os, "sched_setaffinity", lambda thread, cpus: asked.append((thread, cpus)))
+    assert list(realtime.apply("capture", scheduled(capture=NodeScheduling(cpus=(1, 2))))) == []
+    assert (os.getpid(), (1, 2)) in asked
+
+
+def test_the_doctor_has_a_row_for_everything(tmp_path: Path) -> None:
+    configuration = Configuration(
+        vehicle="doc", runtime=RuntimeConfig(runtime_dir=str(tmp_path / "rt")), output=str(tmp_path / "out")
+    )
+    findings = list(doctor.examine(configuration))
+    rows = {finding.what: finding for finding in findings}
+    expected = {
+        "cores",
+        "governor",
+        "SCHED_FIFO",
+        "memory lock",
+        "runtime directory",
+        "shared memory",
+        "output",
+        "clock",
+    }
+    assert expected | {"models", "camera"} <= set(rows)
+    assert all(f.verdict in ("ok", "warning", "failed") for f in findings)
+    assert all(f.advice for f in findings if f.verdict == "warning")
+    assert not (tmp_path / "out").exists()
+    lines = doctor.table(findings).splitlines()
+    assert len(lines) == len(findings)
+
+
+def test_the_doctor_s_exit_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place = f"runtime.runtime_dir={tmp_path / 'rt'}"
+    assert main(["doctor", "--set", place, "--model", f"detector={tmp_path / 'none.onnx'}"]) == 1
+    out = capsys.readouterr().out
+    assert "failed  detector" in out
+    assert "none.onnx" in out
+
+
+def test_a_full_disk_costs_lines_not_the_drive() -> None:
+    with open("/dev/full", "w") as full:
+        live = LiveLine(full)
+        live.say("a line")
+        live.update("a status")
+        assert live.lost == 2
+        os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())  # what is buffered goes there when it is closed
+
+
+def test_a_logbook_goes_on_without_its_disk(tmp_path: Path) -> None:
+    class Full:
+        def add(self, estimate: Estimate) -> None:
+            raise OSError(28, "No space left on device")
+
+        def add_map(self, map_update: MapUpdate) -> None:
+            raise AssertionError("not after the disk has failed")
+
+    stamps = {"t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0}
+    with Bus("disk", "supervisor", hub=True, runtime_dir=tmp_path) as hub:
+        logbook = Logbook(hub, Full(), tolerant=True)
+        with Bus("disk", "optimize", runtime_dir=tmp_path) as bus:
+            out, gained = bus.publisher("estimate"), bus.publisher("map")
+            assert out.wait_matched(10.0)
+            assert gained.wait_matched(10.0)
+            gained.put(MapUpdate(epoch=0, frame_id=0), Trace((Stage("optimize", 1, 2),)))
+            for number in range(3):
+                status = (Status.END_OF_SOURCE,) if number == 2 else ()
+                estimate = Estimate(
+                    epoch=0,
+                    frame_id=number,
+                    T_world_ego=SE2(),
+                    cov=(0.0,) * 9,
+                    valid=not status,
+                    status=status,
+                    **stamps,
+                )
+                out.put(estimate, Trace((Stage("optimize", 1, 2),)))
+            logbook.wait_over(10.0)
+        assert logbook.ended
+        assert (logbook.recorded, logbook.error) == (2, None)
+        assert isinstance(logbook.unwritten, OSError)
+        logbook.close()

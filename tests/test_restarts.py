@@ -1,0 +1,138 @@
+"""Restarts: when, how often, and what a node is told of the one before it."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.configuration import Configuration, RuntimeConfig, SourceConfig
+from runtime.notify import Notifier
+from runtime.restarts import EpochFile, Restarts, Resume
+from runtime.stations import DEAF_RECORDS, Hearing
+from runtime.vitals import Vitals
+
+CONFIG = RuntimeConfig(restarts_max=3, restart_window_s=10.0, restart_backoff_ms=100.0, restart_backoff_max_ms=150.0)
+
+
+@pytest.fixture
+def vitals() -> Vitals:
+    return Vitals()
+
+
+def test_at_once_then_later_then_no_more(vitals: Vitals) -> None:
+    restarts = Restarts(CONFIG)
+    due_s = [restarts.died(100.0 + number, "killed", vitals) for number in range(4)]
+    assert due_s == [100.0, 101.1, pytest.approx(102.15), None]
+    assert (restarts.count, restarts.cause) == (3, "killed")
+    assert restarts.assignment().restarts == 3
+
+
+def test_what_lies_behind_the_window_is_forgiven(vitals: Vitals) -> None:
+    restarts = Restarts(CONFIG)
+    for number in range(20):
+        assert restarts.died(11.0 * number, "killed", vitals) == 11.0 * number
+    assert restarts.count == 20
+
+
+def test_the_next_one_goes_on_where_the_last_frame_was(vitals: Vitals) -> None:
+    restarts = Restarts(CONFIG)
+    restarts.died(0.0, "first", vitals)
+    assert restarts.assignment().resume is None
+    vitals.count(next_frame=42, t_source_ns=7, t_capture_ns=8)
+    restarts.died(0.0, "second", vitals)
+    restarts.died(0.0, "before its first frame", Vitals())
+    assignment = restarts.assignment()
+    assert assignment.resume == Resume(42, 7, 8)
+    assert msgspec.json.decode(msgspec.json.encode(assignment), type=type(assignment)) == assignment
+
+
+@pytest.mark.parametrize(
+    ("rate", "restart", "restarts"),
+    [(None, None, True), (33.0, None, True), ("max", None, False), (None, "never", False), ("max", "always", True)],
+)
+def test_a_run_that_may_lose_no_frame_is_not_mended(rate: object, restart: object, restarts: bool) -> None:
+    configuration = Configuration(
+        source=SourceConfig(rate=rate),  # type: ignore[arg-type]
+        runtime=RuntimeConfig(restart=restart),  # type: ignore[arg-type]
+    )
+    assert (configuration.restarts, configuration.spares) == (restarts, restarts)
+
+
+def test_epochs_grow_through_every_death(tmp_path: Path) -> None:
+    path = tmp_path / "epoch"
+    first = EpochFile(path)
+    assert first.last == -1
+    first.store(0)
+    first.store(3)
+    first.store(2)
+    assert EpochFile(path).last == 3  # the one before was never closed
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 1)), max_size=60))
+def test_a_node_that_takes_up_anything_is_not_deaf(steps: list[tuple[int, int]]) -> None:
+    hearing, sent, taken, since = Hearing(), 0, 0, 0
+    hearing.missed(0, 0, 0.0, 1.0)
+    for second, (more, heard) in enumerate(steps, start=1):
+        sent += more
+        taken += heard
+        since = sent if heard else since
+        missed = hearing.missed(sent, taken, float(second), 1.5)
+        assert missed in (0, sent - since)
+        assert bool(missed) <= (sent - since >= DEAF_RECORDS)
+
+
+def test_silence_is_not_deafness() -> None:
+    hearing = Hearing()
+    assert not any(hearing.missed(5, 5, float(second), 1.0) for second in range(100))
+    assert hearing.missed(5 + DEAF_RECORDS, 5, 100.0, 1.0) == DEAF_RECORDS
+    assert hearing.missed(2, 5, 101.0, 1.0) == 0  # the sender began anew
+
+
+@pytest.fixture
+def systemd(tmp_path: Path) -> socket.socket:
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    listener.bind(str(tmp_path / "notify"))
+    listener.settimeout(5.0)
+    yield listener  # type: ignore[misc]
+    listener.close()
+
+
+def test_systemd_is_told(systemd: socket.socket) -> None:
+    notifier = Notifier({"NOTIFY_SOCKET": systemd.getsockname(), "WATCHDOG_USEC": "300000"})
+    assert notifier.period_s == pytest.approx(0.1)
+    notifier.once("READY=1")
+    notifier.once("READY=1")
+    notifier.alive("frame 7")
+    notifier.alive("not due yet")
+    time.sleep(0.11)
+    notifier.alive("frame 9")
+    notifier.once("STOPPING=1")
+    said = [systemd.recv(4096).decode() for _ in range(4)]
+    assert said == ["READY=1", "WATCHDOG=1\nSTATUS=frame 7", "WATCHDOG=1\nSTATUS=frame 9", "STOPPING=1"]
+
+
+def test_without_systemd_nothing_is_said() -> None:
+    notifier = Notifier({})
+    assert notifier.period_s is None
+    notifier.once("READY=1")
+    notifier.alive("x")
+
+
+def test_another_process_s_watchdog_is_not_ours(systemd: socket.socket) -> None:
+    environment = {"NOTIFY_SOCKET": systemd.getsockname(), "WATCHDOG_USEC": "300000", "WATCHDOG_PID": str(os.getppid())}
+    notifier = Notifier(environment)
+    assert notifier.period_s is None
+    notifier.alive("x")
+    assert systemd.recv(4096) == b"STATUS=x"
+
+
+def test_a_systemd_that_is_gone_stops_nobody(tmp_path: Path) -> None:
+    Notifier({"NOTIFY_SOCKET": str(tmp_path / "nobody")}).once("READY=1")
