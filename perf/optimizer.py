@@ -30,6 +30,7 @@ from birdslam.graph import GraphConfig, PoseGraph
 from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.types import Measurements
 from birdslam.weights import WeightsConfig
+from perf.figures import curve, noise, write_json
 
 label = "the pose graph's update against gtsam's smoothers"
 
@@ -41,6 +42,7 @@ class Contender(Protocol):
 
 
 _WARM_UP = 100  # frames before memory is looked at
+_PARTS = 50  # of a drive, for the plot over its frames
 _PRIOR = gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)
 
 
@@ -51,24 +53,36 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--contenders", default=",".join(CONTENDERS), help="a list")
     parser.add_argument("--limit-s", type=float, default=60.0, help="time for each contender's frames")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--output", type=Path, required=True, help="JSON, a list of objects")
+    parser.add_argument("--output", type=Path, help="JSON, a list of objects")
     options = parser.parse_args(arguments)
-    rows = []
+    rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         for vehicles in (int(n) for n in options.vehicles.split(",")):
             log = Path(folder) / f"{vehicles}.log"
             config = DriveConfig(frames=options.frames, vehicles=vehicles, traffic="convoy")
-            log.write_bytes(
-                msgspec.msgpack.encode([msgspec.msgpack.encode(m) for m in drive(config, options.seed).measurements])
-            )
+            write_log(log, config, options.seed)
             for contender in options.contenders.split(","):
-                rows.append(_measure(contender, vehicles, log, options.limit_s))
-                print(json.dumps(rows[-1]), flush=True)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps(rows, indent=1) + "\n")
+                row = measure(contender, vehicles, log, options.limit_s)
+                rows.append({"name": f"{contender} {vehicles} vehicles", **row})
+                print(f"{rows[-1]['name']:44} {told(row)}", flush=True)
+                if options.output is not None:
+                    write_json(options.output, rows)  # after each: Ctrl-C keeps what was measured
 
 
-def _measure(contender: str, vehicles: int, log: Path, limit_s: float) -> dict[str, Any]:
+def write_log(log: Path, config: DriveConfig, seed: int) -> None:
+    """What every contender takes."""
+    records = [msgspec.msgpack.encode(m) for m in drive(config, seed).measurements]
+    log.write_bytes(msgspec.msgpack.encode(records))
+
+
+def told(row: dict[str, Any]) -> str:
+    """For a person."""
+    times = "  ".join(f"{name} {row[f'{name}_us'] / 1e3:.2f}" for name in ("p50", "p99", "max"))
+    grown = f"frames {row['frames']}  memory {row['rss_growth_mb']:+.0f} MB  exceptions {row['exceptions']}"
+    return f"{times} ms  {grown}"
+
+
+def measure(contender: str, vehicles: int, log: Path, limit_s: float) -> dict[str, Any]:
     """One contender in a process of its own."""
     one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     command = [sys.executable, "-m", "perf.optimizer", contender, str(vehicles), str(log), str(limit_s)]
@@ -122,6 +136,9 @@ def _drive_through(contender: str, vehicles: int, log: Path, limit_s: float) -> 
         "last_thousand_p50_us": round(np.median(times_us[-1000:]), 1),
         "rss_growth_mb": round((rss - rss_before) / 2**20, 2),
         "exceptions": exceptions,
+        "curve_us": curve(times_us),
+        "over_frames_us": [round(float(np.median(part)), 1) for part in np.array_split(times_us, _PARTS) if part.size],
+        "noise": noise("time_us", times_us),
     }
 
 

@@ -1,0 +1,227 @@
+"""The product as it runs: `birdslam run` with its real processes, and this process as its planner."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import msgspec
+import psutil
+
+from birdslam.types import Status
+from perf.errors import PerfError
+from runtime.bus import Message
+from runtime.client import Planner
+from runtime.topology import NODES
+
+START_S, END_S = 90.0, 30.0
+_SAMPLE_S = 1.0
+_VEHICLE = "perf"
+DEMO = "demo: the built-in demo world does not exist yet; give kitti:DIR or video:FILE"
+
+
+class Ask(msgspec.Struct, frozen=True, kw_only=True):
+    """What to run; the rest is the product's configuration."""
+
+    source: str
+    rate: float
+    seconds: float
+    models: tuple[str, ...] = ()  # ROLE=PATH
+    settings: tuple[str, ...] = ()  # KEY=VALUE
+    config: str = ""  # a file
+    loop: bool = True
+    planners: int = 0  # further ones
+    profile: Path | None = None  # a folder for py-spy's traces
+
+    def command(self, place: Path) -> list[str]:
+        """The command line of `birdslam`, with all its files under `place`."""
+        settings = [
+            f"runtime.runtime_dir={place / 'rt'}",
+            f"source.frames={max(1, round(self.rate * self.seconds))}",
+            f"source.loop={str(self.loop).lower()}",
+            *self.settings,
+        ]
+        return [
+            *(sys.executable, "-m", "runtime.cli", "run", *([self.config] if self.config else [])),
+            *("--source", self.source, "--rate", str(self.rate), "--vehicle", _VEHICLE, "--output", str(place / "out")),
+            *(part for model in self.models for part in ("--model", model)),
+            *(part for setting in settings for part in ("--set", setting)),
+        ]
+
+
+@dataclass
+class Sample:
+    """Of the processes, once a second."""
+
+    t_s: float
+    cpu_s: dict[str, float]  # process -> processor time so far
+    rss_mb: dict[str, float]
+
+
+@dataclass
+class Run:
+    """What came out of it."""
+
+    messages: list[Message] = field(default_factory=list)
+    samples: list[Sample] = field(default_factory=list)
+    summary: dict[str, Any] = field(default_factory=dict)
+    place: Path = Path()
+    complete: bool = False  # not cut short by Ctrl-C
+
+    def after(self, warm_up_s: float) -> Self:
+        """Without its first seconds, in which caches fill and the spares load."""
+        first_ns = self.messages[0].t_received_ns if self.messages else 0
+        begun_s = first_ns / 1e9 + warm_up_s
+        self.messages = [m for m in self.messages if m.t_received_ns / 1e9 >= begun_s]
+        self.samples = [sample for sample in self.samples if sample.t_s >= begun_s]
+        return self
+
+
+@contextlib.contextmanager
+def drive(ask: Ask) -> Iterator[Run]:
+    """Runs it to its end; on Ctrl-C ends it in order, and what was received until then is in the result.
+
+    The files of the run live as long as the context. Raises PerfError with the product's own words where it fails.
+    """
+    if ask.source.partition(":")[0] == "demo":
+        raise PerfError(DEMO)
+    with tempfile.TemporaryDirectory(prefix="perf") as folder:
+        run = Run(place=Path(folder))
+        log = run.place / "run.log"
+        (run.place / "rt").mkdir(mode=0o700)
+        with log.open("wb") as output:
+            process = subprocess.Popen(ask.command(run.place), stdout=output, stderr=output, start_new_session=True)
+        try:
+            with _planners(ask.planners, run.place / "rt"), _profiled(ask.profile, process):
+                with contextlib.suppress(KeyboardInterrupt):
+                    run.complete = _receive(run, process)
+                _finish(process, run.complete)
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+        summary = run.place / "out" / "summary.json"
+        if not run.messages or not summary.is_file():
+            raise PerfError(f"birdslam run: {log.read_text(errors='replace').strip()[-2000:] or 'gave no estimate'}")
+        run.summary = json.loads(summary.read_text())
+        yield run
+
+
+def _receive(run: Run, process: subprocess.Popen[bytes]) -> bool:
+    """Every estimate; true at the end of the source, false where the process ended before it."""
+    sample_s, until_s = 0.0, time.monotonic() + START_S
+    with Planner(_VEHICLE, run.place / "rt") as planner:
+        while process.poll() is None and (run.messages or time.monotonic() < until_s):
+            message = planner.wait_message(0.1)
+            if message is not None:
+                if Status.END_OF_SOURCE in message.record.status:
+                    return True
+                run.messages.append(message)
+            now_s = time.monotonic()
+            if run.messages and now_s - sample_s >= _SAMPLE_S:
+                run.samples.append(_sample(process.pid, now_s))
+                sample_s = now_s
+    return False
+
+
+def _finish(process: subprocess.Popen[bytes], ended: bool) -> None:
+    """Its results are written when it is gone."""
+    if process.poll() is None and not ended:
+        process.terminate()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(END_S)
+
+
+def _commands(pid: int) -> list[tuple[psutil.Process, list[str]]]:
+    found = []
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for child in psutil.Process(pid).children():
+            with contextlib.suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
+                found.append((child, child.cmdline()))
+    return found
+
+
+def _named(pid: int) -> dict[str, psutil.Process]:
+    """The processes of a run: "supervisor", each node, and "NODE spare" for the one that stands by."""
+    found = {"supervisor": psutil.Process(pid)}
+    for child, command in sorted(_commands(pid), key=lambda pair: (pair[0].create_time(), pair[0].pid)):
+        for node in NODES:
+            if node in command:
+                found[f"{node} spare" if node in found else node] = child
+    return found
+
+
+def _sample(pid: int, now_s: float) -> Sample:
+    cpu_s, rss_mb = {}, {}
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for name, process in _named(pid).items():
+            with contextlib.suppress(psutil.NoSuchProcess), process.oneshot():
+                times = process.cpu_times()
+                cpu_s[name] = times.user + times.system
+                rss_mb[name] = process.memory_info().rss / 2**20
+    return Sample(now_s, cpu_s, rss_mb)
+
+
+@contextlib.contextmanager
+def _planners(count: int, runtime_dir: Path) -> Iterator[None]:
+    """Further planners in processes of their own, which take every estimate."""
+    command = [sys.executable, "-m", "runtime.cli", "listen", "--vehicle", _VEHICLE, "--runtime-dir", str(runtime_dir)]
+    others = [
+        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+        for _ in range(count)
+    ]
+    try:
+        yield
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
+
+
+@contextlib.contextmanager
+def _profiled(folder: Path | None, process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """py-spy's flame graph of each process, from when it runs to its end: FOLDER/NODE.svg."""
+    if folder is None:
+        yield
+        return
+    tool = shutil.which("py-spy", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
+    if tool is None:
+        raise PerfError("--profile needs py-spy: pip install py-spy")
+    folder.mkdir(parents=True, exist_ok=True)
+    until_s = time.monotonic() + START_S
+    while process.poll() is None and not set(NODES) <= set(_named(process.pid)) and time.monotonic() < until_s:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(0.05)
+    spies = []
+    for name, watched in _named(process.pid).items():
+        command = [tool, "record", "--native", "--threads", "--format", "flamegraph"]
+        command += ["--output", str(folder / f"{name.replace(' ', '_')}.svg"), "--pid", str(watched.pid)]
+        spies.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE))
+    try:
+        yield
+    finally:
+        for spy in spies:
+            if spy.poll() is None:
+                spy.send_signal(signal.SIGINT)  # it writes what it has
+            _, errors = spy.communicate()
+            if spy.returncode:
+                print(f"py-spy: {errors.decode(errors='replace').strip()}", file=sys.stderr)
+
+
+def add_run_options(add: Any) -> None:
+    """The options of a parser that make an Ask; `add` is its add_argument."""
+    add("--source", required=True, metavar="URI", help="kitti:DIR or video:FILE, in a loop")
+    add("--config", default="", metavar="CONFIG.toml", help="of the product")
+    add("--model", action="append", default=[], metavar="ROLE=PATH")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="any key of the configuration")

@@ -1,0 +1,180 @@
+"""The whole product at a rate: how old an estimate is at the planner, where that time went, and what it costs.
+
+    python -m perf system --source kitti:DIR --model detector=F.onnx --rate 33 --seconds 120 --output F.json
+
+The real processes run (`birdslam run`); this process is their planner. A recording is played in a loop at `--rate`,
+whatever its own. The first seconds are left out of the figures, but not out of the count of dropped frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from perf.figures import BLOCKS, Ledger, curve, noise, shown, spread
+from perf.live import Ask, Run, add_run_options, drive
+from perf.machine import Steal, loaded
+from runtime.bus import Message
+from runtime.configuration import BudgetsConfig
+from runtime.latency import stages
+from runtime.topology import NODES
+
+label = "age at the planner, rate, drops, CPU and memory of the real processes"
+
+WARM_UP_S = 3.0
+TAIL_PERCENTILE = 99.0
+
+
+def run(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="python -m perf system", description=label)
+    add_run_options(parser.add_argument)
+    parser.add_argument("--rate", type=float, default=33.0, help="Hz")
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--load", type=int, default=0, help="so many busy cores beside it")
+    parser.add_argument("--planners", type=int, default=0, help="so many further planners")
+    parser.add_argument("--profile", type=Path, metavar="DIR", help="py-spy's flame graph of each process goes there")
+    parser.add_argument("--output", type=Path, help="JSON")
+    options = parser.parse_args(arguments)
+    ask = Ask(
+        source=options.source,
+        rate=options.rate,
+        seconds=options.seconds + WARM_UP_S,
+        models=tuple(options.model),
+        settings=tuple(options.set),
+        config=options.config,
+        planners=options.planners,
+        profile=options.profile,
+    )
+    settings = {**msgspec.to_builtins(ask, enc_hook=str), "seconds": options.seconds, "load": options.load}
+    with Ledger(options.output, label, **settings) as ledger:
+        steal = Steal()
+        with loaded(options.load), drive(ask) as result:
+            ledger.set(**figures(result, WARM_UP_S), steal_during_percent=steal.percent())
+        print(table(ledger.content))
+        if not result.complete:
+            raise KeyboardInterrupt
+    return 0 if all(row["met"] for row in ledger.content["budgets"]) else 1
+
+
+def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
+    """What `system` says of a run; the means of `stages` add up to the mean of `age_ms`."""
+    summary, received = result.summary, len(result.messages)
+    result.after(warm_up_s)
+    age_ms = np.array([age_of(message) for message in result.messages])
+    split: dict[str, list[float]] = {}
+    for message in result.messages:
+        for name, ms in parts(message):
+            split.setdefault(name, []).append(ms)
+    parts_ms = {name: np.array(values) for name, values in split.items()}
+    late = age_ms >= np.percentile(age_ms, TAIL_PERCENTILE) if age_ms.size else np.zeros(0, dtype=bool)
+    cpu, rss_mb = usage(result)
+    periods_ms = np.diff([message.t_received_ns for message in result.messages]) / 1e6
+    return {
+        "rate_hz": round(1e3 / float(periods_ms.mean()), 3) if periods_ms.size else 0.0,
+        "frames": summary["frames_in"],
+        "dropped": summary["frames_dropped"],
+        "dropped_by": summary["dropped_by"],
+        "missed_by_planner": summary["frames_processed"] - received,
+        "cpu_cores": round(float(sum(np.mean(values) for values in cpu.values() if len(values))), 3),
+        "cpu_cores_by": {name: round(float(np.mean(values)), 3) for name, values in cpu.items() if len(values)},
+        "rss_mb": round(sum(rss_mb.values()), 1),
+        "rss_mb_by": {name: round(value, 1) for name, value in rss_mb.items()},
+        "age_ms": spread(age_ms) | {"mean": _mean(age_ms)},
+        "period_ms": spread(periods_ms),
+        "stages": {
+            name: spread(values) | {"mean": _mean(values), "mean_in_tail": _mean(values[late])}
+            for name, values in parts_ms.items()
+        },
+        "age_curve_ms": curve(age_ms),
+        "statuses": summary["statuses"],
+        "restarts": summary["restarts"],
+        "budgets": list(budgets(summary["configuration"]["budgets"], age_ms, parts_ms)),
+        "configuration": summary["configuration"],
+        "networks": summary["models"],
+        "noise": noise("age_ms", age_ms) | noise("period_ms", periods_ms) | _noise_of_cpu(cpu),
+    }
+
+
+def age_of(message: Message) -> float:
+    """From the frame's capture until this planner had the estimate, in ms."""
+    return float(message.t_received_ns - message.record.t_capture_ns) / 1e6
+
+
+def parts(message: Message) -> Iterator[tuple[str, float]]:
+    """(name, ms) of what an estimate's age is made of; they add up to it."""
+    first = message.trace.stages[0]
+    yield f"due -> {first.node}", (first.received_ns - message.record.t_capture_ns) / 1e6
+    yield from stages(message.trace, message.t_received_ns)
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    return round(float(values.mean()), 4) if values.size else 0.0
+
+
+def usage(result: Run) -> tuple[dict[str, list[float]], dict[str, float]]:
+    """Cores in use by each process, second for second, and the most memory that it had (MB)."""
+    cores: dict[str, list[float]] = {}
+    most_mb: dict[str, float] = {}
+    for before, after in zip(result.samples, result.samples[1:], strict=False):
+        for name in before.cpu_s.keys() & after.cpu_s.keys():
+            used = (after.cpu_s[name] - before.cpu_s[name]) / (after.t_s - before.t_s)
+            cores.setdefault(name, []).append(max(0.0, used))
+    for sample in result.samples:
+        for name, mb in sample.rss_mb.items():
+            most_mb[name] = max(most_mb.get(name, 0.0), mb)
+    return dict(sorted(cores.items())), dict(sorted(most_mb.items()))
+
+
+def _noise_of_cpu(cpu: dict[str, list[float]]) -> dict[str, list[float]]:
+    seconds = min((len(values) for name, values in cpu.items() if name in NODES), default=0)
+    if seconds < BLOCKS:
+        return {}
+    total = np.sum([values[:seconds] for name, values in cpu.items() if name in NODES], axis=0)
+    return {"cpu_cores": [round(float(block.mean()), 4) for block in np.array_split(total, BLOCKS)]}
+
+
+def budgets(
+    configured: dict[str, float], age_ms: NDArray[np.float64], parts_ms: dict[str, NDArray[np.float64]]
+) -> Iterator[dict[str, Any]]:
+    """Each budget of the configuration, what it was held against, and whether it was met."""
+    limits = msgspec.convert(configured, BudgetsConfig)
+    measured = {"end_to_end_ms": age_ms}
+    for name, values in parts_ms.items():
+        measured[f"{name.replace(' -> ', '_to_')}_ms"] = values
+    for key in BudgetsConfig.__struct_fields__:
+        if key != "percentile" and measured.get(key, np.zeros(0)).size:
+            value = float(np.percentile(measured[key], limits.percentile))
+            limit = float(getattr(limits, key))
+            yield {
+                "budget": key,
+                "percentile": limits.percentile,
+                "limit_ms": limit,
+                "measured_ms": round(value, 3),
+                "met": value <= limit,
+            }
+
+
+def table(content: dict[str, Any]) -> str:
+    """For a person."""
+    cpu = ", ".join(f"{name} {cores:.2f}" for name, cores in content["cpu_cores_by"].items())
+    lines = [
+        f"{'rate':32}{content['rate_hz']:.2f} Hz",
+        f"{'dropped':32}{content['dropped']} of {content['frames']} frames",
+        f"{'cores':32}{content['cpu_cores']:.2f} ({cpu})",
+        f"{'memory':32}{content['rss_mb']:.0f} MB",
+        f"{'steal':32}{content['steal_during_percent']:.2f} %",
+        f"{'age at the planner':32}{shown(content['age_ms'], 'ms')}  mean {content['age_ms']['mean']:.2f}",
+    ]
+    for name, stage in content["stages"].items():
+        lines.append(f"  {name:30}{shown(stage, 'ms')}  mean {stage['mean']:.2f}")
+    for row in content["budgets"]:
+        verdict = "met" if row["met"] else "NOT MET"
+        told = f"p{row['percentile']:g} {row['measured_ms']:.2f} of {row['limit_ms']:g} ms: {verdict}"
+        lines.append(f"{row['budget']:32}{told}")
+    return "\n".join(lines)

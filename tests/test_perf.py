@@ -1,0 +1,268 @@
+"""The suite measures right and judges fairly; and ours over its peers has not got worse than the reference's bounds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.se2 import SE2
+from birdslam.simulation.drive import DriveConfig
+from birdslam.types import Estimate
+from perf import all as everything
+from perf import compare, optimizer, ratios, report, system, transport
+from perf.__main__ import main
+from perf.errors import PerfError
+from perf.figures import BLOCKS, Ledger, curve, noise, spread
+from perf.live import Ask, Run, Sample, drive
+from runtime.bus import Message
+from runtime.wire import Stage, Trace
+
+MS = 1_000_000
+
+
+@given(st.lists(st.floats(0.0, 1e6), min_size=1, max_size=300))
+def test_a_spread_is_ordered_and_within_its_series(values: list[float]) -> None:
+    found = spread(values)
+    assert min(values) - 1e-3 <= found["p50"] <= found["p99"] <= found["p999"] <= found["max"] <= max(values) + 1e-3
+    assert found["n"] == len(values)
+    levels, points = zip(*curve(values), strict=True)
+    assert list(levels) == sorted(levels)
+    assert list(points) == sorted(points)
+
+
+def test_nothing_measured_gives_no_figure() -> None:
+    assert spread([]) == {"n": 0}
+    assert curve([]) == []
+    assert noise("age_ms", [1.0] * (2 * BLOCKS - 1)) == {}
+
+
+def test_noise_is_the_blocks_of_a_series() -> None:
+    found = noise("age_ms", np.repeat(np.arange(BLOCKS, dtype=float), 7))
+    assert found == {"age_ms.p50": list(range(BLOCKS)), "age_ms.p99": list(range(BLOCKS))}
+
+
+def _report(shift: float, seed: int, dropped: int = 0, exact: float = 0.5) -> dict[str, Any]:
+    values = np.random.default_rng(seed).gamma(9.0, 1.0, 600) * shift
+    row = {"name": "ring", "noise": noise("latency_ms", values), "dropped": dropped, "sent": 600}
+    return {"benchmarks": {"transport": {"rows": [row, {"name": "offline", "exact": {"ate_m": exact}}]}}}
+
+
+def _verdicts(old: list[Any], new: list[Any]) -> dict[str, str]:
+    return {line.name: line.verdict for line in compare.compare(old, new)}
+
+
+def test_compare_calls_noise_not_distinguishable() -> None:
+    for seed in range(20):
+        verdicts = _verdicts([_report(1.0, seed)], [_report(1.0, 100 + seed)])
+        assert set(verdicts.values()) == {"not distinguishable"}
+
+
+def test_compare_sees_what_changed_and_in_which_direction() -> None:
+    worse = _verdicts([_report(1.0, 1)], [_report(1.5, 2, dropped=200, exact=0.6)])
+    better = _verdicts([_report(1.5, 2, dropped=200, exact=0.6)], [_report(1.0, 1)])
+    assert set(worse) == {
+        "transport / ring / latency_ms.p50",
+        "transport / ring / latency_ms.p99",
+        "transport / ring / dropped",
+        "transport / offline / ate_m (exact)",
+    }
+    assert set(worse.values()) == {"worse"}
+    assert set(better.values()) == {"better"}
+
+
+def test_compare_does_not_care_for_a_small_shift_however_sure() -> None:
+    assert set(_verdicts([_report(1.0, 1)] * 9, [_report(1.02, 1)] * 9).values()) == {"not distinguishable"}
+
+
+def test_compare_exits_by_its_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = []
+    for name, content in (("old", _report(1.0, 1)), ("new", _report(2.0, 2))):
+        paths.append(tmp_path / f"{name}.json")
+        paths[-1].write_text(json.dumps(content))
+    old, new = map(str, paths)
+    assert main(["compare", old, old]) == 0
+    assert main(["compare", old, new]) == 1
+    assert main(["compare", new, old]) == 0
+    assert main(["compare", old, str(tmp_path / "absent.json")]) == 2
+    assert "absent.json: No such file" in capsys.readouterr().err
+    with pytest.raises(PerfError, match="no figure in common"):
+        compare.compare([_report(1.0, 1)], [{}])
+
+
+def _cut_short(path: Path) -> None:
+    with Ledger(path, "a benchmark") as ledger:
+        ledger.add("first", "shown", value=np.float64(1.5))
+        raise KeyboardInterrupt
+
+
+def test_a_ledger_keeps_what_was_measured_when_it_is_cut_short(tmp_path: Path) -> None:
+    path = tmp_path / "some" / "figures.json"
+    with pytest.raises(KeyboardInterrupt):
+        _cut_short(path)
+    kept = json.loads(path.read_text())
+    assert kept["rows"] == [{"name": "first", "value": 1.5}]
+    assert kept["complete"] is False
+    assert {"cpu", "cores", "kernel", "commit", "versions"} <= kept["machine"].keys()
+    with Ledger(path, "a benchmark"):
+        pass
+    assert json.loads(path.read_text())["complete"] is True
+
+
+def _message(frame: int, slow_ms: int = 0) -> Message:
+    due = frame * 30 * MS
+    stages = (
+        Stage("capture", due + 1 * MS, due + 2 * MS, due + 2 * MS),
+        Stage("perceive", due + 3 * MS, due + (13 + slow_ms) * MS, due + (13 + slow_ms) * MS),
+        Stage("optimize", due + (14 + slow_ms) * MS, due + (15 + slow_ms) * MS, due + (15 + slow_ms) * MS),
+    )
+    estimate = Estimate(frame_id=frame, t_source_ns=due, t_capture_ns=due, t_utc_ns=0, epoch=0, **_pose())
+    return Message(estimate, Trace(stages), due + (17 + slow_ms) * MS)
+
+
+def _pose() -> dict[str, Any]:
+    return {"T_world_ego": SE2(), "cov": (0.0,) * 9, "valid": True}
+
+
+def _run(budget_ms: float) -> Run:
+    messages = [_message(frame, slow_ms=30 if frame % 100 == 50 else frame % 3) for frame in range(300)]
+    samples = [
+        Sample(float(second), {"perceive": 0.5 * second}, {"perceive": 100.0 + second, "optimize": 50.0})
+        for second in range(9)
+    ]
+    summary = {
+        "frames_in": 305,
+        "frames_dropped": 5,
+        "dropped_by": {"perceive": 5},
+        "frames_processed": 300,
+        "statuses": {},
+        "restarts": {},
+        "models": {},
+        "configuration": {"budgets": {"perceive_ms": budget_ms}},
+    }
+    return Run(messages=messages, samples=samples, summary=summary, complete=True)
+
+
+def test_the_parts_of_an_age_add_up_to_it() -> None:
+    for message in (_message(1), _message(2, slow_ms=9)):
+        assert sum(ms for _, ms in system.parts(message)) == pytest.approx(system.age_of(message))
+    found = system.figures(_run(100.0))
+    assert sum(stage["mean"] for stage in found["stages"].values()) == pytest.approx(found["age_ms"]["mean"], abs=1e-2)
+    assert found["stages"]["perceive"]["mean_in_tail"] > 2 * found["stages"]["perceive"]["mean"]
+    assert found["cpu_cores"] == pytest.approx(0.5)
+    assert found["rss_mb"] == pytest.approx(158.0)
+    assert found["dropped"] == 5
+    assert found["rate_hz"] == pytest.approx(1e3 / 30.0, rel=0.01)
+
+
+def test_budgets_are_those_of_the_configuration() -> None:
+    held = {row["budget"]: row for row in system.figures(_run(100.0))["budgets"]}
+    assert all(row["met"] for row in held.values())
+    assert len(held) == 7
+    broken = {row["budget"] for row in system.figures(_run(11.0))["budgets"] if not row["met"]}
+    assert broken == {"perceive_ms"}
+
+
+def test_a_warm_up_is_left_out() -> None:
+    run = _run(100.0).after(3.0)
+    assert len(run.messages) == 200
+    assert run.messages[0].record.frame_id == 100
+
+
+def test_the_demo_world_is_said_to_be_missing(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(PerfError, match="does not exist yet"), drive(Ask(source="demo", rate=33.0, seconds=1.0)):
+        pass
+    for benchmark in ("system", "accuracy", "inference"):
+        assert main([benchmark, "--source", "demo"]) == 2
+        assert "demo" in capsys.readouterr().err
+
+
+def test_every_benchmark_has_a_label(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    listed = {line.split()[0] for line in capsys.readouterr().out.splitlines()}
+    assert {step.benchmark for step in everything.STEPS} | {"all", "compare"} <= listed
+    assert main(["nothing"]) == 2
+
+
+def test_a_report_shows_what_is_there_and_names_what_is_not(tmp_path: Path) -> None:
+    run = system.figures(_run(11.0)) | {"steal_during_percent": 0.5}
+    row = {
+        **{"carrier": "ring", "bytes": 200, "rate_hz": 33, "load": 0, "sent": 100, "dropped": 1, "steal_percent": 0.0},
+        "latency_ms": spread([1.0, 2.0]),
+        "curve_ms": curve([1.0, 2.0]),
+        "cpu_percent": {"sender": 1.0, "receiver": 2.0},
+    }
+    with Ledger(None, "") as ledger:
+        machine = ledger.content["machine"]
+    content = {
+        **{"command": "python -m perf all", "source": "kitti:00", "models": [], "machine": machine},
+        "outcome": {"system": "complete", "transport": "interrupted"},
+        "benchmarks": {"system": run, "transport": {"rows": [{"name": "ring 200 B", **row}]}},
+    }
+    report.write(tmp_path, content)
+    text = (tmp_path / "report.md").read_text()
+    assert "transport: interrupted" in text
+    assert "ring 200 B" in text
+    assert "## Optimizer" not in text
+    assert machine["cpu"] in text
+    perceive = next(line for line in text.splitlines() if line.startswith("| perceive |"))
+    assert perceive.endswith("| p99 11 | no |")
+    for name in ("age.png", "stages.png", "transport.png"):
+        assert f"({name})" in text
+        assert (tmp_path / name).stat().st_size > 1000
+
+
+def test_carriers_deliver_every_message_of_a_slow_stream() -> None:
+    rows = [transport.measure(transport.Case(carrier, 4_000, 20, 0), 0.5) for carrier in ("ring", "zenoh-shm")]
+    for row in rows:
+        assert row["sent"] == 10
+        assert row["latency_ms"]["n"] + row["dropped"] == 10
+        assert row["latency_ms"]["n"] > 0
+
+
+def test_the_optimizer_is_measured_with_its_noise(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    optimizer.write_log(log, DriveConfig(frames=60, vehicles=1), seed=1)
+    row = optimizer.measure("ours", 1, log, 10.0)
+    assert row["frames"] == 60
+    assert len(row["noise"]["time_us.p50"]) == BLOCKS
+    assert len(row["over_frames_us"]) == 50
+
+
+def test_a_bound_is_passed_only_where_every_round_is_worse() -> None:
+    bounds = {"a": ratios.Bound(1.0, 2.0)}
+    assert ratios.worse({"a": [5.0, 1.9]}, bounds) == []
+    assert ratios.worse({"a": [5.0, 2.1]}, bounds) == ["a"]
+
+
+def test_ours_over_its_peers_has_not_got_worse() -> None:
+    """Ratios of one machine at one time; noise gets a second and a third chance, a change that made us slower none."""
+    bounds, found = ratios.reference(), ratios.measure(1)
+    assert found.keys() == bounds.keys()
+    for _ in range(2):
+        if ratios.worse(found, bounds):
+            again = ratios.measure(1)
+            found = {name: values + again[name] for name, values in found.items()}
+    assert not ratios.worse(found, bounds), found
+
+
+def test_interrupting_the_suite_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(step: everything.Step, options: SimpleNamespace, models: list[str]) -> str:
+        if step.file == "optimizer":
+            return "interrupted"
+        (options.output / f"{step.file}.json").write_text(json.dumps({"rows": [], "label": step.file}))
+        return "complete"
+
+    monkeypatch.setattr(everything, "_run", interrupted)
+    assert everything.run(["--output", str(tmp_path), "--model", "detector=none.onnx"]) == 130
+    kept = json.loads((tmp_path / "report.json").read_text())
+    assert kept["outcome"]["optimizer"] == "interrupted"
+    assert "transport" not in kept["outcome"]
+    assert kept["benchmarks"]["inference"]["label"] == "inference"
+    assert "optimizer: interrupted" in (tmp_path / "report.md").read_text()
