@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-_SMALL_ANGLE_RAD = 1e-6  # below it the closed forms of exp and log lose digits to cancellation
+_SMALL_ANGLE_RAD = 1e-9  # below it the first order is exact in double precision
 
 
 def wrap(angle_rad: float) -> float:
@@ -66,16 +66,16 @@ class SE2(msgspec.Struct, frozen=True, array_like=True):
         """The motion of the constant twist `xi` = (x_m, y_m, yaw_rad) over one unit of time."""
         vx, vy, w = (float(v) for v in xi)
         if abs(w) < _SMALL_ANGLE_RAD:
-            a, b = 1.0 - w * w / 6.0, w / 2.0
+            a, b = 1.0, w / 2.0
         else:
-            a, b = math.sin(w) / w, (1.0 - math.cos(w)) / w
+            a, b = math.sin(w) / w, 2.0 * math.sin(w / 2.0) ** 2 / w  # 1 - cos w would lose digits
         return SE2(a * vx - b * vy, b * vx + a * vy, wrap(w))
 
     def log(self) -> NDArray[np.float64]:
         """The twist (3,) in (m, m, rad) whose `exp` is this motion; yaw in [-pi, pi)."""
         w = wrap(self.yaw_rad)
         half = w / 2.0
-        a = 1.0 - w * w / 12.0 if abs(w) < _SMALL_ANGLE_RAD else half / math.tan(half)
+        a = 1.0 if abs(w) < _SMALL_ANGLE_RAD else half / math.tan(half)
         return np.array([a * self.x_m + half * self.y_m, -half * self.x_m + a * self.y_m, w])
 
     def adjoint(self) -> NDArray[np.float64]:
