@@ -41,7 +41,7 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     moved_across_rel: float = 0.05  # distance then: along the line of sight, and across it
     sigma_yaw_rate_radps: float = 0.5
     direction_inflation: float = 3.0  # of the motion's direction: its errors last for many frames
-    sigma_yaw_unknown_rad: float = 0.5
+    sigma_yaw_unknown_rad: float = 0.2
     sigma_yaw_moving_rad: float = 0.1
 
 
