@@ -79,4 +79,4 @@ def test_no_machine_path_or_secret_host_in_the_tree() -> None:
             if path.suffix in (".py", ".toml", ".md", ".service", ".sh") and path.name != Path(__file__).name:
                 text = path.read_text()
                 assert "/home/" not in text, path
-                assert "/work/" not in text, path
+                assert "/root/" not in text, path
