@@ -6,12 +6,7 @@ from birdslam.perception.network import Findings, ModelSpec, Network, load_netwo
 from birdslam.perception.schedule import Networks, Pending, Perception, Ready
 from birdslam.perception.segmentation import Segmentation
 
-VEHICLE_LABELS: frozenset[Label] = frozenset({"car", "truck", "bus"})
-MOVABLE_LABELS: frozenset[Label] = VEHICLE_LABELS | {"person", "bicycle", "motorcycle"}  # no landmark lies on them
-
 __all__ = [
-    "MOVABLE_LABELS",
-    "VEHICLE_LABELS",
     "Detections",
     "Findings",
     "Label",
