@@ -17,9 +17,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.checkpoint import Checkpoint, CheckpointError, Epoch, pack, plain, unpack
 from birdslam.edges import PoseEdges, pose_edges
 from birdslam.landmarks import Landmarks, PendingMap, Sightings, sightings
-from birdslam.planar import log
+from birdslam.planar import rates
+from birdslam.readout import vehicle_estimates
 from birdslam.se2 import SE2
 from birdslam.traffic import Traffic
 from birdslam.types import INVALIDATING, Estimate, MapUpdate, Measurements, Status, VehicleEstimate
@@ -66,16 +68,6 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     blind_radps: Positive = 0.1
 
 
-# The paper's own back end, together with WeightsConfig(mode="paper"): Eqs. 2-8 and nothing else
-PAPER = GraphConfig(
-    ego_nodes=1,
-    constant_velocity=False,
-    detection_gate_sigma=1e6,
-    landmark_gate_sigma=1e6,
-    landmark_common_m=0.0,
-)
-
-
 class PoseGraph:
     """`update` is one step. Bounded in time and memory; deterministic; raises nothing for what a record may say."""
 
@@ -102,13 +94,52 @@ class PoseGraph:
         if not math.isfinite(window.P.trace()):  # numbers that no road has: begin anew rather than publish them
             window, reset = self._begin(m, True), True
         status = (*m.status, Status.GRAPH_RESET) if reset else m.status
-        return self._record(m, status, window.P[:3, :3], self._vehicle_estimates(m, window))
+        return self._record(m, status, window.P[:3, :3], self._others(m, window))
 
     def map_update(self) -> MapUpdate | None:
         """What the map gained since the last call, in world; None where it gained nothing."""
         return self._map.take()
 
     # --- the life of the graph ---
+
+    def checkpoint(self) -> bytes:
+        """The graph as it stands between two frames, for `restore`."""
+        begun = None
+        if self._window is not None:
+            begun = Epoch(
+                window=self._window.state(),
+                vehicles=self._traffic.vehicles,
+                landmarks=self._landmarks.state(),
+                t_ns=self._t_ns,
+                t_before_ns=self._t_before_ns,
+                motion=self._motion,
+            )
+        settings = plain(graph=self.config, weights=self.weights)
+        return pack(Checkpoint(settings=settings, epoch=self.epoch, begun=begun, pending=self._map.state()))
+
+    @staticmethod
+    def restore(data: bytes, config: GraphConfig, weights: WeightsConfig) -> PoseGraph:
+        """The graph of a `checkpoint`, which goes on with the very bytes that the one it was taken of would give.
+
+        Raises CheckpointError, which says why, for bytes that are torn, no checkpoint, or one of other settings.
+        """
+        checkpoint = unpack(data, plain(graph=config, weights=weights))
+        graph = PoseGraph(config, weights, checkpoint.epoch)
+        begun = checkpoint.begun
+        graph._map.take_up(checkpoint.pending, checkpoint.epoch)
+        if begun is None:
+            return graph
+        try:
+            graph._window = Window.taken_up(begun.window)
+            graph._landmarks = Landmarks.taken_up(begun.landmarks, config.max_landmarks)
+        except ValueError as error:
+            raise CheckpointError(f"does not fit together: {error}") from None
+        if len(begun.vehicles) != len(graph._window.velocity):
+            raise CheckpointError(f"does not fit together: {len(begun.vehicles)} vehicles are not the window's")
+        graph._traffic = Traffic(config.forget_s, config.max_vehicles, config.detection_contradictions)
+        graph._traffic.take_up(begun.vehicles)
+        graph._t_ns, graph._t_before_ns, graph._motion = begun.t_ns, begun.t_before_ns, begun.motion
+        return graph
 
     def _begin(self, m: Measurements, reset: bool) -> Window:
         config = self.config
@@ -134,25 +165,32 @@ class PoseGraph:
         """Moves the window on to this frame, if it follows another, and takes the frame's edges in."""
         config, traffic = self.config, self._traffic
         vehicles, row_of = traffic.vehicles, traffic.row_of
-        known = [k for k, e in enumerate(edges.cv) if e.vehicle in row_of]
+        rows_seen = [row_of.get(e.vehicle, -1) for e in edges.cv]
+        known = [k for k, row in enumerate(rows_seen) if row >= 0]
         linked = [k for k, e in enumerate(edges.vv) if self._links(e.vehicle, e.from_frame)]
-        vv_rows = np.array([row_of[edges.vv[k].vehicle] for k in linked], dtype=np.int64)
-        vv_poses, vv_covs = (edges.poses[edges.vv_at][linked], edges.covs[edges.vv_at][linked]) if linked else _NO_EDGES
+        rows_linked = [row_of[edges.vv[k].vehicle] for k in linked]
+        vv_rows = np.array(rows_linked, dtype=np.int64)
+        vv_poses, vv_covs = edges.poses[edges.vv_at], edges.covs[edges.vv_at]
+        if len(linked) < len(edges.vv):
+            vv_poses, vv_covs = vv_poses[linked], vv_covs[linked]
         hold = Status.STANDSTILL in m.status
 
         # Every vehicle that an edge of this frame ties to its last pose gets a new one here
-        tied = set(vv_rows.tolist())
+        tied = set(rows_linked)
         if config.constant_velocity:
-            tied.update(row_of[edges.cv[k].vehicle] for k in known)
+            tied.update([rows_seen[k] for k in known])
         else:
-            known = [k for k in known if row_of[edges.cv[k].vehicle] in tied]
-        dt_s = np.array(
-            [max((m.t_source_ns - v.node_ns) * 1e-9, _SHORTEST_S) if i in tied else 0.0 for i, v in enumerate(vehicles)]
-        )
+            known = [k for k in known if rows_seen[k] in tied]
+        passed_s = [0.0] * len(vehicles)
+        for row in tied:
+            v = vehicles[row]
+            passed_s[row] = max((m.t_source_ns - v.node_ns) * 1e-9, _SHORTEST_S)
+            v.node_frame, v.node_ns = m.frame_id, m.t_source_ns
+        dt_s = np.array(passed_s)
         vv_dt_s = dt_s[vv_rows]
         growth = dt_s[:, None] * self._changes if config.constant_velocity else np.zeros((len(vehicles), 3))
         if linked and not config.constant_velocity:  # the twist of this interval is what VV says, whatever it was
-            window.retwist(vv_rows, log(vv_poses) / vv_dt_s[:, None], vv_covs / np.square(vv_dt_s)[:, None, None])
+            window.retwist(vv_rows, *rates(vv_poses, vv_dt_s), vv_covs / np.square(vv_dt_s)[:, None, None])
             vv_rows, vv_dt_s, (vv_poses, vv_covs) = vv_rows[:0], vv_dt_s[:0], _NO_EDGES
         if follows and edges.cc is not None:
             cov = np.zeros((3, 3)) if hold else edges.covs[0]
@@ -165,7 +203,7 @@ class PoseGraph:
         cv_poses, cv_covs = edges.poses[edges.cv_at], edges.covs[edges.cv_at]
         some = slice(None) if len(known) == len(edges.cv) else known
         now = Edges(
-            cv_rows=np.array([row_of[edges.cv[k].vehicle] for k in known], dtype=np.int64),
+            cv_rows=np.array([rows_seen[k] for k in known], dtype=np.int64),
             cv_poses=cv_poses[some],
             cv_covs=cv_covs[some],
             vv_rows=vv_rows,
@@ -177,16 +215,24 @@ class PoseGraph:
         )
         wild = window.correct(now, config.detection_gate_sigma**2, hold)
 
-        for row in tied:
-            vehicles[row].node_frame, vehicles[row].node_ns = m.frame_id, m.t_source_ns
         rows, begun = traffic.see(edges.cv, known, [known[i] for i in wild], m.t_source_ns)
         if rows is not None:
             window.select(np.array(rows, dtype=np.int64))
         if begun:
             at = [traffic.begin(edges.cv[k].vehicle, m.frame_id, m.t_source_ns) for k in begun]
-            window.place(np.array(at, dtype=np.int64), cv_poses[begun], cv_covs[begun], self._birth)
+            window.place(np.array(at, dtype=np.int64), cv_poses[begun], cv_covs[begun], self._born(cv_covs[begun]))
         settled = [] if seen is None else self._landmarks.see(seen, window, config.landmark_least_frames)
         self._map.add(m.frame_id, settled, window.world, m.lanes)
+
+    def _born(self, covs: Floats) -> Floats:
+        """(k, 3, 3) of the twists of vehicles first seen with `covs` (k, 3, 3), at rest for all that is known.
+
+        A yaw that is off turns the velocity: of the twist, which is told in axes that are off, both share the doubt.
+        """
+        out = np.tile(self._birth, (len(covs), 1, 1))
+        out[:, 0, 0] += covs[:, 2, 2] * self._birth[1, 1]
+        out[:, 1, 1] += covs[:, 2, 2] * self._birth[0, 0]
+        return out
 
     def _links(self, vehicle: int, from_frame: int) -> bool:
         """Whether a VV edge starts at the vehicle's newest pose."""
@@ -213,13 +259,18 @@ class PoseGraph:
         rate = np.abs(self._motion.log()) / max((self._t_ns - self._t_before_ns) * 1e-9, _SHORTEST_S)
         rate += np.array([config.blind_mps, config.blind_mps, config.blind_radps])
         cov = window.P[:3, :3] + np.diag(np.square(rate * since_s))
-        return self._record(m, m.status, cov, self._vehicle_estimates(m, window))
+        return self._record(
+            m, m.status, cov, vehicle_estimates(window, self._traffic.vehicles, m.t_source_ns, self._changes)
+        )
+
+    def _others(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
+        return vehicle_estimates(window, self._traffic.vehicles, m.t_source_ns, self._changes)
 
     def _record(
         self, m: Measurements, status: tuple[Status, ...], cov: Floats, vehicles: tuple[VehicleEstimate, ...]
     ) -> Estimate:
-        cov = cov.copy()
-        cov.reshape(9)[::4] = np.maximum(cov.diagonal(), 0.0)  # where all is known, rounding has either sign
+        numbers = cov.ravel().tolist()
+        numbers[::4] = [max(variance, 0.0) for variance in numbers[::4]]  # where all is known, rounding has either sign
         return Estimate(
             epoch=self.epoch,
             frame_id=m.frame_id,
@@ -227,43 +278,11 @@ class PoseGraph:
             t_capture_ns=m.t_capture_ns,
             t_utc_ns=m.t_utc_ns,
             T_world_ego=SE2() if self._window is None else self._window.world,
-            cov=tuple(cov.ravel().tolist()),
+            cov=tuple(numbers),
             valid=INVALIDATING.isdisjoint(status),
             vehicles=vehicles,
             attitude=m.attitude,
             ground=m.ground,
             scale_sigma_rel=m.scale_sigma_rel,
             status=tuple(dict.fromkeys(status)),
-        )
-
-    def _vehicle_estimates(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
-        vehicles, t_ns = self._traffic.vehicles, m.t_source_ns
-        if not vehicles:
-            return ()
-        ahead_s = [max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles]
-        poses, velocities, covs = window.in_world(np.array(ahead_s) if any(ahead_s) else None, self._changes)
-        numbers = zip(
-            vehicles,
-            poses.tolist(),
-            covs[:, :3, :3].reshape(-1, 9).tolist(),
-            velocities.tolist(),
-            covs[:, 3:, 3:].reshape(-1, 4).tolist(),
-            strict=True,
-        )
-        return tuple(
-            [
-                VehicleEstimate(
-                    vehicle=v.vehicle,
-                    T_world_vehicle=SE2(x_m, y_m, yaw_rad),
-                    cov=tuple(cov),
-                    velocity_mps=tuple(velocity),
-                    velocity_cov=tuple(velocity_cov),
-                    age_ns=max(t_ns - v.seen_ns, 0),
-                    frames=v.frames,
-                    label=v.label,
-                    length_m=v.length_m,
-                    width_m=v.width_m,
-                )
-                for v, (x_m, y_m, yaw_rad), cov, velocity, velocity_cov in numbers
-            ]
         )

@@ -10,7 +10,9 @@ from __future__ import annotations
 import cmath
 from collections import deque
 from dataclasses import dataclass
+from itertools import chain
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,14 +46,15 @@ def sightings(edges: tuple[LandmarkEdge, ...]) -> Sightings:
 
     An edge whose covariance is none (not positive definite) or whose numbers are no road's is left out.
     """
-    numbers = {e.landmark: (e.x_m, e.y_m, *e.cov) for e in edges}
-    table = np.array(list(numbers.values())).reshape(-1, 6)
+    latest = {e.landmark: e for e in edges}
+    ids = list(latest)
+    flat = chain.from_iterable((e.x_m, e.y_m, *e.cov) for e in latest.values())
+    table = np.fromiter(flat, np.float64, 6 * len(ids)).reshape(-1, 6)
     if np.abs(table).max(initial=0.0) > LARGEST_M:
         sane = np.abs(table).max(axis=1) <= LARGEST_M
-        numbers = {i: row for (i, row), keep in zip(numbers.items(), sane.tolist(), strict=True) if keep}
-        table = table[sane]
+        ids, table = [i for i, keep in zip(ids, sane.tolist(), strict=True) if keep], table[sane]
     x, y, xx, xy, _, yy = table.T
-    out = Sightings(list(numbers), x + 1j * y, 0.5 * (xx + yy) + _LEAST_VARIANCE_M2, 0.5 * (xx - yy) + 1j * xy)
+    out = Sightings(ids, x + 1j * y, 0.5 * (xx + yy) + _LEAST_VARIANCE_M2, 0.5 * (xx - yy) + 1j * xy)
     good = out.means > np.abs(out.deviators)
     return out if good.all() else out[np.flatnonzero(good)]
 
@@ -67,6 +70,15 @@ def sum_of_edges(gaps_m: Complexes, means: Floats, deviators: Complexes) -> tupl
     m, d = float(information.sum()), complex(deviation.sum())
     det_sum = m * m - abs(d) ** 2
     return (m * moment - d * moment.conjugate()) / det_sum, m / det_sum, -d / det_sum
+
+
+class LandmarksState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """All that `Landmarks` holds; see there."""
+
+    tied: Sightings
+    information: Floats
+    moment: Complexes
+    frames: Rows
 
 
 class Landmarks:
@@ -89,8 +101,24 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self._row)
 
+    def state(self) -> LandmarksState:
+        """For `taken_up`; the arrays are the landmarks' own."""
+        return LandmarksState(tied=self._tied, information=self._information, moment=self._moment, frames=self._frames)
+
+    @staticmethod
+    def taken_up(state: LandmarksState, capacity: int) -> Landmarks:
+        """The landmarks that had this state. Raises ValueError where its arrays do not belong together."""
+        tied = state.tied
+        parts = (tied.points, tied.means, tied.deviators, state.information, state.moment, state.frames)
+        if any(len(part) != len(tied.ids) for part in parts):
+            raise ValueError(f"{len(tied.ids)} landmarks with arrays of {[len(part) for part in parts]}")
+        out = Landmarks(capacity)
+        out._row = {i: row for row, i in enumerate(tied.ids)}
+        out._tied, out._information, out._moment, out._frames = tied, state.information, state.moment, state.frames
+        return out
+
     def edge(self, seen: Sightings, window: Window, gate: float) -> tuple[complex, float, complex] | None:
-        """The sum of a key frame's edges as one on the last key node's translation, in that node's axes.
+        """The sum of a key frame's edges as one on the last key node's place in ego.
 
         A landmark whose squared Mahalanobis distance is past `gate` weighs less by the square of the excess.
         """
@@ -99,10 +127,10 @@ class Landmarks:
         if not len(now):
             return None
         then = rows[now]
-        node, back = complex(window.at[KEY_NODE]), complex(window.heading[KEY_NODE]).conjugate()
-        gaps = (seen.points[now] - node) * back - self._tied.points[then]  # Eq. 3
+        node, heading = complex(window.at[KEY_NODE]), complex(window.heading[KEY_NODE])
+        gaps = seen.points[now] - node - heading * self._tied.points[then]  # Eq. 3
         means = seen.means[now] + self._tied.means[then]
-        deviators = seen.deviators[now] * (back * back) + self._tied.deviators[then]
+        deviators = seen.deviators[now] + heading * heading * self._tied.deviators[then]
         # The node's own doubt counts in what is wild
         at = 3 + 3 * KEY_NODE
         (xx, xy), (_, yy) = window.P[at : at + 2, at : at + 2].tolist()
@@ -143,6 +171,14 @@ class Landmarks:
         return np.array([self._row.get(i, -1) for i in seen.ids], dtype=np.int64)
 
 
+class PendingState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """All that `PendingMap` holds; see there."""
+
+    frame_id: int
+    landmarks: list[tuple[float, float]]
+    lanes: list[tuple[SE2, tuple[LanePoint, ...]]]
+
+
 class PendingMap:
     """What the map gained and nobody has asked for yet; the oldest go past `landmarks` points or `frames` of lanes.
 
@@ -157,6 +193,17 @@ class PendingMap:
         self._epoch, self._frame_id = epoch, 0
         self._landmarks: deque[tuple[float, float]] = deque(maxlen=self._capacity[0])
         self._lanes: deque[tuple[SE2, tuple[LanePoint, ...]]] = deque(maxlen=self._capacity[1])
+
+    def state(self) -> PendingState:
+        """For `take_up`."""
+        return PendingState(frame_id=self._frame_id, landmarks=list(self._landmarks), lanes=list(self._lanes))
+
+    def take_up(self, state: PendingState, epoch: int) -> None:
+        """Goes on where the map of this state was."""
+        self.begin(epoch)
+        self._frame_id = state.frame_id
+        self._landmarks.extend(state.landmarks)
+        self._lanes.extend(state.lanes)
 
     def add(
         self, frame_id: int, landmarks_m: list[tuple[float, float]], T_world_ego: SE2, lanes: tuple[LanePoint, ...]
@@ -173,11 +220,13 @@ class PendingMap:
         lanes_m = [
             (x, y) for T, points in self._lanes for x, y in (T @ np.array([(p.x_m, p.y_m) for p in points])).tolist()
         ]
+        lane_ids = tuple(p.lane for _, points in self._lanes for p in points)
         out = MapUpdate(
             epoch=self._epoch,
             frame_id=self._frame_id,
             landmarks_m=tuple(self._landmarks),
             lanes_m=tuple(lanes_m),
+            lane_ids=lane_ids if any(lane >= 0 for lane in lane_ids) else (),
         )
         self._landmarks.clear()
         self._lanes.clear()

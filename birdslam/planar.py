@@ -53,53 +53,74 @@ def exp(xi: Floats) -> Floats:
 def log(pose: Floats) -> Floats:
     """(N, 3) twists whose `exp` are the poses (N, 3)."""
     x, y, w = pose.T
-    half = w / 2.0
-    a = np.cos(half) / np.sinc(half / np.pi)
-    return np.stack([a * x + half * y, a * y - half * x, w], axis=1)
-
-
-def advance(velocity: Complexes, turn_radps: Floats, dt_s: Floats) -> tuple[Complexes, Complexes, Floats, Floats]:
-    """The motion of constant twists (N,) over `dt_s` (N,), position and heading, and how errors come through it.
-
-    An error e of the pose before and d of the twist are `turn` e + `push` d, (N, 3, 3) each, of the pose behind:
-    `turn` is the adjoint of the motion's inverse, `push` dt times the right Jacobian 1 - ad / 2 + ad^2 / 6.
-    """
-    w, step = turn_radps * dt_s, velocity * dt_s
-    iw = 1j * w
-    heading = np.exp(iw)
-    if np.abs(w).max(initial=0.0) < _SMALL_RAD:
-        at = step * (1.0 + iw * (1.0 / 2.0 + iw * (1.0 / 6.0 + iw * (1.0 / 24.0 + iw / 120.0))))
-    else:  # (e^iw - 1) / iw
-        at = step * np.exp(0.5 * iw) * np.sinc(w / (2.0 * np.pi))
-    push = np.zeros((len(w), 3, 3))
-    push[:, 0, 0] = push[:, 1, 1] = dt_s - dt_s * w * w / 6.0
-    half = 0.5 * dt_s * w
-    push[:, 0, 1] = half
-    push[:, 1, 0] = -half
-    bend = step * dt_s * (w / 6.0 + 0.5j)
-    push[:, 0, 2] = bend.real
-    push[:, 1, 2] = bend.imag
-    push[:, 2, 2] = dt_s
-    return at, heading, inverse_adjoint(at, heading), push
-
-
-def inverse_adjoint(at: Complexes, heading: Complexes) -> Floats:
-    """(N, 3, 3): Ad of the inverses of the poses; moves a tangent over the pose to its far side."""
-    out = np.zeros((len(at), 3, 3))
-    back = heading.conj()
-    lever = at * back
-    out[:, 0, 0] = out[:, 1, 1] = back.real
-    out[:, 0, 1] = heading.imag
-    out[:, 1, 0] = back.imag
-    out[:, 0, 2] = -lever.imag
-    out[:, 1, 2] = lever.real
-    out[:, 2, 2] = 1.0
+    half = 0.5 * w
+    h2 = half * half
+    if h2.max(initial=0.0) < _SMALL_RAD**2:  # half / tan half
+        a = 1.0 - h2 * (1.0 / 3.0 + h2 * (1.0 / 45.0 + h2 * (2.0 / 945.0)))
+    else:
+        a = np.cos(half) / np.sinc(half / np.pi)
+    out = pose.copy()
+    out[:, 0] = a * x + half * y
+    out[:, 1] = a * y - half * x
     return out
 
 
-def gaps(out: Floats, measured: Floats, at: Complexes, heading: Complexes, turned: Complexes) -> None:
-    """To `out` (3N,): poses `measured` (N, 3) seen from the poses `at`, `heading`, which they are `turned` against."""
-    gap = (measured[:, 0] + 1j * measured[:, 1] - at) * heading.conj()
-    out[0::3] = gap.real
-    out[1::3] = gap.imag
-    np.arctan2(turned.imag, turned.real, out=out[2::3])
+def advance(
+    heading: Complexes, velocity: Complexes, turn_radps: Floats, dt_s: Floats
+) -> tuple[Complexes, Complexes, Complexes]:
+    """Poses with `heading` (N,) drive for `dt_s` (N,) with constant twists (N,): how far, with which heading then.
+
+    Beside it (N, 6) how errors of (x_m, y_m, yaw_rad) of the pose and (x_mps, y_mps, yaw_radps) of the twist, all but
+    the twist's velocity in the axes in which the heading is told, move the place behind: the partial derivatives of
+    its x + iy. Those of its yaw are 1 of the yaw and `dt_s` of the twist's.
+    """
+    w = turn_radps * dt_s
+    half = np.exp(0.5j * w)
+    chord = _chord(w, half)
+    towards = heading * dt_s
+    g = towards * chord
+    way = g * velocity
+    partial = np.empty((len(w), 6), dtype=np.complex128)
+    partial[:, 0] = 1.0
+    partial[:, 1] = 1j
+    partial[:, 2] = 1j * way
+    partial[:, 3] = g
+    np.multiply(g, 1j, out=partial[:, 4])
+    partial[:, 5] = towards * half * velocity * dt_s * (0.5j - w / 12.0)
+    return way, heading * half * half, partial
+
+
+def rates(poses: Floats, dt_s: Floats) -> tuple[Complexes, Floats]:
+    """The twists (N,) that take `dt_s` (N,) to come to the poses (N, 3): velocity and yaw rate."""
+    w = poses[:, 2]
+    return (poses[:, 0] + 1j * poses[:, 1]) / (_chord(w, np.exp(0.5j * w)) * dt_s), w / dt_s
+
+
+def _chord(w: Floats, half: Complexes) -> Complexes:
+    """(e^iw - 1) / iw, given `half` = e^(iw / 2)."""
+    w2 = w * w
+    if w2.max(initial=0.0) < _SMALL_RAD**2:
+        return half * (1.0 - w2 * (1.0 / 24.0 - w2 / 1920.0))
+    out: Complexes = half * np.sinc(w / _TAU)
+    return out
+
+
+def pairs(partial: Complexes) -> Floats:
+    """(N, 2, k) view of complex (N, k): the real parts above the imaginary ones."""
+    return partial.view(np.float64).reshape(*partial.shape, 2).transpose(0, 2, 1)
+
+
+def turned(covs: Floats, heading: Complexes) -> Floats:
+    """(N, 3, 3) covariances (N, 3, 3) of (x_m, y_m, yaw_rad) in axes that point to `heading` (N,), told outside."""
+    R = np.zeros((len(heading), 3, 3))
+    R[:, 0, 0] = R[:, 1, 1] = heading.real
+    R[:, 1, 0] = heading.imag
+    R[:, 0, 1] = -heading.imag
+    R[:, 2, 2] = 1.0
+    return R @ covs @ R.transpose(0, 2, 1)
+
+
+def unit(yaw_rad: Floats) -> Complexes:
+    """e^(i yaw), elementwise."""
+    out: Complexes = np.exp(1j * yaw_rad)
+    return out

@@ -33,6 +33,11 @@ class Traffic:
         self.vehicles: list[Vehicle] = []
         self.row_of: dict[int, int] = {}
 
+    def take_up(self, vehicles: list[Vehicle]) -> None:
+        """Goes on with the vehicles of an earlier process, in the order of the window's rows."""
+        self.vehicles = vehicles
+        self.row_of = {v.vehicle: row for row, v in enumerate(vehicles)}
+
     def see(
         self, edges: list[VehicleEdge], tied: list[int], wild: list[int], t_ns: int
     ) -> tuple[list[int] | None, list[int]]:

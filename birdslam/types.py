@@ -51,11 +51,13 @@ class Status(enum.StrEnum):
     ODOMETRY_COASTING = "odometry_coasting"  # the motion is predicted from the one before, not measured
     SCALE_CARRIED = "scale_carried"  # no road seen: the metric scale is an older one
     SCALE_INVALID = "scale_invalid"  # the metric scale has been carried for too long to trust
+    MOTION_IMPLAUSIBLE = "motion_implausible"  # a motion of no car, or a long blindness; until all is steady again
     STANDSTILL = "standstill"  # the car stands: the pose is held
     GROUND_VIOLATED = "ground_violated"  # the road does not fit the ground plane
     CALIBRATION_DRIFT = "calibration_drift"  # the estimated pitch or height left the calibrated one
     DETECTIONS_CARRIED = "detections_carried"  # the detector did not run on this frame
     SEGMENTATION_CARRIED = "segmentation_carried"  # the segmenter did not run on this frame
+    DEPTH_CARRIED = "depth_carried"  # the depth network did not run on this frame
     NETWORK_FAILED = "network_failed"  # a network gave no usable numbers on this frame
     INPUT_STALE = "input_stale"  # the record in front of this one came later than it should
     DEGRADED_RATE = "degraded_rate"  # short of time: the networks run on fewer frames
@@ -63,7 +65,9 @@ class Status(enum.StrEnum):
     DEGRADED_ODOMETRY = "degraded_odometry"  # short of time: no network runs, the ego alone is followed
     COASTING = "coasting"  # short of time: nobody looked at this frame; the last pose, its covariance grown
     COASTED_TOO_LONG = "coasted_too_long"  # no frame has been looked at for too long
+    PERCEPTION_LATE = "perception_late"  # perceive has not answered in time: the optimizer coasts from the last answer
     GRAPH_RESET = "graph_reset"  # the optimizer began a new epoch on this frame
+    GRAPH_RESTORED = "graph_restored"  # the optimizer began anew from its last checkpoint: the epoch goes on
     NOT_INITIALISED = "not_initialised"  # no motion has been measured yet
     UNKNOWN = "unknown"  # a status that a newer sender knows and this reader does not
 
@@ -79,6 +83,7 @@ INVALIDATING = frozenset(
         Status.CAMERA_FROZEN,
         Status.CAMERA_DARK,
         Status.SCALE_INVALID,
+        Status.MOTION_IMPLAUSIBLE,
         Status.COASTED_TOO_LONG,
         Status.NOT_INITIALISED,
     }
@@ -98,6 +103,12 @@ def _check_cov(record: msgspec.Struct, *fields: str) -> None:
         cov = getattr(record, name)
         if min(cov[:: math.isqrt(len(cov)) + 1]) < 0.0:
             raise ValueError(f"{type(record).__name__}.{name} has a negative variance")
+
+
+def _check_points(record: msgspec.Struct, *points_m: tuple[float, float]) -> None:
+    for x_m, y_m in points_m:
+        if not math.isfinite(x_m + y_m):
+            raise ValueError(f"{type(record).__name__} needs finite points, got ({x_m}, {y_m})")
 
 
 @dataclass(frozen=True)
@@ -125,10 +136,10 @@ class FrameRef(msgspec.Struct, frozen=True, kw_only=True):
     t_source_ns: int
     t_capture_ns: int
     t_utc_ns: int
-    slot: int = -1
+    slot: int = -1  # of the ring
     sequence: int = 0  # the slot's sequence number when the frame was written (see runtime/frames.py)
     ring_epoch: int = 0  # which incarnation of the ring
-    width_px: int = 0
+    width_px: int = 0  # of the image
     height_px: int = 0
     channels: int = 0  # 1 grey, 3 BGR
     dropped: int = 0  # frames that capture itself had to drop since the start
@@ -197,10 +208,11 @@ class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class LanePoint(msgspec.Struct, frozen=True, array_like=True):
-    """A point of a lane line on the road, in ego; it has no identity and only feeds the map."""
+    """A point of a lane line on the road, in ego; it only feeds the map."""
 
     x_m: float
     y_m: float
+    lane: int = -1  # points of one line share it, from frame to frame; -1: of no lane that is known
 
     def __post_init__(self) -> None:
         _check_finite(self, "x_m", "y_m")
@@ -212,8 +224,8 @@ class Attitude(msgspec.Struct, frozen=True, kw_only=True):
     It is no part of the graph; trajectories are written in 6-DoF with it (a graded road, the camera's vibration).
     """
 
-    z_m: float = 0.0
-    pitch_rad: float = 0.0
+    z_m: float = 0.0  # the ego over the world's plane
+    pitch_rad: float = 0.0  # of the camera; > 0: nose down
     roll_rad: float = 0.0
 
     def __post_init__(self) -> None:
@@ -223,8 +235,8 @@ class Attitude(msgspec.Struct, frozen=True, kw_only=True):
 class Ground(msgspec.Struct, frozen=True, kw_only=True):
     """The camera over the road in this frame, as the front end estimates it (camera.GroundPlane on the wire)."""
 
-    height_m: float
-    pitch_rad: float = 0.0
+    height_m: float  # of the camera over the road
+    pitch_rad: float = 0.0  # of the camera against the road; > 0: nose down
     roll_rad: float = 0.0
 
     def __post_init__(self) -> None:
@@ -256,20 +268,23 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
 class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True):
     """One vehicle in an `Estimate`: pose and velocity over the ground, in world."""
 
-    vehicle: BodyId
-    T_world_vehicle: SE2
-    cov: Cov3
+    vehicle: BodyId  # its number, for as long as it is followed
+    T_world_vehicle: SE2  # where it is
+    cov: Cov3  # of the pose
     velocity_mps: Annotated[tuple[float, ...], msgspec.Meta(min_length=2, max_length=2)]  # (x, y) in world
-    velocity_cov: Cov2
+    velocity_cov: Cov2  # of the velocity
     age_ns: int  # source time since it was last seen; 0: seen in this frame
     frames: int  # how many frames it has been seen in
-    label: str = "car"
-    length_m: float = 4.0
-    width_m: float = 1.7
+    label: str = "car"  # its class
+    length_m: float = 4.0  # of its footprint
+    width_m: float = 1.7  # of its footprint
 
     def __post_init__(self) -> None:
-        _check_finite(self, "velocity_mps", "length_m", "width_m")
-        _check_cov(self, "cov", "velocity_cov")
+        cov, u = self.cov, self.velocity_cov
+        total = sum(cov) + sum(u) + sum(self.velocity_mps) + self.length_m + self.width_m
+        if not (math.isfinite(total) and min(cov[0], cov[4], cov[8], u[0], u[3]) >= 0.0):  # else no need to look closer
+            _check_finite(self, "velocity_mps", "length_m", "width_m")
+            _check_cov(self, "cov", "velocity_cov")
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
@@ -278,19 +293,19 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     A raised `epoch` says that the world frame began anew: poses of different epochs must not be compared.
     """
 
-    epoch: int
-    frame_id: FrameId
-    t_source_ns: int
-    t_capture_ns: int
-    t_utc_ns: int
-    T_world_ego: SE2
-    cov: Cov3
-    valid: bool
-    vehicles: tuple[VehicleEstimate, ...] = ()
-    attitude: Attitude = Attitude()
-    ground: Ground | None = None
-    scale_sigma_rel: float = 0.0
-    status: tuple[Status, ...] = ()
+    epoch: int  # which world: raised where the world frame began anew
+    frame_id: FrameId  # as capture counts them; never falls within a run
+    t_source_ns: int  # the camera's or the recording's own clock
+    t_capture_ns: int  # CLOCK_MONOTONIC of the vehicle's computer
+    t_utc_ns: int  # UTC of the same moment
+    T_world_ego: SE2  # where the ego is
+    cov: Cov3  # of the pose
+    valid: bool  # may be driven by: none of its statuses is invalidating
+    vehicles: tuple[VehicleEstimate, ...] = ()  # all that are followed, those just out of sight too
+    attitude: Attitude = Attitude()  # height and tilt, which the pose leaves out
+    ground: Ground | None = None  # the camera over the road
+    scale_sigma_rel: float = 0.0  # 1-sigma of the metric scale as a fraction
+    status: tuple[Status, ...] = ()  # expected trouble
 
     def __post_init__(self) -> None:
         _check_finite(self, "scale_sigma_rel")
@@ -304,8 +319,54 @@ class MapUpdate(msgspec.Struct, frozen=True, kw_only=True):
     frame_id: FrameId
     landmarks_m: tuple[tuple[float, float], ...] = ()  # road points that left the window, settled
     lanes_m: tuple[tuple[float, float], ...] = ()  # points of lane lines
+    lane_ids: tuple[int, ...] = ()  # the lane of each of `lanes_m`, -1: of none; empty: of none at all
 
     def __post_init__(self) -> None:
-        for x_m, y_m in (*self.landmarks_m, *self.lanes_m):
-            if not math.isfinite(x_m + y_m):
-                raise ValueError(f"MapUpdate needs finite points, got ({x_m}, {y_m})")
+        if len(self.lane_ids) not in (0, len(self.lanes_m)):
+            raise ValueError(f"lane_ids has {len(self.lane_ids)} entries for {len(self.lanes_m)} points of lanes_m")
+        _check_points(self, *self.landmarks_m, *self.lanes_m)
+
+
+class TimedPose(msgspec.Struct, frozen=True, array_like=True):
+    """A body's pose in world at one frame."""
+
+    frame_id: FrameId
+    t_source_ns: int
+    T_world_body: SE2  # where it was
+
+
+class VehiclePath(msgspec.Struct, frozen=True, kw_only=True):
+    """Where one vehicle was seen, oldest first."""
+
+    vehicle: BodyId
+    poses: tuple[TimedPose, ...]
+    label: str = "car"
+    length_m: float = 4.0
+    width_m: float = 1.7
+
+
+class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
+    """The answer to "where has everybody been": key poses in world of `epoch`, oldest first, the newest always last.
+
+    Thinned: poses are further apart the further back they are (see atlas.AtlasConfig).
+    """
+
+    epoch: int
+    frame_id: FrameId  # of the newest estimate that is in it
+    t_source_ns: int
+    ego: tuple[TimedPose, ...] = ()
+    vehicles: tuple[VehiclePath, ...] = ()  # those seen in that time
+
+
+class MapSnapshot(msgspec.Struct, frozen=True, kw_only=True):
+    """The answer to "what is the road like": all points of the map, in world of `epoch`, thinned to one in a cell."""
+
+    epoch: int
+    frame_id: FrameId  # of the newest update that is in it
+    landmarks_m: tuple[tuple[float, float], ...] = ()  # road points
+    lanes_m: tuple[tuple[float, float], ...] = ()  # points of lane lines
+    cell_m: float = 0.25  # the side of a cell near the car; far back they are larger
+
+    def __post_init__(self) -> None:
+        _check_finite(self, "cell_m")
+        _check_points(self, *self.landmarks_m, *self.lanes_m)

@@ -1,4 +1,4 @@
-"""The pose graph: held to gtsam on the same edges, and to the truth of simulated drives."""
+"""The pose graph on simulated drives: the truth, epochs, vehicles, the map, bounds. More in test_consistency."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 
-import gtsam
 import msgspec
 import numpy as np
 import pytest
@@ -18,22 +17,21 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from birdslam.graph import GraphConfig, PoseGraph
 from birdslam.landmarks import sum_of_edges
-from birdslam.planar import between, compose, log
+from birdslam.planar import between
 from birdslam.se2 import SE2
 from birdslam.simulation.drive import Drive, DriveConfig, drive
 from birdslam.types import Estimate, LanePoint, Measurements, Status
 from birdslam.weights import WeightsConfig
+from perf import incremental, optimizer
 from perf.__main__ import main as perf_main
 from perf.optimizer import CONTENDERS
 
 Floats = NDArray[np.float64]
 
 ALL_EDGES = WeightsConfig(leave_out=())
-POSES_ONLY = WeightsConfig(leave_out=("cp",))
 EQ_6 = GraphConfig(constant_velocity=False, detection_gate_sigma=1e3)  # the paper's graph, and nothing counts as wild
 NO_CP = DriveConfig(landmarks=0, lane_points=0)
 
@@ -81,147 +79,6 @@ def test_velocity_is_the_motion_over_time() -> None:
                 if np.hypot(*(now - before)[:2]) < 5.0:
                     # the chord against the tangent at its end: equal to the first order in the turn
                     np.testing.assert_allclose(v.velocity_mps, (now - before)[:2] * 33.0, atol=0.15)
-
-
-# --- gtsam ---
-
-
-def batch(
-    measurements: list[Measurements], config: GraphConfig
-) -> tuple[gtsam.Values, gtsam.Marginals, dict[int, int]]:
-    """gtsam's answer to the same edges, all at once; also the frame of each vehicle's newest pose."""
-    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    exact = gtsam.noiseModel.Isotropic.Sigma(3, 1e-7)
-    ego, vehicle = (lambda frame: gtsam.symbol("x", frame)), (lambda j, frame: gtsam.symbol(chr(ord("A") + j), frame))
-    noise = lambda cov: gtsam.noiseModel.Gaussian.Covariance(np.reshape(cov, (3, 3)))  # noqa: E731
-    pose = lambda T: gtsam.Pose2(T.x_m, T.y_m, T.yaw_rad)  # noqa: E731
-    nodes: dict[int, list[int]] = {}
-    first = measurements[0].frame_id
-    values.insert(ego(first), gtsam.Pose2())
-    factors.add(gtsam.PriorFactorPose2(ego(first), gtsam.Pose2(), exact))
-    for m in measurements:
-        if m.cc:
-            factors.add(
-                gtsam.BetweenFactorPose2(ego(m.cc.from_frame), ego(m.frame_id), pose(m.cc.T_from_to), noise(m.cc.cov))
-            )
-            values.insert(ego(m.frame_id), values.atPose2(ego(m.cc.from_frame)).compose(pose(m.cc.T_from_to)))
-        for e in m.cv:
-            factors.add(
-                gtsam.BetweenFactorPose2(ego(e.frame), vehicle(e.vehicle, e.frame), pose(e.T_ego_vehicle), noise(e.cov))
-            )
-            values.insert(vehicle(e.vehicle, e.frame), values.atPose2(ego(e.frame)).compose(pose(e.T_ego_vehicle)))
-            nodes.setdefault(e.vehicle, []).append(e.frame)
-            if config.constant_velocity:
-                keys = [vehicle(e.vehicle, f) for f in nodes[e.vehicle][-3:]]
-                if len(keys) > 1:
-                    factors.add(_constant_velocity(keys, np.diff(nodes[e.vehicle][-3:]) / 33.0, config))
-        for e in m.vv:
-            key = vehicle(e.vehicle, e.to_frame)
-            factors.add(
-                gtsam.BetweenFactorPose2(vehicle(e.vehicle, e.from_frame), key, pose(e.T_from_to), noise(e.cov))
-            )
-    params = gtsam.LevenbergMarquardtParams()
-    params.setRelativeErrorTol(1e-15)
-    params.setAbsoluteErrorTol(1e-15)
-    params.setMaxIterations(50)
-    values = gtsam.LevenbergMarquardtOptimizer(factors, values, params).optimize()
-    return values, gtsam.Marginals(factors, values), {j: frames[-1] for j, frames in nodes.items()}
-
-
-def _constant_velocity(keys: list[int], dt_s: Floats, config: GraphConfig) -> gtsam.CustomFactor:
-    """The twist of the last interval is that of the one before, or in the first interval 0, give or take."""
-    change = np.array([config.change_forward_mps, config.change_sideways_mps, config.change_turn_radps])
-    variance = np.square(change) * dt_s[-1]
-    if len(keys) == 2:
-        variance += np.square([config.birth_forward_mps, config.birth_sideways_mps, config.birth_turn_radps])
-
-    def twists(poses: list[Floats]) -> Floats:
-        motions = [log(between(a, b)[None])[0] / dt for (a, b), dt in zip(pairwise(poses), dt_s, strict=True)]
-        return motions[-1] - (motions[0] if len(motions) == 2 else 0.0)
-
-    def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
-        found = [values.atPose2(key) for key in keys]
-        poses = [np.array([p.x(), p.y(), p.theta()]) for p in found]
-        if jacobians is not None:
-            for k in range(len(poses)):
-                jacobians[k] = np.empty((3, 3), order="F")
-                for axis, step in enumerate(np.eye(3) * 1e-5):
-                    ahead, behind = ([*poses[:k], compose(poses[k], s * step), *poses[k + 1 :]] for s in (1.0, -1.0))
-                    jacobians[k][:, axis] = (twists(ahead) - twists(behind)) / 2e-5
-        return twists(poses)
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Variances(variance), keys, error)
-
-
-def assert_gtsam_agrees(
-    world: Drive, config: GraphConfig, weights: WeightsConfig, tolerance: float, frames: Iterable[int]
-) -> None:
-    graph = PoseGraph(config, weights)
-    for k, m in enumerate(world.measurements):
-        estimate = graph.update(m)
-        if k not in frames:
-            continue
-        used = [replace(x, vv=()) if "vv" in weights.left_out else x for x in world.measurements[: k + 1]]
-        values, marginals, newest = batch(used, config)
-        key = gtsam.symbol("x", m.frame_id)
-        theirs = values.atPose2(key)
-        np.testing.assert_allclose(
-            off(estimate.T_world_ego, np.array([theirs.x(), theirs.y(), theirs.theta()])), 0.0, atol=tolerance
-        )
-        np.testing.assert_allclose(
-            np.reshape(estimate.cov, (3, 3)), marginals.marginalCovariance(key), rtol=0.02, atol=1e-7
-        )
-        compared = 0
-        for v in estimate.vehicles:
-            if newest[v.vehicle] != m.frame_id:
-                continue
-            key = gtsam.symbol(chr(ord("A") + v.vehicle), m.frame_id)
-            theirs = values.atPose2(key)
-            np.testing.assert_allclose(
-                off(v.T_world_vehicle, np.array([theirs.x(), theirs.y(), theirs.theta()])), 0.0, atol=tolerance
-            )
-            np.testing.assert_allclose(
-                np.reshape(v.cov, (3, 3)), marginals.marginalCovariance(key), rtol=0.02, atol=2e-4
-            )
-            compared += 1
-        assert compared > 0
-
-
-@pytest.mark.parametrize("drop", [0.0, 0.2])
-def test_equals_gtsam_on_the_papers_edges(drop: float) -> None:
-    """With residuals so small that the second order is below the tolerance, the answers are the same to 1e-6."""
-    world = drive(replace(NO_CP, frames=60, vehicles=5, noise=1e-4, drop=drop), seed=11)
-    assert_gtsam_agrees(world, EQ_6, ALL_EDGES, 1e-6, frames={5, 20, len(world.measurements) - 1})
-
-
-def test_equals_gtsam_with_the_constant_velocity_factor() -> None:
-    world = drive(replace(NO_CP, frames=40, vehicles=3, noise=1e-3), seed=12)
-    config = GraphConfig(detection_gate_sigma=1e3, change_sideways_mps=2.0)
-    assert_gtsam_agrees(world, config, POSES_ONLY, 2e-3, frames={6, 39})
-
-
-def test_full_noise_costs_no_more_than_five_percent_of_the_batch() -> None:
-    """One linearisation and the marginalisation of all but the newest poses, against the batch of all edges so far."""
-    ours: dict[str, list[float]] = {"ego": [], "vehicle": []}
-    theirs: dict[str, list[float]] = {"ego": [], "vehicle": []}
-
-    def note(body: str, estimate: SE2, values: gtsam.Values, key: int, truth: Floats) -> None:
-        other = values.atPose2(key)
-        ours[body].append(float(np.hypot(*off(estimate, truth)[:2])))
-        theirs[body].append(float(np.hypot(*between(np.array([other.x(), other.y(), other.theta()]), truth)[:2])))
-
-    for seed in range(10):
-        world = drive(replace(NO_CP, frames=120, vehicles=6, sigma_cv_rad=0.05), seed)
-        estimates = run(world.measurements)
-        for k in range(29, 120, 30):
-            values = batch(world.measurements[: k + 1], EQ_6)[0]
-            note("ego", estimates[k].T_world_ego, values, gtsam.symbol("x", k), world.ego[k])
-            for vehicle, pose in seen(estimates[k]).items():
-                key = gtsam.symbol(chr(ord("A") + vehicle), k)
-                note("vehicle", pose, values, key, world.vehicles[vehicle][k])
-    for body in ours:
-        ate_ours, ate_theirs = (np.sqrt(np.mean(np.square(errors[body]))) for errors in (ours, theirs))
-        assert ate_ours <= 1.05 * ate_theirs, body
 
 
 # --- where the world begins does not matter ---
@@ -499,38 +356,6 @@ def test_the_map_holds_what_was_seen() -> None:
         assert min(np.hypot(*(np.array(point) - other)) for other in truth.values()) < 0.1
 
 
-# --- uncertainty ---
-
-
-def nees(world: Drive, config: GraphConfig, weights: WeightsConfig) -> tuple[float, float | None]:
-    """Squared errors over their covariances at the end of a drive: of the ego, and of a vehicle seen for long."""
-    last = run(world.measurements, config, weights)[-1]
-    weigh = lambda r, cov: float(r @ np.linalg.solve(np.reshape(cov, (3, 3)), r))  # noqa: E731
-    vehicles = [
-        weigh(off(v.T_world_vehicle, world.vehicles[v.vehicle][last.frame_id]), v.cov)
-        for v in last.vehicles
-        if v.age_ns == 0 and v.frames > 20
-    ]
-    return weigh(off(last.T_world_ego, world.ego[last.frame_id]), last.cov), vehicles[0] if vehicles else None
-
-
-@pytest.mark.parametrize("wild", [0.0, 0.1])
-@pytest.mark.parametrize("model", ["Eq. 6", "constant velocity"])
-def test_covariances_are_honest(model: str, wild: float) -> None:
-    """The mean NEES of 100 seeded drives lies within the 95 % bounds, also with outliers in."""
-    traffic, config, weights = (
-        (DriveConfig().traffic, GraphConfig(constant_velocity=False), ALL_EDGES)
-        if model == "Eq. 6"
-        else ("drawn", GraphConfig(), WeightsConfig())
-    )
-    world = DriveConfig(frames=40, vehicles=2, landmarks=8, lane_points=0, wild=wild, traffic=traffic)  # type: ignore[arg-type]
-    found = [nees(drive(world, seed), config, weights) for seed in range(100)]
-    for name, values in (("ego", [ego for ego, _ in found]), ("vehicle", [v for _, v in found if v is not None])):
-        low, high = chi2.ppf([0.025, 0.975], 3 * len(values)) / len(values)
-        assert len(values) >= 60
-        assert low <= np.mean(values) <= high, name
-
-
 # --- bounded, deterministic, never raises ---
 
 
@@ -665,6 +490,40 @@ def test_the_benchmark_measures_what_it_says(tmp_path: Path, capsys: pytest.Capt
     assert len(capsys.readouterr().out.splitlines()) == 2
 
 
+def test_the_benchmark_gives_every_contender_the_same_edges(tmp_path: Path) -> None:
+    """All four kinds, CP on the key frames of ours, so that no edge of the log is left out by anyone."""
+    optimizer.write_log(tmp_path / "log", DriveConfig(frames=40, vehicles=3, traffic="convoy"), seed=1)
+    log = [
+        msgspec.msgpack.decode(record, type=Measurements)
+        for record in msgspec.msgpack.decode((tmp_path / "log").read_bytes(), type=list[bytes])
+    ]
+    assert all(m.cc and len(m.cv) == len(m.vv) == 3 for m in log[1:])
+    ours = CONTENDERS["ours"][0]()
+    for k, m in enumerate(log):
+        without = replace(m, cp=())
+        assert bool(m.cp) == (k % GraphConfig().ego_nodes == 0)
+        data = ours.graph.checkpoint()  # type: ignore[attr-defined]
+        settings = ours.graph.config, ours.graph.weights  # type: ignore[attr-defined]
+        blind = PoseGraph.restore(data, *settings).update(without)
+        assert (ours.step(m) != blind) == (k > 0 and bool(m.cp))
+
+
+def test_the_batch_is_measured_against_the_incremental_graph(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = f"--frames 40 --vehicles 2 --seeds 1 --lag 4 --output {tmp_path}/F.json"
+    assert perf_main(["incremental", *arguments.split()]) == 0
+    found = json.loads((tmp_path / "F.json").read_text())
+    assert [row["method"] for row in found["accuracy"]] == list(incremental.WHO)
+    for row in found["accuracy"]:
+        assert 0.0 < row["ego_ate_m"] < 1.0
+        assert 0.0 < row["vehicle_ate_m"] < 2.0
+    ours, *_, batch = found["rows"]
+    assert ours["ratio"] == ours["newest_ratio"] == 1.0
+    assert batch["newest_ratio"] > batch["ratio"] > 1.0
+    assert "published" in capsys.readouterr().out
+
+
 def test_an_unknown_benchmark_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert perf_main(["nonsense"]) == 2
     said = capsys.readouterr()
@@ -676,7 +535,7 @@ def test_an_unknown_benchmark_is_named(capsys: pytest.CaptureFixture[str]) -> No
     "kind", ["incremental_fixed_lag_qr", "incremental_fixed_lag_cholesky", "batch_fixed_lag", "isam2"]
 )
 def test_the_other_contenders_solve_the_same_world(kind: str) -> None:
-    world = drive(replace(NO_CP, frames=30, vehicles=3, noise=0.0, traffic="convoy"), seed=1)
+    world = drive(DriveConfig(frames=30, vehicles=3, landmarks=6, lane_points=0, noise=0.0, traffic="convoy"), seed=1)
     contender = CONTENDERS[kind][0]()
     for m in world.measurements:
         poses = contender.step(m)

@@ -196,18 +196,22 @@ class _Camera:
         return EgoEdge(from_frame=before, to_frame=frame, T_from_to=T, cov=cov)
 
     def _vehicle_edge(self, vehicle: int, frame: int, seen: Floats) -> VehicleEdge:
-        """Noise is longest along the line of sight; its axes are the vehicle's own."""
-        config = self.config
+        """Noise is longest along the line of sight; its axes are those of the pose as it is measured."""
+        config, rng = self.config, self._rng
         far_m = float(np.hypot(seen[0], seen[1]))
-        along, across = config.sigma_cv_m + config.sigma_cv_rel * far_m, config.sigma_cv_m
-        angle = np.arctan2(seen[1], seen[0]) - seen[2]
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        cov = np.zeros((3, 3))
-        cov[:2, :2] = turn @ np.diag([along**2, across**2]) @ turn.T
-        cov[2, 2] = config.sigma_cv_rad**2
-        T, numbers = self._noisy(seen, 0.5 * (cov + cov.T))
-        if self._rng.uniform() < config.wild:
-            T = SE2(T.x_m + self._rng.uniform(8.0, 30.0), T.y_m + self._rng.uniform(-10.0, 10.0), T.yaw_rad)
+        sigmas = np.array([config.sigma_cv_m + config.sigma_cv_rel * far_m, config.sigma_cv_m, config.sigma_cv_rad])
+        noise = config.noise * sigmas * rng.standard_normal(3)
+        sight = np.arctan2(seen[1], seen[0])
+        yaw = wrap(float(seen[2] + noise[2]))
+        turn = np.eye(3)
+        turn[:2, :2] = SE2(yaw_rad=float(sight)).rotation()
+        x, y = seen[:2] + turn[:2, :2] @ noise[:2]
+        T = SE2(float(x), float(y), yaw)
+        turn[:2, :2] = SE2(yaw_rad=float(sight) - yaw).rotation()
+        cov = turn @ np.diag(sigmas**2) @ turn.T
+        if rng.uniform() < config.wild:
+            T = SE2(T.x_m + rng.uniform(8.0, 30.0), T.y_m + rng.uniform(-10.0, 10.0), T.yaw_rad)
+        numbers = tuple((0.5 * (cov + cov.T)).ravel().tolist())
         return VehicleEdge(vehicle=vehicle, frame=frame, T_ego_vehicle=T, cov=numbers)
 
     def _landmark_edges(self, frame: int, ego: Floats) -> tuple[LandmarkEdge, ...]:

@@ -1,0 +1,127 @@
+"""A pose graph taken up from its bytes goes on as if nothing had happened, or says why it can't."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from birdslam.checkpoint import CheckpointError, pack, plain, unpack
+from birdslam.graph import GraphConfig, PoseGraph
+from birdslam.simulation.drive import DriveConfig, drive
+from birdslam.types import Measurements, Status
+from birdslam.weights import WeightsConfig
+
+SETTINGS = {
+    "measured": (GraphConfig(), WeightsConfig()),
+    "all edges": (GraphConfig(max_vehicles=3), WeightsConfig(leave_out=())),
+    "paper": (GraphConfig(ego_nodes=1, constant_velocity=False), WeightsConfig(mode="paper")),
+}
+WORLDS = [drive(DriveConfig(frames=120, vehicles=5, wild=0.05, drop=0.1), seed).measurements for seed in range(3)]
+
+
+def goes_on(graph: PoseGraph, log: list[Measurements]) -> bytes:
+    """All that the graph says of these frames."""
+    return b"".join(msgspec.msgpack.encode((graph.update(m), graph.map_update(), graph.epoch)) for m in log)
+
+
+def worn(log: list[Measurements], break_at: int, blind_at: int) -> list[Measurements]:
+    """With a new epoch somewhere, and a frame without a picture."""
+    log = list(log)
+    log[break_at % len(log)] = replace(log[break_at % len(log)], cc=None)
+    blind = log[blind_at % len(log)]
+    log[blind_at % len(log)] = Measurements(
+        frame_id=blind.frame_id,
+        t_source_ns=blind.t_source_ns,
+        t_capture_ns=0,
+        t_utc_ns=0,
+        status=(Status.FRAME_UNREADABLE,),
+    )
+    return log
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    world=st.sampled_from(WORLDS),
+    cut=st.integers(0, 200),
+    break_at=st.integers(0, 200),
+    blind_at=st.integers(0, 200),
+    mode=st.sampled_from(sorted(SETTINGS)),
+    taken=st.booleans(),
+)
+def test_a_restored_graph_goes_on_with_the_same_bytes(
+    world: list[Measurements], cut: int, break_at: int, blind_at: int, mode: str, taken: bool
+) -> None:
+    log = worn(world, break_at, blind_at)
+    cut %= len(log) + 1
+    graph = PoseGraph(*SETTINGS[mode], epoch=7)
+    for m in log[:cut]:
+        graph.update(m)
+        if taken:
+            graph.map_update()
+    data = graph.checkpoint()
+    restored = PoseGraph.restore(data, *SETTINGS[mode])
+    assert restored.checkpoint() == data
+    assert goes_on(restored, log[cut:]) == goes_on(graph, log[cut:])
+
+
+def test_a_checkpoint_does_not_change_with_the_graph_it_was_taken_of() -> None:
+    graph = PoseGraph(*SETTINGS["measured"])
+    for m in WORLDS[0][:50]:
+        graph.update(m)
+    data = graph.checkpoint()
+    first = goes_on(PoseGraph.restore(data, *SETTINGS["measured"]), WORLDS[0][50:])
+    assert goes_on(PoseGraph.restore(data, *SETTINGS["measured"]), WORLDS[0][50:]) == first
+
+
+def checkpoint() -> bytes:
+    graph = PoseGraph(*SETTINGS["measured"])
+    for m in WORLDS[0][:30]:
+        graph.update(m)
+    return graph.checkpoint()
+
+
+@given(where=st.integers(0, 10**6), bit=st.integers(0, 7))
+def test_a_flipped_bit_is_found(where: int, bit: int) -> None:
+    torn = bytearray(checkpoint())
+    torn[where % len(torn)] ^= 1 << bit
+    with pytest.raises(CheckpointError, match=r"torn|no checkpoint|version"):
+        PoseGraph.restore(bytes(torn), *SETTINGS["measured"])
+
+
+@given(length=st.integers(0, 10**6))
+def test_a_cut_is_found(length: int) -> None:
+    data = checkpoint()
+    with pytest.raises(CheckpointError, match=r"torn|no checkpoint|version"):
+        PoseGraph.restore(data[: length % len(data)], *SETTINGS["measured"])
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00" * 100, msgspec.msgpack.encode({"epoch": 1})])
+def test_other_bytes_are_refused(data: bytes) -> None:
+    with pytest.raises(CheckpointError, match="no checkpoint of a pose graph"):
+        PoseGraph.restore(data, *SETTINGS["measured"])
+
+
+def test_other_settings_are_named() -> None:
+    data = checkpoint()
+    with pytest.raises(CheckpointError, match=r"graph\.ego_nodes = 4, here it is 5"):
+        PoseGraph.restore(data, GraphConfig(ego_nodes=5), WeightsConfig())
+    with pytest.raises(CheckpointError, match=r"weights\.mode = measured, here it is paper"):
+        PoseGraph.restore(data, GraphConfig(), WeightsConfig(mode="paper"))
+
+
+def test_parts_that_do_not_belong_together_are_refused() -> None:
+    """Whole by its sum, but not what this code writes."""
+    whole = unpack(checkpoint(), plain(graph=GraphConfig(), weights=WeightsConfig()))
+    begun = whole.begun
+    assert begun is not None
+    for broken in (
+        replace(begun, vehicles=begun.vehicles[1:]),
+        replace(begun, window=replace(begun.window, P=begun.window.P[1:])),
+        replace(begun, window=replace(begun.window, next_node=99)),
+        replace(begun, landmarks=replace(begun.landmarks, frames=begun.landmarks.frames[1:])),
+    ):
+        with pytest.raises(CheckpointError, match="does not fit together"):
+            PoseGraph.restore(pack(replace(whole, begun=broken)), *SETTINGS["measured"])
