@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.pose import Pose, cross, orthonormal, rotation_exp
+from birdslam.pose import Pose, middle, orthonormal, rotation_exp
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -41,7 +41,9 @@ class SlidingWindow:
 
     def append(self, frame: int, pose: Pose, ids: Ints, xy: Floats) -> None:
         """A new image: ids (N,) ascending, xy (N, 2) normalised coordinates."""
-        merged = np.union1d(self.ids, ids)
+        merged = np.concatenate([self.ids, ids])
+        merged.sort(kind="stable")
+        merged = merged[np.concatenate([[True], merged[1:] != merged[:-1]])] if len(merged) else merged
         obs = np.full((len(self.poses) + 1, len(merged), 2), np.nan)
         old = np.searchsorted(merged, self.ids)
         obs[:-1, old] = self.obs
@@ -54,21 +56,20 @@ class SlidingWindow:
 
     def drop(self, index: int) -> None:
         """Forgets one image. Landmarks anchored in it move to the next image that saw them."""
-        anchor = self.anchors()
-        X = self.points_w(anchor)
-        keep = np.arange(len(self.poses)) != index
-        self.obs = self.obs[keep]
+        anchor, gone, xy = self.anchors(), self.poses[index], self.obs[index]
+        self.obs = self.obs[np.arange(len(self.poses)) != index]
         del self.poses[index], self.frames[index]
         seen = np.isfinite(self.obs[..., 0]).any(axis=0)
         moved = np.flatnonzero(seen & (anchor == index) & np.isfinite(self.rho))
         if len(moved):
-            new = self.anchors()
+            new = self.anchors()[moved]
             R, p = self._stacked()
-            z = np.einsum("mi,mi->m", R[new[moved], :, 2], X[moved] - p[new[moved]])
             # A point at infinity stays there; one behind its new anchor is forgotten.
-            far = ~np.isfinite(X[moved, 0])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                self.rho[moved] = np.where(far, 0.0, np.where(z > _MIN_DEPTH, 1.0 / z, np.nan))
+            far = self.rho[moved] <= 1e-6
+            depth = 1.0 / np.where(far, 1.0, self.rho[moved])
+            X = (np.column_stack([xy[moved], np.ones(len(moved))]) * depth[:, None]) @ gone.R.T + gone.p
+            z = (R[new, :, 2] * (X - p[new])).sum(axis=1)
+            self.rho[moved] = np.where(far, 0.0, np.where(z > _MIN_DEPTH, 1.0 / np.maximum(z, _MIN_DEPTH), np.nan))
         self.ids, self.obs = self.ids[seen], self.obs[:, seen]
         self.rho, self.rho_sigma = self.rho[seen], self.rho_sigma[seen]
 
@@ -79,23 +80,13 @@ class SlidingWindow:
         self.rho = self.rho / factor
         self.rho_sigma = self.rho_sigma / factor
 
-    def points_w(self, anchor: Ints) -> Floats:
-        """(M, 3) landmarks in the window's frame; NaN or infinite where the depth is unknown or endless."""
-        R, p = self._stacked()
-        rays = self._rays(anchor)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = np.where(self.rho > 1e-6, 1.0 / self.rho, np.nan)
-        out: Floats = np.einsum("mij,mj->mi", R[anchor], rays) * depth[:, None] + p[anchor]
-        return out
-
     def predict_xy(self, pose: Pose) -> Floats:
         """(M, 2) where a camera at `pose` sees the landmarks; NaN where unknown or behind it."""
         anchor = self.anchors()
-        q, _, _ = self._project(anchor, pose.R[None], pose.p[None], self.rho)
-        q = q[0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            xy = q[:, :2] / q[:, 2:]
-        xy[~(q[:, 2] > _MIN_DEPTH)] = np.nan
+        R, p = self._stacked()
+        rays = np.column_stack([self.obs[anchor, np.arange(len(self.ids))], np.ones(len(self.ids))])
+        q = pose.R.T @ ((R[anchor] @ rays[:, :, None])[:, :, 0] + self.rho[:, None] * (p[anchor] - pose.p)).T
+        xy: Floats = (q[:2] / np.where(q[2] > _MIN_DEPTH, q[2], np.nan)).T
         return xy
 
     # --- estimation ---
@@ -116,60 +107,66 @@ class SlidingWindow:
         m = at[known]
         anchor = self.anchors()[m]
         R, p = self._stacked()
-        rays = self.obs[anchor, m]
-        rays = np.column_stack([rays, np.ones(len(m))])
+        rays = np.column_stack([self.obs[anchor, m], np.ones(len(m))])
         base = (R[anchor] @ rays[:, :, None])[:, :, 0]
-        rho, target = self.rho[m], xy[known]
+        rho, target = self.rho[m], xy[known].T
         depth_noise = np.where(np.isfinite(self.rho_sigma[m]), self.rho_sigma[m], 0.0)
-        pose, info = guess, np.zeros((6, 6))
+        from_w = base + rho[:, None] * p[anchor]  # the landmark, but for the camera's own place
+        pose, info, f = guess, np.zeros((6, 6)), self.focal_px
+        limit = self.reject_px / self.sigma_px
+        J = np.zeros((6, 2, len(m)))  # of (translation, rotation) in the camera's own axes
         for k in range(iterations):
-            q = (base + rho[:, None] * (p[anchor] - pose.p)) @ pose.R
-            z = np.maximum(q[:, 2], _MIN_DEPTH)
-            uv = q[:, :2] / z[:, None]
-            r = (uv - target) * self.focal_px
-            D = self._projection_derivative(uv, z) * self.focal_px
-            J = np.concatenate([-rho[:, None, None] * D, cross(D, q[:, None])], axis=2)
+            q = pose.R.T @ (from_w - rho[:, None] * pose.p).T
+            ahead = q[2] > _MIN_DEPTH
+            z = np.maximum(q[2], _MIN_DEPTH)
+            u, v = uv = q[:2] / z
+            r = (uv - target) * f
+            by_z = f / z
+            J[0, 0] = J[1, 1] = -rho * by_z
+            J[2] = rho * by_z * uv
+            J[3, 0], J[3, 1] = f * u * v, f * (q[2] / z + v * v)
+            J[4, 0], J[4, 1] = -f * (q[2] / z + u * u), -f * u * v
+            J[5, 0], J[5, 1] = f * v, -f * u
             # An uncertain depth blurs the observation along its epipolar line; isotropic is near enough.
-            along = (D @ ((p[anchor] - pose.p) @ pose.R)[:, :, None])[:, :, 0] * depth_noise[:, None]
-            variance = self.sigma_px**2 + (along**2).sum(axis=1)
-            norm = np.sqrt((r**2).sum(axis=1) / variance)
-            gate = (
-                max(self.reject_px / self.sigma_px, 3.0 * 1.2 * float(np.median(norm)))
-                if k < 3
-                else self.reject_px / self.sigma_px
-            )
-            w = np.where(norm < gate, 1.0 / np.maximum(1.0, norm / 1.5), 0.0) * (q[:, 2] > _MIN_DEPTH) / variance
-            Jw = (J * w[:, None, None]).reshape(-1, 6)
-            info = J.reshape(-1, 6).T @ Jw
-            g = Jw.T @ r.reshape(-1)
-            step = -np.linalg.solve(info + 1e-9 * np.trace(info) * np.eye(6) + 1e-9 * np.eye(6), g)
+            a = pose.R.T @ (p[anchor] - pose.p).T
+            along = (a[:2] - uv * a[2]) * (by_z * depth_noise)
+            variance = self.sigma_px**2 + (along**2).sum(axis=0)
+            norm = np.sqrt((r**2).sum(axis=0) / variance)
+            gate = max(limit, 3.0 * 1.2 * middle(norm)) if k < 3 else limit
+            w = np.where(ahead & (norm < gate), 1.0 / (np.maximum(1.0, norm / 1.5) * variance), 0.0)
+            flat = J.reshape(6, -1)
+            Jw = (J * w).reshape(6, -1)
+            info = Jw @ flat.T
+            g = Jw @ r.reshape(-1)
+            step = -np.linalg.solve(info + (1e-9 * np.trace(info) + 1e-9) * np.eye(6), g)
             pose = pose.moved(step)
             if k >= 3 and np.abs(step).max() < 1e-5:
                 break
-        fits[np.flatnonzero(known)] = (norm < self.reject_px / self.sigma_px) & (q[:, 2] > _MIN_DEPTH)
+        fits[np.flatnonzero(known)] = (norm < limit) & ahead
         return pose, fits, info
 
     def triangulate(self) -> None:
         """Inverse depths of what the newest image and another see, by linear least squares with the poses held."""
         newest = np.isfinite(self.obs[-1, :, 0])
-        anchor, xy = self.anchors()[newest], self.obs[:, newest]
+        anchor, xy = self.anchors()[newest], self.obs[:, newest].transpose(0, 2, 1)
         R, p = self._stacked()
-        rays = np.column_stack([xy[anchor, np.arange(len(anchor))], np.ones(len(anchor))])
-        q0 = (R[anchor] @ rays[:, :, None])[None, :, :, 0] @ R
-        dq = (p[anchor][None] - p[:, None]) @ R
-        others = np.isfinite(xy[..., 0]) & (np.arange(len(p))[:, None] != anchor[None])
+        rays = np.concatenate([xy[anchor, :, np.arange(len(anchor))].T, np.ones((1, len(anchor)))])
+        R_w = R.transpose(0, 2, 1)
+        q0 = R_w @ (R[anchor] @ rays.T[:, :, None])[:, :, 0].T  # (F, 3, M)
+        dq = R_w @ (p[anchor].T - p[:, :, None])
+        others = np.isfinite(xy[:, 0]) & (np.arange(len(p))[:, None] != anchor[None])
         # r(rho) = (q0 + rho dq)_xy - xy (q0 + rho dq)_z is linear in rho; weights 1 / q_z make it a reprojection error
-        xy = np.where(others[..., None], xy, 0.0)
-        a = dq[..., :2] - xy * dq[..., 2:]
-        b = q0[..., :2] - xy * q0[..., 2:]
-        aa, ab = (a * a).sum(axis=2), (a * b).sum(axis=2)
+        xy = np.where(others[:, None], xy, 0.0)
+        a = dq[:, :2] - xy * dq[:, 2:]
+        b = q0[:, :2] - xy * q0[:, 2:]
+        aa, ab = (a * a).sum(axis=1), (a * b).sum(axis=1)
         rho = np.where(np.isfinite(self.rho[newest]), self.rho[newest], 0.0)
         for _ in range(2):
-            w = others / np.maximum(q0[..., 2] + rho * dq[..., 2], 0.1) ** 2
+            w = others / np.maximum(q0[:, 2] + rho * dq[:, 2], 0.1) ** 2
             den = (w * aa).sum(axis=0)
             rho = np.where(den > 1e-12, np.maximum(-(w * ab).sum(axis=0) / np.maximum(den, 1e-12), 0.0), 0.0)
-        z = np.maximum(q0[..., 2] + rho * dq[..., 2], 0.1)
-        r = np.sqrt((others * ((b + a * rho[:, None]) ** 2).sum(axis=2) / z**2).max(axis=0))
+        z = np.maximum(q0[:, 2] + rho * dq[:, 2], 0.1)
+        r = np.sqrt((others * ((b + a * rho) ** 2).sum(axis=1) / z**2).max(axis=0))
         good = (den > 1e-12) & others.any(axis=0) & (r * self.focal_px < self.reject_px)
         sigma = self.sigma_px / self.focal_px / np.sqrt(np.maximum(den, 1e-12))
         self.rho[newest] = np.where(good, rho, np.nan)
@@ -191,45 +188,61 @@ class SlidingWindow:
             return info_newest
         rank = np.lexsort((self.ids, -count))
         chosen = np.sort(rank[usable[rank]][:max_landmarks])
+        chosen = chosen[np.argsort(anchor[chosen], kind="stable")]  # those of one anchor stand together
         anchor, rho, xy = anchor[chosen], self.rho[chosen].copy(), self.obs[:, chosen]
-        rays = np.column_stack([self.obs[anchor, chosen], np.ones(len(chosen))])
-        # One row for each observation but the anchors' own, landmark by landmark.
-        m, j = np.nonzero((np.isfinite(xy[..., 0]) & (np.arange(F)[:, None] != anchor[None])).T)
-        first = np.searchsorted(m, np.arange(len(chosen)))
-        i, target, row, f = anchor[m], xy[j, m], np.arange(len(m)), self.focal_px
+        groups = [slice(*np.searchsorted(anchor, [i, i + 1])) for i in range(F)]
+        rays = np.concatenate([xy[anchor, np.arange(len(chosen))].T, np.ones((1, len(chosen)))])
+        # Everything stands in a grid of images (F) and landmarks (M, last: numpy is quick along it). What was not seen,
+        # or is the anchor's own, weighs nothing.
+        others = np.isfinite(xy[..., 0]) & (np.arange(F)[:, None] != anchor[None])
+        target, f = np.where(others[:, None], xy.transpose(0, 2, 1), 0.0), self.focal_px
         moved = np.zeros((free, 6))  # steps so far: (translation, rotation vector), both in the window's axes
-        S, norm, C = np.eye(6 * free), np.zeros(len(m)), np.ones(len(chosen))
+        S, norm, C = np.eye(6 * free), np.zeros(others.shape), np.ones(len(chosen))
+        J_anchor, J_seen = np.zeros((2, F, 6, 2, len(chosen)))
         for k in range(iterations):
             R, p = self._stacked()
-            base = (R[anchor] @ rays[:, :, None])[m, :, 0]
-            between = p[i] - p[j]
-            c = base + rho[m, None] * between
-            q = (c[:, None] @ R[j])[:, 0]
+            base = np.concatenate([R[i] @ rays[:, of] for i, of in enumerate(groups)], axis=1)  # (3, M)
+            between = p[anchor].T - p[:, :, None]  # (F, 3, M)
+            c = base + rho * between
+            q = R.transpose(0, 2, 1) @ c
             ahead = q[:, 2] > _MIN_DEPTH
             z = np.where(ahead, q[:, 2], 1.0)
             uv = q[:, :2] / z[:, None]
             r = (uv - target) * f
             norm = np.sqrt((r**2).sum(axis=1)) / self.sigma_px
             gate = self.reject_px / self.sigma_px * (2.0 if k == 0 else 1.0)
-            w = np.where(ahead & (norm < gate), 1.0 / np.maximum(1.0, norm / 1.5), 0.0) / self.sigma_px**2
-            sw = np.sqrt(w)[:, None]
-            rw = r * sw
-            # E (N, 2, 3): whitened derivative by the landmark in the window's axes
-            E = self._projection_derivative(uv, z) * (f * sw[..., None]) @ R[j].transpose(0, 2, 1)
-            J_rho = (E @ between[:, :, None])[:, :, 0]
-            E_rho = E * rho[m, None, None]
-            J = np.zeros((len(m), F, 2, 6))
-            J[row, i] = np.concatenate([E_rho, cross(base[:, None], E)], axis=2)
-            J[row, j] = np.concatenate([-E_rho, cross(E, c[:, None])], axis=2)
-            J_free = J[:, held:].transpose(0, 2, 1, 3).reshape(2 * len(m), 6 * free)
-            A = J_free.T @ J_free + np.diag(np.tile(prior, free))
-            g = J_free.T @ rw.reshape(-1) + (prior * moved).reshape(-1)
-            by_landmark = J_rho.reshape(-1, 1) * J_free
-            B = np.add.reduceat(by_landmark, 2 * first, axis=0)
-            C = np.add.reduceat((J_rho**2).sum(axis=1), first) + 1e-6
-            gr = np.add.reduceat((J_rho * rw).sum(axis=1), first)
-            S = A - B.T @ (B / C[:, None])
-            step = -np.linalg.solve(S, g - B.T @ (gr / C))
+            w = np.where(others & ahead & (norm < gate), 1.0 / np.maximum(1.0, norm / 1.5), 0.0) / self.sigma_px**2
+            sw = np.sqrt(w)
+            rw = r * sw[:, None]
+            # E (F, 3, 2, M): whitened derivative of both coordinates by the landmark in the window's axes
+            E = (R[:, :, :2, None] - R[:, :, 2, None, None] * uv[:, None]) * (f * sw / z)[:, None, None]
+            J_rho = (E * between[:, :, None]).sum(axis=1)  # (F, 2, M)
+            np.multiply(E, rho, out=J_anchor[:, :3])
+            np.negative(J_anchor[:, :3], out=J_seen[:, :3])
+            _cross(base[None, :, None], E, J_anchor[:, 3:])
+            _cross(-c[:, :, None], E, J_seen[:, 3:])
+            seen = J_seen.reshape(F, 6, -1)
+            A = np.zeros((F, 6, F, 6))
+            A[range(F), :, range(F)] = seen @ seen.transpose(0, 2, 1)
+            g = (seen @ rw.reshape(F, -1, 1))[..., 0]
+            for i, of in enumerate(groups):
+                if of.start == of.stop:
+                    continue
+                of_i, seen_i = J_anchor[..., of].reshape(F, 6, -1), J_seen[..., of].reshape(F, 6, -1)
+                A[i, :, i] += (of_i @ of_i.transpose(0, 2, 1)).sum(axis=0)
+                g[i] += (of_i @ rw[..., of].reshape(F, -1, 1)).sum(axis=0)[:, 0]
+                mixed = of_i @ seen_i.transpose(0, 2, 1)  # (F, 6, 6); nothing where the image is the anchor
+                A[i] += mixed.transpose(1, 0, 2)
+                A[:, :, i] += mixed.transpose(0, 2, 1)
+            B = (J_rho[:, None] * J_seen).sum(axis=2)  # (F, 6, M)
+            B[anchor, :, np.arange(len(anchor))] += (J_rho[:, None] * J_anchor).sum(axis=(0, 2)).T
+            B = B[held:].reshape(6 * free, -1).T
+            C = (J_rho**2).sum(axis=(0, 1)) + 1e-6
+            gr = (J_rho * rw).sum(axis=(0, 1))
+            A_free = A[held:, :, held:].reshape(6 * free, 6 * free) + np.diag(np.tile(prior, free))
+            g_free = (g[held:] + prior * moved).reshape(-1)
+            S = A_free - B.T @ (B / C[:, None])
+            step = -np.linalg.solve(S, g_free - B.T @ (gr / C))
             if not np.isfinite(step).all():
                 return info_newest
             rho = np.maximum(rho - (gr + B @ step) / C, 0.0)
@@ -244,13 +257,12 @@ class SlidingWindow:
         info_newest = S[n:, n:] - S[n:, :n] @ np.linalg.solve(S[:n, :n], S[:n, n:]) if n else S
         turn = np.kron(np.eye(2), self.poses[-1].R)  # to the newest camera's own axes
         info_newest = turn.T @ info_newest @ turn
-        self.poses = [Pose(orthonormal(T.R), T.p) for T in self.poses]
+        self.poses = [Pose(R, T.p) for R, T in zip(orthonormal(self._stacked()[0]), self.poses, strict=True)]
         self.rho[chosen] = rho
         self.rho_sigma[chosen] = 1.0 / np.sqrt(C)
         # What no longer fits is forgotten; if it is a landmark after all, it is triangulated anew.
-        fits = np.add.reduceat((norm < self.reject_px / self.sigma_px).astype(float), first)
-        bad = 2.0 * fits < np.bincount(m, minlength=len(chosen))
-        self.rho[chosen[bad]] = np.nan
+        fits = (others & (norm < self.reject_px / self.sigma_px)).sum(axis=0)
+        self.rho[chosen[2 * fits < others.sum(axis=0)]] = np.nan
         return info_newest
 
     # --- geometry shared by the above ---
@@ -258,25 +270,12 @@ class SlidingWindow:
     def _stacked(self) -> tuple[Floats, Floats]:
         return np.stack([T.R for T in self.poses]), np.stack([T.p for T in self.poses])
 
-    def _rays(self, anchor: Ints) -> Floats:
-        return np.column_stack([self.obs[anchor, np.arange(len(self.ids))], np.ones(len(self.ids))])
 
-    def _project(self, anchor: Ints, R: Floats, p: Floats, rho: Floats) -> tuple[Floats, Floats, Bools]:
-        """q (F, M, 3) = rho times the landmark in each camera (R, p), dq/drho, and which are observed (F, M)."""
-        Rs, ps = self._stacked()
-        base = (Rs[anchor] @ self._rays(anchor)[:, :, None])[:, :, 0]
-        dq = (ps[anchor][None] - p[:, None]) @ R
-        q = base[None] @ R + rho[None, :, None] * dq
-        return q, dq, np.isfinite(self.obs[..., 0])
-
-    @staticmethod
-    def _projection_derivative(uv: Floats, z: Floats) -> Floats:
-        """(..., 2, 3) derivative of q_xy / q_z."""
-        D = np.zeros((*uv.shape[:-1], 2, 3))
-        D[..., 0, 0] = D[..., 1, 1] = 1.0 / z
-        D[..., 0, 2] = -uv[..., 0] / z
-        D[..., 1, 2] = -uv[..., 1] / z
-        return D
+def _cross(a: Floats, b: Floats, out: Floats) -> None:
+    """a x b along the second axis of (F, 3, ..., M)."""
+    out[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+    out[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
+    out[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def two_view(xy_a: Floats, xy_b: Floats, focal_px: float, threshold_px: float) -> tuple[Pose, Bools] | None:

@@ -24,6 +24,7 @@ from birdslam.trajectory import Pose, as_poses, inverse, read_kitti
 from birdslam.types import Estimate, MapUpdate, Measurements
 
 STANDING_RADIUS_M, STANDING_FRAMES = 0.05, 10  # a car whose truth stays within it for so long stands
+SEGMENTS_M = (10.0, 20.0, 30.0, 40.0, 50.0)  # KITTI's benchmark has 100 to 800 m, longer than a clip
 GROUND_AXES = (0, 2)  # x right and z forward of a camera: what is left of a position on the road
 
 
@@ -45,6 +46,8 @@ class OdometryReport(msgspec.Struct, frozen=True, kw_only=True):
     standing_drift_m: float | None = None  # how far the estimate strays while the truth stands; None: it never does
     statuses: dict[str, int] = {}  # how many frames carried each status
     car_ahead: CarAheadReport | None = None  # where the recording has LiDAR
+    segment_t_pct: float | None = None  # mean error of stretches of SEGMENTS_M, each aligned at its own first pose:
+    segment_r_deg_per_m: float | None = None  # what the truth's first poses lack touches only those that begin there
 
 
 def rms(errors: NDArray[np.float64]) -> float:
@@ -120,6 +123,29 @@ def rpe(truth: Pose, estimated: Pose) -> tuple[float, float]:
     return rms(np.linalg.norm(error[:, :3, 3], axis=1)), float(np.rad2deg(rms(angles)))
 
 
+def segment_errors(truth: Pose, estimated: Pose) -> tuple[float, float] | None:
+    """KITTI's odometry metric (Geiger et al. 2012): over stretches of SEGMENTS_M of the truth's way from every frame.
+
+    The mean error of their end in percent of their length, and of their direction in degrees a metre; None where the
+    truth is shorter than all of them.
+    """
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
+    pairs = [
+        (first, last, length)
+        for length in SEGMENTS_M
+        for first, last in enumerate(np.searchsorted(way, way + length).tolist())
+        if last < len(way)
+    ]
+    if not pairs:
+        return None
+    first, last, length = (np.array(column) for column in zip(*pairs, strict=True))
+    goal, own = (inverse(poses[first]) @ poses[last] for poses in (truth, estimated))
+    error = inverse(own) @ goal
+    turned_deg = np.rad2deg(Rotation.from_matrix(error[:, :3, :3]).magnitude())
+    strayed = np.linalg.norm(error[:, :3, 3], axis=1)
+    return 100.0 * float(np.mean(strayed / length)), float(np.mean(turned_deg / length))
+
+
 def compare(sequence: str, truth: Pose | None, estimated: Pose, statuses: dict[str, int]) -> OdometryReport:
     """The report of one sequence. Raises ValueError where the two don't have the same number of poses."""
     path_estimated_m = path_length_m(estimated)
@@ -131,6 +157,7 @@ def compare(sequence: str, truth: Pose | None, estimated: Pose, statuses: dict[s
         raise ValueError(f"sequence {sequence}: {len(estimated)} poses estimated for {len(truth)} frames")
     path_m, error_m = path_length_m(truth), ate_m(truth, estimated)
     rpe_t_m, rpe_r_deg = rpe(truth, estimated)
+    segments = segment_errors(truth, estimated)
     return OdometryReport(
         sequence=sequence,
         frames=len(estimated),
@@ -146,6 +173,8 @@ def compare(sequence: str, truth: Pose | None, estimated: Pose, statuses: dict[s
         path_estimated_m=path_estimated_m,
         standing_drift_m=standing_drift_m(truth, estimated),
         statuses=statuses,
+        segment_t_pct=None if segments is None else segments[0],
+        segment_r_deg_per_m=None if segments is None else segments[1],
     )
 
 

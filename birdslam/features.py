@@ -22,15 +22,23 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+# When Lucas-Kanade ends: after so many steps, or at a shorter one (px); the way back need not be exact
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.03)
+_BACK_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 0.1)
+_BACK_OFF_PX = 2.0
+
 
 class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How corners are found and followed; lengths in pixels; cells are for an image 1242 px wide."""
 
     max_tracks: Count = 450
+    refill_share: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.3  # of them gone, until new ones are looked for
     cell_px: Count = 24  # at most one new corner in a cell of this size
     min_corner_score: Positive = 8.0  # smaller eigenvalue of the structure tensor, (grey / px)^2, half image
-    window_px: Annotated[int, msgspec.Meta(ge=5)] = 17
-    pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 3
+    # Of Lucas-Kanade: OpenCV's loop over a row takes eight columns at once, and a ninth costs as much as eight more
+    window_columns_px: Annotated[int, msgspec.Meta(ge=5)] = 8
+    window_rows_px: Annotated[int, msgspec.Meta(ge=5)] = 20
+    pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 2
     max_roundtrip_px: Positive = 0.7  # forward and back again must end where it began
     max_residual_grey: Positive = 14.0  # mean absolute difference of the windows (after LK), grey levels
     dark_mean_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 8.0
@@ -125,19 +133,19 @@ class FeatureTracker:
         self, then: NDArray[np.uint8], now: NDArray[np.uint8], px: Floats, start: Floats
     ) -> tuple[Floats, Bools]:
         cfg = self.config
-        window = (cfg.window_px, cfg.window_px)
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.03)
+        window = (cfg.window_columns_px, cfg.window_rows_px)
         here = px.astype(np.float32).reshape(-1, 1, 2)
         guess = np.where(np.isfinite(start), start, px).astype(np.float32).reshape(-1, 1, 2)
         there, ok, error = cv2.calcOpticalFlowPyrLK(
             then, now, here, guess.copy(), winSize=window, maxLevel=cfg.pyramid_levels,
-            criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
+            criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
         )  # fmt: skip  # type: ignore[call-overload]
-        # The way back starts off by the guess's own error, not at the answer: a wrong match must not confirm itself.
+        # The way back starts off by the guess's own error, as far as it reaches without a pyramid, and not at the
+        # answer: a wrong match must not confirm itself.
+        off = np.clip(there - guess, -_BACK_OFF_PX, _BACK_OFF_PX)
         back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
-            now, then, there, (there - (guess - here)).astype(np.float32), winSize=window,
-            maxLevel=min(1, cfg.pyramid_levels), criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            minEigThreshold=1e-4,
+            now, then, there, (here + off).astype(np.float32), winSize=window, maxLevel=0,
+            criteria=_BACK_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
         )  # fmt: skip  # type: ignore[call-overload]
         roundtrip = np.abs(back - here).reshape(-1, 2).max(axis=1)
         end: Floats = there.reshape(-1, 2).astype(np.float64)
@@ -152,7 +160,7 @@ class FeatureTracker:
         """The best corner of each cell that holds no track, best first, until `max_tracks` are reached."""
         cfg = self.config
         room = cfg.max_tracks - len(px)
-        if room <= 0:
+        if room <= cfg.refill_share * cfg.max_tracks:
             return np.zeros((0, 2))
         half = cv2.pyrDown(grey)
         score = cv2.cornerMinEigenVal(half, 5, ksize=3) * (255.0 * 255.0)  # OpenCV's unit is (1 / 255 px)^2

@@ -22,6 +22,7 @@ from birdslam.camera import Camera
 from birdslam.features import FeatureConfig, FeatureTracker, Tracks
 from birdslam.motion import Motion, MotionConfig, coasting_cov, measured_cov, planar, standing_cov
 from birdslam.pose import Pose, rotation_exp, rotation_log
+from birdslam.roadalign import RoadFit
 from birdslam.roadscale import MetricScale, RoadScaleConfig
 from birdslam.se2 import SE2
 from birdslam.types import Status
@@ -36,6 +37,7 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 _MIN_INTERVAL_S = 0.004
 _STILL = Pose(np.eye(3), np.zeros(3))
+_NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
 
 
 class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,7 +50,7 @@ class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     key_images: Annotated[int, msgspec.Meta(ge=3)] = 8
     held_images: Count = 2  # the oldest of them, which the adjustment leaves alone: they carry the unit of length
     adjusted_landmarks: Count = 160
-    adjust_iterations: Count = 2
+    adjust_iterations: Count = 1  # each image adjusts again what the one before left
     key_parallax_px: Positive = 8.0  # a new key image when the median landmark has moved so far, rotation taken out
     key_distance_m: Positive = 0.7
     sigma_track_px: Positive = 0.35
@@ -97,12 +99,17 @@ class Odometry:
         self._base_t_ns = 0
         self._velocity: _Velocity | None = None
         self._interval_s = 0.1
-        self._road_tracks: tuple[Ints, Floats] = (np.zeros(0, np.int64), np.zeros((0, 2)))
+        self._road_tracks: tuple[Ints, Floats] = _NO_TRACKS
 
     @property
     def road_tracks(self) -> tuple[Ints, Floats]:
         """(ids (N,), px (N, 2)): followed corners of the present image that lie on the road (paper, Sec. 3.1)."""
         return self._road_tracks
+
+    @property
+    def road_fit(self) -> RoadFit | None:
+        """What the road's image alone said of the last motion, where it was of use."""
+        return self._scale.fit
 
     # --- feature tracking ---
 
@@ -170,6 +177,7 @@ class Odometry:
             if dt_s > self.config.max_coast_s or len(displacement) < self.config.min_fitting:
                 # Nothing links this image to the base any more: the window begins anew here, at the coasted pose.
                 self._begin(tracks, frame_id, t_source_ns, boxes)
+                self._scale.turned_unseen()
             return motion
         pose, info = found
         if self._stands(self._pose.between(pose), displacement):
@@ -297,6 +305,8 @@ class Odometry:
         cfg = self.config
         if len(displacement) < cfg.min_fitting or float(np.median(displacement)) > cfg.standstill_px:
             return False
+        if float(np.quantile(displacement, 0.8)) < cfg.standstill_px:
+            return True  # four corners of five have not moved: what the others make of the pose does not count
         turn = float(np.linalg.norm(rotation_log(step.R)))
         return float(np.linalg.norm(step.p)) < cfg.standstill_m and turn < cfg.standstill_rad
 
@@ -315,6 +325,7 @@ class Odometry:
 
     def _coasting(self, frame_id: int, dt_s: float, status: list[Status]) -> Motion:
         """The last velocity goes on; the base image stays."""
+        self._road_tracks = _NO_TRACKS  # those of the last measured image would say that the car has not moved since
         step = self._predicted_step(dt_s)
         T_prev_curr = planar(step, self._scale.ground)
         cov = coasting_cov(

@@ -1,7 +1,8 @@
-"""Rigid motions in space, as the image odometry needs them: rotations as matrices and as vectors, and `Pose`."""
+"""Rigid motions in space, as the image odometry needs them: rotations as matrices and as vectors, `Pose`; a median."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,32 +11,26 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def skew(v: Floats) -> Floats:
-    """(..., 3, 3) with skew(v) @ x = v x x, of (..., 3)."""
-    out = np.zeros((*v.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return out
-
-
-def cross(a: Floats, b: Floats) -> Floats:
-    """(..., 3) a x b, without the overhead of numpy.cross."""
-    a, b = np.broadcast_arrays(a, b)
-    out = np.empty(a.shape)
-    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return out
+def middle(values: Floats) -> float:
+    """The median (of an even number the upper one), without the overhead of numpy.median."""
+    half = len(values) // 2
+    return float(np.partition(values, half)[half])
 
 
 def rotation_exp(w: Floats) -> Floats:
     """(3, 3) rotation by the vector w (3,) in radians (Rodrigues)."""
-    angle = float(np.sqrt(w @ w))
-    S = skew(w)
-    if angle < 1e-8:
-        return np.eye(3) + S + 0.5 * S @ S
-    out: Floats = np.eye(3) + np.sin(angle) / angle * S + (1.0 - np.cos(angle)) / angle**2 * (S @ S)
-    return out
+    x, y, z = w.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    # I + a S + b S^2 with S = skew(w), S^2 = w w^T - angle^2 I
+    a, b = (1.0, 0.5) if angle < 1e-8 else (math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2)
+    c = 1.0 - b * angle * angle
+    return np.array(
+        [
+            [c + b * x * x, b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, c + b * y * y, b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, c + b * z * z],
+        ]
+    )
 
 
 def rotation_log(R: Floats) -> Floats:
@@ -47,9 +42,11 @@ def rotation_log(R: Floats) -> Floats:
 
 
 def orthonormal(R: Floats) -> Floats:
-    """The nearest rotation: products of many rotations stay rotations."""
-    U, _, Vt = np.linalg.svd(R)
-    out: Floats = U @ Vt
+    """The nearest rotations to (..., 3, 3) that lack little to be such: products of many rotations stay rotations.
+
+    One step of Newton for the polar factor: what is left is the square of what was lacking.
+    """
+    out: Floats = 1.5 * R - 0.5 * R @ np.swapaxes(R, -1, -2) @ R
     return out
 
 

@@ -9,7 +9,7 @@ roll together: in one pair of images the three are correlated, and a wrong pitch
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import cv2
 import msgspec
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.camera import Camera
-from birdslam.pose import Pose, cross, rotation_exp
+from birdslam.pose import Pose, middle, rotation_exp
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -42,7 +42,10 @@ class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     contrast_floor_grey: Positive = 2.0
     effective_sample_fraction: Positive = 0.013  # neighbouring pixels, and the road's shape, err together
     sigma_rotation_rad: Positive = 0.0005  # of the relative rotation that odometry hands over
-    max_iterations: Annotated[int, msgspec.Meta(ge=1)] = 7
+    max_iterations: Annotated[int, msgspec.Meta(ge=3)] = 7
+    coarse_step: Annotated[int, msgspec.Meta(ge=1)] = 4  # every so-manieth sample comes near to the answer
+    coarse_tolerance: Positive = 2e-3
+    tolerance: Positive = 1e-3
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,27 @@ class RoadFit:
     cov: Floats
     correlation: float
     samples: int
+
+
+@dataclass(frozen=True)
+class _View:
+    """Samples of the present image: their rays (3, N), those turned into the past camera (3, N), their grey (N,)."""
+
+    rays: Floats
+    turned: Floats
+    grey: Floats
+
+
+def _brightness(there: Floats, here: Floats) -> tuple[float, float]:
+    """Bias and gain by which the present image becomes the past one."""
+    gain = float(np.clip(((there - there.mean()) * (here - here.mean())).mean() / max(here.var(), 1e-6), 0.5, 2.0))
+    return float(there.mean() - gain * here.mean()), gain
+
+
+def _correlation(there: Floats, here: Floats, weights: Floats) -> float:
+    w = weights / weights.sum()
+    a, b = there - w @ there, here - w @ here
+    return float((w * a) @ b / np.sqrt(max(float((w * a) @ a * ((w * b) @ b)), 1e-12)))
 
 
 def plane_normal(pitch_rad: float, roll_rad: float) -> tuple[Floats, Floats, Floats]:
@@ -82,11 +106,12 @@ class RoadImage:
         smooth = cv2.GaussianBlur(grey[top_px:], (5, 5), 1.0)
         window = (config.contrast_window_px, config.contrast_window_px)
         mean = cv2.boxFilter(smooth, cv2.CV_32F, window)
-        contrast = cv2.sqrBoxFilter(smooth, cv2.CV_32F, window) - mean * mean
-        contrast = np.sqrt(np.maximum(contrast, 0.0, out=contrast), out=contrast) + np.float32(
-            config.contrast_floor_grey
-        )
-        self.grey: Grey = (smooth - mean) / contrast * np.float32(10.0)
+        contrast = cv2.sqrBoxFilter(smooth, cv2.CV_32F, window)
+        cv2.subtract(contrast, cv2.multiply(mean, mean), dst=contrast)
+        cv2.sqrt(np.maximum(contrast, 0.0, out=contrast), dst=contrast)
+        np.add(contrast, np.float32(config.contrast_floor_grey), out=contrast)
+        difference = cv2.subtract(smooth, mean, dst=mean, dtype=cv2.CV_32F)
+        self.grey: Grey = cv2.divide(difference, contrast, dst=mean, scale=10.0)  # type: ignore[assignment]
         self._slopes: tuple[Grey, Grey] | None = None
 
     @property
@@ -144,80 +169,99 @@ class RoadAligner:
 
         `T_past_present` is the motion with its length in the odometry's own unit, lambda times it are metres.
         """
-        cam, cfg = self.camera, self.config
+        cfg = self.config
         if len(px) < cfg.min_samples:
             return None
-        rays = np.column_stack(
-            [(px[:, 0] - cam.cx_px) / cam.fx_px, (px[:, 1] - cam.cy_px) / cam.fy_px, np.ones(len(px))]
-        )
-        here = present.grey[px[:, 1] - present.top_px, px[:, 0]].astype(np.float64)
-        slope_u, slope_v = past.slopes
-        state = np.concatenate([prior, np.zeros(3)])
-        weight_prior = np.zeros((6, 6))
+        fine = self._view(present, px, T_past_present)
+        coarse = _View(*(part[..., :: cfg.coarse_step] for part in (fine.rays, fine.turned, fine.grey)))
+        x = np.concatenate([prior, np.zeros(3)])
+        mean, weight_prior = x.copy(), np.zeros((6, 6))
         weight_prior[:_PLANE, :_PLANE] = np.linalg.inv(prior_cov)
         weight_prior[3:, 3:] = np.eye(3) / cfg.sigma_rotation_rad**2
-        mean = np.concatenate([prior, np.zeros(3)])
-        Rr0 = rays @ T_past_present.R.T
-        gain, bias, fitted = 1.0, 0.0, False
-        A = np.zeros((8, 8))
-        correlation = 0.0
-        rows, cols = past.grey.shape
-        for _ in range(cfg.max_iterations):
-            normal, by_pitch, by_roll = plane_normal(state[1], state[2])
-            dR = rotation_exp(state[3:])
-            Rr = Rr0 @ dR.T
-            t = np.exp(state[0]) * T_past_present.p
-            rho = -(rays @ normal) / cam.height_m  # Eq. 1 is X = rays / rho
-            q = Rr + rho[:, None] * t
-            z = np.maximum(q[:, 2], 1e-3)
-            x, y = q[:, 0] / z, q[:, 1] / z
-            u, v = cam.fx_px * x + cam.cx_px, cam.fy_px * y + cam.cy_px - past.top_px
-            seen = (u > 1) & (u < cols - 2) & (v > 1) & (v < rows - 2) & (q[:, 2] > 0.05)
-            if seen.sum() < cfg.min_samples:
-                return None
-            map_u, map_v = u.astype(np.float32), v.astype(np.float32)
-            there = cv2.remap(past.grey, map_u, map_v, cv2.INTER_LINEAR).ravel().astype(np.float64)
-            gu = cv2.remap(slope_u, map_u, map_v, cv2.INTER_LINEAR).ravel() * (cam.fx_px / z)
-            gv = cv2.remap(slope_v, map_u, map_v, cv2.INTER_LINEAR).ravel() * (cam.fy_px / z)
-            if not fitted:
-                a, b = there[seen], here[seen]
-                gain = float(np.clip(((a - a.mean()) * (b - b.mean())).mean() / max(b.var(), 1e-6), 0.5, 2.0))
-                bias = float(a.mean() - gain * b.mean())
-                fitted = True
-            r = there - gain * here - bias
-            gq = np.column_stack([gu, gv, -(gu * x + gv * y)])  # d grey / d q
-            along = gq @ t
-            J = np.column_stack(
-                [along * rho, along * (rays @ by_pitch) / -cam.height_m, along * (rays @ by_roll) / -cam.height_m,
-                 cross(Rr, gq), -np.ones(len(r)), -here]
-            )  # fmt: skip
-            sigma = 1.4826 * float(np.median(np.abs(r[seen]))) + 0.5
-            w = np.where(seen, 1.0 / np.maximum(1.0, np.abs(r) / (1.5 * sigma)), 0.0)
-            w *= cfg.effective_sample_fraction / sigma**2
-            A = (J * w[:, None]).T @ J
-            g = (J * w[:, None]).T @ r
-            A[:6, :6] += weight_prior
-            g[:6] += weight_prior @ (state - mean)
-            A[6, 6] += 1e-9
-            A[7, 7] += 1e-6
-            step = -np.linalg.solve(A, g)
-            step[:6] = np.clip(step[:6], -0.1, 0.1)
-            state += step[:6]
-            bias, gain = bias + step[6], gain + step[7]
-            if np.abs(step[:6]).max() < 5e-5:
-                break
-        ws = np.where(seen, w, 0.0)
-        ws /= ws.sum()
-        a, b = there - ws @ there, here - ws @ here
-        correlation = float((ws * a) @ b / np.sqrt(max(float((ws * a) @ a * ((ws * b) @ b)), 1e-12)))
+        light = None  # bias and gain of the brightness
+        # Few samples come near to the answer, all of them settle it.
+        for view, share, tolerance, iterations in (
+            (coarse, cfg.coarse_step, cfg.coarse_tolerance, cfg.max_iterations - 2),
+            (fine, 1, cfg.tolerance, 3),
+        ):
+            for _ in range(iterations):
+                seen, there = self._look(view, past, T_past_present, x)
+                if share * int(seen.sum()) < cfg.min_samples:
+                    return None
+                if light is None:
+                    light = _brightness(there[0][seen], view.grey[seen])
+                r = there[0] - light[1] * view.grey - light[0]
+                J = self._derivative(view, there, T_past_present, x)
+                sigma = 1.4826 * middle(np.abs(r[seen])) + 0.5
+                w = np.where(seen, 1.0 / np.maximum(1.0, np.abs(r) * (1.0 / (1.5 * sigma))), 0.0)
+                w *= share * cfg.effective_sample_fraction / sigma**2
+                Jw = J * w
+                A, g = Jw @ J.T, Jw @ r
+                A[:6, :6] += weight_prior
+                g[:6] += weight_prior @ (x - mean)
+                A[6, 6] += 1e-9
+                A[7, 7] += 1e-6
+                step = -np.linalg.solve(A, g)
+                step[:6] = np.clip(step[:6], -0.1, 0.1)
+                x = x + step[:6]
+                light = (light[0] + step[6], light[1] + step[7])
+                if np.abs(step[:6]).max() < tolerance:
+                    break
+        correlation = _correlation(there[0], fine.grey, w)
         # What the images alone say: the prior that guided the fit is taken out again. A direction that they do not see
         # keeps a variance of about one, so that it is harmless.
         data = A.copy()
         data[:_PLANE, :_PLANE] -= weight_prior[:_PLANE, :_PLANE]
         info = data[:3, :3] - data[:3, 3:] @ np.linalg.solve(data[3:, 3:], data[3:, :3]) + np.diag([1.0, 10.0, 10.0])
-        cov: NDArray[Any] = np.linalg.inv(0.5 * (info + info.T))
-        measured: NDArray[Any] = state[:_PLANE] + cov @ weight_prior[:_PLANE, :_PLANE] @ (state[:_PLANE] - prior)
+        cov: Floats = np.asarray(np.linalg.inv(0.5 * (info + info.T)), np.float64)
+        measured: Floats = x[:_PLANE] + cov @ weight_prior[:_PLANE, :_PLANE] @ (x[:_PLANE] - prior)
         return RoadFit(measured, cov, correlation, int(seen.sum()))
+
+    def _view(self, present: RoadImage, px: Ints, T_past_present: Pose) -> _View:
+        cam = self.camera
+        rays = np.stack(
+            [(px[:, 0] - cam.cx_px) / cam.fx_px, (px[:, 1] - cam.cy_px) / cam.fy_px, np.ones(len(px))]
+        )  # fmt: skip
+        grey = present.grey[px[:, 1] - present.top_px, px[:, 0]].astype(np.float64)
+        return _View(rays, T_past_present.R @ rays, grey)
+
+    def _look(
+        self, view: _View, past: RoadImage, T_past_present: Pose, x: Floats
+    ) -> tuple[Bools, tuple[Floats, Floats, Floats, Floats, Floats]]:
+        """Which samples the past image shows; its grey there, its slopes by q_x, q_y, q_z, and 1 / depth by Eq. 1."""
+        cam = self.camera
+        rho = (plane_normal(x[1], x[2])[0] @ view.rays) / -cam.height_m  # Eq. 1 is X = rays / rho
+        q = rotation_exp(x[3:]) @ view.turned + rho * (np.exp(x[0]) * T_past_present.p)[:, None]
+        by_z = 1.0 / np.maximum(q[2], 1e-3)
+        px, py = q[0] * by_z, q[1] * by_z
+        u = (cam.fx_px * px + cam.cx_px).astype(np.float32)
+        v = (cam.fy_px * py + (cam.cy_px - past.top_px)).astype(np.float32)
+        rows, cols = past.grey.shape
+        seen = (u > 1) & (u < cols - 2) & (v > 1) & (v < rows - 2) & (q[2] > 0.05)
+        grey, by_u, by_v = (
+            cv2.remap(image, u, v, cv2.INTER_LINEAR).ravel().astype(np.float64) for image in (past.grey, *past.slopes)
+        )
+        by_x, by_y = by_u * (cam.fx_px * by_z), by_v * (cam.fy_px * by_z)
+        return seen, (grey, by_x, by_y, -(by_x * px + by_y * py), rho)
+
+    def _derivative(
+        self, view: _View, there: tuple[Floats, Floats, Floats, Floats, Floats], T_past_present: Pose, x: Floats
+    ) -> Floats:
+        """(8, N) of the residual by (log lambda, pitch, roll, rotation error, bias, gain)."""
+        _, gx, gy, gz, rho = there
+        _, by_pitch, by_roll = plane_normal(x[1], x[2])
+        t = np.exp(x[0]) * T_past_present.p
+        rx, ry, rz = rotation_exp(x[3:]) @ view.turned
+        along = gx * t[0] + gy * t[1] + gz * t[2]
+        J = np.empty((8, len(gx)))
+        np.multiply(along, rho, out=J[0])
+        along = along * (-1.0 / self.camera.height_m)
+        J[1] = along * (by_pitch @ view.rays)
+        J[2] = along * (by_roll @ view.rays)
+        J[3], J[4], J[5] = ry * gz - rz * gy, rz * gx - rx * gz, rx * gy - ry * gx
+        J[6] = -1.0
+        np.negative(view.grey, out=J[7])
+        return J
 
     def search(
         self, past: RoadImage, present: RoadImage, T_past_present: Pose, px: Ints, tilt: tuple[float, float],

@@ -47,12 +47,16 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bounce_m: Positive = 3.0
     sigma_travel_rad: Positive = 0.012  # direction of travel against the road, over one metre
     sigma_mount_rad: Positive = 0.02  # of the calibrated pitch and roll
+    sigma_unseen_rad: Positive = 0.03  # of the tilt after a gap in which nobody saw how the camera turned
     scale_walk_rel_per_sqrt_m: Positive = 0.004  # drift of the visual scale
     tilt_walk_rad_per_sqrt_m: Positive = 0.003  # crown and grade of the road
     mount_memory_m: Positive = 40.0  # distance over which the mean pitch and roll follow
     carried_after_m: Positive = 6.0  # without a comparison, until the status says so
     invalid_sigma_rel: Positive = 0.15
-    calibration_drift_rad: Positive = 0.045  # between the calibrated and the mean pitch or roll
+    drift_sigma: Positive = 3.0  # between the calibrated and the mean pitch or roll, until the status says so
+    drift_memory_m: Positive = 12.0  # distance over which that mean is taken
+    sigma_drift_pitch_rad: Positive = 0.005  # of the mean: bounces, load, and the grade of the way
+    sigma_drift_roll_rad: Positive = 0.012  # and the road's crown
 
 
 class RoadFilter:
@@ -65,6 +69,7 @@ class RoadFilter:
         self.config = config
         self.tilt = np.array([camera.pitch_rad, camera.roll_rad])
         self.mount = self.tilt.copy()
+        self.recent = self.tilt.copy()  # the mean over a shorter way, in which a mount that was knocked shows
         self.mount_var = config.sigma_mount_rad**2
         self.cov: Floats = np.diag([1.0, config.sigma_mount_rad**2, config.sigma_mount_rad**2])
         self.owed_log = 0.0  # correction of log lambda that the caller has not applied yet
@@ -74,6 +79,11 @@ class RoadFilter:
         """The unit of length was lost (the window began anew) or doubted."""
         self.cov[0, :] = self.cov[:, 0] = 0.0
         self.cov[0, 0] = sigma_rel**2
+
+    def turned_unseen(self) -> None:
+        """The camera turned and nobody saw by how much: all that is known of the tilt is what the mount gives."""
+        self.cov[1:, :] = self.cov[:, 1:] = 0.0
+        self.cov[1, 1] = self.cov[2, 2] = self.config.sigma_unseen_rad**2
 
     def predict(self, R_prev_curr: Floats, travelled_m: float) -> None:
         """The camera turned by R_prev_curr over a plane that bends a little on the way."""
@@ -140,6 +150,7 @@ class RoadFilter:
         seen_var = float(self.cov[1, 1]) + self.config.sigma_bounce_rad**2
         rate = max(rate, self.mount_var / (self.mount_var + seen_var * self.config.bounce_m / max(travelled_m, 1e-3)))
         self.mount = self.mount + rate * (self.tilt - self.mount)
+        self.recent = self.recent + min(1.0, travelled_m / self.config.drift_memory_m) * (self.tilt - self.recent)
         self.mount_var = max((1.0 - rate) * self.mount_var, (0.1 * self.config.sigma_bounce_rad) ** 2)
 
 
@@ -163,6 +174,7 @@ class MetricScale:
         self._kept: list[_Kept] = []
         self._confirmed = 0
         self._refused = 0
+        self.fit: RoadFit | None = None  # what the last image's comparison alone said, where it was taken over
 
     @property
     def ground(self) -> GroundPlane:
@@ -182,6 +194,10 @@ class MetricScale:
         self._kept = [_Kept(self._aligner.image(grey), pose)]
         self.forget(sigma_rel)
 
+    def turned_unseen(self) -> None:
+        """The odometry lost sight of how the camera turned."""
+        self._filter.turned_unseen()
+
     def forget(self, sigma_rel: float) -> None:
         """The unit of length is only known to `sigma_rel` from here on."""
         if not self._confirmed:
@@ -199,6 +215,7 @@ class MetricScale:
     def compare(self, grey: NDArray[np.uint8], pose: Pose, boxes_px: Floats, road_mask: Bools | None) -> float:
         """Compares the road with that of an earlier image; returns the factor on all lengths."""
         cfg = self.config
+        self.fit = None
         image = self._aligner.image(grey)
         factor = float(np.exp(np.clip(self._filter.owed_log, -0.1, 0.1)))
         self._filter.owed_log = 0.0
@@ -224,8 +241,9 @@ class MetricScale:
             out.append(Status.SCALE_INVALID)
         if self._refused >= cfg.violated_after:
             out.append(Status.GROUND_VIOLATED)
-        calibrated = np.array([self.camera.pitch_rad, self.camera.roll_rad])
-        if np.abs(self._filter.mount - calibrated).max() > cfg.calibration_drift_rad:
+        away = self._filter.recent - np.array([self.camera.pitch_rad, self.camera.roll_rad])
+        sigma = np.hypot(self.camera.tilt_sigma_rad, [cfg.sigma_drift_pitch_rad, cfg.sigma_drift_roll_rad])
+        if np.abs(away / sigma).max() > cfg.drift_sigma:
             out.append(Status.CALIBRATION_DRIFT)
         return out
 
@@ -234,7 +252,8 @@ class MetricScale:
         if not self._kept:
             return None
         if self._in_doubt():
-            return self._kept[0]  # lengths are not known: the longest there is
+            # Lengths are not known: the longest there is, or, where that looked like nothing, the shortest, and so on.
+            return self._kept[-self._refused % len(self._kept)]
         distance = np.array([np.linalg.norm(k.pose.p - pose.p) for k in self._kept])
         usable = np.flatnonzero(distance > cfg.min_baseline_m)
         if not len(usable):
@@ -258,6 +277,8 @@ class MetricScale:
             loose = prior_cov.copy()
             loose[0, :] = loose[:, 0] = 0.0
             loose[0, 0] = 0.3**2
+            if self._refused >= cfg.doubt_after:
+                loose[1:, 1:] += np.eye(2) * cfg.sigma_unseen_rad**2
             other = self._aligner.align(past.image, image, Pose(T.R, T.p * found), px, prior, loose)
             # What was confirmed before has to be beaten clearly: the dark below a car ahead agrees with standing still.
             lead = 0.02 if not self._confirmed else 0.1
@@ -270,6 +291,7 @@ class MetricScale:
             self._refused += 1
             return 1.0
         self._refused = 0
+        self.fit = fit
         filter_.cov = prior_cov
         factor = searched * filter_.accept(fit)
         self._confirmed = 1 if abs(np.log(factor)) > 0.3 else self._confirmed + 1

@@ -28,6 +28,7 @@ from birdslam.evaluation import (
     path_length_m,
     rpe,
     scale_error,
+    segment_errors,
     standing_drift_m,
 )
 from birdslam.results import ResultsError
@@ -115,6 +116,25 @@ def test_planar_error_is_blind_to_height_and_no_larger(seed: int) -> None:
     assert ate_m(truth, lifted) > 4.0
     estimated = shaken(truth, seed)
     assert ate_m(truth, estimated, GROUND_AXES) <= ate_m(truth, estimated)
+
+
+def test_segments_do_not_see_what_the_first_pose_lacks() -> None:
+    truth = np.tile(np.eye(4), (80, 1, 1))
+    truth[:, 2, 3] = np.arange(80.0)
+    longer, turned = truth.copy(), truth.copy()
+    longer[:, :3, 3] *= 1.02
+    found = segment_errors(truth, longer)
+    assert found is not None
+    assert found == pytest.approx((2.0, 0.0), abs=1e-9)
+    turned[1:] = truth[1:] @ np.linalg.inv(truth[1])
+    Ry = Rotation.from_euler("y", 1.0, degrees=True).as_matrix()
+    turned[1:, :3, 3] = truth[1, :3, 3] + (truth[1:, :3, 3] - truth[1, :3, 3]) @ Ry.T
+    turned[1:, :3, :3] = Ry
+    found = segment_errors(truth, turned)
+    assert found is not None
+    assert found[0] < 0.1  # five of the 250 stretches begin at frame 0
+    assert ate_m(truth, turned) > 0.7
+    assert segment_errors(truth[:8], truth[:8]) is None
 
 
 def test_an_estimate_that_never_moved() -> None:

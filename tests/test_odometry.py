@@ -243,6 +243,49 @@ def test_vehicles_everywhere_leave_nothing_to_measure() -> None:
     assert {Status.LOW_TEXTURE, Status.ODOMETRY_COASTING} <= set(motions[-1].status)
 
 
+def _lorry(image: np.ndarray, left_px: float, width_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """A textured side of a lorry over the whole height of the view, and its box."""
+    side = np.clip(_texture(7)[0][: image.shape[0], :width_px], 0, 255).astype(np.uint8)
+    out, first = image.copy(), round(left_px)
+    a, b = max(first, 0), min(first + width_px, image.shape[1])
+    if b > a:
+        out[:, a:b] = side[:, a - first : b - first]
+    return out, np.array([[a, 0.0, b, image.shape[0]]]) if b > a else NO_BOXES
+
+
+def test_a_lorry_that_passes_a_standing_car_does_not_move_it() -> None:
+    truth = street([(0.5, 0.0)] * 8 + [(0.0, 0.0)] * 14)
+    at_px = {k: -260.0 + 45.0 * (k - 8) for k in range(9, 23)}  # it hides up to 40 % of the view
+    chained, motions = drive(
+        truth,
+        edit=lambda k, image: _lorry(image, at_px[k], 250)[0] if k in at_px else image,
+        boxes=lambda k: _lorry(np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8), at_px[k], 250)[1] if k in at_px else NO_BOXES,
+    )
+    assert all(Status.STANDSTILL in m.status for m in motions if m.to_frame > 9)
+    assert np.array_equal(chained[22].p, chained[10].p)
+
+
+def test_a_lorry_ahead_that_fills_half_the_view_does_not_hold_the_car_back() -> None:
+    truth = street([(0.6, 0.0)] * 26)
+    width_px, left_px = 300, 160.0
+    _, box = _lorry(np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8), left_px, width_px)
+    chained, motions = drive(
+        truth,
+        edit=lambda k, image: _lorry(image, left_px, width_px)[0] if k > 5 else image,  # as fast as the car itself
+        boxes=lambda k: box if k > 5 else NO_BOXES,
+    )
+    assert not any(m.standstill for m in motions)
+    assert np.linalg.norm(chained[26].p) == pytest.approx(path_m(truth), rel=0.06)
+
+
+def test_a_turn_on_the_spot_at_33_hz_does_not_travel_either() -> None:
+    truth = street([(0.2, 0.0)] * 14 + [(0.0, 0.004)] * 30)
+    chained, _ = drive(truth, rate_hz=33.0)
+    assert np.linalg.norm(chained[44].p - chained[14].p) < 0.15
+    turned = rotation_log(chained[14].between(chained[44]).R)
+    assert np.linalg.norm(turned) == pytest.approx(0.12, abs=0.005)
+
+
 def test_a_hidden_road_carries_the_scale_and_says_so() -> None:
     truth = street([(0.7, 0.0)] * 34)
     hidden = np.zeros((HEIGHT_PX, WIDTH_PX), bool)
