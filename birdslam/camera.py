@@ -43,6 +43,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A pinhole camera over a road, as a camera file (TOML) states it.
 
     `distortion` holds OpenCV's coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty for an undistorted image.
+    `tilt_sigma_rad` is how well pitch and roll are known; by default as well as a bracket is screwed on.
     Raises ValueError (on decoding: msgspec.ValidationError) where the numbers can't be a camera's.
     """
 
@@ -56,10 +57,13 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pitch_rad: float = 0.0
     roll_rad: float = 0.0
     distortion: tuple[float, ...] = ()
+    tilt_sigma_rad: Positive = 0.015
 
     def __post_init__(self) -> None:
-        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.height_m, self.pitch_rad, self.roll_rad)
-        if not all(math.isfinite(n) for n in (*numbers, *self.distortion)):
+        lens = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
+        if not all(
+            math.isfinite(n) for n in (*lens, self.height_m, self.pitch_rad, self.roll_rad, self.tilt_sigma_rad)
+        ):
             raise ValueError("camera: every number must be finite")
         if not (0.0 < self.cx_px < self.width_px and 0.0 < self.cy_px < self.height_px):
             raise ValueError(

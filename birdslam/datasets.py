@@ -42,6 +42,7 @@ __all__ = [
     "VideoRecording",
     "load_camera",
     "open_recording",
+    "read_speeds",
 ]
 
 
@@ -80,15 +81,21 @@ class Recording(ABC):
 
 
 def open_recording(uri: str, camera: Camera | None = None, stride: int = 1) -> Recording:
-    """Open `kitti:DIR` or `video:FILE`; `camera` goes before the recording's own calibration, every `stride`-th frame.
+    """Open `kitti:DIR`, `video:FILE` or `demo`, the drive that ships with birdslam, every `stride`-th frame of it.
+
+    `camera` goes before the recording's own calibration.
 
     Raises DatasetError where it can't be used.
     """
     scheme, _, rest = uri.partition(":")
     if stride < 1:
         raise DatasetError(f"{uri}: the stride must be 1 or more, got {stride}")
+    if scheme == "demo" and not rest:
+        from birdslam.demo_drive import DemoRecording  # only now: it is a Recording of this module
+
+        return DemoRecording(camera, stride)
     if not rest or scheme not in ("kitti", "video"):
-        raise DatasetError(f"{uri}: no recording; expected kitti:DIR or video:FILE")
+        raise DatasetError(f"{uri}: no recording; expected kitti:DIR, video:FILE or demo")
     path = Path(rest).expanduser()
     return KittiRecording(path, camera, stride) if scheme == "kitti" else VideoRecording(path, camera, stride)
 
@@ -101,6 +108,31 @@ def load_camera(path: Path) -> Camera:
         raise DatasetError(f"camera file {path}: can't be read: {error.strerror}") from None
     except (ValueError, msgspec.ValidationError) as error:  # ValueError: no UTF-8, or no TOML
         raise DatasetError(f"camera file {path}: {error}") from None
+
+
+def read_speeds(path: Path) -> NDArray[np.float64]:
+    """(N, 2) of a text file: time in s by the recording's clock, speed in m/s; by commas or blanks, `#` comments."""
+    rows: list[tuple[float, float]] = []
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: can't be read: {getattr(error, 'strerror', None) or 'not UTF-8'}") from None
+    for number, line in enumerate(lines, start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            t_s, speed_mps = (float(word) for word in words)
+        except ValueError:
+            raise DatasetError(f"{path}: line {number} is no time in s and speed in m/s: {line[:40]!r}") from None
+        if not (math.isfinite(t_s) and 0.0 <= speed_mps < 150.0):
+            raise DatasetError(f"{path}: line {number}: {speed_mps:g} m/s at {t_s:g} s is no speed of a car")
+        if rows and t_s <= rows[-1][0]:
+            raise DatasetError(f"{path}: line {number} is not later than the time before it")
+        rows.append((t_s, speed_mps))
+    if len(rows) < 2:
+        raise DatasetError(f"{path}: holds {len(rows)} speeds, 2 are needed")
+    return np.array(rows)
 
 
 class KittiRecording(Recording):

@@ -1,0 +1,303 @@
+"""`birdslam calibrate`: readers of intrinsics, the witnesses of pitch and roll, the height, and every bad input."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from birdslam.calibration import CalibrationConfig, CalibrationError, calibrate
+from birdslam.datasets import DatasetError, load_camera, read_speeds
+from birdslam.frontend import FrontEndConfig
+from birdslam.intrinsics import from_chessboard, read_intrinsics
+from birdslam.perception import Perception, Ready
+from birdslam.types import Frame
+from birdslam.vehicleheight import Sight, VehicleHeightConfig, stand_of
+from runtime.cli import main
+from tests.test_odometry import CAMERA, PITCH_RAD, render, street
+
+ROS = """image_width: 640
+image_height: 480
+camera_name: front
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [438.5, 0.0, 305.5, 0.0, 437.25, 243.75, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.3, 0.1, 0.001, 0.0005, 0.0]}
+"""
+ROS_MESSAGE = """header:
+  seq: 0
+height: 480
+width: 640
+distortion_model: "plumb_bob"
+D: [-0.3, 0.1, 0.001, 0.0005, 0.0]
+K: [438.5, 0.0, 305.5, 0.0, 437.25, 243.75, 0.0, 0.0, 1.0]
+---
+"""
+OPENCV = """%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 4.385e+02, 0., 3.055e+02, 0., 4.3725e+02, 2.4375e+02, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ -3.0e-01, 1.0e-01, 1.0e-03, 5.0e-04, 0. ]
+"""
+
+
+@pytest.mark.parametrize("text", [ROS, ROS_MESSAGE, OPENCV], ids=["ros", "message", "opencv"])
+def test_the_same_camera_in_every_yaml(tmp_path: Path, text: str) -> None:
+    (tmp_path / "camera.yaml").write_text(text)
+    lens = read_intrinsics(tmp_path / "camera.yaml")
+    assert (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px) == (438.5, 437.25, 305.5, 243.75)
+    assert lens.distortion == (-0.3, 0.1, 0.001, 0.0005, 0.0)
+    assert (lens.width_px, lens.height_px) == (640, 480)
+
+
+def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "out.yml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", np.array([[500.0, 0, 320], [0, 501.0, 240], [0, 0, 1]]))
+    storage.write("distortion_coefficients", np.array([[-0.1, 0.01, 0.0, 0.0]]))
+    storage.release()
+    lens = read_intrinsics(path)
+    assert (lens.fx_px, lens.fy_px, lens.width_px, lens.distortion) == (500.0, 501.0, 640, (-0.1, 0.01, 0.0, 0.0))
+
+
+def test_a_kitti_file(tmp_path: Path) -> None:
+    path = tmp_path / "calib.txt"
+    path.write_text("P2: 721.5 0 609.5 44.8 0 721.5 172.8 0.2 0 0 1 0.002\n")
+    lens = read_intrinsics(path)
+    assert (lens.fx_px, lens.cx_px, lens.distortion, lens.width_px) == (721.5, 609.5, (), None)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.yaml", None, "can't be read"),
+        ("a.yaml", "[1, 2", "no YAML"),
+        ("a.yaml", "- 1\n- 2\n", "holds no camera"),
+        ("a.yaml", "image_width: 3\n", "neither camera_matrix nor K"),
+        ("a.yaml", ROS.replace("438.5", ".nan"), "not finite"),
+        ("a.yaml", ROS.replace("438.5", "wide"), "no number"),
+        ("a.yaml", ROS.replace("438.5, 0.0,", "438.5, 9.0,"), "skew"),
+        ("a.yaml", ROS.replace("438.5, ", ""), "8 numbers"),
+        ("a.yaml", ROS.replace("plumb_bob", "equidistant"), "equidistant is not supported"),
+        ("a.yaml", ROS.replace("image_width: 640", "image_width: wide"), "width is 'wide'"),
+        ("a.yaml", ROS + "x: !!python/object/apply:sys.exit [3]\n", "no YAML"),
+        ("a.txt", "P9: 1 2 3\n", "no KITTI calibration"),
+        ("a.txt", "P2: 1 2 nan 4 5 6 7 8 9 10 11 12\n", "not finite"),
+    ],
+)
+def test_a_bad_file_is_named(tmp_path: Path, name: str, text: str | None, said: str) -> None:
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    with pytest.raises(DatasetError, match=said) as error:
+        read_intrinsics(tmp_path / name)
+    assert name in str(error.value)
+
+
+# --- chessboard ---
+
+LENS = np.array([[520.0, 0, 315.0], [0, 518.0, 236.0], [0, 0, 1]])
+SQUARE_M, COLUMNS, ROWS = 0.03, 8, 5
+
+
+def _board(turn: tuple[float, float, float], at_m: tuple[float, float, float]) -> np.ndarray:
+    """A board of COLUMNS x ROWS inner corners, its middle `at_m` in front of the camera, 640x480."""
+    side = 40
+    pattern = np.full(((ROWS + 3) * side, (COLUMNS + 3) * side), 235, np.uint8)
+    for v in range(ROWS + 1):
+        for u in range(COLUMNS + 1):
+            if (u + v) % 2 == 0:
+                pattern[(v + 1) * side : (v + 2) * side, (u + 1) * side : (u + 2) * side] = 25
+    to_m = np.array([[SQUARE_M / side, 0, 0], [0, SQUARE_M / side, 0], [0, 0, 1]])
+    middle = np.array([(COLUMNS + 3) / 2 * SQUARE_M, (ROWS + 3) / 2 * SQUARE_M, 0.0])
+    R, _ = cv2.Rodrigues(np.array(turn))
+    t = np.array(at_m) - R @ middle
+    H = LENS @ np.column_stack([R[:, 0], R[:, 1], t]) @ to_m
+    image = cv2.warpPerspective(pattern, H, (640, 480), flags=cv2.INTER_AREA, borderValue=128)
+    return cv2.GaussianBlur(image, (3, 3), 0.7)
+
+
+@pytest.fixture(scope="module")
+def boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("boards")
+    rng = np.random.default_rng(4)
+    for k in range(9):
+        turn = (*rng.uniform(-0.5, 0.5, 2), float(rng.uniform(-0.2, 0.2)))
+        at = (*rng.uniform(-0.06, 0.06, 2), float(rng.uniform(0.35, 0.5)))
+        cv2.imwrite(str(folder / f"{k}.png"), _board(turn, at))
+    return folder
+
+
+def test_a_chessboard_gives_the_lens(boards: Path) -> None:
+    lens = from_chessboard(boards, COLUMNS, ROWS, SQUARE_M)
+    assert (lens.fx_px, lens.fy_px) == pytest.approx((520.0, 518.0), rel=0.01)
+    assert (lens.cx_px, lens.cy_px) == pytest.approx((315.0, 236.0), abs=6.0)
+    assert (lens.width_px, lens.height_px, len(lens.distortion)) == (640, 480, 5)
+    assert lens.reprojection_px is not None
+    assert lens.reprojection_px < 0.3
+
+
+def test_a_bad_chessboard_is_named(boards: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="was found in 0 of 9 images"):
+        from_chessboard(boards, COLUMNS + 1, ROWS + 1, SQUARE_M)
+    with pytest.raises(DatasetError, match="no such directory"):
+        from_chessboard(tmp_path / "nowhere", COLUMNS, ROWS, SQUARE_M)
+    with pytest.raises(DatasetError, match="no images"):
+        from_chessboard(tmp_path, COLUMNS, ROWS, SQUARE_M)
+    with pytest.raises(DatasetError, match="is none"):
+        from_chessboard(boards, 2, 0, SQUARE_M)
+    flat = tmp_path / "flat"
+    flat.mkdir()
+    for k in range(7):
+        cv2.imwrite(str(flat / f"{k}.png"), _board((0.0, 0.0, 0.01 * k), (0.01 * k, 0.0, 0.4)))
+    with pytest.raises(DatasetError, match="tilt the board more"):
+        from_chessboard(flat, COLUMNS, ROWS, SQUARE_M)
+    cv2.imwrite(str(flat / "7.png"), np.zeros((100, 100), np.uint8))
+    with pytest.raises(DatasetError, match=r"7\.png: is 100x100"):
+        from_chessboard(flat, COLUMNS, ROWS, SQUARE_M)
+    (flat / "7.png").write_bytes(b"torn")
+    with pytest.raises(DatasetError, match=r"7\.png: torn"):
+        from_chessboard(flat, COLUMNS, ROWS, SQUARE_M)
+
+
+# --- the stand by the vehicles ---
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_stand_by_vehicles_is_within_its_sigma(seed: int) -> None:
+    rng, truth = np.random.default_rng(seed), np.array([1.4, 0.02, -0.01])
+    sights = []
+    for vehicle in range(40):
+        tall_m, far_m, b = rng.normal(1.53, 0.12), rng.uniform(8, 40), rng.uniform(-0.5, 0.5)
+        for k in range(8):
+            z = far_m + 0.5 * k
+            bottom = truth[0] / z - truth[1] + truth[2] * b + rng.normal(0, 0.002)
+            sights.append(Sight(vehicle, bottom, 0.002, tall_m / z + rng.normal(0, 0.002), 0.002, b, 1.53, 0.08))
+    for _ in range(10):  # a detector's ghosts: vehicles that hang in the air
+        sights.append(Sight(100 + len(sights), -0.05, 0.002, 0.1, 0.002, 0.0, 1.53, 0.08))
+    wide = np.diag([1.0, 0.1**2, 0.1**2])
+    stand = stand_of(sights, np.array([1.65, 0.0, 0.0]), wide, VehicleHeightConfig())
+    assert stand is not None
+    assert np.sqrt(np.diag(stand.cov)) == pytest.approx([0.08, 0.004, 0.015], rel=0.4)
+    assert (np.abs(stand.state - truth) < 2.5 * np.sqrt(np.diag(stand.cov))).all()
+    assert stand_of(sights[:16], np.array([1.65, 0.0, 0.0]), wide, VehicleHeightConfig()) is None
+
+
+# --- a drive ---
+
+
+@functools.cache
+def _images(steps: int, step_m: float) -> tuple[np.ndarray, ...]:
+    return tuple(render(pose, k) for k, pose in enumerate(street([(step_m, 0.0)] * steps)))
+
+
+def _drive(images: tuple[np.ndarray, ...]) -> Iterator[tuple[Frame, Ready]]:
+    for k, image in enumerate(images):
+        yield Frame(k, k * 10**8, k, k, image), Ready(Perception())
+
+
+def test_a_rendered_drive_gives_the_pitch_and_checks_the_height() -> None:
+    images = _images(40, 0.8)
+    camera = msgspec.structs.replace(CAMERA, height_m=1.5)  # 1.65 is the truth
+    found = calibrate(
+        lambda: _drive(images), camera, FrontEndConfig(), CalibrationConfig(),
+        {"wheels": lambda start, end, start_ns, end_ns: 0.8 * (end - start)},
+    )  # fmt: skip
+    sigma = np.sqrt(np.diag(np.reshape(found.cov, (2, 2))))
+    assert abs(found.camera.pitch_rad - PITCH_RAD) < 2.5 * sigma[0] < math.radians(0.6)
+    assert abs(found.camera.roll_rad) < 2.5 * sigma[1]
+    assert found.camera.tilt_sigma_rad == pytest.approx(sigma.max())
+    assert {w.cue for w in found.witnesses} == {"road", "travel"}
+    (check,) = found.height_checks
+    assert abs(check.height_m - 1.65) < 2.5 * check.sigma_m < 0.15
+    assert abs(check.height_m - 1.5) > 2.0 * check.sigma_m  # the wrong one is found out
+    assert found.yaw_rad == pytest.approx(0.0, abs=0.01)
+
+
+def test_too_short_a_drive_is_refused() -> None:
+    images = _images(12, 0.8)
+    with pytest.raises(CalibrationError, match="too little motion"):
+        calibrate(lambda: _drive(images), CAMERA, FrontEndConfig(), CalibrationConfig())
+
+
+# --- the command ---
+
+
+def _said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    status = main(["calibrate", *arguments])
+    told = capsys.readouterr()
+    return status, told.out + told.err
+
+
+def test_the_command_on_kitti(data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = data_dir / "kitti_odometry" / "sequences" / "06"
+    status, told = _said(capsys, str(sequence), "--output", str(tmp_path / "camera.toml"))
+    assert status == 0
+    assert "by road: pitch" in told
+    assert "by travel: pitch" in told
+    assert "by poses: 1.6" in told
+    assert "DISAGREES" not in told
+    camera = load_camera(tmp_path / "camera.toml")
+    assert camera.pitch_rad == pytest.approx(math.radians(1.0), abs=math.radians(0.4))
+    assert camera.height_m == 1.65
+    assert camera.tilt_sigma_rad < 0.01
+    # A wrong height is found out by the poses; without one stated, they give it.
+    (tmp_path / "lens.yaml").write_text(
+        f"image_width: {camera.width_px}\nimage_height: {camera.height_px}\n"
+        f"K: [{camera.fx_px}, 0, {camera.cx_px}, 0, {camera.fy_px}, {camera.cy_px}, 0, 0, 1.0]\n"
+    )
+    lens = ("--intrinsics", str(tmp_path / "lens.yaml"), "--output", str(tmp_path / "b.toml"), "--stride", "2")
+    status, told = _said(capsys, str(sequence), *lens, "--height", "1.9")
+    assert status == 0
+    assert "height 1.900 m, as stated" in told
+    assert "DISAGREES" in told
+    status, told = _said(capsys, str(sequence), *lens)
+    assert status == 0
+    assert load_camera(tmp_path / "b.toml").height_m == pytest.approx(1.65, abs=0.08)
+
+
+def test_bad_input_is_one_line(data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence, out = str(data_dir / "kitti_odometry" / "sequences" / "06"), str(tmp_path / "c.toml")
+    (tmp_path / "lens.yaml").write_text(ROS)
+    (tmp_path / "speed.csv").write_text("1000, 3\n1001, 4\n")
+    (tmp_path / "torn.csv").write_text("0, 3\n1, fast\n")
+    for arguments, wanted in (
+        (("/nowhere", "--output", out), "no such directory"),
+        ((sequence, "--output", out, "--intrinsics", str(tmp_path / "lens.yaml")), "but the camera given is 640x480"),
+        ((sequence, "--output", out, "--intrinsics", str(tmp_path / "no.yaml")), "no.yaml: can't be read"),
+        ((sequence, "--output", out, "--height", "nan"), "is no height of a camera"),
+        ((sequence, "--output", out, "--speed", str(tmp_path / "speed.csv")), "lie outside the recording's"),
+        ((sequence, "--output", out, "--speed", str(tmp_path / "torn.csv")), "torn.csv: line 2 is no time"),
+        ((sequence, "--output", out, "--chessboard", str(tmp_path), "--board", "nine"), "expected COLSxROWS"),
+        ((str(data_dir / "kitti_raw_clip"), "--output", out), "too little motion"),
+    ):
+        status, told = _said(capsys, *arguments)
+        assert status == 2, arguments
+        assert wanted in told
+        assert told.startswith("birdslam: ") or "run without" in told
+    assert not Path(out).exists()
+
+
+@pytest.mark.parametrize("text", ["", "0 1\n", "0 1\n0 2\n", "0 1\nnan 2\n", "0 1\n1 -2\n", "0 1 2\n"])
+def test_a_bad_speed_file_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "speed.txt").write_text(text)
+    with pytest.raises(DatasetError, match=r"speed\.txt"):
+        read_speeds(tmp_path / "speed.txt")
