@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +12,9 @@ from birdslam import bev
 from birdslam.camera import Camera, GroundPlane
 from birdslam.localisation import Observation
 from birdslam.se2 import SE2
+from birdslam.track import Track
 
-if TYPE_CHECKING:
-    from birdslam.tracking import Track
-
+HEIGHT_SHOWS_REL = 0.2  # 1-sigma of a box's height; past it the box says nothing of a size
 NEAREST_M, FAR_M = 1.0, 1e4  # a nearer box is out of the image; from there one looks at the horizon
 
 
@@ -51,30 +49,43 @@ def predicted_boxes_px(
 def within_gate(
     tracks: Sequence[Track], observations: Sequence[Observation], T_world_ego: SE2, gate_sigma: float
 ) -> NDArray[np.bool_]:
-    """(tracks, observations): within the gate, by the height of the box alone: no road, no learned size."""
-    rough = np.array([_rough(observation) for observation in observations])
-    x_m, bearing, along, across = rough.T
+    """(tracks, observations): within the gate, by the height of the box and the track's learned size; no road."""
+    depth, bearing, sigma_rel, turned_m = np.array([_rough(observation) for observation in observations]).T
+    lengths = np.array([observation.dimensions.length_m for observation in observations])
+    sigma_sides = np.array([max(observation.sigma_left, observation.sigma_right) for observation in observations])
+    learned = np.array([_learned_height_m(track) for track in tracks])[:, None]
+    of_class = np.array([observation.dimensions.height_m for observation in observations])
+    x_m = np.where(np.isnan(learned), 1.0, learned / of_class) * depth + lengths / 2.0
+    along = np.square(x_m * sigma_rel) + np.square(turned_m)
+    across = np.square(x_m * sigma_sides) + np.square(turned_m / 2.0)
     R = T_world_ego.rotation()
-    centres = T_world_ego @ np.column_stack([x_m, bearing * x_m])
-    covs = np.empty((len(rough), 2, 2))
-    covs[:, 0, 0] = along
-    covs[:, 0, 1] = covs[:, 1, 0] = along * bearing
-    covs[:, 1, 1] = along * bearing**2 + across
-    S = np.array([track.cov[:2, :2] for track in tracks])[:, None] + (R @ covs @ R.T)[None]
-    gap = centres[None] - np.array([track.state[:2] for track in tracks])[:, None]
+    centres = T_world_ego @ np.stack([x_m, bearing * x_m], axis=-1).reshape(-1, 2)
+    covs = np.empty((*x_m.shape, 2, 2))
+    covs[..., 0, 0] = along
+    covs[..., 0, 1] = covs[..., 1, 0] = along * bearing
+    covs[..., 1, 1] = along * np.square(bearing) + across
+    S = np.array([track.cov[:2, :2] for track in tracks])[:, None] + R @ covs @ R.T
+    gap = centres.reshape(*x_m.shape, 2) - np.array([track.state[:2] for track in tracks])[:, None]
     out: NDArray[np.bool_] = _squared_mahalanobis(gap, S) <= gate_sigma**2
     return out
 
 
+def _learned_height_m(track: Track) -> float:
+    """What made it look as tall as it last did from where it was placed; NaN where its height did not show."""
+    seen = track.observation
+    return track.place.depth_m * seen.tan_height if _sigma_height_rel(seen) < HEIGHT_SHOWS_REL else math.nan
+
+
 def _rough(seen: Observation) -> tuple[float, float, float, float]:
-    """Its centre's depth in metres by the height of its class, and bearing; variances along and across, in m^2."""
-    depth_m, dimensions = seen.depth_by_height_m, seen.dimensions
-    x_m = depth_m + dimensions.length_m / 2.0
-    sigma_rel = math.hypot(seen.sigma_top, seen.sigma_bottom) / max(seen.tan_height, 1e-3)
+    """Depth (m) by the height of its class, bearing, 1-sigma of the depth (relative), what its yaw may hide (m)."""
+    dimensions = seen.dimensions
     turned_m = dimensions.length_m / (2.0 if seen.cut_side else 4.0)  # its yaw is not known here
-    along = x_m**2 * (sigma_rel**2 + dimensions.sigma_height_rel**2) + turned_m**2
-    across = (x_m * max(seen.sigma_left, seen.sigma_right)) ** 2 + (turned_m / 2.0) ** 2
-    return x_m, seen.bearing, along, across
+    sigma_rel = math.hypot(_sigma_height_rel(seen), dimensions.sigma_height_rel)
+    return seen.depth_by_height_m, seen.bearing, sigma_rel, turned_m
+
+
+def _sigma_height_rel(seen: Observation) -> float:
+    return math.hypot(seen.sigma_top, seen.sigma_bottom) / max(seen.tan_height, 1e-3)
 
 
 def in_ego(T_world_ego: SE2, point: NDArray[np.float64]) -> tuple[float, float]:

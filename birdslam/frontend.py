@@ -10,13 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.camera import Camera, GroundPlane
+from birdslam.heightwatch import HeightWatch, HeightWatchConfig
+from birdslam.hindsight import Hindsight, HindsightConfig, Moment
 from birdslam.horizon import Horizon, HorizonConfig
-from birdslam.localisation import LocalisationConfig, localise
+from birdslam.lanes import Completion, LanesConfig
+from birdslam.localisation import LocalisationConfig
 from birdslam.odometry import Motion, Odometry, OdometryConfig
 from birdslam.perception import Perception
+from birdslam.pseudolidar import FrustumNetwork, PseudoLidarConfig
 from birdslam.se2 import SE2
 from birdslam.static_map import LaneMapper, StaticMapConfig, landmark_edges
-from birdslam.tracking import Track, Tracker, TrackingConfig
+from birdslam.tracking import Tracker, TrackingConfig
 from birdslam.types import (
     Attitude,
     EgoEdge,
@@ -24,8 +28,8 @@ from birdslam.types import (
     Ground,
     Measurements,
     Status,
-    VehicleEdge,
 )
+from birdslam.vehicle_edges import Present, vehicle_edges
 
 
 class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -34,8 +38,12 @@ class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     odometry: OdometryConfig = OdometryConfig()
     localisation: LocalisationConfig = LocalisationConfig()
     horizon: HorizonConfig = HorizonConfig()
+    pseudolidar: PseudoLidarConfig = PseudoLidarConfig()
     tracking: TrackingConfig = TrackingConfig()
+    hindsight: HindsightConfig = HindsightConfig()
     static_map: StaticMapConfig = StaticMapConfig()
+    lanes: LanesConfig = LanesConfig()
+    height: HeightWatchConfig = HeightWatchConfig()
 
 
 class Pending(Protocol):
@@ -65,14 +73,29 @@ class EgoMotion(Protocol):
 class FrontEnd:
     """step(): one frame in, its `Measurements` out. Deterministic; owns no thread."""
 
-    def __init__(self, camera: Camera, config: FrontEndConfig, odometry: EgoMotion | None = None) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        config: FrontEndConfig,
+        odometry: EgoMotion | None = None,
+        frustum_network: FrustumNetwork | None = None,
+        complete: Completion | None = None,
+    ) -> None:
         self.camera = camera
         self.config = config
         self.odometry: EgoMotion = odometry or Odometry(camera, config.odometry)
-        self.tracker = Tracker(camera, config.tracking, config.localisation)
-        self.horizon = Horizon(camera, config.horizon)
+        self.hindsight = Hindsight(
+            camera,
+            Tracker(camera, config.tracking, config.localisation, config.pseudolidar),
+            Horizon(camera, config.horizon),
+            config.localisation,
+            config.hindsight,
+            config.pseudolidar,
+            frustum_network,
+        )
         self._reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
-        self._lanes = LaneMapper(camera, config.static_map)
+        self._lanes = LaneMapper(camera, config.static_map, config.lanes, complete)
+        self.height = HeightWatch(camera, config.height, config.localisation)
         self._last_frame: int | None = None
         self._last_pitch = (0, 0.0)  # when, and the camera's against the level
 
@@ -89,30 +112,28 @@ class FrontEnd:
         boxes_px = np.zeros((0, 4)) if detections is None else detections.boxes_px
         road = None if segmentation is None else segmentation.road
         motion = self.odometry.estimate(tracks, frame.frame_id, frame.t_source_ns, boxes_px, road)
+        if motion is None:
+            self._lanes.clear()
         cc = None if motion is None else self._advance(motion)
-        self._expect_road(frame.t_source_ns, motion)
-
-        # Dynamic object localisation: only what the detector saw in this very frame
-        observations = []
-        if detections is not None and perception.ages.get("detector", 0) == 0:
-            observations = localise(
-                boxes_px,
-                detections.scores,
-                detections.labels,
-                self.camera,
-                self.horizon.ground,
-                self.config.localisation,
-            )
         T_world_ego = self._reckoning.T_world_ego
-        seen = self.tracker.step(observations, T_world_ego, self.horizon, frame.frame_id, frame.t_source_ns)
-        ground, sigma_pitch_rad = self.horizon.ground, self.horizon.sigma_pitch_rad
+        self.hindsight.begin(self._moment(frame, motion))
+
+        # Dynamic object localisation: of this very frame, or of the earlier one that late detections are of
+        age = perception.ages.get("detector", 0)
+        depth = perception.depth if perception.ages.get("depth", 0) == age else None
+        road_then = road if perception.ages.get("segmenter", 0) == age else None
+        seen = self.hindsight.see(detections, frame.frame_id - age, depth, road_then)
+        ground, sigma_pitch_rad = self.hindsight.road.ground, self.hindsight.road.sigma_pitch_rad
+        present = Present(frame.frame_id, frame.t_source_ns, T_world_ego, ground)
+        cv, vv = vehicle_edges(seen, present, self.camera, self.config.tracking)
+        status += self.height.step(cv, motion)
 
         return _measurements(
             frame,
             [*status, *perception.status, *(motion.status if motion else (Status.NOT_INITIALISED,))],
             cc=cc,
-            cv=tuple(self._vehicle_edge(track) for track in seen),
-            vv=tuple(track.motion for track in seen if track.motion is not None),
+            cv=cv,
+            vv=vv,
             cp=landmark_edges(
                 *self.odometry.road_tracks,
                 frame.frame_id,
@@ -123,7 +144,7 @@ class FrontEnd:
             ),
             lanes=self._lanes.step(
                 frame.frame_id,
-                self._reckoning.T_world_ego,
+                T_world_ego,
                 ground,
                 segmentation,
                 frame.frame_id - perception.ages.get("segmenter", 0),
@@ -140,15 +161,20 @@ class FrontEnd:
         self._last_frame = frame.frame_id
         return (Status.FRAMES_DROPPED,) if gap else ()
 
-    def _expect_road(self, t_source_ns: int, motion: Motion | None) -> None:
+    def _moment(self, frame: Frame, motion: Motion | None) -> Moment:
         """The road as this frame's image and the camera's own pitching since the last frame give it."""
-        pitch_rad = self._reckoning.attitude.pitch_rad
+        t_source_ns, pitch_rad = frame.t_source_ns, self._reckoning.attitude.pitch_rad
         (last_ns, last_rad), self._last_pitch = self._last_pitch, (t_source_ns, pitch_rad)
-        dt_s = max(0.0, (t_source_ns - last_ns) * 1e-9)
-        if motion is None:
-            self.horizon.predict(dt_s, None, None, 0.0)
-        else:
-            self.horizon.predict(dt_s, pitch_rad - last_rad, motion.ground, motion.pitch_sigma_rad)
+        return Moment(
+            frame_id=frame.frame_id,
+            t_source_ns=t_source_ns,
+            T_world_ego=self._reckoning.T_world_ego,
+            ego_cov=None if motion is None else np.asarray(motion.cov),
+            dt_s=max(0.0, (t_source_ns - last_ns) * 1e-9),
+            turn_rad=None if motion is None else pitch_rad - last_rad,
+            image_ground=None if motion is None else motion.ground,
+            image_sigma_rad=0.0 if motion is None else motion.pitch_sigma_rad,
+        )
 
     def _advance(self, motion: Motion) -> EgoEdge:
         """CC, from the frame of the last one: a coasted frame has a pose of its own, which the next edge starts from.
@@ -163,26 +189,6 @@ class FrontEnd:
             to_frame=motion.to_frame,
             T_from_to=T_world_last.between(self._reckoning.T_world_ego) if chained else motion.T_prev_curr,
             cov=tuple(np.ravel(motion.cov).tolist()),
-        )
-
-    def _vehicle_edge(self, track: Track) -> VehicleEdge:
-        seen, place, tracking = track.observation, track.place, self.config.tracking
-        yaw_rad = track.T_world_ego.between(track.pose()).yaw_rad
-        cov = np.zeros((3, 3))
-        R_vehicle_ego = SE2(yaw_rad=-yaw_rad).rotation()
-        cov[:2, :2] = R_vehicle_ego @ place.cov @ R_vehicle_ego.T  # the tangent at the vehicle's pose
-        sigma_yaw_rad = math.hypot(tracking.sigma_yaw_moving_rad, track.sigma_yaw_rad)
-        cov[2, 2] = (sigma_yaw_rad if track.yaw_known else tracking.sigma_yaw_unknown_rad) ** 2
-        return VehicleEdge(
-            vehicle=track.vehicle,
-            frame=track.seen_frame,
-            T_ego_vehicle=SE2(float(place.centre_m[0]), float(place.centre_m[1]), yaw_rad),
-            cov=tuple(cov.ravel().tolist()),
-            label=track.label,
-            score=seen.score,
-            box_px=seen.box_px,
-            length_m=seen.dimensions.length_m,
-            width_m=seen.dimensions.width_m,
         )
 
 

@@ -22,6 +22,7 @@ fit raised (Huber).
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterable, Sequence
 from typing import Literal
@@ -32,6 +33,7 @@ from numpy.typing import NDArray
 
 from birdslam.camera import Camera, GroundPlane
 from birdslam.localisation import Observation
+from birdslam.parallax import LearnedSize
 
 Floats = NDArray[np.float64]
 
@@ -89,6 +91,12 @@ class Horizon:
         at = self._at(vehicle)
         return math.exp(float(self._x[at])), math.exp(float(self._x[at + 1]))
 
+    def road(self) -> Horizon:
+        """The road alone, without vehicles, to be predicted on while this one stays."""
+        road = copy.copy(self)
+        road._vehicles, road._x, road._P = [], self._x[:COMMON].copy(), self._P[:COMMON, :COMMON].copy()
+        return road
+
     def predict(
         self, dt_s: float, turn_rad: float | None, image_ground: GroundPlane | None, image_sigma_rad: float
     ) -> None:
@@ -138,11 +146,13 @@ class Horizon:
         outlines_m: Floats,
         extents_m: Floats,
         turned_rad: Floats,
+        learned: LearnedSize | None = None,
     ) -> tuple[Floats, Floats]:
         """Log depths (N,) of the nearest faces and their variances (N,), all of this frame's boxes together.
 
         `outlines_m` and `extents_m` (N,): what each class measures across and along the line of sight at its yaw;
         `turned_rad` (N,): by how much that line turned since last seen. Observations are against the present `ground`.
+        `learned`, of N, counts in the depths that are returned and is not kept: in the next frame it may say otherwise.
         """
         for vehicle, observation in zip(vehicles, seen, strict=True):
             if vehicle not in self._vehicles:
@@ -161,11 +171,19 @@ class Horizon:
         z = np.concatenate([slopes, tops, log_width - np.log(outlines_m)])
         R0 = np.concatenate([sigma_slope[:, 0] ** 2, sigma_slope[:, 1] ** 2, sigma_width**2])
         R0[np.repeat([cue not in self.config.cues for cue in CUES], n)] = UNUSED**2
-        return self._iterate(at, bearing, extents_m * self.config.roof_reach_rel, z, R0)
+        log_z, P_z, P_zh = self._iterate(at, bearing, extents_m * self.config.roof_reach_rel, z, R0)
+        if learned is None:
+            return log_z, P_z
+        gain = P_zh[:, None] / (self._P[at, at][:, None] + learned.variance)
+        each = log_z[:, None] + gain * (learned.log_height - self._x[at][:, None])
+        mean = (learned.weight * each).sum(axis=1)
+        spread = np.square(each - mean[:, None]) + P_z[:, None] - gain * P_zh[:, None]
+        return mean, (learned.weight * spread).sum(axis=1)
 
     def _iterate(
         self, at: NDArray[np.intp], bearing: Floats, reach: Floats, z: Floats, R: Floats
-    ) -> tuple[Floats, Floats]:
+    ) -> tuple[Floats, Floats, Floats]:
+        """log z, its variances, and its covariances with log h of the same vehicles, (N,) each."""
         n, m = len(at), len(self._x)
         height_m = self._image_ground.height_m
         # First guess of the depth: by the prior height from the height of the box
@@ -211,7 +229,7 @@ class Horizon:
             x = prior + gain @ innovation
         P = P - gain @ PJt.T
         self._x, self._P = x[:m], (P[:m, :m] + P[:m, :m].T) / 2.0
-        return x[m:], np.diag(P)[m:].copy()
+        return x[m:], np.diag(P)[m:].copy(), P[range(m, m + n), at]
 
     def _doubt(self, information: Floats, innovation: Floats) -> Floats:
         """The inverse of the innovations' covariance, (M, M), with each box's worst cue trusted less where it misfits.

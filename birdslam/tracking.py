@@ -8,18 +8,22 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from birdslam.association import NEAREST_M, in_ego, predicted_boxes_px, within_gate
+from birdslam.association import predicted_boxes_px, within_gate
 from birdslam.camera import Camera, GroundPlane
 from birdslam.horizon import Horizon
 from birdslam.localisation import LocalisationConfig, Observation, Place, extent_m, iou, place
+from birdslam.parallax import ParallaxConfig
+from birdslam.placing import Body, Placing
+from birdslam.pseudolidar import DepthPlace, PseudoLidarConfig
 from birdslam.se2 import SE2, wrap
+from birdslam.track import Track
 from birdslam.types import MotionEdge
 
 
@@ -43,47 +47,25 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     direction_inflation: float = 3.0  # of the motion's direction: its errors last for many frames
     sigma_yaw_unknown_rad: float = 0.2
     sigma_yaw_moving_rad: float = 0.1
-
-
-@dataclass
-class Track:
-    """One vehicle; `state` is (x_m, y_m, vx_mps, vy_mps) of its centre in the odometry's world, `cov` (4, 4)."""
-
-    state: NDArray[np.float64]
-    cov: NDArray[np.float64]
-    yaw_rad: float
-    observation: Observation  # the last one
-    place: Place  # and where it put the vehicle, in the ego of frame `seen_frame`
-    serial: int  # known to the horizon by it
-    first_m: NDArray[np.float64]  # (2,) where it was first seen, in the odometry's world
-    first_sight_m: NDArray[np.float64]  # (2,) from the ego to there, along world's axes
-    seen_frame: int
-    seen_ns: int
-    T_world_ego: SE2  # of frame `seen_frame`
-    T_world_seen: SE2  # its own pose then
-    vehicle: int = -1  # the persistent id, once confirmed
-    hits: int = 1
-    votes: Counter[str] = field(default_factory=Counter)
-    sigma_yaw_rad: float = 0.0  # of a yaw that motion has shown
-    yaw_known: bool = False
-    motion: MotionEdge | None = None  # VV: from when it was last seen to now, as predicted before it was seen again
-
-    @property
-    def label(self) -> str:
-        return max(sorted(self.votes), key=self.votes.__getitem__)
-
-    def pose(self) -> SE2:
-        """T_world_vehicle in the odometry's world."""
-        return SE2(float(self.state[0]), float(self.state[1]), self.yaw_rad)
+    parallax: ParallaxConfig = ParallaxConfig()
+    stands: float = 0.5  # the probability from which on a vehicle does, by its parallax: its yaw is kept
+    late_sigma_m: float = 3.0  # a late detection that the velocity puts so far off is not shown in the present frame
 
 
 class Tracker:
     """step(): predict, associate, correct, begin and forget tracks; returns those seen in this frame."""
 
-    def __init__(self, camera: Camera, config: TrackingConfig, localisation: LocalisationConfig) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        config: TrackingConfig,
+        localisation: LocalisationConfig,
+        pseudolidar: PseudoLidarConfig | None = None,
+    ) -> None:
         self.camera = camera
         self.config = config
         self.localisation = localisation
+        self.placing = Placing(localisation, config.parallax, pseudolidar or PseudoLidarConfig())
         self.tracks: list[Track] = []
         self._next_id = 0
         self._next_serial = 0
@@ -93,13 +75,25 @@ class Tracker:
         self._ego_speed_mps = 0.0
 
     def step(
-        self, observations: list[Observation], T_world_ego: SE2, horizon: Horizon, frame_id: int, t_source_ns: int
+        self,
+        observations: list[Observation] | None,
+        T_world_ego: SE2,
+        horizon: Horizon,
+        frame_id: int,
+        t_source_ns: int,
+        ego_cov: NDArray[np.float64] | None = None,
+        by_depth: Sequence[DepthPlace | None] = (),
     ) -> list[Track]:
         """Confirmed tracks that were seen in this frame, each with its state corrected, ordered by id.
 
-        Depths come of all of them together (`horizon`), which learns the road's tilt and their sizes from it.
+        Depths come of all of them together (`horizon`), which learns the road's tilt and their sizes from it. None for
+        `observations`: no detector looked at this frame. `ego_cov` (3, 3) is of the ego's last step, in its tangent.
+        `by_depth` are the places that a depth map gives the observations, where there is one.
         """
-        self._predict(t_source_ns, T_world_ego)
+        self._predict(t_source_ns, T_world_ego, ego_cov)
+        for known in self.tracks:
+            known.missed += observations is not None
+        observations = observations or []
         pairs: list[tuple[Track | None, Observation]] = [*self._associate(observations, T_world_ego, horizon.ground)]
         matched = {id(observation) for _, observation in pairs}
         pairs += [
@@ -107,58 +101,39 @@ class Tracker:
             for observation in observations
             if id(observation) not in matched and observation.score >= self.config.birth_score
         ]
-        for track, seen, where in self._localise(pairs, T_world_ego, horizon):
-            if isinstance(track, Track):
-                self._correct(track, seen, where, T_world_ego, horizon, frame_id, t_source_ns)
+        bodies = self._bodies(pairs, dict(zip(map(id, observations), by_depth, strict=False)))
+        for body, where in zip(bodies, self.placing.places(bodies, T_world_ego, horizon), strict=True):
+            if body.track is not None:
+                self._correct(body.track, body.seen, where, T_world_ego, horizon, frame_id, t_source_ns)
             else:
-                self.tracks.append(self._begin(track, seen, where, T_world_ego, frame_id, t_source_ns))
+                self.tracks.append(self._begin(body.serial, body.seen, where, T_world_ego, frame_id, t_source_ns))
         self.tracks = [track for track in self.tracks if not self._is_lost(track, t_source_ns)]
         horizon.keep_only(track.serial for track in self.tracks)
+        self.placing.keep_only(track.serial for track in self.tracks)
         seen_now = [t for t in self.tracks if t.seen_frame == frame_id and t.hits >= self.config.confirm_hits]
         for track in seen_now:
             if track.vehicle < 0:
                 track.vehicle, self._next_id = self._next_id, self._next_id + 1
         return sorted(seen_now, key=lambda track: track.vehicle)
 
-    def _localise(
-        self, pairs: list[tuple[Track | None, Observation]], T_world_ego: SE2, horizon: Horizon
-    ) -> list[tuple[Track | int, Observation, Place]]:
-        """Each pair's place; a new vehicle has its serial number instead of a track, and is headed like the ego."""
-        bodies: list[Track | int] = []
-        for track, _ in pairs:
-            bodies.append(self._next_serial if track is None else track)
+    def _bodies(
+        self, pairs: list[tuple[Track | None, Observation]], by_depth: dict[int, DepthPlace | None]
+    ) -> list[Body]:
+        """The pairs; a new vehicle gets its serial number."""
+        bodies = []
+        for track, seen in pairs:
+            serial = self._next_serial if track is None else track.serial
             self._next_serial += track is None
-        yaws = [wrap(body.yaw_rad - T_world_ego.yaw_rad) if isinstance(body, Track) else 0.0 for body in bodies]
-        serials = [body.serial if isinstance(body, Track) else body for body in bodies]
-        seen = [observation for _, observation in pairs]
-        turned = np.array([_turned_rad(body, o, T_world_ego) for body, o in zip(bodies, seen, strict=True)])
-        extents = np.array(
-            [
-                extent_m(o.dimensions, yaw, self._expected_depth_m(body, o, T_world_ego), o.bearing)
-                for body, o, yaw in zip(bodies, seen, yaws, strict=True)
-            ]
-        ).reshape(-1, 2)
-        log_depths, variances = horizon.update(serials, seen, extents[:, 1], extents[:, 0], turned)
-        places = [
-            place(o, log_depth, variance, yaw, self.localisation)
-            for o, log_depth, variance, yaw in zip(seen, log_depths.tolist(), variances.tolist(), yaws, strict=True)
-        ]
-        return list(zip(bodies, seen, places, strict=True))
+            bodies.append(Body(serial, track, seen, by_depth.get(id(seen))))
+        return bodies
 
-    @staticmethod
-    def _expected_depth_m(body: Track | int, seen: Observation, T_world_ego: SE2) -> float:
-        """Of the nearest face, before it is measured: as the track predicts it, or by the height of its class."""
-        if not isinstance(body, Track):
-            return seen.depth_by_height_m
-        reach_m = body.place.centre_m[0] - body.place.depth_m
-        return max(NEAREST_M, in_ego(T_world_ego, body.state[:2])[0] - reach_m)
-
-    def _predict(self, t_source_ns: int, T_world_ego: SE2) -> None:
+    def _predict(self, t_source_ns: int, T_world_ego: SE2, ego_cov: NDArray[np.float64] | None) -> None:
         dt_s = 0.0 if self._t_ns is None else max(0.0, (t_source_ns - self._t_ns) * 1e-9)
         if dt_s > 0.0:
             step = self._T_world_ego.between(T_world_ego)
             self._ego_speed_mps = math.hypot(step.x_m, step.y_m) / dt_s
         self._t_ns, self._T_world_ego, self._dt_s = t_source_ns, T_world_ego, dt_s
+        self.placing.predict(dt_s, T_world_ego, ego_cov)
         F = np.eye(4)
         F[0, 2] = F[1, 3] = dt_s
         G = np.array([[dt_s**2 / 2, 0.0], [0.0, dt_s**2 / 2], [dt_s, 0.0], [0.0, dt_s]])
@@ -196,23 +171,34 @@ class Tracker:
     ) -> None:
         track.motion = self._predicted_motion(track, frame_id, t_source_ns)
         R = T_world_ego.rotation()
-        S = track.cov[:2, :2] + R @ seen.cov @ R.T
-        gain = track.cov[:, :2] @ np.linalg.inv(S)
-        track.state = track.state + gain @ (T_world_ego @ seen.centre_m - track.state[:2])
-        track.cov = track.cov - gain @ S @ gain.T
+        R_seen = R @ seen.cov @ R.T
+        S = track.cov[:2, :2] + R_seen
+        innovation = T_world_ego @ seen.centre_m - track.state[:2]
+        information = np.linalg.inv(S)
+        track.stands = self.placing.parallax.standing(track.serial) > self.config.stands
+        if track.stands and innovation @ information @ innovation > self.config.gate_sigma**2:
+            # Its size is thought of anew: that is no motion
+            track.state[:2] += innovation
+            track.first_m = track.first_m + innovation
+            track.cov[:2, :], track.cov[2:, :2] = 0.0, 0.0
+            track.cov[:2, :2] = R_seen
+        else:
+            gain = track.cov[:, :2] @ information
+            track.state = track.state + gain @ innovation
+            track.cov = track.cov - gain @ S @ gain.T
         track.observation, track.place = observation, seen
         track.seen_frame, track.seen_ns, track.T_world_ego = frame_id, t_source_ns, T_world_ego
         track.hits += 1
+        track.missed = 0
         track.votes[observation.label] += 1
         if not observation.cut_side:
             self._turn(track, T_world_ego, horizon)
-        track.T_world_seen = track.pose()
 
     def _predicted_motion(self, track: Track, frame_id: int, t_source_ns: int) -> MotionEdge | None:
-        """VV by constant velocity; None until the track has an id, since edges name it."""
-        if track.vehicle < 0:
+        """VV by constant velocity; None for a track that no edge has shown yet."""
+        if track.shown is None:
             return None
-        dt_s = (t_source_ns - track.seen_ns) * 1e-9
+        dt_s = (t_source_ns - track.shown.t_ns) * 1e-9
         R = SE2(yaw_rad=track.yaw_rad).rotation()
         growth = track.cov[2:, 2:] * dt_s**2 + np.eye(2) * (self.config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
         cov = np.zeros((3, 3))
@@ -220,9 +206,9 @@ class Tracker:
         cov[2, 2] = (self.config.sigma_yaw_rate_radps * dt_s) ** 2
         return MotionEdge(
             vehicle=track.vehicle,
-            from_frame=track.seen_frame,
+            from_frame=track.shown.frame,
             to_frame=frame_id,
-            T_from_to=track.T_world_seen.between(track.pose()),
+            T_from_to=track.shown.T_world_vehicle.between(track.pose()),
             cov=tuple(cov.ravel().tolist()),
         )
 
@@ -231,6 +217,8 @@ class Tracker:
 
         It turns about what was seen of it: that its centre lies elsewhere than was thought is no motion.
         """
+        if track.stands:
+            return
         vx, vy = track.state[2:].tolist()
         speed = math.hypot(vx, vy)
         sigma = math.sqrt(max(float(np.trace(track.cov[2:, 2:])) / 2.0, 1e-12))
@@ -286,19 +274,10 @@ class Tracker:
             seen_frame=frame_id,
             seen_ns=t_source_ns,
             T_world_ego=T_world_ego,
-            T_world_seen=T_world_ego @ SE2(float(seen.centre_m[0]), float(seen.centre_m[1])),
             votes=Counter({observation.label: 1}),
         )
 
     def _is_lost(self, track: Track, t_source_ns: int) -> bool:
-        confirmed = track.hits >= self.config.confirm_hits
-        patience_s = self.config.forget_s if confirmed else self.config.forget_unconfirmed_s
+        lasting = track.hits >= self.config.confirm_hits or not track.missed
+        patience_s = self.config.forget_s if lasting else self.config.forget_unconfirmed_s
         return (t_source_ns - track.seen_ns) * 1e-9 > patience_s
-
-
-def _turned_rad(body: Track | int, seen: Observation, T_world_ego: SE2) -> float:
-    """By how much the line of sight to a vehicle turned over the ground since it was last seen."""
-    if not isinstance(body, Track):
-        return 0.0
-    before = math.atan(body.observation.bearing) + body.T_world_ego.yaw_rad
-    return wrap(math.atan(seen.bearing) + T_world_ego.yaw_rad - before)

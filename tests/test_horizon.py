@@ -1,5 +1,6 @@
 """The road's tilt and vehicles' sizes from boxes that a known world projects."""
 
+import copy
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ from birdslam import bev
 from birdslam.camera import Camera, GroundPlane
 from birdslam.horizon import Horizon, HorizonConfig
 from birdslam.localisation import DIMENSIONS, LocalisationConfig, Observation, extent_m, localise
+from birdslam.parallax import LearnedSize
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 CAR = DIMENSIONS["car"]
@@ -160,3 +162,29 @@ def test_parked_cars_are_seen_from_a_passing_ego_without_drift() -> None:
         road.horizon.keep_only(boxes)
     assert np.linalg.eigvalsh(road.horizon._P).min() > 0.0
     assert road.horizon.ground.pitch_rad == pytest.approx(0.005, abs=0.004)
+
+
+def test_a_size_that_is_learned_elsewhere_counts_in_the_depth_and_is_not_kept() -> None:
+    road = Road()
+    box = {0: road.box(40.0, 0.0, 1.7)}
+    (prior_m,), (prior_sigma,) = (list(x.values()) for x in road.see(box))
+    seen = localise(box[0][None], np.ones(1), ("car",), CAMERA, road.horizon.ground, LOCALISATION)
+    extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
+
+    def again(weights: list[float], heights_m: list[float], sigma: float) -> tuple[float, float]:
+        learned = LearnedSize(np.array([weights]), np.log([heights_m]), np.full((1, len(weights)), sigma**2))
+        horizon = copy.deepcopy(road.horizon)
+        log_z, var = horizon.update([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), learned)
+        assert horizon.size(0)[0] < 1.62
+        return float(np.exp(log_z[0])), float(np.sqrt(var[0]))
+
+    truth_m = 40.0 - CAR.length_m / 2.0
+    told_m, told_sigma = again([1.0], [1.7], 0.001)
+    assert abs(told_m - truth_m) < 0.3 * abs(prior_m - truth_m)
+    assert told_sigma < prior_sigma
+    vague_m, _ = again([1.0], [1.7], 1e3)
+    mixed_m, mixed_sigma = again([0.5, 0.5], [1.4, 1.7], 0.001)
+    assert again([1.0, 0.0], [1.7, 1.2], 0.001)[0] == pytest.approx(told_m)
+    assert abs(vague_m - prior_m) < 0.1 * abs(told_m - prior_m)
+    assert mixed_m < told_m
+    assert mixed_sigma > 1.5 * told_sigma

@@ -9,20 +9,22 @@ from birdslam import bev
 from birdslam.camera import Camera, GroundPlane
 from birdslam.horizon import Horizon, HorizonConfig
 from birdslam.localisation import LocalisationConfig, localise
+from birdslam.pseudolidar import DepthPlace
 from birdslam.se2 import SE2, wrap
-from birdslam.tracking import Track, Tracker, TrackingConfig
+from birdslam.track import Track
+from birdslam.tracking import Tracker, TrackingConfig
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 GROUND = GroundPlane(1.65)
 PERIOD_NS = 100_000_000
 
 
-def box_px(T_ego_vehicle: SE2) -> np.ndarray | None:
+def box_px(T_ego_vehicle: SE2, height_m: float = 1.5) -> np.ndarray | None:
     footprint = np.array([(sx * 2.0, sy * 0.85) for sx in (-1, 1) for sy in (-1, 1)])
     on_road = T_ego_vehicle @ footprint
     if on_road[:, 0].min() < 3.0:
         return None
-    corners = np.vstack([np.column_stack([on_road, np.full(4, z)]) for z in (0.0, 1.5)])
+    corners = np.vstack([np.column_stack([on_road, np.full(4, z)]) for z in (0.0, height_m)])
     px = bev.ego_to_pixel(CAMERA, GROUND, corners)
     box = np.array([*px.min(axis=0), *px.max(axis=0)])
     return box if box[0] > 0 and box[2] < CAMERA.width_px and box[3] < CAMERA.height_px else None
@@ -92,8 +94,6 @@ def test_an_oncoming_car_turns_to_where_it_goes() -> None:
     (track,) = tracks
     assert abs(wrap(track.yaw_rad - math.pi)) < 0.15
     assert track.state[2] == pytest.approx(-10.0, abs=1.5)
-    assert track.motion is not None
-    assert track.motion.T_from_to.x_m == pytest.approx(1.0, abs=0.2)  # VV: forward, in its own frame
 
 
 def test_crossing_cars_do_not_swap_ids() -> None:
@@ -117,3 +117,57 @@ def test_labels_are_voted_and_false_alarms_get_no_id() -> None:
     assert [t.label for t in tracks] == ["car"]
     assert len(drive.tracker.tracks) == 1
     assert tracks[0].vehicle == 0
+
+
+def test_a_place_by_depth_counts_by_its_covariance() -> None:
+    def after(sigma_m: float | None) -> tuple[float, float]:
+        drive = Drive()
+        tracks: list[Track] = []
+        for k in range(6):
+            box = box_px(SE2(25.0, 1.0, 0.0))
+            assert box is not None
+            seen = localise(box[None], np.full(1, 0.9), ("car",), CAMERA, drive.horizon.ground, LocalisationConfig())
+            by_depth = None
+            if sigma_m is not None:
+                by_depth = DepthPlace(np.array([26.0, 1.04]), np.eye(2) * sigma_m**2, 0.0, 0.1)
+            drive.horizon.predict(0.1, 0.0, None, 0.0)
+            tracks = drive.tracker.step(seen, SE2(), drive.horizon, k, k * PERIOD_NS, None, [by_depth])
+        (track,) = tracks
+        return float(track.place.centre_m[0]), float(track.place.cov[0, 0])
+
+    alone_m, alone_var = after(None)
+    assert after(0.01)[0] == pytest.approx(26.0, abs=0.02)
+    sure_m, sure_var = after(1.0)
+    assert alone_m < sure_m < 26.0
+    assert sure_var < alone_var
+    assert after(1e3) == pytest.approx((alone_m, alone_var), rel=1e-3)
+
+
+def test_what_stands_by_its_parallax_keeps_its_yaw_while_its_size_is_learned() -> None:
+    drive = Drive(noise_px=0.3)
+    tracks: list[Track] = []
+    for k in range(45):
+        tracks = drive.step(SE2(0.9 * k, 0.0, 0.0), [SE2(65.0, 4.0, 0.0)])
+    (track,) = tracks
+    assert track.stands
+    assert drive.tracker.placing.parallax.standing(track.serial) > 0.9
+    assert track.yaw_rad == 0.0
+    assert math.hypot(track.state[0] - 65.0, track.state[1] - 4.0) < 1.0
+
+
+def test_a_vehicle_of_no_usual_size_keeps_its_id_while_its_size_is_learned() -> None:
+    drive = Drive(noise_px=0.3)
+    ids, errors = set(), []
+    for k in range(50):
+        ego = SE2(0.9 * k, 0.0, 0.0)
+        box = box_px(ego.between(SE2(70.0, 8.0, 0.0)), height_m=2.5)
+        assert box is not None
+        box = box + drive.noise_px * drive.rng.standard_normal(4)
+        seen = localise(box[None], np.full(1, 0.9), ("car",), CAMERA, drive.horizon.ground, LocalisationConfig())
+        drive.horizon.predict(0.1, 0.0, None, 0.0)
+        for track in drive.tracker.step(seen, ego, drive.horizon, k, k * PERIOD_NS):
+            ids.add(track.vehicle)
+            errors.append(float((ego @ track.place.centre_m)[0]) - 70.0)
+    assert ids == {0}
+    assert abs(errors[0]) > 15.0  # taken for a car as cars are
+    assert np.abs(errors[-10:]).max() < 0.2 * abs(errors[0])

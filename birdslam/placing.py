@@ -1,0 +1,118 @@
+"""The places of a frame's vehicles, all of them together, from everything that tells depth.
+
+Boxes against the road (horizon.py), sizes learned as the ego drives by (parallax.py), and a depth map where there is
+one (pseudolidar.py). A further source of a place with its covariance belongs into `Placing.places`, beside the last.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.association import NEAREST_M, in_ego
+from birdslam.horizon import Horizon
+from birdslam.localisation import LocalisationConfig, Observation, Place, extent_m, place
+from birdslam.parallax import LearnedSize, Parallax, ParallaxConfig, sights_of
+from birdslam.pseudolidar import DepthPlace, PseudoLidarConfig, combined
+from birdslam.se2 import SE2, wrap
+from birdslam.track import Track
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Body:
+    """An observation and whose it is: a track's, or that of a vehicle which is new."""
+
+    serial: int
+    track: Track | None
+    seen: Observation
+    by_depth: DepthPlace | None = None
+
+    def yaw_rad(self, T_world_ego: SE2) -> float:
+        """In ego; a new vehicle is headed like the ego."""
+        return 0.0 if self.track is None else wrap(self.track.yaw_rad - T_world_ego.yaw_rad)
+
+    def expected_depth_m(self, T_world_ego: SE2) -> float:
+        """Of the nearest face, before it is measured: as the track predicts it, or by the height of its class."""
+        if self.track is None:
+            return self.seen.depth_by_height_m
+        reach_m = self.track.place.centre_m[0] - self.track.place.depth_m
+        return max(NEAREST_M, in_ego(T_world_ego, self.track.state[:2])[0] - reach_m)
+
+    def turned_rad(self, T_world_ego: SE2) -> float:
+        """By how much the line of sight to it turned over the ground since it was last seen."""
+        if self.track is None:
+            return 0.0
+        before = math.atan(self.track.observation.bearing) + self.track.T_world_ego.yaw_rad
+        return wrap(math.atan(self.seen.bearing) + T_world_ego.yaw_rad - before)
+
+
+class Placing:
+    """predict() once a frame, then places() of its bodies."""
+
+    def __init__(
+        self, localisation: LocalisationConfig, parallax: ParallaxConfig, pseudolidar: PseudoLidarConfig
+    ) -> None:
+        self.localisation = localisation
+        self.pseudolidar = pseudolidar
+        self.parallax = Parallax(parallax)
+
+    def predict(self, dt_s: float, T_world_ego: SE2, ego_cov: Floats | None) -> None:
+        """To the next frame's ego pose, with the covariance (3, 3) of the step to it."""
+        self.parallax.predict(dt_s, T_world_ego, ego_cov)
+
+    def keep_only(self, serials: Iterable[int]) -> None:
+        """Forget the other vehicles."""
+        self.parallax.keep_only(serials)
+
+    def places(self, bodies: Sequence[Body], T_world_ego: SE2, horizon: Horizon) -> list[Place]:
+        """In ego, one for each body; the horizon learns the road's tilt and their sizes from all of them."""
+        seen, serials = [body.seen for body in bodies], [body.serial for body in bodies]
+        yaws = [body.yaw_rad(T_world_ego) for body in bodies]
+        depths = [body.expected_depth_m(T_world_ego) for body in bodies]
+        turned = np.array([body.turned_rad(T_world_ego) for body in bodies])
+        extents = np.array(
+            [extent_m(o.dimensions, yaw, depth, o.bearing) for o, yaw, depth in zip(seen, yaws, depths, strict=True)]
+        ).reshape(-1, 2)
+        centres = np.array(
+            [
+                place(o, math.log(depth), 0.0, yaw, self.localisation).centre_m
+                for o, yaw, depth in zip(seen, yaws, depths, strict=True)
+            ]
+        ).reshape(-1, 2)
+        learned = self._sizes(bodies, centres, extents, turned, T_world_ego, horizon)
+        log_depths, variances = horizon.update(serials, seen, extents[:, 1], extents[:, 0], turned, learned)
+        by_boxes = [
+            place(o, log_depth, variance, yaw, self.localisation)
+            for o, log_depth, variance, yaw in zip(seen, log_depths.tolist(), variances.tolist(), yaws, strict=True)
+        ]
+        return [
+            combined(by_box, body.by_depth, self.pseudolidar) for by_box, body in zip(by_boxes, bodies, strict=True)
+        ]
+
+    def _sizes(
+        self,
+        bodies: Sequence[Body],
+        centres_m: Floats,
+        extents_m: Floats,
+        turned_rad: Floats,
+        T_world_ego: SE2,
+        horizon: Horizon,
+    ) -> LearnedSize:
+        """What the vehicles' growth in the image says of their heights."""
+        for body, centre_m in zip(bodies, centres_m, strict=True):
+            if body.track is None:
+                d = body.seen.dimensions
+                sigmas = d.sigma_height_rel, d.sigma_width_rel
+                self.parallax.begin(body.serial, centre_m, T_world_ego, math.log(d.height_m), sigmas)
+        seen, height_m = [body.seen for body in bodies], horizon.ground.height_m
+        over_roof_m = np.array([max(0.0, height_m - o.dimensions.height_m) for o in seen])
+        roof_m2 = over_roof_m * extents_m[:, 0] * horizon.config.roof_reach_rel
+        sights = sights_of(seen, centres_m, extents_m, turned_rad, roof_m2)
+        serials = [body.serial for body in bodies]
+        return self.parallax.update(serials, sights, T_world_ego, height_m, horizon.sigma_pitch_rad)

@@ -1,0 +1,191 @@
+"""Detections that come late: the same vehicles as if they had come in time, shown where they are by now."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from birdslam import bev
+from birdslam.camera import GroundPlane
+from birdslam.frontend import FrontEnd, FrontEndConfig
+from birdslam.hindsight import Hindsight, HindsightConfig, Moment
+from birdslam.horizon import Horizon, HorizonConfig
+from birdslam.localisation import DIMENSIONS, LocalisationConfig, iou
+from birdslam.perception import Detections, Perception, Ready
+from birdslam.se2 import SE2
+from birdslam.tracking import Tracker, TrackingConfig
+from birdslam.types import Measurements
+from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
+
+CAR = DIMENSIONS["car"]
+STEP = SE2(0.8, 0.0, 0.01)  # of the ego, a frame of 0.1 s
+PERIOD_NS = 100_000_000
+FRAMES = 25
+
+
+def ego(k: int) -> SE2:
+    pose = SE2()
+    for _ in range(k):
+        pose = pose @ STEP
+    return pose
+
+
+EGO = [ego(k) for k in range(FRAMES)]
+
+
+def cars(k: int) -> list[SE2]:
+    """In the world of frame 0: one parked, one driving on ahead, one that comes."""
+    return [SE2(40.0, 5.0, 0.0), SE2(15.0 + 1.1 * k, 0.5, 0.0), SE2(75.0 - 1.0 * k, 10.0, math.pi)]
+
+
+def detections(k: int, noise_px: float = 0.0, seed: int = 0, heights_m: tuple[float, ...] = (1.53,) * 3) -> Detections:
+    rng = np.random.default_rng([seed, k])
+    boxes = []
+    for pose, height_m in zip(cars(k), heights_m, strict=True):
+        half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
+        on_road = EGO[k].between(pose) @ np.array(half)
+        corners = np.vstack([np.column_stack([on_road, np.full(4, z)]) for z in (0.0, height_m)])
+        px = bev.ego_to_pixel(CAMERA, CAMERA.ground, corners)
+        boxes.append([*px.min(axis=0), *px.max(axis=0)] + noise_px * rng.standard_normal(4))
+    return Detections(np.array(boxes), np.full(3, 0.9), ("car",) * 3)
+
+
+def hindsight(config: HindsightConfig | None = None) -> Hindsight:
+    localisation = LocalisationConfig()
+    tracker, horizon = Tracker(CAMERA, TrackingConfig(), localisation), Horizon(CAMERA, HorizonConfig())
+    return Hindsight(CAMERA, tracker, horizon, localisation, config or HindsightConfig())
+
+
+def moment(k: int) -> Moment:
+    return Moment(
+        k, k * PERIOD_NS, EGO[k], None, 0.1, 0.0, GroundPlane(CAMERA.height_m, CAMERA.pitch_rad + 1e-4 * k), 0.003
+    )
+
+
+def follow(used: list[int | None], noise_px: float = 0.5) -> tuple[list[tuple[float, ...]], list[GroundPlane]]:
+    """What is seen when frame k knows the detections of frame used[k], and the road under the camera in each frame."""
+    sight, seen, roads = hindsight(), [], []
+    for k, source in enumerate(used):
+        sight.begin(moment(k))
+        tracks = sight.see(None if source is None else detections(source, noise_px), -1 if source is None else source)
+        seen += [(t.seen_frame, t.vehicle, *t.state.tolist(), *t.cov.ravel().tolist()) for t in tracks]
+        roads.append(sight.road.ground)
+    return seen, roads
+
+
+@given(st.lists(st.integers(0, 4), min_size=FRAMES, max_size=FRAMES))
+@settings(max_examples=10, deadline=None)
+def test_vehicles_are_as_if_detections_had_come_in_time(delays: list[int]) -> None:
+    """A detector that takes `delays` frames, one image at a time."""
+    used: list[int | None] = []
+    at_work: tuple[int, int] | None = None
+    found: int | None = None
+    for k, delay in enumerate(delays):
+        at_work = at_work or (k, k + delay)
+        if at_work[1] <= k:
+            found, at_work = at_work[0], None
+        used.append(found)
+    in_time: list[int | None] = [k if k in used else None for k in range(FRAMES)]
+    late, roads = follow(used)
+    punctual, punctual_roads = follow(in_time)
+    assert late == [seen for seen in punctual if seen[0] in used]
+    whole = [k for k in range(FRAMES) if used[k] == k]
+    assert [roads[k] for k in whole] == [punctual_roads[k] for k in whole]
+
+
+def test_a_result_is_used_once_and_none_after_the_latest() -> None:
+    seen, _ = follow([0, 1, 2, 2, 2, 2, 6])
+    assert sorted({row[0] for row in seen}) == [2, 6]
+    sight = hindsight(HindsightConfig(latest_ms=250.0))
+    tracks: list[int] = []
+    for k, source in enumerate([0, 1, 2, 2, 2, 2, 2, 2, 2, 2, 3, 8, 8]):  # 3 is 0.7 s old, 8 is 0.3 s old when it comes
+        sight.begin(moment(k))
+        tracks += [t.seen_frame for t in sight.see(detections(source), source)]
+    assert sorted(set(tracks)) == [2]
+
+
+def test_an_older_result_does_not_follow_a_newer_one() -> None:
+    seen, _ = follow([0, 1, 2, 3, 4, 3, 6])
+    assert sorted({row[0] for row in seen}) == [2, 3, 4, 6]
+
+
+def test_a_source_that_begins_anew_awaits_nothing_of_the_old() -> None:
+    sight = hindsight()
+    for k in range(6):
+        sight.begin(moment(k))
+        sight.see(detections(min(k, 4)), min(k, 4))
+    sight.begin(moment(0))
+    assert sight.see(detections(5), 5) == []
+    sight.see(detections(0), 0)
+    assert sight.road is sight.horizon
+
+
+def drive(delay: int, seed: int, noise_px: float, heights_m: tuple[float, ...], **config: float) -> list[Measurements]:
+    """The front end with detections that are `delay` frames late."""
+    script = {k: motion(k, STEP) for k in range(1, FRAMES)}
+    tracking = TrackingConfig(**config)
+    front = FrontEnd(CAMERA, FrontEndConfig(tracking=tracking), ScriptedOdometry(script))
+    out = []
+    for k in range(FRAMES):
+        perception = Perception()
+        if k >= delay:
+            perception = Perception(detections(k - delay, noise_px, seed, heights_m), None, {"detector": delay}, ())
+        out.append(front.step(frame(k), Ready(perception)))
+    return out
+
+
+def deviations(log: list[Measurements]) -> tuple[np.ndarray, np.ndarray]:
+    """Of CV edges from where the vehicles truly are in the edge's frame: Mahalanobis distances squared; metres."""
+    squared, metres = [], []
+    for m in log[12:]:
+        for edge in m.cv:
+            assert edge.frame == m.frame_id
+            gaps = [EGO[m.frame_id].between(car) for car in cars(m.frame_id)]
+            truth = min(
+                gaps, key=lambda t, e=edge: math.hypot(t.x_m - e.T_ego_vehicle.x_m, t.y_m - e.T_ego_vehicle.y_m)
+            )
+            R = edge.T_ego_vehicle.rotation()
+            error = R.T @ [edge.T_ego_vehicle.x_m - truth.x_m, edge.T_ego_vehicle.y_m - truth.y_m]
+            squared.append(float(error @ np.linalg.solve(np.reshape(edge.cov, (3, 3))[:2, :2], error)))
+            metres.append(float(np.linalg.norm(error)))
+    return np.array(squared), np.array(metres)
+
+
+def sizes(seed: int) -> tuple[float, ...]:
+    return tuple(CAR.height_m * np.exp(CAR.sigma_height_rel * np.random.default_rng(seed).standard_normal(3)))
+
+
+@pytest.mark.parametrize("delay", [1, 3])
+def test_late_vehicles_are_where_their_covariance_says(delay: int) -> None:
+    late = [deviations(drive(delay, seed, 1.0, sizes(seed))) for seed in range(12)]
+    punctual = [deviations(drive(0, seed, 1.0, sizes(seed))) for seed in range(12)]
+    squared, metres = (np.concatenate(numbers) for numbers in zip(*late, strict=True))
+    _, metres_punctual = (np.concatenate(numbers) for numbers in zip(*punctual, strict=True))
+    assert len(metres) > 0.9 * len(metres_punctual)
+    assert 0.1 < squared.mean() < 2.0  # of two degrees of freedom
+    assert np.mean(squared < 6.18) > 0.954
+    assert np.median(metres) < 1.5 * np.median(metres_punctual)
+
+
+def test_late_edges_end_in_the_frame_at_hand_and_carry_on_from_one_another() -> None:
+    log = drive(2, 0, 0.0, (CAR.height_m,) * 3)
+    last: dict[int, int] = {}
+    for m in log:
+        assert {edge.vehicle for edge in m.vv} <= {edge.vehicle for edge in m.cv}
+        for vv in m.vv:
+            assert (vv.from_frame, vv.to_frame) == (last[vv.vehicle], m.frame_id)
+        last |= {edge.vehicle: m.frame_id for edge in m.cv}
+        boxes_px = np.array([edge.box_px for edge in m.cv]).reshape(-1, 4)
+        if m.frame_id > 12:
+            goal_px, stale_px = detections(m.frame_id).boxes_px, detections(m.frame_id - 2).boxes_px
+            assert iou(goal_px, boxes_px).max(axis=1).mean() > iou(goal_px, stale_px).max(axis=1).mean()
+    assert len(last) == 3
+    assert [edge.T_from_to.x_m for edge in log[-1].vv] == pytest.approx([0.0, 1.1, 1.0], abs=0.05)
+
+
+def test_a_late_vehicle_whose_velocity_is_not_known_is_not_shown() -> None:
+    shown = [len(m.cv) for m in drive(1, 0, 0.5, (CAR.height_m,) * 3, late_sigma_m=0.45)]
+    assert shown[4] < 3
+    assert shown[-1] == 3

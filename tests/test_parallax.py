@@ -1,0 +1,167 @@
+"""Sizes from the growth of what stands, and none from what drives."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from birdslam.parallax import UNKNOWN, LearnedSize, Parallax, ParallaxConfig, Sights
+from birdslam.se2 import SE2
+
+HEIGHT_M = 1.65  # of the camera
+REACH_M = 2.0
+CLASS_M = 1.53
+SIGMAS = (0.08, 0.2)
+
+
+def sights(at: np.ndarray, height_m: float, noise: np.ndarray) -> Sights:
+    """Of one vehicle whose centre is at (2,) in ego; `noise` (3,) standard normal."""
+    depth = float(at[0]) - REACH_M
+    sigma = np.array([0.03, 0.04, 0.001])
+    values = np.array([math.log(height_m / depth), -math.log(depth), at[1] / at[0]]) + sigma * noise
+    return Sights(
+        log_height=values[:1],
+        log_width=values[1:2],
+        bearing=values[2:],
+        sigma=sigma[None],
+        depth_m=np.array([depth]),
+        bottom=np.array([HEIGHT_M / depth]),
+        sigma_bottom=np.array([0.0015]),
+        reach_m=np.array([REACH_M]),
+        turned_rad=np.zeros(1),
+    )
+
+
+class Road:
+    """An ego that drives on at `ego_mps` and one vehicle, at `centre_m` in world, which moves by `mps` (2,)."""
+
+    def __init__(
+        self,
+        height_m: float,
+        x_m: float = 70.0,
+        y_m: float = 4.0,
+        ego_mps: float = 9.0,
+        seed: int = 0,
+        hz: float = 10.0,
+    ) -> None:
+        white = ParallaxConfig(box_memory_s=1.0 / hz, view_memory_s=1.0 / hz, sigma_face_m=0.0, sigma_scale_rel=0.0)
+        self.parallax = Parallax(white)  # as the noise of this world is
+        self.height_m, self.ego_mps, self.dt_s = height_m, ego_mps, 1.0 / hz
+        self.rng = np.random.default_rng(seed)
+        self.at, self.ego_m = np.array([x_m, 4.0]), 0.0
+        self.begun = False
+
+    def drive(self, seconds: float, mps: tuple[float, float] = (0.0, 0.0), noisy: bool = True) -> LearnedSize:
+        for _ in range(round(seconds / self.dt_s)):
+            T_world_ego = SE2(self.ego_m, 0.0, 0.0)
+            seen = sights(self.at - [self.ego_m, 0.0], self.height_m, noisy * self.rng.standard_normal(3))
+            self.parallax.predict(self.dt_s, T_world_ego, None)
+            if not self.begun:
+                depth = CLASS_M / math.exp(float(seen.log_height[0])) + REACH_M
+                centre = np.array([depth, depth * float(seen.bearing[0])])
+                self.parallax.begin(3, centre, T_world_ego, math.log(CLASS_M), SIGMAS)
+                self.begun = True
+            learned = self.parallax.update([3], seen, T_world_ego, HEIGHT_M, 0.003)
+            self.at = self.at + np.array(mps) * self.dt_s
+            self.ego_m += self.ego_mps * self.dt_s
+        return learned
+
+    def height(self, learned: LearnedSize) -> float:
+        """The mean over all that may be, with what the class says."""
+        information = 1.0 / learned.variance + 1.0 / SIGMAS[0] ** 2
+        each = (learned.log_height / learned.variance + math.log(CLASS_M) / SIGMAS[0] ** 2) / information
+        return math.exp(float((learned.weight * each).sum()))
+
+
+@pytest.mark.parametrize("height_m", [1.40, 1.53, 1.70])
+def test_a_parked_car_tells_its_size_as_the_ego_comes_near(height_m: float) -> None:
+    road = Road(height_m)
+    learned = road.drive(5.5)
+    assert road.parallax.standing(3) > 0.95
+    assert road.height(learned) == pytest.approx(height_m, rel=0.03)
+
+
+def test_what_stands_and_is_of_no_usual_size_is_seen_through() -> None:
+    road = Road(2.45)
+    learned = road.drive(5.5)
+    assert road.parallax.standing(3) > 0.9
+    best = int(learned.weight.argmax())
+    assert learned.log_height[0, best] == pytest.approx(math.log(2.45), abs=0.25)
+    assert road.height(learned) > 2.2
+
+
+@pytest.mark.parametrize("mps", [(9.0, 0.0), (12.0, 0.0), (-9.0, 0.0), (0.0, 4.0)])
+def test_one_that_drives_does_not_stand_and_keeps_the_size_of_its_class(mps: tuple[float, float]) -> None:
+    road = Road(1.53, x_m=60.0)
+    learned = road.drive(2.5, mps)
+    assert road.parallax.standing(3) < 0.1
+    assert road.height(learned) == pytest.approx(1.53, rel=0.03)
+    moving = learned.variance[0, 2:]
+    assert (moving >= UNKNOWN).all()
+
+
+def test_one_that_starts_and_one_that_stops() -> None:
+    road = Road(1.53, x_m=60.0, ego_mps=4.0)
+    road.drive(4.0)
+    assert road.parallax.standing(3) > 0.9
+    road.drive(3.0, (5.0, 0.0))
+    assert road.parallax.standing(3) < 0.1
+    road.drive(6.0)
+    assert road.parallax.standing(3) > 0.5
+
+
+def test_its_covariance_is_honest() -> None:
+    squared = []
+    for seed in range(60):
+        height_m = CLASS_M * math.exp(SIGMAS[0] * np.random.default_rng([7, seed]).standard_normal())
+        learned = Road(height_m, seed=seed).drive(4.0)
+        error = learned.log_height[0, 0] - math.log(height_m)
+        squared.append(error**2 / learned.variance[0, 0])
+    assert 0.4 < np.mean(squared) < 1.6
+
+
+def test_a_faster_camera_learns_no_more_in_the_same_time_from_errors_that_last() -> None:
+    told = []
+    for hz in (10.0, 30.0):
+        road = Road(1.53, hz=hz)
+        road.parallax = Parallax(ParallaxConfig())
+        told.append(float(road.drive(4.0, noisy=False).variance[0, 0]))
+    assert told[0] == pytest.approx(told[1], rel=0.1)
+
+
+def test_without_motion_nothing_is_learned() -> None:
+    road = Road(1.7, ego_mps=0.0)
+    learned = road.drive(5.0)
+    assert road.height(learned) == pytest.approx(CLASS_M, rel=0.03)
+
+
+def test_the_forgotten_are_gone_and_the_rest_stay() -> None:
+    road = Road(1.53)
+    road.drive(1.0)
+    before = road.parallax.standing(3)
+    road.parallax.begin(5, np.array([20.0, 0.0]), SE2(), math.log(CLASS_M), SIGMAS)
+    road.parallax.keep_only([3])
+    assert road.parallax.standing(3) == before
+    with pytest.raises(ValueError, match="5 is not in list"):
+        road.parallax.standing(5)
+    road.parallax.keep_only([])
+    road.parallax.predict(0.1, SE2(), np.eye(3))
+    nothing = road.parallax.update([], sights(np.array([9.0, 0.0]), 1.5, np.zeros(3)), SE2(), HEIGHT_M, 0.01)
+    assert nothing.weight.shape == (0, 4)
+
+
+@given(st.lists(st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-8, 8)), min_size=3, max_size=25))
+@settings(max_examples=25, deadline=None)
+def test_wild_sights_leave_weights_and_covariances_what_they_are(noise: list[tuple[float, float, float]]) -> None:
+    parallax = Parallax(ParallaxConfig())
+    parallax.begin(0, np.array([30.0, 2.0]), SE2(), math.log(CLASS_M), SIGMAS)
+    for k, draws in enumerate(noise):
+        ego = SE2(0.5 * k, 0.0, 0.0)
+        parallax.predict(0.1, ego, np.diag([1e-3, 1e-4, 1e-7]))
+        seen = sights(np.array([30.0 - 0.5 * k, 2.0]), CLASS_M, np.array(draws))
+        learned = parallax.update([0], seen, ego, HEIGHT_M, 0.003)
+        assert learned.weight.sum() == pytest.approx(1.0, abs=1e-6)
+        assert (learned.variance > 0.0).all()
+        assert np.isfinite(learned.log_height).all()
