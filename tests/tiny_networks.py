@@ -49,6 +49,18 @@ def constant(path: Path, input_shape: Shape, answer: NDArray[np.float32]) -> Pat
     return _save(path, nodes, {"images": input_shape}, {"output": answer.shape}, weights)
 
 
+def constants(path: Path, input_shape: Shape, answers: dict[str, NDArray[np.float32]]) -> Path:
+    """Each output is its answer whatever the image."""
+    return answering(path, {"images": input_shape}, answers)
+
+
+def answering(path: Path, inputs: dict[str, Shape], answers: dict[str, NDArray]) -> Path:
+    """Each output is its answer whatever the inputs, which it must have."""
+    nodes = [helper.make_node("Identity", [f"{name}_"], [name]) for name in answers]
+    weights = {f"{name}_": answer.astype(np.float32) for name, answer in answers.items()}
+    return _save(path, nodes, inputs, {n: a.shape for n, a in answers.items()}, weights)
+
+
 def two_inputs(path: Path, shape: Shape) -> Path:
     """Takes `images` and `other`."""
     nodes = [helper.make_node("Add", ["images", "other"], ["output"])]

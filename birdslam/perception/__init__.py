@@ -1,12 +1,18 @@
 """Perception: networks by manifest, their schedule, and what they find in an image."""
 
+from birdslam.perception.boxes3d import Boxes3d
+from birdslam.perception.depth import DepthMap
 from birdslam.perception.detection import Detections
+from birdslam.perception.findings import Findings
 from birdslam.perception.manifest import Label, ModelError, shipped_manifests
-from birdslam.perception.network import Findings, ModelSpec, Network, load_network
-from birdslam.perception.schedule import Networks, Pending, Perception, Ready
+from birdslam.perception.network import ModelSpec, Network, load_network
+from birdslam.perception.schedule import ROLES, Networks, Pending, Perception, Ready
 from birdslam.perception.segmentation import Segmentation
 
 __all__ = [
+    "ROLES",
+    "Boxes3d",
+    "DepthMap",
     "Detections",
     "Findings",
     "Label",

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.manifest import Input, Misfit, Yolox
 from birdslam.perception.views import View
 
@@ -19,11 +20,15 @@ SAME_ROWS = 0.5  # overlap over union of the rows of two halves of one object
 
 @dataclass(frozen=True)
 class Detections:
-    """Boxes (N, 4) x1, y1, x2, y2 in pixels of the undistorted image, scores (N,) in [0, 1] falling, labels."""
+    """Boxes (N, 4) x1, y1, x2, y2 in pixels of the undistorted image, scores (N,) in [0, 1] falling, labels.
+
+    `boxes3d` holds a body for each box, where the network knows of bodies.
+    """
 
     boxes_px: NDArray[np.float64]
     scores: NDArray[np.float64]
     labels: tuple[str, ...]
+    boxes3d: Boxes3d | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -31,7 +36,8 @@ class Detections:
     def only(self, labels: Collection[str]) -> Detections:
         """Those with one of the labels."""
         keep = [i for i, label in enumerate(self.labels) if label in labels]
-        return Detections(self.boxes_px[keep], self.scores[keep], tuple(self.labels[i] for i in keep))
+        bodies = None if self.boxes3d is None else self.boxes3d.take(keep)
+        return Detections(self.boxes_px[keep], self.scores[keep], tuple(self.labels[i] for i in keep), bodies)
 
 
 @dataclass(frozen=True)
@@ -61,11 +67,7 @@ class YoloxDecoder:
             said = f"{table.classes}, so {5 + table.classes} channels"
             raise Misfit("detector.classes", said, f"{shape[2]} channels in {table.output} {shape}")
         self._cells, self._strides = cells, strides
-        group_of = {label: i for i, group in enumerate(table.rivals) for label in group}
-        # Classes that compete in NMS share a number; ids of others stay clear of the groups.
-        self._groups = np.arange(table.classes) + len(table.rivals)
-        for index, label in table.labels.items():
-            self._groups[index] = group_of.get(label, self._groups[index])
+        self._groups = rival_groups(table.classes, table.labels, table.rivals)
         self._wanted = np.isin(np.arange(table.classes), list(table.labels))
 
     def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Candidates:
@@ -81,31 +83,57 @@ class YoloxDecoder:
         with np.errstate(over="ignore"):
             half = np.exp(chosen[:, 2:4]) * self._strides[rows] / 2.0
         centre = (chosen[:, :2] + self._cells[rows]) * self._strides[rows]
-        boxes = view.to_image(np.hstack([centre - half, centre + half]))
-        margin_px = CUT_MARGIN * (view.x1_px - view.x0_px)
-        cut = np.column_stack(
-            [
-                (boxes[:, 0] < view.x0_px + margin_px) & (view.x0_px > 0),
-                (boxes[:, 2] > view.x1_px - margin_px) & (view.x1_px < view.image_width_px),
-            ]
-        )
-        boxes[:, 0::2] = np.clip(boxes[:, 0::2], view.x0_px, view.x1_px)
-        boxes[:, 1::2] = np.clip(boxes[:, 1::2], 0.0, view.image_height_px)
-        solid = np.all(boxes[:, 2:] - boxes[:, :2] >= 1.0, axis=1)
-        return Candidates(boxes[solid], scores[solid], classes[solid], cut[solid])
+        return candidates_in_image(np.hstack([centre - half, centre + half]), scores, classes, view)
 
     def merge(self, parts: Sequence[Candidates], views: Sequence[View]) -> Detections:
         """The boxes of all views of one image, each object once."""
-        boxes, scores, classes, cut = (
-            np.concatenate([getattr(part, field) for part in parts])
-            for field in ("boxes_px", "scores", "classes", "cut")
-        )
-        kept = suppress(boxes, scores, self._groups[classes], cut, self.table.nms_iou)
-        boxes, scores, classes, cut = boxes[kept], scores[kept], classes[kept], cut[kept]
-        slack_px = 2.0 * CUT_MARGIN * (views[0].x1_px - views[0].x0_px)
-        boxes, alive = join_halves(boxes, self._groups[classes], cut, slack_px)
-        order = alive[np.argsort(-scores[alive], kind="stable")]
-        return Detections(boxes[order], scores[order], tuple(self.table.labels[int(c)] for c in classes[order]))
+        return merge_views(parts, views, self._groups, self.table.labels, self.table.nms_iou)
+
+
+def rival_groups(classes: int, labels: Mapping[int, str], rivals: Sequence[Sequence[str]]) -> NDArray[np.int64]:
+    """(classes,): classes that compete in NMS share a number; those of others stay clear of the groups."""
+    group_of = {label: i for i, group in enumerate(rivals) for label in group}
+    groups = np.arange(classes) + len(rivals)
+    for index, label in labels.items():
+        groups[index] = group_of.get(label, groups[index])
+    return groups
+
+
+def candidates_in_image(
+    boxes_px: NDArray[np.float64], scores: NDArray[np.float64], classes: NDArray[np.int64], view: View
+) -> Candidates:
+    """Boxes (N, 4) of the network's input, in the image and cut to the view; slivers are left out."""
+    boxes = view.to_image(boxes_px)
+    margin_px = CUT_MARGIN * (view.x1_px - view.x0_px)
+    cut = np.column_stack(
+        [
+            (boxes[:, 0] < view.x0_px + margin_px) & (view.x0_px > 0),
+            (boxes[:, 2] > view.x1_px - margin_px) & (view.x1_px < view.image_width_px),
+        ]
+    )
+    boxes[:, 0::2] = np.clip(boxes[:, 0::2], view.x0_px, view.x1_px)
+    boxes[:, 1::2] = np.clip(boxes[:, 1::2], 0.0, view.image_height_px)
+    solid = np.all(boxes[:, 2:] - boxes[:, :2] >= 1.0, axis=1)
+    return Candidates(boxes[solid], scores[solid], classes[solid], cut[solid])
+
+
+def merge_views(
+    parts: Sequence[Candidates],
+    views: Sequence[View],
+    groups: NDArray[np.int64],
+    labels: Mapping[int, str],
+    nms_iou: float,
+) -> Detections:
+    """The boxes of all views of one image, each object once; `groups` (classes,) as `rival_groups` gives them."""
+    boxes, scores, classes, cut = (
+        np.concatenate([getattr(part, field) for part in parts]) for field in ("boxes_px", "scores", "classes", "cut")
+    )
+    kept = suppress(boxes, scores, groups[classes], cut, nms_iou)
+    boxes, scores, classes, cut = boxes[kept], scores[kept], classes[kept], cut[kept]
+    slack_px = 2.0 * CUT_MARGIN * (views[0].x1_px - views[0].x0_px)
+    boxes, alive = join_halves(boxes, groups[classes], cut, slack_px)
+    order = alive[np.argsort(-scores[alive], kind="stable")]
+    return Detections(boxes[order], scores[order], tuple(labels[int(c)] for c in classes[order]))
 
 
 def _grid(width_px: int, height_px: int, strides: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

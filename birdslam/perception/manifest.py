@@ -9,19 +9,40 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol, TypeVar, get_args
 
 import msgspec
 
 SHIPPED_DIRECTORY = Path(__file__).parent / "manifests"
+SHIPPED_NETWORKS = Path(__file__).parent / "shipped"  # each .onnx with its manifest beside it
 
-Role = Literal["detector", "segmenter"]
+Role = Literal["detector", "segmenter", "depth", "multitask"]
 Label = Literal["car", "truck", "bus", "person", "bicycle", "motorcycle"]
 Meaning = Literal["road", "lane"]
 Pixels = Annotated[int, msgspec.Meta(ge=8, le=8192)]
 Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Sha256 = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
+
+
+class Described(Protocol):
+    """What every manifest says, whatever its network takes."""
+
+    @property
+    def role(self) -> str: ...
+    @property
+    def sha256(self) -> str: ...
+
+
+Kind = TypeVar("Kind", bound=Described)
+
+
+class Glance(msgspec.Struct, frozen=True):
+    """What a manifest of any kind says of itself."""
+
+    role: str
+    title: str = ""
+    sha256: Sha256 = ""
 
 
 class ModelError(ValueError):
@@ -102,23 +123,72 @@ class Yolox(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 raise ValueError(f"labels: there is no class {index} among {self.classes} classes")
 
 
+class CenterNet(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="centernet"
+):
+    """Objects as points: a heat map (1, classes, h, w) with a peak at each centre, its size and its offset in the cell.
+
+    `sizes` is (1, 2, h, w) width and height, in cells of the map or in pixels of the input; `offsets`, where there is
+    one, (1, 2, h, w) x and y in cells, to be added to the peak's cell. `heat` says what the heat map holds: scores, or
+    logits that a sigmoid makes scores. A peak is the largest of its 3x3 cells. Labels and rivals as for YOLOX; NMS
+    joins tiles and rivals.
+    """
+
+    heat_map: str
+    sizes: str
+    offsets: str = ""
+    heat: Literal["scores", "logits"] = "scores"
+    size_unit: Literal["cells", "pixels"] = "cells"
+    classes: Count
+    labels: Annotated[dict[int, Label], msgspec.Meta(min_length=1)]
+    score_threshold: Fraction
+    nms_iou: Fraction = 0.6
+    rivals: tuple[tuple[Label, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        for index in self.labels:
+            if not 0 <= index < self.classes:
+                raise ValueError(f"labels: there is no class {index} among {self.classes} classes")
+
+
 class ClassMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One meaning of a (1, channels, h, w) output: where `channel` is the largest, or where it is above `threshold`."""
+    """One meaning of a (1, channels, h, w) output of scores or logits.
+
+    `channel` is one channel or a list of them, each a class that means the same. By rule "argmax" the meaning is where
+    the largest of all channels is one of these; by "above" where one of these is over `threshold`, which with `sigmoid`
+    is a probability that the output's logits are held against.
+    """
 
     meaning: Meaning
     output: str
-    channel: Annotated[int, msgspec.Meta(ge=0)]
+    channel: int | tuple[int, ...]
     channels: Count
     rule: Literal["argmax", "above"] = "argmax"
     threshold: float = 0.0
+    sigmoid: bool = False
 
     def __post_init__(self) -> None:
-        if self.channel >= self.channels:
-            raise ValueError(f"channel: there is no channel {self.channel} among {self.channels}")
-        if self.rule == "argmax" and self.channels < 2:
-            raise ValueError('rule: "argmax" needs at least two channels')
+        if not self.chosen or len(set(self.chosen)) != len(self.chosen):
+            raise ValueError(f"channel: a channel, or a list with each channel once, got {self.channel}")
+        for channel in self.chosen:
+            if not 0 <= channel < self.channels:
+                raise ValueError(f"channel: there is no channel {channel} among {self.channels}")
+        if self.rule == "argmax" and self.channels <= len(self.chosen):
+            raise ValueError('rule: "argmax" needs at least one channel more than those chosen: at least two channels')
         if not math.isfinite(self.threshold) or (self.rule == "argmax" and self.threshold != 0.0):
             raise ValueError('threshold: a finite number, and only with rule = "above"')
+        if self.sigmoid and not (self.rule == "above" and 0.0 < self.threshold < 1.0):
+            raise ValueError('sigmoid: only with rule = "above" and a threshold between 0 and 1')
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        """The channels of this meaning."""
+        return (self.channel,) if isinstance(self.channel, int) else self.channel
+
+    @property
+    def bar(self) -> float:
+        """What a channel must exceed under rule "above", in the output's own numbers."""
+        return math.log(self.threshold / (1.0 - self.threshold)) if self.sigmoid else self.threshold
 
 
 class ClassMaps(
@@ -132,6 +202,70 @@ class ClassMaps(
         meanings = [m.meaning for m in self.maps]
         if len(set(meanings)) != len(meanings):
             raise ValueError(f"maps: each meaning once, got {', '.join(meanings)}")
+
+
+class Disparity(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="disparity"
+):
+    """Monodepth2's and Lite-Mono's (1, 1, h, w) sigmoid disparity over the whole input.
+
+    depth = depth_scale / (1 / max + (1 / min - 1 / max) * disparity), with the bounds that the network was trained
+    with; `depth_scale` is 5.4 for networks trained on KITTI's stereo pairs. One trained on single images alone has no
+    scale of its own: `metric` false has the road under the camera give it, frame by frame.
+    """
+
+    output: str
+    min_depth_m: Annotated[float, msgspec.Meta(gt=0.0)] = 0.1
+    max_depth_m: Annotated[float, msgspec.Meta(gt=0.0)] = 100.0
+    depth_scale: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
+    metric: bool = True
+    sigma_rel: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.15  # 1-sigma of a pixel's depth, as a fraction
+
+    def __post_init__(self) -> None:
+        if not self.min_depth_m < self.max_depth_m < math.inf:
+            raise ValueError(f"max_depth_m: {self.max_depth_m} is not over min_depth_m = {self.min_depth_m}")
+        if not math.isfinite(self.depth_scale):
+            raise ValueError("depth_scale: a finite number")
+
+
+class MetricDepth(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="metric"
+):
+    """(1, 1, h, w) or (1, h, w) depth along the optical axis over the whole input, in units of `metres_per_unit`.
+
+    What lies outside of min_depth_m to max_depth_m is moved to that bound. `canonical_focal_rel` > 0: the network
+    answers as if the focal length were so many times the image's width, and is brought to the camera's own.
+    """
+
+    output: str
+    metres_per_unit: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
+    min_depth_m: Annotated[float, msgspec.Meta(gt=0.0)] = 0.5
+    max_depth_m: Annotated[float, msgspec.Meta(gt=0.0)] = 200.0
+    canonical_focal_rel: Annotated[float, msgspec.Meta(ge=0.0, le=10.0)] = 0.0
+    sigma_rel: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.1
+
+    def __post_init__(self) -> None:
+        if not self.min_depth_m < self.max_depth_m < math.inf:
+            raise ValueError(f"max_depth_m: {self.max_depth_m} is not over min_depth_m = {self.min_depth_m}")
+        if not math.isfinite(self.metres_per_unit):
+            raise ValueError("metres_per_unit: a finite number")
+
+
+class MultiTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The shipped kind of network: boxes with bodies, masks and depth in one run (perception/multitask.py).
+
+    A box's centre counts from `score_threshold` on; a mask is where its logit is over the bar.
+    """
+
+    score_threshold: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.3
+    nms_iou: Fraction = 0.5
+    road_logit: float = 0.0
+    lane_logit: float = 0.0
+    depth_sigma_rel: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.15  # 1-sigma of a pixel's depth, as a fraction
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.road_logit) and math.isfinite(self.lane_logit)):
+            raise ValueError("road_logit and lane_logit must be finite")
 
 
 class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -155,11 +289,13 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     sha256: Sha256 = ""  # of the .onnx file; a file with another one is refused
     schedule: Schedule = Schedule()
     tiles: Tiles | None = None
-    detector: Yolox | None = None
+    detector: Yolox | CenterNet | None = None
     segmenter: ClassMaps | None = None
+    depth: Disparity | MetricDepth | None = None
+    multitask: MultiTask | None = None
 
     def __post_init__(self) -> None:
-        given = [role for role in ("detector", "segmenter") if getattr(self, role) is not None]
+        given = [role for role in get_args(Role) if getattr(self, role) is not None]
         if given != [self.role]:
             raise ValueError(f"role: a {self.role} needs the table [{self.role}] and no other, got {given}")
         if self.tiles is not None and self.detector is None:
@@ -168,8 +304,13 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 def read_manifest(path: Path) -> Manifest:
     """The manifest in a TOML file. Raises ModelError naming the file and the key."""
+    return read_as(path, Manifest)
+
+
+def read_as(path: Path, kind: type[Kind]) -> Kind:
+    """A manifest of some kind in a TOML file. Raises ModelError naming the file and the key."""
     try:
-        return msgspec.toml.decode(path.read_bytes(), type=Manifest)
+        return msgspec.toml.decode(path.read_bytes(), type=kind)
     except OSError as error:
         raise ModelError(f"{path}: the manifest can't be read: {error.strerror}") from error
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
@@ -186,29 +327,33 @@ def find_manifest(network: Path, sha256: str, explicit: str = "") -> tuple[Manif
 
     Raises ModelError where there is none, where it can't be read, or where it pins another hash.
     """
-    path, manifest = _locate(network, sha256, explicit)
+    return find_as(network, sha256, explicit, Manifest)
+
+
+def find_as(network: Path, sha256: str, explicit: str, kind: type[Kind]) -> tuple[Kind, Path]:
+    """`find_manifest` for a manifest of another kind."""
+    path = _locate(network, sha256, explicit)
+    manifest = read_as(path, kind)
     if manifest.sha256 and manifest.sha256 != sha256:
         raise ModelError(f"{network}: sha256: the manifest {path} says {manifest.sha256}, the file has {sha256}")
     return manifest, path
 
 
-def _locate(network: Path, sha256: str, explicit: str) -> tuple[Path, Manifest]:
+def _locate(network: Path, sha256: str, explicit: str) -> Path:
     shipped = shipped_manifests()
     if explicit:
         path = shipped.get(explicit, Path(explicit))
         if not path.is_file():
             raise ModelError(f"{network}: no manifest {explicit!r}: no such file, and shipped are {', '.join(shipped)}")
-        return path, read_manifest(path)
+        return path
     beside = network.with_suffix(".toml")
     if beside.is_file():
-        return beside, read_manifest(beside)
+        return beside
     for path in shipped.values():
-        manifest = read_manifest(path)
-        if manifest.sha256 == sha256:
-            return path, manifest
+        if read_manifest(path).sha256 == sha256:
+            return path
     if network.stem in shipped:
-        path = shipped[network.stem]
-        return path, read_manifest(path)
+        return shipped[network.stem]
     raise ModelError(
         f"{network}: no manifest: none beside it ({beside.name}), none shipped with its SHA-256 {sha256} or its name "
         f"(shipped: {', '.join(shipped)}); state one by manifest ="

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol, get_args
+from typing import Annotated, Any, Protocol, cast, get_args
 
 import msgspec
 import numpy as np
@@ -14,27 +13,36 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
-from birdslam.perception.detection import Detections, YoloxDecoder
+from birdslam.perception.centernet import CenterNetDecoder
+from birdslam.perception.depth import DisparityDecoder, MetricDepthDecoder
+from birdslam.perception.detection import YoloxDecoder
+from birdslam.perception.findings import Findings
 from birdslam.perception.manifest import (
+    CenterNet,
     ClassMaps,
     Count,
+    Disparity,
     Input,
     Manifest,
+    MetricDepth,
     Misfit,
     ModelError,
+    MultiTask,
     Role,
     Schedule,
     Yolox,
     find_manifest,
 )
-from birdslam.perception.segmentation import ClassMapsDecoder, Segmentation
+from birdslam.perception.multitask import OUTPUTS, MultiTaskDecoder
+from birdslam.perception.onnx_file import has_weights_elsewhere
+from birdslam.perception.segmentation import ClassMapsDecoder
 from birdslam.perception.subnormal import without_tiny_weights
 from birdslam.perception.views import Preparation, View, make_views
 
-_SESSION_ERRORS = tuple(
+SESSION_ERRORS = tuple(
     error for error in vars(ort_errors).values() if isinstance(error, type) and issubclass(error, Exception)
 )
-_PROVIDERS = ["CPUExecutionProvider"]
+PROVIDERS = ["CPUExecutionProvider"]
 _FLOAT32 = "tensor(float)"
 
 
@@ -48,14 +56,6 @@ class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     awaited: bool | None = None
 
 
-@dataclass(frozen=True)
-class Findings:
-    """What one network found in one image; None is what it doesn't look for."""
-
-    detections: Detections | None = None
-    segmentation: Segmentation | None = None
-
-
 class Decoder(Protocol):
     """Makes the meaning of a network's outputs: `read` each view's, then `merge` those of one image."""
 
@@ -65,11 +65,20 @@ class Decoder(Protocol):
 
 
 # The decodings there are: a manifest's table -> (what reads it, the field of Findings that it fills, outputs it reads).
+# Where the field is "" the reader makes Findings itself.
 # The reader is called with (table, input, shapes of the outputs) and raises Misfit. A new decoding is a row here, its
 # table in manifest.py and, for a new role, a field in Manifest and in Findings.
 DECODINGS: dict[type, tuple[Callable[..., Decoder], str, Callable[[Any], tuple[str, ...]]]] = {
     Yolox: (YoloxDecoder, "detections", lambda table: (table.output,)),
+    CenterNet: (
+        CenterNetDecoder,
+        "detections",
+        lambda table: tuple(filter(None, (table.heat_map, table.sizes, table.offsets))),
+    ),
+    Disparity: (DisparityDecoder, "depth", lambda table: (table.output,)),
+    MetricDepth: (MetricDepthDecoder, "depth", lambda table: (table.output,)),
     ClassMaps: (ClassMapsDecoder, "segmentation", lambda table: tuple(dict.fromkeys(m.output for m in table.maps))),
+    MultiTask: (MultiTaskDecoder, "", lambda table: OUTPUTS),
 }
 
 
@@ -142,7 +151,13 @@ class Network:
             if not self.infer():
                 return None
             parts.append(self.read(view))
-        return Findings(**{self._finding: self.decoder.merge(parts, views)})
+        found = self.decoder.merge(parts, views)
+        return Findings(**{self._finding: found}) if self._finding else cast(Findings, found)
+
+    @property
+    def output_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of the outputs that the manifest names."""
+        return {name: tensor.shape for name, tensor in self._tensors.items()}
 
     def describe(self) -> dict[str, Any]:
         """What ran, for a summary: plain values."""
@@ -178,15 +193,27 @@ def load_network(name: str, spec: ModelSpec) -> Network:
         raise ModelError(f"{path}: role: the manifest {origin} says {manifest.role}, it was given as the {name}")
     said = {key: value for key in ("every", "threads", "awaited") if (value := getattr(spec, key)) is not None}
     schedule = msgspec.structs.replace(manifest.schedule, **said)
+    refuse_weights_elsewhere(path, content)
     try:
         return Network(name, path, manifest, sha256, content, schedule)
     except Misfit as error:
         raise ModelError(f"{path}: {error} (manifest {origin})") from error
-    except _SESSION_ERRORS as error:
+    except SESSION_ERRORS as error:
         raise ModelError(f"{path}: no network that onnxruntime can run: {error}") from error
 
 
-def _options(threads: int) -> ort.SessionOptions:
+def refuse_weights_elsewhere(path: Path, content: bytes) -> None:
+    """Raises ModelError where the network is not whole in its file: its SHA-256 would not hold what it computes."""
+    try:
+        elsewhere = has_weights_elsewhere(content)
+    except ValueError as error:
+        raise ModelError(f"{path}: no network that onnxruntime can run: {error}") from error
+    if elsewhere:
+        raise ModelError(f"{path}: its weights lie in another file (external data): a network must be whole in its own")
+
+
+def session_options(threads: int) -> ort.SessionOptions:
+    """As every network here runs: on so many threads, which sleep when they wait."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
@@ -200,9 +227,9 @@ def _options(threads: int) -> ort.SessionOptions:
 
 def _open_session(content: bytes, input: Input, outputs: tuple[str, ...], threads: int) -> ort.InferenceSession:
     """A session with the input's shape fixed, after its inputs and outputs were compared with the manifest."""
-    probe_options = _options(1)
+    probe_options = session_options(1)
     probe_options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    probe = ort.InferenceSession(content, probe_options, providers=_PROVIDERS)
+    probe = ort.InferenceSession(content, probe_options, providers=PROVIDERS)
     has_inputs = [i.name for i in probe.get_inputs()]
     if has_inputs != [input.name]:
         raise Misfit("input.name", repr(input.name), f"the inputs {has_inputs}")
@@ -212,7 +239,7 @@ def _open_session(content: bytes, input: Input, outputs: tuple[str, ...], thread
     axes = {"N": 1, "C": 3, "H": input.height_px, "W": input.width_px}
     if len(has.shape) != 4:
         raise Misfit("input.layout", input.layout, f"the shape {has.shape}")
-    options = _options(threads)
+    options = session_options(threads)
     for axis, size in zip(input.layout, has.shape, strict=True):
         key = {"H": "input.height_px", "W": "input.width_px"}.get(axis, "input.layout")
         if isinstance(size, str):
@@ -225,4 +252,4 @@ def _open_session(content: bytes, input: Input, outputs: tuple[str, ...], thread
             raise Misfit("output", repr(output), f"the outputs {list(has_outputs)}")
         if has_outputs[output] != _FLOAT32:
             raise Misfit("output", f"{output} as {_FLOAT32} (all that manifests can say)", has_outputs[output])
-    return ort.InferenceSession(without_tiny_weights(content), options, providers=_PROVIDERS)
+    return ort.InferenceSession(without_tiny_weights(content), options, providers=PROVIDERS)

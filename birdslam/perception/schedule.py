@@ -10,16 +10,20 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.perception.depth import DepthMap
 from birdslam.perception.detection import Detections
+from birdslam.perception.findings import Findings
 from birdslam.perception.manifest import Role, Schedule
-from birdslam.perception.network import Findings
 from birdslam.perception.segmentation import Segmentation
 from birdslam.types import Status
 
 CARRIED: dict[Role, Status] = {
     "detector": Status.DETECTIONS_CARRIED,
     "segmenter": Status.SEGMENTATION_CARRIED,
+    "depth": Status.DEPTH_CARRIED,
 }
+FIELDS: dict[Role, str] = {"detector": "detections", "segmenter": "segmentation", "depth": "depth"}  # of `Perception`
+ROLES: dict[Role, tuple[Role, ...]] = {"multitask": ("detector", "segmenter", "depth")}  # others fill their own
 
 
 @dataclass(frozen=True)
@@ -27,13 +31,15 @@ class Perception:
     """What the networks know at one frame.
 
     `ages`: head name -> frames since the frame that its result in use was computed on, 0 is this one; a head without
-    any result yet is absent. A head whose result isn't this frame's says so in `status`.
+    any result yet is absent. A head that fills several roles stands there with these roles, not with its name. A head
+    whose result isn't this frame's says so in `status`.
     """
 
     detections: Detections | None = None
     segmentation: Segmentation | None = None
     ages: dict[str, int] = field(default_factory=dict)
     status: tuple[Status, ...] = ()
+    depth: DepthMap | None = None
 
 
 class Pending(Protocol):
@@ -69,18 +75,25 @@ class _Slot:
     """One head's run and its last result."""
 
     head: Head
+    fills: tuple[Role, ...]  # what its findings are used for
     running: Future[Findings | None] | None = None
     started_frame: int | None = None
     outdated: bool = False  # the run under way belongs to frames of before a restart of the source
     findings: Findings = field(default_factory=Findings)
     found_frame: int | None = None
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What its age stands under."""
+        return self.fills if self.head.role in ROLES else (self.head.name,)
+
 
 class Networks:
     """Starts each head on the frames that it is due on and carries its last result in between.
 
     A head is due when `every` frames have passed since the one it last started on, so that a dropped frame doesn't
-    starve it; while its last run is under way it isn't started again. `submit(run, image) -> Future` is the executor's
+    starve it; while its last run is under way it isn't started again. A head that fills several roles leaves those to
+    others that have a head of their own. `submit(run, image) -> Future` is the executor's
     (birdslam has no threads of its own; it needs one for each head). `patience_s` None awaits every head that runs, so
     that the results depend on the frames alone. Else `result()` waits that long in all, for the heads that started on
     its frame and are `awaited`; what isn't there is carried and goes on in the background.
@@ -101,7 +114,13 @@ class Networks:
         self.heads = tuple(heads)
         self._submit = submit
         self._patience_s = patience_s
-        self._slots = [_Slot(head) for head in heads]
+        own = {head.role for head in heads}
+        self._slots = [
+            _Slot(
+                head, tuple(role for role in ROLES.get(head.role, (head.role,)) if role == head.role or role not in own)
+            )
+            for head in heads
+        ]
         self._last_frame = -1
 
     def start(self, frame_id: int, image: NDArray[np.uint8] | None, only: Collection[Role] | None = None) -> Pending:
@@ -112,11 +131,11 @@ class Networks:
         source that began anew: what is known of the old frames is forgotten.
         """
         if frame_id <= self._last_frame:
-            self._slots = [_Slot(s.head, s.running, outdated=s.running is not None) for s in self._slots]
+            self._slots = [_Slot(s.head, s.fills, s.running, outdated=s.running is not None) for s in self._slots]
         self._last_frame = frame_id
         for slot in self._slots:
             due = slot.started_frame is None or frame_id - slot.started_frame >= slot.head.schedule.every
-            wanted = only is None or slot.head.role in only
+            wanted = bool(slot.fills) and (only is None or not set(only).isdisjoint(slot.fills))
             if image is not None and due and wanted and slot.running is None:
                 slot.running = self._submit(slot.head.run, image)
                 slot.started_frame = frame_id
@@ -146,11 +165,9 @@ class Networks:
                 else:
                     slot.findings, slot.found_frame = findings, slot.started_frame
             if slot.found_frame != frame_id:
-                status.append(CARRIED[slot.head.role])
-        found = {}
-        for slot in self._slots:
-            found.update({key: value for key, value in vars(slot.findings).items() if value is not None})
-        ages = {s.head.name: frame_id - s.found_frame for s in self._slots if s.found_frame is not None}
+                status.extend(CARRIED[role] for role in slot.fills)
+        found = {FIELDS[role]: getattr(s.findings, FIELDS[role]) for s in self._slots for role in s.fills}
+        ages = {name: frame_id - s.found_frame for s in self._slots if s.found_frame is not None for name in s.names}
         return Perception(**found, ages=ages, status=tuple(dict.fromkeys(status)))
 
 

@@ -53,13 +53,14 @@ class ClassMapsDecoder:
 
         Resizing the margin and not the mask keeps the border smooth at the image's resolution.
         """
-        channel = scores[entry.channel]
+        chosen = entry.chosen
+        channel = scores[chosen[0]] if len(chosen) == 1 else scores[list(chosen)].max(axis=0)
         if entry.rule == "above":
-            margin = channel - np.float32(entry.threshold)
+            margin = channel - np.float32(entry.bar)
         elif entry.channels == 2:
-            margin = channel - scores[1 - entry.channel]
+            margin = channel - scores[1 - chosen[0]]
         else:
-            margin = channel - np.delete(scores, entry.channel, axis=0).max(axis=0)
+            margin = channel - np.delete(scores, chosen, axis=0).max(axis=0)
         # The view's rectangle in the map, which may be coarser than the input.
         fy, fx = margin.shape[0] / self.input.height_px, margin.shape[1] / self.input.width_px
         rows = slice(round(view.top_px * fy), max(round((view.top_px + view.height_px) * fy), 1))

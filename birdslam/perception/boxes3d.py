@@ -1,0 +1,76 @@
+"""What a network says of a vehicle's body: where its centre is, how large it is, which way it faces."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.camera import Camera, GroundPlane
+
+
+@dataclass(frozen=True)
+class Boxes3d:
+    """N bodies, one for each 2-D box and in its order; sigmas are standard deviations.
+
+    `alpha_rad` is the observation angle: the yaw in ego less the bearing under which the centre is seen, REP-103
+    (0 faces away from the camera, pi/2 faces left). The axis can be sure where its front is not: `flip` is the
+    probability that the front is the rear.
+
+    With `canonical_focal_rel` > 0 depths are those of a camera whose focal length is so many times its image's width:
+    `in_metres` makes them the camera's own.
+    """
+
+    centre_px: NDArray[np.float64]  # (N, 2) the body's centre in the undistorted image, also beyond its edge
+    depth_m: NDArray[np.float64]  # (N,) of that centre along the optical axis
+    size_m: NDArray[np.float64]  # (N, 3) length, width, height
+    alpha_rad: NDArray[np.float64]  # (N,) in (-pi, pi]
+    sigma_depth_m: NDArray[np.float64]  # (N,)
+    sigma_size_m: NDArray[np.float64]  # (N, 3)
+    sigma_alpha_rad: NDArray[np.float64]  # (N,) of the axis, in a Gaussian near its peak
+    flip: NDArray[np.float64]  # (N,) in [0, 0.5]
+    canonical_focal_rel: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.depth_m)
+
+    def take(self, rows: NDArray[np.int64] | Sequence[int]) -> Boxes3d:
+        """Those in the given rows, in that order."""
+        return Boxes3d(
+            self.centre_px[rows],
+            self.depth_m[rows],
+            self.size_m[rows],
+            self.alpha_rad[rows],
+            self.sigma_depth_m[rows],
+            self.sigma_size_m[rows],
+            self.sigma_alpha_rad[rows],
+            self.flip[rows],
+            self.canonical_focal_rel,
+        )
+
+    def in_metres(self, camera: Camera) -> Boxes3d:
+        """The bodies as this camera sees them; itself where they are not canonical."""
+        if self.canonical_focal_rel <= 0.0:
+            return self
+        factor = camera.fx_px / (self.canonical_focal_rel * camera.width_px)
+        return replace(
+            self,
+            depth_m=self.depth_m * factor,
+            sigma_depth_m=self.sigma_depth_m * factor,
+            canonical_focal_rel=0.0,
+        )
+
+    def centres_cam_m(self, camera: Camera) -> NDArray[np.float64]:
+        """(N, 3) the bodies' centres in the camera frame."""
+        x = (self.centre_px[:, 0] - camera.cx_px) / camera.fx_px
+        y = (self.centre_px[:, 1] - camera.cy_px) / camera.fy_px
+        return self.in_metres(camera).depth_m[:, None] * np.column_stack([x, y, np.ones_like(x)])
+
+    def in_ego(self, camera: Camera, ground: GroundPlane) -> NDArray[np.float64]:
+        """(N, 3) x_m, y_m, yaw_rad in ego: the bodies dropped onto the road."""
+        centres_m = self.centres_cam_m(camera) @ ground.R_ego_cam.T
+        yaw_rad = self.alpha_rad + np.arctan2(centres_m[:, 1], centres_m[:, 0])
+        return np.column_stack([centres_m[:, :2], np.remainder(yaw_rad + math.pi, 2.0 * math.pi) - math.pi])

@@ -1,0 +1,42 @@
+"""The network that completes lane grids where something hid the road (paper, Sec. 3.2: ENet)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from birdslam.perception.manifest import ModelError
+from birdslam.perception.network import session_options
+
+SHIPPED = Path(__file__).parent / "shipped" / "lanes.onnx"
+
+
+class GridCompletion:
+    """Occupancy grids of road and lane boundary (2, rows, columns), 0..1, to completed ones of the same shape.
+
+    Raises ModelError where the file can't be read, is no network, or is none for grids of `shape`.
+    """
+
+    def __init__(self, shape: tuple[int, int], path: Path = SHIPPED) -> None:
+        try:
+            self._session = ort.InferenceSession(
+                path.read_bytes(), session_options(threads=1), providers=["CPUExecutionProvider"]
+            )
+        except OSError as error:
+            raise ModelError(f"{path}: the network can't be read: {error.strerror}") from error
+        except Exception as error:  # onnxruntime's own kinds have no common name
+            raise ModelError(f"{path}: no network that onnxruntime can run: {error}") from error
+        expected = [1, 2, *shape]
+        for what, tensors in (("inputs", self._session.get_inputs()), ("outputs", self._session.get_outputs())):
+            if [list(tensor.shape) for tensor in tensors] != [expected]:
+                raise ModelError(f"{path}: {what} of {[t.shape for t in tensors]} where grids of {expected} are needed")
+        self._input = self._session.get_inputs()[0].name
+        self(np.zeros((2, *shape), dtype=np.float32))  # warm-up
+
+    def __call__(self, grids: NDArray[np.float32]) -> NDArray[np.float32]:
+        (out,) = self._session.run(None, {self._input: grids[None]})
+        completed: NDArray[np.float32] = out[0]
+        return completed

@@ -1,0 +1,18 @@
+"""What one network found in one image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from birdslam.perception.depth import DepthMap
+from birdslam.perception.detection import Detections
+from birdslam.perception.segmentation import Segmentation
+
+
+@dataclass(frozen=True)
+class Findings:
+    """None is what a network doesn't look for."""
+
+    detections: Detections | None = None
+    segmentation: Segmentation | None = None
+    depth: DepthMap | None = None

@@ -1,0 +1,135 @@
+"""CenterNet by manifest: peaks become boxes where the objects are, in one view and over tiles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_networks as tiny
+from numpy.typing import NDArray
+
+from birdslam.perception import ModelError, ModelSpec, load_network
+from birdslam.perception.centernet import CenterNetDecoder
+from birdslam.perception.manifest import CenterNet, FitPad, Input, Stretch, Tiles
+from birdslam.perception.views import make_views
+
+MANIFEST = """
+role = "detector"
+[input]
+name = "images"
+width_px = 64
+height_px = 32
+layout = "NCHW"
+colour = "BGR"
+resize = { mode = "stretch" }
+[detector]
+decoding = "centernet"
+heat_map = "hm"
+sizes = "wh"
+offsets = "reg"
+heat = "logits"
+classes = 3
+score_threshold = 0.3
+labels = { 0 = "car", 2 = "truck" }
+rivals = [["car", "truck"]]
+"""
+CELLS = (8, 16)  # of 4 px
+
+
+def maps(objects: list[tuple[int, tuple[float, float, float, float], float]]) -> dict[str, NDArray[np.float32]]:
+    """Outputs that say: class, box in input pixels, score."""
+    heat = np.full((1, 3, *CELLS), -9.0, np.float32)
+    sizes, offsets = np.zeros((1, 2, *CELLS), np.float32), np.zeros((1, 2, *CELLS), np.float32)
+    for index, (x1, y1, x2, y2), score in objects:
+        x, y = (x1 + x2) / 8.0, (y1 + y2) / 8.0
+        row, column = int(y), int(x)
+        heat[0, index, row, column] = np.log(score / (1.0 - score))
+        heat[0, index, row, max(column - 1, 0)] = np.log(score / (1.0 - score)) - 0.5  # its foothills
+        sizes[0, :, row, column] = (x2 - x1) / 4.0, (y2 - y1) / 4.0
+        offsets[0, :, row, column] = x - column, y - row
+    return {"hm": heat, "wh": sizes, "reg": offsets}
+
+
+def load(tmp_path: Path, text: str, answers: dict[str, NDArray[np.float32]]):  # type: ignore[no-untyped-def]
+    network = tiny.constants(tmp_path / "net.onnx", (1, 3, 32, 64), answers)
+    network.with_suffix(".toml").write_text(text)
+    return load_network("detector", ModelSpec(str(network)))
+
+
+def test_peaks_are_boxes_of_the_image_best_first(tmp_path: Path) -> None:
+    objects = [
+        (0, (8.0, 8.0, 20.0, 16.0), 0.6),
+        (2, (30.0, 10.0, 50.0, 30.0), 0.9),
+        (1, (2.0, 20.0, 10.0, 30.0), 0.9),  # of a class that nobody asked for
+        (0, (40.0, 2.0, 44.0, 6.0), 0.2),  # below the threshold
+        (2, (8.0, 8.0, 20.0, 16.0), 0.4),  # on the first car: a rival
+    ]
+    found = load(tmp_path, MANIFEST, maps(objects)).run(np.zeros((64, 256, 3), np.uint8))
+    assert found.detections.labels == ("truck", "car")
+    np.testing.assert_allclose(found.detections.scores, [0.9, 0.6], atol=1e-6)
+    np.testing.assert_allclose(found.detections.boxes_px, [[120, 20, 200, 60], [32, 16, 80, 32]], atol=1e-4)
+
+
+def test_scores_sizes_in_pixels_and_no_offsets(tmp_path: Path) -> None:
+    text = MANIFEST.replace('heat = "logits"', 'heat = "scores"\nsize_unit = "pixels"').replace('offsets = "reg"\n', "")
+    answers = maps([(0, (8.0, 8.0, 24.0, 16.0), 0.6)])
+    answers["hm"] = 1.0 / (1.0 + np.exp(-answers["hm"]))
+    answers["wh"] *= 4.0
+    found = load(tmp_path, text, answers).run(np.zeros((32, 64, 3), np.uint8))
+    np.testing.assert_allclose(found.detections.boxes_px, [[8, 8, 24, 16]], atol=1e-4)
+
+
+def test_an_object_in_two_tiles_is_one() -> None:
+    table = CenterNet(
+        heat_map="hm", sizes="wh", offsets="reg", heat="logits", classes=3, labels={0: "car"}, score_threshold=0.3
+    )
+    fit = Input(name="i", width_px=64, height_px=32, layout="NCHW", colour="BGR", resize=FitPad())
+    decoder = CenterNetDecoder(table, fit, {k: v.shape for k, v in maps([]).items()})
+    views = make_views(128, 32, fit, Tiles(columns=3, overlap=0.5))
+    box = np.array([[50.0, 10.0, 62.0, 20.0]])  # in the overlap of the first two
+    parts = []
+    for view in views:
+        inside = view.x0_px <= box[0, 0] and box[0, 2] <= view.x1_px
+        seen = tuple(view.to_network(box)[0].tolist())
+        parts.append(decoder.read(maps([(0, seen, 0.8)] if inside else []), view))  # type: ignore[list-item]
+    assert sum(len(part.scores) for part in parts) == 2
+    found = decoder.merge(parts, views)
+    np.testing.assert_allclose(found.boxes_px, box, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"hm": np.zeros((1, 2, *CELLS), np.float32)}, ["detector.classes", "3", "2 in hm"]),
+        ({"hm": np.zeros((3, *CELLS), np.float32)}, ["detector.heat_map", "(1, classes, h, w)"]),
+        ({"wh": np.zeros((1, 2, 4, 8), np.float32)}, ["detector.sizes", "(1, 2, 8, 16)", "(1, 2, 4, 8)"]),
+        ({"reg": np.zeros((1, 1, *CELLS), np.float32)}, ["detector.offsets", "(1, 1, 8, 16)"]),
+    ],
+)
+def test_a_network_of_another_shape_is_refused(
+    tmp_path: Path, changed: dict[str, NDArray[np.float32]], named: list[str]
+) -> None:
+    with pytest.raises(ModelError) as caught:
+        load(tmp_path, MANIFEST, {**maps([]), **changed})
+    for part in named:
+        assert part in str(caught.value)
+
+
+def test_a_class_without_a_channel_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="there is no class 3 among 3"):
+        load(tmp_path, MANIFEST.replace("2 = ", "3 = "), maps([]))
+
+
+def test_numbers_gone_wild_stay_in_bounds() -> None:
+    table = CenterNet(heat_map="hm", sizes="wh", heat="logits", classes=3, labels={0: "car"}, score_threshold=0.1)
+    stretch = Input(name="i", width_px=64, height_px=32, layout="NCHW", colour="BGR", resize=Stretch())
+    shapes = {k: v.shape for k, v in maps([]).items()}
+    (view,) = make_views(640, 320, stretch, None)
+    rng = np.random.default_rng(3)
+    tensors = {k: (rng.normal(size=s) * 1e9).astype(np.float32) for k, s in shapes.items()}
+    decoder = CenterNetDecoder(table, stretch, shapes)
+    boxes = decoder.merge([decoder.read(tensors, view)], [view]).boxes_px
+    assert len(boxes)
+    assert (boxes >= 0).all()
+    assert (boxes <= [640, 320, 640, 320]).all()

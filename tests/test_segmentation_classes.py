@@ -1,0 +1,73 @@
+"""Segmentation networks of any classes: lists of classes by argmax, scores and logits against a threshold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_networks as tiny
+
+from birdslam.perception import ModelError, ModelSpec, Segmentation, load_network
+
+MANIFEST = """
+role = "segmenter"
+[input]
+name = "images"
+width_px = 8
+height_px = 8
+layout = "NCHW"
+colour = "RGB"
+resize = { mode = "stretch" }
+[segmenter]
+decoding = "class_maps"
+[[segmenter.maps]]
+meaning = "road"
+output = "classes"
+channel = CHANNEL
+channels = 4
+"""
+
+
+def run(tmp_path: Path, text: str, scores: np.ndarray) -> Segmentation:
+    network = tiny.constants(tmp_path / "net.onnx", (1, 3, 8, 8), {"classes": scores.astype(np.float32)})
+    network.with_suffix(".toml").write_text(text)
+    found = load_network("segmenter", ModelSpec(str(network))).run(np.zeros((8, 8, 3), np.uint8))
+    assert found is not None
+    assert found.segmentation is not None
+    return found.segmentation
+
+
+def test_a_list_of_classes_is_where_one_of_them_is_the_largest(tmp_path: Path) -> None:
+    scores = np.random.default_rng(0).normal(size=(1, 4, 8, 8))
+    road = run(tmp_path, MANIFEST.replace("CHANNEL", "[0, 3]"), scores).road
+    np.testing.assert_array_equal(road, np.isin(scores[0].argmax(axis=0), [0, 3]))
+    road = run(tmp_path, MANIFEST.replace("CHANNEL", "2"), scores).road
+    np.testing.assert_array_equal(road, scores[0].argmax(axis=0) == 2)
+
+
+def test_logits_are_held_against_a_probability(tmp_path: Path) -> None:
+    logits = np.random.default_rng(1).normal(size=(1, 4, 8, 8))
+    probability = 1.0 / (1.0 + np.exp(-logits[0]))
+    text = MANIFEST + 'rule = "above"\nthreshold = 0.7\nsigmoid = true\n'
+    road = run(tmp_path, text.replace("CHANNEL", "[1, 2]"), logits).road
+    np.testing.assert_array_equal(road, (probability[1] > 0.7) | (probability[2] > 0.7))
+    plain = run(tmp_path, text.replace("CHANNEL", "1").replace("sigmoid = true", ""), logits).road
+    np.testing.assert_array_equal(plain, logits[0, 1] > 0.7)
+
+
+@pytest.mark.parametrize(
+    ("channel", "more", "named"),
+    [
+        ("[]", "", "channel: a channel, or a list"),
+        ("[1, 1]", "", "channel: a channel, or a list"),
+        ("[0, 4]", "", "there is no channel 4 among 4"),
+        ("-1", "", "there is no channel -1"),
+        ("[0, 1, 2, 3]", "", "argmax"),
+        ("0", "sigmoid = true", "sigmoid: only with rule"),
+        ("0", 'rule = "above"\nsigmoid = true\nthreshold = 1.0', "sigmoid: only with rule"),
+    ],
+)
+def test_a_list_that_makes_no_sense_is_refused(tmp_path: Path, channel: str, more: str, named: str) -> None:
+    with pytest.raises(ModelError, match=named.replace("[", r"\[")):
+        run(tmp_path, MANIFEST.replace("CHANNEL", channel) + more, np.zeros((1, 4, 8, 8)))
