@@ -1,0 +1,87 @@
+"""An endless stream of examples from a seed: worlds are rendered, kept a while, and looked at more than once.
+
+Rendering costs more than learning from a frame at the small size. So each frame of a pool is shown several times,
+each time through another window and another camera's eyes; the pool is renewed frame by frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.simulation.truth import WorldFrame
+from birdslam.training.augmentation import AugmentationConfig, draw_window, photometric
+from birdslam.training.targets import Example, TargetsConfig, encode
+
+Render = Callable[[int, int, int], WorldFrame]  # (seed, width_px, height_px), as `simulation.world.sample`
+
+HELD_OUT_SEEDS = 1_000_000  # seeds below are for evaluation; training draws from here on
+
+
+class StreamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How examples come about."""
+
+    width_px: int = 640
+    height_px: int = 192
+    looks: int = 2  # at each rendered frame, on the average
+    pool_frames: int = 500
+    batch: int = 16
+    targets: TargetsConfig = TargetsConfig()
+    augmentation: AugmentationConfig = AugmentationConfig()
+
+
+@dataclass(frozen=True)
+class Examples:
+    """B examples, stacked; see `targets.Example`."""
+
+    image: NDArray[np.uint8]
+    masks: NDArray[np.float32]
+    log_depth: NDArray[np.float32]
+    sky: NDArray[np.bool_]
+    objects: NDArray[np.float32]
+
+
+def examples(seed: int, config: StreamConfig, render: Render) -> Iterator[Examples]:
+    """Batches without end; the same for the same seed."""
+    rng = np.random.default_rng(seed)
+    pool: list[WorldFrame] = []
+    owed = 0.0
+    while True:
+        batch = []
+        for _ in range(config.batch):
+            owed += 1.0 / config.looks
+            if owed >= 1.0 or not pool:
+                owed = max(0.0, owed - 1.0)
+                frame = render(int(rng.integers(HELD_OUT_SEEDS, 2**62)), config.width_px, config.height_px)
+                if len(pool) < config.pool_frames:
+                    pool.append(frame)
+                else:
+                    pool[int(rng.integers(len(pool)))] = frame
+            else:
+                frame = pool[int(rng.integers(len(pool)))]
+            batch.append(look(frame, config, rng))
+        yield stack(batch)
+
+
+def look(frame: WorldFrame, config: StreamConfig, rng: np.random.Generator) -> Example:
+    """A frame through a drawn window and a drawn camera's eyes."""
+    height_px, width_px = frame.image.shape[:2]
+    window = draw_window(width_px, height_px, config.augmentation, rng)
+    example = encode(frame, window, config.width_px, config.height_px, config.targets)
+    image = photometric(example.image, config.augmentation, rng)
+    return Example(image, example.masks, example.log_depth, example.sky, example.objects)
+
+
+def stack(batch: list[Example]) -> Examples:
+    """One array of each kind."""
+    return Examples(
+        np.stack([example.image for example in batch]),
+        np.stack([example.masks for example in batch]),
+        np.stack([example.log_depth for example in batch]),
+        np.stack([example.sky for example in batch]),
+        np.stack([example.objects for example in batch]),
+    )

@@ -1,0 +1,120 @@
+"""One lesson after the other: the network, its optimiser, its moving average, and what they need to go on later."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgspec
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from birdslam.perception.multitask import OUTPUTS, body_slices
+from birdslam.training.losses import Batch, LossConfig, loss
+from birdslam.training.network import MultiTask, NetworkConfig
+from birdslam.training.stream import Examples
+
+
+class TeacherConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the weights move."""
+
+    network: NetworkConfig = NetworkConfig()
+    loss: LossConfig = LossConfig()
+    weight_decay: float = 0.01
+    warm_up_steps: int = 200
+    rate_end: float = 0.02  # of the stage's learning rate, at its end
+    clip: float = 5.0  # norm of the gradient
+    average: float = 0.997  # of the old weights, at each step
+
+
+class Teacher:
+    """Holds the network in training and its average, which is what is exported."""
+
+    def __init__(self, config: TeacherConfig, half: bool) -> None:
+        """`half`: compute in bfloat16 where that is safe."""
+        self.config = config
+        self.half = half
+        self.network = MultiTask(config.network).to(memory_format=torch.channels_last)
+        self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)
+        decayed = [p for p in self.network.parameters() if p.ndim > 1]
+        free = [p for p in self.network.parameters() if p.ndim <= 1]
+        self.optimiser = torch.optim.AdamW(
+            [{"params": decayed, "weight_decay": config.weight_decay}, {"params": free, "weight_decay": 0.0}], lr=1e-3
+        )
+
+    def lesson(
+        self,
+        examples: tuple[Tensor, ...],
+        progress: float,
+        step: int,
+        rate: float,
+        share: Callable[[Sequence[Parameter]], None] | None = None,
+    ) -> dict[str, float]:
+        """One step on a batch; `progress` through the stage in [0, 1], `rate` its learning rate. Returns the parts.
+
+        `share` makes the gradients those of several teachers that learn side by side.
+        """
+        cosine = 0.5 * (1.0 + math.cos(math.pi * min(progress, 1.0)))
+        warm = min(1.0, (step + 1) / self.config.warm_up_steps)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate * warm * (self.config.rate_end + (1.0 - self.config.rate_end) * cosine)
+        self.network.train()
+        batch = as_batch(examples)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
+            outputs = self.network(batch.image)
+        parts = loss(outputs, batch, self.config.loss)
+        total = torch.stack(list(parts.values())).sum()
+        self.optimiser.zero_grad()
+        total.backward()
+        if share is not None:
+            share([p for p in self.network.parameters() if p.grad is not None])
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
+        if bool(torch.isfinite(norm)):
+            self.optimiser.step()
+            self.average.update_parameters(self.network)
+        return {"total": float(total), **{name: float(part) for name, part in parts.items()}, "norm": float(norm)}
+
+    def enlarge(self, factor: float) -> None:
+        """For inputs `factor` times as wide: what is as large on the image as before is `factor` times as far away."""
+        shift = math.log(factor)
+        with torch.no_grad():
+            for network in (self.network, self.average.module):
+                network.depth[-1].bias += shift
+                network.body[-1].bias[body_slices()["log_depth"]] += shift
+
+    def state(self) -> dict[str, Any]:
+        """All that is needed to go on; `load` takes it back."""
+        return {
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Goes on from a state of before."""
+        self.network.load_state_dict(state["network"])
+        self.average.load_state_dict(state["average"])
+        self.optimiser.load_state_dict(state["optimiser"])
+
+    @torch.no_grad()
+    def answer(self, image: Tensor) -> dict[str, Tensor]:
+        """What the average says of images (B, 3, H, W) in [-1, 1], by the names of the outputs."""
+        self.average.eval()
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
+            outputs = self.average(image)
+        return dict(zip(OUTPUTS, (output.float() for output in outputs), strict=True))
+
+
+def as_tensors(examples: Examples) -> tuple[Tensor, ...]:
+    """What passes between processes: bytes as they are."""
+    arrays = (examples.image, examples.masks, examples.log_depth, examples.sky, examples.objects)
+    return tuple(torch.from_numpy(array) for array in arrays)
+
+
+def as_batch(tensors: tuple[Tensor, ...]) -> Batch:
+    """The image as the network takes it."""
+    image, masks, log_depth, sky, objects = tensors
+    return Batch(image.permute(0, 3, 1, 2).float() / 127.5 - 1.0, masks, log_depth, sky, objects)
