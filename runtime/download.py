@@ -1,0 +1,81 @@
+"""Files from the network: with a limit on their size, with progress, and whole or not at all."""
+
+from __future__ import annotations
+
+import http.client
+import sys
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+CHUNK_BYTES = 1 << 16
+SCHEMES = ("https", "http")
+
+Progress = Callable[[int, int | None], None]  # bytes so far, bytes in all where the server says
+
+
+class DownloadError(ValueError):
+    """A file that could not be had; the message names its address and the reason."""
+
+
+def download(address: str, target: Path, limit_bytes: int, timeout_s: float, progress: Progress) -> None:
+    """Writes the file at an http(s) address to `target`; `timeout_s` is for the connection and each wait for data.
+
+    Raises DownloadError, with `target` gone, where it is over the limit, shorter than announced, or out of reach.
+    """
+    if urlsplit(address).scheme not in SCHEMES:
+        raise DownloadError(f"{address}: no address that begins with {' or '.join(f'{s}://' for s in SCHEMES)}")
+    try:
+        _fetch(address, target, limit_bytes, timeout_s, progress)
+    except DownloadError:
+        target.unlink(missing_ok=True)
+        raise
+    except urllib.error.HTTPError as error:
+        target.unlink(missing_ok=True)
+        raise DownloadError(f"{address}: the server says {error.code} {error.reason}") from error
+    except (urllib.error.URLError, http.client.HTTPException, OSError, ValueError) as error:
+        target.unlink(missing_ok=True)
+        raise DownloadError(f"{address}: {getattr(error, 'reason', None) or error}") from error
+
+
+def _fetch(address: str, target: Path, limit_bytes: int, timeout_s: float, progress: Progress) -> None:
+    request = urllib.request.Request(address, headers={"User-Agent": "birdslam"})
+    opener = urllib.request.build_opener(_Redirects)
+    with opener.open(request, timeout=timeout_s) as response, target.open("wb") as file:
+        announced = response.headers.get("Content-Length")
+        total_bytes = int(announced) if announced is not None and announced.isdigit() else None
+        if total_bytes is not None and total_bytes > limit_bytes:
+            raise DownloadError(f"{address}: {total_bytes} bytes are over the limit of {limit_bytes}")
+        got_bytes = 0
+        while chunk := response.read(CHUNK_BYTES):
+            got_bytes += len(chunk)
+            if got_bytes > limit_bytes:
+                raise DownloadError(f"{address}: more than the limit of {limit_bytes} bytes")
+            file.write(chunk)
+            progress(got_bytes, total_bytes)
+        if total_bytes is not None and got_bytes < total_bytes:
+            raise DownloadError(f"{address}: broke off after {got_bytes} of {total_bytes} bytes")
+
+
+class _Redirects(urllib.request.HTTPRedirectHandler):
+    """Follows a server to another web address, and to nothing else."""
+
+    def redirect_request(self, request: Any, file: Any, code: Any, message: Any, headers: Any, address: str) -> Any:
+        if urlsplit(address).scheme not in SCHEMES:
+            raise DownloadError(f"{request.full_url}: leads to {address}, which is no {' or '.join(SCHEMES)} address")
+        return super().redirect_request(request, file, code, message, headers, address)
+
+
+def on_terminal(name: str) -> Progress:
+    """Progress as one line on standard error that is written over; nothing where that is no terminal."""
+
+    def show(got_bytes: int, total_bytes: int | None) -> None:
+        if sys.stderr.isatty():
+            share = f" of {total_bytes / 1e6:.1f}" if total_bytes else ""
+            end = "\n" if got_bytes == total_bytes else ""
+            print(f"\r{name}: {got_bytes / 1e6:.1f}{share} MB", end=end, file=sys.stderr, flush=True)
+
+    return show
