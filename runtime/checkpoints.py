@@ -1,0 +1,69 @@
+"""The optimizer's last checkpoints, in a file of the vehicle's runtime directory that outlives a kill -9 of it.
+
+The file is mapped, so that a store is a copy in memory. Two places take turns, and a place's number is written last:
+whatever a kill cuts short, the other one is whole. (What is inside is checked by `PoseGraph.restore`.)
+"""
+
+from __future__ import annotations
+
+import logging
+import mmap
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+MOST_BYTES = 1 << 20
+_PLACES, _HEAD_BYTES = 2, 64
+_TURN, _FRAME, _EPOCH, _BYTES = range(4)  # words of a head; _TURN is 0 where there is nothing
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A checkpoint: the last frame that is in it, and the epoch that it is of."""
+
+    frame_id: int
+    epoch: int
+    data: bytes
+
+
+class CheckpointFile:
+    """Written by the optimizer at work, read once by the one after it. Raises OSError where there is no room for it."""
+
+    def __init__(self, path: Path) -> None:
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            size = _PLACES * (_HEAD_BYTES + MOST_BYTES)
+            os.posix_fallocate(fd, 0, size)
+            memory = mmap.mmap(fd, size)
+        finally:
+            os.close(fd)
+        places = np.frombuffer(memory, dtype=np.uint8).reshape(_PLACES, _HEAD_BYTES + MOST_BYTES)
+        self._heads = [place[:_HEAD_BYTES].view(np.int64) for place in places]
+        self._bodies = [place[_HEAD_BYTES:] for place in places]
+        self._turn = max(int(head[_TURN]) for head in self._heads)
+
+    def store(self, frame_id: int, epoch: int, data: bytes) -> bool:
+        """One more, over the older of the two; False where it is too large."""
+        if len(data) > MOST_BYTES:
+            log.warning("a checkpoint of %d B is over %d B: a restart will begin a new epoch", len(data), MOST_BYTES)
+            return False
+        self._turn += 1
+        head, body = self._heads[self._turn % _PLACES], self._bodies[self._turn % _PLACES]
+        head[_TURN] = 0
+        body[: len(data)] = np.frombuffer(data, dtype=np.uint8)
+        head[_FRAME], head[_EPOCH], head[_BYTES] = frame_id, epoch, len(data)
+        head[_TURN] = self._turn
+        return True
+
+    def take(self) -> list[Kept]:
+        """What there is, the newest first. It is gone then: what a checkpoint brings about, it does not do twice."""
+        found = []
+        for head, body in sorted(zip(self._heads, self._bodies, strict=True), key=lambda place: -int(place[0][_TURN])):
+            if head[_TURN] > 0 and 0 < head[_BYTES] <= MOST_BYTES:
+                found.append(Kept(int(head[_FRAME]), int(head[_EPOCH]), body[: int(head[_BYTES])].tobytes()))
+            head[_TURN] = 0
+        return found

@@ -1,0 +1,53 @@
+"""How a session of the bus is set up: local and bounded; nothing of zenoh's defaults that opens or grows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+_URGENT_BATCHES = 16  # zenoh's largest
+_LEASE_MS = 1_000  # a stopped or unreachable peer is given up after this
+_RETRY = {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2}
+_MAX_ZENOH_BYTES = 1 << 17  # zenoh would put together 1 GiB; room for two of our largest messages
+_FILTER_BYTES = 65_000  # payload and attachment together; zenoh drops what is larger, so wire.py refuses it before
+_LOSSLESS_PATIENCE_US = 60_000_000  # how long a blocked put may wait before zenoh gives the link up
+
+
+def session_config(listen: list[Path], connect: list[Path], lossless: bool) -> zenoh.Config:
+    """Of zenoh: unix sockets alone, to listen on and to connect to."""
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        "listen/endpoints": [f"unixsock-stream/{path}" for path in listen],
+        "connect/endpoints": [f"unixsock-stream/{path}" for path in connect],
+        "connect/retry": _RETRY,
+        "connect/timeout_ms": -1,  # retry in the background for ever: the hub may come later, and again
+        "scouting/delay": 0,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "transport/link/protocols": ["unixsock-stream"],
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": _LEASE_MS,
+        # Express messages go in batches of their own: room for those of a few frames while the link's thread waits for
+        # the processor, else a burst of three is dropped.
+        "transport/link/tx/queue/size/real_time": _URGENT_BATCHES,
+        "transport/link/rx/max_message_size": _MAX_ZENOH_BYTES,
+        "adminspace/enabled": False,
+        "low_pass_filter": [
+            {
+                "id": "size",
+                "flows": ["ingress", "egress"],
+                "messages": ["put", "query", "reply"],
+                "key_exprs": ["**"],
+                "size_limit": _FILTER_BYTES,
+            }
+        ],
+    }
+    if lossless:
+        settings["transport/link/tx/queue/congestion_control/block/wait_before_close"] = _LOSSLESS_PATIENCE_US
+    config = zenoh.Config()
+    for name, value in settings.items():
+        config.insert_json5(name, json.dumps(value))
+    return config

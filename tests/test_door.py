@@ -1,0 +1,269 @@
+"""What comes late and asks: kept messages, the planner's questions, and that silence is told as such."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.se2 import SE2
+from birdslam.types import MapSnapshot, MapUpdate, TimedPose, Trajectory, VehiclePath
+from runtime.bus import Bus, BusClosed, BusError
+from runtime.client import Planner
+from runtime.configuration import Configuration, SourceConfig
+from runtime.door import Door
+from runtime.parts import map_parts, trajectory_parts, whole_map, whole_trajectory
+from runtime.questions import WAITING_QUESTIONS, Refusal, positive
+from runtime.topology import QUESTIONS, TOPICS, key_of
+from runtime.wire import Health, Part, encode
+from tests.test_bus import LIMIT_S, estimate, measurements, until
+
+CONFIGURATION = Configuration(source=SourceConfig(uri="rtsp://driver:secret@10.0.0.7/front"))
+
+
+@pytest.fixture
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("run")
+
+
+@pytest.fixture
+def join(base: Path) -> Iterator[Any]:
+    with ExitStack() as stack:
+        yield lambda node, **options: stack.enter_context(Bus("car", node, runtime_dir=base, **options))
+
+
+def at(number: int, x_m: float, y_m: float = 0.0) -> Any:
+    return msgspec.structs.replace(
+        estimate(number), t_source_ns=number * 100_000_000, T_world_ego=SE2(x_m, y_m, 0.0), epoch=3
+    )
+
+
+def test_the_last_messages_are_kept_for_those_that_come_late(join: Any) -> None:
+    join("supervisor", hub=True)
+    perceive = join("perceive")
+    out = perceive.publisher("measurements")
+    for number in range(TOPICS["measurements"].kept + 5):  # and nobody listens
+        out.put(measurements(number))
+    optimize = join("optimize")
+    perceive.declare_alive()
+    assert not optimize.wait_alive({"perceive"}, LIMIT_S)
+    kept = optimize.kept("measurements")
+    assert [message.record.frame_id for message in kept] == list(range(5, TOPICS["measurements"].kept + 5))
+    assert [message.trace.stages[-1].node for message in kept] == ["perceive"] * len(kept)
+    assert optimize.kept("estimate", timeout_s=0.2) == []  # nobody sends them
+
+
+def test_a_planner_that_comes_late_has_the_last_estimate(join: Any, base: Path) -> None:
+    join("supervisor", hub=True)
+    optimize = join("optimize")
+    out = optimize.publisher("estimate")
+    said = optimize.publisher("health/optimize")
+    optimize.declare_alive()
+    out.put(estimate(41))
+    said.put(Health(node="optimize", t_ns=5, frames=7))
+    with Planner("car", base) as planner:
+        until(lambda: planner.latest().estimate is not None, "the last estimate")
+        reading = planner.latest()
+        assert reading.estimate is not None
+        assert reading.estimate.frame_id == 41
+        assert reading.alive
+        health = planner.health("optimize")
+        assert health is not None
+        assert (health.node, health.frames) == ("optimize", 7)
+        assert planner.health("capture", timeout_s=0.2) is None
+
+
+def test_what_planners_ask_for(join: Any, base: Path) -> None:
+    door = Door(CONFIGURATION, hub := join("supervisor", hub=True))
+    with Planner("car", base) as planner:
+        hub.declare_alive()
+        until(lambda: "supervisor" in planner._bus.alive, "the supervisor")
+        with pytest.raises(BusError, match="there is no map yet"):
+            planner.map()
+        for number in range(50):
+            door.add(at(number, float(number)))
+            door.add_map(MapUpdate(epoch=3, frame_id=number, lanes_m=((float(number), 2.0),)))
+        chart = planner.map()
+        assert chart is not None
+        assert (chart.epoch, chart.frame_id) == (3, 49)
+        assert sorted(chart.lanes_m) == [(float(number), 2.0) for number in range(50)]
+        way = planner.trajectory()
+        assert way is not None
+        assert [pose.T_world_body.x_m for pose in way.ego] == [float(number) for number in range(50)]
+        lately = planner.trajectory(last_s=1.0)
+        assert lately is not None
+        assert [pose.frame_id for pose in lately.ego] == list(range(39, 50))
+        for wrong in (0.0, -1.0, math.nan, math.inf):
+            with pytest.raises(BusError, match="last_s"):
+                planner.trajectory(last_s=wrong)
+        told = planner.configuration()
+        assert told is not None
+        assert told["source"]["uri"] == "rtsp://10.0.0.7/front"
+        assert msgspec.convert(told, Configuration).slam == CONFIGURATION.slam
+        assert "secret" not in str(told)
+
+
+def test_a_long_drive_is_answered_in_parts_that_fit(join: Any, base: Path) -> None:
+    door = Door(Configuration(), hub := join("supervisor", hub=True))
+    with Planner("car", base) as planner:
+        hub.declare_alive()
+        until(lambda: "supervisor" in planner._bus.alive, "the supervisor")
+        for number in range(3000):
+            door.add(at(number, float(number)))
+            points = tuple((number + 0.3 * k, float(k)) for k in range(4))
+            door.add_map(MapUpdate(epoch=3, frame_id=number, lanes_m=points, landmarks_m=points))
+        way, chart = planner.trajectory(timeout_s=LIMIT_S), planner.map(timeout_s=LIMIT_S)
+        assert way is not None
+        assert chart is not None
+        assert way == door._atlas.trajectory()
+        assert chart == door._atlas.map()
+        assert len(encode_all(map_parts(chart))) > 5
+
+
+def encode_all(parts: Any) -> list[bytes]:
+    return [encode(part) for part in parts]
+
+
+points = st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)), max_size=30)
+
+
+@given(st.integers(0, 4500), st.integers(0, 2500))
+def test_a_map_is_whole_again(landmarks: int, lanes: int) -> None:
+    chart = MapSnapshot(
+        epoch=1,
+        frame_id=2,
+        landmarks_m=tuple((float(k), 0.1) for k in range(landmarks)),
+        lanes_m=tuple((float(k), 0.2) for k in range(lanes)),
+    )
+    parts = map_parts(chart)
+    assert whole_map(parts) == chart
+    assert len(encode_all(parts)) == max(1, -(-max(landmarks, lanes) // 1000))
+
+
+@given(st.integers(0, 2000), st.lists(st.integers(0, 64), max_size=64))
+def test_a_trajectory_is_whole_again(ego: int, vehicles: list[int]) -> None:
+    def poses(count: int) -> tuple[TimedPose, ...]:
+        return tuple(TimedPose(k, k * 10**17 // 5000, SE2(k + 0.1, 0.2, 0.3)) for k in range(count))
+
+    way = Trajectory(
+        epoch=1,
+        frame_id=2,
+        t_source_ns=3,
+        ego=poses(ego),
+        vehicles=tuple(VehiclePath(vehicle=n, poses=poses(count)) for n, count in enumerate(vehicles)),
+    )
+    parts = trajectory_parts(way)
+    assert whole_trajectory(parts) == way
+    assert encode_all(parts)
+
+
+def test_who_asks_for_everything_gets_nothing(join: Any) -> None:
+    door = Door(Configuration(), hub := join("supervisor", hub=True))
+    door.add(at(1, 0.0))
+    guest = join("guest")
+    hub.declare_alive()
+    assert not guest.wait_alive({"supervisor"}, LIMIT_S)
+    assert guest.ask("map")
+    for selector in ("birdslam/car/v1/*", "birdslam/**", "**"):
+        assert [r for r in guest._session.get(selector, timeout=0.3) if r.ok is not None] == []
+
+
+def test_a_part_that_is_lost_is_told(join: Any) -> None:
+    hub, guest = join("supervisor", hub=True), join("guest")
+    key, answers = key_of("car", "map"), [(encode(MapSnapshot(epoch=1, frame_id=2)), encode(Part(1, 3)))]
+
+    def answer(query: zenoh.Query) -> None:
+        for data, attachment in answers:
+            query.reply(key, data, attachment=attachment)
+        query.drop()
+
+    queryable = hub._session.declare_queryable(key, answer)
+    hub.declare_alive()
+    assert not guest.wait_alive({"supervisor"}, LIMIT_S)
+    with pytest.raises(BusError, match="map: 1 of the answer's 3 parts came"):
+        guest.ask("map")
+    for data, attachment in ((b"\xc1", encode(Part())), (answers[0][0], b"\x92\x00\x00")):
+        answers[:] = [(data, attachment)]
+        with pytest.raises(BusError, match="map: the answer is malformed"):
+            guest.ask("map")
+    answers.clear()
+    assert guest.ask("map") == []
+    queryable.undeclare()
+
+
+def test_a_flood_of_questions_is_answered_in_part_and_harms_nothing(join: Any, base: Path) -> None:
+    door = Door(Configuration(), hub := join("supervisor", hub=True))
+    door.add(at(1, 0.0))
+    with Planner("car", base) as planner:
+        hub.declare_alive()
+        until(lambda: "supervisor" in planner._bus.alive, "the supervisor")
+        with door._turn:  # the desk can't answer now
+            handlers = [
+                planner._bus._session.get(key_of("car", "trajectory"), zenoh.handlers.FifoChannel(8), timeout=LIMIT_S)
+                for _ in range(10 * WAITING_QUESTIONS)
+            ]
+            time.sleep(0.2)
+        answered = sum(any(reply.ok is not None for reply in handler) for handler in handlers)
+        assert 1 <= answered <= 2 * WAITING_QUESTIONS
+        assert planner.trajectory() is not None
+
+
+def test_a_refusal_names_the_parameter() -> None:
+    assert positive({}, "last_s") is None
+    assert positive({"last_s": "2.5"}, "last_s") == 2.5
+    for text in ("", "x", "nan", "inf", "-1", "0", "9" * 500):
+        with pytest.raises(Refusal, match="last_s"):
+            positive({"last_s": text}, "last_s")
+
+
+def test_every_question_has_an_answer(join: Any) -> None:
+    asked: dict[str, Any] = {}
+
+    class Hub:
+        def desk(self, answers: dict[str, Any]) -> None:
+            asked.update(answers)
+
+    Door(Configuration(), Hub())  # type: ignore[arg-type]
+    assert set(asked) == set(QUESTIONS)
+
+
+def test_silence_is_told_as_such(join: Any, base: Path) -> None:
+    """Fresh, then nothing, then fresh again: each is a reading."""
+    join("supervisor", hub=True)
+    optimize = join("optimize")
+    out = optimize.publisher("estimate")
+    with Planner("car", base) as planner:
+        readings = planner.estimates(max_age_ms=100.0)
+        nothing = next(readings)
+        assert (nothing.estimate, nothing.on_time, nothing.usable) == (None, False, False)
+        assert out.wait_matched(LIMIT_S)
+        optimize.declare_alive()
+        until(lambda: planner.latest().alive, "the optimizer")
+        out.put(estimate(1))
+        fresh = next(reading for reading in readings if reading.estimate is not None)
+        assert fresh.estimate is not None
+        assert fresh.estimate.frame_id == 1
+        stale = next(readings)
+        assert stale.estimate == fresh.estimate
+        assert stale.alive
+        assert not stale.on_time
+        assert stale.age_ms > 100.0
+        assert not next(readings).on_time  # and again
+        out.put(estimate(2))
+        again = next(readings)
+        while again.estimate is None or again.estimate.frame_id != 2:
+            again = next(readings)
+        planner.close()
+        assert list(itertools.islice(readings, 3)) == []
+        with pytest.raises(BusClosed):
+            planner.wait(0.0)

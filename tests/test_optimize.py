@@ -1,0 +1,299 @@
+"""The optimizer's process on its own: frames that perceive does not answer, and what a restart takes up."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from birdslam.graph import PoseGraph
+from birdslam.simulation.drive import DriveConfig, drive
+from birdslam.types import INVALIDATING, Estimate, FrameRef, Measurements, Status
+from runtime.bus import Message
+from runtime.checkpoints import MOST_BYTES, CheckpointFile
+from runtime.coasting import Announced, Overdue, deadline_ns, unmeasured
+from runtime.configuration import BudgetsConfig, Configuration, DegradationConfig, RuntimeConfig, SourceConfig
+from runtime.optimize import OptimizeNode
+from runtime.restarts import FIRST, Assignment, Resume
+from runtime.wire import Trace
+
+MS = 1_000_000
+DRIVE = drive(DriveConfig(frames=60, vehicles=3, traffic="convoy"), 1).measurements
+CALM = Configuration().slam
+
+
+class Inbox:
+    dropped = malformed = 0
+
+    def __init__(self) -> None:
+        self.messages: deque[Message] = deque()
+
+    def recv(self, timeout_s: float | None = None) -> Message | None:
+        return self.messages.popleft() if self.messages else None
+
+
+class Bus:
+    """One that a test fills; `past` is what perceive still has."""
+
+    def __init__(self, past: tuple[Measurements, ...] = (), alive: bool = True) -> None:
+        self.inboxes: dict[str, Inbox] = {}
+        self._past, self._alive = past, alive
+
+    def subscriber(self, topic: str, depth: int | None = None) -> Inbox:
+        return self.inboxes.setdefault(topic, Inbox())
+
+    def wait_alive(self, nodes: set[str], timeout_s: float) -> set[str]:
+        return set() if self._alive else set(nodes)
+
+    def kept(self, topic: str, timeout_s: float) -> list[Message]:
+        return [Message(record, Trace(), 0) for record in self._past]
+
+
+def configuration(place: Path | None, **changes: Any) -> Configuration:
+    runtime = RuntimeConfig(runtime_dir=str(place or ""), checkpoint_ms=1e-3)
+    return Configuration(vehicle="test", runtime=runtime, **changes)
+
+
+def ref(frame_id: int, t_capture_ns: int = 0, status: tuple[Status, ...] = ()) -> FrameRef:
+    return FrameRef(
+        frame_id=frame_id,
+        t_source_ns=DRIVE[0].t_source_ns + frame_id * 30 * MS,
+        t_capture_ns=t_capture_ns,
+        t_utc_ns=0,
+        status=status,
+    )
+
+
+def announce(bus: Bus, frame_id: int, t_capture_ns: int) -> None:
+    bus.inboxes["frame"].messages.append(Message(ref(frame_id, t_capture_ns), Trace(), t_capture_ns))
+
+
+def estimates(node: OptimizeNode, record: Any) -> list[Estimate]:
+    return [made for made in node.step(record) if isinstance(made, Estimate)]
+
+
+def alone(records: list[Measurements], epoch: int = 0) -> list[Estimate]:
+    graph = PoseGraph(CALM.graph, CALM.weights, epoch)
+    return [graph.update(record) for record in records]
+
+
+# --- frames without measurements ---
+
+
+def test_a_frame_is_overdue_when_its_estimate_could_not_come_in_time() -> None:
+    budgets = BudgetsConfig(end_to_end_ms=150.0, optimize_ms=12.0, optimize_to_planner_ms=8.0)
+    assert deadline_ns(Configuration(budgets=budgets)) == 130 * MS
+    announced = Announced(130 * MS)
+    assert announced.wait_s(0) == pytest.approx(0.13)
+    for frame_id in range(3):
+        announced.add(Message(ref(frame_id, 1000 * MS + frame_id * 30 * MS), Trace(), 0))
+    assert announced.wait_s(1100 * MS) == pytest.approx(0.03)
+    assert announced.overdue(1129 * MS) is None
+    late = announced.overdue(1165 * MS)  # of two that are, the newer one
+    assert late is not None
+    assert late.record.ref.frame_id == 1
+    assert announced.overdue(1165 * MS) is None
+    announced.answered(7)
+    assert announced.overdue(10_000 * MS) is None
+
+
+def test_the_end_of_the_source_is_no_frame_to_wait_for() -> None:
+    announced = Announced(MS)
+    announced.add(Message(ref(0, 0, (Status.END_OF_SOURCE,)), Trace(), 0))
+    assert announced.overdue(10**12) is None
+
+
+def test_a_silent_perceive_is_coasted_over_and_then_given_up(tmp_path: Path) -> None:
+    bus = Bus()
+    node = OptimizeNode(configuration(tmp_path, degradation=DegradationConfig(coast_max_ms=100.0)), bus)  # type: ignore[arg-type]
+    measured = [made for record in DRIVE[:20] for made in estimates(node, record)]
+    assert measured == alone(list(DRIVE[:20]))
+    coasted = []
+    for frame_id in range(20, 26):
+        announce(bus, frame_id, time.monotonic_ns() - 1000 * MS)
+        late = node.receive(0.0)
+        assert late is not None
+        assert isinstance(late.record, Overdue)
+        coasted += estimates(node, late.record)
+    assert [made.frame_id for made in coasted] == list(range(20, 26))
+    assert all({Status.COASTING, Status.PERCEPTION_LATE} <= set(made.status) for made in coasted)
+    spread = [made.cov[0] + made.cov[4] for made in (measured[-1], *coasted)]
+    assert spread == sorted(set(spread))  # it grows with each
+    since_ns = [made.t_source_ns - measured[-1].t_source_ns for made in coasted]
+    assert [Status.COASTED_TOO_LONG in made.status for made in coasted] == [since > 100 * MS for since in since_ns]
+    assert [made.valid for made in coasted] == [since <= 100 * MS for since in since_ns]
+    assert node.mode == "coasting"
+    assert node.counters()["coasted"] == 6
+    assert estimates(node, DRIVE[26])[0].frame_id == 26
+    assert node.mode == "full"
+
+
+def test_what_was_invalid_stays_so_while_nobody_looks() -> None:
+    last = msgspec.structs.replace(alone(list(DRIVE[:2]))[-1], status=(Status.STANDSTILL, Status.SCALE_INVALID))
+    told = unmeasured(ref(2), last, 10**12)
+    assert told.status == (Status.COASTING, Status.PERCEPTION_LATE, Status.SCALE_INVALID)
+    assert Status.NOT_INITIALISED in unmeasured(ref(2), None, 10**12).status
+    assert Status.FRAME_UNREADABLE in unmeasured(ref(2, 0, (Status.FRAME_UNREADABLE,)), last, 10**12).status
+
+
+def test_at_rate_max_every_frame_is_waited_for() -> None:
+    bus = Bus()
+    OptimizeNode(Configuration(source=SourceConfig(rate="max")), bus)  # type: ignore[arg-type]
+    assert set(bus.inboxes) == {"measurements"}
+
+
+def test_late_measurements_correct_what_was_told(tmp_path: Path) -> None:
+    node = OptimizeNode(configuration(tmp_path), Bus())  # type: ignore[arg-type]
+    for record in DRIVE[:10]:
+        estimates(node, record)
+    goal = alone(list(DRIVE[:14]))
+    (guessed,) = estimates(node, Overdue(ref(12)))
+    (better,) = estimates(node, DRIVE[10])  # two frames behind: of the newest that was told, from where this one is
+    assert (guessed.frame_id, better.frame_id) == (12, 12)
+    assert Status.PERCEPTION_LATE in better.status
+    assert better.T_world_ego == goal[10].T_world_ego != guessed.T_world_ego
+    assert node.counters()["outrun"] == 1
+    assert estimates(node, DRIVE[11])[0].frame_id == 12
+    assert estimates(node, DRIVE[12]) == [goal[12]]  # the same frame again, and now measured
+    assert estimates(node, DRIVE[13]) == [goal[13]]
+
+
+@given(st.lists(st.integers(0, 9), min_size=40, max_size=40), st.integers(0, 2**32))
+@settings(max_examples=30)
+def test_frames_never_go_back_and_the_graph_never_notices(lateness: list[int], seed: int) -> None:
+    """Measurements come in their order, each so many frames late; a frame is coasted over when it has waited two."""
+    node = OptimizeNode(Configuration(source=SourceConfig(rate="max")), Bus())  # type: ignore[arg-type]
+    goal = alone(list(DRIVE[:40]))
+    told: list[Estimate] = []
+    waiting: deque[int] = deque()
+    due = 0
+    for frame_id in range(60):
+        if frame_id < 40:
+            waiting.append(frame_id)
+            due = max(due, frame_id + lateness[frame_id])
+        if waiting and frame_id - waiting[0] >= 2 and frame_id - 2 > (told[-1].frame_id if told else -1):
+            told += estimates(node, Overdue(ref(min(frame_id - 2, 39))))
+        while waiting and waiting[0] + lateness[waiting[0]] <= frame_id:
+            told += estimates(node, DRIVE[waiting.popleft()])
+    frames = [made.frame_id for made in told]
+    assert frames == sorted(frames)
+    measured = [made for made in told if Status.PERCEPTION_LATE not in made.status]
+    assert all(made == goal[made.frame_id] for made in measured)
+    assert all(made.valid == INVALIDATING.isdisjoint(made.status) for made in told)
+    assert node._graph.update(DRIVE[40]) == alone(list(DRIVE[:41]))[40]
+
+
+# --- restarts ---
+
+
+def after(frame_id: int) -> Assignment:
+    """What the next process is told when that frame was the last one sent."""
+    return Assignment(1, "was killed by SIGKILL", Resume(frame_id + 1, 0, 0))
+
+
+def killed_at(place: Path, frames: int) -> list[Estimate]:
+    node = OptimizeNode(configuration(place), Bus())  # type: ignore[arg-type]
+    return [made for record in DRIVE[:frames] for made in estimates(node, record)]
+
+
+def test_a_killed_optimizer_goes_on_as_if_nothing_had_been(tmp_path: Path) -> None:
+    before = killed_at(tmp_path, 20)
+    bus = Bus(past=DRIVE[5:23])
+    node = OptimizeNode(configuration(tmp_path), bus, after(19))  # type: ignore[arg-type]
+    bus.inboxes["measurements"].messages.extend(Message(record, Trace(), 0) for record in DRIVE[21:30])  # some twice
+    told: list[Estimate] = []
+    while (message := node.receive(0.0)) is not None:
+        told += estimates(node, message.record)
+    assert Status.GRAPH_RESTORED in told[0].status
+    told[0] = msgspec.structs.replace(told[0], status=tuple(s for s in told[0].status if s != Status.GRAPH_RESTORED))
+    assert before + told == alone(list(DRIVE[:30]))
+
+
+def test_measurements_since_an_older_checkpoint_are_taken_up_and_not_told_twice(tmp_path: Path) -> None:
+    killed_at(tmp_path, 15)
+    node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[:23]), after(19))  # type: ignore[arg-type]
+    told = []
+    while (message := node.receive(0.0)) is not None:
+        told += estimates(node, message.record)
+    assert [made.frame_id for made in told] == [20, 21, 22]
+    assert [made.T_world_ego for made in told] == [made.T_world_ego for made in alone(list(DRIVE[:23]))[20:]]
+
+
+@pytest.mark.parametrize("gap", ["perceive is gone", "too long", "nothing kept"])
+def test_a_gap_in_the_measurements_begins_a_new_epoch(tmp_path: Path, gap: str) -> None:
+    killed_at(tmp_path, 20)
+    bus = Bus(alive=gap != "perceive is gone", past=DRIVE[25:30] if gap == "too long" else ())
+    node = OptimizeNode(configuration(tmp_path), bus, after(19))  # type: ignore[arg-type]
+    message = node.receive(0.0)
+    (first,) = estimates(node, DRIVE[30] if message is None else message.record)
+    assert Status.GRAPH_RESET in first.status
+    assert first.epoch == 1
+
+
+def test_a_checkpoint_of_an_older_epoch_is_not_taken_up(tmp_path: Path) -> None:
+    node = OptimizeNode(configuration(tmp_path), Bus())  # type: ignore[arg-type]
+    for record in DRIVE[:10]:
+        estimates(node, record)
+    node._checkpoint_ns = 10**15
+    node._keep(9)
+    for made in (msgspec.structs.replace(DRIVE[20], cc=None), *DRIVE[21:23]):
+        assert estimates(node, made)[0].epoch == 1
+    again = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[10:23]), after(22))  # type: ignore[arg-type]
+    (first,) = estimates(again, DRIVE[23])
+    assert (first.epoch, Status.GRAPH_RESET in first.status) == (2, True)
+
+
+def test_a_first_process_and_another_configuration_begin_anew(tmp_path: Path) -> None:
+    killed_at(tmp_path, 20)
+    other = msgspec.structs.replace(CALM, graph=msgspec.structs.replace(CALM.graph, ego_nodes=7))
+    node = OptimizeNode(configuration(tmp_path, slam=other), Bus(past=DRIVE[15:23]), after(19))  # type: ignore[arg-type]
+    assert (node._graph.epoch, node.receive(0.0)) == (1, None)
+    killed_at(tmp_path, 20)
+    node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[15:23]), FIRST)  # type: ignore[arg-type]
+    assert node.receive(0.0) is None
+    assert node._graph.epoch > 1
+
+
+def test_a_checkpoint_brings_nobody_down_twice(tmp_path: Path) -> None:
+    killed_at(tmp_path, 20)
+    for restored in (True, False):  # the first of them dies before it has kept another
+        node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[15:23]), after(19))  # type: ignore[arg-type]
+        assert (node._graph.epoch == 0) == restored
+
+
+# --- the file ---
+
+
+def test_whatever_a_kill_cuts_short_the_other_checkpoint_is_whole(tmp_path: Path) -> None:
+    file = CheckpointFile(tmp_path / "c")
+    assert file.take() == []
+    for number in range(5):
+        assert file.store(number, 7, bytes([number]) * 100)
+    assert [(kept.frame_id, kept.epoch, kept.data) for kept in CheckpointFile(tmp_path / "c").take()] == [
+        (4, 7, b"\4" * 100),
+        (3, 7, b"\3" * 100),
+    ]
+    assert CheckpointFile(tmp_path / "c").take() == []
+    file.store(5, 7, b"a")
+    file.store(6, 7, b"b")
+    file._heads[file._turn % 2][0] = 0  # killed in the middle of it
+    assert [kept.data for kept in CheckpointFile(tmp_path / "c").take()] == [b"a"]
+    assert not file.store(7, 7, bytes(MOST_BYTES + 1))
+    assert (tmp_path / "c").stat().st_mode & 0o777 == 0o600
+
+
+def test_a_torn_checkpoint_is_passed_over(tmp_path: Path) -> None:
+    killed_at(tmp_path, 20)
+    file = CheckpointFile(tmp_path / "test" / "checkpoint")
+    file._bodies[file._turn % 2][200:230] = 77
+    node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[10:23]), after(19))  # type: ignore[arg-type]
+    assert node._graph.epoch == 0  # the one before it
+    message = node.receive(0.0)
+    assert message is not None
+    assert message.record.frame_id == 19
