@@ -1,0 +1,78 @@
+"""A file that only grows, from a thread of its own: whoever writes never waits for the disk."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import deque
+from pathlib import Path
+
+WAITING_BYTES = 1 << 26  # behind a disk that stalls; then `write` waits
+
+
+class AppendOnlyFile:
+    """Pieces of a file, each written whole or cut off again, and brought to the disk (fdatasync) one after the other.
+
+    What was written survives a kill -9 of this process, what was synced a power cut. A disk that fails (it is full)
+    ends it: `error` says why, the file ends with its last whole piece, and later pieces are thrown away.
+    Raises OSError where the file can't be made, FileExistsError where there is one.
+    """
+
+    def __init__(self, path: Path, sync: bool = True) -> None:
+        self.error: OSError | None = None
+        self.written_bytes = 0
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._sync = sync
+        self._pieces: deque[bytes] = deque()
+        self._waiting_bytes = 0
+        self._closed = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="disk", daemon=True)
+        self._thread.start()
+
+    def write(self, piece: bytes) -> None:
+        """One piece more, as soon as the disk takes it."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting_bytes < WAITING_BYTES or self.error is not None)
+            if self.error is None:
+                self._pieces.append(piece)
+                self._waiting_bytes += len(piece)
+                self._changed.notify_all()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: bool(self._pieces) or self._closed)
+                if not self._pieces:
+                    return
+                piece = self._pieces.popleft()
+            try:
+                self._append(piece)
+            except OSError as error:
+                self._fail(error)
+            with self._changed:
+                self._waiting_bytes -= len(piece)
+                self._changed.notify_all()
+
+    def _append(self, piece: bytes) -> None:
+        if self.error is not None:
+            return
+        rest = memoryview(piece)
+        while rest:
+            rest = rest[os.write(self._fd, rest) :]
+        if self._sync:
+            os.fdatasync(self._fd)
+        self.written_bytes += len(piece)
+
+    def _fail(self, error: OSError) -> None:
+        """Takes back what of the piece was written: a torn end would only confuse readers."""
+        self.error = error
+        os.ftruncate(self._fd, self.written_bytes)
+
+    def close(self) -> None:
+        """Waits until all is written."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join()
+        os.close(self._fd)

@@ -1,0 +1,17 @@
+"""What every process that the supervisor starts does first."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+
+LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
+_PR_SET_PDEATHSIG = 1
+
+
+def die_with(parent_pid: int) -> None:
+    """A supervisor that is killed takes its processes along: they are sent SIGTERM."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent_pid:
+        raise SystemExit(0)

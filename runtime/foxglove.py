@@ -1,0 +1,201 @@
+"""The types of Foxglove that a recording uses (https://docs.foxglove.dev, "Message schemas"), and their JSON schemas.
+
+Each struct bears the name and the fields of the Foxglove type; bytes become base64, as its schemas have it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+FLOAT32 = 7  # PackedElementField's numeric type
+LINE_STRIP, LINE_LOOP = 0, 1  # LinePrimitive's types
+ALL = 1  # SceneEntityDeletion's type
+
+
+class Time(msgspec.Struct, frozen=True):
+    sec: int = 0
+    nsec: int = 0
+
+
+class Color(msgspec.Struct, frozen=True):
+    r: float
+    g: float
+    b: float
+    a: float = 1.0
+
+
+WHITE, CLEAR = Color(1.0, 1.0, 1.0), Color(0.0, 0.0, 0.0, 0.0)
+
+
+class Point2(msgspec.Struct, frozen=True):
+    x: float
+    y: float
+
+
+class Vector3(msgspec.Struct, frozen=True):
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+
+class Quaternion(msgspec.Struct, frozen=True):
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    w: float = 1.0
+
+
+class FoxglovePose(msgspec.Struct, frozen=True):
+    position: Vector3 = Vector3()
+    orientation: Quaternion = Quaternion()
+
+
+class FrameTransform(msgspec.Struct, frozen=True, kw_only=True):
+    timestamp: Time
+    parent_frame_id: str
+    child_frame_id: str
+    translation: Vector3
+    rotation: Quaternion
+
+
+class PoseInFrame(msgspec.Struct, frozen=True, kw_only=True):
+    timestamp: Time
+    frame_id: str
+    pose: FoxglovePose
+
+
+class CubePrimitive(msgspec.Struct, frozen=True, kw_only=True):
+    pose: FoxglovePose
+    size: Vector3
+    color: Color
+
+
+class LinePrimitive(msgspec.Struct, frozen=True, kw_only=True):
+    type: int
+    pose: FoxglovePose = FoxglovePose()
+    thickness: float = 0.1
+    scale_invariant: bool = False
+    points: tuple[Vector3, ...]
+    color: Color
+    colors: tuple[Color, ...] = ()
+    indices: tuple[int, ...] = ()
+
+
+class TextPrimitive(msgspec.Struct, frozen=True, kw_only=True):
+    pose: FoxglovePose
+    billboard: bool = True
+    font_size: float = 0.8
+    scale_invariant: bool = False
+    color: Color = WHITE
+    text: str
+
+
+class SceneEntity(msgspec.Struct, frozen=True, kw_only=True):
+    timestamp: Time
+    frame_id: str
+    id: str
+    lifetime: Time = Time()
+    frame_locked: bool = False
+    cubes: tuple[CubePrimitive, ...] = ()
+    lines: tuple[LinePrimitive, ...] = ()
+    texts: tuple[TextPrimitive, ...] = ()
+
+
+class SceneEntityDeletion(msgspec.Struct, frozen=True, kw_only=True):
+    timestamp: Time
+    type: int
+    id: str = ""
+
+
+class SceneUpdate(msgspec.Struct, frozen=True, kw_only=True):
+    deletions: tuple[SceneEntityDeletion, ...]
+    entities: tuple[SceneEntity, ...]
+
+
+class PackedElementField(msgspec.Struct, frozen=True):
+    name: str
+    offset: int
+    type: int = FLOAT32
+
+
+class PointCloud(msgspec.Struct, frozen=True, kw_only=True):
+    timestamp: Time
+    frame_id: str
+    pose: FoxglovePose = FoxglovePose()
+    point_stride: int = 12
+    fields: tuple[PackedElementField, ...] = tuple(PackedElementField(name, 4 * i) for i, name in enumerate("xyz"))
+    data: bytes
+
+
+class CompressedImage(msgspec.Struct, frozen=True, kw_only=True):
+    timestamp: Time
+    frame_id: str
+    data: bytes
+    format: str
+
+
+class CameraCalibration(msgspec.Struct, frozen=True, kw_only=True):
+    timestamp: Time
+    frame_id: str
+    width: int
+    height: int
+    distortion_model: str = "plumb_bob"
+    D: tuple[float, ...] = ()
+    K: tuple[float, ...]
+    R: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    P: tuple[float, ...]
+
+
+class PointsAnnotation(msgspec.Struct, frozen=True, kw_only=True):
+    timestamp: Time
+    type: int = 2  # LINE_LOOP
+    points: tuple[Point2, ...]
+    outline_color: Color
+    outline_colors: tuple[Color, ...] = ()
+    fill_color: Color = CLEAR
+    thickness: float = 2.0
+
+
+class TextAnnotation(msgspec.Struct, frozen=True, kw_only=True):
+    timestamp: Time
+    position: Point2
+    text: str
+    font_size: float = 12.0
+    text_color: Color = WHITE
+    background_color: Color = Color(0.0, 0.0, 0.0, 0.5)
+
+
+class ImageAnnotations(msgspec.Struct, frozen=True, kw_only=True):
+    circles: tuple[()] = ()
+    points: tuple[PointsAnnotation, ...]
+    texts: tuple[TextAnnotation, ...]
+
+
+def schema(record: type[msgspec.Struct]) -> bytes:
+    """The JSON schema of a struct as Foxglove takes it: an object at the top, internal references, no unions."""
+    (top,), parts = msgspec.json.schema_components([record], ref_template="#/$defs/{name}")
+    name = str(top["$ref"]).rpartition("/")[2]
+    inner = {key: part for key, part in parts.items() if key != name}
+    return msgspec.json.encode(_simple({**parts[name], **({"$defs": inner} if inner else {})}))
+
+
+def _simple(part: Any) -> Any:
+    """Tuples of one type as arrays, what may be null as what it is else, enumerations as strings."""
+    if isinstance(part, list):
+        return [_simple(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    if "anyOf" in part:
+        (kept,) = [choice for choice in part["anyOf"] if choice.get("type") != "null"]
+        return _simple(kept)
+    part = {key: value for key, value in part.items() if key not in ("default", "examples")}
+    if "prefixItems" in part:
+        first, *others = part.pop("prefixItems")
+        if any(other != first for other in others):
+            return {"type": "array"}
+        part["items"] = first
+    if "enum" in part:
+        part = {"type": "string"}
+    return {key: _simple(value) for key, value in part.items()}

@@ -1,0 +1,151 @@
+"""A recording that is made frame by frame, with an optimizer that a test holds in its hand."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from birdslam.camera import Camera
+from birdslam.simulation.drive import DriveConfig, drive
+from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
+from runtime.bus import Message
+from runtime.capture import stamps
+from runtime.checkpoints import CheckpointFile
+from runtime.coasting import Overdue
+from runtime.configuration import Configuration, RuntimeConfig
+from runtime.optimize import OptimizeNode
+from runtime.presence import runtime_dir_of
+from runtime.recorder import about
+from runtime.recording import Alive, RecordingWriter
+from runtime.restarts import FIRST, Assignment, Resume
+from runtime.wire import Stage, Trace
+
+CAMERA = Camera(640, 192, 360.0, 360.0, 320.0, 96.0, 1.65)
+
+
+def measured(frames: int, seed: int = 1) -> list[Measurements]:
+    """A drive among vehicles, with lanes and landmarks; its stamps are those of a camera of 33 Hz."""
+    config = DriveConfig(frames=frames, vehicles=4, landmarks=12)
+    return [
+        msgspec.structs.replace(m, t_capture_ns=m.t_source_ns, t_utc_ns=10**18 + m.t_source_ns)
+        for m in drive(config, seed).measurements
+    ]
+
+
+class Perceive:
+    """What the optimizer sees of perceive, and of the bus: nothing comes by itself."""
+
+    dropped = malformed = 0
+
+    def __init__(self) -> None:
+        self.sent: deque[Message] = deque(maxlen=96)
+
+    def subscriber(self, topic: str, depth: int | None = None) -> Perceive:
+        return self
+
+    def recv(self, timeout_s: float | None = None) -> None:
+        return None
+
+    def wait_alive(self, nodes: Any, timeout_s: float) -> set[str]:
+        return set()
+
+    def kept(self, topic: str, timeout_s: float = 0.0) -> list[Message]:
+        return list(self.sent)
+
+
+class Tape:
+    """Writes down what an optimizer makes of measurements; says what of it never came to the recorder."""
+
+    def __init__(self, place: Path, **config: Any) -> None:
+        self.path = place / "drive.mcap"
+        runtime = RuntimeConfig(runtime_dir=str(place / "rt"), checkpoint_ms=1e-3)
+        self.configuration = Configuration(vehicle="tape", camera=CAMERA, runtime=runtime, **config)
+        (place / "rt").mkdir(mode=0o700, parents=True)
+        self.writer = RecordingWriter(self.path, about(self.configuration, {}), CAMERA, flush_ms=1e-3, sync=False)
+        self.perceive = Perceive()
+        self.estimates: list[Estimate] = []
+        self._told: FrameRef | Measurements | None = None
+        self._restarts = 0
+        self._now_ns = 0
+        self._begin(FIRST)
+
+    def _begin(self, assignment: Assignment) -> None:
+        self.writer.draw("/alive", Alive(node="optimize", alive=True), self._tick())
+        self.node = OptimizeNode(self.configuration, self.perceive, assignment)  # type: ignore[arg-type]
+
+    def _tick(self) -> int:
+        self._now_ns += 1_000_000
+        return self._now_ns
+
+    def _trace(self, *nodes: str) -> Trace:
+        return Trace(tuple(Stage(node, self._tick(), self._tick(), self._tick()) for node in nodes))
+
+    def frame(self, measurements: Measurements) -> FrameRef:
+        """Capture announces it."""
+        ref = FrameRef(**stamps(measurements))
+        self.writer.add("frame", ref, self._tick())
+        return ref
+
+    def send(self, measurements: Measurements, recorded: bool = True) -> Message:
+        """Perceive sends measurements."""
+        message = Message(measurements, self._trace("capture", "perceive"), self._now_ns)
+        self.perceive.sent.append(message)
+        if recorded:
+            self.writer.add("measurements", measurements, self._tick(), message.trace)
+        return message
+
+    def take(self, message: Message, recorded: bool = True) -> None:
+        """The optimizer takes something up."""
+        for out in self.node.step(message.record):
+            trace = message.trace.after("optimize", self._tick(), self._tick()).sent(self._tick())
+            if isinstance(out, Estimate):
+                self._told = message.record
+                self.estimates.append(out)
+            if recorded:
+                self.writer.add("estimate" if isinstance(out, Estimate) else "map", out, self._tick(), trace)
+            assert isinstance(out, Estimate | MapUpdate)
+        self.writer.flush_if_due(self._tick())
+
+    def coast(self, ref: FrameRef) -> None:
+        """A frame is overdue."""
+        self.take(Message(Overdue(ref), self._trace("capture"), self._now_ns))
+
+    def step(self, measurements: Measurements) -> None:
+        """A frame as it should be."""
+        self.frame(measurements)
+        self.take(self.send(measurements))
+
+    def restart(self, with_checkpoint: bool, noticed: bool = True) -> None:
+        """The optimizer is killed, and begun anew."""
+        self._restarts += 1
+        if not with_checkpoint:
+            CheckpointFile(runtime_dir_of("tape", self.configuration.runtime_dir) / "checkpoint").take()
+        if noticed:
+            self.writer.draw("/alive", Alive(node="optimize", alive=False), self._tick())
+        last = self.estimates[-1]
+        resume = Resume(last.frame_id + 1, last.t_source_ns, last.t_capture_ns)
+        assignment = Assignment(self._restarts, "was killed by a test", resume)
+        if noticed:
+            self._begin(assignment)
+        else:
+            self.node = OptimizeNode(self.configuration, self.perceive, assignment)  # type: ignore[arg-type]
+        while (message := self.node.receive(0.0)) is not None:
+            self.take(message)
+
+    def end(self, measurements: Measurements) -> None:
+        """END_OF_SOURCE."""
+        ended = Measurements(
+            frame_id=measurements.frame_id + 1,
+            t_source_ns=measurements.t_source_ns,
+            t_capture_ns=measurements.t_capture_ns,
+            t_utc_ns=measurements.t_utc_ns,
+            status=(Status.END_OF_SOURCE,),
+        )
+        self.take(self.send(ended))
+        self.close()
+
+    def close(self) -> None:
+        self.writer.close({})

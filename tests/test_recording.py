@@ -1,0 +1,338 @@
+"""A drive on disk: whole, cut off anywhere, damaged, on a full disk, and written beside a vehicle that goes on."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from birdslam.datasets import DatasetError, load_camera
+from birdslam.types import Estimate, Measurements
+from runtime import appendonly, scene
+from runtime.appendonly import AppendOnlyFile
+from runtime.client import Planner
+from runtime.configuration import Configuration, ConfigurationError, RecordingConfig, SourceConfig
+from runtime.foxglove import CompressedImage, schema
+from runtime.recorder import about
+from runtime.recorder_station import choose_file
+from runtime.recording import JSON_CHANNELS, Recorded, Recording, RecordingError, RecordingWriter
+from runtime.replay import compare
+from runtime.sources import open_source
+from runtime.wire import decode, encode
+from tests.taped_drive import CAMERA, Tape, measured
+from tests.test_pipeline import F_PX, HEIGHT, LIMIT_S, WIDTH, Run, call, road_image
+
+
+@pytest.fixture
+def tape(tmp_path: Path) -> Tape:
+    """A drive of 40 frames with its images, on disk in some ten chunks."""
+    tape = Tape(tmp_path, recording=RecordingConfig(file="drive.mcap", images=True))
+    for number, measurements in enumerate(measured(40)):
+        ref = tape.frame(measurements)
+        if number != 7:  # the ring had gone on
+            image = np.full((192, 640), number, dtype=np.uint8)
+            tape.writer.draw(*scene.from_image(image, 90, ref.t_utc_ns), number)
+        tape.take(tape.send(measurements))
+        for drawn in (scene.from_measurements(measurements, 0), scene.from_estimate(tape.estimates[-1], 0)):
+            for channel, message in drawn:
+                tape.writer.draw(channel, message, number)
+    tape.writer.draw("/estimate", tape.estimates[-1], 40)
+    tape.close()
+    return tape
+
+
+def messages(path: Path) -> list[Recorded]:
+    return list(Recording(path).messages())
+
+
+def test_records_come_back_byte_for_byte(tape: Tape) -> None:
+    recording = Recording(tape.path)
+    told = [message.data for message in recording.messages(("v1/estimate",))]
+    assert told == [encode(estimate) for estimate in tape.estimates]
+    assert [decode(data, Estimate) for data in told] == tape.estimates
+    given = [decode(message.data, Measurements) for message in recording.messages(("v1/measurements",))]
+    assert given == measured(40)
+    assert recording.complete
+    assert recording.damaged == 0
+
+
+def test_it_bears_all_that_a_replay_needs(tape: Tape, tmp_path: Path) -> None:
+    recording = Recording(tape.path)
+    assert msgspec.convert(recording.about.configuration, Configuration) == tape.configuration
+    assert recording.camera == CAMERA
+    assert recording.about.versions["birdslam"]
+    with tape.path.open("rb") as file:
+        attachments = {a.name: a.data for a in make_reader(file).iter_attachments()}
+    (tmp_path / "camera.toml").write_bytes(attachments["camera.toml"])
+    assert load_camera(tmp_path / "camera.toml") == CAMERA
+
+
+def test_a_password_in_the_cameras_address_is_not_recorded() -> None:
+    source = SourceConfig(uri="rtsp://user:secret@camera/stream")
+    assert b"secret" not in msgspec.json.encode(about(Configuration(source=source), {}))
+
+
+def test_other_readers_of_mcap_find_everything_by_its_index(tape: Tape) -> None:
+    with tape.path.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == len(messages(tape.path))
+        assert len(summary.chunk_indexes) > 5
+        schemas = {channel.topic: summary.schemas[channel.schema_id].name for channel in summary.channels.values()}
+        assert schemas["/camera/image"] == "foxglove.CompressedImage"
+        assert schemas["/scene"] == "foxglove.SceneUpdate"
+        assert schemas["v1/estimate"] == schemas["/estimate"] == "birdslam.Estimate"
+        last = [m.data for _, channel, m in reader.iter_messages(topics=["/estimate"]) if channel.topic == "/estimate"]
+        assert msgspec.json.decode(last[-1], type=Estimate) == tape.estimates[-1]
+
+
+def fits(value: Any, part: dict[str, Any], parts: dict[str, Any]) -> bool:
+    """Whether a message is what its schema says, in the part of JSON schema that Foxglove reads."""
+    if "$ref" in part:
+        return fits(value, parts[part["$ref"].removeprefix("#/$defs/")], parts)
+    if part["type"] == "object":
+        fields = part.get("properties")
+        if fields is None:
+            return isinstance(value, dict)
+        return set(part["required"]) <= set(value) <= set(fields) and all(
+            value[name] is None or fits(value[name], fields[name], parts) for name in value
+        )
+    if part["type"] == "array":
+        return isinstance(value, list) and ("items" not in part or all(fits(v, part["items"], parts) for v in value))
+    kinds = {"number": (int, float), "integer": int, "string": str, "boolean": bool}
+    return isinstance(value, kinds[part["type"]])
+
+
+def test_every_message_for_people_fits_its_schema(tape: Tape) -> None:
+    schemas = {name: msgspec.json.decode(schema(record)) for name, record in JSON_CHANNELS.items()}
+    assert all(top["type"] == "object" for top in schemas.values())  # Foxglove takes no other
+    seen = set()
+    for message in messages(tape.path):
+        if message.channel in schemas:
+            top = schemas[message.channel]
+            assert fits(msgspec.json.decode(message.data), top, top.get("$defs", {})), message.channel
+            seen.add(message.channel)
+    assert {"/tf", "/ego", "/scene", "/road", "/camera/boxes", "/camera/image", "/estimate", "/alive"} <= seen
+
+
+def test_cut_off_anywhere_it_is_read_up_to_there(tape: Tape) -> None:
+    whole = tape.path.read_bytes()
+    all_of_it = messages(tape.path)
+    lengths = []
+    for size in [*range(0, len(whole), len(whole) // 60), len(whole) - 1]:
+        tape.path.write_bytes(whole[:size])
+        try:
+            recording = Recording(tape.path)
+        except RecordingError:
+            assert size < 8_000  # not even the beginning
+            continue
+        found = list(recording.messages())
+        assert found == all_of_it[: len(found)]
+        assert not recording.complete or size >= len(whole) - 8  # the magic at its end
+        lengths.append(len(found))
+    assert lengths == sorted(lengths)
+    assert lengths[-1] == len(all_of_it)
+    assert len(set(lengths)) > 5
+
+
+def test_a_damaged_chunk_is_left_out_and_counted(tape: Tape) -> None:
+    data = bytearray(tape.path.read_bytes())
+    with tape.path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    middle = summary.chunk_indexes[4]
+    data[middle.chunk_start_offset + middle.chunk_length // 2] ^= 0x10
+    tape.path.write_bytes(data)
+    recording = Recording(tape.path)
+    found = list(recording.messages(("v1/estimate",)))
+    assert recording.damaged == 1
+    assert recording.complete
+    assert 0 < len(found) < 40
+
+
+@pytest.mark.parametrize("data", [b"", b"no recording", bytes(100), b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + bytes(50)])
+def test_what_is_no_recording_is_named(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"x\.mcap"):
+        Recording(path)
+    with pytest.raises(RecordingError, match="No such file"):
+        Recording(tmp_path / "none.mcap")
+
+
+def test_a_full_disk_ends_the_recording_with_its_last_whole_chunk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    room = [30_000]
+
+    def write(fd: int, data: Any) -> int:
+        size = min(len(data), room[0])
+        room[0] -= size
+        if size == 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return os_write(fd, data[:size])
+
+    os_write = os.write
+    monkeypatch.setattr(appendonly.os, "write", write)
+    tape = Tape(tmp_path)
+    for measurements in measured(80):
+        tape.step(measurements)
+    tape.close()
+    assert tape.writer.error is not None
+    assert tape.writer.error.errno == errno.ENOSPC
+    assert tape.path.stat().st_size == tape.writer.written_bytes <= 30_000
+    verdict = compare(recording := Recording(tape.path))
+    assert verdict.same
+    assert 0 < verdict.equal < 80
+    assert recording.damaged == 0
+
+
+def test_who_writes_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk that hangs holds up nothing until the memory for what waits is full."""
+    read, wrote = os.pipe()
+    monkeypatch.setattr(appendonly.os, "fdatasync", lambda fd: os.read(read, 1))
+    file = AppendOnlyFile(tmp_path / "file")
+    for _ in range(50):
+        file.write(bytes(1000))
+    os.write(wrote, bytes(100))
+    file.close()
+    assert (tmp_path / "file").stat().st_size == 50_000
+
+
+def test_recordings_are_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").touch()
+    for file, reason in (("a.mcap", "exists"), ("a.bag", "expected"), ("no/a.mcap", "there is no directory")):
+        with pytest.raises(ConfigurationError, match=reason):
+            choose_file(RecordingConfig(file=str(tmp_path / file)), "car")
+    chosen = Path(choose_file(RecordingConfig(file=str(tmp_path)), "car"))
+    assert chosen.parent == tmp_path
+    assert chosen.name.startswith("car-")
+    with pytest.raises(FileExistsError):
+        RecordingWriter(tmp_path / "a.mcap", about(Configuration(), {}), None, 100.0)
+
+
+def test_its_images_are_a_source_of_frames(tape: Tape, tmp_path: Path) -> None:
+    source = open_source(Configuration(source=SourceConfig(uri=f"mcap:{tape.path}")))
+    frames = list(source.frames())
+    assert [frame.index for frame in frames] == list(range(40))
+    assert [frame.t_source_ns for frame in frames] == [m.t_source_ns for m in measured(40)]
+    assert source.rate_hz == pytest.approx(33.0)
+    assert source.camera == CAMERA
+    for frame in frames:
+        assert (frame.image is None) == (frame.index == 7)
+        assert frame.image is None or abs(int(frame.image.mean()) - frame.index) <= 1
+    assert "was not recorded" in (frames[7].error or "")
+    strided = list(open_source(Configuration(source=SourceConfig(uri=f"mcap:{tape.path}", stride=3))).frames())
+    assert [frame.t_source_ns for frame in strided] == [frame.t_source_ns for frame in frames[::3]]
+    other = Tape(tmp_path / "other")
+    other.step(measured(1)[0])
+    other.close()
+    with pytest.raises(DatasetError, match="without images"):
+        open_source(Configuration(source=SourceConfig(uri=f"mcap:{other.path}")))
+
+
+# --- beside a vehicle: real processes ---
+
+
+@pytest.fixture(scope="module")
+def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small KITTI drive to go round and round."""
+    sequence = tmp_path_factory.mktemp("road") / "sequences" / "78"
+    (sequence / "image_0").mkdir(parents=True)
+    for number in range(12):
+        assert cv2.imwrite(str(sequence / "image_0" / f"{number:06d}.png"), road_image(0.8 * number))
+    row = f"{F_PX} 0 {WIDTH / 2} 0 0 {F_PX} {HEIGHT / 2} 0 0 0 1 0"
+    (sequence / "calib.txt").write_text(f"P0: {row}\n")
+    (sequence / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(12)))
+    return sequence
+
+
+def drive_on(planner: Planner, frames: int) -> dict[int, float]:
+    """The next so many frames that the planner hears of, and when."""
+    heard: dict[int, float] = {}
+    until_s = time.monotonic() + LIMIT_S
+    while len(heard) < frames:
+        assert time.monotonic() < until_s
+        estimate = planner.wait(1.0)
+        if estimate is not None:
+            heard[estimate.frame_id] = time.monotonic()
+    return heard
+
+
+def test_kills_and_restarts_cost_no_bit_and_a_kill_of_everything_leaves_a_file_that_opens(
+    tmp_path_factory: pytest.TempPathFactory, road: Path
+) -> None:
+    place = tmp_path_factory.mktemp("k")
+    file = place / "k.mcap"
+    run = Run(
+        *(place, "--source", f"kitti:{road}", "--rate", "25", "--set", "source.loop=true"),
+        *("--set", "runtime.spares=false", "--record", str(file), "--record-images"),
+    )
+    try:
+        with Planner(run.vehicle, run.runtime_dir) as planner:
+            drive_on(planner, 25)
+            os.kill(run.node_pid("optimize"), signal.SIGKILL)
+            heard = drive_on(planner, 60)
+            killed_s = time.monotonic()
+            for pid in (run.node_pid("record"), run.process.pid):
+                os.kill(pid, signal.SIGKILL)
+    finally:
+        run.kill()
+    recording = Recording(file)
+    verdict = compare(recording)
+    assert verdict.same, verdict.difference
+    assert not recording.complete
+    assert verdict.restarts == 1
+    assert verdict.unknown == 0
+    found = {decode(message.data, Estimate).frame_id for message in recording.messages(("v1/estimate",))}
+    assert {frame for frame, t_s in heard.items() if t_s < killed_s - 1.5} <= found
+    images = [msgspec.json.decode(m.data, type=CompressedImage) for m in recording.messages(("/camera/image",))]
+    assert len(images) > 50
+    assert cv2.imdecode(np.frombuffer(images[-1].data, np.uint8), cv2.IMREAD_UNCHANGED).shape == (HEIGHT, WIDTH)
+
+
+def test_a_full_disk_ends_the_recording_and_the_drive_goes_on(
+    tmp_path_factory: pytest.TempPathFactory, road: Path
+) -> None:
+    place = tmp_path_factory.mktemp("f")
+    file = place / "f.mcap"
+    run = Run(
+        *(place, "--source", f"kitti:{road}", "--rate", "25", "--set", "source.loop=true"),
+        *("--set", "source.frames=80", "--set", "runtime.spares=false", "--record", str(file)),
+    )
+    try:
+        with Planner(run.vehicle, run.runtime_dir) as planner:
+            drive_on(planner, 20)
+            limit = file.stat().st_size + 20_000  # no file of its process may grow past it: the write fails
+            resource.prlimit(run.node_pid("record"), resource.RLIMIT_FSIZE, (limit, limit))
+            status, out, err = run.end()
+    finally:
+        run.kill()
+    assert status == 0, err
+    assert "the recording has ended: File too large" in out
+    assert "CUT OFF" in out
+    summary = run.summary()
+    assert summary["frames_processed"] >= 75
+    assert not summary["recording"]["complete"]
+    assert file.stat().st_size <= limit
+    verdict = compare(Recording(file))
+    assert verdict.same, verdict.difference
+    assert 0 < verdict.equal < 80
+    answer = call("replay", str(file))
+    assert answer.returncode == 0
+    assert "cut off" in answer.stdout
+    answer = call("run", "--source", f"kitti:{road}", "--record", str(file))
+    assert answer.returncode == 2
+    assert "exists" in answer.stderr

@@ -1,0 +1,224 @@
+"""A recording's measurements give its estimates bit for bit, whatever happened to the vehicle and to the recorder."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import perf.replay
+from birdslam.types import Estimate, Status
+from runtime import recording_commands, replay
+from runtime.configuration import ConfigurationError
+from runtime.recording import Recording
+from runtime.replay import Verdict, compare
+from runtime.report_replay import told
+from tests.taped_drive import Tape, measured
+
+
+def verdict_of(tape: Tape) -> Verdict:
+    return compare(Recording(tape.path))
+
+
+def test_a_drive_gives_its_estimates_and_its_map_again(tmp_path: Path) -> None:
+    tape, frames = Tape(tmp_path), measured(80)
+    for measurements in frames:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    verdict = verdict_of(tape)
+    assert verdict.same
+    assert verdict.equal == 81  # the end too
+    assert verdict.maps > 0
+    assert (verdict.unknown, verdict.unanswered, verdict.restarts, verdict.epochs) == (0, 0, 0, 1)
+    assert any(estimate.vehicles for estimate in tape.estimates)
+
+
+def test_the_last_bit_counts_and_the_first_that_differs_is_named(tmp_path: Path) -> None:
+    tape, frames = Tape(tmp_path), measured(30)
+
+    def bend(estimate: Estimate) -> Estimate:
+        pose = estimate.T_world_ego
+        bent = msgspec.structs.replace(pose, y_m=math.nextafter(pose.y_m, math.inf))
+        return msgspec.structs.replace(estimate, T_world_ego=bent)
+
+    write = tape.writer.add
+    for measurements in frames:
+        if measurements.frame_id == frames[17].frame_id:
+            tape.writer.add = lambda topic, out, *rest: write(  # type: ignore[method-assign]
+                topic, bend(out) if isinstance(out, Estimate) else out, *rest
+            )
+        tape.step(measurements)
+    tape.end(frames[-1])
+    verdict = verdict_of(tape)
+    assert not verdict.same
+    assert verdict.equal == 17
+    assert verdict.difference is not None
+    assert verdict.difference.frame_id == frames[17].frame_id
+    assert [where for where, _, _ in verdict.difference.fields] == ["T_world_ego[1]"]
+    assert f"frame {frames[17].frame_id} DIFFERS" in told(verdict, Recording(tape.path))
+    assert recording_commands.replay(argparse.Namespace(recording=tape.path, set=[], output=None)) == 1
+
+
+def test_frames_that_were_coasted_over_and_measurements_that_came_too_late(tmp_path: Path) -> None:
+    tape, frames = Tape(tmp_path), measured(30)
+    for measurements in frames[:10]:
+        tape.step(measurements)
+    first, second = tape.frame(frames[10]), tape.frame(frames[11])
+    tape.coast(first)
+    tape.coast(second)
+    tape.take(tape.send(frames[10]))  # late: the newest frame is told of again
+    tape.take(tape.send(frames[11]))
+    for measurements in frames[12:]:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    assert [e.frame_id - frames[10].frame_id for e in tape.estimates[10:15]] == [0, 1, 1, 1, 2]
+    verdict = verdict_of(tape)
+    assert verdict.same
+    assert verdict.coasted == 2
+    assert verdict.equal == len(tape.estimates)
+
+
+@pytest.mark.parametrize("with_checkpoint", [True, False])
+def test_restarts_of_the_optimizer(tmp_path: Path, with_checkpoint: bool) -> None:
+    tape, frames = Tape(tmp_path), measured(40)
+    for measurements in frames[:20]:
+        tape.step(measurements)
+    for measurements in frames[20:23]:  # while it is dead
+        tape.frame(measurements)
+        tape.send(measurements)
+    tape.restart(with_checkpoint)
+    for measurements in frames[23:]:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    told_of = {status for estimate in tape.estimates for status in estimate.status}
+    assert (Status.GRAPH_RESTORED in told_of) == with_checkpoint
+    assert (Status.GRAPH_RESET in told_of) != with_checkpoint
+    verdict = verdict_of(tape)
+    assert verdict.same, verdict.difference
+    assert verdict.equal == len(tape.estimates)
+    assert verdict.restarts == 1
+    assert verdict.epochs == (1 if with_checkpoint else 2)
+
+
+def test_a_new_world_without_a_restart_that_anybody_saw_is_a_difference(tmp_path: Path) -> None:
+    tape, frames = Tape(tmp_path), measured(20)
+    for measurements in frames[:10]:
+        tape.step(measurements)
+    tape.restart(with_checkpoint=False, noticed=False)
+    for measurements in frames[10:]:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    verdict = verdict_of(tape)
+    assert verdict.difference is not None
+    assert verdict.difference.frame_id == frames[10].frame_id
+
+
+def test_measurements_that_the_recorder_never_had_end_the_comparison_until_a_new_epoch(tmp_path: Path) -> None:
+    tape, frames = Tape(tmp_path), measured(40)
+    for measurements in frames[:10]:
+        tape.step(measurements)
+    tape.frame(frames[10])
+    tape.take(tape.send(frames[10], recorded=False))
+    for measurements in frames[11:20]:
+        tape.step(measurements)
+    for measurements in frames[21:]:  # frame 20 never came to the optimizer: it begins anew
+        tape.step(measurements)
+    tape.end(frames[-1])
+    verdict = verdict_of(tape)
+    assert verdict.same
+    assert verdict.unknown == 10
+    assert verdict.equal == 10 + 19 + 1
+    assert "were not recorded: 10" in told(verdict, Recording(tape.path))
+
+
+EVENTS = ("well", "well", "well", "dropped", "estimate lost", "late", "restored", "new world")
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(events=st.lists(st.sampled_from(EVENTS), min_size=5, max_size=18), seed=st.integers(0, 3))
+def test_whatever_happens_nothing_differs(events: list[str], seed: int) -> None:
+    frames = iter(measured(4 * len(events) + 2, seed))
+    with tempfile.TemporaryDirectory() as place:
+        tape = Tape(Path(place))
+        last = next(frames)
+        tape.step(last)
+        for event in events:
+            last = next(frames)
+            if event == "dropped":  # by the optimizer's queue
+                tape.frame(last)
+                tape.send(last)
+            elif event == "estimate lost":  # on its way to the recorder
+                tape.frame(last)
+                tape.take(tape.send(last), recorded=False)
+            elif event == "late":
+                newer = next(frames)
+                refs = tape.frame(last), tape.frame(newer)
+                for ref in refs:
+                    tape.coast(ref)
+                for measurements in (last, newer):
+                    tape.take(tape.send(measurements))
+            elif event in ("restored", "new world"):
+                tape.restart(with_checkpoint=event == "restored")
+            last = next(frames)
+            tape.step(last)
+        tape.end(last)
+        verdict = verdict_of(tape)
+        assert verdict.difference is None, (verdict.difference, verdict)
+        assert verdict.equal + events.count("estimate lost") == len(tape.estimates)
+        assert verdict.restarts == sum(event in ("restored", "new world") for event in events)
+        assert verdict.unknown == 0
+
+
+def test_a_recording_that_was_cut_off_replays_up_to_there(tmp_path: Path) -> None:
+    tape, frames = Tape(tmp_path), measured(40)
+    for measurements in frames:
+        tape.step(measurements)
+    tape.close()
+    whole = tape.path.read_bytes()
+    tape.path.write_bytes(whole[: len(whole) // 2])
+    recording = Recording(tape.path)
+    verdict = compare(recording)
+    assert verdict.same
+    assert 5 < verdict.equal < 40
+    assert not recording.complete
+    assert "was cut off" in told(verdict, recording)
+
+
+def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tape, frames = Tape(tmp_path), measured(30)
+    for measurements in frames:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    for name, values in (("same", []), ("paper", ["slam.weights.mode=paper"])):
+        options = argparse.Namespace(recording=tape.path, set=values, output=tmp_path / name)
+        assert recording_commands.replay(options) == 0
+        assert "results in" in capsys.readouterr().out
+    same, paper = ((tmp_path / name / "ego.tum.txt").read_text() for name in ("same", "paper"))
+    assert same != paper
+    assert len(same.splitlines()) == len(paper.splitlines()) == 31
+    recorded = [estimate for estimate in tape.estimates if Status.END_OF_SOURCE not in estimate.status]
+    recording = Recording(tape.path)
+    again = [out for out in replay.estimates(recording, replay.back_end(recording)) if isinstance(out, Estimate)]
+    assert again == recorded
+    with pytest.raises(ConfigurationError, match="back end alone"):
+        recording_commands.replay(
+            argparse.Namespace(recording=tape.path, set=["slam.frontend.x=1"], output=tmp_path / "no")
+        )
+    with pytest.raises(ConfigurationError, match="no_such"):
+        recording_commands.replay(
+            argparse.Namespace(recording=tape.path, set=["slam.graph.no_such=1"], output=tmp_path / "no")
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_long_recording_of_the_running_system_replays(data_dir: Path, tmp_path: Path) -> None:
+    clip = data_dir / "kitti_odometry" / "sequences" / "00"
+    options = ("--source", f"kitti:{clip}", "--minutes", "1.5", "--beside", "0", "--images")
+    assert perf.replay.run([*options, "--output", str(tmp_path / "replay.json")]) == 0

@@ -1,0 +1,86 @@
+"""A recording in rerun, without a display; skipped where rerun-sdk is not installed (it is the extra `view`)."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from runtime import scene
+from runtime.configuration import RecordingConfig
+from runtime.recording import Latency, Recording
+from tests.taped_drive import Tape, measured
+from tests.test_pipeline import call
+
+needs_rerun = pytest.mark.skipif(
+    importlib.util.find_spec("rerun") is None, reason="rerun-sdk is not installed (pip install 'birdslam[view]')"
+)
+
+
+@pytest.fixture
+def tape(tmp_path: Path) -> Tape:
+    tape = Tape(tmp_path, recording=RecordingConfig(file="drive.mcap", images=True))
+    frames = measured(30)
+    for number, measurements in enumerate(frames):
+        if number == 20:
+            tape.restart(with_checkpoint=False)  # a new world
+        ref = tape.frame(measurements)
+        tape.writer.draw(*scene.from_image(np.full((192, 640), number, dtype=np.uint8), 90, ref.t_utc_ns), number)
+        tape.take(tape.send(measurements))
+        latency = Latency(frame_id=ref.frame_id, age_ms=20.0, left_ms=130.0, stages_ms={"capture -> perceive": 0.5})
+        tape.writer.draw("/latency", latency, number)
+    tape.end(frames[-1])
+    return tape
+
+
+@needs_rerun
+def test_a_recording_becomes_a_file_of_reruns(tape: Tape, tmp_path: Path) -> None:
+    from runtime import view
+
+    file = tmp_path / "drive.rrd"
+    assert view.recorded(Recording(tape.path), file) == 0
+    data = file.read_bytes()
+    assert data.startswith(b"RRF")
+    for entity in (b"world/vehicles", b"bev/bodies", b"latency/capture_to_perceive", b"camera/boxes", b"world/map"):
+        assert entity in data, entity
+
+
+@needs_rerun
+def test_everything_of_a_drive_is_sent(tape: Tape) -> None:
+    """What goes to the stream, entity by entity."""
+    from runtime import view
+
+    class Stream:
+        def __init__(self) -> None:
+            self.logged: dict[str, int] = {}
+
+        def log(self, entity: str, *what: object, static: bool = False) -> None:
+            self.logged[entity] = self.logged.get(entity, 0) + 1
+
+        def set_time(self, timeline: str, **when: object) -> None:
+            assert timeline in ("frame", "drive")
+
+        def send_blueprint(self, blueprint: object) -> None:
+            self.blueprint = blueprint
+
+    stream = Stream()
+    view.show(Recording(tape.path), view.Viewer(stream))
+    logged = stream.logged
+    for entity in ("camera", "camera/boxes", "bev/lanes", "latency/age", "latency/left"):
+        assert logged[entity] == 30, entity
+    for entity in ("world/ego", "world/ego_ellipse", "world/vehicles", "world/vehicles/ellipse", "bev/bodies"):
+        assert logged[entity] == 30, entity
+    assert logged["world"] == 3  # its axes, and two epochs that begin
+    assert any(entity.startswith("world/map/") for entity in logged)
+    assert logged["ego/sigma_yaw_rad"] == 30
+    assert logged["status"] >= 2
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rerun") is not None, reason="rerun-sdk is installed")
+def test_without_rerun_it_says_what_to_install(tape: Tape) -> None:
+    answer = call("view", str(tape.path), "--save", str(tape.path.with_suffix(".rrd")))
+    assert answer.returncode == 2
+    assert "birdslam[view]" in answer.stderr
+    assert "Traceback" not in answer.stderr
