@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 
-from perf.faults import Vehicle, model_options
+from perf.faulty_vehicle import Vehicle, model_options
 from runtime.topology import NODES
 
 WARM_S, SAMPLE_S = 60.0, 5.0

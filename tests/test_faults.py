@@ -11,12 +11,14 @@ from pathlib import Path
 import psutil
 import pytest
 
-from perf.faults import FAULTS, Vehicle, inflict, markdown, model_options, survived
+from perf.faults import inflict, markdown, survived
+from perf.faulty_vehicle import Vehicle, model_options
+from perf.strikes import FAULTS
 from runtime.presence import ring_path
 from runtime.topology import NODES
 
 SHORT = (
-    *("kill -9 perceive", "camera gone 1.5 s capture", "malformed messages all"),
+    *("kill -9 perceive", "kill -9 optimize", "camera gone 1.5 s capture", "malformed measurements messages optimize"),
     "kill -9 of everything, second start all",
 )
 BUSY_MACHINE = 10.0  # so many times its promise may a restart take here; `make faults` holds it to 3

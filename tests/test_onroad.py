@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from perf.faults import model_options
+from perf.faulty_vehicle import model_options
 from perf.live import Ask, drive
 from perf.machine import Steal
 from perf.system import WARM_UP_S, figures, table

@@ -1,0 +1,169 @@
+"""A running vehicle whose camera can be made to fail, with a planner that watches it: for faults.py and soak.py.
+
+The camera is software (perf/faulty_camera): a road without end, driven along at constant speed, so that where the car
+is follows from the time alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import cv2
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+
+from birdslam.types import Estimate
+from runtime.client import Planner
+from runtime.topology import NODES
+
+ROOT = Path(__file__).resolve().parent.parent
+WIDTH_PX, HEIGHT_PX, F_PX, HEIGHT_M = 480, 160, 260.0, 1.65
+LOOP_FRAMES, TEXELS, TEXELS_PER_M = 128, 2048, 24.0
+FRAME_M = TEXELS / LOOP_FRAMES / TEXELS_PER_M  # driven from one frame to the next
+RATE_HZ = 15.0
+SETTLE_S, PATIENCE_S = 2.5, 20.0
+
+
+def road_loop() -> NDArray[np.uint8]:
+    """(frames, height, width): a drive at constant speed over a textured road, whose end meets its beginning."""
+    u, v = np.meshgrid(np.arange(WIDTH_PX, dtype=np.float32), np.arange(HEIGHT_PX, dtype=np.float32))
+    depth = F_PX * HEIGHT_M / np.maximum(v - HEIGHT_PX / 2, 0.5)
+    side = ((u - WIDTH_PX / 2) * depth / F_PX * TEXELS_PER_M + TEXELS / 2).astype(np.float32)
+    noise = np.random.default_rng(5).integers(0, 256, (TEXELS, TEXELS), dtype=np.uint8)
+    texture = cv2.GaussianBlur(noise, (0, 0), 2.0, borderType=cv2.BORDER_REFLECT)
+    texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
+    frames = []
+    for number in range(LOOP_FRAMES):
+        ahead = (depth * TEXELS_PER_M + number * TEXELS / LOOP_FRAMES).astype(np.float32)
+        road = cv2.remap(texture, side, ahead, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        frames.append(np.where(v > HEIGHT_PX / 2 + 4, road, 200).astype(np.uint8))
+    return np.stack(frames)
+
+
+class Vehicle:
+    """`birdslam run` with the faulty camera, and a planner; a context manager."""
+
+    vehicle = "faults"
+
+    def __init__(self, place: Path, *options: str, rate_hz: float = RATE_HZ) -> None:
+        self.place, self.runtime_dir, self.output = place, place / "rt", place / "out"
+        self.camera = place / "camera"
+        self.camera.mkdir(exist_ok=True)
+        np.save(self.camera / "frames.npy", road_loop())
+        (self.camera / "rate_hz").write_text(f"{rate_hz}")
+        self.rate_hz, self.period_ns = rate_hz, round(1e9 / rate_hz)
+        self.fault("")
+        (place / "camera.toml").write_text(
+            f"width_px = {WIDTH_PX}\nheight_px = {HEIGHT_PX}\nfx_px = {F_PX}\nfy_px = {F_PX}\n"
+            f"cx_px = {WIDTH_PX / 2}\ncy_px = {HEIGHT_PX / 2}\nheight_m = {HEIGHT_M}\n"
+        )
+        self._options = options
+        self.start()
+
+    def start(self) -> None:
+        """Starts the system; again, where it was killed."""
+        path = os.pathsep.join([str(ROOT / "perf" / "faulty_camera"), str(ROOT), os.environ.get("PYTHONPATH", "")])
+        settings = {
+            "runtime.runtime_dir": self.runtime_dir,
+            "runtime.restarts_max": 1000,
+            "runtime.watchdog_ms": 1000,
+            "camera": self.place / "camera.toml",
+        }
+        with (self.place / "run.log").open("ab") as log:
+            self.process = subprocess.Popen(
+                [
+                    *(sys.executable, "-P", "-m", "runtime.cli", "run", "--source", f"v4l2:{self.camera}"),
+                    *("--vehicle", self.vehicle, "--output", str(self.output), "--model", "none"),
+                    *(part for key, value in settings.items() for part in ("--set", f"{key}={value}")),
+                    *self._options,
+                ],
+                stdout=log,
+                stderr=log,
+                env={**os.environ, "PYTHONPATH": path, "FAULTY_CAMERA": str(self.camera)},
+                start_new_session=True,
+            )
+
+    def fault(self, name: str) -> None:
+        """The camera does this from its next frame on."""
+        draft = self.camera / "draft"
+        draft.write_text(name)
+        draft.rename(self.camera / "fault")
+
+    def truth_m(self, t_capture_ns: int) -> float:
+        """How far along the road the camera was then, to within a frame."""
+        return math.floor(t_capture_ns * 1e-9 * self.rate_hz) * FRAME_M
+
+    def node(self, name: str) -> psutil.Process:
+        """The process of a node that is at work: the spare beside it is younger."""
+        if name == "supervisor":
+            return psutil.Process(self.process.pid)
+        found = [child for child in psutil.Process(self.process.pid).children() if _is_node(child, name)]
+        return min(found, key=lambda child: (child.create_time(), child.pid))
+
+    def spares(self) -> int:
+        """Processes that stand by."""
+        return len(psutil.Process(self.process.pid).children()) - len(NODES)
+
+    def __enter__(self) -> Self:
+        self.planner = Planner(self.vehicle, self.runtime_dir)
+        self.settle()
+        return self
+
+    def settle(self, settle_s: float = SETTLE_S) -> None:
+        """Until estimates are valid and have been for a while, and spares stand by."""
+        until_s, calm_s = time.monotonic() + 3 * PATIENCE_S, 0.0
+        while calm_s < settle_s or self.spares() < len(NODES):
+            if time.monotonic() > until_s or self.process.poll() is not None:
+                raise TimeoutError(f"no valid estimates: {(self.place / 'run.log').read_text()[-2000:]}")
+            begun_s = time.monotonic()
+            estimate = self.planner.wait(1.0)
+            calm_s = calm_s + time.monotonic() - begun_s if estimate is not None and estimate.valid else 0.0
+
+    def watch(self, see: Callable[[Estimate | None], bool], limit_s: float) -> bool:
+        """Shows what the planner gets (None: nothing for a moment), until `see` says enough; whether it did in time."""
+        end_s = time.monotonic() + limit_s
+        while time.monotonic() < end_s:
+            if see(self.planner.wait(0.05)):
+                return True
+        return False
+
+    def stop(self) -> int:
+        """An ordered end; gives the exit status."""
+        self.process.terminate()
+        return self.process.wait(30.0)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.planner.close()
+        if self.process.poll() is None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.stop()
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+
+def _is_node(process: psutil.Process, name: str) -> bool:
+    try:
+        return name in process.cmdline()
+    except psutil.Error:  # it has just ended
+        return False
+
+
+def model_options(folder: Path | None) -> list[str]:
+    """Both networks, where the folder has them."""
+    networks = {"detector": "yolox_nano_416.onnx", "segmenter": "twinlitenet_640x360.onnx"}
+    if folder is None or not all((folder / file).is_file() for file in networks.values()):
+        return []
+    return [f"--model={role}={(folder / file).resolve()}" for role, file in networks.items()]
