@@ -2,10 +2,11 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+TRAIN_VENV := .venv-train
 DATA := $(or $(BIRDSLAM_DATA),../shared/data)
 MODELS := $(or $(BIRDSLAM_MODELS),../shared/models)
 
-.PHONY: setup test test-slow fuzz faults onroad perf lint demo clean
+.PHONY: setup test test-slow fuzz faults onroad perf lint train demo clean
 
 setup: $(VENV)/.ready
 
@@ -40,6 +41,18 @@ onroad: setup
 perf: setup
 	$(BIN)/python -m perf all --output out/perf
 
+# The shipped networks from their seed, on the built-in world alone: hours on four cores; what was begun goes on
+train: $(TRAIN_VENV)/.ready
+	$(TRAIN_VENV)/bin/python -m runtime.train --output out/train
+	$(TRAIN_VENV)/bin/python -m runtime.quantise out/train/multitask.onnx
+	$(TRAIN_VENV)/bin/python -m runtime.train_pointnet --output out/train/pointnet --ship
+	cp out/train/multitask.onnx out/train/multitask.toml out/train/multitask_int8.onnx out/train/multitask_int8.toml birdslam/perception/shipped/
+
+$(TRAIN_VENV)/.ready: pyproject.toml
+	$(PYTHON) -m venv $(TRAIN_VENV)
+	$(TRAIN_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -e '.[train]'
+	@touch $@
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -53,4 +66,4 @@ demo: setup
 		--model segmenter=$(MODELS)/twinlitenet_640x360.onnx --output out/00
 
 clean:
-	rm -rf $(VENV) out build *.egg-info
+	rm -rf $(VENV) $(TRAIN_VENV) out build *.egg-info

@@ -7,7 +7,9 @@ import msgspec
 from birdslam.camera import Camera
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.graph import GraphConfig, PoseGraph
+from birdslam.lanes import Completion
 from birdslam.perception import Networks
+from birdslam.pseudolidar import FrustumNetwork
 from birdslam.types import Estimate, Frame, MapUpdate, Measurements
 from birdslam.weights import WeightsConfig
 
@@ -23,9 +25,16 @@ class SlamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class BirdSLAM:
     """The whole method. The three processes of `runtime` run the same two objects, and get the same bytes."""
 
-    def __init__(self, camera: Camera, networks: Networks, config: SlamConfig) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        networks: Networks,
+        config: SlamConfig,
+        frustum_network: FrustumNetwork | None = None,
+        complete: Completion | None = None,
+    ) -> None:
         self.networks = networks
-        self.frontend = FrontEnd(camera, config.frontend)
+        self.frontend = FrontEnd(camera, config.frontend, frustum_network=frustum_network, complete=complete)
         self.graph = PoseGraph(config.graph, config.weights)
 
     def step(self, frame: Frame) -> tuple[Measurements, Estimate]:

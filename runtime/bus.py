@@ -15,33 +15,31 @@ Never fork after a Bus was opened (spawn instead), and always close it: zenoh's 
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import msgspec
 import zenoh
 
 from runtime.presence import runtime_dir_of, socket_path
-from runtime.topology import NODES, TOPICS, Topic, alive_key, check_name, key_of
-from runtime.wire import MAX_TRACE_BYTES, Stage, Trace, WireError, decode, encode
+from runtime.questions import Answer, Desk, KeptMessages
+from runtime.session import session_config
+from runtime.topology import PROCESSES, QUESTIONS, TOPICS, Topic, alive_key, check_name, key_of
+from runtime.wire import MAX_TRACE_BYTES, Part, Stage, Trace, WireError, decode, encode
 
-_URGENT_BATCHES = 16  # zenoh's largest
-_LEASE_MS = 1_000  # a stopped or unreachable peer is given up after this
-_RETRY = {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2}
-_MAX_ZENOH_BYTES = 1 << 17  # zenoh would put together 1 GiB; room for two of our largest messages
-_FILTER_BYTES = 65_000  # payload and attachment together; zenoh drops what is larger, so wire.py refuses it before
 _LOSSLESS_DEPTH = 4_096
-_LOSSLESS_PATIENCE_US = 60_000_000  # how long a blocked put may wait before zenoh gives the link up
+_ANSWER_S, _ANSWERS = 2.0, 256  # how long a question waits, and how many messages its answer may have
 
 log = logging.getLogger(__name__)
+
+_Attached = TypeVar("_Attached", bound=msgspec.Struct)
 
 
 class BusError(RuntimeError):
@@ -65,6 +63,20 @@ class Message:
     t_received_ns: int
 
 
+def _message(sample: zenoh.Sample, key: str, record: type[msgspec.Struct]) -> Message:
+    """What came in now, decoded. Raises WireError where it is no such record, or was sent to more keys than this."""
+    t_received_ns = time.monotonic_ns()
+    if str(sample.key_expr) != key or sample.kind != zenoh.SampleKind.PUT:
+        raise WireError(f"sent as {sample.kind} to {sample.key_expr}")
+    trace = _attached(sample, Trace)
+    return Message(decode(bytes(sample.payload), record), trace or Trace(), t_received_ns)
+
+
+def _attached(sample: zenoh.Sample, kind: type[_Attached]) -> _Attached | None:
+    attachment = sample.attachment
+    return None if attachment is None else decode(bytes(attachment), kind, MAX_TRACE_BYTES)
+
+
 class Publisher:
     """Sends the records of one topic; made by Bus.publisher."""
 
@@ -79,6 +91,7 @@ class Publisher:
             priority=zenoh.Priority.REAL_TIME if topic.urgent else zenoh.Priority.DATA_LOW,
             express=True,
         )
+        self._kept = KeptMessages(session, key, topic.kept) if topic.kept else None
         callback = zenoh.handlers.Callback(self._matching_changed, indirect=False)
         self._listener = self._publisher.declare_matching_listener(callback)
         at_first: zenoh.MatchingStatus = self._publisher.matching_status  # type: ignore[assignment]
@@ -116,6 +129,8 @@ class Publisher:
         now_ns = time.monotonic_ns()
         sent = trace.sent(now_ns) if trace and trace.stages else Trace((Stage(self._node, now_ns, now_ns, now_ns),))
         attachment = encode(sent)
+        if self._kept is not None:
+            self._kept.add(data, attachment)
         try:
             self._publisher.put(data, attachment=attachment)
         except zenoh.ZError as error:
@@ -149,13 +164,8 @@ class Subscriber:
         self._subscriber = session.declare_subscriber(key, callback)
 
     def _receive(self, sample: zenoh.Sample) -> None:
-        t_received_ns = time.monotonic_ns()
         try:
-            if str(sample.key_expr) != self._key or sample.kind != zenoh.SampleKind.PUT:
-                raise WireError(f"sent as {sample.kind} to {sample.key_expr}")
-            record = decode(bytes(sample.payload), self._topic.record)
-            attachment = sample.attachment
-            trace = Trace() if attachment is None else decode(bytes(attachment), Trace, MAX_TRACE_BYTES)
+            message = _message(sample, self._key, self._topic.record)
         except WireError as error:
             self.malformed += 1
             if self.malformed == 1:
@@ -163,9 +173,14 @@ class Subscriber:
             return
         with self._arrived:
             self.dropped += len(self._queue) == self._queue.maxlen
-            self.newest = Message(record, trace, t_received_ns)
-            self._queue.append(self.newest)
+            self.newest = message
+            self._queue.append(message)
             self._arrived.notify()
+
+    def _receive_kept(self, reply: zenoh.Reply) -> None:
+        """A message of before this subscription; it counts only where none came since."""
+        if reply.ok is not None and self.newest is None:
+            self._receive(reply.ok)
 
     def recv(self, timeout_s: float | None = None) -> Message | None:
         """The next message, as soon as there is one; None where none came within `timeout_s` (None: no limit).
@@ -206,6 +221,7 @@ class Bus:
         self.vehicle, self.node, self._lossless = check_name("vehicle", vehicle), check_name("node", node), lossless
         self._publishers: list[Publisher] = []
         self._subscribers: list[Subscriber] = []
+        self._desks: list[Desk] = []
         self._alive: set[str] = set()
         self._alive_changed = threading.Condition()
         self._alive_callbacks: list[Callable[[str, bool], None]] = []
@@ -214,9 +230,9 @@ class Bus:
 
         directory = runtime_dir_of(vehicle, runtime_dir)
         hub_socket, own_socket = socket_path(directory, "hub"), socket_path(directory, node)
-        listen = [hub_socket] if hub else [own_socket] if node in NODES else []
+        listen = [hub_socket] if hub else [own_socket] if node in PROCESSES else []
         try:
-            self._session = zenoh.open(_config(listen, [] if hub else [hub_socket], lossless))
+            self._session = zenoh.open(session_config(listen, [] if hub else [hub_socket], lossless))
         except zenoh.ZError as error:
             where = ", ".join(map(str, listen)) or hub_socket
             raise BusError(f"{node} can't join the bus of vehicle {vehicle!r} ({where}): {error}") from error
@@ -241,6 +257,63 @@ class Bus:
             raise ValueError(f"{topic}: a queue needs a depth of at least 1, got {depth}")
         self._subscribers.append(Subscriber(self._session, key, spec, depth, self._lossless))
         return self._subscribers[-1]
+
+    def catch_up(self, topic: str, subscriber: Subscriber) -> None:
+        """Gives a subscriber that came late the topic's last message, when it comes; waits for nothing."""
+        self._check_open()
+        callback = zenoh.handlers.Callback(subscriber._receive_kept, indirect=False)
+        self._session.get(key_of(self.vehicle, topic), callback, timeout=_ANSWER_S)
+
+    def kept(self, topic: str, timeout_s: float = _ANSWER_S) -> list[Message]:
+        """The topic's kept messages (Topic.kept), oldest first; empty where nobody answers in time.
+
+        Raises BusError where one is no such record.
+        """
+        key, record = key_of(self.vehicle, topic), TOPICS[topic].record
+        try:
+            return [_message(sample, key, record) for sample in self._get(key, timeout_s)]
+        except WireError as error:
+            raise BusError(f"{topic}: a kept message is malformed: {error}") from error
+
+    def ask(self, question: str, timeout_s: float = _ANSWER_S, **parameters: float) -> list[Any]:
+        """The parts of the answer to one of topology.QUESTIONS, in order; empty where nobody answers in time.
+
+        Raises BusError with the reason where the question is refused, or where the answer is incomplete or malformed.
+        """
+        spec, key = QUESTIONS[question], key_of(self.vehicle, question)
+        asked = {name: f"{value:g}" for name, value in parameters.items()}
+        parts: dict[int, Any] = {}
+        of = 0
+        try:
+            for sample in self._get(zenoh.Selector(key, asked), timeout_s):
+                part = _attached(sample, Part) or Part()
+                parts[part.number], of = decode(bytes(sample.payload), spec.record), part.of
+        except WireError as error:
+            raise BusError(f"{question}: the answer is malformed: {error}") from error
+        if sorted(parts) != list(range(of)):
+            raise BusError(f"{question}: {len(parts)} of the answer's {of} parts came")
+        return [parts[number] for number in range(of)]
+
+    def _get(self, selector: str | zenoh.Selector, timeout_s: float) -> Iterator[zenoh.Sample]:
+        self._check_open()
+        replies = self._session.get(
+            selector,
+            zenoh.handlers.FifoChannel(_ANSWERS),
+            timeout=timeout_s,
+            consolidation=zenoh.ConsolidationMode.NONE,  # all of them, not the last one alone
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                yield reply.ok
+            elif reply.err is not None:
+                raise BusError(f"{selector}: {bytes(reply.err.payload).decode(errors='replace')}")
+
+    def desk(self, answers: Mapping[str, Answer]) -> Desk:
+        """Answers the questions of these names (topology.QUESTIONS) until the bus is closed."""
+        self._check_open()
+        desk = Desk(self._session, {key_of(self.vehicle, name): answer for name, answer in answers.items()})
+        self._desks.append(desk)
+        return desk
 
     def declare_alive(self) -> None:
         """Says that this node is ready for work; taken back by close, or by the death of the process."""
@@ -291,6 +364,8 @@ class Bus:
             publisher._close()
         for subscriber in self._subscribers:
             subscriber.close()
+        for desk in self._desks:
+            desk.close()
         self._session.close()
 
     def __enter__(self) -> Self:
@@ -300,40 +375,3 @@ class Bus:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _config(listen: list[Path], connect: list[Path], lossless: bool) -> zenoh.Config:
-    """Local and bounded; DESIGN.md's measurements say why each of these is not zenoh's default."""
-    settings: dict[str, Any] = {
-        "mode": "peer",
-        "listen/endpoints": [f"unixsock-stream/{path}" for path in listen],
-        "connect/endpoints": [f"unixsock-stream/{path}" for path in connect],
-        "connect/retry": _RETRY,
-        "connect/timeout_ms": -1,  # retry in the background for ever: the hub may come later, and again
-        "scouting/delay": 0,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": True,
-        "transport/link/protocols": ["unixsock-stream"],
-        "transport/shared_memory/enabled": False,
-        "transport/link/tx/lease": _LEASE_MS,
-        # Express messages go in batches of their own: room for those of a few frames while the link's thread waits for
-        # the processor, else a burst of three is dropped.
-        "transport/link/tx/queue/size/real_time": _URGENT_BATCHES,
-        "transport/link/rx/max_message_size": _MAX_ZENOH_BYTES,
-        "adminspace/enabled": False,
-        "low_pass_filter": [
-            {
-                "id": "size",
-                "flows": ["ingress", "egress"],
-                "messages": ["put", "query", "reply"],
-                "key_exprs": ["**"],
-                "size_limit": _FILTER_BYTES,
-            }
-        ],
-    }
-    if lossless:
-        settings["transport/link/tx/queue/congestion_control/block/wait_before_close"] = _LOSSLESS_PATIENCE_US
-    config = zenoh.Config()
-    for name, value in settings.items():
-        config.insert_json5(name, json.dumps(value))
-    return config

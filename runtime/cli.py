@@ -8,7 +8,14 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-from runtime import localisation_options, tracking_options
+from runtime import (
+    calibrate_options,
+    demo_drive_options,
+    localisation_options,
+    models_options,
+    recording_options,
+    tracking_options,
+)
 
 # One thread for BLAS and OpenMP in every process: DESIGN.md measured 100 times the latency with more on busy cores.
 # In `evaluate` too, which must compute as the nodes do.
@@ -20,7 +27,7 @@ USER_ERROR_STATUS = 2  # of the program and of a node: what the user gave can't 
 INTERRUPTED_STATUS = 130
 CLOSED_PIPE_STATUS = 141
 
-USAGE_NOTE = "Sources: kitti:DIR, video:FILE, v4l2:/dev/videoN, rtsp://HOST/PATH."
+USAGE_NOTE = "Sources: demo, kitti:DIR, video:FILE, mcap:FILE, v4l2:/dev/videoN, rtsp://HOST/PATH."
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -50,8 +57,12 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--source", metavar="URI", help="where frames come from")
     run.add_argument("--rate", metavar="HZ|max", help='frames a second, or "max": every frame, as fast as can be')
     run.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
+    run.add_argument("--record", metavar="FILE.mcap", help="write the drive down; a directory: a new file in it")
+    run.add_argument("--record-images", action="store_true", default=None, help="with its frames, as JPEG")
     _add_pipeline_options(run)
     run.set_defaults(command="run")
+
+    recording_options.add_commands(commands)
 
     listen = commands.add_parser("listen", help="print live estimates, as a planner gets them, until the source ends")
     listen.add_argument("--vehicle", metavar="NAME", default="car")
@@ -67,6 +78,13 @@ def _parser() -> argparse.ArgumentParser:
     doctor.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
     _add_pipeline_options(doctor)
     doctor.set_defaults(command="doctor")
+
+    interface = commands.add_parser("interface", help="print what a vehicle says and how to listen: docs/interface.md")
+    interface.set_defaults(command="interface")
+
+    calibrate_options.add_command(commands)
+    models_options.add_commands(commands)
+    demo_drive_options.add_commands(commands)
 
     evaluate = commands.add_parser("evaluate", help="compare with ground truth").add_subparsers(
         required=True, metavar="WHAT"
@@ -88,8 +106,9 @@ def _add_pipeline_options(parser: argparse.ArgumentParser) -> None:
         "--model",
         action="append",
         default=[],
-        metavar="ROLE=PATH",
-        help="an ONNX network for a role (detector, segmenter); may be repeated",
+        metavar="[ROLE=]PATH|NAME",
+        help="an ONNX network for a role (detector, segmenter, depth, multitask), or a model's name; may be repeated; "
+        "roles left over are the shipped network's, with `none` nobody's",
     )
     parser.add_argument("--camera", metavar="FILE", help="a camera file (TOML) instead of the recording's calibration")
     parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame of a recording")

@@ -3,15 +3,17 @@
     from runtime.client import Planner
 
     with Planner("car") as planner:
-        for estimate in planner.estimates():                   # each as it comes
-            drive(estimate)
+        for reading in planner.estimates(max_age_ms=150):      # each as it comes, or that none came in time
+            if reading.usable:
+                drive(reading.estimate)
+            else:
+                slow_down(reading)                             # not alive, not on time, or not valid
 
-    reading = planner.latest(max_age_ms=100)                   # or the newest one, whenever you need it
-    if reading.usable:
-        drive(reading.estimate)
+    reading = planner.latest(max_age_ms=150)                   # or the newest one, whenever you need it
 
 A planner can start before the system does, and lives through its restarts (`Estimate.epoch` then says that the world
-frame began anew). It can never slow the vehicle down: a planner that is busy gets only the newest estimate.
+frame began anew). It can never slow the vehicle down: a planner that is busy gets only the newest estimate. One that
+comes late has the last estimate at once, and asks for the rest: `map`, `trajectory`, `configuration`, `health`.
 """
 
 from __future__ import annotations
@@ -23,11 +25,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
-from birdslam.types import INVALIDATING, Estimate
+from birdslam.types import INVALIDATING, Estimate, MapSnapshot, Trajectory
 from runtime.bus import Bus, BusClosed, Message
+from runtime.parts import whole_map, whole_trajectory
+from runtime.wire import Health, Trace
 
+_NO_TRACE = Trace()
 _number = itertools.count()  # tells the planners of one process apart
 
 
@@ -46,6 +51,7 @@ class Reading:
     valid: bool
     age_ms: float
     left_ms: float | None = None  # of its latency budget when it was sent; negative: it is late
+    trace: Trace = _NO_TRACE  # where its time went, node by node
 
     @property
     def usable(self) -> bool:
@@ -62,19 +68,26 @@ class Planner:
     def __init__(self, vehicle: str = "car", runtime_dir: Path | None = None) -> None:
         self._bus = Bus(vehicle, f"planner-{os.getpid()}-{next(_number)}", runtime_dir=runtime_dir)
         self._subscriber = self._bus.subscriber("estimate")
+        self._bus.on_alive(self._catch_up)
+        self._catch_up("optimize", "optimize" in self._bus.alive)
+
+    def _catch_up(self, node: str, alive: bool) -> None:
+        if node == "optimize" and alive and self._subscriber.newest is None:
+            self._bus.catch_up("estimate", self._subscriber)
 
     def latest(self, max_age_ms: float = 200.0) -> Reading:
         """The newest estimate so far, at once; `on_time` where it is no older than `max_age_ms`."""
-        newest = self._subscriber.newest
-        estimate: Estimate | None = newest.record if newest else None
+        return self._reading(self._subscriber.newest, max_age_ms)
+
+    def _reading(self, message: Message | None, max_age_ms: float) -> Reading:
         alive = "optimize" in self._bus.alive
-        if estimate is None:
+        if message is None:
             return Reading(None, alive, on_time=False, valid=False, age_ms=float("inf"))
+        estimate: Estimate = message.record
         age_ms = (time.monotonic_ns() - estimate.t_capture_ns) / 1e6
         valid = estimate.valid and INVALIDATING.isdisjoint(estimate.status)
-        left_ns = newest.trace.left_ns if newest else None
-        left_ms = None if left_ns is None else left_ns / 1e6
-        return Reading(estimate, alive, 0.0 <= age_ms <= max_age_ms, valid, age_ms, left_ms)
+        left_ms = None if message.trace.left_ns is None else message.trace.left_ns / 1e6
+        return Reading(estimate, alive, 0.0 <= age_ms <= max_age_ms, valid, age_ms, left_ms, message.trace)
 
     def wait(self, timeout_s: float | None = None) -> Estimate | None:
         """The next estimate, as soon as there is one; None where none came in time. Raises BusClosed once closed.
@@ -88,15 +101,46 @@ class Planner:
         """Like `wait`, with the message's trace: where the estimate's time went."""
         return self._subscriber.recv(timeout_s)
 
-    def estimates(self) -> Iterator[Estimate]:
-        """Each estimate as it comes, for as long as the planner is open; through restarts of the system."""
+    def estimates(self, max_age_ms: float = 200.0) -> Iterator[Reading]:
+        """A reading of each estimate as it comes, for as long as the planner is open; through restarts of the system.
+
+        Never silence: when the newest estimate grows older than `max_age_ms` (or there is none for so long), a reading
+        says that it is not on time, and again after each further `max_age_ms`.
+        """
         while True:
+            age_ms = self.latest().age_ms
+            fresh_ms = max_age_ms - age_ms if 0.0 <= age_ms < max_age_ms else max_age_ms
             try:
-                estimate = self.wait()
+                message = self.wait_message(fresh_ms / 1e3)
             except BusClosed:
                 return
-            if estimate is not None:
-                yield estimate
+            if message is not None:
+                yield self._reading(message, max_age_ms)
+            elif not (reading := self.latest(max_age_ms)).on_time:
+                yield reading
+
+    def map(self, timeout_s: float = 2.0) -> MapSnapshot | None:
+        """The whole map of the newest epoch; None where nobody answers.
+
+        Raises BusError with the reason where it is refused, or where a part of it was lost.
+        """
+        parts = self._bus.ask("map", timeout_s)
+        return whole_map(parts) if parts else None
+
+    def trajectory(self, last_s: float | None = None, timeout_s: float = 2.0) -> Trajectory | None:
+        """Where everybody has been in the newest epoch, or in its last `last_s` of the source's time; else as `map`."""
+        parts = self._bus.ask("trajectory", timeout_s, **({} if last_s is None else {"last_s": last_s}))
+        return whole_trajectory(parts) if parts else None
+
+    def configuration(self, timeout_s: float = 2.0) -> dict[str, Any] | None:
+        """The configuration of the run as plain data, as in summary.json; else as `map`."""
+        parts = self._bus.ask("configuration", timeout_s)
+        return parts[0] if parts else None
+
+    def health(self, node: str, timeout_s: float = 2.0) -> Health | None:
+        """What a node said last of itself, within the last second or so; None where it does not answer."""
+        said = self._bus.kept(f"health/{node}", timeout_s)
+        return said[-1].record if said else None
 
     def close(self) -> None:
         """Leaves the bus, and wakes who waits; a second call does nothing."""

@@ -14,24 +14,41 @@ import cv2
 import msgspec
 
 from birdslam import evaluation
+from birdslam.calibration import CalibrationError
 from birdslam.datasets import DatasetError, Recording, open_recording
 from birdslam.perception import ModelError
 from birdslam.results import ResultsError
 from birdslam.slam import BirdSLAM
 from birdslam.types import Estimate, MapUpdate, Measurements, Status
-from runtime import doctor, evaluate_localisation, evaluate_tracking, supervisor
+from runtime import (
+    calibrate,
+    demo_drive,
+    doctor,
+    evaluate_localisation,
+    evaluate_tracking,
+    interface,
+    model_store,
+    models,
+    recording_commands,
+    supervisor,
+)
 from runtime.bus import BusError
 from runtime.cli import USER_ERROR_STATUS
 from runtime.client import Planner
-from runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, load, parse_setting
+from runtime.configuration import FILE_SCHEMES, NO_MODEL, Configuration, ConfigurationError, load, parse_setting
+from runtime.download import DownloadError
 from runtime.inference import Inference
 from runtime.presence import VehicleBusy
+from runtime.recording import RecordingError
 from runtime.sources import RecordedSource, SourceError, offline_frames
 
 USER_ERRORS = (
+    CalibrationError,
     ConfigurationError,
     DatasetError,
+    DownloadError,
     ModelError,
+    RecordingError,
     ResultsError,
     SourceError,
     BusError,
@@ -43,8 +60,17 @@ def execute(options: argparse.Namespace) -> int:
     """The command that was parsed; gives the exit status."""
     commands: dict[str, Callable[[argparse.Namespace], int]] = {
         "run": run,
+        "replay": recording_commands.replay,
+        "view": recording_commands.view,
+        "top": recording_commands.top,
         "listen": listen,
         "doctor": examine,
+        "interface": describe_interface,
+        "calibrate": calibrate_camera,
+        "models list": models.list_models,
+        "models check": models.check,
+        "models add": models.add,
+        "demo-drive make": demo_drive.make,
         "evaluate odometry": evaluate_odometry,
         "evaluate car-ahead": evaluate_car_ahead,
         "evaluate localisation": evaluate_vehicles,
@@ -61,17 +87,24 @@ def execute(options: argparse.Namespace) -> int:
 def configuration_of(options: argparse.Namespace) -> Configuration:
     """The configuration file with the options of the command line on top. Raises ConfigurationError."""
     overrides: dict[str, Any] = dict(parse_setting(text) for text in options.set)
+    named: list[str] = []
     for text in options.model:
         role, equals, path = text.partition("=")
-        if not (role and equals and path):
-            raise ConfigurationError(f"--model {text}: expected ROLE=PATH")
-        overrides[f"models.{role}.path"] = path
+        if text == NO_MODEL:
+            overrides["models.shipped"] = False
+        elif not equals and model_store.is_name(text):
+            named.append(text)
+        elif role and equals and path:
+            overrides[f"models.{role}.path"] = path
+        else:
+            raise ConfigurationError(f"--model {text}: expected ROLE=PATH, or the name of a model")
     keys = {"source": "source.uri", "rate": "source.rate", "stride": "source.stride"}
-    for name in ("source", "rate", "stride", "camera", "vehicle", "output"):
+    keys |= {"record": "recording.file", "record_images": "recording.images"}
+    for name in ("source", "rate", "stride", "camera", "vehicle", "record", "record_images", "output"):
         value = getattr(options, name, None)
         if value is not None:
             overrides[keys.get(name, name)] = _number(value) if name == "rate" else value
-    return load(options.config, overrides)
+    return load(options.config, overrides, named)
 
 
 def _number(text: str) -> float | str:
@@ -91,6 +124,12 @@ def examine(options: argparse.Namespace) -> int:
     findings = list(doctor.examine(configuration_of(options)))
     print(doctor.table(findings))
     return int(any(finding.verdict == "failed" for finding in findings))
+
+
+def describe_interface(options: argparse.Namespace) -> int:
+    """`birdslam interface`: the page of keys, records and statuses."""
+    print(interface.page(), end="")
+    return 0
 
 
 def listen(options: argparse.Namespace) -> int:
@@ -124,6 +163,11 @@ def _as_line(estimate: Estimate, age_ms: float, as_json: bool) -> str:
     ).rstrip()
 
 
+def calibrate_camera(options: argparse.Namespace) -> int:
+    """`birdslam calibrate`: a camera file from a drive."""
+    return calibrate.run(options, configuration_of(options))
+
+
 Drive = Callable[[Recording], Iterator[Measurements | Estimate | MapUpdate]]
 
 
@@ -144,8 +188,10 @@ def _pipeline(configuration: Configuration) -> Iterator[Drive]:
     with contextlib.ExitStack() as stack:
 
         def drive(recording: Recording) -> Iterator[Measurements | Estimate | MapUpdate]:
-            networks = stack.enter_context(Inference(configuration)).networks
-            slam = BirdSLAM(recording.camera, networks, configuration.slam)
+            inference = stack.enter_context(Inference(configuration))
+            slam = BirdSLAM(
+                recording.camera, inference.networks, configuration.slam, frustum_network=inference.frustum_network
+            )
             for frame in offline_frames(RecordedSource(recording, configuration.source)):
                 yield from slam.step(frame)
                 gained = slam.map_update()
@@ -197,7 +243,7 @@ def _evaluate(options: argparse.Namespace) -> list[evaluation.OdometryReport]:
     twice = [name for name, n in Counter(recording.name for recording in recordings).items() if n > 1]
     if twice:
         raise ConfigurationError(f"two sequences are named {twice[0]}: their results would overwrite each other")
-    if not configuration.models.given():
+    if not configuration.models.in_use():
         print(supervisor.WITHOUT_MODELS)
     with _pipeline(configuration) as drive:
         reports = evaluation.evaluate_odometry(recordings, drive, Path(configuration.output))
@@ -211,10 +257,12 @@ def _odometry_table(reports: list[evaluation.OdometryReport]) -> str:
         ("path m", "path_m", 1),
         ("ATE m", "ate_m", 3),
         ("ATE %", "ate_pct", 2),
+        ("ATE se3 m", "ate_se3_m", 3),
         ("ATE sim3 m", "ate_sim3_m", 3),
         ("scale error", "scale_error", 4),
         ("RPE m", "rpe_t_m", 4),
         ("RPE deg", "rpe_r_deg", 4),
+        ("segments %", "segment_t_pct", 2),
         ("standing m", "standing_drift_m", 3),
     )
     lines = [f"{'sequence':16}" + "".join(f"{title:>12}" for title, _, _ in columns)]

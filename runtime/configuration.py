@@ -10,16 +10,24 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 
+from birdslam.atlas import AtlasConfig
 from birdslam.camera import Camera
 from birdslam.datasets import DatasetError, load_camera
-from birdslam.perception import ModelSpec
+from birdslam.motionwatch import MotionWatchConfig
+from birdslam.perception import ROLES, ModelError, ModelSpec
+from birdslam.perception.manifest import SHIPPED_NETWORKS, Role
 from birdslam.slam import SlamConfig
+from runtime import model_store
 
-FILE_SCHEMES = ("kitti", "video")  # sources whose address is a path, and so relative to the file that names it
+NO_MODEL = "none"  # as --model: no network but those that are named beside it, not the shipped one either
+_USER = re.compile(r"(?<=://)[^/@]*@|(?<=rtsp:)[^/@]*@")
+# Sources that are no cameras; the address of each is a path, relative to the file that names it; `demo` has none
+SHIPPED_MULTITASK = "multitask_int8.onnx"  # as good as the fp32 one in half the time; `--model multitask` is that
+FILE_SCHEMES = ("kitti", "video", "mcap", "demo")
 
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -47,11 +55,22 @@ class ModelsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     detector: ModelSpec | None = None
     segmenter: ModelSpec | None = None
+    depth: ModelSpec | None = None
+    multitask: ModelSpec | None = None  # one network for all of these; the others stand before it, each for its own
+    pointnet: ModelSpec | None = None  # Frustum-PointNet: bodies from the depth network's points
+    shipped: bool = True  # the package's own network fills the roles that no other does
 
     def given(self) -> dict[str, ModelSpec]:
-        """Role -> network, in a fixed order."""
-        specs = {role: getattr(self, role) for role in self.__struct_fields__}
+        """Role -> network that the user names, in a fixed order."""
+        specs = {role: getattr(self, role) for role in get_args(Role)}
         return {role: spec for role, spec in specs.items() if spec is not None}
+
+    def in_use(self) -> dict[str, ModelSpec]:
+        """Role -> network of images that runs, in a fixed order."""
+        given = self.given()
+        if self.shipped and "multitask" not in given and not set(ROLES["multitask"]) <= set(given):
+            given["multitask"] = ModelSpec(path=str(SHIPPED_NETWORKS / SHIPPED_MULTITASK))
+        return given
 
 
 class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -67,6 +86,7 @@ class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Processes, memory and time limits."""
 
     runtime_dir: str = ""  # sockets, locks and vitals; "": the user's own (runtime/presence.py)
+    models_dir: str = ""  # installed networks; "": the user's own (runtime/model_store.py)
     ring_slots: Annotated[int, msgspec.Meta(ge=2, le=64)] = 8
     in_flight_frames: PositiveInt = 4  # frames between capture and the estimate at rate "max"
     ready_timeout_s: Positive = 60.0  # for a node to load, warm up and find its peers
@@ -82,6 +102,8 @@ class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     restart_window_s: Positive = 60.0
     restart_backoff_ms: Positive = 100.0  # before the second restart within the window; then twice as long each time
     restart_backoff_max_ms: Positive = 2000.0
+    checkpoint_ms: Positive = 250.0  # of the optimizer's graph, for the process after it
+    catch_up_ms: Positive = 300.0  # it asks perceive for what it has missed since, and waits no longer
     stale_ms: Positive = 500.0  # a node that has received nothing for so long says so in its health
     spares: bool = True  # a process of each node stands by, loaded and warm, for the next restart
 
@@ -141,6 +163,18 @@ class DegradationConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     coast_max_ms: Positive = 500.0  # of source time without a look: what comes then is invalid
 
 
+class RecordingConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is kept of a drive in one file (runtime/recording.py)."""
+
+    file: str = ""  # FILE.mcap, which must not exist yet; a directory: a new file in it, named by the time; "": none
+    images: bool = False  # the frames too, as JPEG
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
+    flush_ms: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)] = 500.0  # what a kill may cost
+    sync: bool = True  # each time to the disk itself: a power cut then costs no more than a kill
+    queue: PositiveInt = 4096  # messages of a topic that wait for the recorder; what is pushed out is counted
+    ready_timeout_s: Positive = 10.0  # for the recorder to be there before the first frame; then the run goes on
+
+
 class NodeScheduling(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Of one node."""
 
@@ -175,7 +209,10 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     runtime: RuntimeConfig = RuntimeConfig()
     budgets: BudgetsConfig = BudgetsConfig()
     degradation: DegradationConfig = DegradationConfig()
+    motion_watch: MotionWatchConfig = MotionWatchConfig()  # live alone: what is evaluated is what was measured
     realtime: RealtimeConfig = RealtimeConfig()
+    atlas: AtlasConfig = AtlasConfig()  # what planners may ask for of the drive so far
+    recording: RecordingConfig = RecordingConfig()
     output: str = "out"
 
     @property
@@ -211,10 +248,10 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return None if self.lossless or deadline_ms is None else round(deadline_ms * 1e6)
 
 
-def load(path: Path | None, overrides: Mapping[str, Any] | None = None) -> Configuration:
+def load(path: Path | None, overrides: Mapping[str, Any] | None = None, models: Iterable[str] = ()) -> Configuration:
     """The configuration of a TOML file, then `overrides` ({"slam.graph.ego_nodes": 8}) on top of it.
 
-    Raises ConfigurationError.
+    `models` are names of networks at hand, each for the role that its manifest states. Raises ConfigurationError.
     """
     tree: dict[str, Any] = {}
     if path is not None:
@@ -229,11 +266,13 @@ def load(path: Path | None, overrides: Mapping[str, Any] | None = None) -> Confi
     for key, value in overrides.items():
         _put(tree, key, value)
     _read_camera_file(tree)
+    _put_models(tree, models)
     try:
         configuration = msgspec.convert(tree, Configuration)
     except msgspec.ValidationError as error:
         key, reason = _explain(str(error))
         raise ConfigurationError(f"{_origin(key, path, overrides)}: {key}: {reason}") from error
+    configuration = _with_models_found(configuration)
     key, deadline_ms = "perceive.deadline_ms", configuration.perceive.deadline_ms
     if deadline_ms is not None and deadline_ms > configuration.budgets.perceived_ms:
         limit = "budgets.capture_ms + capture_to_perceive_ms + perceive_ms"
@@ -263,6 +302,12 @@ def parse_setting(text: str) -> tuple[str, Any]:
         return key.strip(), value
 
 
+def without_passwords(configuration: Configuration) -> Configuration:
+    """With nothing in it that lets anybody in: a camera's address may bear a password."""
+    source = configuration.source
+    return msgspec.structs.replace(configuration, source=msgspec.structs.replace(source, uri=_USER.sub("", source.uri)))
+
+
 def dump(configuration: Configuration) -> dict[str, Any]:
     """Plain JSON-able data; `msgspec.convert(dump(c), Configuration) == c`."""
     return msgspec.to_builtins(configuration)
@@ -287,17 +332,44 @@ def _anchor_paths(tree: dict[str, Any], base: Path) -> None:
                 table[key] = str(base / Path(table[key]).expanduser())
 
     anchor(tree, "camera", "output")
-    anchor(tree.get("runtime"), "runtime_dir")
+    anchor(tree.get("runtime"), "runtime_dir", "models_dir")
     models = tree.get("models")
     for spec in models.values() if isinstance(models, dict) else ():
-        anchor(spec, "path")
+        if isinstance(spec, dict) and not model_store.is_name(str(spec.get("path", ""))):
+            anchor(spec, "path")
         if isinstance(spec, dict) and str(spec.get("manifest", "")).endswith(".toml"):  # else a shipped one's name
             anchor(spec, "manifest")
     source = tree.get("source")
     if isinstance(source, dict) and isinstance(source.get("uri"), str):
-        scheme, colon, address = source["uri"].partition(":")
-        if colon and scheme in FILE_SCHEMES:
+        scheme, _, address = source["uri"].partition(":")
+        if address and scheme in FILE_SCHEMES:
             source["uri"] = f"{scheme}:{base / Path(address).expanduser()}"
+
+
+def _put_models(tree: dict[str, Any], names: Iterable[str]) -> None:
+    """Adds models at hand by name, each for the role that its manifest states."""
+    runtime = tree.get("runtime")
+    models_dir = runtime.get("models_dir") if isinstance(runtime, dict) else None
+    for name in names:
+        try:
+            network = model_store.find(name, models_dir)
+            _put(tree, f"models.{model_store.role_of(network)}.path", str(network))
+        except ModelError as error:
+            raise ConfigurationError(f"--model {name}: {error}") from error
+
+
+def _with_models_found(configuration: Configuration) -> Configuration:
+    """The configuration with the files of models at hand where their names stood."""
+    found: dict[str, ModelSpec] = {}
+    models = configuration.models
+    for role, spec in (*models.given().items(), *([("pointnet", models.pointnet)] if models.pointnet else [])):
+        if model_store.is_name(spec.path) and not Path(spec.path).is_file():
+            try:
+                network = model_store.find(spec.path, configuration.runtime.models_dir)
+            except ModelError as error:
+                raise ConfigurationError(f"models.{role}.path: {error}") from error
+            found[role] = msgspec.structs.replace(spec, path=str(network))
+    return msgspec.structs.replace(configuration, models=msgspec.structs.replace(models, **found))
 
 
 def _read_camera_file(tree: dict[str, Any]) -> None:

@@ -150,9 +150,9 @@ def _lateness_ms() -> float:
 
 
 def _models(configuration: Configuration) -> Iterator[Finding]:
-    specs = configuration.models.given()
+    specs = configuration.models.in_use()
     if not specs:
-        yield Finding("models", "warning", "none", "--model detector=FILE --model segmenter=FILE: else odometry only")
+        yield Finding("models", "warning", "none", "without --model none the shipped network runs; now odometry only")
     for role, spec in specs.items():
         try:
             described = load_network(role, spec).describe()

@@ -24,7 +24,7 @@ from runtime.cli import USER_ERROR_STATUS
 from runtime.configuration import ConfigurationError, load
 from runtime.notify import Notifier
 from runtime.presence import runtime_dir_of, socket_path
-from runtime.topology import NODES
+from runtime.topology import PROCESSES
 from runtime.wire import MAX_MESSAGE_BYTES
 
 _LOOK_S = 1.0
@@ -60,7 +60,7 @@ def gate_config(path: Path, vehicle: str, runtime_dir: Path | None = None) -> ze
     _check_rules(path, config)
     try:
         directory = runtime_dir_of(vehicle, runtime_dir)
-        endpoints = [f"unixsock-stream/{socket_path(directory, node)}" for node in NODES]
+        endpoints = [f"unixsock-stream/{socket_path(directory, node)}" for node in ("hub", *PROCESSES)]
     except (ValueError, OSError) as error:
         raise GateError(f"vehicle {vehicle!r}, runtime directory: {error}") from error
     for key, value in (

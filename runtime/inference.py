@@ -12,6 +12,7 @@ from typing import Any, Self
 from birdslam.frontend import Pending
 from birdslam.perception import Networks, Perception, Ready, load_network
 from birdslam.perception.manifest import Role
+from birdslam.perception.pointnet import PointNet, load_pointnet
 from birdslam.types import Frame
 from runtime.configuration import Configuration
 from runtime.degradation import Mode
@@ -28,7 +29,9 @@ class Inference:
     """
 
     def __init__(self, configuration: Configuration) -> None:
-        heads = [load_network(role, spec) for role, spec in configuration.models.given().items()]
+        heads = [load_network(role, spec) for role, spec in configuration.models.in_use().items()]
+        pointnet = configuration.models.pointnet
+        self.frustum_network: PointNet | None = None if pointnet is None else load_pointnet(pointnet)
         self._deadline_ns = configuration.deadline_ns
         self._awaited: frozenset[Run] = frozenset(head.run for head in heads if head.schedule.awaited)
         self._rate_divisor = configuration.degradation.rate_divisor

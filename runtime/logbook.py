@@ -32,10 +32,11 @@ class Logbook:
     """Listens in a thread of its own from construction on; stands at a planner's place, so its ages are a planner's.
 
     `event_fd` becomes readable when END_OF_SOURCE came back (`ended`), or recording failed (`error`). A `tolerant` one
-    goes on without recording where the disk fails it (`unwritten` says why): the vehicle drives on.
+    goes on without recording where the disk fails it (`unwritten` says why): the vehicle drives on. `door` too
+    gets all of it.
     """
 
-    def __init__(self, bus: Bus, results: Results, tolerant: bool = False) -> None:
+    def __init__(self, bus: Bus, results: Results, tolerant: bool = False, door: Results | None = None) -> None:
         self.event_fd = os.eventfd(0)
         self.ended = False
         self.error: Exception | None = None
@@ -46,6 +47,7 @@ class Logbook:
         self.stages: dict[str, Distribution] = {}
         self.statuses: Counter[str] = Counter()
         self._results = results
+        self._door = door
         self._bus = bus
         self._estimates = bus.subscriber("estimate", depth=QUEUE_FRAMES)
         self._map = bus.subscriber("map", depth=QUEUE_FRAMES)
@@ -75,17 +77,21 @@ class Logbook:
             self._take_map(until_frame=estimate.frame_id)
             self.ended = True
             return
+        self.statuses.update(status.value for status in estimate.status)
+        self._latest = estimate
+        if Status.PERCEPTION_LATE in estimate.status:  # nothing was measured: no row, and no frame that was processed
+            return
+        if self._door is not None:
+            self._door.add(estimate)
         self._write(self._results.add, estimate)
         self._take_map()
         age_ms = (message.t_received_ns - estimate.t_capture_ns) / 1e6
         self.age.add(age_ms)
         for name, ms in stages(message.trace, message.t_received_ns):
             self.stages.setdefault(name, Distribution()).add(ms)
-        self.statuses.update(status.value for status in estimate.status)
         self._first_ns = self._first_ns or message.t_received_ns
         self._last_ns = message.t_received_ns
         self._recent.append((message.t_received_ns, age_ms))
-        self._latest = estimate
         self.recorded += 1
 
     def _write(self, add: Callable[[_Record], None], record: _Record) -> None:
@@ -105,6 +111,8 @@ class Logbook:
             message = self._map.recv(max(0.0, until_s - time.monotonic()))
             if message is None:
                 return
+            if self._door is not None:
+                self._door.add_map(message.record)
             self._write(self._results.add_map, message.record)
             self._map_frame = message.record.frame_id
 
@@ -117,7 +125,7 @@ class Logbook:
     def status_line(self) -> str:
         """What goes on now: rate, age, tracks and warnings of the newest frames."""
         recent, latest = tuple(self._recent), self._latest
-        if latest is None:
+        if latest is None or not recent:
             return "waiting for the first frame"
         span_ns = recent[-1][0] - recent[0][0]
         rate_hz = (len(recent) - 1) * 1e9 / span_ns if span_ns > 0 else 0.0

@@ -16,17 +16,17 @@ import msgspec
 
 from birdslam.camera import Camera
 from birdslam.frontend import FrontEnd
-from birdslam.graph import PoseGraph
-from birdslam.se2 import SE2
-from birdslam.types import Estimate, Frame, FrameRef, MapUpdate, Measurements, Status
+from birdslam.motionwatch import MotionWatch
+from birdslam.types import INVALIDATING, Frame, FrameRef, Measurements, Status
 from runtime.bus import Bus, Message
 from runtime.capture import CaptureNode, stamps
 from runtime.configuration import Configuration, ConfigurationError
 from runtime.degradation import STATUS, Degradation, Mode
 from runtime.frames import FrameReader
 from runtime.inference import Inference
-from runtime.presence import ring_path, runtime_dir_of
-from runtime.restarts import FIRST, Assignment, EpochFile
+from runtime.optimize import OptimizeNode
+from runtime.presence import ring_path
+from runtime.restarts import Assignment
 
 STALE_BUDGETS = 3.0  # a frame that comes to perceive this many times later than budgeted bears INPUT_STALE
 
@@ -81,10 +81,10 @@ class PerceiveNode:
         self._coast_divisor = configuration.degradation.coast_divisor
         self._coast_max_ns = round(configuration.degradation.coast_max_ms * 1e6)
         self._stale_ns = round(configuration.budgets.received_ms * STALE_BUDGETS * 1e6)
-        self._looked_frame, self._looked_ns = (
-            -1,
-            0,
-        )  # the last frame with pixels that was looked at, and its source time
+        self._watch = MotionWatch(configuration.motion_watch)
+        self._looked_frame = -1  # the last frame with pixels that was looked at
+        self._measured_ns: int | None = None  # the source time of the last one whose motion was measured
+        self._looked_invalid: tuple[Status, ...] = ()  # what made it one that nobody may drive by
 
     @property
     def mode(self) -> str:
@@ -116,10 +116,14 @@ class PerceiveNode:
 
     def _look(self, frame: Frame, mode: Mode) -> Measurements:
         stale = time.monotonic_ns() - frame.t_capture_ns > self._stale_ns
+        measurements = self._watch.judge(self._frontend.step(frame, self._inference.start(frame, mode)))
         if frame.image is not None:
-            self._looked_frame, self._looked_ns = frame.frame_id, frame.t_source_ns
-        measurements = self._frontend.step(frame, self._inference.start(frame, mode))
-        status = (*measurements.status, *STATUS[mode], *((Status.INPUT_STALE,) if stale else ()))
+            self._looked_frame = frame.frame_id
+            if Status.ODOMETRY_COASTING not in measurements.status:
+                self._measured_ns = frame.t_source_ns
+        late = self._too_long(frame.t_source_ns)
+        self._looked_invalid = tuple(s for s in measurements.status if s in INVALIDATING)
+        status = (*measurements.status, *late, *STATUS[mode], *((Status.INPUT_STALE,) if stale else ()))
         return msgspec.structs.replace(measurements, status=tuple(dict.fromkeys(status)))
 
     def _coasts(self, ref: FrameRef, mode: Mode) -> bool:
@@ -127,9 +131,13 @@ class PerceiveNode:
         return mode is Mode.COASTING and ref.slot >= 0 and ref.frame_id - self._looked_frame < self._coast_divisor
 
     def _coast(self, ref: FrameRef) -> Measurements:
-        too_long = ref.t_source_ns - self._looked_ns > self._coast_max_ns
-        status = (*ref.status, Status.COASTING, *((Status.COASTED_TOO_LONG,) if too_long else ()))
-        return Measurements(**stamps(ref), status=status)
+        status = (*ref.status, Status.COASTING, *self._looked_invalid, *self._too_long(ref.t_source_ns))
+        return Measurements(**stamps(ref), status=tuple(dict.fromkeys(status)))
+
+    def _too_long(self, t_source_ns: int) -> tuple[Status, ...]:
+        """Whether the motion has only been predicted for longer than anybody should drive by."""
+        since_ns = 0 if self._measured_ns is None else t_source_ns - self._measured_ns
+        return (Status.COASTED_TOO_LONG,) if since_ns > self._coast_max_ns else ()
 
     def drain(self) -> None:
         """Ends with END_OF_SOURCE, as ever."""
@@ -142,72 +150,14 @@ class PerceiveNode:
         self._ring.close()
 
 
-class OptimizeNode:
-    """Measurements -> Estimate, MapUpdate: the pose graph."""
-
-    mode: str = Mode.FULL
-
-    def __init__(self, configuration: Configuration, bus: Bus, assignment: Assignment = FIRST) -> None:
-        self.ended = False
-        self._measurements = bus.subscriber("measurements")
-        self._epochs: EpochFile | None = None
-        if not configuration.lossless:  # a run at rate "max" gives the same bytes each time
-            self._epochs = EpochFile(runtime_dir_of(configuration.vehicle, configuration.runtime_dir) / "epoch")
-        epoch = 0 if self._epochs is None else self._epochs.last + 1
-        self._graph = PoseGraph(configuration.slam.graph, configuration.slam.weights, epoch)
-        self._first_status = (Status.GRAPH_RESET,) if epoch else ()  # planners may know an older world
-        self._last: Estimate | None = None
-
-    def receive(self, timeout_s: float) -> Message | None:
-        return self._measurements.recv(timeout_s)
-
-    def step(self, measurements: Measurements) -> Iterator[Estimate | MapUpdate]:
-        if Status.END_OF_SOURCE in measurements.status:
-            self.ended = True
-            yield from self._end(measurements)
-            return
-        estimate = self._graph.update(measurements)
-        if self._last is None and self._first_status:
-            status = tuple(dict.fromkeys((*estimate.status, *self._first_status)))
-            estimate = msgspec.structs.replace(estimate, status=status)
-        self._last = estimate
-        if self._epochs is not None:
-            self._epochs.store(estimate.epoch)
-        yield estimate
-        gained = self._graph.map_update()
-        if gained is not None:
-            yield gained
-
-    def _end(self, measurements: Measurements) -> Iterator[Estimate | MapUpdate]:
-        """The map is complete before the estimate that ends the run; its update bears the number of the end."""
-        epoch = self._graph.epoch
-        gained = self._graph.map_update() or MapUpdate(epoch=epoch, frame_id=measurements.frame_id)
-        yield msgspec.structs.replace(gained, frame_id=measurements.frame_id)
-        yield Estimate(
-            **stamps(measurements),
-            epoch=epoch,
-            T_world_ego=self._last.T_world_ego if self._last else SE2(),
-            cov=self._last.cov if self._last else (0.0,) * 9,
-            valid=False,
-            status=measurements.status,
-        )
-
-    def drain(self) -> None:
-        """Ends with END_OF_SOURCE, as ever."""
-
-    def counters(self) -> dict[str, int]:
-        return {"dropped": self._measurements.dropped, "malformed": self._measurements.malformed}
-
-    def close(self) -> None:
-        """Holds nothing open."""
-
-
 def prepare(name: str, configuration: Configuration) -> Callable[[Bus, Callable[[float], object], Assignment], Node]:
     """Does what takes long and what several processes may do at once; the result makes the node without delay."""
     if name == "perceive":
         cv2.setNumThreads(configuration.perceive.opencv_threads)
         inference = Inference(configuration)
-        frontend = FrontEnd(calibrated(configuration), configuration.slam.frontend)
+        frontend = FrontEnd(
+            calibrated(configuration), configuration.slam.frontend, frustum_network=inference.frustum_network
+        )
         return lambda bus, wait, assignment: PerceiveNode(configuration, inference, frontend, bus, assignment)
     if name == "optimize":
         return lambda bus, wait, assignment: OptimizeNode(configuration, bus, assignment)

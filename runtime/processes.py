@@ -13,7 +13,6 @@ import msgspec
 
 from runtime.cli import ENVIRONMENT, USER_ERROR_STATUS
 from runtime.configuration import Configuration
-from runtime.restarts import Assignment
 from runtime.vitals import Vitals
 
 _SHOWN_LEVELS = (" WARNING ", " ERROR ", " CRITICAL ")
@@ -50,14 +49,14 @@ class NodeLog:
 class NodeProcess:
     """One process of a node: it loads what it needs at once, and waits for `begin`."""
 
-    def __init__(self, name: str, configuration: Configuration, log: NodeLog) -> None:
+    def __init__(self, name: str, configuration: Configuration, log: NodeLog, module: str = "runtime.runner") -> None:
         self.name = name
         self.vitals = Vitals()
         self.begun_s: float | None = None
         self._log, self._log_start = log, log.size()
         with log.path.open("ab") as output:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "runtime.runner", name, str(self.vitals.fd), str(os.getpid())],
+                [sys.executable, "-P", "-m", module, name, str(self.vitals.fd), str(os.getpid())],
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -68,7 +67,7 @@ class NodeProcess:
         self.pidfd = os.pidfd_open(self._process.pid)
         self._tell(configuration)
 
-    def begin(self, assignment: Assignment) -> None:
+    def begin(self, assignment: msgspec.Struct) -> None:
         """Its work begins, with nothing more to be told."""
         self.begun_s = time.monotonic()
         self._tell(assignment)

@@ -86,6 +86,15 @@ def table(summary: dict[str, Any], output: Path) -> str:
         *((f"  {name}", spread(figures)) for name, figures in summary["stages_ms"].items()),
         *((f"  {name} begun anew", f"{n} times") for name, n in summary["restarts"].items() if n),
         *((f"  {status}", f"{n} frames") for status, n in summary["statuses"].items()),
+        *(("recorded", _recorded(recording)) for recording in [summary.get("recording")] if recording),
         ("results in", str(output)),
     ]
     return "\n".join(f"{name:24}{value}" for name, value in rows)
+
+
+def _recorded(recording: dict[str, Any]) -> str:
+    lost = recording["dropped"] + recording["images_torn"]
+    state = "" if recording["complete"] else ", CUT OFF"
+    return (
+        f"{recording['file']}: {recording['messages']} messages, {lost} lost, {recording['bytes'] / 1e6:.1f} MB{state}"
+    )

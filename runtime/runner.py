@@ -8,7 +8,6 @@ the node fails at work: a camera that is gone, or a bug, with its traceback ther
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import logging
 import os
@@ -28,22 +27,23 @@ from birdslam.perception import ModelError
 from birdslam.types import Estimate, FrameRef, Measurements, Status
 from runtime import realtime
 from runtime.bus import Bus, Publisher
+from runtime.child import LOG_FORMAT, die_with
 from runtime.cli import USER_ERROR_STATUS
+from runtime.coasting import Overdue
 from runtime.configuration import Configuration, ConfigurationError
 from runtime.meter import Meter
 from runtime.nodes import Node, prepare
 from runtime.restarts import Assignment
 from runtime.sources import SourceError
-from runtime.topology import NODES, TOPICS
+from runtime.topology import NODES, RECORDER, TOPICS
 from runtime.vitals import Vitals
 from runtime.wire import Health
 
 log = logging.getLogger(__name__)
 
-LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
 USER_ERRORS = (ConfigurationError, DatasetError, ModelError, SourceError)
+RECORDER_PATIENCE_S = 0.2  # of a node begun anew: its first records are worth so much, no more
 DOWNSTREAM = {"capture": "perceive", "perceive": "optimize", "optimize": "supervisor"}  # who must be there to receive
-_PR_SET_PDEATHSIG = 1
 
 
 class Stop:
@@ -89,6 +89,9 @@ def run(
         try:
             publishers = {TOPICS[topic].record: bus.publisher(topic) for topic in NODES[name].sends}
             _await_downstream(name, bus, publishers, runtime.ready_timeout_s)
+            if configuration.recording.file:
+                first_s = configuration.recording.ready_timeout_s
+                bus.wait_alive({RECORDER.name}, RECORDER_PATIENCE_S if assignment.restarts else first_s)
             gc.collect()
             gc.freeze()  # what was built lives to the end: never walk it again
             stop.at_work = True
@@ -131,7 +134,8 @@ def _loop(
         now_ns = time.monotonic_ns()
         if message is not None:
             taken_ns = now_ns  # waiting in the queue belongs to the hop, not to the step
-            meter.heard(taken_ns)
+            if not isinstance(message.record, Overdue):
+                meter.heard(taken_ns)
             for record in node.step(message.record):
                 now_ns = time.monotonic_ns()
                 trace = message.trace.after(name, taken_ns, now_ns)
@@ -141,7 +145,8 @@ def _loop(
                         t_source_ns=record.t_source_ns,
                         t_capture_ns=record.t_capture_ns,
                     )
-                    meter.frame(record.t_capture_ns, message.trace, taken_ns, now_ns)
+                    if Status.PERCEPTION_LATE not in record.status:
+                        meter.frame(record.t_capture_ns, message.trace, taken_ns, now_ns)
                     if isinstance(record, Estimate):
                         trace = msgspec.structs.replace(trace, left_ns=record.t_capture_ns + budget_ns - now_ns)
                 publishers[type(record)].put(record, trace)
@@ -150,19 +155,12 @@ def _loop(
             publishers[Health].put(meter.health(now_ns, node.mode, node.counters()))
 
 
-def _die_with(parent_pid: int) -> None:
-    """A supervisor that is killed takes its nodes along."""
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != parent_pid:
-        raise SystemExit(0)
-
-
 def main(arguments: list[str]) -> int:
     """Entry point of a node's process."""
     name, vitals_fd, parent_pid = arguments
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=LOG_FORMAT)
     stop = Stop()
-    _die_with(int(parent_pid))
+    die_with(int(parent_pid))
     configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
     sys.setswitchinterval(configuration.runtime.switch_interval_s)
     cv2.setNumThreads(1)  # perceive sets its own

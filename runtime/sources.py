@@ -22,6 +22,7 @@ from birdslam.datasets import RecordedFrame, Recording, open_recording
 from birdslam.types import Frame, Status
 from runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, SourceConfig
 
+SOURCES = "kitti:DIR, video:FILE, mcap:FILE, demo, v4l2:/dev/videoN or rtsp://HOST/PATH"
 LIVE_RATE_HZ = 30.0  # of a camera that does not say
 
 log = logging.getLogger(__name__)
@@ -52,7 +53,12 @@ def open_source(configuration: Configuration, must_open: bool = True) -> Source:
     """
     source = configuration.source
     scheme, colon, address = source.uri.partition(":")
-    if colon and scheme in FILE_SCHEMES:
+    if colon and scheme == "mcap" and address:
+        from runtime.recorded_images import RecordedImages  # only where it is needed: Foxglove's types and mcap
+
+        images = RecordedImages(Path(address).expanduser(), configuration.camera, source.stride)
+        return RecordedSource(images, source)
+    if scheme in FILE_SCHEMES and (colon or scheme == "demo"):
         return RecordedSource(open_recording(source.uri, configuration.camera, source.stride), source)
     if colon and scheme in ("v4l2", "rtsp") and address:
         if configuration.camera is None:
@@ -61,10 +67,8 @@ def open_source(configuration: Configuration, must_open: bool = True) -> Source:
             raise ConfigurationError(f'{source.uri}: rate "max" is for recordings; a live camera has its own')
         return CameraSource(source, configuration.camera, must_open)
     if not source.uri:
-        raise ConfigurationError("no source: give --source kitti:DIR, video:FILE, v4l2:/dev/videoN or rtsp://...")
-    raise ConfigurationError(
-        f"source {source.uri!r}: expected kitti:DIR, video:FILE, v4l2:/dev/videoN or rtsp://HOST/PATH"
-    )
+        raise ConfigurationError(f"no source: give --source {SOURCES}")
+    raise ConfigurationError(f"source {source.uri!r}: expected {SOURCES}")
 
 
 class RecordedSource:

@@ -12,8 +12,7 @@ from runtime.presence import remove_socket, runtime_dir_of
 from runtime.processes import NodeLog, NodeProcess
 from runtime.restarts import FIRST, Restarts
 
-_SUMMED = ("frames", "dropped", "malformed", "torn")
-
+_SUMMED = ("frames", "dropped", "malformed", "torn", "coasted", "outrun")
 
 DEAF_RECORDS = 10  # sent to a node that has taken up none of them
 
@@ -106,7 +105,8 @@ class Station:
         if process.silent_s() * 1e3 > runtime.watchdog_ms:
             return f"is stalled: its loop has shown no life for {runtime.watchdog_ms:g} ms"
         if before is not None and process.ready:
-            sent, taken = before.process.vitals["frames"], process.vitals["frames"] + process.vitals["torn"]
+            sent = before.process.vitals["frames"]
+            taken = sum(process.vitals[counter] for counter in ("frames", "torn", "outrun"))
             missed = self._hearing.missed(sent, taken, time.monotonic(), runtime.watchdog_ms / 1e3)
             if missed:
                 return f"is deaf: has taken up none of the last {missed} frames of {before.name}"

@@ -13,20 +13,25 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import msgspec
+
 from birdslam.perception import load_network
+from birdslam.perception.pointnet import load_pointnet
 from birdslam.results import Recorder, claim_directory
 from runtime.bus import Bus
 from runtime.cli import INTERRUPTED_STATUS, USER_ERROR_STATUS
 from runtime.configuration import Configuration, ConfigurationError, complete
+from runtime.door import Door
 from runtime.live import LiveLine
 from runtime.logbook import Logbook
 from runtime.notify import Notifier
 from runtime.presence import VehicleLock, runtime_dir_of, socket_path
+from runtime.recorder_station import RecorderStation, choose_file
 from runtime.report import summarise, table
 from runtime.sources import CameraSource, open_source
 from runtime.stations import Station
@@ -35,7 +40,7 @@ from runtime.topology import NODES
 START_ORDER = ("optimize", "perceive", "capture")  # each awaits the one before it (runner.py)
 BEFORE = {"perceive": "capture", "optimize": "perceive"}  # who sends to whom
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-WITHOUT_MODELS = "no --model given: odometry only, without vehicles and lanes"
+WITHOUT_MODELS = "no networks: odometry only, without vehicles and lanes"
 CHECK_S = 0.1  # watchdogs are looked after at least so often
 WARNINGS_SHOWN = 5  # at a time; the log has all of them
 
@@ -61,13 +66,22 @@ def run(configuration: Configuration) -> int:
                 lossless=configuration.lossless,
             )
         )
-        logbook = Logbook(bus, recorder, tolerant=configuration.restarts)
+        logbook = Logbook(bus, recorder, tolerant=configuration.restarts, door=Door(configuration, bus))
         stack.callback(logbook.close)
         bus.declare_alive()
-        supervisor = Supervisor(configuration, logbook, live)
+        recording = None
+        if configuration.recording.file:
+            recording = stack.enter_context(closing(RecorderStation(configuration, models, output / "logs")))
+        supervisor = Supervisor(configuration, logbook, live, recording)
         supervisor.run(output / "logs")
+        if recording is not None:
+            recording.finish(configuration.runtime.stop_timeout_s)
     live.clear()
     summary = summarise(configuration, supervisor.stations, logbook, models, supervisor.ended)
+    if recording is not None:
+        summary["recording"] = recording.figures()
+        for line in recording.news():
+            live.say(line)
     try:
         recorder.finish(summary)
     except OSError as error:
@@ -91,9 +105,15 @@ def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any]]:
     configuration = complete(configuration, source.camera, source.rate_hz)
     if isinstance(source, CameraSource):
         source.close()  # capture opens it for itself
+    recording = configuration.recording
+    if recording.file:
+        file = choose_file(recording, configuration.vehicle)
+        configuration = msgspec.structs.replace(configuration, recording=msgspec.structs.replace(recording, file=file))
     models: dict[str, Any] = {
-        role: load_network(role, spec).describe() for role, spec in configuration.models.given().items()
+        role: load_network(role, spec).describe() for role, spec in configuration.models.in_use().items()
     }
+    if configuration.models.pointnet is not None:
+        models["pointnet"] = load_pointnet(configuration.models.pointnet).describe()
     return configuration, models
 
 
@@ -109,12 +129,15 @@ def check_runtime_dir(vehicle: str, runtime_dir: Path | None) -> None:
 class Supervisor:
     """The nodes of one run, from their start to their end."""
 
-    def __init__(self, configuration: Configuration, logbook: Logbook, live: LiveLine) -> None:
+    def __init__(
+        self, configuration: Configuration, logbook: Logbook, live: LiveLine, recording: RecorderStation | None = None
+    ) -> None:
         self.failure = ""
         self.exit_status = 0
         self._config = configuration
         self._logbook = logbook
         self._live = live
+        self._recording = recording
         self._notifier = Notifier()
         self._disk_said = False
         self.stations: dict[str, Station] = {}
@@ -242,6 +265,10 @@ class Supervisor:
             self._disk_said = True
             self._live.say(f"results are not written any more: {self._logbook.unwritten}")
         status = self._logbook.status_line()
+        if self._recording is not None:
+            for line in self._recording.news():
+                self._live.say(line)
+            status = f"{status}  {self._recording.status()}"
         self._live.update(status)
         self._notifier.alive(status)
 

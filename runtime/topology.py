@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 
-from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements
+from birdslam.types import Estimate, FrameRef, MapSnapshot, MapUpdate, Measurements, Trajectory
 from runtime.wire import Health
 
 VERSION = "v1"
@@ -26,6 +27,8 @@ class Topic:
 
     A reader's queue holds `depth` messages: of a `hot` topic only the newest counts (depth 1), of others a few wait.
     When it is full the oldest is dropped, and counted. `urgent` topics are sent before the rest, in the order of puts.
+    The producer answers a query of the topic's own key with its last `kept` messages, for those that come late.
+    `pace`: how often there is one.
     """
 
     name: str
@@ -34,6 +37,8 @@ class Topic:
     depth: int
     hot: bool = False
     urgent: bool = True
+    kept: int = 0
+    pace: str = "each frame"
 
 
 @dataclass(frozen=True)
@@ -50,18 +55,52 @@ NODES = {
     for node in (
         Node("capture", receives=("estimate",), sends=("frame", "health/capture")),  # estimates pace --rate max
         Node("perceive", receives=("frame",), sends=("measurements", "health/perceive")),
-        Node("optimize", receives=("measurements",), sends=("estimate", "map", "health/optimize")),
+        Node("optimize", receives=("frame", "measurements"), sends=("estimate", "map", "health/optimize")),
     )
 }
+RECORDER = Node("record", receives=("frame", "measurements", "estimate", "map"), sends=("health/record",))
+PROCESSES = {**NODES, RECORDER.name: RECORDER}  # the recorder is there only where a drive is recorded
 
 TOPICS = {
     topic.name: topic
     for topic in (
         Topic("frame", FrameRef, "capture", depth=1, hot=True),
-        Topic("measurements", Measurements, "perceive", depth=8),  # a lost one breaks the chain of edges: queue a few
-        Topic("estimate", Estimate, "optimize", depth=1, hot=True),
-        Topic("map", MapUpdate, "optimize", depth=256),
-        *(Topic(f"health/{name}", Health, name, depth=4, urgent=False) for name in NODES),
+        # A lost one breaks the chain of edges: a few are queued, and an optimizer that begins anew asks for the last
+        Topic("measurements", Measurements, "perceive", depth=8, kept=96),
+        Topic("estimate", Estimate, "optimize", depth=1, hot=True, kept=1),
+        Topic("map", MapUpdate, "optimize", depth=256, pace="each frame in which the map gained something"),
+        *(
+            Topic(f"health/{name}", Health, name, depth=4, urgent=False, kept=1, pace="once a second")
+            for name in PROCESSES
+        ),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Question:
+    """What the supervisor is asked for by a query of the key; the answer comes in one or more parts (wire.Part).
+
+    `record` is the type of each part; dict: a plain map. `parameters`: name -> meaning.
+    """
+
+    name: str
+    record: type[Any]
+    meaning: str
+    parameters: dict[str, str]
+
+
+QUESTIONS = {
+    question.name: question
+    for question in (
+        Question("map", MapSnapshot, "the whole map of the newest epoch", {}),
+        Question(
+            "trajectory",
+            Trajectory,
+            "where everybody has been, in the newest epoch",
+            {"last_s": "only the last so many seconds of the source's time; left out: all"},
+        ),
+        Question("configuration", dict, "the configuration of the run, as in summary.json, without passwords", {}),
     )
 }
 
@@ -76,8 +115,9 @@ def check_name(what: str, name: str) -> str:
 
 
 def key_of(vehicle: str, topic: str) -> str:
-    """The zenoh key of a topic. Raises ValueError for a bad vehicle name, KeyError for a topic that does not exist."""
-    return f"birdslam/{check_name('vehicle', vehicle)}/{VERSION}/{TOPICS[topic].name}"
+    """The zenoh key of a topic or a question. Raises ValueError for a bad vehicle name, KeyError for neither."""
+    name = QUESTIONS[topic].name if topic in QUESTIONS else TOPICS[topic].name
+    return f"birdslam/{check_name('vehicle', vehicle)}/{VERSION}/{name}"
 
 
 def alive_key(vehicle: str, node: str) -> str:

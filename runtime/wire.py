@@ -35,7 +35,7 @@ class Stage(msgspec.Struct, frozen=True, array_like=True):
     """What one node did with a message, on CLOCK_MONOTONIC: received it, finished its step, sent the result."""
 
     node: _NodeName
-    received_ns: int
+    received_ns: int  # taken up: what it waited in the node's queue belongs to the hop
     done_ns: int
     sent_ns: int = 0  # stamped by Publisher.put
 
@@ -43,7 +43,7 @@ class Stage(msgspec.Struct, frozen=True, array_like=True):
 class Trace(msgspec.Struct, frozen=True):
     """Where a message's time went; travels as the attachment, so that the payload's bytes stay deterministic."""
 
-    stages: Annotated[tuple[Stage, ...], msgspec.Meta(max_length=8)] = ()
+    stages: Annotated[tuple[Stage, ...], msgspec.Meta(max_length=8)] = ()  # in the order of the way
     left_ns: int | None = None  # of the budget end to end when an estimate was done; negative: it is late
 
     def after(self, node: str, received_ns: int, done_ns: int) -> Trace:
@@ -54,6 +54,13 @@ class Trace(msgspec.Struct, frozen=True):
         """The trace with the sending of its last stage stamped."""
         *earlier, last = self.stages
         return Trace((*earlier, Stage(last.node, last.received_ns, last.done_ns, sent_ns)), self.left_ns)
+
+
+class Part(msgspec.Struct, frozen=True, array_like=True):
+    """Which of the answer's messages this is: one is too small for a long drive. Travels as their attachment."""
+
+    number: Annotated[int, msgspec.Meta(ge=0)] = 0  # from 0 on
+    of: Annotated[int, msgspec.Meta(ge=1, le=256)] = 1  # so many in all
 
 
 class Spread(msgspec.Struct, frozen=True, array_like=True):
@@ -86,6 +93,8 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     restarts: _Count = 0  # of this node in this run
     cause: Annotated[str, msgspec.Meta(max_length=200)] = ""  # of the last restart
     status: tuple[Status, ...] = ()  # INPUT_STALE: this node has received nothing for too long
+    coasted: _Count = 0  # of optimize: frames that it had to estimate without measurements
+    outrun: _Count = 0  # of optimize: measurements that came when a newer frame had been coasted over
 
 
 def _plain(value: Any) -> Any:

@@ -476,8 +476,9 @@ def test_a_planner_iterates_until_it_is_closed(join: Any, base: Path) -> None:
     heard = threading.Semaphore(0)
 
     def drive() -> None:
-        for item in planner.estimates():
-            got.append(item.frame_id)
+        for reading in planner.estimates(60_000.0):
+            assert reading.estimate is not None
+            got.append(reading.estimate.frame_id)
             heard.release()
 
     thread = threading.Thread(target=drive)

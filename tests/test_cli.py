@@ -36,7 +36,7 @@ def test_a_wrong_command_shows_the_usage(arguments: list[str], capsys: pytest.Ca
 def test_options_go_over_the_file(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.write_text(
-        'vehicle = "van"\noutput = "there"\n[source]\nrate = 3\n[models.detector]\npath = "old"\nevery = 2\n'
+        'vehicle = "van"\noutput = "there"\n[source]\nrate = 3\n[models.detector]\npath = "old.onnx"\nevery = 2\n'
     )
     made = configuration(
         "run",
@@ -52,6 +52,12 @@ def test_options_go_over_the_file(tmp_path: Path) -> None:
     assert configuration("run", str(path)).source.rate == 3.0
     assert configuration("run", "--rate", "33").source.rate == 33.0
     assert configuration("evaluate", "odometry", "00", "--config", str(path)).vehicle == "van"
+
+
+def test_no_model_is_a_choice() -> None:
+    assert configuration("run", "--model", "none").models.in_use() == {}
+    one = configuration("run", "--model", "none", "--model", "detector=a.onnx").models
+    assert one.in_use() == {"detector": ModelSpec("a.onnx")}
 
 
 def test_a_model_needs_a_role() -> None:

@@ -86,6 +86,19 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     }
 
 
+def test_the_shipped_network_fills_what_is_left() -> None:
+    own = ModelSpec("own.onnx")
+    assert list(load(None).models.in_use()) == ["multitask"]
+    assert Path(load(None).models.in_use()["multitask"].path).is_file()
+    beside = load(None, {"models.detector.path": "own.onnx"}).models
+    assert beside.given() == {"detector": own}
+    assert list(beside.in_use()) == ["detector", "multitask"]
+    paths = {f"models.{role}.path": "own.onnx" for role in ("detector", "segmenter", "depth")}
+    assert list(load(None, paths).models.in_use()) == ["detector", "segmenter", "depth"]
+    assert load(None, {"models.multitask.path": "own.onnx"}).models.in_use() == {"multitask": own}
+    assert load(None, {"models.shipped": False}).models.in_use() == {}
+
+
 def test_a_camera_file_that_is_wrong_is_named(tmp_path: Path) -> None:
     path = write(tmp_path / "front.toml", CAMERA + "zoom = 3\n")
     with pytest.raises(ConfigurationError, match=r"camera file .*front\.toml: .*zoom"):

@@ -88,7 +88,7 @@ def test_what_runs_in_each_mode(monkeypatch: pytest.MonkeyPatch, mode: Mode, run
     monkeypatch.setattr(inference, "load_network", lambda role, spec: heads[role])
     spec = ModelSpec("none.onnx")
     configuration = Configuration(
-        source=SourceConfig(rate="max"), models=ModelsConfig(detector=spec, segmenter=spec)
+        source=SourceConfig(rate="max"), models=ModelsConfig(detector=spec, segmenter=spec, shipped=False)
     )  # at rate "max" each is awaited, so that they can be counted
     image = np.zeros((4, 4), dtype=np.uint8)
     with Inference(configuration) as networks:
@@ -124,6 +124,7 @@ class Ring:
 def test_coasting_looks_at_few_frames_and_says_so() -> None:
     configuration = Configuration(
         vehicle="test",
+        models=ModelsConfig(shipped=False),
         degradation=DegradationConfig(window_frames=1, late_share=1.0, coast_divisor=5, coast_max_ms=250.0),
     )
     frontend = Blind()

@@ -81,7 +81,7 @@ def wheel(folder: Path) -> Path:
     with zipfile.ZipFile(path, "w") as archive:
         for package in ("birdslam", "runtime"):
             for file in sorted((ROOT / package).rglob("*")):
-                if file.suffix in {".py", ".toml"}:
+                if file.suffix in {".py", ".toml", ".onnx"}:
                     archive.write(file, file.relative_to(ROOT))
         archive.writestr("packages.pth", "/srv/packages\n")
         archive.writestr(f"{info}/METADATA", "Metadata-Version: 2.1\nName: birdslam\nVersion: 0.1.0\n")

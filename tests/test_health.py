@@ -166,7 +166,7 @@ def test_the_doctor_has_a_row_for_everything(tmp_path: Path) -> None:
         "output",
         "clock",
     }
-    assert expected | {"models", "camera"} <= set(rows)
+    assert expected | {"multitask", "camera"} <= set(rows)
     assert all(f.verdict in ("ok", "warning", "failed") for f in findings)
     assert all(f.advice for f in findings if f.verdict == "warning")
     assert not (tmp_path / "out").exists()

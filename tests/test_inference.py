@@ -53,7 +53,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Made:
         spec = ModelSpec("none.onnx")
         configuration = Configuration(
             source=SourceConfig(rate=rate),  # type: ignore[arg-type]
-            models=ModelsConfig(detector=spec, segmenter=spec),
+            models=ModelsConfig(detector=spec, segmenter=spec, shipped=False),
             perceive=PerceiveConfig(deadline_ms=deadline_ms),
         )
         with Inference(configuration) as made:

@@ -15,13 +15,14 @@ import pytest
 
 from birdslam.camera import Camera
 from birdslam.datasets import RecordedFrame
+from birdslam.se2 import SE2
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
-from runtime import capture, nodes
+from runtime import capture
 from runtime.bus import Message
 from runtime.capture import CaptureNode
 from runtime.configuration import Configuration, RuntimeConfig, SourceConfig
 from runtime.frames import FrameReader
-from runtime.nodes import OptimizeNode
+from runtime.optimize import OptimizeNode
 from runtime.presence import ring_path
 from runtime.restarts import FIRST, Assignment, Resume
 from runtime.sources import SourceError
@@ -46,7 +47,7 @@ class FakeBus:
     def __init__(self) -> None:
         self.inbox = Inbox()
 
-    def subscriber(self, topic: str) -> Inbox:
+    def subscriber(self, topic: str, depth: int | None = None) -> Inbox:
         return self.inbox
 
 
@@ -105,7 +106,7 @@ def come_back(inbox: Inbox, ref: FrameRef) -> None:
         t_source_ns=0,
         t_capture_ns=0,
         t_utc_ns=0,
-        T_world_ego=msgspec.convert([0.0, 0.0, 0.0], nodes.SE2),
+        T_world_ego=msgspec.convert([0.0, 0.0, 0.0], SE2),
         cov=(0.0,) * 9,
         valid=False,
         status=ref.status,

@@ -168,7 +168,8 @@ def test_three_processes_give_the_bytes_of_one(drive: Path, place: Path) -> None
 
 def test_real_frames_and_networks_too(data_dir: Path, models_dir: Path, place: Path) -> None:
     networks = {"detector": "yolox_nano_416.onnx", "segmenter": "twinlitenet_640x360.onnx"}
-    options = ["--stride", "6", *(f"--model={role}={models_dir / file}" for role, file in networks.items())]
+    named = [f"--model={role}={models_dir / file}" for role, file in networks.items()]
+    options = ["--stride", "6", "--model", "none", *named]
     sequence = data_dir / "kitti_odometry" / "sequences" / "06"
     offline = evaluate(sequence, place / "a", *options)
     run = run_all(place, sequence, "--rate", "max", *options)

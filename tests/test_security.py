@@ -26,9 +26,11 @@ import zenoh
 from birdslam.types import MapUpdate
 from runtime.bus import Bus, Publisher, Subscriber
 from runtime.client import Planner
+from runtime.configuration import load
+from runtime.door import Door
 from runtime.gate import GateError, gate_config
 from runtime.presence import runtime_dir_of, socket_path
-from runtime.topology import NODES, TOPICS, alive_key, key_of
+from runtime.topology import PROCESSES, QUESTIONS, TOPICS, alive_key, key_of
 from runtime.wire import Health, encode
 from tests.mutations import Chance, mutated
 from tests.test_bus import estimate, measurements, until
@@ -36,7 +38,8 @@ from tests.test_bus import estimate, measurements, until
 ROOT = Path(__file__).resolve().parent.parent
 DEPLOY = ROOT / "deploy"
 LIMIT_S = 20.0
-READABLE = {"estimate", "map", *(f"health/{node}" for node in NODES)}
+ASKABLE = {*QUESTIONS, "estimate", *(f"health/{node}" for node in PROCESSES)}
+READABLE = {"estimate", "map", *(f"health/{node}" for node in PROCESSES)}
 
 needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
 
@@ -144,8 +147,10 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Ite
     (base / "car.toml").write_text('vehicle = "car"\n')
     path = gate_file(base, certificates, port)
     with ExitStack() as stack:
-        stack.enter_context(Bus("car", "supervisor", hub=True, runtime_dir=base))
-        nodes = {name: stack.enter_context(Bus("car", name, runtime_dir=base)) for name in NODES}
+        hub = stack.enter_context(Bus("car", "supervisor", hub=True, runtime_dir=base))
+        door = Door(load(base / "car.toml"), hub)
+        door.add(estimate(1))
+        nodes = {name: stack.enter_context(Bus("car", name, runtime_dir=base)) for name in PROCESSES}
         for node in nodes.values():
             node.declare_alive()
         publishers = {t: nodes[TOPICS[t].producer].publisher(t) for t in TOPICS if t != "frame"}
@@ -208,9 +213,32 @@ def test_the_gates_file_speaks_of_the_topology_and_of_nothing_else() -> None:
 def test_a_planner_reads_what_it_may_and_no_more(vehicle: Vehicle, certificates: Path) -> None:
     with outside(certificates, vehicle.port) as session:
         heard = hear(vehicle, session, keys(READABLE))
-        until(lambda: len(heard.alive) == len(NODES), "all nodes are alive")
+        until(lambda: len(heard.alive) == len(PROCESSES), "all nodes are alive")
         assert heard.keys == keys(READABLE)  # no measurements, no frames
-        assert heard.alive == {alive_key("car", node) for node in NODES}
+        assert heard.alive == {alive_key("car", node) for node in PROCESSES}
+
+
+def answers(session: zenoh.Session, topic: str, limit_s: float = 2.0) -> int:
+    """How many messages answer a query of the key."""
+    return sum(reply.ok is not None for reply in session.get(key_of("car", topic), timeout=limit_s))
+
+
+@needs_openssl
+def test_a_planner_asks_what_it_may_and_no_more(vehicle: Vehicle, certificates: Path) -> None:
+    with (
+        outside(certificates, vehicle.port) as session,
+        outside(certificates, vehicle.port, "stranger") as stranger,
+    ):
+        hear(vehicle, session, keys(READABLE))  # each node has said something, which it keeps
+        for topic in ASKABLE:
+            until(lambda topic=topic: answers(session, topic) == 1, f"an answer about {topic}")  # type: ignore[misc]
+        assert answers(vehicle.nodes["optimize"]._session, "measurements") >= 1  # inside, they are there to be had
+        assert answers(session, "measurements", 0.5) == 0
+        assert answers(session, "frame", 0.5) == 0
+        for topic in (*ASKABLE, "measurements"):
+            assert answers(stranger, topic, 0.3) == 0, topic
+        refused = session.get(f"{key_of('car', 'trajectory')}?last_s=-1", timeout=2.0)
+        assert [bytes(reply.err.payload) for reply in refused if reply.err] == [b"last_s=-1: needs a positive number"]
 
 
 @needs_openssl
@@ -242,8 +270,11 @@ def test_nobody_outside_writes(vehicle: Vehicle, certificates: Path) -> None:
         assert all(listener.malformed == 0 for listener in vehicle.listeners.values())
         assert "impostor" not in vehicle.nodes["capture"].alive
         assert alive_key("car", "impostor") not in heard.alive
-        answers = list(vehicle.nodes["capture"]._session.get("birdslam/car/v1/map", timeout=1.0))
-        assert not [a for a in answers if a.ok is not None]
+        for topic in (*ASKABLE, "measurements", "frame"):
+            asked = vehicle.nodes["capture"]._session.get(
+                key_of("car", topic), timeout=1.0, target=zenoh.QueryTarget.ALL
+            )
+            assert b"lie" not in [bytes(reply.ok.payload) for reply in asked if reply.ok], topic
         queryable.undeclare()
         token.undeclare()
 

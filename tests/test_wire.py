@@ -1,7 +1,7 @@
 """The wire: the same bytes for ever, and nothing but WireError whatever comes in.
 
-Golden messages, one for each record type, lie in tests/golden. A new record type's is written, once, by
-`python -m tests.test_wire`; one that exists is never written again.
+Golden messages, one for each record type, lie in tests/golden. A new record type's, and one more where fields were
+appended, is written by `python -m tests.test_wire`; one that exists is never written again.
 """
 
 from __future__ import annotations
@@ -28,14 +28,18 @@ from birdslam.types import (
     Ground,
     LandmarkEdge,
     LanePoint,
+    MapSnapshot,
     MapUpdate,
     Measurements,
     MotionEdge,
     Status,
+    TimedPose,
+    Trajectory,
     VehicleEdge,
     VehicleEstimate,
+    VehiclePath,
 )
-from runtime.topology import NODES, TOPICS, alive_key, check_name, key_of
+from runtime.topology import NODES, PROCESSES, QUESTIONS, TOPICS, alive_key, check_name, key_of
 from runtime.wire import MAX_MESSAGE_BYTES, MAX_TRACE_BYTES, Health, Spread, Stage, Trace, WireError, decode, encode
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -81,7 +85,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         ),
         vv=(MotionEdge(vehicle=7, from_frame=4710, to_frame=4711, T_from_to=SE2(0.3, 0.002, 0.001), cov=_COV3),),
         cp=(LandmarkEdge(landmark=90_001, frame=4711, x_m=11.75, y_m=-2.5, cov=_COV2),),
-        lanes=(LanePoint(9.5, 1.75), LanePoint(14.25, 1.8)),
+        lanes=(LanePoint(9.5, 1.75, 12), LanePoint(14.25, 1.8, 13)),
         attitude=_ATTITUDE,
         ground=_GROUND,
         scale_sigma_rel=0.015,
@@ -113,7 +117,9 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         scale_sigma_rel=0.015,
         status=(Status.STANDSTILL,),
     ),
-    MapUpdate(epoch=2, frame_id=4711, landmarks_m=((80.5, -9.0),), lanes_m=((81.0, -7.25), (82.0, -7.5))),
+    MapUpdate(
+        epoch=2, frame_id=4711, landmarks_m=((80.5, -9.0),), lanes_m=((81.0, -7.25), (82.0, -7.5)), lane_ids=(12, -1)
+    ),
     Health(
         node="perceive",
         t_ns=1_234_567_890_123,
@@ -133,6 +139,24 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         restarts=2,
         cause="was killed by SIGKILL",
         status=(Status.INPUT_STALE,),
+        coasted=4,
+        outrun=1,
+    ),
+    MapSnapshot(epoch=2, frame_id=7, landmarks_m=((1.5, -2.25),), lanes_m=((3.0, 0.5), (4.0, 0.5)), cell_m=0.5),
+    Trajectory(
+        epoch=2,
+        frame_id=7,
+        t_source_ns=700_000_000,
+        ego=(TimedPose(6, 600_000_000, SE2(1.0, 2.0, 0.5)), TimedPose(7, 700_000_000, SE2(1.5, 2.25, 0.5))),
+        vehicles=(
+            VehiclePath(
+                vehicle=3,
+                poses=(TimedPose(7, 700_000_000, SE2(9.0, 1.0, 0.25)),),
+                label="truck",
+                length_m=8.5,
+                width_m=2.5,
+            ),
+        ),
     ),
     Trace((Stage("capture", 1000, 2000, 2500), Stage("perceive", 3000, 25_000, 26_000)), 42_000_000),
 )
@@ -140,13 +164,41 @@ BY_NAME = {type(example).__name__: example for example in EXAMPLES}
 by_name = pytest.mark.parametrize("name", BY_NAME)
 
 
+def versions(name: str) -> list[Path]:
+    """NAME.msgpack, and where fields were appended since NAME.1.msgpack and so on; the newest last."""
+    return sorted(GOLDEN.glob(f"{name}.*msgpack"), key=lambda path: (len(path.suffixes), path.name))
+
+
 def golden(name: str) -> bytes:
-    return (GOLDEN / f"{name}.msgpack").read_bytes()
+    return versions(name)[-1].read_bytes()
 
 
 def test_every_record_of_a_topic_has_a_golden_message() -> None:
-    assert {topic.record.__name__ for topic in TOPICS.values()} | {"Trace"} == set(BY_NAME)
-    assert {path.stem for path in GOLDEN.iterdir()} == set(BY_NAME)
+    asked = {question.record.__name__ for question in QUESTIONS.values() if question.record is not dict}
+    assert {topic.record.__name__ for topic in TOPICS.values()} | asked | {"Trace"} == set(BY_NAME)
+    assert {path.name.partition(".")[0] for path in GOLDEN.iterdir()} == set(BY_NAME)
+
+
+def without_what_lacks(record: Any, plain: Any) -> Any:
+    """A record, or a tuple of them, with the fields that their message lacks at their defaults."""
+    if isinstance(record, tuple):
+        return tuple(without_what_lacks(*pair) for pair in zip(record, plain, strict=True))
+    if not isinstance(record, msgspec.Struct):
+        return record
+    fields = msgspec.structs.fields(record)
+    sent = plain if isinstance(plain, dict) else dict(zip((f.name for f in fields), plain, strict=False))
+    older = {f.name: without_what_lacks(getattr(record, f.name), sent[f.name]) for f in fields if f.name in sent}
+    return type(record)(**older)
+
+
+@by_name
+def test_older_messages_decode_for_ever(name: str) -> None:
+    """With the fields that they lack at their defaults; none has become another one since."""
+    example = BY_NAME[name]
+    for path in versions(name)[:-1]:
+        older = without_what_lacks(example, msgpack.unpackb(path.read_bytes()))
+        assert older != example
+        assert decode(path.read_bytes(), type(example)) == older
 
 
 @by_name
@@ -374,10 +426,10 @@ def test_mutated_messages_never_do_harm(chance: random.Random, example: msgspec.
 
 def test_the_topology_is_closed() -> None:
     """Each topic has the producer that sends it, and every node receives what some node sends."""
-    for node in NODES.values():
+    for node in PROCESSES.values():
         assert all(TOPICS[topic].producer == node.name for topic in node.sends)
         assert all(TOPICS[topic].producer in NODES for topic in node.receives)
-    assert sorted(topic for node in NODES.values() for topic in node.sends) == sorted(TOPICS)
+    assert sorted(topic for node in PROCESSES.values() for topic in node.sends) == sorted(TOPICS)
     assert all(topic.depth == 1 for topic in TOPICS.values() if topic.hot)
     assert key_of("car-1", "estimate") == "birdslam/car-1/v1/estimate"
     assert key_of("car-1", "health/perceive") == "birdslam/car-1/v1/health/perceive"
@@ -393,7 +445,9 @@ def test_a_name_must_fit_keys_and_files(name: str) -> None:
 if __name__ == "__main__":
     GOLDEN.mkdir(exist_ok=True)
     for example in EXAMPLES:
-        file = GOLDEN / f"{type(example).__name__}.msgpack"
-        if not file.exists():
+        name = type(example).__name__
+        known = versions(name)
+        if not known or known[-1].read_bytes() != encode(example):
+            file = GOLDEN / (f"{name}.{len(known)}.msgpack" if known else f"{name}.msgpack")
             file.write_bytes(encode(example))
             print(f"wrote {file}")
