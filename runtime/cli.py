@@ -108,7 +108,7 @@ def _add_pipeline_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="[ROLE=]PATH|NAME",
         help="an ONNX network for a role (detector, segmenter, depth, multitask), or a model's name; may be repeated; "
-        "roles left over are the shipped network's, with `none` nobody's",
+        "without both a detector and a segmenter the shipped network fills in, unless `none` is named",
     )
     parser.add_argument("--camera", metavar="FILE", help="a camera file (TOML) instead of the recording's calibration")
     parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame of a recording")

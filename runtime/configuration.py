@@ -18,7 +18,7 @@ from birdslam.atlas import AtlasConfig
 from birdslam.camera import Camera
 from birdslam.datasets import DatasetError, load_camera
 from birdslam.motionwatch import MotionWatchConfig
-from birdslam.perception import ROLES, ModelError, ModelSpec
+from birdslam.perception import ModelError, ModelSpec
 from birdslam.perception.manifest import SHIPPED_NETWORKS, Role
 from birdslam.slam import SlamConfig
 from runtime import model_store
@@ -58,7 +58,8 @@ class ModelsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     depth: ModelSpec | None = None
     multitask: ModelSpec | None = None  # one network for all of these; the others stand before it, each for its own
     pointnet: ModelSpec | None = None  # Frustum-PointNet: bodies from the depth network's points
-    shipped: bool = True  # the package's own network fills the roles that no other does
+    shipped: bool = True  # the package's own network runs where no other finds vehicles or the road
+    completion: bool = True  # the package's own ENet completes the lanes where something hid the road
 
     def given(self) -> dict[str, ModelSpec]:
         """Role -> network that the user names, in a fixed order."""
@@ -68,7 +69,7 @@ class ModelsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     def in_use(self) -> dict[str, ModelSpec]:
         """Role -> network of images that runs, in a fixed order."""
         given = self.given()
-        if self.shipped and "multitask" not in given and not set(ROLES["multitask"]) <= set(given):
+        if self.shipped and "multitask" not in given and not {"detector", "segmenter"} <= set(given):
             given["multitask"] = ModelSpec(path=str(SHIPPED_NETWORKS / SHIPPED_MULTITASK))
         return given
 
