@@ -103,6 +103,18 @@ def test_a_frame_is_overdue_when_its_estimate_could_not_come_in_time() -> None:
     assert announced.overdue(10_000 * MS) is None
 
 
+def test_a_frame_that_was_answered_before_it_was_announced_is_never_overdue() -> None:
+    announced = Announced(MS)
+    announced.answered(7)
+    for frame_id in (6, 7):
+        announced.add(Message(ref(frame_id, 0), Trace(), 0))
+    assert announced.overdue(10**12) is None
+    announced.add(Message(ref(8, 0), Trace(), 0))
+    late = announced.overdue(10**12)
+    assert late is not None
+    assert late.record.ref.frame_id == 8
+
+
 def test_the_end_of_the_source_is_no_frame_to_wait_for() -> None:
     announced = Announced(MS)
     announced.add(Message(ref(0, 0, (Status.END_OF_SOURCE,)), Trace(), 0))
