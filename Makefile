@@ -6,7 +6,7 @@ TRAIN_VENV := .venv-train
 DATA := $(or $(BIRDSLAM_DATA),../shared/data)
 MODELS := $(or $(BIRDSLAM_MODELS),../shared/models)
 
-.PHONY: setup test test-slow fuzz faults onroad perf lint train demo clean
+.PHONY: setup test test-slow fuzz faults onroad perf lint train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -58,10 +58,14 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# The built-in drive does not exist yet; the demo is the main job on a real sequence.
+# The drive that ships with birdslam: the three processes at its 33 Hz, then how good it was, bev.png and drive.mp4
 demo: setup
-	@test -d $(DATA)/kitti_odometry/sequences/00 || { echo "make demo needs KITTI odometry 00 in $(DATA)/kitti_odometry/sequences/00 (set BIRDSLAM_DATA)"; exit 1; }
-	@test -f $(MODELS)/yolox_nano_416.onnx && test -f $(MODELS)/twinlitenet_640x360.onnx || { echo "make demo needs yolox_nano_416.onnx and twinlitenet_640x360.onnx in $(MODELS) (set BIRDSLAM_MODELS)"; exit 1; }
+	$(BIN)/birdslam run --source demo --output out/demo
+
+# The main job on a real sequence
+demo-kitti: setup
+	@test -d $(DATA)/kitti_odometry/sequences/00 || { echo "make demo-kitti needs KITTI odometry 00 in $(DATA)/kitti_odometry/sequences/00 (set BIRDSLAM_DATA)"; exit 1; }
+	@test -f $(MODELS)/yolox_nano_416.onnx && test -f $(MODELS)/twinlitenet_640x360.onnx || { echo "make demo-kitti needs yolox_nano_416.onnx and twinlitenet_640x360.onnx in $(MODELS) (set BIRDSLAM_MODELS)"; exit 1; }
 	$(BIN)/birdslam run --source kitti:$(DATA)/kitti_odometry/sequences/00 --model detector=$(MODELS)/yolox_nano_416.onnx \
 		--model segmenter=$(MODELS)/twinlitenet_640x360.onnx --output out/00
 

@@ -16,7 +16,10 @@ bearing, H the camera's height:
 
 and, for the weights of the filters alone, bottom = H / z (Eq. 1): that is the horizon's to learn from.
 
-What comes of it is a measurement of log h that holds all that motion says and nothing of what its class says.
+What comes of it is a measurement of log h that holds all that motion says and nothing of what its class says. Nothing
+comes of a vehicle in the ego's own path: straight ahead there is no parallax. What stands there keeps its bearing, as
+does what drives on before the ego; growth alone gives how fast the gap closes as a share of itself, which any size
+fits.
 """
 
 from __future__ import annotations
@@ -61,6 +64,7 @@ class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     view_memory_s: float = 1.5  # and so do, for longer, the pitch and what is taken for the nearest face
     sigma_scale_rel: float = 0.02  # of the odometry's metres
     sigma_face_m: float = 1.0  # edges of a box lie not all at its nearest face, and on others as it turns
+    path_half_width_m: float = 1.75  # of the ego's path: half a lane
     gate_sigma: float = 3.0  # past it a sight that no filter foretold is trusted the less
 
 
@@ -234,7 +238,8 @@ class Parallax:
         weight = self._weight[rows] * np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
         self._weight[rows] = np.maximum(weight / weight.sum(axis=1, keepdims=True), LEAST_WEIGHT)
         self._unseen_s[rows] = 0.0
-        return self._learned(rows, of_face + config.sigma_scale_rel**2)
+        in_path = np.abs(sights.bearing) * (sights.depth_m + sights.reach_m) < config.path_half_width_m
+        return self._learned(rows, of_face + config.sigma_scale_rel**2, in_path)
 
     def keep_only(self, vehicles: Iterable[int]) -> None:
         """Forget the others."""
@@ -271,12 +276,16 @@ class Parallax:
         cov[:, STILL, :, speed] = 0.0
         self._x, self._P = mean, cov
 
-    def _learned(self, rows: list[int], lasting: Floats) -> LearnedSize:
-        """Of each filter, its log h less what the class said of it; `lasting` (N,) no time mends."""
+    def _learned(self, rows: list[int], lasting: Floats, in_path: NDArray[np.bool_]) -> LearnedSize:
+        """Of each filter, its log h less what the class said of it; `lasting` (N,) no time mends.
+
+        Vehicles `in_path` (N,) are taken out here, not from the filters: once the ego passes beside one, all counts.
+        """
         mean, var = self._x[rows][..., HEIGHT], self._P[rows][..., HEIGHT, HEIGHT]
         prior, prior_var = self._prior[rows].T[..., None]
         information = 1.0 / var - 1.0 / prior_var
         told = information > 1.0 / UNKNOWN
+        told[in_path] = False
         told[:, MOVING] = False  # drivers brake and turn for seconds: what looks like parallax there is none
         information = np.where(told, information, 1.0 / UNKNOWN)
         log_height = np.where(told, (mean / var - prior / prior_var) / information, prior)

@@ -134,7 +134,7 @@ def _extent(scene: Scene, tracks: list[Track]) -> tuple[float, float, float, flo
     )
 
 
-def _colour(vehicle: int) -> tuple[float, float, float]:
+def colour_of(vehicle: int) -> tuple[float, float, float]:
     """A colour of its own for each id; neighbours in number lie far apart in hue."""
     return colorsys.hsv_to_rgb((0.02 + vehicle * 0.6180339887) % 1.0, 0.62, 1.0)
 
@@ -157,7 +157,7 @@ def _draw_map(axes: Any, scene: Scene) -> None:
 def _draw_track(axes: Any, track: Track, ego: NDArray[np.float64]) -> None:
     from matplotlib.patches import Polygon
 
-    colour = _colour(track.vehicle)
+    colour = colour_of(track.vehicle)
     way = _paper(track.poses)
     if track.moving:
         axes.plot(*way.T, color=colour, linewidth=3.4, alpha=0.75, solid_capstyle="round")
@@ -271,7 +271,9 @@ def _draw_panel(figure: Any, scene: Scene, tracks: list[Track], corner: tuple[fl
     for line, track in enumerate(sorted(listed, key=lambda track: track.vehicle), start=1):
         speed = f"{track.speed_mps:5.1f}" if track.moving else "    -"
         name = track.label[:LABEL_CHARACTERS]
-        write(line, f"{track.vehicle:>4}  {name:<{LABEL_CHARACTERS}} {track.frames:>6} {speed}", _colour(track.vehicle))
+        write(
+            line, f"{track.vehicle:>4}  {name:<{LABEL_CHARACTERS}} {track.frames:>6} {speed}", colour_of(track.vehicle)
+        )
     hidden = scene.track_count - len(listed)  # short ones among them
     if hidden > 0:
         write(len(listed) + 1, f"      and {hidden} more", FAINT)

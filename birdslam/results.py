@@ -5,7 +5,7 @@
 | ego.kitti.txt     | camera poses `T_first_i` as KITTI rows, row k is frame k (`trajectory.py`)            |
 | ego.tum.txt       | ego poses in world, TUM lines at the source's times                                   |
 | tracks/ID.tum.txt | footprint centres of one vehicle in world, a line for each frame in which it was seen |
-| map.csv           | road landmarks and lane points in world: epoch,kind,x_m,y_m                           |
+| map.csv           | road landmarks and lane points in world: epoch,kind,x_m,y_m,lane (-1: of none)        |
 | summary.json      | counts of this recording, and what the caller adds                                    |
 | bev.png           | all of it from above (`picture.py`)                                                   |
 
@@ -109,7 +109,7 @@ class Recorder:
             self.close()
             raise ResultsError(f"output directory {directory}: {error.strerror}: {error.filename}") from None
         self._tum.write("# t_s x_m y_m z_m qx qy qz qw: the ego (the camera's foot on the road) in world\n")
-        self._map.write("epoch,kind,x_m,y_m\n")
+        self._map.write("epoch,kind,x_m,y_m,lane\n")
         self.statuses: Counter[str] = Counter()
         self._trajectory = CameraTrajectory(camera.ground)
         self._next_row = 0
@@ -161,11 +161,14 @@ class Recorder:
 
     def add_map(self, update: MapUpdate) -> None:
         """What the map gained."""
-        for kind, points, kept in (
-            ("landmark", update.landmarks_m, self._landmarks),
-            ("lane", update.lanes_m, self._lanes),
+        for kind, points, lanes, kept in (
+            ("landmark", update.landmarks_m, (), self._landmarks),
+            ("lane", update.lanes_m, update.lane_ids, self._lanes),
         ):
-            self._map.writelines(f"{update.epoch},{kind},{x_m:.3f},{y_m:.3f}\n" for x_m, y_m in points)
+            self._map.writelines(
+                f"{update.epoch},{kind},{x_m:.3f},{y_m:.3f},{lane}\n"
+                for (x_m, y_m), lane in zip(points, lanes or (-1,) * len(points), strict=True)
+            )
             if update.epoch == self._epoch:  # of an older epoch: its place is not known any more
                 for x_m, y_m in self._T_picture_world @ np.array(points).reshape(-1, 2):
                     kept.add(float(x_m), float(y_m))

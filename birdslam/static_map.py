@@ -11,9 +11,11 @@ from collections import deque
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from birdslam import bev
 from birdslam.camera import Camera, GroundPlane
+from birdslam.lanes import AmodalLanes, Completion, LanesConfig, cell_keys, points_of
 from birdslam.perception import Segmentation
 from birdslam.se2 import SE2
 from birdslam.types import LandmarkEdge, LanePoint
@@ -68,14 +70,27 @@ class LaneMapper:
     """Lane points of each segmentation, once, in the ego of the frame at hand.
 
     A segmentation may come frames after its image. It is back-projected with the pose and the ground plane of its own
-    frame, which are kept until then.
+    frame, which are kept until then. The lanes that many of them show together come first (`lanes.AmodalLanes`); where
+    there is none, what this one saw stands for itself.
     """
 
-    def __init__(self, camera: Camera, config: StaticMapConfig) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        config: StaticMapConfig,
+        lanes: LanesConfig = LanesConfig(),  # noqa: B008
+        complete: Completion | None = None,
+    ) -> None:
         self.camera = camera
         self.config = config
+        self._amodal = AmodalLanes(lanes, complete)
         self._frames: deque[tuple[int, SE2, GroundPlane]] = deque(maxlen=REMEMBERED_FRAMES)
         self._used_frame = -1
+
+    def clear(self) -> None:
+        """The world frame began anew."""
+        self._amodal.clear()
+        self._frames.clear()
 
     def step(
         self,
@@ -86,7 +101,7 @@ class LaneMapper:
         segmented_frame: int,
         boxes_px: NDArray[np.float64],
     ) -> tuple[LanePoint, ...]:
-        """What the segmentation of `segmented_frame` adds, nothing where it was used before.
+        """What the segmentation of `segmented_frame` adds, nothing where it was used before or the ego stands.
 
         `boxes_px` (N, 4) are the vehicles' latest boxes, under which no line is believed.
         """
@@ -98,8 +113,43 @@ class LaneMapper:
             return ()
         self._used_frame = segmented_frame
         _, T_world_then, ground_then = then
-        points = T_world_ego.between(T_world_then) @ self._points_m(segmentation, ground_then, boxes_px)
-        return tuple(LanePoint(float(x), float(y)) for x, y in points)
+        if not self._amodal.is_news(T_world_then):
+            return ()
+        self._amodal.add(
+            T_world_then, *points_of(segmentation, self.camera, ground_then, boxes_px, self._amodal.config)
+        )
+        points, lanes = self._lanes_m(T_world_ego)
+        seen = T_world_ego.between(T_world_then) @ self._points_m(segmentation, ground_then, boxes_px)
+        if len(points):
+            seen = seen[cKDTree(points).query(seen)[0] > self._amodal.config.same_lane_m]
+        room = self.config.max_lane_points - len(points)
+        return (
+            *(LanePoint(x, y, lane) for (x, y), lane in zip(points.tolist(), lanes.tolist(), strict=True)),
+            *(LanePoint(x, y) for x, y in seen[:room].tolist()),
+        )
+
+    def _lanes_m(self, T_world_ego: SE2) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """(N, 2) points of the lanes ahead, in ego, and their lanes (N,): the middle of what lies in each cell.
+
+        Where there are too many they are thinned evenly, so that they reach as far.
+        """
+        config = self.config
+        clouds = self._amodal.lanes(T_world_ego)
+        if not clouds:
+            return np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+        points = np.concatenate([cloud.points_m for cloud in clouds])
+        lanes = np.repeat([cloud.lane for cloud in clouds], [len(cloud.points_m) for cloud in clouds])
+        ahead = (points[:, 0] >= 0.0) & (points[:, 0] < config.lane_range_m)
+        points, lanes = points[ahead], lanes[ahead]
+        cells = np.column_stack([np.floor(points / config.lane_cell_m).astype(np.int64), lanes])
+        cells, inverse, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+        sums = np.zeros((len(cells), 2))
+        np.add.at(sums, inverse.reshape(-1), points)
+        points, lanes = sums / counts[:, None], cells[:, 2]
+        kept = np.argsort(points[:, 0], kind="stable")
+        if len(kept) > config.max_lane_points:
+            kept = kept[np.linspace(0, len(kept) - 1, config.max_lane_points).astype(np.int64)]
+        return points[kept], lanes[kept]
 
     def _points_m(
         self, segmentation: Segmentation, ground: GroundPlane, boxes_px: NDArray[np.float64]
@@ -113,7 +163,7 @@ class LaneMapper:
         points = bev.pixel_to_ego(self.camera, ground, np.column_stack([columns, rows]).astype(np.float64))
         with np.errstate(invalid="ignore"):
             points = points[points[:, 0] < config.lane_range_m]
-        _, first = np.unique(np.floor(points / config.lane_cell_m).astype(np.int64), axis=0, return_index=True)
+        _, first = np.unique(cell_keys(points, config.lane_cell_m), return_index=True)
         first = first[np.argsort(points[first, 0], kind="stable")][: config.max_lane_points]
         out: NDArray[np.float64] = points[first]
         return out

@@ -190,7 +190,11 @@ def _pipeline(configuration: Configuration) -> Iterator[Drive]:
         def drive(recording: Recording) -> Iterator[Measurements | Estimate | MapUpdate]:
             inference = stack.enter_context(Inference(configuration))
             slam = BirdSLAM(
-                recording.camera, inference.networks, configuration.slam, frustum_network=inference.frustum_network
+                recording.camera,
+                inference.networks,
+                configuration.slam,
+                frustum_network=inference.frustum_network,
+                complete=inference.completion,
             )
             for frame in offline_frames(RecordedSource(recording, configuration.source)):
                 yield from slam.step(frame)

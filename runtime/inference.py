@@ -11,8 +11,10 @@ from typing import Any, Self
 
 from birdslam.frontend import Pending
 from birdslam.perception import Networks, Perception, Ready, load_network
+from birdslam.perception.completion import GridCompletion, shipped_completion
 from birdslam.perception.manifest import Role
 from birdslam.perception.pointnet import PointNet, load_pointnet
+from birdslam.perception.schedule import ROLES
 from birdslam.types import Frame
 from runtime.configuration import Configuration
 from runtime.degradation import Mode
@@ -32,6 +34,9 @@ class Inference:
         heads = [load_network(role, spec) for role, spec in configuration.models.in_use().items()]
         pointnet = configuration.models.pointnet
         self.frustum_network: PointNet | None = None if pointnet is None else load_pointnet(pointnet)
+        self.completion: GridCompletion | None = None  # of lane grids, where there are lanes to see
+        if configuration.models.completion and any("segmenter" in ROLES.get(h.role, (h.role,)) for h in heads):
+            self.completion = shipped_completion(configuration.slam.frontend.lanes.shape)
         self._deadline_ns = configuration.deadline_ns
         self._awaited: frozenset[Run] = frozenset(head.run for head in heads if head.schedule.awaited)
         self._rate_divisor = configuration.degradation.rate_divisor

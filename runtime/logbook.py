@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
 
 from birdslam.types import Estimate, MapUpdate, Status
@@ -32,11 +32,11 @@ class Logbook:
     """Listens in a thread of its own from construction on; stands at a planner's place, so its ages are a planner's.
 
     `event_fd` becomes readable when END_OF_SOURCE came back (`ended`), or recording failed (`error`). A `tolerant` one
-    goes on without recording where the disk fails it (`unwritten` says why): the vehicle drives on. `door` too
-    gets all of it.
+    goes on without recording where the disk fails it (`unwritten` says why): the vehicle drives on. `listeners` too
+    get all of it.
     """
 
-    def __init__(self, bus: Bus, results: Results, tolerant: bool = False, door: Results | None = None) -> None:
+    def __init__(self, bus: Bus, results: Results, tolerant: bool = False, listeners: Sequence[Results] = ()) -> None:
         self.event_fd = os.eventfd(0)
         self.ended = False
         self.error: Exception | None = None
@@ -47,7 +47,7 @@ class Logbook:
         self.stages: dict[str, Distribution] = {}
         self.statuses: Counter[str] = Counter()
         self._results = results
-        self._door = door
+        self._listeners = tuple(listeners)
         self._bus = bus
         self._estimates = bus.subscriber("estimate", depth=QUEUE_FRAMES)
         self._map = bus.subscriber("map", depth=QUEUE_FRAMES)
@@ -81,8 +81,8 @@ class Logbook:
         self._latest = estimate
         if Status.PERCEPTION_LATE in estimate.status:  # nothing was measured: no row, and no frame that was processed
             return
-        if self._door is not None:
-            self._door.add(estimate)
+        for listener in self._listeners:
+            listener.add(estimate)
         self._write(self._results.add, estimate)
         self._take_map()
         age_ms = (message.t_received_ns - estimate.t_capture_ns) / 1e6
@@ -111,8 +111,8 @@ class Logbook:
             message = self._map.recv(max(0.0, until_s - time.monotonic()))
             if message is None:
                 return
-            if self._door is not None:
-                self._door.add_map(message.record)
+            for listener in self._listeners:
+                listener.add_map(message.record)
             self._write(self._results.add_map, message.record)
             self._map_frame = message.record.frame_id
 

@@ -12,6 +12,7 @@ import os
 import re
 from pathlib import Path
 
+from birdslam.perception.completion import SHIPPED as COMPLETION
 from birdslam.perception.manifest import SHIPPED_NETWORKS, Glance, ModelError, find_as
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -43,7 +44,7 @@ def installed(directory: Path) -> dict[str, Path]:
 
 def shipped() -> dict[str, Path]:
     """Name -> network of those inside the package, in order of name."""
-    return {path.stem: path for path in sorted(SHIPPED_NETWORKS.glob("*.onnx"))}
+    return {path.stem: path for path in sorted(SHIPPED_NETWORKS.glob("*.onnx")) if path != COMPLETION}
 
 
 def find(name: str, models_dir: str | Path | None) -> Path:

@@ -156,7 +156,10 @@ def prepare(name: str, configuration: Configuration) -> Callable[[Bus, Callable[
         cv2.setNumThreads(configuration.perceive.opencv_threads)
         inference = Inference(configuration)
         frontend = FrontEnd(
-            calibrated(configuration), configuration.slam.frontend, frustum_network=inference.frustum_network
+            calibrated(configuration),
+            configuration.slam.frontend,
+            frustum_network=inference.frustum_network,
+            complete=inference.completion,
         )
         return lambda bus, wait, assignment: PerceiveNode(configuration, inference, frontend, bus, assignment)
     if name == "optimize":

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from runtime.configuration import Configuration, dump
+from runtime.demo_report import rows as truth_rows
 from runtime.logbook import Logbook
 from runtime.stations import Station
 from runtime.topology import NODES
@@ -86,6 +87,7 @@ def table(summary: dict[str, Any], output: Path) -> str:
         *((f"  {name}", spread(figures)) for name, figures in summary["stages_ms"].items()),
         *((f"  {name} begun anew", f"{n} times") for name, n in summary["restarts"].items() if n),
         *((f"  {status}", f"{n} frames") for status, n in summary["statuses"].items()),
+        *truth_rows(summary),
         *(("recorded", _recorded(recording)) for recording in [summary.get("recording")] if recording),
         ("results in", str(output)),
     ]

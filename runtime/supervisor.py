@@ -26,9 +26,10 @@ from birdslam.results import Recorder, claim_directory
 from runtime.bus import Bus
 from runtime.cli import INTERRUPTED_STATUS, USER_ERROR_STATUS
 from runtime.configuration import Configuration, ConfigurationError, complete
+from runtime.demo_report import Witness
 from runtime.door import Door
 from runtime.live import LiveLine
-from runtime.logbook import Logbook
+from runtime.logbook import Logbook, Results
 from runtime.notify import Notifier
 from runtime.presence import VehicleLock, runtime_dir_of, socket_path
 from runtime.recorder_station import RecorderStation, choose_file
@@ -66,7 +67,9 @@ def run(configuration: Configuration) -> int:
                 lossless=configuration.lossless,
             )
         )
-        logbook = Logbook(bus, recorder, tolerant=configuration.restarts, door=Door(configuration, bus))
+        witness = Witness.of(configuration)
+        listeners: list[Results] = [Door(configuration, bus), *([witness] if witness else [])]
+        logbook = Logbook(bus, recorder, tolerant=configuration.restarts, listeners=listeners)
         stack.callback(logbook.close)
         bus.declare_alive()
         recording = None
@@ -83,6 +86,8 @@ def run(configuration: Configuration) -> int:
         for line in recording.news():
             live.say(line)
     try:
+        if witness is not None:
+            summary |= witness.finish(output)
         recorder.finish(summary)
     except OSError as error:
         supervisor.fail(f"results can't be written: {error}", 1)

@@ -14,7 +14,7 @@ LAYERS = (  # each imports only from itself and from what stands before it
 )
 ON_TOP = (
     *("frontend", "slam", "baselines", "evaluation"),
-    *("localisation_evaluation", "calibration"),
+    *("localisation_evaluation", "calibration", "demo_grading"),
     *("tracking_metrics", "tracking_evaluation", "tracking_picture", "tracking_report", "ablation", "tables"),
 )
 

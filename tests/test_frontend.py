@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from birdslam import bev
 from birdslam.camera import Camera, GroundPlane
 from birdslam.frontend import DeadReckoning, FrontEnd, FrontEndConfig
 from birdslam.odometry import Motion
@@ -178,6 +179,25 @@ def test_a_segmentation_that_comes_late_is_mapped_once_from_where_it_was_seen() 
     assert not out[3].lanes
     assert [p.y_m for p in out[2].lanes] == pytest.approx([p.y_m for p in now])
     assert [p.x_m for p in out[2].lanes] == pytest.approx([p.x_m - 4.0 for p in now])
+
+
+def test_lanes_keep_their_ids_until_the_world_begins_anew() -> None:
+    rows, columns = np.mgrid[: CAMERA.height_px, : CAMERA.width_px]
+    px = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
+    y_m = bev.pixel_to_ego(CAMERA, CAMERA.ground, px)[:, 1].reshape(rows.shape)
+    with np.errstate(invalid="ignore"):
+        masks = Segmentation(road=np.abs(y_m) < 6.0, lane=(np.abs(y_m - 3.0) < 0.15) | (np.abs(y_m + 2.0) < 0.15))
+    nobody = Detections(np.zeros((0, 4)), np.zeros(0), ())
+    views = [Ready(Perception(nobody, masks, {"detector": 0, "segmenter": 0}, ())) for _ in range(25)]
+    script = {k: motion(k, SE2(1.0, 0.0, 0.0)) for k in range(1, 25) if k != 18}
+    out = run(script, views)
+    sides = [{p.lane: round(p.y_m) for p in m.lanes if p.lane >= 0} for m in out]
+    assert sides[5] == {min(sides[5]): -2, max(sides[5]): 3}
+    assert all(side == sides[5] for side in sides[5:18])
+    assert all(-0.5 < p.y_m - sides[5][p.lane] < 0.5 for m in out[5:18] for p in m.lanes if p.lane >= 0)
+    assert max(p.x_m for p in out[17].lanes if p.lane >= 0) > 10.0
+    assert not set(sides[5]) & set(sides[18])  # lost: nothing says that these are the same
+    assert sorted(sides[24].values()) == [-2, 3]
 
 
 def test_the_first_frame_says_that_nothing_is_known() -> None:

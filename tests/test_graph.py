@@ -356,6 +356,25 @@ def test_the_map_holds_what_was_seen() -> None:
         assert min(np.hypot(*(np.array(point) - other)) for other in truth.values()) < 0.1
 
 
+def test_lane_points_keep_their_lanes() -> None:
+    graph = PoseGraph(GraphConfig(), WeightsConfig())
+    world = drive(DriveConfig(frames=4, vehicles=0, lane_points=2), seed=2).measurements
+    plain, *named = (
+        msgspec.structs.replace(m, lanes=(LanePoint(1.0, 0.5, k), LanePoint(2.0, 0.5)))
+        for k, m in zip((-1, 7, 9, 7), world, strict=True)
+    )
+    graph.update(plain)
+    gained = graph.map_update()
+    assert gained is not None
+    assert gained.lane_ids == ()
+    for m in named:
+        graph.update(m)
+    gained = graph.map_update()
+    assert gained is not None
+    assert gained.lane_ids == (7, -1, 9, -1, 7, -1)
+    assert len(gained.lanes_m) == 6
+
+
 # --- bounded, deterministic, never raises ---
 
 

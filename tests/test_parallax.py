@@ -50,7 +50,7 @@ class Road:
         self.parallax = Parallax(white)  # as the noise of this world is
         self.height_m, self.ego_mps, self.dt_s = height_m, ego_mps, 1.0 / hz
         self.rng = np.random.default_rng(seed)
-        self.at, self.ego_m = np.array([x_m, 4.0]), 0.0
+        self.at, self.ego_m = np.array([x_m, y_m]), 0.0
         self.begun = False
 
     def drive(self, seconds: float, mps: tuple[float, float] = (0.0, 0.0), noisy: bool = True) -> LearnedSize:
@@ -100,6 +100,16 @@ def test_one_that_drives_does_not_stand_and_keeps_the_size_of_its_class(mps: tup
     assert road.height(learned) == pytest.approx(1.53, rel=0.03)
     moving = learned.variance[0, 2:]
     assert (moving >= UNKNOWN).all()
+
+
+@pytest.mark.parametrize("mps", [(0.0, 0.0), (1.8, 0.0)])
+def test_straight_ahead_nothing_tells_a_parked_car_from_a_slow_one_so_that_no_size_is_learned(
+    mps: tuple[float, float],
+) -> None:
+    learned = Road(1.70, x_m=16.0, y_m=0.3, ego_mps=2.3).drive(4.0, mps)
+    assert (learned.variance >= UNKNOWN).all()
+    beside = Road(1.70, x_m=16.0, y_m=4.0, ego_mps=2.3).drive(4.0)
+    assert beside.variance[0, 0] < SIGMAS[0]
 
 
 def test_one_that_starts_and_one_that_stops() -> None:

@@ -63,7 +63,9 @@ def test_a_drive(tmp_path: Path) -> None:
         attitude = Attitude(z_m=0.01 * k, pitch_rad=0.001 * k)
         recorder.add(estimate(k, SE2(1.0 * k, 0.0, 0.0), vehicles=tuple(seen), attitude=attitude))
         recorder.add_map(
-            MapUpdate(epoch=0, frame_id=k, landmarks_m=((k + 5.0, -1.0),), lanes_m=((k, 1.75), (k, -1.75)))
+            MapUpdate(
+                epoch=0, frame_id=k, landmarks_m=((k + 5.0, -1.0),), lanes_m=((k, 1.75), (k, -1.75)), lane_ids=(4, -1)
+            )
         )
     recorder.finish({"rate_hz": 33.0, "age_ms": {"p50": math.nan, "p99": np.float64(3.0)}, "path": Path("x")})
 
@@ -77,10 +79,10 @@ def test_a_drive(tmp_path: Path) -> None:
     assert parked[5, :3, 3] == pytest.approx([20.0, 3.0, 0.05])
     assert "# class van, length_m 4.0, width_m 1.7" in (tmp_path / "out" / "tracks" / "2.tum.txt").read_text()
     rows = list(csv.DictReader((tmp_path / "out" / "map.csv").read_text().splitlines()))
-    assert [(row["kind"], float(row["x_m"]), float(row["y_m"])) for row in rows[:3]] == [
-        ("landmark", 5.0, -1.0),
-        ("lane", 0.0, 1.75),
-        ("lane", 0.0, -1.75),
+    assert [(row["kind"], float(row["x_m"]), float(row["y_m"]), int(row["lane"])) for row in rows[:3]] == [
+        ("landmark", 5.0, -1.0, -1),
+        ("lane", 0.0, 1.75, 4),
+        ("lane", 0.0, -1.75, -1),
     ]
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["frames"], summary["tracks"], summary["epochs"], summary["path_m"]) == (30, 2, 1, 29.0)

@@ -31,6 +31,12 @@ def test_numbers_that_are_none_are_refused(bad: float) -> None:
         VehicleEdge(vehicle=0, frame=0, T_ego_vehicle=SE2(), cov=EYE3, box_px=(0.0, bad, 1.0, 1.0))
 
 
+@pytest.mark.parametrize("lane_ids", [(1,), (1, 2, 3)])
+def test_every_lane_point_has_an_id_or_none_has(lane_ids: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=f"lane_ids has {len(lane_ids)} entries for 2 points"):
+        MapUpdate(epoch=0, frame_id=0, lanes_m=((0.0, 0.0), (1.0, 0.0)), lane_ids=lane_ids)
+
+
 def test_opposite_infinities_do_not_cancel() -> None:
     with pytest.raises(ValueError, match="finite"):
         EgoEdge(from_frame=0, to_frame=1, T_from_to=SE2(), cov=(1.0, math.inf, 0.0, -math.inf, 1.0, 0.0, 0.0, 0.0, 1.0))

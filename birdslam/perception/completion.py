@@ -14,6 +14,11 @@ from birdslam.perception.network import session_options
 SHIPPED = Path(__file__).parent / "shipped" / "lanes.onnx"
 
 
+def shipped_completion(shape: tuple[int, int]) -> GridCompletion | None:
+    """The package's own, for grids of `shape`; None where it was built without. Raises ModelError."""
+    return GridCompletion(shape) if SHIPPED.is_file() else None
+
+
 class GridCompletion:
     """Occupancy grids of road and lane boundary (2, rows, columns), 0..1, to completed ones of the same shape.
 

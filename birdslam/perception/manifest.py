@@ -14,7 +14,7 @@ from typing import Annotated, Literal, Protocol, TypeVar, get_args
 import msgspec
 
 SHIPPED_DIRECTORY = Path(__file__).parent / "manifests"
-SHIPPED_NETWORKS = Path(__file__).parent / "shipped"  # each .onnx with its manifest beside it
+SHIPPED_NETWORKS = Path(__file__).parent / "shipped"  # each with its manifest beside it, but that of lane grids
 
 Role = Literal["detector", "segmenter", "depth", "multitask"]
 Label = Literal["car", "truck", "bus", "person", "bicycle", "motorcycle"]

@@ -1,0 +1,162 @@
+"""What is said of a run over the shipped drive: the truth itself is graded faultless, an error as large as it is."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from birdslam.datasets import open_recording
+from birdslam.demo_drive import DemoRecording
+from birdslam.demo_grading import VEHICLES, grade, match, mount_pose_of, true_egos
+from birdslam.se2 import SE2
+from birdslam.side_by_side import SideBySide
+from birdslam.trajectory import as_poses, inverse, split_pose
+from birdslam.types import Estimate, VehicleEstimate
+from runtime.configuration import load
+from runtime.demo_report import Witness, rows
+
+FRAMES = range(0, 90, 3)
+COV = (0.0,) * 9
+
+
+@pytest.fixture(scope="module")
+def demo() -> DemoRecording:
+    recording = open_recording("demo")
+    assert isinstance(recording, DemoRecording)
+    return recording
+
+
+@pytest.fixture(scope="module")
+def truthful(demo: DemoRecording) -> list[Estimate]:
+    """Estimates that say what is true."""
+    poses, out = as_poses(demo.truth_poses()), []
+    T_world_first, T_cam_ego = mount_pose_of(demo, 0), inverse(mount_pose_of(demo, 0))
+    for k in FRAMES:
+        # The world that the recorder's constant mount makes of the camera's poses (trajectory.py)
+        ego, attitude = split_pose(T_world_first @ poses[k] @ T_cam_ego)
+        vehicles = tuple(
+            VehicleEstimate(
+                vehicle=body.body, T_world_vehicle=ego @ body.T_ego_body, cov=COV, velocity_mps=(0.0, 0.0),
+                velocity_cov=(0.0,) * 4, age_ns=0, frames=1, length_m=body.length_m, width_m=body.width_m,
+            )
+            for body in demo.truth_bodies(k)
+            if body.label in VEHICLES
+        )  # fmt: skip
+        out.append(
+            Estimate(
+                epoch=0, frame_id=k, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, T_world_ego=ego, cov=COV, valid=True,
+                vehicles=vehicles, attitude=attitude,
+            )
+        )  # fmt: skip
+    return out
+
+
+def stretched(estimate: Estimate, factor: float) -> Estimate:
+    """The same way, longer by a factor; vehicles stand where they stood from the ego."""
+    pose = estimate.T_world_ego
+    ego = SE2(factor * pose.x_m, factor * pose.y_m, pose.yaw_rad)
+    vehicles = tuple(
+        msgspec.structs.replace(v, T_world_vehicle=ego @ pose.between(v.T_world_vehicle)) for v in estimate.vehicles
+    )
+    return msgspec.structs.replace(estimate, T_world_ego=ego, vehicles=vehicles)
+
+
+def test_the_truth_has_no_errors(demo: DemoRecording, truthful: list[Estimate]) -> None:
+    found = grade(demo, truthful)
+    assert found.frames == len(FRAMES)
+    assert found.ego_ate_m < 0.05  # the springs of the camera alone
+    assert found.vehicles > 5
+    assert found.vehicle_ate_m is not None
+    assert found.vehicle_ate_m < 0.05
+    assert found.vehicle_centre_m == pytest.approx(0.0, abs=1e-9)
+    assert found.found == 1.0
+
+
+def test_a_scale_that_is_off_is_found_and_is_no_error_from_the_ego(
+    demo: DemoRecording, truthful: list[Estimate]
+) -> None:
+    found = grade(demo, [stretched(estimate, 1.05) for estimate in truthful])
+    assert found.ego_scale_error == pytest.approx(0.05, abs=0.005)
+    assert found.ego_ate_m > 0.02 * found.path_m
+    assert found.vehicle_ate_m is not None
+    assert found.vehicle_ate_m > 0.2
+    assert found.vehicle_centre_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_new_epoch_goes_on_where_the_last_one_ended(demo: DemoRecording, truthful: list[Estimate]) -> None:
+    half = len(truthful) // 2
+    whole, cut = grade(demo, truthful), [*truthful[:half]]
+    origin = truthful[half].T_world_ego.inverse()
+    for estimate in truthful[half:]:
+        vehicles = tuple(
+            msgspec.structs.replace(v, T_world_vehicle=origin @ v.T_world_vehicle) for v in estimate.vehicles
+        )
+        moved = origin @ estimate.T_world_ego
+        cut.append(msgspec.structs.replace(estimate, epoch=1, T_world_ego=moved, vehicles=vehicles))
+    step = truthful[half - 1].T_world_ego.between(truthful[half].T_world_ego)
+    found = grade(demo, cut)  # short by the one step that nobody saw
+    assert whole.ego_ate_m < found.ego_ate_m < math.hypot(step.x_m, step.y_m)
+    assert found.vehicle_centre_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_vehicle_out_of_reach_or_out_of_sight_matches_nobody(demo: DemoRecording, truthful: list[Estimate]) -> None:
+    estimate, body = truthful[0], next(b for b in demo.truth_bodies(0) if b.label in VEHICLES)
+    (vehicle,) = (v for v in estimate.vehicles if v.vehicle == body.body)
+    assert [v.vehicle for _, v in match(estimate, [body])] == [body.body]
+    range_m = math.hypot(body.T_ego_body.x_m, body.T_ego_body.y_m)
+    away = SE2(max(2.0, 0.2 * range_m) + 0.1, 0.0, 0.0) @ vehicle.T_world_vehicle
+    for changes in ({"T_world_vehicle": away}, {"age_ns": 1}):
+        other = msgspec.structs.replace(vehicle, **changes)
+        assert match(msgspec.structs.replace(estimate, vehicles=(other,)), [body]) == []
+
+
+def test_nothing_is_known_of_the_vehicles_of_a_drive_without_any(demo: DemoRecording, truthful: list[Estimate]) -> None:
+    found = grade(demo, [msgspec.structs.replace(estimate, vehicles=()) for estimate in truthful])
+    assert (found.vehicles, found.vehicle_ate_m, found.vehicle_centre_m, found.found) == (0, None, None, 0.0)
+    text = dict(rows({"truth": msgspec.to_builtins(found), "video": None}))
+    assert text["ATE of vehicles"].startswith("- m")
+    assert "can't write" in text["video"]
+
+
+def test_true_egos_begin_at_the_origin_and_go_forward(demo: DemoRecording) -> None:
+    egos = true_egos(demo)
+    assert len(egos) == len(demo)
+    np.testing.assert_allclose([egos[0].x_m, egos[0].y_m, egos[0].yaw_rad], 0.0, atol=1e-9)
+    assert egos[30].x_m > 8.0
+
+
+def test_a_run_leaves_a_video_and_its_figures(demo: DemoRecording, truthful: list[Estimate], tmp_path: Path) -> None:
+    witness = Witness.of(load(None, {"source.uri": "demo"}))
+    assert witness is not None
+    assert witness.finish(tmp_path) == {}
+    for estimate in truthful:
+        witness.add(estimate)
+    summary = witness.finish(tmp_path)
+    assert [name for name, _ in rows(summary)] == ["ATE of the ego", "ATE of vehicles", "  from the ego", "video"]
+    video = cv2.VideoCapture(summary["video"])
+    shown, picture = video.read()
+    video.release()
+    assert shown
+    assert picture.shape[1::-1] == SideBySide(demo.camera).size_px
+
+
+def test_the_picture_shows_vehicles_in_both_views(demo: DemoRecording, truthful: list[Estimate]) -> None:
+    image = next(demo.frames(0)).image
+    assert image is not None
+    with_them = SideBySide(demo.camera).draw(image, truthful[0], [], [])
+    without = SideBySide(demo.camera).draw(image, msgspec.structs.replace(truthful[0], vehicles=()), [], [])
+    changed = (with_them != without).any(axis=2)
+    width_px = round(demo.camera.width_px * 1.5)
+    assert changed[:, :width_px].any()
+    assert changed[:, width_px:].any()
+
+
+@pytest.mark.parametrize("settings", [{"source.uri": "kitti:nowhere"}, {"source.uri": "demo", "source.loop": True}])
+def test_a_run_without_truth_or_without_end_has_no_witness(settings: dict[str, object]) -> None:
+    assert Witness.of(load(None, settings)) is None
+    assert rows({}) == []
