@@ -1,7 +1,7 @@
 """A running vehicle whose camera can be made to fail, with a planner that watches it: for faults.py and soak.py.
 
-The camera is software (perf/faulty_camera): a road without end, driven along at constant speed, so that where the car
-is follows from the time alone.
+The camera is software (perf/faulty_camera): a street without end (perf/street.py), driven along at constant speed, so
+that where the car is follows from the time alone.
 """
 
 from __future__ import annotations
@@ -17,37 +17,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import cv2
 import numpy as np
 import psutil
-from numpy.typing import NDArray
 
 from birdslam.types import Estimate
+from perf.street import F_PX, FRAME_M, HEIGHT_M, HEIGHT_PX, WIDTH_PX, street_loop
 from runtime.client import Planner
 from runtime.topology import NODES
 
 ROOT = Path(__file__).resolve().parent.parent
-WIDTH_PX, HEIGHT_PX, F_PX, HEIGHT_M = 480, 160, 260.0, 1.65
-LOOP_FRAMES, TEXELS, TEXELS_PER_M = 128, 2048, 24.0
-FRAME_M = TEXELS / LOOP_FRAMES / TEXELS_PER_M  # driven from one frame to the next
 RATE_HZ = 15.0
 SETTLE_S, PATIENCE_S = 2.5, 20.0
-
-
-def road_loop() -> NDArray[np.uint8]:
-    """(frames, height, width): a drive at constant speed over a textured road, whose end meets its beginning."""
-    u, v = np.meshgrid(np.arange(WIDTH_PX, dtype=np.float32), np.arange(HEIGHT_PX, dtype=np.float32))
-    depth = F_PX * HEIGHT_M / np.maximum(v - HEIGHT_PX / 2, 0.5)
-    side = ((u - WIDTH_PX / 2) * depth / F_PX * TEXELS_PER_M + TEXELS / 2).astype(np.float32)
-    noise = np.random.default_rng(5).integers(0, 256, (TEXELS, TEXELS), dtype=np.uint8)
-    texture = cv2.GaussianBlur(noise, (0, 0), 2.0, borderType=cv2.BORDER_REFLECT)
-    texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
-    frames = []
-    for number in range(LOOP_FRAMES):
-        ahead = (depth * TEXELS_PER_M + number * TEXELS / LOOP_FRAMES).astype(np.float32)
-        road = cv2.remap(texture, side, ahead, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-        frames.append(np.where(v > HEIGHT_PX / 2 + 4, road, 200).astype(np.uint8))
-    return np.stack(frames)
 
 
 class Vehicle:
@@ -59,7 +39,7 @@ class Vehicle:
         self.place, self.runtime_dir, self.output = place, place / "rt", place / "out"
         self.camera = place / "camera"
         self.camera.mkdir(exist_ok=True)
-        np.save(self.camera / "frames.npy", road_loop())
+        np.save(self.camera / "frames.npy", street_loop())
         (self.camera / "rate_hz").write_text(f"{rate_hz}")
         self.rate_hz, self.period_ns = rate_hz, round(1e9 / rate_hz)
         self.fault("")
