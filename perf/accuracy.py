@@ -1,10 +1,11 @@
-"""The trajectory offline, where nothing is lost, beside live runs at a rate and under load, with what they dropped.
+"""How right the system is, offline where nothing is lost, and live at a rate and under load, with what it dropped.
 
-    python -m perf accuracy --source kitti:DIR --model detector=F.onnx [--rates 10,33] [--load 1] [--output F.json]
+    python -m perf accuracy [--source demo] [--source kitti:DIR] [--labels DIR] [--load 1] [--output F.json]
 
-Offline is `birdslam evaluate odometry`; live is `birdslam run`, whose rows of dropped frames hold the last pose. Both
-against KITTI's truth by the same functions. Localisation and tracking read labels, not images: their tables don't
-change under load, and come from `birdslam evaluate localisation` and `birdslam evaluate tracking`.
+One table. Of each source: the odometry against its true poses and, on the shipped drive, the vehicles against theirs,
+of `birdslam run --rate max` (the bytes of `birdslam evaluate odometry`) and of live runs, whose rows of dropped frames
+hold the last pose; all by the same functions. Of the labels of KITTI tracking: `birdslam evaluate localisation` and
+`birdslam evaluate tracking`; they read boxes, not images, so no load can change them. What is missing is a row.
 """
 
 from __future__ import annotations
@@ -14,57 +15,83 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from birdslam.datasets import DatasetError, Recording, open_recording
 from birdslam.evaluation import OdometryReport, compare, from_first, in_camera0
+from birdslam.tracking_evaluation import EGO as EGO_BODY
 from birdslam.trajectory import as_poses, read_kitti
 from perf.errors import PerfError
 from perf.figures import Ledger, numbers, spread
-from perf.live import DEMO, Ask, Run, add_run_options, drive
+from perf.live import Ask, add_run_options, drive
 from perf.machine import loaded
 from perf.system import age_of
 
-label = "the odometry's errors offline, beside the live run under real-time load"
+label = "errors of ego, vehicles and places offline, beside the live run under real-time load"
 
-COLUMNS = ("ate_m", "ate_se3_m", "scale_error", "rpe_t_m", "rpe_r_deg")
+EGO = ("ate_m", "ate_se3_m", "scale_error", "rpe_t_m", "rpe_r_deg")
+VEHICLES = ("vehicle_ate_m", "vehicle_centre_rel", "found")
+COLUMNS = (*EGO, *VEHICLES)
+SEQUENCES = "0000,0001,0002,0003,0004,0005,0006,0008"  # of KITTI tracking, with detections
+SEEDS = 2  # of the simulated odometry
+
+Row = dict[str, Any]
 
 
 def run(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m perf accuracy", description=label)
-    add_run_options(parser.add_argument)
-    parser.add_argument("--rates", type=numbers, default=(10, 33), help="Hz of the live runs, a list")
+    add_run_options(parser.add_argument, many=True)
+    parser.add_argument("--labels", type=Path, help="KITTI tracking's training folder")
+    parser.add_argument("--rates", type=numbers, default=(33,), help="Hz of the live runs beside the source's own")
     parser.add_argument("--load", type=int, default=1, help="busy cores in one more run at the highest rate; 0: none")
     parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
-    if options.source.partition(":")[0] == "demo":
-        raise PerfError(DEMO)
+    sources = options.source or ["demo"]
+    with Ledger(options.output, label, sources=sources, models=options.model, labels=str(options.labels)) as ledger:
+        for source in sources:
+            _source(ledger, options, source)
+        for name, measure in (("localisation", _localisation), ("tracking", _tracking)) if options.labels else ():
+            _labels(ledger, options.labels, name, measure)
+
+
+def _source(ledger: Ledger, options: argparse.Namespace, source: str) -> None:
+    name = source if ":" not in source else f"{source.partition(':')[0]}:{Path(source).name}"
     try:
-        recording = open_recording(options.source)
+        recording = open_recording(source)
     except DatasetError as error:
-        raise PerfError(str(error)) from error
+        _missing(ledger, name, str(error))
+        return
     if recording.truth_poses() is None:
-        raise PerfError(f"{options.source}: has no true poses to compare with")
-    with Ledger(options.output, label, source=options.source, models=options.model) as ledger:
-        offline = _offline(options)
-        exact = {name: offline[name] for name in COLUMNS if offline[name] is not None}  # it repeats to the bit
-        ledger.add("offline", _told(offline), **offline, exact=exact)
-        runs = [(rate, 0) for rate in options.rates] + ([(max(options.rates), options.load)] if options.load else [])
-        for rate, load in runs:
-            with loaded(load), drive(_ask(options, recording, rate)) as result:
-                row = _live(result, recording)
-                beside = f", {load} busy" if load else ""
-                ledger.add(f"live {rate} Hz{beside}", _told(row), rate_hz=rate, load=load, **row)
-                if not result.complete:
-                    raise KeyboardInterrupt
+        _missing(ledger, name, "has no true poses to compare with")
+        return
+    row = _offline(options, source, recording)
+    ledger.add(
+        f"{name} offline", told(row), **row, exact={key: row[key] for key in COLUMNS if row.get(key) is not None}
+    )
+    rates = sorted({round(recording.rate_hz), *options.rates})
+    for rate, load in [(rate, 0) for rate in rates] + ([(rates[-1], options.load)] if options.load else []):
+        with loaded(load), drive(_ask(options, source, recording, rate)) as result:
+            row = graded(recording, result.place / "out", result.summary)
+            ages_ms = [age_of(message) for message in result.messages]
+            row |= {"epochs": len({m.record.epoch for m in result.messages}), "age_ms": spread(ages_ms)}
+            beside = f", {load} busy" if load else ""
+            ledger.add(f"{name} live {rate} Hz{beside}", told(row), rate_hz=rate, load=load, **row)
+            if not result.complete:
+                raise KeyboardInterrupt
 
 
-def _ask(options: argparse.Namespace, recording: Recording, rate: float) -> Ask:
+def _missing(ledger: Ledger, name: str, reason: str) -> None:
+    ledger.add(name, f"missing: {reason}", missing=reason)
+
+
+def _ask(options: argparse.Namespace, source: str, recording: Recording, rate: float) -> Ask:
     return Ask(
-        source=options.source,
+        source=source,
         rate=rate,
         seconds=len(recording) / rate,
         models=tuple(options.model),
@@ -74,32 +101,85 @@ def _ask(options: argparse.Namespace, recording: Recording, rate: float) -> Ask:
     )
 
 
-def _offline(options: argparse.Namespace) -> dict[str, Any]:
+def _offline(options: argparse.Namespace, source: str, recording: Recording) -> Row:
     with tempfile.TemporaryDirectory(prefix="perf") as folder:
-        command = [sys.executable, "-m", "runtime.cli", "evaluate", "odometry", options.source, "--output", folder]
-        command += ["--config", options.config] if options.config else []
-        command += [part for model in options.model for part in ("--model", model)]
-        command += [part for setting in options.set for part in ("--set", setting)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise PerfError(done.stderr.strip())
-        report = json.loads((Path(folder) / "report.json").read_text())[0]
-    return {**{name: report[name] for name in ("frames", *COLUMNS)}, "dropped": 0, "statuses": report["statuses"]}
+        given = ["run", *([options.config] if options.config else []), "--source", source, "--rate", "max"]
+        given += [part for model in options.model for part in ("--model", model)]
+        given += [part for setting in options.set for part in ("--set", setting)]
+        given += ["--set", f"runtime.runtime_dir={folder}/rt", "--vehicle", "perf", "--output", f"{folder}/out"]
+        (Path(folder) / "rt").mkdir(mode=0o700)
+        _birdslam(*given)
+        out = Path(folder) / "out"
+        return graded(recording, out, json.loads((out / "summary.json").read_text()))
 
 
-def _live(result: Run, recording: Recording) -> dict[str, Any]:
+def _birdslam(*arguments: str) -> None:
+    command = [sys.executable, "-m", "runtime.cli", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise PerfError(done.stderr.strip())
+
+
+def graded(recording: Recording, output: Path, summary: Row) -> Row:
+    """A run's files in `output` against the truth of its recording."""
     truth = recording.truth_poses()
     assert truth is not None
-    rows = as_poses(read_kitti(result.place / "out" / "ego.kitti.txt"))
+    rows = as_poses(read_kitti(output / "ego.kitti.txt"))
     estimated = in_camera0(rows, recording.T_cam0_cam())
     goal = from_first(as_poses(truth[: len(estimated)]))  # frames that were dropped at the very end have no row
-    report: OdometryReport = compare(recording.name, goal, estimated, result.summary["statuses"])
-    errors = {name: msgspec.structs.asdict(report)[name] for name in ("frames", *COLUMNS, "statuses")}
-    ages_ms = [age_of(message) for message in result.messages]
-    epochs = len({message.record.epoch for message in result.messages})
-    return {**errors, "dropped": result.summary["frames_dropped"], "epochs": epochs, "age_ms": spread(ages_ms)}
+    report: OdometryReport = compare(recording.name, goal, estimated, summary["statuses"])
+    errors = {name: msgspec.structs.asdict(report)[name] for name in ("frames", *EGO, "statuses")}
+    of_vehicles = {name: summary["truth"][name] for name in VEHICLES} if "truth" in summary else {}
+    return {**errors, **of_vehicles, "dropped": summary["frames_dropped"]}
 
 
-def _told(row: dict[str, Any]) -> str:
-    errors = "  ".join(f"{name} {row[name]:.4g}" for name in COLUMNS if row[name] is not None)
-    return f"{errors}  dropped {row['dropped']} frames"
+def _labels(ledger: Ledger, labels: Path, name: str, measure: Callable[[Path, Path], dict[str, Row]]) -> None:
+    """The rows of an evaluation against labels."""
+    if not labels.is_dir():
+        _missing(ledger, name, f"{labels}: no such directory")
+        return
+    with tempfile.TemporaryDirectory(prefix="perf") as folder:
+        try:
+            rows = measure(labels, Path(folder))
+        except PerfError as error:
+            _missing(ledger, name, str(error))
+            return
+    for row_name, row in rows.items():
+        exact = {key: value for key, value in row.items() if isinstance(value, float)}
+        ledger.add(f"{name} {row_name}", told(row), **row, exact=exact)
+
+
+def _localisation(labels: Path, folder: Path) -> dict[str, Row]:
+    """Range -> medians of the centres' errors over all sequences."""
+    given = ("evaluate", "localisation", str(labels), "--sequences", SEQUENCES, "--detections", "rrc")
+    _birdslam(*given, "--output", str(folder / "out"))
+    rows = json.loads((folder / "out" / "report.json").read_text())
+    return {
+        f"{row['range']} m": {"frames": row["n"], "vehicle_centre_rel": row["depth_error_median_rel"]}
+        for row in rows
+        if row["sequence"] == "all"
+    }
+
+
+def _tracking(labels: Path, folder: Path) -> dict[str, Row]:
+    """Method -> mean of the egos' errors, median of the vehicles', on simulated odometry."""
+    methods = {"birdslam": "as configured", "paper": "as published"}
+    given = ("evaluate", "tracking", str(labels), "--frames", "paper", "--seeds", str(SEEDS))
+    _birdslam(*given, "--methods", ",".join(methods), "--output", str(folder / "out"))
+    rows = json.loads((folder / "out" / "report.json").read_text())
+    out: dict[str, Row] = {}
+    for method, name in methods.items():
+        egos = [row for row in rows if row["method"] == method and row["body"] == EGO_BODY]
+        vehicles = [row for row in rows if row["method"] == method and row["body"] != EGO_BODY]
+        out[name] = {
+            "frames": round(sum(row["frames"] for row in egos)),
+            **{key: float(np.mean([row[key] for row in egos])) for key in ("ate_m", "rpe_t_m", "rpe_r_deg")},
+            "vehicle_ate_m": float(np.median([row["ate_m"] for row in vehicles])),
+        }
+    return out
+
+
+def told(row: Row) -> str:
+    """For a person."""
+    errors = "  ".join(f"{name} {row[name]:.4g}" for name in COLUMNS if row.get(name) is not None)
+    return errors + (f"  dropped {row['dropped']} frames" if "dropped" in row else "")

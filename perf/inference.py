@@ -1,10 +1,10 @@
 """Networks on this machine: each alone, its preparation, run and reading apart, and the whole perceive step.
 
-    python -m perf inference --source kitti:DIR --model detector=F.onnx --model segmenter=G.onnx [--output F.json]
+    python -m perf inference [--source kitti:DIR] [--model detector=F.onnx --model segmenter=G.onnx] [--output F.json]
 
-A network alone takes frame after frame. The perceive step is the product's (runtime/inference.py and FrontEnd), paced
-at `--rate` with the deadline and the schedule of the configuration: networks that are carried don't hold it up.
-A quantised network is one more `--model` of its role.
+Without `--model` these are the shipped ones, int8 and fp32. A network alone takes frame after frame. The perceive step
+is the product's (runtime/inference.py and FrontEnd), paced at `--rate` with the deadline and the schedule of the
+configuration: networks that are carried don't hold it up. A quantised network is one more `--model` of its role.
 """
 
 from __future__ import annotations
@@ -22,14 +22,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.frontend import FrontEnd
 from birdslam.perception import ModelError, ModelSpec, Network, load_network
+from birdslam.perception.completion import GridCompletion
+from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.types import Frame
 from perf.errors import PerfError
 from perf.figures import Ledger, curve, noise, numbers, shown, spread
-from perf.live import DEMO, add_run_options
+from perf.live import add_run_options
 from runtime.configuration import Configuration, ConfigurationError, complete, load, parse_setting
 from runtime.inference import Inference
+from runtime.nodes import front_end
 from runtime.sources import SourceError, offline_frames, open_source
 
 label = "every network, and the whole perceive step, by threads"
@@ -48,13 +50,12 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="of each row")
     parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
-    if options.source.partition(":")[0] == "demo":
-        raise PerfError(DEMO)
     models = [tuple(text.partition("=")[::2]) for text in options.model]
     try:
-        configuration, frames = _frames(options)
-        with Ledger(options.output, label, source=options.source, rate=options.rate, models=models) as ledger:
-            for (role, path), threads in itertools.product(models, options.threads):
+        configuration, frames = _frames(options, models)
+        alone_too = [*models, *_shipped(configuration)]
+        with Ledger(options.output, label, source=options.source, rate=options.rate, models=alone_too) as ledger:
+            for (role, path), threads in itertools.product(alone_too, options.threads):
                 network = load_network(role, ModelSpec(path=path, threads=threads))
                 row = _row(alone(network, frames, options.seconds))
                 ledger.add(
@@ -64,15 +65,40 @@ def run(arguments: list[str]) -> None:
                     size_bytes=network.path.stat().st_size,
                     **row,
                 )
+            if configuration.models.completion:
+                row = _row(_completion(configuration, options.seconds))
+                ledger.add("completion lanes.onnx 1 threads", _told(row), **row)
             for threads in options.threads:
-                row = _row(perceive(_with_threads(configuration, models, threads), frames, options))
+                row = _row(perceive(_with_threads(configuration, threads), frames, options))
                 ledger.add(f"perceive step {threads} threads", _told(row), threads=threads, **row)
     except (ModelError, ConfigurationError, SourceError) as error:
         raise PerfError(str(error)) from error
 
 
-def _frames(options: argparse.Namespace) -> tuple[Configuration, list[Frame]]:
+def _shipped(configuration: Configuration) -> list[tuple[str, str]]:
+    """The package's own network where the configuration runs it: as it runs, and in fp32."""
+    spec = configuration.models.in_use().get("multitask")
+    if spec is None or configuration.models.multitask is not None:
+        return []
+    return [("multitask", spec.path), ("multitask", str(SHIPPED_NETWORKS / "multitask.onnx"))]
+
+
+def _completion(configuration: Configuration, seconds: float) -> Parts:
+    """ENet on a pair of grids, one half full: what is in them does not matter to its time."""
+    shape = configuration.slam.frontend.lanes.shape
+    complete_lanes = GridCompletion(shape)
+    grids = np.random.default_rng(1).integers(0, 2, (2, *shape)).astype(np.float32)
+    took_ms: list[float] = []
+    until_s = time.perf_counter() + seconds
+    while (begun_s := time.perf_counter()) < until_s:
+        complete_lanes(grids)
+        took_ms.append((time.perf_counter() - begun_s) * 1e3)
+    return {"network": took_ms}
+
+
+def _frames(options: argparse.Namespace, models: list[tuple[str, str]]) -> tuple[Configuration, list[Frame]]:
     overrides: dict[str, Any] = dict(parse_setting(text) for text in options.set)
+    overrides |= {f"models.{role}.path": path for role, path in reversed(models)}  # the first of a role
     overrides |= {"source.uri": options.source, "source.rate": options.rate}
     configuration = load(Path(options.config) if options.config else None, overrides)
     source = open_source(configuration)
@@ -83,8 +109,9 @@ def _frames(options: argparse.Namespace) -> tuple[Configuration, list[Frame]]:
     return configuration, frames
 
 
-def _with_threads(configuration: Configuration, models: list[tuple[str, str]], threads: int) -> Configuration:
-    specs = {role: ModelSpec(path=path, threads=threads) for role, path in reversed(models)}  # the first of a role
+def _with_threads(configuration: Configuration, threads: int) -> Configuration:
+    in_use = configuration.models.in_use()
+    specs = {role: msgspec.structs.replace(spec, threads=threads) for role, spec in in_use.items()}
     return msgspec.structs.replace(configuration, models=msgspec.structs.replace(configuration.models, **specs))
 
 
@@ -123,7 +150,7 @@ def perceive(configuration: Configuration, frames: list[Frame], options: argpars
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     step_ms: list[float] = []
     with Inference(configuration) as inference:
-        frontend = FrontEnd(configuration.camera, configuration.slam.frontend)
+        frontend = front_end(configuration, inference)
         gc.collect()
         gc.freeze()
         begun_ns = time.monotonic_ns()

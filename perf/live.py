@@ -25,10 +25,9 @@ from runtime.bus import Message
 from runtime.client import Planner
 from runtime.topology import NODES
 
-START_S, END_S = 90.0, 30.0
+START_S, END_S = 90.0, 120.0  # the shipped drive is graded and filmed at its end
 _SAMPLE_S = 1.0
 _VEHICLE = "perf"
-DEMO = "demo: the built-in demo world does not exist yet; give kitti:DIR or video:FILE"
 
 
 class Ask(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,6 +77,7 @@ class Run:
     summary: dict[str, Any] = field(default_factory=dict)
     place: Path = Path()
     complete: bool = False  # not cut short by Ctrl-C
+    rate_hz: float | None = None  # that was asked for
 
     def after(self, warm_up_s: float) -> Self:
         """Without its first seconds, in which caches fill and the spares load."""
@@ -94,10 +94,8 @@ def drive(ask: Ask) -> Iterator[Run]:
 
     The files of the run live as long as the context. Raises PerfError with the product's own words where it fails.
     """
-    if ask.source.partition(":")[0] == "demo":
-        raise PerfError(DEMO)
     with tempfile.TemporaryDirectory(prefix="perf") as folder:
-        run = Run(place=Path(folder))
+        run = Run(place=Path(folder), rate_hz=ask.rate)
         log = run.place / "run.log"
         (run.place / "rt").mkdir(mode=0o700)
         with log.open("wb") as output:
@@ -205,7 +203,7 @@ def _profiled(folder: Path | None, process: subprocess.Popen[bytes]) -> Iterator
             process.wait(0.05)
     spies = []
     for name, watched in _named(process.pid).items():
-        command = [tool, "record", "--native", "--threads", "--format", "flamegraph"]
+        command = [tool, "record", "--native", "--threads", "--rate", "25", "--format", "flamegraph"]
         command += ["--output", str(folder / f"{name.replace(' ', '_')}.svg"), "--pid", str(watched.pid)]
         spies.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE))
     try:
@@ -219,9 +217,13 @@ def _profiled(folder: Path | None, process: subprocess.Popen[bytes]) -> Iterator
                 print(f"py-spy: {errors.decode(errors='replace').strip()}", file=sys.stderr)
 
 
-def add_run_options(add: Any) -> None:
-    """The options of a parser that make an Ask; `add` is its add_argument."""
-    add("--source", required=True, metavar="URI", help="kitti:DIR or video:FILE, in a loop")
+def add_run_options(add: Any, many: bool = False) -> None:
+    """The options of a parser that make an Ask; `add` is its add_argument. `many`: a list of sources."""
+    sources = "demo (the default: the shipped drive), kitti:DIR or video:FILE"
+    if many:
+        add("--source", action="append", default=[], metavar="URI", help=sources)
+    else:
+        add("--source", default="demo", metavar="URI", help=sources)
     add("--config", default="", metavar="CONFIG.toml", help="of the product")
     add("--model", action="append", default=[], metavar="ROLE=PATH")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="any key of the configuration")

@@ -21,7 +21,7 @@ def draw(folder: Path, benchmarks: Benchmarks) -> list[str]:
     """Draws what the benchmarks have; gives the files' names."""
     names = []
     for name, figure in _figures(benchmarks):
-        figure.savefig(folder / name, dpi=90, bbox_inches="tight")
+        figure.savefig(folder / name, dpi=80, bbox_inches="tight")
         plt.close(figure)
         names.append(name)
     return names
@@ -35,6 +35,9 @@ def _figures(benchmarks: Benchmarks) -> Iterator[tuple[str, Figure]]:
     transport = benchmarks.get("transport", {}).get("rows", [])
     if transport:
         yield "transport.png", _transport(transport)
+    vehicles = benchmarks.get("vehicles", {}).get("rows", [])
+    if vehicles:
+        yield "vehicles.png", _vehicles(vehicles)
     optimizer = benchmarks.get("optimizer", {}).get("rows", [])
     if optimizer:
         yield "optimizer.png", _optimizer(optimizer)
@@ -92,6 +95,20 @@ def _transport(rows: list[dict[str, Any]]) -> Figure:
         axes.set_ylabel("share that is slower")
     grid[0][0].legend(fontsize=7)
     figure.tight_layout()
+    return figure
+
+
+def _vehicles(rows: list[dict[str, Any]]) -> Figure:
+    figure, (over, tails) = plt.subplots(1, 2, figsize=(11, 4))
+    for key in ("p50", "p99", "max"):
+        over.plot([row["vehicles"] for row in rows], [row["step_ms"][key] for row in rows], marker="o", label=key)
+    over.set(xlabel="vehicles in sight", ylabel="step, ms", title="The optimize process at its rate", ylim=(0.0, None))
+    for row in rows:
+        _tail(tails, row["curve_ms"], f"{row['vehicles']} vehicles (steal {row['steal_percent']:.2g} %)")
+    tails.set(xlabel="step, ms", ylabel="share that is slower")
+    for axes in (over, tails):
+        axes.grid(True, which="both", alpha=0.3)
+        axes.legend(fontsize=8)
     return figure
 
 

@@ -1,15 +1,16 @@
 """The whole product at a rate: how old an estimate is at the planner, where that time went, and what it costs.
 
-    python -m perf system --source kitti:DIR --model detector=F.onnx --rate 33 --seconds 120 --output F.json
+    python -m perf system --source demo|kitti:DIR --rate 33 --seconds 120 [--model detector=F.onnx] --output F.json
 
 The real processes run (`birdslam run`); this process is their planner. A recording is played in a loop at `--rate`,
-whatever its own. The first seconds are left out of the figures, but not out of the count of dropped frames.
+whatever its own. `--vehicles 0,5,10,15` drives the optimize process alone (convoy.py). The first seconds are left out
+of the figures, but not out of the count of dropped frames.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from perf.figures import BLOCKS, Ledger, curve, noise, shown, spread
+from birdslam.types import Status
+from perf import convoy
+from perf.figures import BLOCKS, Ledger, curve, noise, numbers, shown, spread
 from perf.live import Ask, Run, add_run_options, drive
 from perf.machine import Steal, loaded
 from runtime.bus import Message
@@ -37,10 +40,14 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--rate", type=float, default=33.0, help="Hz")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--load", type=int, default=0, help="so many busy cores beside it")
+    parser.add_argument("--vehicles", type=numbers, help="a list: the optimize process alone, with so many in sight")
     parser.add_argument("--planners", type=int, default=0, help="so many further planners")
     parser.add_argument("--profile", type=Path, metavar="DIR", help="py-spy's flame graph of each process goes there")
     parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
+    if options.vehicles is not None:
+        _with_vehicles(options)
+        return 0
     ask = Ask(
         source=options.source,
         rate=options.rate,
@@ -62,16 +69,20 @@ def run(arguments: list[str]) -> int:
     return 0 if all(row["met"] for row in ledger.content["budgets"]) else 1
 
 
+def _with_vehicles(options: argparse.Namespace) -> None:
+    settings = {"rate": options.rate, "seconds": options.seconds, "load": options.load}
+    with Ledger(options.output, label, vehicles=options.vehicles, **settings) as ledger, loaded(options.load):
+        for vehicles in options.vehicles:
+            row = convoy.measure(vehicles, options.rate, options.seconds, WARM_UP_S, tuple(options.set))
+            ledger.add(f"{vehicles} vehicles", convoy.told(row), **row)
+
+
 def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
     """What `system` says of a run; the means of `stages` add up to the mean of `age_ms`."""
     summary, received = result.summary, len(result.messages)
     result.after(warm_up_s)
     age_ms = np.array([age_of(message) for message in result.messages])
-    split: dict[str, list[float]] = {}
-    for message in result.messages:
-        for name, ms in parts(message):
-            split.setdefault(name, []).append(ms)
-    parts_ms = {name: np.array(values) for name, values in split.items()}
+    parts_ms = split(result.messages)
     late = age_ms >= np.percentile(age_ms, TAIL_PERCENTILE) if age_ms.size else np.zeros(0, dtype=bool)
     cpu, rss_mb = usage(result)
     periods_ms = np.diff([message.t_received_ns for message in result.messages]) / 1e6
@@ -81,14 +92,16 @@ def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
         "dropped": summary["frames_dropped"],
         "dropped_by": summary["dropped_by"],
         "missed_by_planner": summary["frames_processed"] - received,
+        "coasted": sum(Status.PERCEPTION_LATE in message.record.status for message in result.messages),
         "cpu_cores": round(float(sum(np.mean(values) for values in cpu.values() if len(values))), 3),
         "cpu_cores_by": {name: round(float(np.mean(values)), 3) for name, values in cpu.items() if len(values)},
         "rss_mb": round(sum(rss_mb.values()), 1),
         "rss_mb_by": {name: round(value, 1) for name, value in rss_mb.items()},
         "age_ms": spread(age_ms) | {"mean": _mean(age_ms)},
         "period_ms": spread(periods_ms),
+        "start_late_ms": spread(lateness(result.messages, result.rate_hz)),
         "stages": {
-            name: spread(values) | {"mean": _mean(values), "mean_in_tail": _mean(values[late])}
+            name: spread(gone(values)) | {"mean": _mean(values), "mean_in_tail": _mean(values[late])}
             for name, values in parts_ms.items()
         },
         "age_curve_ms": curve(age_ms),
@@ -113,8 +126,32 @@ def parts(message: Message) -> Iterator[tuple[str, float]]:
     yield from stages(message.trace, message.t_received_ns)
 
 
+def split(messages: Sequence[Message]) -> dict[str, NDArray[np.float64]]:
+    """Part -> (N,) ms of each message; NaN where its way did not lead there (a coasted frame had no perceive)."""
+    out: dict[str, NDArray[np.float64]] = {}
+    for number, message in enumerate(messages):
+        for name, ms in parts(message):
+            out.setdefault(name, np.full(len(messages), np.nan))[number] = ms
+    return out
+
+
+def gone(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Those of the messages whose way led there."""
+    return values[~np.isnan(values)]
+
+
+def lateness(messages: Sequence[Message], rate_hz: float | None) -> NDArray[np.float64]:
+    """(N,) ms from when a frame would have been due, by the one that kept the pace best, to its capture."""
+    if not messages or rate_hz is None:
+        return np.zeros(0)
+    period_ns = 1e9 / rate_hz
+    offsets = np.array([m.record.t_capture_ns - m.record.frame_id * period_ns for m in messages])
+    return (offsets - offsets.min()) / 1e6
+
+
 def _mean(values: NDArray[np.float64]) -> float:
-    return round(float(values.mean()), 4) if values.size else 0.0
+    """Over all messages, those without the part counted as none of it: so the parts' means add up."""
+    return round(float(np.nansum(values)) / values.size, 4) if values.size else 0.0
 
 
 def usage(result: Run) -> tuple[dict[str, list[float]], dict[str, float]]:
@@ -146,7 +183,7 @@ def budgets(
     limits = msgspec.convert(configured, BudgetsConfig)
     measured = {"end_to_end_ms": age_ms}
     for name, values in parts_ms.items():
-        measured[f"{name.replace(' -> ', '_to_')}_ms"] = values
+        measured[f"{name.replace(' -> ', '_to_')}_ms"] = gone(values)
     for key in BudgetsConfig.__struct_fields__:
         if key != "percentile" and measured.get(key, np.zeros(0)).size:
             value = float(np.percentile(measured[key], limits.percentile))
@@ -165,7 +202,7 @@ def table(content: dict[str, Any]) -> str:
     cpu = ", ".join(f"{name} {cores:.2f}" for name, cores in content["cpu_cores_by"].items())
     lines = [
         f"{'rate':32}{content['rate_hz']:.2f} Hz",
-        f"{'dropped':32}{content['dropped']} of {content['frames']} frames",
+        f"{'dropped':32}{content['dropped']} of {content['frames']} frames, {content['coasted']} coasted",
         f"{'cores':32}{content['cpu_cores']:.2f} ({cpu})",
         f"{'memory':32}{content['rss_mb']:.0f} MB",
         f"{'steal':32}{content['steal_during_percent']:.2f} %",

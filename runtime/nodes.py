@@ -150,17 +150,22 @@ class PerceiveNode:
         self._ring.close()
 
 
+def front_end(configuration: Configuration, inference: Inference) -> FrontEnd:
+    """As perceive has it."""
+    return FrontEnd(
+        calibrated(configuration),
+        configuration.slam.frontend,
+        frustum_network=inference.frustum_network,
+        complete=inference.completion,
+    )
+
+
 def prepare(name: str, configuration: Configuration) -> Callable[[Bus, Callable[[float], object], Assignment], Node]:
     """Does what takes long and what several processes may do at once; the result makes the node without delay."""
     if name == "perceive":
         cv2.setNumThreads(configuration.perceive.opencv_threads)
         inference = Inference(configuration)
-        frontend = FrontEnd(
-            calibrated(configuration),
-            configuration.slam.frontend,
-            frustum_network=inference.frustum_network,
-            complete=inference.completion,
-        )
+        frontend = front_end(configuration, inference)
         return lambda bus, wait, assignment: PerceiveNode(configuration, inference, frontend, bus, assignment)
     if name == "optimize":
         return lambda bus, wait, assignment: OptimizeNode(configuration, bus, assignment)
