@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.camera import Camera, GroundPlane
+from birdslam.depthplace import PseudoLidarConfig
 from birdslam.heightwatch import HeightWatch, HeightWatchConfig
 from birdslam.hindsight import Hindsight, HindsightConfig, Moment
 from birdslam.horizon import Horizon, HorizonConfig
@@ -17,9 +18,9 @@ from birdslam.lanes import Completion, LanesConfig
 from birdslam.localisation import LocalisationConfig
 from birdslam.odometry import Motion, Odometry, OdometryConfig
 from birdslam.perception import Perception
-from birdslam.pseudolidar import FrustumNetwork, PseudoLidarConfig
+from birdslam.pseudolidar import FrustumNetwork
 from birdslam.se2 import SE2
-from birdslam.static_map import LaneMapper, StaticMapConfig, landmark_edges
+from birdslam.static_map import Aside, LaneMapper, StaticMapConfig, landmark_edges
 from birdslam.tracking import Tracker, TrackingConfig
 from birdslam.types import (
     Attitude,
@@ -80,6 +81,7 @@ class FrontEnd:
         odometry: EgoMotion | None = None,
         frustum_network: FrustumNetwork | None = None,
         complete: Completion | None = None,
+        aside: Aside | None = None,
     ) -> None:
         self.camera = camera
         self.config = config
@@ -94,7 +96,7 @@ class FrontEnd:
             frustum_network,
         )
         self._reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
-        self._lanes = LaneMapper(camera, config.static_map, config.lanes, complete)
+        self._lanes = LaneMapper(camera, config.static_map, config.lanes, complete, aside)
         self.height = HeightWatch(camera, config.height, config.localisation)
         self._last_frame: int | None = None
         self._last_pitch = (0, 0.0)  # when, and the camera's against the level

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.camera import Camera, GroundPlane
+from birdslam.depthplace import DepthPlace, PseudoLidarConfig
 from birdslam.horizon import Horizon
-from birdslam.localisation import LocalisationConfig, localise
+from birdslam.localisation import LocalisationConfig, Observation, localise
 from birdslam.perception import DepthMap, Detections
-from birdslam.pseudolidar import FrustumNetwork, PseudoLidarConfig, localise_by_depth
+from birdslam.pseudolidar import FrustumNetwork, bodies_by_detector, localise_by_depth
 from birdslam.se2 import SE2
 from birdslam.track import Track
 from birdslam.tracking import Tracker
@@ -120,7 +121,8 @@ class Hindsight:
         """The oldest open frame, with its detections or without any."""
         moment = self._open.popleft()
         _predict(self.horizon, moment)
-        observations, by_depth = None, []
+        observations: list[Observation] | None = None
+        by_depth: list[DepthPlace | None] = []
         if detections is not None:
             observations = localise(
                 detections.boxes_px,
@@ -128,12 +130,9 @@ class Hindsight:
                 detections.labels,
                 self.camera,
                 self.horizon.ground,
-                self.localisation,
+                self.localisation.told(detections.edge_sigma),
             )
-        if observations and depth is not None:
-            by_depth = localise_by_depth(
-                observations, depth, self.camera, self.horizon.ground, self.pseudolidar, road, self.frustum_network
-            )
+            observations, by_depth = self._by_depth(observations, detections, depth, road)
         return self.tracker.step(
             observations,
             moment.T_world_ego,
@@ -143,6 +142,21 @@ class Hindsight:
             moment.ego_cov,
             by_depth,
         )
+
+    def _by_depth(
+        self,
+        seen: list[Observation],
+        detections: Detections,
+        depth: DepthMap | None,
+        road: NDArray[np.bool_] | None,
+    ) -> tuple[list[Observation], list[DepthPlace | None]]:
+        """The second source of each observation's place; bodies that the detector itself knows of need no depth map."""
+        ground, config = self.horizon.ground, self.pseudolidar
+        if detections.boxes3d is not None and self.frustum_network is None:
+            return bodies_by_detector(seen, detections, self.camera, ground, config)
+        if depth is None:
+            return seen, []
+        return seen, localise_by_depth(seen, depth, self.camera, ground, config, road, self.frustum_network)
 
 
 def _predict(horizon: Horizon, moment: Moment) -> None:

@@ -56,6 +56,13 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
     max_range_m: float = 100.0  # by the height of its class
 
+    def told(self, edge_sigma: tuple[float, float] | None) -> LocalisationConfig:
+        """With what a detector itself says of its boxes' edges, where it does (see `perception.Detections`)."""
+        if edge_sigma is None:
+            return self
+        rel, px = edge_sigma
+        return msgspec.structs.replace(self, sigma_box_rel=rel, sigma_box_px=px)
+
 
 @dataclass(frozen=True)
 class Observation:

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.association import NEAREST_M, in_ego
+from birdslam.depthplace import DepthPlace, PseudoLidarConfig, combined
 from birdslam.horizon import Horizon
 from birdslam.localisation import LocalisationConfig, Observation, Place, extent_m, place
 from birdslam.parallax import LearnedSize, Parallax, ParallaxConfig, sights_of
-from birdslam.pseudolidar import DepthPlace, PseudoLidarConfig, combined
 from birdslam.se2 import SE2, wrap
 from birdslam.track import Track
 
@@ -34,8 +34,10 @@ class Body:
     by_depth: DepthPlace | None = None
 
     def yaw_rad(self, T_world_ego: SE2) -> float:
-        """In ego; a new vehicle is headed like the ego."""
-        return 0.0 if self.track is None else wrap(self.track.yaw_rad - T_world_ego.yaw_rad)
+        """In ego; a new vehicle is headed as it looks, or like the ego where its front was not seen."""
+        if self.track is None:
+            return self.by_depth.yaw_rad if self.by_depth is not None and self.by_depth.front_seen else 0.0
+        return wrap(self.track.yaw_rad - T_world_ego.yaw_rad)
 
     def expected_depth_m(self, T_world_ego: SE2) -> float:
         """Of the nearest face, before it is measured: as the track predicts it, or by the height of its class."""

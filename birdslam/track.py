@@ -44,6 +44,7 @@ class Track:
     votes: Counter[str] = field(default_factory=Counter)
     sigma_yaw_rad: float = 0.0  # of a yaw that motion has shown
     yaw_known: bool = False
+    front_logit: float = 0.0  # of the yaw's end being the front, by what a network saw of the body
     stands: bool = False  # in all likelihood
     motion: MotionEdge | None = None  # VV: from when it was last shown to now, as predicted before it was seen again
 

@@ -17,14 +17,16 @@ from scipy.optimize import linear_sum_assignment
 
 from birdslam.association import predicted_boxes_px, within_gate
 from birdslam.camera import Camera, GroundPlane
+from birdslam.depthplace import DepthPlace, PseudoLidarConfig
 from birdslam.horizon import Horizon
 from birdslam.localisation import LocalisationConfig, Observation, Place, extent_m, iou, place
 from birdslam.parallax import ParallaxConfig
 from birdslam.placing import Body, Placing
-from birdslam.pseudolidar import DepthPlace, PseudoLidarConfig
 from birdslam.se2 import SE2, wrap
 from birdslam.track import Track
 from birdslam.types import MotionEdge
+
+MOTION_LOGIT = 6.0  # of the front of a vehicle that was seen to move
 
 
 class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -45,6 +47,7 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     moved_across_rel: float = 0.05  # distance then: along the line of sight, and across it
     sigma_yaw_rate_radps: float = 0.5
     direction_inflation: float = 3.0  # of the motion's direction: its errors last for many frames
+    body_yaw_inflation: float = 3.0  # of a yaw that a network sees in the body: so do its errors
     sigma_yaw_unknown_rad: float = 0.2
     sigma_yaw_moving_rad: float = 0.1
     parallax: ParallaxConfig = ParallaxConfig()
@@ -105,8 +108,9 @@ class Tracker:
         for body, where in zip(bodies, self.placing.places(bodies, T_world_ego, horizon), strict=True):
             if body.track is not None:
                 self._correct(body.track, body.seen, where, T_world_ego, horizon, frame_id, t_source_ns)
+                self._face(body.track, body.by_depth, T_world_ego, horizon)
             else:
-                self.tracks.append(self._begin(body.serial, body.seen, where, T_world_ego, frame_id, t_source_ns))
+                self.tracks.append(self._begin(body, where, T_world_ego, frame_id, t_source_ns))
         self.tracks = [track for track in self.tracks if not self._is_lost(track, t_source_ns)]
         horizon.keep_only(track.serial for track in self.tracks)
         self.placing.keep_only(track.serial for track in self.tracks)
@@ -227,8 +231,28 @@ class Tracker:
         if speed < slowest or not self._has_moved(track):
             return
         turn = wrap(math.atan2(vy, vx) - track.yaw_rad)
-        noise = (config.direction_inflation * sigma / speed) ** 2
-        before = track.sigma_yaw_rad**2 + (config.sigma_yaw_rate_radps * self._dt_s) ** 2
+        if track.yaw_known and abs(turn) > math.pi / 2.0:  # it was taken for the other way round
+            track.yaw_rad, turn = wrap(track.yaw_rad + math.pi), wrap(turn - math.pi)
+        track.front_logit = MOTION_LOGIT
+        self._turned(track, turn, (config.direction_inflation * sigma / speed) ** 2, T_world_ego, horizon)
+
+    def _face(self, track: Track, by_depth: DepthPlace | None, T_world_ego: SE2, horizon: Horizon) -> None:
+        """Towards the yaw that a network saw in the body: its axis each time, its front by all that was seen so far."""
+        if by_depth is None or not by_depth.front_seen or track.observation.cut_side:
+            return
+        turn = wrap(T_world_ego.yaw_rad + by_depth.yaw_rad - track.yaw_rad)
+        opposed = abs(turn) > math.pi / 2.0
+        said = by_depth.front_logit / self.config.body_yaw_inflation**2
+        track.front_logit = min(track.front_logit + (-said if opposed else said), MOTION_LOGIT)
+        if opposed:
+            turn = wrap(turn - math.pi)
+        if track.front_logit < 0.0:
+            track.yaw_rad, track.front_logit = wrap(track.yaw_rad + math.pi), -track.front_logit
+        self._turned(track, turn, (self.config.body_yaw_inflation * by_depth.sigma_yaw_rad) ** 2, T_world_ego, horizon)
+
+    def _turned(self, track: Track, turn: float, noise: float, T_world_ego: SE2, horizon: Horizon) -> None:
+        """The yaw corrected by a measured turn with its variance."""
+        before = track.sigma_yaw_rad**2 + (self.config.sigma_yaw_rate_radps * self._dt_s) ** 2
         gain = before / (before + noise) if track.yaw_known else 1.0
         track.sigma_yaw_rad = math.sqrt((1.0 - gain) * before if track.yaw_known else noise)
         track.yaw_rad = wrap(track.yaw_rad + gain * turn)
@@ -254,10 +278,11 @@ class Tracker:
         along, across = (x * dx + y * dy) / distance2, (x * dy - y * dx) / distance2
         return math.hypot(along / self.config.moved_along_rel, across / self.config.moved_across_rel) > 1.0
 
-    def _begin(
-        self, serial: int, observation: Observation, seen: Place, T_world_ego: SE2, frame_id: int, t_source_ns: int
-    ) -> Track:
-        # Most traffic runs along the road: until it is seen to move otherwise, it is headed like the ego.
+    def _begin(self, body: Body, seen: Place, T_world_ego: SE2, frame_id: int, t_source_ns: int) -> Track:
+        # Most traffic runs along the road: until it is seen to face or to move otherwise, it is headed like the ego.
+        observation, by_depth = body.seen, body.by_depth
+        if by_depth is not None and not by_depth.front_seen:
+            by_depth = None
         R = T_world_ego.rotation()
         cov = np.zeros((4, 4))
         cov[:2, :2] = R @ seen.cov @ R.T
@@ -265,16 +290,19 @@ class Tracker:
         return Track(
             state=np.concatenate([T_world_ego @ seen.centre_m, np.zeros(2)]),
             cov=cov,
-            yaw_rad=T_world_ego.yaw_rad,
+            yaw_rad=wrap(T_world_ego.yaw_rad + body.yaw_rad(T_world_ego)),
             observation=observation,
             place=seen,
-            serial=serial,
+            serial=body.serial,
             first_m=T_world_ego @ seen.centre_m,
             first_sight_m=R @ seen.centre_m,
             seen_frame=frame_id,
             seen_ns=t_source_ns,
             T_world_ego=T_world_ego,
             votes=Counter({observation.label: 1}),
+            sigma_yaw_rad=0.0 if by_depth is None else by_depth.sigma_yaw_rad,
+            yaw_known=by_depth is not None,
+            front_logit=0.0 if by_depth is None else by_depth.front_logit,
         )
 
     def _is_lost(self, track: Track, t_source_ns: int) -> bool:

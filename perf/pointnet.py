@@ -22,11 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.camera import GroundPlane
+from birdslam.depthplace import DepthPlace, PseudoLidarConfig, combined
 from birdslam.localisation import LocalisationConfig, Observation, Place, iou, localise, place
 from birdslam.perception import DepthMap, ModelError, ModelSpec, Network, load_network
 from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perception.pointnet import PointNet, load_pointnet
-from birdslam.pseudolidar import DepthPlace, PseudoLidarConfig, combined, localise_by_depth, places_of
+from birdslam.pseudolidar import localise_by_depth, places_of
 from birdslam.se2 import SE2
 from perf.errors import PerfError
 from perf.figures import Ledger

@@ -133,3 +133,14 @@ def test_numbers_gone_wild_stay_in_bounds() -> None:
     assert len(boxes)
     assert (boxes >= 0).all()
     assert (boxes <= [640, 320, 640, 320]).all()
+
+
+def test_a_manifest_says_how_sure_the_edges_of_its_boxes_are(tmp_path: Path) -> None:
+    image, objects = np.zeros((64, 256, 3), np.uint8), [(0, (8.0, 8.0, 20.0, 16.0), 0.6)]
+    assert load(tmp_path, MANIFEST, maps(objects)).run(image).detections.edge_sigma is None
+    said = MANIFEST + "box_sigma = { rel = 0.1, px = 1.5 }\n"
+    found = load(tmp_path, said, maps(objects)).run(image).detections
+    assert found.edge_sigma == (0.1, 1.5 * 4)  # the image is four times as wide as the input, and twice as high
+    assert found.only(("car",)).edge_sigma == found.edge_sigma
+    with pytest.raises(ModelError, match=r"px.*\$\.detector\.box_sigma"):
+        load(tmp_path, MANIFEST + "box_sigma = { rel = 0.1 }\n", maps(objects))

@@ -1,6 +1,7 @@
 """Detections that come late: the same vehicles as if they had come in time, shown where they are by now."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -189,3 +190,16 @@ def test_a_late_vehicle_whose_velocity_is_not_known_is_not_shown() -> None:
     shown = [len(m.cv) for m in drive(1, 0, 0.5, (CAR.height_m,) * 3, late_sigma_m=0.45)]
     assert shown[4] < 3
     assert shown[-1] == 3
+
+
+def test_a_detector_that_is_less_sure_of_its_edges_gives_poorer_places() -> None:
+    """`Detections.edge_sigma` takes the place of the configuration's own."""
+    covs = {}
+    for said in (None, (0.02, 1.0), (0.2, 10.0)):
+        front = hindsight()
+        for k in range(4):
+            front.begin(moment(k))
+            tracks = front.see(replace(detections(k), edge_sigma=said), k)
+        covs[said] = tracks[0].place.cov
+    np.testing.assert_array_equal(covs[None], covs[0.02, 1.0])
+    assert np.linalg.eigvalsh(covs[0.2, 10.0] - covs[None]).min() > 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,19 +12,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from birdslam.bev import ego_to_pixel
+from birdslam.bodyfit import fitted, footprints, surface_m
 from birdslam.camera import Camera
+from birdslam.depthplace import DepthPlace, PseudoLidarConfig, combined
 from birdslam.localisation import LocalisationConfig, Observation, Place, localise, place
-from birdslam.perception import Boxes3d, DepthMap
-from birdslam.pseudolidar import (
-    DepthPlace,
-    PseudoLidarConfig,
-    combined,
-    fitted,
-    footprints,
-    in_metres,
-    localise_by_depth,
-    surface_m,
-)
+from birdslam.perception import Boxes3d, DepthMap, Detections
+from birdslam.pseudolidar import bodies_by_detector, in_metres, localise_by_depth
 from birdslam.se2 import SE2, wrap
 
 CAMERA = Camera(
@@ -195,6 +189,45 @@ def test_the_network_is_asked_for_boxes_with_points_and_its_answers_are_places_i
     assert fallback[0].size_m is None
 
 
+def found_with(poses: list[SE2], bodies: Boxes3d) -> Detections:
+    _, boxes = scene(poses)
+    return Detections(boxes, np.linspace(0.9, 0.8, len(boxes)), ("car",) * len(boxes), bodies)
+
+
+def test_bodies_that_the_detector_knows_of_are_the_second_source() -> None:
+    poses = [SE2(10.0, 2.0, 0.4), SE2(25.0, -3.0, 2.0)]
+    detections = found_with(poses, told(poses))
+    seen = observed(detections.boxes_px)[::-1]  # as bodies go with their boxes, the order is of no matter
+    measured, (far, near) = bodies_by_detector(seen, detections, CAMERA, CAMERA.ground, CONFIG)
+    assert near is not None
+    assert far is not None
+    np.testing.assert_allclose(near.centre_m, [10.0, 2.0], atol=1e-6)
+    np.testing.assert_allclose(far.centre_m, [25.0, -3.0], atol=1e-6)
+    assert near.cov[0, 0] == pytest.approx(0.5**2)
+    assert near.front_seen
+    assert [o.box_px for o in measured] == [o.box_px for o in seen]
+    off = PseudoLidarConfig(rule="off")
+    assert bodies_by_detector(seen, detections, CAMERA, CAMERA.ground, off) == (seen, [None, None])
+    without = Detections(detections.boxes_px, detections.scores, detections.labels)
+    assert bodies_by_detector(seen, without, CAMERA, CAMERA.ground, CONFIG) == (seen, [None, None])
+
+
+@given(st.floats(3.0, 7.0), st.floats(0.05, 3.0), st.floats(8.0, 40.0), st.floats(-math.pi, math.pi))
+def test_the_length_is_of_class_and_body_together_and_the_face_stays(
+    length_m: float, sigma_m: float, x_m: float, yaw_rad: float
+) -> None:
+    poses = [SE2(x_m, 0.0, yaw_rad)]
+    size = replace(told(poses), size_m=np.array([[length_m, CAR.width_m, CAR.height_m]]))
+    detections = found_with(poses, replace(size, sigma_size_m=np.full((1, 3), sigma_m)))
+    (seen,), (found,) = bodies_by_detector(observed(detections.boxes_px), detections, CAMERA, CAMERA.ground, CONFIG)
+    together_m, of_class_m = seen.dimensions.length_m, CAR.sigma_length_rel * CAR.length_m
+    assert min(length_m, CAR.length_m) - 1e-9 <= together_m <= max(length_m, CAR.length_m) + 1e-9
+    assert seen.dimensions.sigma_length_rel * together_m == pytest.approx(1 / math.hypot(1 / sigma_m, 1 / of_class_m))
+    assert found is not None
+    half_m = 0.5 * abs(math.cos(yaw_rad))
+    assert found.centre_m[0] - half_m * together_m == pytest.approx(x_m - half_m * length_m)
+
+
 @given(st.floats(0.0, 2 * math.pi), st.floats(6.0, 40.0), st.floats(-3.0, 3.0), st.floats(-0.4, 0.4))
 def test_the_visible_surface_is_on_the_footprint_and_in_front(yaw: float, x_m: float, y_m: float, ray: float) -> None:
     pose = SE2(x_m, y_m, yaw)
@@ -223,8 +256,8 @@ def by_depth(x_m: float = 20.0, var: float = 4.0) -> DepthPlace:
 
 def test_two_sources_are_better_than_one() -> None:
     both = combined(by_box(20.0), by_depth(21.0), CONFIG)
-    np.testing.assert_allclose(both.centre_m, [20.5, 1.1])
-    np.testing.assert_allclose(both.cov, np.diag([2.0, 0.02]))
+    np.testing.assert_allclose(both.centre_m, [20.5, 1.0])  # sideways both rest on the edges of the one box
+    np.testing.assert_allclose(both.cov, np.diag([2.0, 0.04]))
     assert both.depth_m == pytest.approx(18.5)
     sure = combined(by_box(20.0), by_depth(21.0, 1e-6), CONFIG)
     assert sure.centre_m[0] == pytest.approx(21.0, abs=1e-3)

@@ -1,15 +1,16 @@
 """Ids that last: vehicles of a known world through the tracker, with gaps, flicker and false alarms."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from birdslam import bev
 from birdslam.camera import Camera, GroundPlane
+from birdslam.depthplace import DepthPlace
 from birdslam.horizon import Horizon, HorizonConfig
 from birdslam.localisation import LocalisationConfig, localise
-from birdslam.pseudolidar import DepthPlace
 from birdslam.se2 import SE2, wrap
 from birdslam.track import Track
 from birdslam.tracking import Tracker, TrackingConfig
@@ -171,3 +172,62 @@ def test_a_vehicle_of_no_usual_size_keeps_its_id_while_its_size_is_learned() -> 
     assert ids == {0}
     assert abs(errors[0]) > 15.0  # taken for a car as cars are
     assert np.abs(errors[-10:]).max() < 0.2 * abs(errors[0])
+
+
+class Looks:
+    """A standing ego that looks at one standing car, and is told by a network how that faces."""
+
+    def __init__(self, config: TrackingConfig | None = None) -> None:
+        self.drive = Drive(config)
+        self.frame = 0
+
+    def see(self, at: SE2, said_rad: float, flip: float = 0.05, sigma_rad: float = 0.1) -> Track | None:
+        box = box_px(at)
+        assert box is not None
+        seen = localise(box[None], np.array([0.9]), ("car",), CAMERA, self.drive.horizon.ground, LocalisationConfig())
+        by_depth = DepthPlace(np.array([at.x_m, at.y_m]), np.eye(2), said_rad, sigma_rad, flip)
+        t_ns = self.frame * PERIOD_NS
+        tracks = self.drive.tracker.step(seen, SE2(), self.drive.horizon, self.frame, t_ns, None, [by_depth])
+        self.frame += 1
+        return tracks[0] if tracks else None
+
+
+@pytest.mark.parametrize("yaw_rad", [0.3, -1.2, 2.8, math.pi])
+def test_a_car_that_never_moved_faces_as_it_looks(yaw_rad: float) -> None:
+    looks, track = Looks(), None
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        track = looks.see(SE2(14.0, 1.0, yaw_rad), wrap(yaw_rad + 0.1 * rng.standard_normal()))
+    assert track is not None
+    assert abs(wrap(track.yaw_rad - yaw_rad)) < 0.1
+    assert track.yaw_known
+    assert track.sigma_yaw_rad < 0.15
+
+
+def test_a_front_that_is_mostly_taken_for_the_rear_turns_once_and_the_axis_stays() -> None:
+    looks, yaws = Looks(), []
+    for k in range(40):
+        track = looks.see(SE2(14.0, 1.0, 0.2), 0.2 if k % 4 else wrap(0.2 + math.pi), flip=0.2)  # the first is wrong
+        if track is not None:
+            yaws.append(track.yaw_rad)
+    assert abs(wrap(yaws[0] - 0.2)) > 3.0
+    turns = [abs(wrap(b - a)) > 1.0 for a, b in pairwise(yaws)]
+    assert sum(turns) == 1
+    assert abs(wrap(yaws[-1] - 0.2)) < 0.05
+
+
+def test_an_axis_alone_leaves_a_car_headed_like_the_ego() -> None:
+    looks, track = Looks(), None
+    for _ in range(5):
+        track = looks.see(SE2(14.0, 1.0, 0.0), 1.0, flip=0.5)
+    assert track is not None
+    assert track.yaw_rad == 0.0
+    assert not track.yaw_known
+
+
+def test_motion_says_which_end_is_the_front() -> None:
+    looks, track = Looks(), None
+    for k in range(25):
+        track = looks.see(SE2(40.0 - 1.0 * k, 3.0, math.pi), 0.05, flip=0.3)  # it comes, and looks as if it went
+    assert track is not None
+    assert abs(wrap(track.yaw_rad - math.pi)) < 0.2

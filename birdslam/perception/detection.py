@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.perception.boxes3d import Boxes3d
-from birdslam.perception.manifest import Input, Misfit, Yolox
+from birdslam.perception.manifest import BoxSigma, Input, Misfit, Yolox
 from birdslam.perception.views import View
 
 CUT_MARGIN = 0.015  # of a tile's width: a box that ends so near to a tile's inner edge is taken to go on behind it
@@ -22,13 +22,15 @@ SAME_ROWS = 0.5  # overlap over union of the rows of two halves of one object
 class Detections:
     """Boxes (N, 4) x1, y1, x2, y2 in pixels of the undistorted image, scores (N,) in [0, 1] falling, labels.
 
-    `boxes3d` holds a body for each box, where the network knows of bodies.
+    `boxes3d` holds a body for each box, where the network knows of bodies. `edge_sigma` is the 1-sigma of an edge, as a
+    fraction of the box's side and in pixels of the image on top of that; None: the network does not say.
     """
 
     boxes_px: NDArray[np.float64]
     scores: NDArray[np.float64]
     labels: tuple[str, ...]
     boxes3d: Boxes3d | None = None
+    edge_sigma: tuple[float, float] | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -37,7 +39,8 @@ class Detections:
         """Those with one of the labels."""
         keep = [i for i, label in enumerate(self.labels) if label in labels]
         bodies = None if self.boxes3d is None else self.boxes3d.take(keep)
-        return Detections(self.boxes_px[keep], self.scores[keep], tuple(self.labels[i] for i in keep), bodies)
+        labels_kept = tuple(self.labels[i] for i in keep)
+        return replace(self, boxes_px=self.boxes_px[keep], scores=self.scores[keep], labels=labels_kept, boxes3d=bodies)
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,13 @@ class YoloxDecoder:
 
     def merge(self, parts: Sequence[Candidates], views: Sequence[View]) -> Detections:
         """The boxes of all views of one image, each object once."""
-        return merge_views(parts, views, self._groups, self.table.labels, self.table.nms_iou)
+        merged = merge_views(parts, views, self._groups, self.table.labels, self.table.nms_iou)
+        return replace(merged, edge_sigma=edge_sigma(self.table.box_sigma, views[0]))
+
+
+def edge_sigma(said: BoxSigma | None, view: View) -> tuple[float, float] | None:
+    """What a manifest says of its boxes' edges, in pixels of the image."""
+    return None if said is None else (said.rel, said.px / float(view.ratio.min()))
 
 
 def rival_groups(classes: int, labels: Mapping[int, str], rivals: Sequence[Sequence[str]]) -> NDArray[np.int64]:

@@ -101,6 +101,16 @@ class Tiles(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     overlap: Annotated[float, msgspec.Meta(ge=0.0, le=0.9)] = 0.2
 
 
+class BoxSigma(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """1-sigma of each edge of a detector's boxes, as measured against the truth: `rel` of the box's side and `px`.
+
+    Pixels are those of the network's input. It says how much Eq. 1 on the bottom of a box is worth.
+    """
+
+    rel: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
+    px: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)]
+
+
 class Yolox(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="yolox"):
     """(1, cells, 5 + classes): xy, log wh, objectness, classes (both already sigmoid) on square grids of `strides`.
 
@@ -116,6 +126,7 @@ class Yolox(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     score_threshold: Fraction
     nms_iou: Fraction
     rivals: tuple[tuple[Label, ...], ...] = ()
+    box_sigma: BoxSigma | None = None  # None: localisation.sigma_box_rel and sigma_box_px of the configuration
 
     def __post_init__(self) -> None:
         for index in self.labels:
@@ -144,6 +155,7 @@ class CenterNet(
     score_threshold: Fraction
     nms_iou: Fraction = 0.6
     rivals: tuple[tuple[Label, ...], ...] = ()
+    box_sigma: BoxSigma | None = None  # as YOLOX
 
     def __post_init__(self) -> None:
         for index in self.labels:
@@ -261,6 +273,7 @@ class MultiTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     nms_iou: Fraction = 0.5
     road_logit: float = 0.0
     lane_logit: float = 0.0
+    box_sigma: BoxSigma = BoxSigma(rel=0.045, px=0.5)  # of the shipped one, on held-out worlds at two image sizes
     depth_sigma_rel: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.15  # 1-sigma of a pixel's depth, as a fraction
 
     def __post_init__(self) -> None:
