@@ -25,6 +25,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import msgspec
@@ -43,6 +44,7 @@ CUES: tuple[Cue, ...] = ("bottom", "top", "width")  # measurements of each box, 
 ITERATIONS = 2
 DEPTH_UNKNOWN = 2.0  # 1-sigma of log z before a frame is seen
 UNUSED = 1e3  # 1-sigma of a cue that is not to be used
+_LEAST = 1e-12  # variance of what a class leaves no doubt of
 
 
 class HorizonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -63,6 +65,17 @@ class HorizonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cues: tuple[Cue, ...] = ("bottom", "top", "width")
     gate_sigma: float = 2.0  # past it a cue is trusted the less the worse it fits
     image_pitch_frames: float = 5.0  # for how long the error of a pitch from the images lasts
+
+
+@dataclass(frozen=True)
+class Depths:
+    """Of one frame's boxes, (N,) each: log depths of the nearest faces and the heights that they were found with."""
+
+    log_depth: Floats
+    variance: Floats
+    log_height: Floats
+    height_variance: Floats
+    depth_per_height: Floats  # by how much log_depth goes with log_height
 
 
 class Horizon:
@@ -147,8 +160,8 @@ class Horizon:
         extents_m: Floats,
         turned_rad: Floats,
         learned: LearnedSize | None = None,
-    ) -> tuple[Floats, Floats]:
-        """Log depths (N,) of the nearest faces and their variances (N,), all of this frame's boxes together.
+    ) -> Depths:
+        """The depths of all of this frame's boxes together.
 
         `outlines_m` and `extents_m` (N,): what each class measures across and along the line of sight at its yaw;
         `turned_rad` (N,): by how much that line turned since last seen. Observations are against the present `ground`.
@@ -159,7 +172,7 @@ class Horizon:
                 self._begin(vehicle, observation)
         n = len(seen)
         if not n:
-            return np.zeros(0), np.zeros(0)
+            return Depths(*np.zeros((5, 0)))
         at = np.array([self._at(vehicle) for vehicle in vehicles])
         self._P[at + 1, at + 1] += self.config.width_drift_rel**2 + (self.config.width_turn_rel * turned_rad) ** 2
         tops = np.array([o.slope_top for o in seen])
@@ -172,13 +185,16 @@ class Horizon:
         R0 = np.concatenate([sigma_slope[:, 0] ** 2, sigma_slope[:, 1] ** 2, sigma_width**2])
         R0[np.repeat([cue not in self.config.cues for cue in CUES], n)] = UNUSED**2
         log_z, P_z, P_zh = self._iterate(at, bearing, extents_m * self.config.roof_reach_rel, z, R0)
+        log_h, P_h = self._x[at], np.maximum(self._P[at, at], _LEAST)
         if learned is None:
-            return log_z, P_z
-        gain = P_zh[:, None] / (self._P[at, at][:, None] + learned.variance)
-        each = log_z[:, None] + gain * (learned.log_height - self._x[at][:, None])
-        mean = (learned.weight * each).sum(axis=1)
-        spread = np.square(each - mean[:, None]) + P_z[:, None] - gain * P_zh[:, None]
-        return mean, (learned.weight * spread).sum(axis=1)
+            return Depths(log_z, P_z, log_h, P_h, P_zh / P_h)
+        gap = learned.log_height - log_h[:, None]
+        of_depth, of_height = (P[:, None] / (P_h[:, None] + learned.variance) for P in (P_zh, P_h))
+        return Depths(
+            *_mixed(learned.weight, log_z[:, None] + of_depth * gap, P_z[:, None] - of_depth * P_zh[:, None]),
+            *_mixed(learned.weight, log_h[:, None] + of_height * gap, P_h[:, None] - of_height * P_h[:, None]),
+            P_zh / P_h,
+        )
 
     def _iterate(
         self, at: NDArray[np.intp], bearing: Floats, reach: Floats, z: Floats, R: Floats
@@ -270,3 +286,9 @@ class Horizon:
         gain = self._P[:, 0] / (self._P[0, 0] + sigma_rad**2)
         self._x = self._x + gain * (pitch_rad - self._x[0])
         self._P = self._P - np.outer(gain, self._P[0])
+
+
+def _mixed(weight: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:
+    """Mean (N,) and variance (N,) of mixtures (N, K)."""
+    mean = (weight * means).sum(axis=1)
+    return mean, (weight * (np.square(means - mean[:, None]) + variances)).sum(axis=1)

@@ -108,12 +108,26 @@ class Observation:
 
 
 @dataclass(frozen=True)
+class Taken:
+    """What a vehicle was taken for when it was placed: later frames may know better (retrospect.py).
+
+    `depth_per_height` says by how much the logarithm of its depth went with `log_height`, that of its height in metres.
+    """
+
+    log_height: float
+    sigma_log_height: float
+    depth_per_height: float
+    standing: float  # the probability that it stands
+
+
+@dataclass(frozen=True)
 class Place:
     """Where an observed vehicle is in ego: its nearest face's depth, its footprint's centre (2,), and cov (2, 2)."""
 
     depth_m: float
     centre_m: NDArray[np.float64]
     cov: NDArray[np.float64]
+    taken: Taken | None = None
 
 
 def iou(a_px: NDArray[np.float64], b_px: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.association import NEAREST_M, in_ego
 from birdslam.depthplace import DepthPlace, PseudoLidarConfig, combined
-from birdslam.horizon import Horizon
-from birdslam.localisation import LocalisationConfig, Observation, Place, extent_m, place
+from birdslam.horizon import Depths, Horizon
+from birdslam.localisation import LocalisationConfig, Observation, Place, Taken, extent_m, place
 from birdslam.parallax import LearnedSize, Parallax, ParallaxConfig, sights_of
 from birdslam.se2 import SE2, wrap
 from birdslam.track import Track
@@ -88,14 +88,29 @@ class Placing:
             ]
         ).reshape(-1, 2)
         learned = self._sizes(bodies, centres, extents, turned, T_world_ego, horizon)
-        log_depths, variances = horizon.update(serials, seen, extents[:, 1], extents[:, 0], turned, learned)
+        found = horizon.update(serials, seen, extents[:, 1], extents[:, 0], turned, learned)
         by_boxes = [
             place(o, log_depth, variance, yaw, self.localisation)
-            for o, log_depth, variance, yaw in zip(seen, log_depths.tolist(), variances.tolist(), yaws, strict=True)
+            for o, log_depth, variance, yaw in zip(
+                seen, found.log_depth.tolist(), found.variance.tolist(), yaws, strict=True
+            )
         ]
-        return [
+        where = [
             combined(by_box, body.by_depth, self.pseudolidar) for by_box, body in zip(by_boxes, bodies, strict=True)
         ]
+        return [
+            replace(whole, taken=self._taken(found, k, serials[k], float(whole.cov[0, 0] / by_box.cov[0, 0])))
+            for k, (whole, by_box) in enumerate(zip(where, by_boxes, strict=True))
+        ]
+
+    def _taken(self, depths: Depths, k: int, serial: int, share: float) -> Taken:
+        """`share` of the box's variance along the line of sight is left: so much of the place is still the box's."""
+        return Taken(
+            log_height=float(depths.log_height[k]),
+            sigma_log_height=math.sqrt(float(depths.height_variance[k])),
+            depth_per_height=float(depths.depth_per_height[k]) * min(share, 1.0),
+            standing=self.parallax.standing(serial),
+        )
 
     def _sizes(
         self,

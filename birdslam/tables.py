@@ -15,6 +15,7 @@ import msgspec
 from birdslam.kitti import DatasetError
 from birdslam.tracking_evaluation import EGO, Row, mean_ate_m
 
+OURS = {"birdslam_live": "ours, live", "birdslam": "**ours**"}
 Cells = dict[str, dict[str, float]]  # sequence -> body -> metres
 
 METHOD_TITLES = {
@@ -104,10 +105,11 @@ def methods_table(rows: Sequence[Row], published: Published, ego: bool) -> str:
     table = published.table2 if ego else published.table1
     chosen = _chosen(rows)
     redone = [name for name in METHOD_TITLES if name in chosen]
+    own = [name for name in OURS if name in chosen]
     head = ["Seq", "Car", "frames"]
     head += [f"published: {title}" for title in METHOD_TITLES.values()]
     head += [f"re-implemented: {METHOD_TITLES[name]}" for name in redone]
-    head += ["**ours**"] if "birdslam" in chosen else []
+    head += [OURS[name] for name in own]
     bodies = {s: (EGO,) if ego else paper.bodies for s, paper in published.sequences.items()}
     lines = []
     for sequence, names in bodies.items():
@@ -116,13 +118,12 @@ def methods_table(rows: Sequence[Row], published: Published, ego: bool) -> str:
             any_row = next(iter(of.values()), None)
             line = [sequence, body, "" if any_row is None else f"{any_row.frames:g} of {any_row.frames_labelled}"]
             line += [_number(table.ate_m.get(name, {}).get(sequence, {}).get(body)) for name in METHOD_TITLES]
-            line += [_row_number(of.get(name)) for name in (*redone, *(["birdslam"] if "birdslam" in chosen else []))]
+            line += [_row_number(of.get(name)) for name in (*redone, *own)]
             lines.append(line)
     present = _present(rows, bodies)
     means: list[str] = ["mean", "of those at hand", ""]
     means += [_number(_published_mean(table.ate_m.get(name, {}), present)) for name in METHOD_TITLES]
-    means += [_number(mean_ate_m(rows, name, present)) for name in redone]
-    means += [_number(mean_ate_m(rows, "birdslam", present))] if "birdslam" in chosen else []
+    means += [_number(mean_ate_m(rows, name, present)) for name in (*redone, *own)]
     return _markdown(head, [*lines, means])
 
 

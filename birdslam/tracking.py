@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -268,7 +269,7 @@ class Tracker:
         shift_m = T_world_ego.rotation() @ (turned.centre_m - track.place.centre_m)
         track.state[:2] += shift_m
         track.first_m = track.first_m + shift_m
-        track.place = Place(depth_m, turned.centre_m, track.place.cov)
+        track.place = replace(track.place, depth_m=depth_m, centre_m=turned.centre_m)
 
     def _has_moved(self, track: Track) -> bool:
         """Whether it left where it was first seen by more than a parked car seems to that is seen better and better."""

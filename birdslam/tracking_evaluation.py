@@ -22,6 +22,7 @@ from birdslam.frontend import EgoMotion, FrontEnd, FrontEndConfig, Pending
 from birdslam.graph import GraphConfig, PoseGraph
 from birdslam.kitti import KITTI_RATE_HZ, NS_PER_S
 from birdslam.kitti_tracking import VEHICLE_KINDS, TrackingSequence
+from birdslam.retrospect import Retrospect, RetrospectConfig
 from birdslam.se2 import SE2
 from birdslam.simulation.odometry import SimulatedOdometry
 from birdslam.slam import SlamConfig
@@ -36,7 +37,7 @@ NO_IMAGE = np.zeros((1, 1), dtype=np.uint8)  # for an odometry that looks at non
 
 
 class Method(Protocol):
-    """A module of baselines/, or `Live`."""
+    """A module of baselines/, `Live` or `Final`."""
 
     @property
     def label(self) -> str: ...
@@ -69,18 +70,45 @@ class Live:
         return replace(m, cv=tuple(cv), cp=tuple(cp))
 
 
+@dataclass(frozen=True)
+class Final:
+    """The vehicles' ways as our system knows them at the end of the log, beside the ego's live one.
+
+    A batch, and the paper's graph, which keeps every pose, answer for each frame with all of them: so does this.
+    """
+
+    label: str
+    live: Live
+    retrospect: RetrospectConfig
+
+    def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
+        """One update for each record, and a look back."""
+        graph, live = PoseGraph(self.live.graph, self.live.weights), LiveTrajectories()
+        past = Retrospect(self.retrospect)
+        for measurements in log:
+            estimate = graph.update(measurements)
+            live.add(estimate)
+            past.add(measurements, estimate)
+        out = Trajectories(ego=live.result.ego)
+        for (epoch, vehicle), way in past.ways().items():
+            for frame, pose in way.items():
+                out.put_vehicle(vehicle, frame, live.T_first_world[epoch] @ pose)
+        return out
+
+
 PAPER = Live("BirdSLAM as published", WeightsConfig(mode="paper"), GraphConfig(constant_velocity=False))
 
 
 def ours(config: SlamConfig) -> Live:
-    """The method as configured."""
-    return Live("BirdSLAM (this system)", config.weights, config.graph)
+    """The method as configured: what a planner gets."""
+    return Live("BirdSLAM (this system), live", config.weights, config.graph)
 
 
 def methods(config: SlamConfig) -> dict[str, Method]:
     """Every method by its name; `config` is that of `birdslam`."""
     return {
-        "birdslam": ours(config),
+        "birdslam": Final("BirdSLAM (this system)", ours(config), RetrospectConfig()),
+        "birdslam_live": ours(config),
         "paper": PAPER,
         "batch_se3": batch_se3,
         "nair": nair,

@@ -80,6 +80,10 @@ def _preface(setting: Setting, outcomes: Sequence[Outcome]) -> str:
         f"{', ± their standard deviation' if setting.seeds > 1 else ''}.",
         '"Re-implemented" methods are ours after the papers\' descriptions (birdslam/baselines/ says what each keeps '
         "and what it can't), run on the same measurements as ours.",
+        '"Ours" are the vehicles\' ways as our system knows them once the sequence is over (birdslam/retrospect.py), '
+        "as the paper's graph and every batch do. 'Ours, live' is what a planner gets in each frame, which "
+        "knows nothing of later ones, and so is 're-implemented: BirdSLAM'. The ego's are the same. Tables 3 and 4 "
+        "compare live estimates.",
     ]
     if setting.frames == "paper":
         lines.append("Frames: the first so many of each sequence; the paper gives their number, not where they start.")

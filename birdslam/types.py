@@ -174,9 +174,15 @@ class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True):
     box_px: Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)] = (0.0, 0.0, 0.0, 0.0)
     length_m: float = 4.0
     width_m: float = 1.7
+    # What it was taken for in this frame: later ones may know better, and where it was then with it
+    log_height: float = 0.0  # of its height in metres
+    sigma_log_height: float = 0.0
+    depth_per_height: float = 0.0  # by how much the logarithm of its depth goes with log_height; 0: not at all
+    standing: float = 0.0  # the probability that it stands
 
     def __post_init__(self) -> None:
         _check_finite(self, "score", "box_px", "length_m", "width_m")
+        _check_finite(self, "log_height", "sigma_log_height", "depth_per_height", "standing")
         _check_cov(self, "cov")
 
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from birdslam.association import predicted_boxes_px
 from birdslam.camera import Camera, GroundPlane
-from birdslam.localisation import Place
 from birdslam.se2 import SE2
 from birdslam.track import Shown, Track
 from birdslam.tracking import TrackingConfig
@@ -66,6 +65,7 @@ def _vehicle_edge(track: Track, config: TrackingConfig) -> VehicleEdge:
         box_px=seen.box_px,
         length_m=seen.dimensions.length_m,
         width_m=seen.dimensions.width_m,
+        **({} if place.taken is None else vars(place.taken)),
     )
 
 
@@ -87,7 +87,7 @@ def _moved_on(track: Track, present: Present, camera: Camera, config: TrackingCo
     cov_world = R_world_then @ track.place.cov @ R_world_then.T + drift
     cov_world += dt_s * (track.cov[2:, :2] + track.cov[:2, 2:])
     centre = present.T_world_ego.inverse() @ (track.T_world_ego @ track.place.centre_m + velocity * dt_s)
-    moved.place = Place(track.place.depth_m, centre, R_now_world @ cov_world @ R_now_world.T)
+    moved.place = replace(track.place, centre_m=centre, cov=R_now_world @ cov_world @ R_now_world.T)
     moved.observation = replace(track.observation, box_px=tuple(box.tolist()))
     moved.seen_frame, moved.seen_ns, moved.T_world_ego = present.frame_id, present.t_source_ns, present.T_world_ego
     if track.motion is not None:

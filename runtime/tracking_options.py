@@ -6,7 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
-METHODS = ("birdslam", "paper", "batch_se3", "nair", "namdev", "cubeslam")
+METHODS = ("birdslam", "birdslam_live", "paper", "batch_se3", "nair", "namdev", "cubeslam")
 SEEDS = 5
 
 

@@ -39,7 +39,8 @@ class Road:
         for box in boxes.values():
             seen += localise(box[None], np.ones(1), ("car",), CAMERA, self.horizon.ground, LOCALISATION)
         extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
-        log_z, var = self.horizon.update(list(boxes), seen, extents[:, 1], extents[:, 0], np.zeros(len(seen)))
+        depths = self.horizon.update(list(boxes), seen, extents[:, 1], extents[:, 0], np.zeros(len(seen)))
+        log_z, var = depths.log_depth, depths.variance
         return dict(zip(boxes, np.exp(log_z), strict=True)), dict(zip(boxes, np.sqrt(var), strict=True))
 
 
@@ -147,8 +148,8 @@ def test_forgotten_vehicles_leave_what_they_said_of_the_road() -> None:
 def test_nothing_seen_is_nothing_learned() -> None:
     horizon = Horizon(CAMERA, CONFIG)
     ground = horizon.ground
-    log_z, var = horizon.update([], [], np.zeros(0), np.zeros(0), np.zeros(0))
-    assert len(log_z) == len(var) == 0
+    depths = horizon.update([], [], np.zeros(0), np.zeros(0), np.zeros(0))
+    assert len(depths.log_depth) == len(depths.variance) == len(depths.log_height) == 0
     assert horizon.ground == ground
 
 
@@ -174,9 +175,13 @@ def test_a_size_that_is_learned_elsewhere_counts_in_the_depth_and_is_not_kept() 
     def again(weights: list[float], heights_m: list[float], sigma: float) -> tuple[float, float]:
         learned = LearnedSize(np.array([weights]), np.log([heights_m]), np.full((1, len(weights)), sigma**2))
         horizon = copy.deepcopy(road.horizon)
-        log_z, var = horizon.update([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), learned)
+        found = horizon.update([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), learned)
         assert horizon.size(0)[0] < 1.62
-        return float(np.exp(log_z[0])), float(np.sqrt(var[0]))
+        depth_m, height_m = float(np.exp(found.log_depth[0])), float(np.exp(found.log_height[0]))
+        # The height that comes with the depth is the one that the depth was found with
+        as_before = prior_m * (height_m / road.horizon.size(0)[0]) ** found.depth_per_height[0]
+        assert depth_m == pytest.approx(as_before, rel=0.02)
+        return depth_m, float(np.sqrt(found.variance[0]))
 
     truth_m = 40.0 - CAR.length_m / 2.0
     told_m, told_sigma = again([1.0], [1.7], 0.001)

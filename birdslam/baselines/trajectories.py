@@ -25,19 +25,19 @@ class LiveTrajectories:
 
     def __init__(self) -> None:
         self.result = Trajectories()
-        self._epoch: int | None = None
-        self._T_first_world = SE2()
+        self.T_first_world: dict[int, SE2] = {}  # of each epoch's world
         self._last = SE2()
 
     def add(self, estimate: Estimate) -> None:
-        if self._epoch != estimate.epoch:
-            self._T_first_world = self._last @ estimate.T_world_ego.inverse()
-            self._epoch = estimate.epoch
-        self._last = self._T_first_world @ estimate.T_world_ego
+        T_first_world = self.T_first_world.get(estimate.epoch)
+        if T_first_world is None:
+            T_first_world = self._last @ estimate.T_world_ego.inverse()
+            self.T_first_world[estimate.epoch] = T_first_world
+        self._last = T_first_world @ estimate.T_world_ego
         self.result.ego[estimate.frame_id] = self._last
         for vehicle in estimate.vehicles:
             if vehicle.age_ns == 0:
-                pose = self._T_first_world @ vehicle.T_world_vehicle
+                pose = T_first_world @ vehicle.T_world_vehicle
                 self.result.put_vehicle(vehicle.vehicle, estimate.frame_id, pose)
 
 

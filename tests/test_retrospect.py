@@ -1,0 +1,191 @@
+"""Vehicles in retrospect: sizes learned late correct earlier sights, what stood stands still, what moved is left to."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from birdslam import bev
+from birdslam.frontend import FrontEnd, FrontEndConfig
+from birdslam.graph import GraphConfig, PoseGraph
+from birdslam.localisation import DIMENSIONS
+from birdslam.perception import Detections, Perception, Ready
+from birdslam.retrospect import Retrospect, RetrospectConfig, Sight, way
+from birdslam.se2 import SE2
+from birdslam.types import Measurements, Status, VehicleEdge
+from birdslam.weights import WeightsConfig
+from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
+
+Floats = NDArray[np.float64]
+CAR = DIMENSIONS["car"]
+CONFIG = RetrospectConfig()
+FRAMES = 40
+STEP = SE2(1.0, 0.0, 0.0)  # of the ego, a frame of 0.1 s
+PARKED = SE2(75.0, 6.0, 0.0)
+
+
+def oncoming(k: int) -> SE2:
+    return SE2(95.0 - 0.9 * k, 4.0, math.pi)
+
+
+def box_px(at: SE2, height_m: float) -> list[float]:
+    half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
+    corners = np.vstack([np.column_stack([at @ np.array(half), np.full(4, z)]) for z in (0.0, height_m)])
+    px = bev.ego_to_pixel(CAMERA, CAMERA.ground, corners)
+    return [*px.min(axis=0), *px.max(axis=0)]
+
+
+def log_of(seed: int, parked_height_m: float, oncoming_height_m: float) -> list[Measurements]:
+    """The front end's, of a car parked beside the road and of one that comes, with half a pixel of noise."""
+    rng = np.random.default_rng(seed)
+    front = FrontEnd(CAMERA, FrontEndConfig(), ScriptedOdometry({k: motion(k, STEP) for k in range(1, FRAMES)}))
+    out = []
+    for k in range(FRAMES):
+        ego = SE2(float(k), 0.0, 0.0)
+        boxes = [
+            box_px(ego.between(car), height_m)
+            for car, height_m in ((PARKED, parked_height_m), (oncoming(k), oncoming_height_m))
+            if ego.between(car).x_m > 8.0
+        ]
+        found = np.array(boxes).reshape(-1, 4) + 0.5 * rng.standard_normal((len(boxes), 4))
+        detections = Detections(found, np.full(len(boxes), 0.9), ("car",) * len(boxes))
+        out.append(front.step(frame(k), Ready(Perception(detections, None, {"detector": 0}, ()))))
+    return out
+
+
+def errors(log: list[Measurements]) -> dict[str, tuple[float, float]]:
+    """Root mean squares in metres, of the live estimate and in retrospect, for each of the two cars."""
+    graph, past = PoseGraph(GraphConfig(), WeightsConfig()), Retrospect(CONFIG)
+    live: dict[int, dict[int, SE2]] = {}
+    for m in log:
+        estimate = graph.update(m)
+        past.add(m, estimate)
+        for v in estimate.vehicles:
+            if v.age_ns == 0:
+                live.setdefault(v.vehicle, {})[m.frame_id] = v.T_world_vehicle
+    found = {"parked": ([], []), "oncoming": ([], [])}  # type: ignore[var-annotated]
+    for (epoch, vehicle), poses in past.ways().items():
+        assert epoch == 0
+        assert poses.keys() == live[vehicle].keys()
+        for k, pose in poses.items():
+            name, truth = min(
+                (("parked", PARKED), ("oncoming", oncoming(k))), key=lambda car, p=pose: abs(car[1].y_m - p.y_m)
+            )
+            for gaps, at in zip(found[name], (live[vehicle][k], pose), strict=True):
+                gaps.append(math.hypot(at.x_m - truth.x_m, at.y_m - truth.y_m))
+    return {name: tuple(float(np.sqrt(np.mean(np.square(g)))) for g in gaps) for name, gaps in found.items()}  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("parked_height_m", [1.38, 1.46, 1.68])
+def test_a_parked_cars_way_is_better_known_once_its_size_is(parked_height_m: float) -> None:
+    trials = [errors(log_of(seed, parked_height_m, 1.53)) for seed in range(4)]
+    live, retrospect = np.mean([t["parked"] for t in trials], axis=0)
+    assert retrospect < 0.6 * live
+
+
+def test_over_many_sizes_no_kind_of_motion_is_worse_in_retrospect() -> None:
+    heights = 1.53 * np.exp(CAR.sigma_height_rel * np.random.default_rng(0).standard_normal((10, 2)))
+    trials = [errors(log_of(seed, *pair)) for seed, pair in enumerate(heights.tolist())]
+    for name in ("parked", "oncoming"):
+        live, retrospect = np.sqrt(np.mean(np.square([t[name] for t in trials]), axis=0))
+        assert retrospect < 0.9 * live, name
+
+
+# --- one vehicle's sights ---
+
+
+def sights(
+    xs_m: Floats,
+    log_heights: Floats | float = 0.4,
+    depth_per_height: float = 0.0,
+    standing: Floats | float = 0.0,
+    sigma_m: float = 1.0,
+) -> list[Sight]:
+    """A vehicle straight ahead of an ego that stands, at `xs_m` (N,)."""
+    each = np.broadcast_arrays(xs_m, log_heights, standing)
+    out = []
+    for k, (x_m, log_height, stands) in enumerate(zip(*(a.tolist() for a in each), strict=True)):
+        T = SE2(x_m, 0.0, 0.0)
+        cov = (sigma_m**2, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.01)
+        edge = VehicleEdge(
+            vehicle=1,
+            frame=k,
+            T_ego_vehicle=T,
+            cov=cov,
+            log_height=log_height,
+            depth_per_height=depth_per_height,
+            standing=stands,
+        )
+        out.append(Sight(k, 0.1 * k, edge, SE2(), T))
+    return out
+
+
+def along(seen: list[Sight]) -> Floats:
+    return np.array([pose.x_m for pose in way(seen, CONFIG).values()])
+
+
+def test_a_size_known_in_the_end_moves_every_sight_by_what_its_depth_owed_to_it() -> None:
+    face_m, reach_m = 38.0, 2.0
+    taken = np.linspace(0.5, 0.4, 30)  # it was taken for ten percent taller than it is
+    seen_m = face_m * np.exp(taken - 0.4) + reach_m
+    assert np.abs(along(sights(seen_m, taken, depth_per_height=1.0)) - 40.0).max() < 0.05
+    assert np.abs(along(sights(seen_m, taken, depth_per_height=0.0)) - 40.0).max() > 2.0
+    assert way(sights(seen_m[:1], taken[:1], 1.0), CONFIG)[0].x_m == pytest.approx(seen_m[0])
+
+
+def test_what_stood_has_one_place_and_what_drove_has_not() -> None:
+    noise = np.random.default_rng(3).standard_normal(60)
+    still = along(sights(40.0 + noise, standing=0.95))
+    assert np.ptp(still) < 0.3
+    assert abs(still.mean() - 40.0) < 0.3
+    driving_m = 40.0 + 0.8 * np.arange(60)
+    told_wrong = along(sights(driving_m + noise, standing=0.95))  # its sights say otherwise
+    assert np.abs(told_wrong - driving_m).max() < 2.0
+    assert np.abs(along(sights(driving_m + noise)) - told_wrong).max() == 0.0
+
+
+def test_what_drives_now_hardly_stood_a_moment_before() -> None:
+    noise = 0.3 * np.random.default_rng(4).standard_normal(40)
+    x_m = 30.0 + 0.15 * np.arange(40) + noise
+    standing = np.where(np.arange(40) < 4, 0.8, 0.0)  # as a filter has it at first
+    assert np.abs(along(sights(x_m, standing=standing)) - along(sights(x_m))).max() == 0.0
+
+
+def test_one_that_stops_stops() -> None:
+    x_m = np.concatenate([20.0 + 1.0 * np.arange(20), np.full(30, 39.0)])
+    standing = np.where(np.arange(50) < 22, 0.0, 0.97)
+    found = along(sights(x_m + 0.3 * np.random.default_rng(5).standard_normal(50), standing=standing))
+    assert np.ptp(found[25:]) < 0.3
+    assert np.abs(found - x_m).max() < 1.5
+
+
+def test_a_wild_sight_counts_for_little() -> None:
+    x_m = 40.0 + 0.5 * np.arange(40)
+    wild = x_m + 25.0 * (np.arange(40) == 20)
+    assert np.abs(along(sights(wild, sigma_m=0.3)) - x_m).max() < 0.5
+
+
+def test_worlds_are_kept_apart() -> None:
+    log = log_of(0, 1.5, 1.5)
+    log[20] = replace(log[20], cc=None)
+    graph, past = PoseGraph(GraphConfig(), WeightsConfig()), Retrospect(CONFIG)
+    for m in log:
+        estimate = graph.update(m)
+        past.add(m, estimate)
+    assert estimate.epoch == 1
+    ways = past.ways()
+    assert {epoch for epoch, _ in ways} == {0, 1}
+    for (epoch, _), poses in ways.items():
+        assert all((k >= 20) == (epoch == 1) for k in poses)
+
+
+def test_frames_without_sights_are_none() -> None:
+    past = Retrospect(CONFIG)
+    graph = PoseGraph(GraphConfig(), WeightsConfig())
+    m = Measurements(frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, status=(Status.FRAME_UNREADABLE,))
+    past.add(m, graph.update(m))
+    assert past.ways() == {}
