@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,6 +23,11 @@ from birdslam.perception import Segmentation
 from birdslam.se2 import SE2
 from birdslam.types import LandmarkEdge, LanePoint
 
+Floats = NDArray[np.float64]
+Ids = NDArray[np.int64]
+Aside = Callable[..., Future[Any]]  # (function, *arguments)
+
+NO_LANE = LanePoint(0.0, 0.0).lane
 REMEMBERED_FRAMES = 64  # a segmentation that is older than that is no news
 
 
@@ -66,12 +74,21 @@ def landmark_edges(
     )
 
 
+def _at_once(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    done: Future[Any] = Future()
+    done.set_result(run(*arguments))
+    return done
+
+
 class LaneMapper:
     """Lane points of each segmentation, once, in the ego of the frame at hand.
 
     A segmentation may come frames after its image. It is back-projected with the pose and the ground plane of its own
     frame, which are kept until then. The lanes that many of them show together come first (`lanes.AmodalLanes`); where
     there is none, what this one saw stands for itself.
+
+    With `aside`, which runs a function elsewhere, a frame does not wait for this: the points come with a later frame,
+    in its ego, and a segmentation that comes meanwhile adds nothing.
     """
 
     def __init__(
@@ -80,17 +97,24 @@ class LaneMapper:
         config: StaticMapConfig,
         lanes: LanesConfig = LanesConfig(),  # noqa: B008
         complete: Completion | None = None,
+        aside: Aside | None = None,
     ) -> None:
         self.camera = camera
         self.config = config
+        self._aside = aside or _at_once
+        self._running: Future[tuple[Floats, Ids]] | None = None
+        self._running_at = (-1, SE2())  # the frame that its points are in the ego of, and that ego
+        self._outdated = False  # the run under way belongs to a world of before
         self._amodal = AmodalLanes(lanes, complete)
         self._frames: deque[tuple[int, SE2, GroundPlane]] = deque(maxlen=REMEMBERED_FRAMES)
         self._used_frame = -1
 
     def clear(self) -> None:
         """The world frame began anew."""
-        self._amodal.clear()
         self._frames.clear()
+        self._outdated = self._running is not None
+        if not self._outdated:
+            self._amodal.clear()
 
     def step(
         self,
@@ -106,15 +130,39 @@ class LaneMapper:
         `boxes_px` (N, 4) are the vehicles' latest boxes, under which no line is believed.
         """
         self._frames.append((frame_id, T_world_ego, ground))
-        if segmentation is None or segmented_frame == self._used_frame:
+        earlier = self._finished(frame_id, T_world_ego)
+        if segmentation is not None and segmented_frame != self._used_frame and self._running is None:
+            then = next((f for f in self._frames if f[0] == segmented_frame), None)
+            if then is not None:
+                self._used_frame = segmented_frame
+                if self._amodal.is_news(then[1]):
+                    self._running_at = frame_id, T_world_ego
+                    self._running = self._aside(self._gather, T_world_ego, *then[1:], segmentation, boxes_px)
+        return earlier or self._finished(frame_id, T_world_ego)
+
+    def _finished(self, frame_id: int, T_world_ego: SE2) -> tuple[LanePoint, ...]:
+        """What a run gave that has ended, in the ego of the frame at hand."""
+        if self._running is None or not self._running.done():
             return ()
-        then = next((f for f in self._frames if f[0] == segmented_frame), None)
-        if then is None:
+        (points, lanes), self._running = self._running.result(), None
+        if self._outdated:
+            self._outdated = False
+            self._amodal.clear()
             return ()
-        self._used_frame = segmented_frame
-        _, T_world_then, ground_then = then
-        if not self._amodal.is_news(T_world_then):
-            return ()
+        run_frame, T_world_run = self._running_at
+        if run_frame != frame_id:
+            points = T_world_ego.between(T_world_run) @ points
+        return tuple(LanePoint(x, y, lane) for (x, y), lane in zip(points.tolist(), lanes.tolist(), strict=True))
+
+    def _gather(
+        self,
+        T_world_ego: SE2,
+        T_world_then: SE2,
+        ground_then: GroundPlane,
+        segmentation: Segmentation,
+        boxes_px: Floats,
+    ) -> tuple[Floats, Ids]:
+        """(N, 2) points in ego and their lanes (N,), for those that belong to none what a LanePoint has then."""
         self._amodal.add(
             T_world_then, *points_of(segmentation, self.camera, ground_then, boxes_px, self._amodal.config)
         )
@@ -122,11 +170,8 @@ class LaneMapper:
         seen = T_world_ego.between(T_world_then) @ self._points_m(segmentation, ground_then, boxes_px)
         if len(points):
             seen = seen[cKDTree(points).query(seen)[0] > self._amodal.config.same_lane_m]
-        room = self.config.max_lane_points - len(points)
-        return (
-            *(LanePoint(x, y, lane) for (x, y), lane in zip(points.tolist(), lanes.tolist(), strict=True)),
-            *(LanePoint(x, y) for x, y in seen[:room].tolist()),
-        )
+        seen = seen[: self.config.max_lane_points - len(points)]
+        return np.concatenate([points, seen]), np.concatenate([lanes, np.full(len(seen), NO_LANE)])
 
     def _lanes_m(self, T_world_ego: SE2) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """(N, 2) points of the lanes ahead, in ego, and their lanes (N,): the middle of what lies in each cell.

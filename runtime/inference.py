@@ -27,7 +27,8 @@ class Inference:
 
     At rate "max" every network is awaited, so that a run can be repeated. Else a frame waits for those that are worth
     it (`ModelSpec.awaited`) until its deadline, which counts from its capture: a frame that comes late waits less, and
-    the delay does not grow. What is not there by then is carried, with its age. Raises perception.ModelError.
+    the delay does not grow. What is not there by then is carried, with its age. Nor does a frame wait for the lanes
+    then, which come with a later one. Raises perception.ModelError.
     """
 
     def __init__(self, configuration: Configuration) -> None:
@@ -43,6 +44,7 @@ class Inference:
         self._ran_frame = -self._rate_divisor  # the last frame that networks were offered
         self._started: list[Future[Any]] = []  # for the frame at hand, and awaited
         self._threads = ThreadPoolExecutor(max(1, len(heads)), thread_name_prefix="network")
+        self._lanes = ThreadPoolExecutor(1, thread_name_prefix="lanes")
         self.networks = Networks(heads, self._submit, None if self._deadline_ns is None else 0.0)
 
     def _submit(self, run: Run, *arguments: Any) -> Future[Any]:
@@ -50,6 +52,11 @@ class Inference:
         if run in self._awaited:
             self._started.append(future)
         return future
+
+    @property
+    def aside(self) -> Run | None:
+        """Runs a function on a thread beside the frames; None at rate "max", where nothing may depend on the clock."""
+        return None if self._deadline_ns is None else self._lanes.submit
 
     @property
     def roles(self) -> frozenset[str]:
@@ -78,6 +85,7 @@ class Inference:
 
     def close(self) -> None:
         """Ends the threads, after the runs at hand."""
+        self._lanes.shutdown(wait=True, cancel_futures=True)
         self._threads.shutdown(wait=True, cancel_futures=True)
 
     def __enter__(self) -> Self:

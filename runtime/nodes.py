@@ -157,6 +157,7 @@ def front_end(configuration: Configuration, inference: Inference) -> FrontEnd:
         configuration.slam.frontend,
         frustum_network=inference.frustum_network,
         complete=inference.completion,
+        aside=inference.aside,
     )
 
 
