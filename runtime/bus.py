@@ -336,9 +336,14 @@ class Bus:
             return wanted - self._alive
 
     def on_alive(self, callback: Callable[[str, bool], None]) -> None:
-        """Calls `callback(node, alive)` at each change from now on, on zenoh's thread: it must be quick."""
+        """Calls `callback(node, True)` for each node that is alive now, and `callback(node, alive)` at each change from
+        now on, on zenoh's thread: it must be quick.
+        """
         with self._alive_changed:
             self._alive_callbacks.append(callback)
+            known = sorted(self._alive)
+        for node in known:
+            callback(node, True)
 
     def _liveliness_changed(self, sample: zenoh.Sample) -> None:
         node, alive = str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT

@@ -14,6 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from runtime.configuration import Configuration
+from runtime.presence import runtime_dir_of
+
 MOST_BYTES = 1 << 20
 _PLACES, _HEAD_BYTES = 2, 64
 _TURN, _FRAME, _EPOCH, _BYTES = range(4)  # words of a head; _TURN is 0 where there is nothing
@@ -28,6 +31,11 @@ class Kept:
     frame_id: int
     epoch: int
     data: bytes
+
+
+def checkpoint_path(configuration: Configuration) -> Path:
+    """Where the checkpoints of this vehicle lie."""
+    return runtime_dir_of(configuration.vehicle, configuration.runtime_dir) / "checkpoint"
 
 
 class CheckpointFile:
@@ -67,3 +75,27 @@ class CheckpointFile:
                 found.append(Kept(int(head[_FRAME]), int(head[_EPOCH]), body[: int(head[_BYTES])].tobytes()))
             head[_TURN] = 0
         return found
+
+
+def newest(path: Path) -> Kept | None:
+    """The newest whole checkpoint in the file, as another process sees it; None where there is none now."""
+    size = _HEAD_BYTES + MOST_BYTES
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return None
+    try:
+        heads = [(_head(fd, place * size), place) for place in range(_PLACES)]
+        (turn, frame_id, epoch, length), place = max(heads, key=lambda found: found[0][_TURN])
+        if turn <= 0 or not 0 < length <= MOST_BYTES:
+            return None
+        data = os.pread(fd, length, place * size + _HEAD_BYTES)
+        whole = len(data) == length and _head(fd, place * size)[_TURN] == turn  # else the optimizer is writing there
+        return Kept(frame_id, epoch, data) if whole else None
+    finally:
+        os.close(fd)
+
+
+def _head(fd: int, start: int) -> list[int]:
+    words = np.frombuffer(os.pread(fd, _HEAD_BYTES, start).ljust(_HEAD_BYTES, b"\0"), dtype=np.int64)
+    return [int(word) for word in words[: _BYTES + 1]]

@@ -69,7 +69,6 @@ class Planner:
         self._bus = Bus(vehicle, f"planner-{os.getpid()}-{next(_number)}", runtime_dir=runtime_dir)
         self._subscriber = self._bus.subscriber("estimate")
         self._bus.on_alive(self._catch_up)
-        self._catch_up("optimize", "optimize" in self._bus.alive)
 
     def _catch_up(self, node: str, alive: bool) -> None:
         if node == "optimize" and alive and self._subscriber.newest is None:

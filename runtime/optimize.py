@@ -15,7 +15,7 @@ from birdslam.se2 import SE2
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
 from runtime.bus import Bus, Message
 from runtime.capture import stamps
-from runtime.checkpoints import CheckpointFile
+from runtime.checkpoints import CheckpointFile, checkpoint_path
 from runtime.coasting import ANNOUNCED_FRAMES, TOLD_AGAIN, Announced, Overdue, deadline_ns, unmeasured
 from runtime.configuration import Configuration
 from runtime.degradation import Mode
@@ -52,7 +52,7 @@ class OptimizeNode:
         if not configuration.lossless:  # a run at rate "max" gives the same bytes each time
             directory = runtime_dir_of(configuration.vehicle, configuration.runtime_dir)
             self._epochs = EpochFile(directory / "epoch")
-            self._checkpoints = CheckpointFile(directory / "checkpoint")
+            self._checkpoints = CheckpointFile(checkpoint_path(configuration))
         epoch = 0 if self._epochs is None else self._epochs.last + 1
         self._untold = (Status.GRAPH_RESET,) if epoch else ()  # planners may know an older world
         restored = self._restored(configuration, bus, assignment)

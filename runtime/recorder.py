@@ -2,7 +2,9 @@
 
 `python -m runtime.recorder record VITALS_FD PARENT_PID`, on standard input the configuration as a line of JSON, then an
 `Order` as another. It ends by itself when the end of the source has come through, or in order on SIGTERM. Exit status:
-0 when the recording is complete; 1 where the disk failed it, with one ERROR line; 2 where the file can't be made.
+0 when the recording is complete; 2 where the file can't be made, 3 where the disk failed it, each with one ERROR line;
+1 for a bug. One that died or stalled is begun anew in a file of its own (recorder_station.py), which bears the
+optimizer's graph as it is then: it replays from there.
 """
 
 from __future__ import annotations
@@ -26,14 +28,16 @@ import psutil
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
 from runtime import scene
 from runtime.bus import Bus, Message
+from runtime.checkpoints import checkpoint_path, newest
 from runtime.child import LOG_FORMAT, die_with
 from runtime.cli import USER_ERROR_STATUS
 from runtime.configuration import Configuration, dump, without_passwords
 from runtime.frames import FrameError, FrameReader
 from runtime.latency import stages
 from runtime.presence import ring_path
-from runtime.recording import EXACT, About, Alive, Latency, RecordingWriter
+from runtime.recording import EXACT, About, Alive, GraphCheckpoint, Latency, RecordingWriter
 from runtime.report import LIBRARIES
+from runtime.restarts import FIRST, Assignment
 from runtime.topology import NODES, RECORDER
 from runtime.vitals import Vitals
 from runtime.wire import Health
@@ -43,23 +47,33 @@ QUIET_S = 0.2  # at the end: nothing more has come for so long
 END_S = 2.0  # after END_OF_SOURCE, for the rest of the map
 HEALTH_NS = 1_000_000_000
 EVENTS = 256  # of liveliness that wait
+DISK_STATUS = 3
 NICENESS = 5  # the pipeline goes first
 
 log = logging.getLogger(__name__)
 
 
 class Order(msgspec.Struct, frozen=True):
-    """What the recorder is told beside the configuration: the networks with their hashes."""
+    """What the recorder is told beside the configuration: the networks with their hashes, its file, who was before."""
 
     models: dict[str, Any]
+    file: str
+    assignment: Assignment = FIRST
 
 
 class Recorder:
     """From the bus into the file, turn by turn."""
 
-    def __init__(self, configuration: Configuration, bus: Bus, writer: RecordingWriter, vitals: Vitals) -> None:
+    def __init__(
+        self,
+        configuration: Configuration,
+        bus: Bus,
+        writer: RecordingWriter,
+        vitals: Vitals,
+        assignment: Assignment = FIRST,
+    ) -> None:
         config = configuration.recording
-        self._writer, self._vitals = writer, vitals
+        self._writer, self._vitals, self._assignment = writer, vitals, assignment
         self._estimates = bus.subscriber("estimate", config.queue)
         others = (*(topic for topic in EXACT if topic != "estimate"), *(f"health/{name}" for name in NODES))
         self._others = {topic: bus.subscriber(topic, config.queue) for topic in others}
@@ -76,6 +90,14 @@ class Recorder:
         self._said_ns, self._frames, self._frames_said = time.monotonic_ns(), 0, 0
         self._end_frame: int | None = None  # of END_OF_SOURCE
         self._map_frame = -1
+        self._estimate_frame = -1
+        self._missed = (
+            0  # frames between what the recorder before this one brought to the disk and the first of this one
+        )
+        self._checkpoints: Path | None = None  # where a file that begins in the middle of a drive finds its graph
+        if assignment.restarts:
+            self._checkpoints = checkpoint_path(configuration)
+        self._first_measured: int | None = None  # the frame of the first measurements in this file
         if configuration.camera is not None:
             self._draw(scene.from_camera(configuration.camera, time.time_ns()), time.monotonic_ns())
 
@@ -95,10 +117,21 @@ class Recorder:
         now_ns = time.monotonic_ns()
         if now_ns - self._said_ns >= HEALTH_NS:
             self._say(now_ns)
+        if self._checkpoints is not None and self._first_measured is not None:
+            self._begin_from_checkpoint(self._checkpoints, self._first_measured, now_ns)
         self._vitals.count(frames=self._writer.messages, torn=self.torn, **self._counters())
         self._vitals.beat()
-        self._writer.flush_if_due(now_ns)
+        if self._writer.flush_if_due(now_ns):
+            self._vitals.count(next_frame=self._estimate_frame + 1)
         return bool(heard)
+
+    def _begin_from_checkpoint(self, path: Path, first_frame: int, now_ns: int) -> None:
+        """As soon as there is one from which on all measurements are in this file."""
+        kept = newest(path)
+        if kept is not None and kept.frame_id >= first_frame - 1:
+            checkpoint = GraphCheckpoint(frame_id=kept.frame_id, epoch=kept.epoch, data=kept.data)
+            self._writer.begin_from(checkpoint, now_ns)
+            self._checkpoints = None
 
     @property
     def over(self) -> bool:
@@ -117,7 +150,7 @@ class Recorder:
 
     def _counters(self) -> dict[str, int]:
         malformed = self._estimates.malformed + sum(s.malformed for s in self._others.values())
-        return {"dropped": sum(self.dropped().values()), "malformed": malformed}
+        return {"dropped": sum(self.dropped().values()) + self._missed, "malformed": malformed}
 
     def _take(self, topic: str, message: Message) -> None:
         record, t_ns = message.record, message.t_received_ns
@@ -128,6 +161,8 @@ class Recorder:
         elif isinstance(record, FrameRef):
             self._take_image(record, t_ns)
         elif isinstance(record, Measurements):
+            if self._first_measured is None:
+                self._first_measured = record.frame_id
             self._draw(scene.from_measurements(record, record.t_utc_ns), t_ns)
         elif isinstance(record, MapUpdate):
             self._map_frame = record.frame_id
@@ -136,6 +171,10 @@ class Recorder:
             if Status.END_OF_SOURCE in record.status:
                 self._end_frame = record.frame_id
                 return
+            resume = self._assignment.resume
+            if resume is not None and self._estimate_frame < 0:
+                self._missed = max(0, record.frame_id - resume.next_frame)
+            self._estimate_frame = record.frame_id
             self._frames += 1
             self._writer.draw("/estimate", record, t_ns)
             self._writer.draw("/latency", _latency(record, message), t_ns)
@@ -173,13 +212,16 @@ class Recorder:
             cpu_percent=self._process.cpu_percent(),
             dropped=counters["dropped"],
             malformed=counters["malformed"],
+            restarts=self._assignment.restarts,
+            cause=self._assignment.cause[:200],
         )
         self._health.put(health)
         self._writer.draw("/health/record", health, now_ns)
 
     def end(self) -> dict[str, str]:
         """What the file says of its end."""
-        counts = {"estimates": self._frames, "images": self.images, "images_torn": self.torn, **self._counters()}
+        counts = {"estimates": self._frames, "images": self.images, "images_torn": self.torn, "missed": self._missed}
+        counts |= self._counters()
         dropped = {f"dropped {topic}": n for topic, n in self.dropped().items()}
         return {name: str(count) for name, count in {**counts, **dropped}.items()}
 
@@ -194,7 +236,7 @@ def _latency(estimate: Estimate, message: Message) -> Latency:
     )
 
 
-def about(configuration: Configuration, models: dict[str, Any]) -> About:
+def about(configuration: Configuration, models: dict[str, Any], restarts: int = 0) -> About:
     """Of a recording that begins now."""
     versions = {"python": platform.python_version(), **{name: importlib.metadata.version(name) for name in LIBRARIES}}
     utc_offset_ns = time.time_ns() - time.monotonic_ns()
@@ -203,16 +245,18 @@ def about(configuration: Configuration, models: dict[str, Any]) -> About:
         models=models,
         versions=versions,
         utc_offset_ns=utc_offset_ns,
+        restarts=restarts,
     )
 
 
 def record(configuration: Configuration, order: Order, vitals: Vitals, stop: list[int]) -> str:
     """A whole recording; why it ended early, or nothing. Raises OSError where the file can't be made."""
     config = configuration.recording
-    described = about(configuration, order.models)
-    writer = RecordingWriter(Path(config.file), described, configuration.camera, config.flush_ms, config.sync)
+    described = about(configuration, order.models, order.assignment.restarts)
+    writer = RecordingWriter(Path(order.file), described, configuration.camera, config.flush_ms, config.sync)
     with Bus(configuration.vehicle, RECORDER.name, runtime_dir=configuration.runtime_dir) as bus:
-        recorder = Recorder(configuration, bus, writer, vitals)
+        recorder = Recorder(configuration, bus, writer, vitals, order.assignment)
+        vitals.beat()
         vitals.count(ready=1)
         bus.declare_alive()
         end_s = None
@@ -222,9 +266,10 @@ def record(configuration: Configuration, order: Order, vitals: Vitals, stop: lis
                 end_s = time.monotonic() + END_S
         while writer.error is None and not recorder.over and recorder.turn(QUIET_S):
             pass
+        vitals.count(ready=0)  # no beat any more: it waits for the disk
         writer.close(recorder.end())
     error = writer.error
-    return f"{error.strerror}: {config.file} ends with what was written until then" if error else ""
+    return f"{error.strerror}: {order.file} ends with what was written until then" if error else ""
 
 
 def main(arguments: list[str]) -> int:
@@ -247,14 +292,14 @@ def main(arguments: list[str]) -> int:
     try:
         reason = record(configuration, order, vitals, stop)
     except OSError as error:
-        log.error("%s can't be made: %s", configuration.recording.file, error.strerror)
+        log.error("%s can't be made: %s", order.file, error.strerror)
         return USER_ERROR_STATUS
     except Exception:
         log.exception("%s failed", RECORDER.name)
         return 1
     if reason:
         log.error("the recording has ended: %s", reason)
-        return 1
+        return DISK_STATUS
     vitals.count(ended=1)
     return 0
 

@@ -6,6 +6,7 @@
 | v1/estimate, v1/map         |              |                                                                        |
 | v1/measurements/trace,      | MessagePack  | the trace of the record with the same sequence number: what replay     |
 | v1/estimate/trace           |              | learns from it is which message an estimate answers                    |
+| v1/checkpoint               | MessagePack  | once in a file that begins in the middle of a drive: the graph there   |
 | /estimate, /health/NODE,    | JSON, schema | for plots: the estimate again, the nodes' health, where the time went, |
 | /latency, /alive            |              | nodes that came and went                                               |
 | /tf, /scene, ... (scene.py) | JSON, schema | what Foxglove draws; /camera/image where images were asked for         |
@@ -48,6 +49,7 @@ EXACT: dict[str, type[msgspec.Struct]] = {
     "map": MapUpdate,
 }
 TRACED = ("measurements", "estimate")
+CHECKPOINT = "v1/checkpoint"
 MAX_RECORD_BYTES = 1 << 28  # nothing that we write comes near it
 _TORN = (McapError, struct.error, zlib.error, zstandard.ZstdError, RuntimeError, ValueError, MemoryError)
 
@@ -68,6 +70,14 @@ class Latency(msgspec.Struct, frozen=True, kw_only=True):
     stages_ms: dict[str, float] = {}
 
 
+class GraphCheckpoint(msgspec.Struct, frozen=True, kw_only=True):
+    """The optimizer's graph after a frame: where the replay of a file begins whose beginning another one has."""
+
+    frame_id: int
+    epoch: int
+    data: bytes
+
+
 class Alive(msgspec.Struct, frozen=True, kw_only=True):
     """A node became ready for work, or was gone."""
 
@@ -82,6 +92,7 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
     models: dict[str, Any]
     versions: dict[str, str]
     utc_offset_ns: int  # UTC less CLOCK_MONOTONIC
+    restarts: int = 0  # of the recorder: the files before this one have the beginning of the drive
 
 
 JSON_CHANNELS: dict[str, type[msgspec.Struct]] = {
@@ -117,6 +128,7 @@ class RecordingWriter:
         self._schemas: dict[str, int] = {}
         exact = {f"v1/{name}": record for name, record in EXACT.items()} | {f"v1/{n}/trace": Trace for n in TRACED}
         self._channels = {name: self._register(name, record, "msgpack") for name, record in exact.items()}
+        self._channels[CHECKPOINT] = self._register(CHECKPOINT, GraphCheckpoint, "msgpack")
         self._channels |= {name: self._register(name, record, "json") for name, record in JSON_CHANNELS.items()}
 
     def _register(self, channel: str, record: type[msgspec.Struct], encoding: str) -> int:
@@ -141,6 +153,10 @@ class RecordingWriter:
         if topic in TRACED:
             self._add(f"v1/{topic}/trace", encode(trace or Trace()), t_ns)
 
+    def begin_from(self, checkpoint: GraphCheckpoint, t_ns: int) -> None:
+        """Where a replay of this file begins."""
+        self._add(CHECKPOINT, msgspec.msgpack.encode(checkpoint), t_ns)
+
     def draw(self, channel: str, message: msgspec.Struct, t_ns: int) -> None:
         """A message for people's tools."""
         self._add(channel, msgspec.json.encode(message), t_ns)
@@ -151,12 +167,14 @@ class RecordingWriter:
         self._writer.add_message(self._channels[channel], t_utc_ns, data, t_utc_ns, sequence & 0xFFFFFFFF)
         self.messages += 1
 
-    def flush_if_due(self, now_ns: int) -> None:
-        """Hands what has gathered to the disk, where it is time."""
-        if self._flushed_ns is None or now_ns - self._flushed_ns >= self._flush_ns:
+    def flush_if_due(self, now_ns: int) -> bool:
+        """Hands what has gathered to the disk, where it is time; whether it was."""
+        due = self._flushed_ns is None or now_ns - self._flushed_ns >= self._flush_ns
+        if due:
             self._flushed_ns = now_ns
             self._writer.flush()
             self._file.write(self._pending.take())
+        return due
 
     def close(self, end: dict[str, str]) -> None:
         """The rest, how it ended, and the index; waits for the disk."""

@@ -9,7 +9,8 @@ from the clock. What a recording can leave open, it is held to one by one, and t
   which on it was given all measurements.
 
 Where measurements are missing that the optimizer had, its graph is not known any more: nothing is compared until a new
-epoch begins, and that is counted. `estimates` is the same with another configuration, as a new result.
+epoch begins, and that is counted. A file that begins in the middle of a drive, since the recorder died, has in it the
+graph of one frame, from which on it is compared. `estimates` is the same with another configuration, as a new result.
 """
 
 from __future__ import annotations
@@ -21,13 +22,15 @@ from typing import Any
 
 import msgspec
 
+from birdslam.checkpoint import CheckpointError
 from birdslam.graph import GraphConfig, PoseGraph
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
 from birdslam.weights import WeightsConfig
 from runtime.coasting import TOLD_AGAIN, unmeasured
 from runtime.configuration import DegradationConfig
 from runtime.optimize import farewell
-from runtime.recording import Alive, Recording, RecordingError
+from runtime.recording import CHECKPOINT, Alive, GraphCheckpoint, Recording, RecordingError
+from runtime.verdict import Difference, Verdict, differing
 from runtime.wire import Trace, WireError, decode, encode
 
 BackEnd = tuple[GraphConfig, WeightsConfig]
@@ -37,34 +40,6 @@ COMPARED = (
     *("v1/frame", "v1/measurements", "v1/measurements/trace", "v1/estimate", "v1/estimate/trace"),
     *("v1/map", "/alive"),
 )
-
-
-@dataclass
-class Difference:
-    """The first estimate that came out otherwise."""
-
-    frame_id: int
-    fields: list[tuple[str, Any, Any]]  # where, recorded, replayed
-
-
-@dataclass
-class Verdict:
-    """What a comparison came to."""
-
-    equal: int = 0  # estimates, bit for bit
-    coasted: int = 0  # of them, without measurements
-    unknown: int = 0  # estimates that can't be compared: what they answer is not in the recording
-    unanswered: int = 0  # measurements without an estimate
-    maps: int = 0  # map updates, bit for bit
-    epochs: int = 0
-    restarts: int = 0  # of the optimizer
-    difference: Difference | None = None
-    open_end: int = 0  # measurements at the end of a recording that was cut off
-
-    @property
-    def same(self) -> bool:
-        """All that can be compared is equal, and something could be."""
-        return self.difference is None and self.equal > 0
 
 
 class _Message(msgspec.Struct):
@@ -113,6 +88,7 @@ class Comparison:
         self._frames: dict[int, FrameRef] = {}
         self._maps: dict[int, MapUpdate] = {}
         self._alive = 0  # how often the optimizer came
+        self._checkpoint = _checkpoint(recording)
         self._epoch: int | None = None
 
     def run(self) -> Verdict:
@@ -193,8 +169,14 @@ class Comparison:
         """(state before, measurements given to it, whether the optimizer was begun anew)."""
         now = [] if answered is None else [answered]
         new_world = Status.GRAPH_RESET in estimate.status
+        checkpoint = self._checkpoint
         if self._state is None:
-            if new_world or self.verdict.equal + self.verdict.unknown == 0:
+            at_first = self.verdict.equal + self.verdict.unknown == 0 and checkpoint is None
+            if checkpoint is not None and now and estimate.epoch == checkpoint.epoch:
+                since = [m for m in (*open_, *now) if m.frame_id > checkpoint.frame_id]
+                if since and since[-1].frame_id == estimate.frame_id:
+                    yield _State(PoseGraph.restore(checkpoint.data, *self._back_end)), since, False
+            if new_world or at_first:
                 yield self._fresh(estimate), now, False
             return
         came_again = self._alive - 1 > self.verdict.restarts
@@ -248,6 +230,20 @@ class Comparison:
             self.verdict.difference = Difference(recorded.frame_id, differing(recorded, replayed))
 
 
+def _checkpoint(recording: Recording) -> GraphCheckpoint | None:
+    """The graph that a file begins with whose beginning another one has. Raises RecordingError."""
+    if not recording.about.restarts:
+        return None
+    for message in recording.messages((CHECKPOINT,)):
+        try:
+            checkpoint = msgspec.msgpack.decode(message.data, type=GraphCheckpoint)
+            PoseGraph.restore(checkpoint.data, *back_end(recording))
+        except (msgspec.DecodeError, CheckpointError) as error:
+            raise RecordingError(f"{recording.path}: its checkpoint {error}") from None
+        return checkpoint
+    return None
+
+
 def compare(recording: Recording) -> Verdict:
     """Whether the back end gives the recorded estimates, bit for bit."""
     return Comparison(recording).run()
@@ -269,22 +265,6 @@ def estimates(recording: Recording, config: BackEnd) -> Iterator[Estimate | MapU
         gained = graph.map_update()
         if gained is not None:
             yield gained
-
-
-def differing(recorded: msgspec.Struct, replayed: msgspec.Struct) -> list[tuple[str, Any, Any]]:
-    """(where, recorded, replayed) of each number or text that is not the same."""
-    return list(_walk("", msgspec.to_builtins(recorded), msgspec.to_builtins(replayed)))
-
-
-def _walk(where: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
-    if isinstance(a, dict) and isinstance(b, dict):
-        for key in dict.fromkeys((*a, *b)):
-            yield from _walk(f"{where}.{key}".lstrip("."), a.get(key), b.get(key))
-    elif isinstance(a, list | tuple) and isinstance(b, list | tuple) and len(a) == len(b):
-        for number, (one, other) in enumerate(zip(a, b, strict=True)):
-            yield from _walk(f"{where}[{number}]", one, other)
-    elif a != b:
-        yield where, a, b
 
 
 def _canonical(record: msgspec.Struct) -> bytes:

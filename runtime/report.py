@@ -97,6 +97,7 @@ def table(summary: dict[str, Any], output: Path) -> str:
 def _recorded(recording: dict[str, Any]) -> str:
     lost = recording["dropped"] + recording["images_torn"]
     state = "" if recording["complete"] else ", CUT OFF"
-    return (
-        f"{recording['file']}: {recording['messages']} messages, {lost} lost, {recording['bytes'] / 1e6:.1f} MB{state}"
-    )
+    if recording["restarts"]:
+        state = f", begun anew {recording['restarts']} times"
+    size = f"{recording['messages']} messages, {lost} lost, {recording['bytes'] / 1e6:.1f} MB"
+    return f"{', '.join(recording['files'])}: {size}{state}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from runtime.recording import Recording
-from runtime.replay import Verdict
+from runtime.verdict import Verdict
 
 SHOWN_FIELDS = 12
 

@@ -95,8 +95,8 @@ def run(
             gc.collect()
             gc.freeze()  # what was built lives to the end: never walk it again
             stop.at_work = True
+            vitals.beat()  # before it is ready: who is ready without a beat is stalled
             vitals.count(ready=1)
-            vitals.beat()
             bus.declare_alive()
             _loop(node, publishers, Meter(name, configuration, assignment), vitals, stop, configuration)
         finally:

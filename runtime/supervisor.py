@@ -235,6 +235,8 @@ class Supervisor:
             station.enforce()
             if station.due_s is not None and station.due_s <= now_s:
                 self._begin_again(station)
+        if self._recording is not None:
+            self._recording.watch(may_begin_again=self._config.restarts and self._deadline_s is None)
         if self._deadline_s is None and all(station.process.ready for station in stations):
             self._notifier.once("READY=1")
             if self._config.spares:  # one after the other, so that loading them takes one core at the most

@@ -66,7 +66,7 @@ class Watch:
         rows = [self._row(name, now_ns) for name in PROCESSES if name in NODES or self._healths[name].newest]
         causes = [
             f"{name} was begun anew {health.restarts} times, at last since it {health.cause}"
-            for name in NODES
+            for name in PROCESSES
             if (health := self._health(name)) is not None and health.restarts
         ]
         return "\n".join([self._line(now_ns), head, *rows, *causes])

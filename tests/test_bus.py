@@ -247,10 +247,14 @@ def test_liveliness_comes_and_goes(join: Any, base: Path) -> None:
     assert hub.wait_alive(["capture", "perceive"], LIMIT_S) == set()
     late = join("planner-1")
     assert late.wait_alive({"capture", "perceive"}, LIMIT_S) == set()
+    known: list[tuple[str, bool]] = []
+    late.on_alive(lambda node, alive: known.append((node, alive)))
+    assert known == [("capture", True), ("perceive", True)]
     capture.close()
     until(lambda: hub.alive == {"perceive"} == late.alive, "capture has left")
     until(lambda: ("capture", False) in seen, "it was called")
     assert seen == [("capture", True), ("perceive", True), ("capture", False)]
+    until(lambda: ("capture", False) in known, "the late one was called too")
 
 
 def test_vehicles_do_not_hear_each_other(base: Path) -> None:

@@ -16,7 +16,7 @@ from birdslam.graph import PoseGraph
 from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.types import INVALIDATING, Estimate, FrameRef, Measurements, Status
 from runtime.bus import Message
-from runtime.checkpoints import MOST_BYTES, CheckpointFile
+from runtime.checkpoints import MOST_BYTES, CheckpointFile, newest
 from runtime.coasting import Announced, Overdue, deadline_ns, unmeasured
 from runtime.configuration import BudgetsConfig, Configuration, DegradationConfig, RuntimeConfig, SourceConfig
 from runtime.optimize import OptimizeNode
@@ -298,6 +298,22 @@ def test_whatever_a_kill_cuts_short_the_other_checkpoint_is_whole(tmp_path: Path
     assert [kept.data for kept in CheckpointFile(tmp_path / "c").take()] == [b"a"]
     assert not file.store(7, 7, bytes(MOST_BYTES + 1))
     assert (tmp_path / "c").stat().st_mode & 0o777 == 0o600
+
+
+def test_another_process_looks_at_the_newest_checkpoint_and_takes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "c"
+    assert newest(path) is None
+    file = CheckpointFile(path)
+    assert newest(path) is None
+    for frame_id in range(5):
+        file.store(frame_id, 1, bytes([frame_id]) * (frame_id + 1))
+        found = newest(path)
+        assert found is not None
+        assert (found.frame_id, found.epoch, found.data) == (frame_id, 1, bytes([frame_id]) * (frame_id + 1))
+    assert [kept.frame_id for kept in CheckpointFile(path).take()] == [4, 3]
+    assert newest(path) is None
+    path.write_bytes(b"no such file")
+    assert newest(path) is None
 
 
 def test_a_torn_checkpoint_is_passed_over(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import os
 import resource
 import signal
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from runtime.recorder_station import choose_file
 from runtime.recording import JSON_CHANNELS, Recorded, Recording, RecordingError, RecordingWriter
 from runtime.replay import compare
 from runtime.sources import open_source
-from runtime.wire import decode, encode
+from runtime.wire import Health, decode, encode
 from tests.taped_drive import CAMERA, Tape, measured
 from tests.test_pipeline import F_PX, HEIGHT, LIMIT_S, WIDTH, Run, call, road_image
 
@@ -301,6 +302,72 @@ def test_kills_and_restarts_cost_no_bit_and_a_kill_of_everything_leaves_a_file_t
     images = [msgspec.json.decode(m.data, type=CompressedImage) for m in recording.messages(("/camera/image",))]
     assert len(images) > 50
     assert cv2.imdecode(np.frombuffer(images[-1].data, np.uint8), cv2.IMREAD_UNCHANGED).shape == (HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize(
+    ("number", "cause"),
+    [(signal.SIGKILL, "was killed by SIGKILL"), (signal.SIGSTOP, "is stalled: its loop has shown no life for 500 ms")],
+)
+def test_a_recorder_that_dies_or_stalls_is_begun_anew_in_a_file_of_its_own(
+    number: signal.Signals, cause: str, tmp_path_factory: pytest.TempPathFactory, road: Path
+) -> None:
+    place = tmp_path_factory.mktemp("r")
+    files = [place / "r.mcap", place / "r-2.mcap"]
+    run = Run(
+        *(place, "--source", f"kitti:{road}", "--rate", "25", "--set", "source.loop=true"),
+        *("--set", "source.frames=150", "--set", "runtime.watchdog_ms=500", "--set", "runtime.spares=false"),
+        *("--record", str(files[0])),
+    )
+    try:
+        with Planner(run.vehicle, run.runtime_dir) as planner:
+            drive_on(planner, 20)
+            os.kill(run.node_pid("record"), number)
+            heard = drive_on(planner, 40)
+            status, out, err = run.end()
+    finally:
+        run.kill()
+    assert status == 0, err
+    assert f"record {cause}; it is begun anew" in out
+    assert max(b - a for a, b in pairwise(heard.values())) < 1.0  # nobody waited for it
+    summary = run.summary()["recording"]
+    assert summary["files"] == [str(file) for file in files]
+    assert (summary["restarts"], summary["complete"]) == (1, False)
+    first, second = (Recording(file) for file in files)
+    verdicts = [compare(first), compare(second)]
+    assert [verdict.difference for verdict in verdicts] == [None, None]
+    assert min(verdict.equal for verdict in verdicts) > 5
+    assert second.complete
+    assert not first.complete
+    assert (first.about.restarts, second.about.restarts) == (0, 1)
+    frames = [
+        [decode(message.data, Estimate).frame_id for message in recording.messages(("v1/estimate",))]
+        for recording in (first, second)
+    ]
+    assert summary["dropped"] >= frames[1][0] - frames[0][-1] - 1 > 0
+    said = [msgspec.json.decode(m.data, type=Health) for m in second.messages(("/health/record",))]
+    assert {(health.restarts, health.cause) for health in said} == {(1, cause)}
+
+
+def test_a_recorder_that_keeps_dying_is_given_up_and_the_drive_goes_on(
+    tmp_path_factory: pytest.TempPathFactory, road: Path
+) -> None:
+    place = tmp_path_factory.mktemp("g")
+    run = Run(
+        *(place, "--source", f"kitti:{road}", "--rate", "25", "--set", "source.loop=true"),
+        *("--set", "source.frames=120", "--set", "runtime.restarts_max=1", "--set", "runtime.spares=false"),
+        *("--record", str(place / "g.mcap")),
+    )
+    try:
+        with Planner(run.vehicle, run.runtime_dir) as planner:
+            for _ in range(2):
+                drive_on(planner, 15)
+                os.kill(run.node_pid("record"), signal.SIGKILL)
+            status, out, err = run.end()
+    finally:
+        run.kill()
+    assert status == 0, err
+    assert "nothing is recorded any more, the run goes on" in out
+    assert run.summary()["frames_processed"] > 100
 
 
 def test_a_full_disk_ends_the_recording_and_the_drive_goes_on(

@@ -17,8 +17,9 @@ from birdslam.types import Estimate, Status
 from runtime import recording_commands, replay
 from runtime.configuration import ConfigurationError
 from runtime.recording import Recording
-from runtime.replay import Verdict, compare
+from runtime.replay import compare
 from runtime.report_replay import told
+from runtime.verdict import Verdict
 from tests.taped_drive import Tape, measured
 
 
