@@ -162,6 +162,7 @@ def perceive(configuration: Configuration, frames: list[Frame], options: argpars
             now_ns = time.monotonic_ns()
             frame = Frame(number, due_ns, now_ns, 0, image, ())
             frontend.step(frame, inference.start(frame))
+            inference.over()
             if number >= WARM_UP_FRAMES:
                 step_ms.append((time.monotonic_ns() - now_ns) / 1e6)
     gc.unfreeze()

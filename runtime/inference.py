@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -10,6 +11,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from birdslam.frontend import Pending
+from birdslam.lane_mapper import LaneHead
 from birdslam.perception import Networks, Perception, Ready, load_network
 from birdslam.perception.completion import GridCompletion, shipped_completion
 from birdslam.perception.manifest import Role
@@ -32,7 +34,9 @@ class Inference:
     """
 
     def __init__(self, configuration: Configuration) -> None:
-        heads = [load_network(role, spec) for role, spec in configuration.models.in_use().items()]
+        schedule = configuration.perceive.schedule
+        heads = [load_network(role, schedule.of(role, spec)) for role, spec in configuration.models.in_use().items()]
+        self._lanes_every = schedule.lanes.every or 1
         pointnet = configuration.models.pointnet
         self.frustum_network: PointNet | None = None if pointnet is None else load_pointnet(pointnet)
         self.completion: GridCompletion | None = None  # of lane grids, where there are lanes to see
@@ -44,7 +48,8 @@ class Inference:
         self._ran_frame = -self._rate_divisor  # the last frame that networks were offered
         self._started: list[Future[Any]] = []  # for the frame at hand, and awaited
         self._threads = ThreadPoolExecutor(max(1, len(heads)), thread_name_prefix="network")
-        self._lanes = ThreadPoolExecutor(1, thread_name_prefix="lanes")
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="beside")
+        self._frame_over = threading.Event()
         self.networks = Networks(heads, self._submit, None if self._deadline_ns is None else 0.0)
 
     def _submit(self, run: Run, *arguments: Any) -> Future[Any]:
@@ -55,8 +60,27 @@ class Inference:
 
     @property
     def aside(self) -> Run | None:
-        """Runs a function on a thread beside the frames; None at rate "max", where nothing may depend on the clock."""
-        return None if self._deadline_ns is None else self._lanes.submit
+        """Runs a function on a thread of its own; None at rate "max", where nothing may depend on the clock.
+
+        It begins when the frame at hand is over: it would take the interpreter's lock from what goes out.
+        """
+        return None if self._deadline_ns is None else self._run_aside
+
+    def _run_aside(self, run: Run, *arguments: Any) -> Future[Any]:
+        def when_over() -> Any:
+            self._frame_over.wait()
+            return run(*arguments)
+
+        return self._beside.submit(when_over)
+
+    def over(self) -> None:
+        """What the frame at hand gave is sent."""
+        self._frame_over.set()
+
+    @property
+    def lane_head(self) -> LaneHead:
+        """Lanes, on their schedule."""
+        return LaneHead(self.completion, self.aside, self._lanes_every)
 
     @property
     def roles(self) -> frozenset[str]:
@@ -66,6 +90,7 @@ class Inference:
     def start(self, frame: Frame, mode: Mode = Mode.FULL) -> Pending:
         """Starts the networks that are due on a frame, and that the mode allows."""
         self._started = []
+        self._frame_over.clear()
         if mode in (Mode.ODOMETRY, Mode.COASTING):
             return Ready(Perception())
         image = frame.image
@@ -85,7 +110,8 @@ class Inference:
 
     def close(self) -> None:
         """Ends the threads, after the runs at hand."""
-        self._lanes.shutdown(wait=True, cancel_futures=True)
+        self._frame_over.set()
+        self._beside.shutdown(wait=True, cancel_futures=True)
         self._threads.shutdown(wait=True, cancel_futures=True)
 
     def __enter__(self) -> Self:

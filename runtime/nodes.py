@@ -110,6 +110,7 @@ class PerceiveNode:
             return
         mode = self._degradation.mode
         yield self._coast(ref) if self._coasts(ref, mode) else self._look(frame, mode)
+        self._inference.over()
         age_ms = (time.monotonic_ns() - ref.t_capture_ns) / 1e6
         if self._degradation.judge(age_ms):
             log.warning("frame %d: mode %s after %s", ref.frame_id, self._degradation.mode, mode)
@@ -156,8 +157,7 @@ def front_end(configuration: Configuration, inference: Inference) -> FrontEnd:
         calibrated(configuration),
         configuration.slam.frontend,
         frustum_network=inference.frustum_network,
-        complete=inference.completion,
-        aside=inference.aside,
+        lane_head=inference.lane_head,
     )
 
 
