@@ -268,27 +268,30 @@ class RoadAligner:
         lengths: Floats,
     ) -> float:  # fmt: skip
         """The one of `lengths` at which a motion of known direction fits best, over a few pitches about `tilt`."""
-        cam = self.camera
+        cam, f32 = self.camera, np.float32
         px = px[:: max(1, len(px) // 900)]
-        rays = np.column_stack(
+        rays = np.stack(
             [(px[:, 0] - cam.cx_px) / cam.fx_px, (px[:, 1] - cam.cy_px) / cam.fy_px, np.ones(len(px))]
-        )
-        here = present.grey[px[:, 1] - present.top_px, px[:, 0]].astype(np.float64)
-        direction = T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9)
-        turned = rays @ T_past_present.R.T
+        ).astype(f32)  # fmt: skip
+        here = present.grey[px[:, 1] - present.top_px, px[:, 0]]
+        direction = (T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9)).astype(f32)
+        turned = T_past_present.R.astype(f32) @ rays
+        rows, cols = past.grey.shape
         best = (float(lengths[0]), -1.0)
         for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01):
-            rho = -(rays @ plane_normal(pitch_rad, tilt[1])[0]) / cam.height_m
-            q = turned[None] + (lengths[:, None] * rho[None])[:, :, None] * direction
-            z = np.maximum(q[..., 2], 1e-3)
-            u = (cam.fx_px * q[..., 0] / z + cam.cx_px).astype(np.float32)
-            v = (cam.fy_px * q[..., 1] / z + cam.cy_px - past.top_px).astype(np.float32)
+            rho = (plane_normal(pitch_rad, tilt[1])[0].astype(f32) @ rays) * f32(-1.0 / cam.height_m)
+            way = lengths.astype(f32)[:, None] * rho  # (lengths, samples); what a sample moves, over its depth
+            by_z = f32(1.0) / np.maximum(turned[2] + way * direction[2], f32(1e-3))
+            u = (turned[0] + way * direction[0]) * by_z * f32(cam.fx_px) + f32(cam.cx_px)
+            v = (turned[1] + way * direction[1]) * by_z * f32(cam.fy_px) + f32(cam.cy_px - past.top_px)
             there = cv2.remap(past.grey, u, v, cv2.INTER_LINEAR)
-            inside = (u > 0) & (u < past.grey.shape[1] - 1) & (v > 0) & (v < past.grey.shape[0] - 1)
-            count = np.maximum(inside.sum(axis=1), 1)
-            a = np.where(inside, there - (there * inside).sum(axis=1, keepdims=True) / count[:, None], 0.0)
-            b = np.where(inside, here - (here * inside).sum(axis=1, keepdims=True) / count[:, None], 0.0)
-            correlation = (a * b).sum(axis=1) / np.sqrt(np.maximum((a * a).sum(axis=1) * (b * b).sum(axis=1), 1e-9))
+            inside = ((u > 0) & (u < cols - 1) & (v > 0) & (v < rows - 1)).astype(f32)
+            count = np.maximum(inside.sum(axis=1), 1.0)
+            a, b = there * inside, here * inside
+            mean_a, mean_b = a.sum(axis=1) / count, b.sum(axis=1) / count
+            ab, aa, bb = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (a, a), (b, b)))
+            variances = (aa - count * mean_a**2) * (bb - count * mean_b**2)
+            correlation = (ab - count * mean_a * mean_b) / np.sqrt(np.maximum(variances, 1e-9))
             correlation[count < 0.5 * len(px)] = -1.0
             k = int(correlation.argmax())
             if correlation[k] > best[1]:
