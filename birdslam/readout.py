@@ -57,6 +57,7 @@ def vehicle_estimates(
                 label=v.label,
                 length_m=v.length_m,
                 width_m=v.width_m,
+                delay_ns=v.delay_ns,
             )
             for v, (x_m, y_m, yaw_rad), cov, velocity, velocity_cov in numbers
         ]

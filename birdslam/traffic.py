@@ -21,6 +21,7 @@ class Vehicle:
     label: str = "car"
     length_m: float = 0.0
     width_m: float = 0.0
+    delay_ns: int = 0  # of the sight at seen_ns
 
 
 class Traffic:
@@ -63,7 +64,7 @@ class Traffic:
                 if v.contradicted >= min(v.agreed, self._contradictions):
                     begun.append(k)
             v.seen_ns, v.frames, v.label = t_ns, v.frames + 1, edge.label
-            v.length_m, v.width_m = edge.length_m, edge.width_m
+            v.length_m, v.width_m, v.delay_ns = edge.length_m, edge.width_m, edge.delay_ns
         known = len(self.vehicles)
         alive = [row for row, v in enumerate(self.vehicles) if (t_ns - v.seen_ns) * 1e-9 <= self._forget_s]
         if not born and len(alive) == known:

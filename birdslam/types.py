@@ -179,6 +179,7 @@ class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True):
     sigma_log_height: float = 0.0
     depth_per_height: float = 0.0  # by how much the logarithm of its depth goes with log_height; 0: not at all
     standing: float = 0.0  # the probability that it stands
+    delay_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # > 0: seen so long before this frame, and moved on to it
 
     def __post_init__(self) -> None:
         _check_finite(self, "score", "box_px", "length_m", "width_m")
@@ -279,11 +280,12 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True):
     cov: Cov3  # of the pose
     velocity_mps: Annotated[tuple[float, ...], msgspec.Meta(min_length=2, max_length=2)]  # (x, y) in world
     velocity_cov: Cov2  # of the velocity
-    age_ns: int  # source time since it was last seen; 0: seen in this frame
+    age_ns: int  # source time since the frame that last told of it; 0: this frame does
     frames: int  # how many frames it has been seen in
     label: str = "car"  # its class
     length_m: float = 4.0  # of its footprint
     width_m: float = 1.7  # of its footprint
+    delay_ns: int = 0  # by so much older was the image that it was seen in: it was last seen age_ns + delay_ns ago
 
     def __post_init__(self) -> None:
         cov, u = self.cov, self.velocity_cov

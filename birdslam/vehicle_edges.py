@@ -40,14 +40,14 @@ def vehicle_edges(
         track = seen if seen.seen_frame == present.frame_id else _moved_on(seen, present, camera, config)
         if track is None:
             continue
-        cv.append(_vehicle_edge(track, config))
+        cv.append(_vehicle_edge(track, present.t_source_ns - seen.seen_ns, config))
         if track.motion is not None:
             vv.append(track.motion)
         seen.shown = Shown(present.frame_id, present.t_source_ns, track.pose())
     return tuple(cv), tuple(vv)
 
 
-def _vehicle_edge(track: Track, config: TrackingConfig) -> VehicleEdge:
+def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> VehicleEdge:
     seen, place = track.observation, track.place
     yaw_rad = track.T_world_ego.between(track.pose()).yaw_rad
     cov = np.zeros((3, 3))
@@ -65,6 +65,7 @@ def _vehicle_edge(track: Track, config: TrackingConfig) -> VehicleEdge:
         box_px=seen.box_px,
         length_m=seen.dimensions.length_m,
         width_m=seen.dimensions.width_m,
+        delay_ns=max(delay_ns, 0),
         **({} if place.taken is None else vars(place.taken)),
     )
 

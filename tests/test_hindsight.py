@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from birdslam import bev
 from birdslam.camera import GroundPlane
 from birdslam.frontend import FrontEnd, FrontEndConfig
+from birdslam.graph import GraphConfig, PoseGraph
 from birdslam.hindsight import Hindsight, HindsightConfig, Moment
 from birdslam.horizon import Horizon, HorizonConfig
 from birdslam.localisation import DIMENSIONS, LocalisationConfig, iou
@@ -18,6 +19,7 @@ from birdslam.perception import Detections, Perception, Ready
 from birdslam.se2 import SE2
 from birdslam.tracking import Tracker, TrackingConfig
 from birdslam.types import Measurements
+from birdslam.weights import WeightsConfig
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
 
 CAR = DIMENSIONS["car"]
@@ -184,6 +186,15 @@ def test_late_edges_end_in_the_frame_at_hand_and_carry_on_from_one_another() -> 
             assert iou(goal_px, boxes_px).max(axis=1).mean() > iou(goal_px, stale_px).max(axis=1).mean()
     assert len(last) == 3
     assert [edge.T_from_to.x_m for edge in log[-1].vv] == pytest.approx([0.0, 1.1, 1.0], abs=0.05)
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_an_estimate_says_how_old_the_sights_are_that_tell_of_it(delay: int) -> None:
+    graph = PoseGraph(GraphConfig(), WeightsConfig())
+    estimates = [graph.update(m) for m in drive(delay, 0, 0.0, (CAR.height_m,) * 3)]
+    assert len(estimates[-1].vehicles) == 3
+    for estimate in estimates:
+        assert {v.age_ns + v.delay_ns for v in estimate.vehicles} <= {delay * PERIOD_NS}
 
 
 def test_a_late_vehicle_whose_velocity_is_not_known_is_not_shown() -> None:
