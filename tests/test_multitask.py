@@ -483,6 +483,27 @@ def test_a_lesson_learns() -> None:
     assert np.mean(costs[-5:]) < 0.6 * np.mean(costs[:5])
 
 
+@needs_torch
+def test_a_network_that_sees_further_begins_as_the_one_before_it() -> None:
+    import torch
+
+    from birdslam.training.network import NetworkConfig
+    from birdslam.training.teacher import Teacher, TeacherConfig
+
+    torch.manual_seed(5)
+    before = Teacher(TeacherConfig(network=NetworkConfig(context=0)), half=False)
+    after = Teacher(TeacherConfig(), half=False)
+    after.begin(before.state())
+    image = torch.rand(1, 3, 64, 128) * 2.0 - 1.0
+    for name, answer in before.answer(image).items():
+        torch.testing.assert_close(after.answer(image)[name], answer)
+    # What lies outside of a cell's own view counts once the new blocks have learnt anything
+    torch.nn.init.ones_(after.average.module.context[0].norm.weight)
+    assert not torch.equal(after.answer(image)["depth"], before.answer(image)["depth"])
+    with pytest.raises(ValueError, match="context"):
+        before.begin(after.state())
+
+
 @pytest.mark.slow
 @needs_torch
 @pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs the extra [train]: numba")

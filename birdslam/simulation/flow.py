@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.simulation import materials as m
-from birdslam.simulation.fleet import Body, draw_cyclist, draw_pedestrian, draw_shape, draw_vehicle
+from birdslam.simulation.fleet import (
+    Body,
+    draw_cyclist,
+    draw_pedestrian,
+    draw_shape,
+    draw_truck,
+    draw_vehicle,
+)
 from birdslam.simulation.street import Street
 
 Floats = NDArray[np.float64]
@@ -81,6 +88,8 @@ def populate(
         out.append(mover)
         return True
 
+    if u[5] < 0.18:
+        _pass(rng.spawn(1)[0], street, ego_s_m, ego_d_m, add)
     jam = u[1] < 0.18
     for lane in street.lanes:
         gap = (6.0 + 5.0 * u[2]) if jam else 14.0 + 60.0 * (1.0 - dense) * rng.uniform(0.5, 1.5)
@@ -100,6 +109,19 @@ def populate(
     _cross(rng, street, ego_s_m, reach_m, add)
     _walk(rng, street, ego_s_m, reach_m, add, u[4])
     return out
+
+
+def _pass(rng: np.random.Generator, street: Street, ego_s_m: float, ego_d_m: float, add) -> None:  # type: ignore[no-untyped-def]
+    """A truck, a bus or a van close beside the ego, so that the image's border cuts it."""
+    near = [lane for lane in street.lanes if 2.4 < abs(lane.d_m - ego_d_m) < 4.8]
+    if near:
+        lane = near[int(rng.integers(0, len(near)))]
+        pick = rng.random()
+        body = draw_truck(rng) if pick < 0.6 else draw_shape(rng, "bus" if pick < 0.75 else "big_van")
+        s = ego_s_m + rng.uniform(2.0, 9.0) + 0.5 * float(body.parameters[m.LENGTH])
+        turn = (0.0 if lane.direction > 0 else math.pi) + rng.normal(0.0, 0.015)
+        speed = lane.speed_mps * rng.uniform(0.0, 1.0)
+        add(Mover(body, s, lane.d_m + rng.normal(0.0, 0.15), turn, speed, lane.speed_mps, lane.d_m), 0.3)
 
 
 def _park(rng, street: Street, ego_s_m: float, reach_m: float, add, full: float) -> None:  # type: ignore[no-untyped-def]

@@ -178,7 +178,8 @@ def _surface(kind, tone, bank, s, d, foot, sky):  # type: ignore[no-untyped-def]
     if kind == st.ASPHALT or kind == st.PARKING or kind == st.CYCLE:
         grey = 0.105 * tone * (1.0 + 0.07 * large + 0.06 * mid + 0.2 * fine)
         if sky[24] > 0.0:
-            grey *= 1.0 + sky[24] * noise(bank, 1, s * 0.15, d * 0.15, t * 0.15)
+            grit = noise(bank, 1, s * 0.15, d * 0.15, t * 0.15) + 0.6 * noise(bank, 0, s * 0.11, d * 0.17, t * 0.14)
+            grey *= max(1.0 + sky[24] * grit, 0.2)
         crack = noise(bank, 2, s * 0.06 + sky[18], d * 0.06, t * 0.06)
         if sky[18] > 0.35:
             grey *= 1.0 - 0.6 * min(crack * 1.2, 1.0)
@@ -220,7 +221,9 @@ def _surface(kind, tone, bank, s, d, foot, sky):  # type: ignore[no-untyped-def]
         grey = 0.17 * (1.0 + 0.2 * large + 0.2 * mid + 0.3 * fine)
         return grey * 1.15, grey, grey * 0.75, CLASS_OTHER
     clump = noise(bank, 3, s * 0.5, d * 0.5, t * 0.5)
-    k = max(0.25, 1.0 + 0.25 * large + 0.25 * mid + 0.3 * clump + 0.25 * fine) * (0.6 + 0.8 * sky[22])
+    rough = sky[25]
+    k = max(0.25, 1.0 + (0.1 + 0.2 * rough) * (large + mid) + 0.4 * rough * clump + (0.1 + 0.2 * rough) * fine)
+    k *= 0.6 + 0.8 * sky[22]
     dry = 0.5 + 0.5 * large * 0.5 + (sky[23] - 0.5)
     return (0.05 + 0.06 * dry) * k, (0.085 + 0.02 * dry) * k, 0.028 * k, CLASS_GRASS
 

@@ -3,7 +3,7 @@
 `sky` holds: 0-2 towards the sun, 3-5 its light, 6-8 light from the zenith, 9-11 light from the horizon, 12-14 haze,
 15 metres of sight, 16 wetness of the road, 17 clouds, 18 seed, 19 glare about the sun, 20 leaves' translucence,
 21 light from a street canyon (ambient factor), 22 snow or dust on grass (brightness), 23 season's tint of grass,
-24 how coarse the grit of asphalt is.
+24 how coarse the grit of asphalt is, 25 how rough the grass is, 0 a mown lawn.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 
 from numba import njit
 
-SKY_SLOTS = 25
+SKY_SLOTS = 26
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")

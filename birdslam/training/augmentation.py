@@ -102,7 +102,7 @@ def _light(width_px: int, height_px: int, rng: np.random.Generator) -> NDArray[n
             centre = rng.uniform(0.0, 1.0, 2) * [width_px, height_px]
             corners = centre + rng.uniform(-0.35, 0.35, (4, 2)) * [width_px, height_px]
             hull = cv2.convexHull(corners.astype(np.int32))
-            cv2.fillConvexPoly(field, hull, float(rng.uniform(0.35, 0.8)))
+            cv2.fillConvexPoly(field, hull, float(rng.uniform(0.2, 0.8)))
     return field.astype(np.float32, copy=False)
 
 

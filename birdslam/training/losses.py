@@ -18,10 +18,10 @@ _BODY = body_slices()
 class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Weights that bring the parts to one order of size."""
 
-    depth: float = 3.0
+    depth: float = 4.0
     sky: float = 0.1
     shape: float = 0.5  # of the depth's error about its mean over the image
-    road: float = 1.0
+    road: float = 1.5
     lane: float = 1.3
     overlap: float = 0.5  # of a mask, by Dice
     heat: float = 1.0

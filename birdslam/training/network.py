@@ -18,12 +18,31 @@ class NetworkConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     widths: tuple[int, ...] = (16, 32, 64, 96, 160)
     depths: tuple[int, ...] = (1, 2, 2, 3, 2)
     pyramid: int = 48
+    context: int = 2  # blocks on the coarsest grid
+    context_width: int = 96  # channels within such a block
 
 
 def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
     )
+
+
+class _Context(nn.Module):
+    """What the rest of the image says, added to each cell: how high the camera is and where the street leads.
+
+    Without it a cell of the coarsest grid sees less than half of the image. It begins as nothing: its last scale is 0.
+    """
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.narrow = _convolution(channels, width)
+        self.wide = nn.Conv2d(width, channels, 3, 1, 2, dilation=2, bias=False)
+        self.norm = nn.BatchNorm2d(channels)
+        nn.init.zeros_(self.norm.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.relu(x + self.norm(self.wide(self.narrow(x))))
 
 
 class MultiTask(nn.Module):
@@ -40,6 +59,7 @@ class MultiTask(nn.Module):
             stages.append(nn.Sequential(*blocks))
             channels = width
         self.encoder = nn.ModuleList(stages)
+        self.context = nn.Sequential(*[_Context(channels, config.context_width) for _ in range(config.context)])
         self.lateral = nn.ModuleList([nn.Conv2d(width, config.pyramid, 1) for width in config.widths[1:]])
         self.smooth = nn.ModuleList([_convolution(config.pyramid, config.pyramid) for _ in config.widths[1:-1]])
         neck = config.pyramid
@@ -57,6 +77,7 @@ class MultiTask(nn.Module):
         for stage in self.encoder:
             x = stage(x)
             levels.append(x)
+        levels[-1] = self.context(levels[-1])
         merged = self.lateral[-1](levels[-1])
         for level in range(len(self.smooth) - 1, -1, -1):
             up = functional.interpolate(merged, scale_factor=2.0, mode="nearest")

@@ -27,7 +27,7 @@ class TeacherConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     warm_up_steps: int = 200
     rate_end: float = 0.02  # of the stage's learning rate, at its end
     clip: float = 5.0  # norm of the gradient
-    average: float = 0.997  # of the old weights, at each step
+    average: float = 0.998  # of the old weights, at each step
 
 
 class Teacher:
@@ -75,7 +75,8 @@ class Teacher:
         if bool(torch.isfinite(norm)):
             self.optimiser.step()
             self.average.update_parameters(self.network)
-        return {"total": float(total), **{name: float(part) for name, part in parts.items()}, "norm": float(norm)}
+        costs = {"total": total, **parts, "norm": norm}
+        return {name: float(cost.detach()) for name, cost in costs.items()}
 
     def enlarge(self, factor: float) -> None:
         """For inputs `factor` times as wide: what is as large on the image as before is `factor` times as far away."""
@@ -98,6 +99,16 @@ class Teacher:
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
         self.optimiser.load_state_dict(state["optimiser"])
+
+    def begin(self, state: dict[str, Any]) -> None:
+        """Takes over the weights of another's state, as far as that network has them; the optimiser begins anew.
+
+        Raises ValueError where the other has weights that this network has no place for.
+        """
+        for name in ("network", "average"):
+            strange = getattr(self, name).load_state_dict(state[name], strict=False).unexpected_keys
+            if strange:
+                raise ValueError(f"weights of another network: {', '.join(strange[:3])}")
 
     @torch.no_grad()
     def answer(self, image: Tensor) -> dict[str, Tensor]:
