@@ -106,13 +106,14 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
             depths.append(_beside_lidar(found, points_m, recording.camera))
         if "segmenter" in others:
             theirs = others["segmenter"].run(image)
-            if found.segmentation and theirs and theirs.segmentation:
+            if found.segmentation is not None and theirs is not None and theirs.segmentation is not None:
                 road += overlap(found.segmentation.road, theirs.segmentation.road)
                 lane += overlap(found.segmentation.lane, theirs.segmentation.lane)
                 shares.append([mask.road.mean() for mask in (found.segmentation, theirs.segmentation)])
         if "detector" in others:
             theirs = others["detector"].run(image)
-            if found.detections and theirs and theirs.detections:
+            # Nothing found is an answer too: an image in which one of the two sees nobody counts
+            if found.detections is not None and theirs is not None and theirs.detections is not None:
                 agreed += _agreement(found.detections, theirs.detections)
     figures: dict[str, float] = {"frames": len(recording)}
     if depths:
