@@ -24,8 +24,6 @@ from runtime import (
     calibrate,
     demo_drive,
     doctor,
-    evaluate_localisation,
-    evaluate_tracking,
     interface,
     model_store,
     models,
@@ -230,11 +228,15 @@ def evaluate_car_ahead(options: argparse.Namespace) -> int:
 
 def evaluate_benchmark(options: argparse.Namespace) -> int:
     """`birdslam evaluate tracking` and `ablation`: the paper's tables on KITTI tracking."""
+    from runtime import evaluate_tracking  # only here: gtsam would lie in a drive's memory
+
     return evaluate_tracking.evaluate(options, configuration_of(options))
 
 
 def evaluate_vehicles(options: argparse.Namespace) -> int:
     """`birdslam evaluate localisation`: vehicles' places against labels."""
+    from runtime import evaluate_localisation  # only here: scipy.stats would lie in a drive's memory
+
     return evaluate_localisation.evaluate(options, configuration_of(options))
 
 
