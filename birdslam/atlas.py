@@ -11,7 +11,7 @@ import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, repeat
 from typing import Annotated
 
 import msgspec
@@ -113,7 +113,7 @@ class _Chapter:
         """What the map gained."""
         self._map_frame_id = update.frame_id
         self._landmarks.add(update.landmarks_m)
-        self._lanes.add(update.lanes_m)
+        self._lanes.add(update.lanes_m, update.lane_ids)
 
     def trajectory(self, last_s: float | None) -> Trajectory:
         since_ns = -math.inf if last_s is None else self._t_ns - last_s * 1e9
@@ -133,12 +133,14 @@ class _Chapter:
         )
 
     def map(self) -> MapSnapshot:
+        lanes_m, lane_ids = self._lanes.taken()
         return MapSnapshot(
             epoch=self._epoch,
             frame_id=self._map_frame_id,
-            landmarks_m=self._landmarks.taken(),
-            lanes_m=self._lanes.taken(),
+            landmarks_m=self._landmarks.taken()[0],
+            lanes_m=lanes_m,
             cell_m=self._config.map_cell_m,
+            lane_ids=lane_ids if any(lane >= 0 for lane in lane_ids) else (),
         )
 
 
@@ -198,28 +200,36 @@ class _Path:
 
 @dataclass(slots=True)
 class _Cells:
-    """Points of the road, one for each cell that any fell into: their mean. In octaves of the cell's side."""
+    """Points of the road, one for each cell that any fell into: their mean, and the newest id among them (-1: none).
+
+    In octaves of the cell's side.
+    """
 
     config: AtlasConfig
-    octaves: list[dict[tuple[int, int], tuple[float, float, int]]] = field(init=False)  # sums and counts, oldest first
+    octaves: list[dict[tuple[int, int], tuple[float, float, int, int]]] = field(init=False)  # sums, count, id
 
     def __post_init__(self) -> None:
         self.octaves = [{} for _ in range(self.config.map_octaves)]
 
-    def add(self, points_m: Points) -> None:
+    def add(self, points_m: Points, ids: Iterable[int] = ()) -> None:
         config = self.config
-        for x_m, y_m in points_m:
+        for (x_m, y_m), own in zip(points_m, chain(ids, repeat(-1)), strict=False):
             if abs(x_m) + abs(y_m) > _FARTHEST_M:
                 continue
-            moment, side_m = (x_m, y_m, 1), config.map_cell_m
+            moment, side_m = (x_m, y_m, 1, own), config.map_cell_m
             for cells in self.octaves:
-                x, y, n = moment
+                x, y, n, lane = moment
                 key = math.floor(x / n / side_m), math.floor(y / n / side_m)
                 before = cells.pop(key, None)  # and back in as the newest
-                cells[key] = moment if before is None else (before[0] + x, before[1] + y, before[2] + n)
+                if before is not None:
+                    newest = lane if lane >= 0 else before[3]
+                    moment = before[0] + x, before[1] + y, before[2] + n, newest
+                cells[key] = moment
                 if len(cells) <= config.map_cells:
                     break
                 moment, side_m = cells.pop(next(iter(cells))), 2.0 * side_m
 
-    def taken(self) -> tuple[tuple[float, float], ...]:
-        return tuple((x / n, y / n) for cells in reversed(self.octaves) for x, y, n in cells.values())
+    def taken(self) -> tuple[tuple[tuple[float, float], ...], tuple[int, ...]]:
+        """The points, oldest first, and their ids."""
+        cells = [moment for octave in reversed(self.octaves) for moment in octave.values()]
+        return tuple((x / n, y / n) for x, y, n, _ in cells), tuple(lane for *_, lane in cells)

@@ -14,13 +14,15 @@ from birdslam.depthplace import PseudoLidarConfig
 from birdslam.heightwatch import HeightWatch, HeightWatchConfig
 from birdslam.hindsight import Hindsight, HindsightConfig, Moment
 from birdslam.horizon import Horizon, HorizonConfig
-from birdslam.lanes import Completion, LanesConfig
+from birdslam.lane_edges import LaneEdgesConfig
+from birdslam.lane_mapper import LaneHead, LaneMapper
+from birdslam.lanes import LanesConfig
 from birdslam.localisation import LocalisationConfig
 from birdslam.odometry import Motion, Odometry, OdometryConfig
 from birdslam.perception import Perception
 from birdslam.pseudolidar import FrustumNetwork
 from birdslam.se2 import SE2
-from birdslam.static_map import Aside, LaneMapper, StaticMapConfig, landmark_edges
+from birdslam.static_map import StaticMapConfig, landmark_edges
 from birdslam.tracking import Tracker, TrackingConfig
 from birdslam.types import (
     Attitude,
@@ -44,6 +46,7 @@ class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hindsight: HindsightConfig = HindsightConfig()
     static_map: StaticMapConfig = StaticMapConfig()
     lanes: LanesConfig = LanesConfig()
+    lane_edges: LaneEdgesConfig = LaneEdgesConfig()
     height: HeightWatchConfig = HeightWatchConfig()
 
 
@@ -80,8 +83,7 @@ class FrontEnd:
         config: FrontEndConfig,
         odometry: EgoMotion | None = None,
         frustum_network: FrustumNetwork | None = None,
-        complete: Completion | None = None,
-        aside: Aside | None = None,
+        lane_head: LaneHead = LaneHead(),  # noqa: B008
     ) -> None:
         self.camera = camera
         self.config = config
@@ -96,7 +98,7 @@ class FrontEnd:
             frustum_network,
         )
         self._reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
-        self._lanes = LaneMapper(camera, config.static_map, config.lanes, complete, aside)
+        self._lanes = LaneMapper(camera, config.static_map, config.lanes, config.lane_edges, lane_head)
         self.height = HeightWatch(camera, config.height, config.localisation)
         self._last_frame: int | None = None
         self._last_pitch = (0, 0.0)  # when, and the camera's against the level
@@ -130,32 +132,36 @@ class FrontEnd:
         cv, vv = vehicle_edges(seen, present, self.camera, self.config.tracking)
         status += self.height.step(cv, motion)
 
+        # Lanes, by what is known of this frame's road or an earlier one's (Sec. 3.2)
+        segmented = frame.frame_id - perception.ages.get("segmenter", 0)
+        lanes = self._lanes.step(
+            frame.frame_id, T_world_ego, ground, sigma_pitch_rad, segmentation, segmented, boxes_px
+        )
+        status += lanes.status
+        ages = perception.ages if lanes.age is None else perception.ages | {"lanes": lanes.age}
+
         return _measurements(
             frame,
             [*status, *perception.status, *(motion.status if motion else (Status.NOT_INITIALISED,))],
             cc=cc,
             cv=cv,
             vv=vv,
-            cp=landmark_edges(
-                *self.odometry.road_tracks,
-                frame.frame_id,
-                self.camera,
-                ground,
-                sigma_pitch_rad,
-                self.config.static_map,
+            cp=(
+                *landmark_edges(
+                    *self.odometry.road_tracks,
+                    frame.frame_id,
+                    self.camera,
+                    ground,
+                    sigma_pitch_rad,
+                    self.config.static_map,
+                ),
+                *lanes.edges,
             ),
-            lanes=self._lanes.step(
-                frame.frame_id,
-                T_world_ego,
-                ground,
-                segmentation,
-                frame.frame_id - perception.ages.get("segmenter", 0),
-                boxes_px,
-            ),
+            lanes=lanes.points,
             attitude=self._reckoning.attitude,
             ground=Ground(height_m=ground.height_m, pitch_rad=ground.pitch_rad, roll_rad=ground.roll_rad),
             scale_sigma_rel=0.0 if motion is None else motion.scale_sigma_rel,
-            ages=dict(perception.ages),
+            ages=dict(ages),
         )
 
     def _dropped(self, frame: Frame) -> tuple[Status, ...]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from birdslam.edges import LARGEST_M
 from birdslam.se2 import SE2
-from birdslam.types import LandmarkEdge, LanePoint, MapUpdate
+from birdslam.types import LANE_LANDMARKS, LandmarkEdge, LanePoint, MapUpdate
 from birdslam.window import KEY_NODE, Rows, Window
 
 Floats = NDArray[np.float64]
@@ -145,13 +145,13 @@ class Landmarks:
         """Ties a key frame's landmarks to the ego, now that it is corrected; returns those that settled, in world.
 
         A landmark that is out of sight settles: it is on the map where it was seen in `least_frames` key frames, at
-        its mean over them, weighted by information.
+        its mean over them, weighted by information. A lane's stations do not: their lane is on the map.
         """
         seen = seen[: self._capacity]
         rows = self._rows(seen)
         gone = np.ones(len(self._row), dtype=np.bool_)
         gone[rows[rows >= 0]] = False
-        gone &= self._frames >= least_frames
+        gone &= (self._frames >= least_frames) & (np.fromiter(self._row, np.int64, len(gone)) < LANE_LANDMARKS)
         settled = [(p.real, p.imag) for p in (self._moment[gone] / self._information[gone]).tolist()]
 
         T = window.world

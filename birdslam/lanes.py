@@ -2,7 +2,7 @@
 
 Near points of road and lane boundaries, gathered over a window of frames with the odometry, fill two occupancy grids in
 the ego of the newest frame. Lone cells are dropped, a network (ENet) completes the grids, opening and closing clean
-them, and the Hough transform segregates the boundary's cells into lanes. Lanes keep their ids from frame to frame.
+them, and the Hough transform segregates the boundary's cells into lanes, which keep their ids (lane_ids.py).
 
 A grid is (rows, columns) over x (row 0 is `behind_m` behind the ego) and y (column 0 is `half_width_m` to the right).
 """
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 from typing import Protocol
 
 import cv2
@@ -20,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from birdslam import bev
 from birdslam.camera import Camera, GroundPlane
+from birdslam.lane_ids import LaneCloud, LaneIds
 from birdslam.perception import Segmentation
 from birdslam.se2 import SE2
 
@@ -75,14 +74,6 @@ class Completion(Protocol):
     def __call__(self, grids: Grids) -> Grids: ...
 
 
-@dataclass(frozen=True)
-class LaneCloud:
-    """The cells of one lane boundary: `points_m` (N, 2) in ego, `lane` its id."""
-
-    lane: int
-    points_m: Floats
-
-
 class AmodalLanes:
     """`add` for each segmented frame, then `lanes` in the ego of any later pose. Deterministic."""
 
@@ -90,7 +81,7 @@ class AmodalLanes:
         self.config = config
         self.complete = complete
         self._frames: deque[tuple[SE2, Floats, Floats]] = deque(maxlen=config.window_frames)
-        self._ids = LaneIds(config)
+        self.ids = LaneIds(config.same_lane_m, config.cell_m, config.remembered_m)
 
     def is_news(self, T_world_ego: SE2) -> bool:
         """Whether the ego has moved on since the frame that was added last."""
@@ -107,17 +98,17 @@ class AmodalLanes:
     def clear(self) -> None:
         """The world frame began anew: what was gathered has no place in it, and no lane is called as one before."""
         self._frames.clear()
-        self._ids.forget()
+        self.ids.forget()
 
     def lanes(self, T_world_ego: SE2) -> tuple[LaneCloud, ...]:
         """The lanes around the ego at `T_world_ego`, each with its id."""
         grids = self.grids(T_world_ego)
         if self.complete is None:
-            return self._ids.name(T_world_ego, segregate(grids, self.config))
+            return self.ids.name(T_world_ego, segregate(grids, self.config))
         clouds = segregate(np.maximum(grids, self.complete(grids)), self.config)  # what was seen stays
         seen = cv2.dilate(grids[BOUNDARY], np.ones((5, 5), dtype=np.uint8)) > 0.0
         known = [cloud for cloud in clouds if np.sum(seen[_cells_of(cloud, self.config)]) >= self.config.least_cells]
-        return self._ids.name(T_world_ego, known)
+        return self.ids.name(T_world_ego, known)
 
     def grids(self, T_world_ego: SE2) -> Grids:
         """(2, rows, columns) occupancy of 0..1 of road and lane boundary, gathered and filtered."""
@@ -168,12 +159,6 @@ def _cells_of(centres_m: Floats, config: LanesConfig) -> tuple[NDArray[np.int64]
     """The rows and columns of cells by their centres (N, 2) in ego."""
     row, column = np.floor((centres_m + _origin_m(config)) / config.cell_m).astype(np.int64).T
     return row, column
-
-
-def cell_keys(points_m: Floats, cell_m: float) -> NDArray[np.int64]:
-    """(N,) one number for each cell that points (N, 2) lie in, in the order of x and then y."""
-    out: NDArray[np.int64] = np.floor(points_m / cell_m).astype(np.int64) @ np.array([1 << 32, 1])
-    return out
 
 
 def _origin_m(config: LanesConfig) -> Floats:
@@ -283,48 +268,3 @@ def _join(pieces: Floats, touching: Bools, config: LanesConfig) -> NDArray[np.in
     first, second = np.nonzero(joined)
     _, lane = connected_components(coo_array((np.ones(len(first)), (first, second)), (count, count)), directed=False)
     return np.asarray(lane, dtype=np.int64)
-
-
-class LaneIds:
-    """Gives the clouds of each frame the ids that they had: a lane is the one whose points, in world, lie nearest."""
-
-    def __init__(self, config: LanesConfig) -> None:
-        self._config = config
-        self._next = 0
-        self.forget()
-
-    def forget(self) -> None:
-        """Where the lanes were."""
-        self._points = np.zeros((0, 2))  # remembered, in world
-        self._lanes = np.zeros(0, dtype=np.int64)
-
-    def name(self, T_world_ego: SE2, clouds: list[Floats]) -> tuple[LaneCloud, ...]:
-        """Clouds (N, 2) in ego, each with an id; no two have the same."""
-        config = self._config
-        in_world = [T_world_ego @ cloud for cloud in clouds]
-        votes: list[tuple[int, int, int]] = []  # (how many points, the cloud, the lane)
-        if len(self._points):
-            tree = cKDTree(self._points)
-            for k, points in enumerate(in_world):
-                distance, at = tree.query(points, distance_upper_bound=config.same_lane_m)
-                seen, counts = np.unique(self._lanes[at[np.isfinite(distance)]], return_counts=True)
-                votes += [(int(n), k, int(lane)) for n, lane in zip(counts, seen, strict=True)]
-        lane_of: dict[int, int] = {}
-        for _, k, lane in sorted(votes, key=lambda vote: (-vote[0], vote[1:])):
-            if k not in lane_of and lane not in lane_of.values():
-                lane_of[k] = lane
-        for k in range(len(clouds)):
-            if k not in lane_of:
-                lane_of[k], self._next = self._next, self._next + 1
-        self._remember(T_world_ego, in_world, [lane_of[k] for k in range(len(clouds))])
-        return tuple(LaneCloud(lane_of[k], cloud) for k, cloud in enumerate(clouds))
-
-    def _remember(self, T_world_ego: SE2, clouds: list[Floats], lanes: list[int]) -> None:
-        """The newest points stand for a lane's cell, `cell_m` wide, that was seen before."""
-        config = self._config
-        points = np.concatenate([*clouds, self._points]) if clouds else self._points
-        ids = np.concatenate([np.repeat(lanes, [len(c) for c in clouds]), self._lanes]) if clouds else self._lanes
-        near = np.linalg.norm(points - [T_world_ego.x_m, T_world_ego.y_m], axis=1) < config.remembered_m
-        points, ids = points[near], ids[near]
-        _, first = np.unique(cell_keys(points, config.cell_m), return_index=True)
-        self._points, self._lanes = points[first], ids[first].astype(np.int64)

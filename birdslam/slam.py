@@ -7,7 +7,7 @@ import msgspec
 from birdslam.camera import Camera
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.graph import GraphConfig, PoseGraph
-from birdslam.lanes import Completion
+from birdslam.lane_mapper import LaneHead
 from birdslam.perception import Networks
 from birdslam.pseudolidar import FrustumNetwork
 from birdslam.types import Estimate, Frame, MapUpdate, Measurements
@@ -31,10 +31,10 @@ class BirdSLAM:
         networks: Networks,
         config: SlamConfig,
         frustum_network: FrustumNetwork | None = None,
-        complete: Completion | None = None,
+        lane_head: LaneHead = LaneHead(),  # noqa: B008
     ) -> None:
         self.networks = networks
-        self.frontend = FrontEnd(camera, config.frontend, frustum_network=frustum_network, complete=complete)
+        self.frontend = FrontEnd(camera, config.frontend, frustum_network=frustum_network, lane_head=lane_head)
         self.graph = PoseGraph(config.graph, config.weights)
 
     def step(self, frame: Frame) -> tuple[Measurements, Estimate]:

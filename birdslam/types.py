@@ -58,6 +58,7 @@ class Status(enum.StrEnum):
     DETECTIONS_CARRIED = "detections_carried"  # the detector did not run on this frame
     SEGMENTATION_CARRIED = "segmentation_carried"  # the segmenter did not run on this frame
     DEPTH_CARRIED = "depth_carried"  # the depth network did not run on this frame
+    LANES_CARRIED = "lanes_carried"  # lanes were due to be made out, but their last run is not done yet
     NETWORK_FAILED = "network_failed"  # a network gave no usable numbers on this frame
     INPUT_STALE = "input_stale"  # the record in front of this one came later than it should
     DEGRADED_RATE = "degraded_rate"  # short of time: the networks run on fewer frames
@@ -200,8 +201,14 @@ class MotionEdge(msgspec.Struct, frozen=True, kw_only=True):
         _check_cov(self, "cov")
 
 
+LANE_LANDMARKS = 1 << 48  # landmarks from this number on are stations of lanes, those below it corners of the road
+
+
 class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """CP: a static point of the road seen from the ego (camera-point edge, Eq. 3), back-projected by Eq. 1."""
+    """CP: a static point of the road seen from the ego (camera-point edge, Eq. 3), back-projected by Eq. 1.
+
+    From LANE_LANDMARKS on it is where a lane crosses a fixed line of the world: sure across the lane alone.
+    """
 
     landmark: BodyId
     frame: FrameId
@@ -374,7 +381,10 @@ class MapSnapshot(msgspec.Struct, frozen=True, kw_only=True):
     landmarks_m: tuple[tuple[float, float], ...] = ()  # road points
     lanes_m: tuple[tuple[float, float], ...] = ()  # points of lane lines
     cell_m: float = 0.25  # the side of a cell near the car; far back they are larger
+    lane_ids: tuple[int, ...] = ()  # the lane of each of `lanes_m`, -1: of none; empty: of none at all
 
     def __post_init__(self) -> None:
+        if len(self.lane_ids) not in (0, len(self.lanes_m)):
+            raise ValueError(f"lane_ids has {len(self.lane_ids)} entries for {len(self.lanes_m)} points of lanes_m")
         _check_finite(self, "cell_m")
         _check_points(self, *self.landmarks_m, *self.lanes_m)

@@ -8,16 +8,17 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec.structs import replace
 
-from birdslam.types import Cov2, Cov3, Measurements
+from birdslam.types import LANE_LANDMARKS, Cov2, Cov3, Measurements
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-EdgeType = Literal["cc", "cp", "cv", "vv"]
+EdgeType = Literal["cc", "cp", "cv", "vv", "lanes"]
 
 
 class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`measured`: each edge keeps its own covariance; `paper`: an edge's information is `lambda` times the unit matrix.
 
-    `leave_out` names the edge types that do not enter the graph (the ablations of Table 3). None is the mode's own
+    `leave_out` names the edge types that do not enter the graph (the ablations of Table 3); "lanes" are the CP edges of
+    lanes, "cp" all. None is the mode's own
     choice: the paper leaves out nothing; `measured` leaves out VV, which the tracker predicts from the very detections
     that the CV edges carry, since the graph has a constant-velocity factor of its own.
     """
@@ -54,6 +55,8 @@ def weighted(measurements: Measurements, config: WeightsConfig) -> Measurements:
     out = config.left_out
     threshold_m = config.depth_threshold_m
     cp = () if "cp" in out else measurements.cp
+    if "lanes" in out and cp:
+        cp = tuple([edge for edge in cp if edge.landmark < LANE_LANDMARKS])
     if threshold_m is not None and cp:
         cp = tuple([edge for edge in cp if edge.x_m <= threshold_m])
     cv = () if "cv" in out else measurements.cv

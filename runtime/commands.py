@@ -33,7 +33,15 @@ from runtime import (
 from runtime.bus import BusError
 from runtime.cli import USER_ERROR_STATUS
 from runtime.client import Planner
-from runtime.configuration import FILE_SCHEMES, NO_MODEL, Configuration, ConfigurationError, load, parse_setting
+from runtime.configuration import (
+    FILE_SCHEMES,
+    NO_MODEL,
+    Configuration,
+    ConfigurationError,
+    complete,
+    load,
+    parse_setting,
+)
 from runtime.download import DownloadError
 from runtime.inference import Inference
 from runtime.presence import VehicleBusy
@@ -186,15 +194,16 @@ def _pipeline(configuration: Configuration) -> Iterator[Drive]:
     with contextlib.ExitStack() as stack:
 
         def drive(recording: Recording) -> Iterator[Measurements | Estimate | MapUpdate]:
-            inference = stack.enter_context(Inference(configuration))
+            source = RecordedSource(recording, configuration.source)
+            inference = stack.enter_context(Inference(complete(configuration, recording.camera, source.rate_hz)))
             slam = BirdSLAM(
                 recording.camera,
                 inference.networks,
                 configuration.slam,
                 frustum_network=inference.frustum_network,
-                complete=inference.completion,
+                lane_head=inference.lane_head,
             )
-            for frame in offline_frames(RecordedSource(recording, configuration.source)):
+            for frame in offline_frames(source):
                 yield from slam.step(frame)
                 gained = slam.map_update()
                 if gained is not None:

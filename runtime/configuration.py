@@ -22,6 +22,7 @@ from birdslam.perception import ModelError, ModelSpec
 from birdslam.perception.manifest import SHIPPED_NETWORKS, Role
 from birdslam.slam import SlamConfig
 from runtime import model_store
+from runtime.schedule import ScheduleConfig
 
 NO_MODEL = "none"  # as --model: no network but those that are named beside it, not the shipped one either
 _USER = re.compile(r"(?<=://)[^/@]*@|(?<=rtsp:)[^/@]*@")
@@ -81,6 +82,7 @@ class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     deadline_ms: Positive | None = None  # None: by the frame rate
     deadline_periods: Positive = 0.75  # of the source's frames; the rest is for what comes after the networks
     opencv_threads: PositiveInt = 2
+    schedule: ScheduleConfig = ScheduleConfig()
 
 
 class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -283,10 +285,14 @@ def load(path: Path | None, overrides: Mapping[str, Any] | None = None, models: 
 
 
 def complete(configuration: Configuration, camera: Camera, rate_hz: float) -> Configuration:
-    """The configuration with what its source knows: the camera, and how long a frame may wait at that frame rate."""
+    """The configuration with what its source knows: the camera, and what comes of its frame rate.
+
+    That is how long a frame may wait, and on which frames each head runs.
+    """
     rate, perceive = configuration.source.rate, configuration.perceive
+    hz = rate if isinstance(rate, float) else rate_hz
+    perceive = msgspec.structs.replace(perceive, schedule=perceive.schedule.at(hz))
     if perceive.deadline_ms is None:
-        hz = rate if isinstance(rate, float) else rate_hz
         deadline_ms = min(perceive.deadline_periods * 1e3 / hz, configuration.budgets.perceived_ms)
         perceive = msgspec.structs.replace(perceive, deadline_ms=deadline_ms)
     return msgspec.structs.replace(configuration, camera=camera, perceive=perceive)

@@ -20,6 +20,7 @@ def map_parts(snapshot: MapSnapshot) -> list[MapSnapshot]:
             snapshot,
             landmarks_m=snapshot.landmarks_m[start : start + PART_POINTS // 2],
             lanes_m=snapshot.lanes_m[start : start + PART_POINTS // 2],
+            lane_ids=snapshot.lane_ids[start : start + PART_POINTS // 2],
         )
         for start in starts
     ]
@@ -31,6 +32,7 @@ def whole_map(parts: Sequence[MapSnapshot]) -> MapSnapshot:
         parts[-1],
         landmarks_m=tuple(point for part in parts for point in part.landmarks_m),
         lanes_m=tuple(point for part in parts for point in part.lanes_m),
+        lane_ids=tuple(lane for part in parts for lane in part.lane_ids),
     )
 
 

@@ -196,3 +196,33 @@ def test_full_records_stay_under_a_mebibyte() -> None:
     assert isinstance(points, MapSnapshot)
     assert len(points.lanes_m) > 2 * config.map_cells
     assert max(len(msgspec.msgpack.encode(record)) for record in (way, points)) < 2**20
+
+
+def test_lane_points_keep_the_newest_id_of_their_cell() -> None:
+    atlas = Atlas(SMALL)
+    side_m = SMALL.map_cell_m
+    first = MapUpdate(
+        epoch=0,
+        frame_id=0,
+        lanes_m=((0.1 * side_m, 0.0), (5.5 * side_m, 0.0), (9.5 * side_m, 0.0)),
+        lane_ids=(3, 4, -1),
+    )
+    again = MapUpdate(epoch=0, frame_id=1, lanes_m=((0.2 * side_m, 0.0), (5.6 * side_m, 0.0)), lane_ids=(7, -1))
+    atlas.add(at(0, SE2()), first)
+    atlas.add(at(1, SE2()), again)
+    chart = atlas.map()
+    assert chart is not None
+    assert {round(x / side_m - 0.5): lane for (x, _), lane in zip(chart.lanes_m, chart.lane_ids, strict=True)} == {
+        0: 7,  # seen again under another id
+        5: 4,  # seen again, of no lane that is known: it stays
+        9: -1,
+    }
+
+
+def test_a_map_without_lanes_that_have_ids_says_none() -> None:
+    atlas = Atlas(SMALL)
+    atlas.add(at(0, SE2()), MapUpdate(epoch=0, frame_id=0, lanes_m=((0.0, 0.0),)))
+    chart = atlas.map()
+    assert chart is not None
+    assert len(chart.lanes_m) == 1
+    assert chart.lane_ids == ()

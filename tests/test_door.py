@@ -137,13 +137,14 @@ def encode_all(parts: Any) -> list[bytes]:
 points = st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)), max_size=30)
 
 
-@given(st.integers(0, 4500), st.integers(0, 2500))
-def test_a_map_is_whole_again(landmarks: int, lanes: int) -> None:
+@given(st.integers(0, 4500), st.integers(0, 2500), st.booleans())
+def test_a_map_is_whole_again(landmarks: int, lanes: int, named: bool) -> None:
     chart = MapSnapshot(
         epoch=1,
         frame_id=2,
         landmarks_m=tuple((float(k), 0.1) for k in range(landmarks)),
         lanes_m=tuple((float(k), 0.2) for k in range(lanes)),
+        lane_ids=tuple(range(lanes)) if named else (),
     )
     parts = map_parts(chart)
     assert whole_map(parts) == chart

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from birdslam import bev
 from birdslam.camera import Camera
+from birdslam.lane_ids import LaneCloud
 from birdslam.lanes import (
     BOUNDARY,
     ROAD,
@@ -16,7 +17,6 @@ from birdslam.lanes import (
     Completion,
     Floats,
     Grids,
-    LaneCloud,
     LanesConfig,
     cell_centres_m,
     count_cells,

@@ -148,7 +148,14 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         coasted=4,
         outrun=1,
     ),
-    MapSnapshot(epoch=2, frame_id=7, landmarks_m=((1.5, -2.25),), lanes_m=((3.0, 0.5), (4.0, 0.5)), cell_m=0.5),
+    MapSnapshot(
+        epoch=2,
+        frame_id=7,
+        landmarks_m=((1.5, -2.25),),
+        lanes_m=((3.0, 0.5), (4.0, 0.5)),
+        cell_m=0.5,
+        lane_ids=(12, -1),
+    ),
     Trajectory(
         epoch=2,
         frame_id=7,
