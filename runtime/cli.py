@@ -22,6 +22,11 @@ from runtime import (
 ENVIRONMENT = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
     "ORT_DISABLE_TELEMETRY": "1",  # onnxruntime's wheels come with it on
+    # glibc: what a frame's images leave is for those of the next, in place of going back to the kernel, which hands out
+    # each page anew with a fault (docs/realtime.md)
+    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),  # the most that it takes
+    "MALLOC_TRIM_THRESHOLD_": str(1 << 32),
+    "MALLOC_TOP_PAD_": str(16 << 20),
 }
 USER_ERROR_STATUS = 2  # of the program and of a node: what the user gave can't be used
 INTERRUPTED_STATUS = 130

@@ -126,10 +126,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def examine(options: argparse.Namespace) -> int:
-    """`birdslam doctor`: a row for each check; 1 where one has failed."""
+    """`birdslam doctor`: a row for each check; 1 where one is an error."""
     findings = list(doctor.examine(configuration_of(options)))
     print(doctor.table(findings))
-    return int(any(finding.verdict == "failed" for finding in findings))
+    return int(any(finding.verdict == "error" for finding in findings))
 
 
 def describe_interface(options: argparse.Namespace) -> int:
