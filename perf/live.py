@@ -27,6 +27,7 @@ from runtime.topology import NODES
 
 START_S, END_S = 90.0, 120.0  # the shipped drive is graded and filmed at its end
 _SAMPLE_S = 1.0
+_PSS_EVERY = 8  # samples
 _VEHICLE = "perf"
 
 
@@ -66,6 +67,7 @@ class Sample:
     t_s: float
     cpu_s: dict[str, float]  # process -> processor time so far
     rss_mb: dict[str, float]
+    pss_mb: dict[str, float] = field(default_factory=dict)  # pages shared with others by their part; now and then
 
 
 @dataclass
@@ -128,7 +130,7 @@ def _receive(run: Run, process: subprocess.Popen[bytes]) -> bool:
                 run.messages.append(message)
             now_s = time.monotonic()
             if run.messages and now_s - sample_s >= _SAMPLE_S:
-                run.samples.append(_sample(process.pid, now_s))
+                run.samples.append(_sample(process.pid, now_s, len(run.samples) % _PSS_EVERY == _PSS_EVERY - 1))
                 sample_s = now_s
     return False
 
@@ -160,15 +162,17 @@ def _named(pid: int) -> dict[str, psutil.Process]:
     return found
 
 
-def _sample(pid: int, now_s: float) -> Sample:
-    cpu_s, rss_mb = {}, {}
+def _sample(pid: int, now_s: float, with_pss: bool) -> Sample:
+    sample = Sample(now_s, {}, {})
     with contextlib.suppress(psutil.NoSuchProcess):
         for name, process in _named(pid).items():
             with contextlib.suppress(psutil.NoSuchProcess), process.oneshot():
                 times = process.cpu_times()
-                cpu_s[name] = times.user + times.system
-                rss_mb[name] = process.memory_info().rss / 2**20
-    return Sample(now_s, cpu_s, rss_mb)
+                sample.cpu_s[name] = times.user + times.system
+                sample.rss_mb[name] = process.memory_info().rss / 2**20
+                if with_pss:  # the kernel walks all pages for it
+                    sample.pss_mb[name] = process.memory_full_info().pss / 2**20
+    return sample
 
 
 @contextlib.contextmanager

@@ -96,7 +96,7 @@ def _system(benchmarks: Benchmarks) -> Iterator[str]:
     runs = {name: run for name, run in benchmarks.items() if "age_ms" in run}
     if not runs:
         return
-    titles = ("run", "rate Hz", "dropped", "cores", "MB", "age p50", "p99", "p99.9", "max", "steal %")
+    titles = ("run", "rate Hz", "dropped", "cores", "MB", "MB shared once", "age p50", "p99", "p99.9", "max", "steal %")
     yield from table(
         titles,
         (
@@ -106,6 +106,7 @@ def _system(benchmarks: Benchmarks) -> Iterator[str]:
                 f"{run['dropped']} of {run['frames']}",
                 run["cpu_cores"],
                 run["rss_mb"],
+                run.get("pss_mb"),
                 *_percentiles(run["age_ms"]),
                 run["steal_during_percent"],
             ]
@@ -128,7 +129,10 @@ def _system(benchmarks: Benchmarks) -> Iterator[str]:
         f"{name}: " + ", ".join(f"{process} {cores:.2f}" for process, cores in run["cpu_cores_by"].items())
         for name, run in runs.items()
     )
-    yield "\nMemory counts every process at its most, spares and shared pages included."
+    yield (
+        "\nMB is every process at its most, spares included, with the pages that it shares with others; MB shared once "
+        "counts those once (PSS)."
+    )
 
 
 def _vehicles(benchmarks: Benchmarks) -> Iterator[str]:

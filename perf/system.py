@@ -97,6 +97,7 @@ def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
         "cpu_cores_by": {name: round(float(np.mean(values)), 3) for name, values in cpu.items() if len(values)},
         "rss_mb": round(sum(rss_mb.values()), 1),
         "rss_mb_by": {name: round(value, 1) for name, value in rss_mb.items()},
+        "pss_mb": round(max((sum(sample.pss_mb.values()) for sample in result.samples), default=0.0), 1) or None,
         "age_ms": spread(age_ms) | {"mean": _mean(age_ms)},
         "period_ms": spread(periods_ms),
         "start_late_ms": spread(lateness(result.messages, result.rate_hz)),
@@ -120,8 +121,15 @@ def age_of(message: Message) -> float:
 
 
 def parts(message: Message) -> Iterator[tuple[str, float]]:
-    """(name, ms) of what an estimate's age is made of; they add up to it."""
+    """(name, ms) of what an estimate's age is made of; they add up to it.
+
+    Measurements that come after their frame was given up correct the newest coasted one: that estimate bears their
+    trace, which began before its own frame was captured.
+    """
     first = message.trace.stages[0]
+    if first.received_ns < message.record.t_capture_ns:
+        yield "told again", age_of(message)
+        return
     yield f"due -> {first.node}", (first.received_ns - message.record.t_capture_ns) / 1e6
     yield from stages(message.trace, message.t_received_ns)
 
@@ -204,7 +212,7 @@ def table(content: dict[str, Any]) -> str:
         f"{'rate':32}{content['rate_hz']:.2f} Hz",
         f"{'dropped':32}{content['dropped']} of {content['frames']} frames, {content['coasted']} coasted",
         f"{'cores':32}{content['cpu_cores']:.2f} ({cpu})",
-        f"{'memory':32}{content['rss_mb']:.0f} MB",
+        f"{'memory':32}{content['rss_mb']:.0f} MB, {content['pss_mb'] or 0:.0f} MB with shared pages counted once",
         f"{'steal':32}{content['steal_during_percent']:.2f} %",
         f"{'age at the planner':32}{shown(content['age_ms'], 'ms')}  mean {content['age_ms']['mean']:.2f}",
     ]

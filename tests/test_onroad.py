@@ -21,22 +21,30 @@ BUDGET_FACTOR = 1.5  # over the configuration's
 DROPPED_SHARE = 0.02
 PERIODS = 3.0  # between two estimates at the planner, at p99
 CORES = 2.5  # issue 7
-MEMORY_MB = 1024.0  # issue 7; without the spares, which are a second system in waiting
+MEMORY_MB = 1024.0  # issue 7; the nodes at work, and all there is with the pages that they share counted once
+
+
+@pytest.mark.onroad
+def test_the_shipped_drive_keeps_its_budgets(capsys: pytest.CaptureFixture[str]) -> None:
+    _hold(Ask(source="demo", rate=33.0, seconds=SECONDS + WARM_UP_S), capsys)
 
 
 @pytest.mark.onroad
 @pytest.mark.parametrize("rate_hz", [10.0, 33.0])
-def test_the_running_system_keeps_its_budgets(
+def test_a_real_sequence_keeps_its_budgets(
     data_dir: Path, models_dir: Path, rate_hz: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
     models = tuple(option.removeprefix("--model=") for option in model_options(models_dir))
     source = f"kitti:{data_dir / 'kitti_odometry' / 'sequences' / '00'}"
-    ask = Ask(source=source, rate=rate_hz, seconds=SECONDS + WARM_UP_S, models=models)
-    steal = Steal()
+    _hold(Ask(source=source, rate=rate_hz, seconds=SECONDS + WARM_UP_S, models=models), capsys)
+
+
+def _hold(ask: Ask, capsys: pytest.CaptureFixture[str]) -> None:
+    steal, rate_hz = Steal(), ask.rate
     with drive(ask) as run:
         found = figures(run, WARM_UP_S) | {"steal_during_percent": steal.percent()}
     with capsys.disabled():
-        print(f"\n{rate_hz:g} Hz\n{table(found)}")
+        print(f"\n{ask.source}, {rate_hz:g} Hz\n{table(found)}")
     memory_mb = sum(mb for name, mb in found["rss_mb_by"].items() if not name.endswith("spare"))
     broken = [
         f"{row['budget']}: {row['measured_ms']} ms of {row['limit_ms']:g}"
@@ -49,6 +57,7 @@ def test_the_running_system_keeps_its_budgets(
         "drops": found["dropped"] <= DROPPED_SHARE * found["frames"],
         "cores": found["cpu_cores"] <= min(CORES, os.cpu_count() or 1),
         "memory": memory_mb <= MEMORY_MB,
+        "memory with spares, shared pages once": found["pss_mb"] <= MEMORY_MB,
         "restarts": not any(found["restarts"].values()),
         f"budgets ({', '.join(broken)})": not broken,
     }

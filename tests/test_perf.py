@@ -196,6 +196,13 @@ def test_a_coasted_estimate_has_other_parts_and_they_add_up_too() -> None:
     }
 
 
+def test_an_estimate_that_is_told_again_is_of_no_stage() -> None:
+    message = _message(5)
+    newer = msgspec.structs.replace(message.record, t_capture_ns=message.record.t_capture_ns + 4 * MS)
+    again = Message(newer, message.trace, message.t_received_ns)
+    assert dict(system.parts(again)) == {"told again": pytest.approx(system.age_of(again))}
+
+
 def test_lateness_is_against_the_frame_that_kept_the_pace_best() -> None:
     messages = [_message(frame) for frame in range(5)]
     late = msgspec.structs.replace(messages[3].record, t_capture_ns=messages[3].record.t_capture_ns + 4 * MS)
