@@ -53,33 +53,42 @@ def claim_directory(directory: Path) -> None:
 
 
 class Thinned:
-    """Rows of numbers, at most `keep` of them: past that, every second one goes, and every second one to come."""
+    """Rows of numbers, at most `keep` of them: past that, every second one goes, and every second one to come.
 
-    def __init__(self, width: int, keep: int) -> None:
-        self._width, self._keep = width, keep
-        self._rows: list[tuple[float, ...]] = []
+    Room for `begin` rows is there from the start (None: for all), and doubles where that is not enough.
+    """
+
+    def __init__(self, width: int, keep: int, begin: int | None = None) -> None:
+        self._keep = keep
+        self._rows = np.full((keep if begin is None else min(begin, keep), width), np.nan)  # written to: it is there
+        self._kept = 0
         self._step = 1
         self._seen = 0
 
     def add(self, *row: float) -> None:
         """Keep this row, or pass over it."""
         if self._seen % self._step == 0:
-            if len(self._rows) >= self._keep:
-                del self._rows[1::2]
+            if self._kept >= self._keep:
+                left = self._rows[: self._kept : 2].copy()
+                self._rows[: len(left)], self._kept = left, len(left)
                 self._step *= 2
             if self._seen % self._step == 0:
-                self._rows.append(row)
+                if self._kept == len(self._rows):
+                    more = np.full((min(2 * self._kept, self._keep) - self._kept, self._rows.shape[1]), np.nan)
+                    self._rows = np.concatenate([self._rows, more])
+                self._rows[self._kept] = row
+                self._kept += 1
         self._seen += 1
 
     def array(self) -> NDArray[np.float64]:
         """(N, width) of the rows kept."""
-        return np.array(self._rows, dtype=np.float64).reshape(-1, self._width)
+        return self._rows[: self._kept].copy()
 
 
 class _KeptTrack:
     def __init__(self) -> None:
-        self.poses = Thinned(3, KEPT_TRACK_POSES)
-        self.speeds = Thinned(1, KEPT_TRACK_POSES)
+        self.poses = Thinned(3, KEPT_TRACK_POSES, begin=16)
+        self.speeds = Thinned(1, KEPT_TRACK_POSES, begin=16)
         self.described = ""
         self.last: VehicleEstimate | None = None
         self.T_picture_vehicle = SE2()

@@ -23,7 +23,7 @@ import psutil
 from birdslam.types import Estimate
 from perf.street import F_PX, FRAME_M, HEIGHT_M, HEIGHT_PX, WIDTH_PX, street_loop
 from runtime.client import Planner
-from runtime.topology import NODES
+from runtime.topology import NODES, PROCESSES, RECORDER
 
 ROOT = Path(__file__).resolve().parent.parent
 RATE_HZ = 15.0
@@ -31,45 +31,57 @@ SETTLE_S, PATIENCE_S = 2.5, 20.0
 
 
 class Vehicle:
-    """`birdslam run` with the faulty camera, and a planner; a context manager."""
+    """`birdslam run` with the faulty camera, and a planner; a context manager.
+
+    `source` takes the camera's place: a recording, round and round.
+    """
 
     vehicle = "faults"
 
-    def __init__(self, place: Path, *options: str, rate_hz: float = RATE_HZ) -> None:
+    def __init__(self, place: Path, *options: str, rate_hz: float = RATE_HZ, source: str = "") -> None:
         self.place, self.runtime_dir, self.output = place, place / "rt", place / "out"
+        self.rate_hz, self.period_ns = rate_hz, round(1e9 / rate_hz)
         self.camera = place / "camera"
+        self._options = options
+        self._input = ("--source", source, "--rate", f"{rate_hz:g}", "--set", "source.loop=true")
+        self._environment = {**os.environ}
+        if not source:
+            self._make_camera()
+            camera_file = f"camera={place / 'camera.toml'}"
+            self._input = ("--source", f"v4l2:{self.camera}", "--model", "none", "--set", camera_file)
+        self.start()
+
+    def _make_camera(self) -> None:
+        """It takes the place of OpenCV's in every process of the vehicle."""
+        path = os.pathsep.join([str(ROOT / "perf" / "faulty_camera"), str(ROOT), os.environ.get("PYTHONPATH", "")])
+        self._environment |= {"PYTHONPATH": path, "FAULTY_CAMERA": str(self.camera)}
         self.camera.mkdir(exist_ok=True)
         np.save(self.camera / "frames.npy", street_loop())
-        (self.camera / "rate_hz").write_text(f"{rate_hz}")
-        self.rate_hz, self.period_ns = rate_hz, round(1e9 / rate_hz)
+        (self.camera / "rate_hz").write_text(f"{self.rate_hz}")
         self.fault("")
-        (place / "camera.toml").write_text(
+        (self.place / "camera.toml").write_text(
             f"width_px = {WIDTH_PX}\nheight_px = {HEIGHT_PX}\nfx_px = {F_PX}\nfy_px = {F_PX}\n"
             f"cx_px = {WIDTH_PX / 2}\ncy_px = {HEIGHT_PX / 2}\nheight_m = {HEIGHT_M}\n"
         )
-        self._options = options
-        self.start()
 
     def start(self) -> None:
         """Starts the system; again, where it was killed."""
-        path = os.pathsep.join([str(ROOT / "perf" / "faulty_camera"), str(ROOT), os.environ.get("PYTHONPATH", "")])
         settings = {
             "runtime.runtime_dir": self.runtime_dir,
             "runtime.restarts_max": 1000,
             "runtime.watchdog_ms": 1000,
-            "camera": self.place / "camera.toml",
         }
         with (self.place / "run.log").open("ab") as log:
             self.process = subprocess.Popen(
                 [
-                    *(sys.executable, "-P", "-m", "runtime.cli", "run", "--source", f"v4l2:{self.camera}"),
-                    *("--vehicle", self.vehicle, "--output", str(self.output), "--model", "none"),
+                    *(sys.executable, "-P", "-m", "runtime.cli", "run", *self._input),
+                    *("--vehicle", self.vehicle, "--output", str(self.output)),
                     *(part for key, value in settings.items() for part in ("--set", f"{key}={value}")),
                     *self._options,
                 ],
                 stdout=log,
                 stderr=log,
-                env={**os.environ, "PYTHONPATH": path, "FAULTY_CAMERA": str(self.camera)},
+                env=self._environment,
                 start_new_session=True,
             )
 
@@ -92,7 +104,17 @@ class Vehicle:
 
     def spares(self) -> int:
         """Processes that stand by."""
-        return len(psutil.Process(self.process.pid).children()) - len(NODES)
+        children = psutil.Process(self.process.pid).children()
+        return sum(not _is_node(child, RECORDER.name) for child in children) - len(NODES)
+
+    def processes(self) -> dict[str, psutil.Process]:
+        """All of them by name: the supervisor, the nodes, the spare of each, and the recorder where there is one."""
+        found = {"supervisor": psutil.Process(self.process.pid)}
+        for child in sorted(found["supervisor"].children(), key=lambda child: (child.create_time(), child.pid)):
+            for name in PROCESSES:
+                if _is_node(child, name):
+                    found[f"{name} spare" if name in found else name] = child
+        return found
 
     def __enter__(self) -> Self:
         self.planner = Planner(self.vehicle, self.runtime_dir)

@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from perf.figures import Ledger
@@ -23,6 +24,7 @@ from perf.machine import Steal
 from runtime.recording import Recording
 from runtime.replay import compare
 from runtime.report_replay import told
+from runtime.wire import Health
 
 label = "a recorded drive and its replay, bit for bit, and what recording costs"
 
@@ -56,6 +58,7 @@ def run(arguments: list[str]) -> int:
             frames=summary["frames_processed"],
             dropped_by_nodes=summary["frames_dropped"],
             recording=summary["recording"],
+            recorder=_recorder(recording),
             mb_a_minute=file.stat().st_size / 1e6 / options.minutes,
             equal=verdict.equal,
             coasted=verdict.coasted,
@@ -69,6 +72,7 @@ def run(arguments: list[str]) -> int:
         )
         print(f"frames: {summary['frames_processed']} processed, {summary['frames_dropped']} dropped by the nodes")
         print(f"recording: {file.stat().st_size / 1e6:.1f} MB, {summary['recording']}")
+        print("recorder: {cpu_percent:.1f} % of a core at the median, {rss_mb:.0f} MB".format(**_recorder(recording)))
         print(told(verdict, recording))
         print(f"replayed in {replay_s:.1f} s, {options.minutes * 60.0 / replay_s:.0f} times as fast as it was driven")
         whole = recording.complete and not summary["recording"]["dropped"] and not verdict.unknown
@@ -102,6 +106,17 @@ def _cost(options: argparse.Namespace, place: Path) -> dict[str, Any]:
     return {
         name: {f"p{percent}": round(float(np.percentile(values, percent)), 2) for percent in (50, 99)}
         for name, values in ages.items()
+    }
+
+
+def _recorder(recording: Recording) -> dict[str, float]:
+    """What its process took, by what it says of itself once a second."""
+    said = [msgspec.json.decode(message.data, type=Health) for message in recording.messages(("/health/record",))]
+    if not said:
+        return {"cpu_percent": float("nan"), "rss_mb": float("nan")}
+    return {
+        "cpu_percent": float(np.median([health.cpu_percent for health in said])),
+        "rss_mb": max(health.rss_bytes for health in said) / 2**20,
     }
 
 

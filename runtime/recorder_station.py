@@ -10,6 +10,7 @@ import select
 import signal
 import time
 from collections import Counter
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ def choose_file(config: RecordingConfig, vehicle: str) -> str:
     """
     path = Path(config.file)
     if path.is_dir():
-        path /= f"{vehicle}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}{SUFFIX}"
+        path /= f"{vehicle}-{datetime.now(UTC):%Y%m%dT%H%M%S%fZ}{SUFFIX}"  # a service may be started twice in a second
     if path.suffix != SUFFIX:
         raise ConfigurationError(f"recording.file: {path}: expected FILE{SUFFIX} or a directory")
     if path.exists():

@@ -23,6 +23,7 @@ import msgspec
 from birdslam.perception import load_network
 from birdslam.perception.pointnet import load_pointnet
 from birdslam.results import Recorder, claim_directory
+from runtime import realtime
 from runtime.bus import Bus
 from runtime.cli import INTERRUPTED_STATUS, USER_ERROR_STATUS
 from runtime.configuration import Configuration, ConfigurationError, complete
@@ -44,12 +45,14 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 WITHOUT_MODELS = "no networks: odometry only, without vehicles and lanes"
 CHECK_S = 0.1  # watchdogs are looked after at least so often
 WARNINGS_SHOWN = 5  # at a time; the log has all of them
+DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come to in a long drive among lane lines
 
 
 def run(configuration: Configuration) -> int:
     """A whole run; gives the exit status. Raises what a user has to mend before anything is started."""
     configuration, models = check(configuration)
     output = Path(configuration.output)
+    realtime.reserve(*DRIVE_MIB)
     live = LiveLine(sys.stdout)
     with ExitStack() as stack:
         stack.enter_context(VehicleLock(configuration.vehicle, configuration.runtime_dir))

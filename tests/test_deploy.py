@@ -116,6 +116,8 @@ uri = "kitti:/srv/drive"
 loop = true
 [runtime]
 stop_timeout_s = 8.0
+[recording]
+file = "/var/lib/birdslam/recordings"
 """
 
 
@@ -281,6 +283,14 @@ def test_install_start_break_and_remove(machine: Machine) -> None:
     assert summary["ended"] == "SIGTERM"
     assert machine("find", "/var/cache/birdslam", "-name", "onnxruntime.db") == ""  # its telemetry
     assert summary["frames_processed"] > 0
+
+    # Each start has its recording, also those that were killed; the last one is whole, and replays.
+    recordings = machine("find", "/var/lib/birdslam/recordings", "-name", "car-*.mcap").split()
+    assert len(recordings) == len(set(recordings)) >= 4
+    assert summary["recording"]["complete"]
+    assert summary["recording"]["files"] == [max(recordings)]
+    for recording in recordings:
+        machine("/opt/birdslam/current/bin/birdslam", "replay", recording, user="birdslam")
     assert machine("ls", "-A", "/run/birdslam", "/dev/shm", check=False).split() in ([], ["/dev/shm:"])
 
     # Removed: the configuration stays, until it is purged.

@@ -306,3 +306,30 @@ def test_a_frame_s_images_cost_no_page_of_the_kernel() -> None:
     ]
     assert faults[0] > 100
     assert faults[1] < 5
+
+
+_RESERVED = """
+import resource, sys, threading
+from runtime import realtime
+if sys.argv[1] == "reserved":
+    realtime.reserve(12.0, 4.0)
+def drive():
+    global faults, kept
+    before = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
+    kept = {number: (0.5 * number, 1.5 * number) for number in range(40_000)}
+    faults = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt - before
+thread = threading.Thread(target=drive)
+thread.start()
+thread.join()
+print(faults)
+"""
+
+
+def test_what_a_drive_fills_can_be_reserved() -> None:
+    """Some 8 MiB of objects and a table of 2, made by a thread after the start."""
+    plain, reserved = (
+        int(subprocess.run([sys.executable, "-c", _RESERVED, how], capture_output=True, check=True).stdout)
+        for how in ("plain", "reserved")
+    )
+    assert plain > 1000
+    assert reserved < plain / 4
