@@ -48,6 +48,8 @@ class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     bounce_m: Positive = 3.0  # for so long a bounce of the car lasts
     sigma_bounce_rad: Positive = 0.012
     sigma_fit_rad: Positive = 0.004  # of one comparison of the road: it is no perfect plane
+    sigma_length_rel: Positive = 0.02  # of the running scale
+    sigma_curvature_per_m: Positive = 0.0006  # of roads along the way
     sigma_road_rad: Positive = 0.002  # of their mean: crown and grade of the way driven
     straight_rad_per_m: Positive = 0.005
     sigma_direction_rad: Positive = 0.012  # of the direction of travel over one metre
@@ -208,9 +210,13 @@ def _by_road(seen: _Seen, config: CalibrationConfig) -> Witness | None:
     """The mean of the comparisons of the road; those of one bounce of the car are one sample."""
     if len(seen.fits) < config.min_fits:
         return None
-    tilt = np.array([fit.state[1:] for fit, _ in seen.fits])
-    # Each knows the tilt together with the length of its step, which the running scale knows better than it does
-    noise = np.array([np.linalg.inv(np.linalg.inv(fit.cov)[1:, 1:]) for fit, _ in seen.fits])
+    # Each knows the tilt together with the length of its step, which the running scale knows better than it does, and
+    # with the road's curvature, which is little in the mean.
+    known = np.diag([config.sigma_length_rel**-2, 0.0, 0.0, config.sigma_curvature_per_m**-2])
+    own = np.linalg.inv([fit.cov for fit, _ in seen.fits])
+    cov = np.linalg.inv(own + known)
+    tilt = np.einsum("nij,njk,nk->ni", cov, own, [fit.state for fit, _ in seen.fits])[:, 1:3]
+    noise = cov[:, 1:3, 1:3]
     noise = noise + np.eye(2) * (config.sigma_fit_rad**2 + config.sigma_bounce_rad**2)
     share = np.array([min(1.0, way_m / config.bounce_m) for _, way_m in seen.fits])
     info = np.linalg.inv(noise) * share[:, None, None]
@@ -221,8 +227,8 @@ def _by_road(seen: _Seen, config: CalibrationConfig) -> Witness | None:
         mean = np.linalg.solve(total, np.einsum("n,nij,nj->i", weights, info, tilt))
         away = np.sqrt(np.einsum("ni,nij,nj->n", tilt - mean, np.linalg.inv(noise), tilt - mean))
         weights = 1.0 / np.maximum(1.0, away / 1.5)  # Huber
-    cov = np.linalg.inv(total) + np.eye(2) * config.sigma_road_rad**2
-    return _witness("road", mean, cov, len(tilt))
+    of_mean = np.linalg.inv(total) + np.eye(2) * config.sigma_road_rad**2
+    return _witness("road", mean, of_mean, len(tilt))
 
 
 def _by_travel(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness | None:

@@ -23,7 +23,8 @@ from birdslam.features import FeatureConfig, FeatureTracker, Tracks
 from birdslam.motion import Motion, MotionConfig, coasting_cov, measured_cov, planar, standing_cov
 from birdslam.pose import Pose, rotation_exp, rotation_log
 from birdslam.roadalign import RoadFit
-from birdslam.roadscale import MetricScale, RoadScaleConfig
+from birdslam.roadfilter import RoadScaleConfig
+from birdslam.roadscale import MetricScale
 from birdslam.se2 import SE2
 from birdslam.types import Status
 
@@ -49,7 +50,7 @@ class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # the window
     key_images: Annotated[int, msgspec.Meta(ge=3)] = 8
     held_images: Count = 2  # the oldest of them, which the adjustment leaves alone: they carry the unit of length
-    adjusted_landmarks: Count = 160
+    adjusted_landmarks: Count = 400
     adjust_iterations: Count = 1  # each image adjusts again what the one before left
     key_parallax_px: Positive = 8.0  # a new key image when the median landmark has moved so far, rotation taken out
     key_distance_m: Positive = 0.7

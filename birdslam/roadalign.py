@@ -4,6 +4,10 @@ Points followed on the road by optical flow give a length that is always short: 
 change of perspective there. So the earlier image is warped by the homography of the road plane,
 K (R + lambda t n(pitch, roll)^T / H) K^-1, against the present one, over the length's factor lambda, the pitch and the
 roll together: in one pair of images the three are correlated, and a wrong pitch biases the length by several per cent.
+
+So does a plane where the road bends: over a crest of 1000 m radius it lies 0.2 m below its tangent 20 m ahead, which a
+camera 1.65 m above it takes for 12 % of the distance. The road is therefore a parabola along the direction of travel,
+s^2 / 2 times `curvature` (1/m, > 0 in a sag) above the plane that touches it at the camera's foot; the tilt is of that.
 """
 
 from __future__ import annotations
@@ -26,7 +30,12 @@ Bools = NDArray[np.bool_]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 _MARGIN_PX = 4  # from the image's edge, for the warp and the smoothing
-_PLANE = 3  # log lambda, pitch, roll; behind them a rotation error (3) and the brightness' bias and gain
+ROAD = 4  # log lambda, pitch, roll, curvature; behind them what odometry handed over wrongly and the brightness
+MOTION = 5  # the rotation's error (3), that of the direction of travel to the right and down (2)
+_LEAST_INFORMATION = (1.0, 10.0, 10.0, 1e4)
+_LARGEST_STEP = np.array([0.1, 0.1, 0.1, 0.005] + [0.1] * MOTION)  # of one iteration
+_STEP_UNITS = np.array([1.0, 1.0, 1.0, 0.05] + [1.0] * MOTION)  # a change of the curvature by this equals one by 1 rad
+_BEYOND_CREST = 0.01  # where a ray would miss the parabola: that is behind the crest
 
 
 class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,6 +51,7 @@ class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     contrast_floor_grey: Positive = 2.0
     effective_sample_fraction: Positive = 0.013  # neighbouring pixels, and the road's shape, err together
     sigma_rotation_rad: Positive = 0.0005  # of the relative rotation that odometry hands over
+    sigma_direction_rad: Positive = 0.007  # of the direction of its translation
     max_iterations: Annotated[int, msgspec.Meta(ge=3)] = 7
     coarse_step: Annotated[int, msgspec.Meta(ge=1)] = 4  # every so-manieth sample comes near to the answer
     coarse_tolerance: Positive = 2e-3
@@ -50,7 +60,7 @@ class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class RoadFit:
-    """What one comparison alone says: (log lambda, pitch_rad, roll_rad) and its covariance (3, 3)."""
+    """What one comparison alone says: (log lambda, pitch_rad, roll_rad, curvature_per_m) and its covariance (4, 4)."""
 
     state: Floats
     cov: Floats
@@ -77,6 +87,13 @@ def _correlation(there: Floats, here: Floats, weights: Floats) -> float:
     w = weights / weights.sum()
     a, b = there - w @ there, here - w @ here
     return float((w * a) @ b / np.sqrt(max(float((w * a) @ a * ((w * b) @ b)), 1e-12)))
+
+
+def _translation(T_past_present: Pose, x: Floats) -> Floats:
+    """(3,) in metres, its direction corrected by what x says of it."""
+    t, (right, down) = T_past_present.p, x[ROAD + 3 : ROAD + MOTION]
+    out: Floats = np.exp(x[0]) * (t + float(np.linalg.norm(t)) * np.array([right, down, 0.0]))
+    return out
 
 
 def plane_normal(pitch_rad: float, roll_rad: float) -> tuple[Floats, Floats, Floats]:
@@ -165,7 +182,7 @@ class RoadAligner:
     def align(
         self, past: RoadImage, present: RoadImage, T_past_present: Pose, px: Ints, prior: Floats, prior_cov: Floats
     ) -> RoadFit | None:  # fmt: skip
-        """Fits (log lambda, pitch, roll) of the present camera, joined with the prior; None where the road is no help.
+        """Fits (log lambda, pitch, roll, curvature) of the present camera, joined with the prior; None: no help.
 
         `T_past_present` is the motion with its length in the odometry's own unit, lambda times it are metres.
         """
@@ -174,10 +191,12 @@ class RoadAligner:
             return None
         fine = self._view(present, px, T_past_present)
         coarse = _View(*(part[..., :: cfg.coarse_step] for part in (fine.rays, fine.turned, fine.grey)))
-        x = np.concatenate([prior, np.zeros(3)])
-        mean, weight_prior = x.copy(), np.zeros((6, 6))
-        weight_prior[:_PLANE, :_PLANE] = np.linalg.inv(prior_cov)
-        weight_prior[3:, 3:] = np.eye(3) / cfg.sigma_rotation_rad**2
+        x = np.concatenate([prior, np.zeros(MOTION)])
+        mean, weight_prior = x.copy(), np.zeros((ROAD + MOTION, ROAD + MOTION))
+        weight_prior[:ROAD, :ROAD] = np.linalg.inv(prior_cov)
+        weight_prior[ROAD:, ROAD:] = np.diag(
+            np.repeat([cfg.sigma_rotation_rad**-2, cfg.sigma_direction_rad**-2], [3, 2])
+        )
         light = None  # bias and gain of the brightness
         # Few samples come near to the answer, all of them settle it.
         for view, share, tolerance, iterations in (
@@ -197,24 +216,24 @@ class RoadAligner:
                 w *= share * cfg.effective_sample_fraction / sigma**2
                 Jw = J * w
                 A, g = Jw @ J.T, Jw @ r
-                A[:6, :6] += weight_prior
-                g[:6] += weight_prior @ (x - mean)
-                A[6, 6] += 1e-9
-                A[7, 7] += 1e-6
+                A[:-2, :-2] += weight_prior
+                g[:-2] += weight_prior @ (x - mean)
+                A[-2, -2] += 1e-9
+                A[-1, -1] += 1e-6
                 step = -np.linalg.solve(A, g)
-                step[:6] = np.clip(step[:6], -0.1, 0.1)
-                x = x + step[:6]
-                light = (light[0] + step[6], light[1] + step[7])
-                if np.abs(step[:6]).max() < tolerance:
+                x = x + np.clip(step[:-2], -_LARGEST_STEP, _LARGEST_STEP)
+                light = (light[0] + step[-2], light[1] + step[-1])
+                if (np.abs(step[:-2]) < tolerance * _STEP_UNITS).all():
                     break
         correlation = _correlation(there[0], fine.grey, w)
         # What the images alone say: the prior that guided the fit is taken out again. A direction that they do not see
-        # keeps a variance of about one, so that it is harmless.
+        # keeps a variance far above what roads have, so that it is harmless.
         data = A.copy()
-        data[:_PLANE, :_PLANE] -= weight_prior[:_PLANE, :_PLANE]
-        info = data[:3, :3] - data[:3, 3:] @ np.linalg.solve(data[3:, 3:], data[3:, :3]) + np.diag([1.0, 10.0, 10.0])
+        data[:ROAD, :ROAD] -= weight_prior[:ROAD, :ROAD]
+        mixed = data[:ROAD, ROAD:]
+        info = data[:ROAD, :ROAD] - mixed @ np.linalg.solve(data[ROAD:, ROAD:], mixed.T) + np.diag(_LEAST_INFORMATION)
         cov: Floats = np.asarray(np.linalg.inv(0.5 * (info + info.T)), np.float64)
-        measured: Floats = x[:_PLANE] + cov @ weight_prior[:_PLANE, :_PLANE] @ (x[:_PLANE] - prior)
+        measured: Floats = x[:ROAD] + cov @ weight_prior[:ROAD, :ROAD] @ (x[:ROAD] - prior)
         return RoadFit(measured, cov, correlation, int(seen.sum()))
 
     def _view(self, present: RoadImage, px: Ints, T_past_present: Pose) -> _View:
@@ -225,13 +244,14 @@ class RoadAligner:
         grey = present.grey[px[:, 1] - present.top_px, px[:, 0]].astype(np.float64)
         return _View(rays, T_past_present.R @ rays, grey)
 
-    def _look(
-        self, view: _View, past: RoadImage, T_past_present: Pose, x: Floats
-    ) -> tuple[Bools, tuple[Floats, Floats, Floats, Floats, Floats]]:
-        """Which samples the past image shows; its grey there, its slopes by q_x, q_y, q_z, and 1 / depth by Eq. 1."""
+    def _look(self, view: _View, past: RoadImage, T_past_present: Pose, x: Floats) -> tuple[Bools, tuple[Floats, ...]]:
+        """Which samples the past image shows; its grey there, its slopes by q_x, q_y, q_z, 1 / depth, and its root."""
         cam = self.camera
-        rho = (plane_normal(x[1], x[2])[0] @ view.rays) / -cam.height_m  # Eq. 1 is X = rays / rho
-        q = rotation_exp(x[3:]) @ view.turned + rho * (np.exp(x[0]) * T_past_present.p)[:, None]
+        # Eq. 1 is X = rays / rho; with the curvature rho solves H rho^2 - below rho - curvature / 2 = 0
+        below = -(plane_normal(x[1], x[2])[0] @ view.rays)
+        root = np.sqrt(np.maximum(below**2 + 2.0 * cam.height_m * x[3], _BEYOND_CREST * below**2))
+        rho = (below + root) * (0.5 / cam.height_m)
+        q = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned + rho * _translation(T_past_present, x)[:, None]
         by_z = 1.0 / np.maximum(q[2], 1e-3)
         px, py = q[0] * by_z, q[1] * by_z
         u = (cam.fx_px * px + cam.cx_px).astype(np.float32)
@@ -242,58 +262,28 @@ class RoadAligner:
             cv2.remap(image, u, v, cv2.INTER_LINEAR).ravel().astype(np.float64) for image in (past.grey, *past.slopes)
         )
         by_x, by_y = by_u * (cam.fx_px * by_z), by_v * (cam.fy_px * by_z)
-        return seen, (grey, by_x, by_y, -(by_x * px + by_y * py), rho)
+        return seen, (grey, by_x, by_y, -(by_x * px + by_y * py), rho, root)
 
     def _derivative(
-        self, view: _View, there: tuple[Floats, Floats, Floats, Floats, Floats], T_past_present: Pose, x: Floats
-    ) -> Floats:
-        """(8, N) of the residual by (log lambda, pitch, roll, rotation error, bias, gain)."""
-        _, gx, gy, gz, rho = there
+        self, view: _View, there: tuple[Floats, ...], T_past_present: Pose, x: Floats
+    ) -> Floats:  # fmt: skip
+        """(11, N) of the residual by (log lambda, pitch, roll, curvature, errors of the motion, bias, gain)."""
+        _, gx, gy, gz, rho, root = there
         _, by_pitch, by_roll = plane_normal(x[1], x[2])
-        t = np.exp(x[0]) * T_past_present.p
-        rx, ry, rz = rotation_exp(x[3:]) @ view.turned
+        t = _translation(T_past_present, x)
+        rx, ry, rz = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned
         along = gx * t[0] + gy * t[1] + gz * t[2]
-        J = np.empty((8, len(gx)))
+        J = np.empty((ROAD + MOTION + 2, len(gx)))
         np.multiply(along, rho, out=J[0])
-        along = along * (-1.0 / self.camera.height_m)
-        J[1] = along * (by_pitch @ view.rays)
-        J[2] = along * (by_roll @ view.rays)
-        J[3], J[4], J[5] = ry * gz - rz * gy, rz * gx - rx * gz, rx * gy - ry * gx
-        J[6] = -1.0
-        np.negative(view.grey, out=J[7])
+        np.divide(along, root, out=along)
+        np.multiply(along, 0.5, out=J[3])
+        along *= -rho
+        np.multiply(along, by_pitch @ view.rays, out=J[1])
+        np.multiply(along, by_roll @ view.rays, out=J[2])
+        J[4], J[5], J[6] = ry * gz - rz * gy, rz * gx - rx * gz, rx * gy - ry * gx
+        by_length = rho * float(np.linalg.norm(t))
+        np.multiply(gx, by_length, out=J[7])
+        np.multiply(gy, by_length, out=J[8])
+        J[9] = -1.0
+        np.negative(view.grey, out=J[10])
         return J
-
-    def search(
-        self, past: RoadImage, present: RoadImage, T_past_present: Pose, px: Ints, tilt: tuple[float, float],
-        lengths: Floats,
-    ) -> float:  # fmt: skip
-        """The one of `lengths` at which a motion of known direction fits best, over a few pitches about `tilt`."""
-        cam, f32 = self.camera, np.float32
-        px = px[:: max(1, len(px) // 900)]
-        rays = np.stack(
-            [(px[:, 0] - cam.cx_px) / cam.fx_px, (px[:, 1] - cam.cy_px) / cam.fy_px, np.ones(len(px))]
-        ).astype(f32)  # fmt: skip
-        here = present.grey[px[:, 1] - present.top_px, px[:, 0]]
-        direction = (T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9)).astype(f32)
-        turned = T_past_present.R.astype(f32) @ rays
-        rows, cols = past.grey.shape
-        best = (float(lengths[0]), -1.0)
-        for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01):
-            rho = (plane_normal(pitch_rad, tilt[1])[0].astype(f32) @ rays) * f32(-1.0 / cam.height_m)
-            way = lengths.astype(f32)[:, None] * rho  # (lengths, samples); what a sample moves, over its depth
-            by_z = f32(1.0) / np.maximum(turned[2] + way * direction[2], f32(1e-3))
-            u = (turned[0] + way * direction[0]) * by_z * f32(cam.fx_px) + f32(cam.cx_px)
-            v = (turned[1] + way * direction[1]) * by_z * f32(cam.fy_px) + f32(cam.cy_px - past.top_px)
-            there = cv2.remap(past.grey, u, v, cv2.INTER_LINEAR)
-            inside = ((u > 0) & (u < cols - 1) & (v > 0) & (v < rows - 1)).astype(f32)
-            count = np.maximum(inside.sum(axis=1), 1.0)
-            a, b = there * inside, here * inside
-            mean_a, mean_b = a.sum(axis=1) / count, b.sum(axis=1) / count
-            ab, aa, bb = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (a, a), (b, b)))
-            variances = (aa - count * mean_a**2) * (bb - count * mean_b**2)
-            correlation = (ab - count * mean_a * mean_b) / np.sqrt(np.maximum(variances, 1e-9))
-            correlation[count < 0.5 * len(px)] = -1.0
-            k = int(correlation.argmax())
-            if correlation[k] > best[1]:
-                best = (float(lengths[k]), float(correlation[k]))
-        return best[0]

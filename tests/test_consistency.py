@@ -16,7 +16,7 @@ from birdslam.camera import Camera
 from birdslam.graph import GraphConfig, PoseGraph
 from birdslam.planar import between
 from birdslam.roadalign import RoadFit
-from birdslam.roadscale import RoadFilter, RoadScaleConfig
+from birdslam.roadfilter import RoadFilter, RoadScaleConfig
 from birdslam.se2 import SE2
 from birdslam.simulation.drive import Drive, DriveConfig, drive
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
@@ -216,24 +216,30 @@ def scale_nees(seed: int, wild: float, comparisons: int) -> float:
     filter_.forget_scale(start)
     log_scale = start * rng.standard_normal()  # of true lengths over visual ones
     mount = config.sigma_mount_rad * rng.standard_normal(2)
-    tilt = mount.copy()
-    floor = np.array([config.sigma_scale_floor_rel, config.sigma_tilt_floor_rad, config.sigma_tilt_floor_rad])
+    tilt = mount + config.sigma_bounce_rad * rng.standard_normal(2)
+    curvature = config.sigma_curvature_per_m * rng.standard_normal()
+    tilt_floor = config.sigma_tilt_floor_rad
+    floor = np.array([config.sigma_scale_floor_rel, tilt_floor, tilt_floor, config.sigma_curvature_floor_per_m])
     step_m = 1.0
+    keep = np.exp(-step_m / config.curvature_memory_m)
     for _ in range(comparisons):
         log_scale += config.scale_walk_rel_per_sqrt_m * np.sqrt(step_m) * rng.standard_normal()
+        # The road bends under a car that holds its place in space; its springs pull it back to the mount
+        tilt = tilt + np.array([curvature * step_m, 0.0])
         tilt = tilt + config.tilt_walk_rad_per_sqrt_m * np.sqrt(step_m) * rng.standard_normal(2)
+        curvature = keep * curvature + np.sqrt(1.0 - keep**2) * config.sigma_curvature_per_m * rng.standard_normal()
+        mount = mount + config.mount_walk_rad_per_sqrt_m * np.sqrt(step_m) * rng.standard_normal(2)
         filter_.predict(np.eye(3), step_m)
-        # What one comparison knows: some combinations of the three well, others hardly
-        A = rng.standard_normal((3, 3)) * np.array([0.02, 0.01, 0.01])[:, None]
+        # What one comparison knows: some combinations of the four well, others hardly
+        A = rng.standard_normal((4, 4)) * np.array([0.02, 0.01, 0.01, 0.0005])[:, None]
         cov = A @ A.T
-        noise = np.linalg.cholesky(cov + np.diag(floor**2)) @ rng.standard_normal(3)
-        state = np.array([log_scale, *tilt]) + noise
+        noise = np.linalg.cholesky(cov + np.diag(floor**2)) @ rng.standard_normal(4)
+        state = np.array([log_scale, *tilt, curvature]) + noise
         if rng.uniform() < wild:
             state[0] += rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.0)  # the bonnet, a car's shadow
         fit = RoadFit(state=state, cov=cov, correlation=0.9, samples=1000)
         if filter_.innovation(fit)[2] < config.max_innovation_sigma:
             log_scale -= np.log(filter_.accept(fit))
-            filter_.settle_mount(step_m)
         log_scale -= filter_.owed_log
         filter_.owed_log = 0.0
     return float(log_scale**2 / filter_.cov[0, 0])

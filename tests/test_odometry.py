@@ -291,7 +291,8 @@ def test_a_hidden_road_carries_the_scale_and_says_so() -> None:
     hidden = np.zeros((HEIGHT_PX, WIDTH_PX), bool)
     chained, motions = drive(truth, masks=lambda k: hidden if 10 <= k < 26 else None)
     sigma = [m.scale_sigma_rel for m in motions]
-    assert sigma[24] > sigma[12] + 0.002
+    walked = OdometryConfig().road.scale_walk_rel_per_sqrt_m ** 2 * 12 * 0.7
+    assert sigma[24] ** 2 - sigma[12] ** 2 > 0.5 * walked
     assert [Status.SCALE_CARRIED in m.status for m in motions[6:]] == [False] * 11 + [True] * 8 + [False] * 9
     assert sigma[-1] < sigma[24]
     assert path_m(chained.values()) == pytest.approx(path_m(truth), rel=0.05)
