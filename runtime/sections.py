@@ -1,0 +1,178 @@
+"""The tables of the configuration that are the shell's own; those of the method stand beside its code."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, get_args
+
+import msgspec
+
+from birdslam.perception import ModelSpec
+from birdslam.perception.manifest import SHIPPED_NETWORKS, Role
+from runtime.schedule import ScheduleConfig
+
+SHIPPED_MULTITASK = "multitask_int8.onnx"  # as good as the fp32 one in half the time; `--model multitask` is that
+
+PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+
+
+class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where frames come from, and how fast."""
+
+    uri: str = ""  # kitti:DIR, video:FILE, v4l2:/dev/videoN, rtsp://...
+    rate: Positive | Literal["max"] | None = None  # Hz; None: by the source's own time stamps; "max": lossless
+    stride: PositiveInt = 1  # every so-manieth frame of a recording
+    frames: PositiveInt | None = None  # end after so many; None: all
+    loop: bool = False  # a recording begins anew at its end
+    prefetch_frames: PositiveInt = 4  # decoded ahead of their time, so that a slow file is not a late frame
+    reopen_ms: Positive = 100.0  # between tries to open a camera that is gone; each is a frame without an image
+    camera_timeout_s: Positive = 5.0  # a camera or stream that delivers nothing for so long has failed
+
+
+class ModelsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The network of each role; a role without one goes unfilled."""
+
+    detector: ModelSpec | None = None
+    segmenter: ModelSpec | None = None
+    depth: ModelSpec | None = None
+    multitask: ModelSpec | None = None  # one network for all of these; the others stand before it, each for its own
+    pointnet: ModelSpec | None = None  # Frustum-PointNet: bodies from the depth network's points
+    shipped: bool = True  # the package's own network runs where no other finds vehicles or the road
+    completion: bool = True  # the package's own ENet completes the lanes where something hid the road
+
+    def given(self) -> dict[str, ModelSpec]:
+        """Role -> network that the user names, in a fixed order."""
+        specs = {role: getattr(self, role) for role in get_args(Role)}
+        return {role: spec for role, spec in specs.items() if spec is not None}
+
+    def in_use(self) -> dict[str, ModelSpec]:
+        """Role -> network of images that runs, in a fixed order."""
+        given = self.given()
+        if self.shipped and "multitask" not in given and not {"detector", "segmenter"} <= set(given):
+            given["multitask"] = ModelSpec(path=str(SHIPPED_NETWORKS / SHIPPED_MULTITASK))
+        return given
+
+
+class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The perceive process."""
+
+    # A frame waits for networks until its deadline, from its capture on; at rate "max" each is awaited to its end.
+    deadline_ms: Positive | None = None  # None: by the frame rate
+    deadline_periods: Positive = 0.75  # of the source's frames; the rest is for what comes after the networks
+    opencv_threads: PositiveInt = 2
+    schedule: ScheduleConfig = ScheduleConfig()
+
+
+class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Processes, memory and time limits."""
+
+    runtime_dir: str = ""  # sockets, locks and vitals; "": the user's own (runtime/presence.py)
+    models_dir: str = ""  # installed networks; "": the user's own (runtime/model_store.py)
+    ring_slots: Annotated[int, msgspec.Meta(ge=2, le=64)] = 8
+    in_flight_frames: PositiveInt = 4  # frames between capture and the estimate at rate "max"
+    ready_timeout_s: Positive = 60.0  # for a node to load, warm up and find its peers
+    drain_timeout_s: Positive = 2.0  # for the last frame's estimate to come back before the end is announced
+    stop_timeout_s: Positive = 10.0  # for all nodes to end
+    beat_s: Positive = 0.1  # a node's loop shows life at least so often
+    watchdog_ms: Annotated[float, msgspec.Meta(ge=200.0)] = 2000.0  # a ready node without a beat for so long is stalled
+    term_grace_ms: Positive = 200.0  # between a stalled node's SIGTERM and its SIGKILL
+    switch_interval_s: Positive = 5e-4  # of the GIL, for the threads that wait beside a busy one
+    # A node that died or stalled is begun anew; None: "always", but "never" at rate "max", which may lose no frame
+    restart: Literal["always", "never"] | None = None
+    restarts_max: PositiveInt = 5  # of one node within the window: one more ends the run
+    restart_window_s: Positive = 60.0
+    restart_backoff_ms: Positive = 100.0  # before the second restart within the window; then twice as long each time
+    restart_backoff_max_ms: Positive = 2000.0
+    checkpoint_ms: Positive = 250.0  # of the optimizer's graph, for the process after it
+    catch_up_ms: Positive = 300.0  # it asks perceive for what it has missed since, and waits no longer
+    stale_ms: Positive = 500.0  # a node that has received nothing for so long says so in its health
+    spares: bool = True  # a process of each node stands by, loaded and warm, for the next restart
+
+
+class BudgetsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How long each node, each hop and the whole may take, from a frame's capture on, at `percentile` of the frames.
+
+    Raises ValueError where the parts exceed the whole.
+    """
+
+    percentile: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)] = 99.0
+    capture_ms: Positive = 10.0
+    capture_to_perceive_ms: Positive = 10.0
+    perceive_ms: Positive = 100.0
+    perceive_to_optimize_ms: Positive = 10.0
+    optimize_ms: Positive = 10.0
+    optimize_to_planner_ms: Positive = 10.0
+    end_to_end_ms: Positive = 150.0
+
+    def __post_init__(self) -> None:
+        parts = [name for name in self.__struct_fields__ if name not in ("percentile", "end_to_end_ms")]
+        total_ms = sum(getattr(self, name) for name in parts)
+        if total_ms > self.end_to_end_ms:
+            raise ValueError(f"{' + '.join(parts)} = {total_ms:g} is over end_to_end_ms = {self.end_to_end_ms:g}")
+
+    def step_ms(self, node: str) -> float:
+        """What one node may take for a frame."""
+        limit_ms: float = getattr(self, f"{node}_ms")
+        return limit_ms
+
+    def hop_ms(self, node: str) -> float | None:
+        """What a record may take on its way to a node; None for capture, to which none comes."""
+        hops = {"perceive": self.capture_to_perceive_ms, "optimize": self.perceive_to_optimize_ms}
+        return hops.get(node)
+
+    @property
+    def perceived_ms(self) -> float:
+        """The age by which perceive must have sent its measurements."""
+        return self.capture_ms + self.capture_to_perceive_ms + self.perceive_ms
+
+    @property
+    def received_ms(self) -> float:
+        """The age by which a frame must have come to perceive."""
+        return self.capture_ms + self.capture_to_perceive_ms
+
+
+class DegradationConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """When perceive does less, to keep its budget, and when it does more again (runtime/degradation.py)."""
+
+    enabled: bool = True  # never at rate "max"
+    window_frames: PositiveInt = 10  # judged together
+    late_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5  # so many of them late: one mode less
+    calm_frames: PositiveInt = 50  # in a row within `calm_share` of the budget: one mode more
+    calm_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.7
+    rate_divisor: PositiveInt = 3  # in mode "rate" the networks run on every so-manieth frame at the most
+    coast_divisor: PositiveInt = 3  # in mode "coasting" every so-manieth frame is looked at
+    coast_max_ms: Positive = 500.0  # of source time without a look: what comes then is invalid
+
+
+class RecordingConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is kept of a drive in one file (runtime/recording.py)."""
+
+    file: str = ""  # FILE.mcap, which must not exist yet; a directory: a new file in it, named by the time; "": none
+    images: bool = False  # the frames too, as JPEG
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
+    flush_ms: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)] = 500.0  # what a kill may cost
+    sync: bool = True  # each time to the disk itself: a power cut then costs no more than a kill
+    queue: PositiveInt = 4096  # messages of a topic that wait for the recorder; what is pushed out is counted
+    ready_timeout_s: Positive = 10.0  # for the recorder to be there before the first frame; then the run goes on
+
+
+class NodeScheduling(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Of one node."""
+
+    priority: Annotated[int, msgspec.Meta(ge=1, le=98)] = 10  # under SCHED_FIFO
+    cpus: tuple[Annotated[int, msgspec.Meta(ge=0)], ...] = ()  # the cores it may run on; none: all
+
+
+class RealtimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The scheduling of the nodes, where the system permits it (runtime/realtime.py); a line in the log where not."""
+
+    fifo: Literal["auto", "on", "off"] = "auto"  # SCHED_FIFO; "auto": with a live camera
+    lock_memory: Literal["auto", "on", "off"] = "auto"  # nothing is paged out; "auto": with a live camera
+    capture: NodeScheduling = NodeScheduling(priority=30)
+    perceive: NodeScheduling = NodeScheduling(priority=10)
+    optimize: NodeScheduling = NodeScheduling(priority=20)
+
+    def of(self, node: str) -> NodeScheduling:
+        """The scheduling of one node."""
+        scheduling: NodeScheduling = getattr(self, node)
+        return scheduling
