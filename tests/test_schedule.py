@@ -1,0 +1,142 @@
+"""`[perceive.schedule]`: what it says of each head is what runs."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from birdslam.camera import Camera
+from birdslam.perception import Detections, Findings, ModelSpec, Perception, Segmentation
+from birdslam.perception.manifest import Schedule
+from birdslam.types import Frame, Status
+from runtime import inference
+from runtime.configuration import (
+    Configuration,
+    ConfigurationError,
+    ModelsConfig,
+    PerceiveConfig,
+    SourceConfig,
+    complete,
+    load,
+)
+from runtime.inference import Inference
+from runtime.schedule import NetworkTurn, ScheduleConfig, Turn
+
+CAMERA = Camera(640, 192, 370.0, 370.0, 320.0, 88.0, 1.6)
+IMAGE = np.zeros((4, 4), dtype=np.uint8)
+
+
+def of_toml(tmp_path: Path, text: str) -> ScheduleConfig:
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    return load(path).perceive.schedule
+
+
+def test_dividers_and_rates_of_each_head(tmp_path: Path) -> None:
+    text = """
+[perceive.schedule]
+detector = { every = 2 }
+segmenter = { hz = 10, awaited = false }
+lanes = { hz = 8 }
+"""
+    schedule = of_toml(tmp_path, text).at(33.0)
+    assert schedule.detector == NetworkTurn(every=2)
+    assert schedule.segmenter == NetworkTurn(every=3, awaited=False)
+    assert schedule.lanes == Turn(every=4)
+    spec = ModelSpec("n.onnx", every=5, threads=2)
+    assert schedule.of("segmenter", spec) == ModelSpec("n.onnx", every=3, threads=2, awaited=False)
+    assert schedule.of("depth", spec) == spec  # of which nothing is said
+
+
+@pytest.mark.parametrize(("rate_hz", "every"), [(33.0, 7), (10.0, 2), (5.0, 1), (2.0, 1)])
+def test_lanes_are_made_out_five_times_a_second_unless_it_is_said_otherwise(rate_hz: float, every: int) -> None:
+    configuration = complete(Configuration(), CAMERA, rate_hz)
+    assert configuration.perceive.schedule.lanes.every == every
+    fixed = complete(Configuration(source=SourceConfig(rate=50.0)), CAMERA, rate_hz)  # the rate it is paced at
+    assert fixed.perceive.schedule.lanes.every == 10
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("detector = { every = 2, hz = 3 }", "every and hz say the same"),
+        ("lanes = { awaited = true }", "perceive.schedule.lanes.awaited: there is no such key"),
+        ("pointnet = { every = 2 }", "perceive.schedule.pointnet: there is no such key"),
+        ("detector = { every = 0 }", "perceive.schedule.detector.every"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(tmp_path: Path, text: str, reason: str) -> None:
+    with pytest.raises(ConfigurationError, match=reason):
+        of_toml(tmp_path, f"[perceive.schedule]\n{text}\n")
+
+
+class Head:
+    """A network that answers when it is let."""
+
+    def __init__(self, role: str, spec: ModelSpec) -> None:
+        self.name = self.role = role
+        said = {key: getattr(spec, key) for key in ("every", "awaited") if getattr(spec, key) is not None}
+        self.schedule = Schedule(**said)
+        self.go, self.done = threading.Event(), threading.Event()
+        self.frames: list[int] = []
+
+    def run(self, image: np.ndarray) -> Findings:
+        self.frames.append(int(image[0, 0]))
+        self.go.wait()
+        self.done.set()
+        if self.role == "detector":
+            return Findings(detections=Detections(np.zeros((0, 4)), np.zeros(0), ()))
+        return Findings(segmentation=Segmentation(image > 0, image > 0))
+
+
+def test_each_head_runs_on_its_frames_and_a_late_one_is_skipped_and_said_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    heads: dict[str, Head] = {}
+
+    def loaded(role: str, spec: ModelSpec) -> Head:
+        heads[role] = Head(role, spec)
+        return heads[role]
+
+    monkeypatch.setattr(inference, "load_network", loaded)
+    spec = ModelSpec("none.onnx")
+    schedule = ScheduleConfig(detector=NetworkTurn(every=1), segmenter=NetworkTurn(hz=11.0, awaited=False))
+    configuration = complete(
+        Configuration(
+            models=ModelsConfig(detector=spec, segmenter=spec, shipped=False),
+            perceive=PerceiveConfig(deadline_ms=60.0, schedule=schedule),
+        ),
+        CAMERA,
+        33.0,
+    )
+    with Inference(configuration) as networks:
+        heads["detector"].go.set()
+        seen: list[Perception] = []
+
+        def look() -> Perception:
+            k = len(seen)
+            frame = Frame(k, 0, time.monotonic_ns(), 0, np.full_like(IMAGE, k))
+            seen.append(networks.start(frame).result())
+            return seen[-1]
+
+        late = [look() for _ in range(5)]
+        heads["segmenter"].go.set()
+        heads["segmenter"].done.wait()
+        while "segmenter" not in look().ages:  # it is done by now, or in no time
+            pass
+        first = len(seen) - 1
+        while len(heads["segmenter"].frames) < 4:
+            look()
+            heads["segmenter"].done.wait()
+    assert heads["detector"].frames == list(range(len(seen)))
+    for perception in late:
+        assert "segmenter" not in perception.ages
+        assert perception.status == (Status.SEGMENTATION_CARRIED,)
+        assert perception.ages["detector"] == 0
+    assert seen[first].ages["segmenter"] == first  # what was begun on frame 0, with its age
+    assert seen[first].status == (Status.SEGMENTATION_CARRIED,)
+    ran = heads["segmenter"].frames
+    assert ran[0] == 0
+    assert min(np.diff(ran)) >= 3
