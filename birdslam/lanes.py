@@ -114,10 +114,10 @@ class AmodalLanes:
         """(2, rows, columns) occupancy of 0..1 of road and lane boundary, gathered and filtered."""
         config = self.config
         counts = np.zeros((2, *config.shape), dtype=np.float32)
-        for channel in (ROAD, BOUNDARY):
-            points = [T_world_ego.between(T) @ seen[channel] for T, *seen in self._frames if len(seen[channel])]
-            if points:
-                counts[channel] = count_cells(np.concatenate(points), config)
+        for T_world_then, *seen in self._frames:
+            T_ego_then = T_world_ego.between(T_world_then)
+            for channel in (ROAD, BOUNDARY):
+                counts[channel] += count_cells(T_ego_then @ seen[channel], config)
         occupancy = np.minimum(counts / config.full_count, 1.0).astype(np.float32)
         for channel in (ROAD, BOUNDARY):
             occupancy[channel] *= dense(counts[channel] > 0, config)
@@ -149,9 +149,9 @@ def count_cells(points_m: Floats, config: LanesConfig) -> NDArray[np.float32]:
     """How many of the points (N, 2) in ego fall into each cell."""
     rows, columns = config.shape
     x, y = points_m.T
-    row = ((x + config.behind_m) / config.cell_m + 1.0).clip(0.0, rows + 1.0).astype(np.int64)  # a rim for the rest
-    column = ((y + config.half_width_m) / config.cell_m + 1.0).clip(0.0, columns + 1.0).astype(np.int64)
-    counts = np.bincount(row * (columns + 2) + column, minlength=(rows + 2) * (columns + 2))
+    row = ((x + config.behind_m) / config.cell_m + 1.0).clip(0.0, rows + 1.0).astype(np.int32)  # a rim for the rest
+    column = ((y + config.half_width_m) / config.cell_m + 1.0).clip(0.0, columns + 1.0).astype(np.int32)
+    counts = np.bincount(row * np.int32(columns + 2) + column, minlength=(rows + 2) * (columns + 2))
     return counts.reshape(rows + 2, columns + 2)[1:-1, 1:-1].astype(np.float32)
 
 
