@@ -27,7 +27,7 @@ from birdslam.perception import ModelError
 from birdslam.types import Estimate, FrameRef, Measurements, Status
 from runtime import realtime
 from runtime.bus import Bus, Publisher
-from runtime.child import LOG_FORMAT, die_with
+from runtime.child import LOG_FORMAT, die_with, give_back_memory
 from runtime.cli import USER_ERROR_STATUS
 from runtime.coasting import Overdue
 from runtime.configuration import Configuration, ConfigurationError
@@ -167,6 +167,7 @@ def main(arguments: list[str]) -> int:
     vitals = Vitals(int(vitals_fd))
     try:
         make = prepare(name, configuration)
+        give_back_memory()
         vitals.count(prepared=1)
         line = sys.stdin.buffer.readline()
         if line:  # else this spare is needed no more
