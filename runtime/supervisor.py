@@ -25,6 +25,7 @@ from birdslam.perception.pointnet import load_pointnet
 from birdslam.results import Recorder, claim_directory
 from runtime import realtime
 from runtime.bus import Bus
+from runtime.child import give_back_memory
 from runtime.cli import INTERRUPTED_STATUS, USER_ERROR_STATUS
 from runtime.configuration import Configuration, ConfigurationError, complete
 from runtime.demo_report import Witness
@@ -51,6 +52,7 @@ DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come t
 def run(configuration: Configuration) -> int:
     """A whole run; gives the exit status. Raises what a user has to mend before anything is started."""
     configuration, models = check(configuration)
+    give_back_memory()  # the networks that were looked at
     output = Path(configuration.output)
     realtime.reserve(*DRIVE_MIB)
     live = LiveLine(sys.stdout)
