@@ -7,7 +7,7 @@ been steady again; then the world begins anew, since how far the car has come me
 from __future__ import annotations
 
 from collections import deque
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import msgspec
 
@@ -16,16 +16,25 @@ from birdslam.types import EgoEdge, Measurements, Status
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 _KEPT_FRAMES = 64
 _SHORTEST_S = 1e-3
+_CLOCK_TOLERANCE = 0.1  # of a span
 
 
 class MotionWatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How fast a car's speed may change, and how long the odometry must be steady to be believed again."""
 
     acceleration_mps2: Positive = 15.0
-    change_mps: Positive = 3.0  # beside it, for the noise of a single motion
+    change_mps: Positive = 3.0  # beside it, for the noise of the motions within span_s
+    span_s: Positive = 0.1  # over which a speed is taken: that of one motion at 33 Hz is three times as noisy as at 10
     sigmas: Positive = 3.0  # beside both, of the metric scale
     blind_s: Positive = 0.5  # of source time without a measured motion: where the car is by then is not known
     steady_s: Positive = 0.5  # of source time, in which every motion is measured and possible
+
+
+class _Moved(NamedTuple):
+    t_ns: int  # source time of its end
+    dt_s: float
+    x_m: float  # forwards
+    scale_sigma_rel: float
 
 
 class MotionWatch:
@@ -34,42 +43,59 @@ class MotionWatch:
     def __init__(self, config: MotionWatchConfig) -> None:
         self._config = config
         self._times_ns: deque[tuple[int, int]] = deque(maxlen=_KEPT_FRAMES)  # (frame, source time)
-        self._last: tuple[int, float, float] | None = None  # source time, speed (m/s), 1-sigma of the scale
+        self._moved: deque[_Moved] = deque(maxlen=_KEPT_FRAMES)  # the measured ones
         self._broken_ns: int | None = None  # source time of the last motion that was not measured or not possible
 
     def judge(self, measurements: Measurements) -> Measurements:
         """The same; with MOTION_IMPLAUSIBLE; or, where it can be believed again, without its CC edge."""
         m, cc = measurements, measurements.cc
         self._times_ns.append((m.frame_id, m.t_source_ns))
-        speed_mps = None if cc is None or Status.ODOMETRY_COASTING in m.status else self._speed_mps(cc)
-        if speed_mps is not None and not self._possible(m, speed_mps):
+        moved = None if cc is None or Status.ODOMETRY_COASTING in m.status else self._measured(m, cc)
+        if moved is not None:
+            self._moved.append(moved)
+            if not self._possible():
+                self._broken_ns = m.t_source_ns
+        elif self._moved and (m.t_source_ns - self._moved[-1].t_ns) * 1e-9 > self._config.blind_s:
             self._broken_ns = m.t_source_ns
-        if speed_mps is None and self._last is not None:
-            blind = (m.t_source_ns - self._last[0]) * 1e-9 > self._config.blind_s
-            self._broken_ns = m.t_source_ns if blind else self._broken_ns
-        if speed_mps is not None:
-            self._last = m.t_source_ns, speed_mps, m.scale_sigma_rel
         if self._broken_ns is None:
             return m
-        if speed_mps is None:
+        if moved is None:
             self._broken_ns = m.t_source_ns
         if (m.t_source_ns - self._broken_ns) * 1e-9 >= self._config.steady_s:
             self._broken_ns = None
             return msgspec.structs.replace(m, cc=None)
         return msgspec.structs.replace(m, status=(*m.status, Status.MOTION_IMPLAUSIBLE))
 
-    def _speed_mps(self, cc: EgoEdge) -> float | None:
-        """Forwards, over the edge; None where its beginning is too long ago."""
+    def _measured(self, m: Measurements, cc: EgoEdge) -> _Moved | None:
+        """The edge forwards; None where its beginning is too long ago."""
         times_ns = dict(self._times_ns)
         if cc.from_frame not in times_ns or cc.to_frame not in times_ns:
             return None
         dt_s = (times_ns[cc.to_frame] - times_ns[cc.from_frame]) * 1e-9
-        return cc.T_from_to.x_m / dt_s if dt_s > _SHORTEST_S else None
+        return _Moved(m.t_source_ns, dt_s, cc.T_from_to.x_m, m.scale_sigma_rel) if dt_s > _SHORTEST_S else None
 
-    def _possible(self, m: Measurements, speed_mps: float) -> bool:
-        if self._last is None:
+    def _possible(self) -> bool:
+        """The speed over the newest span_s against that over the span before it."""
+        config, moved = self._config, list(self._moved)
+        now, before = _newest(moved, config.span_s)
+        then, _ = _newest(before, config.span_s)
+        if not then:
             return True
-        config, (t_ns, last_mps, last_sigma) = self._config, self._last
-        scale = config.sigmas * max(m.scale_sigma_rel, last_sigma) * max(abs(speed_mps), abs(last_mps))
-        limit_mps = config.change_mps + config.acceleration_mps2 * max(m.t_source_ns - t_ns, 0) * 1e-9 + scale
-        return abs(speed_mps - last_mps) <= limit_mps
+        now_mps, then_mps = _speed_mps(now), _speed_mps(then)
+        sigma = max(entry.scale_sigma_rel for entry in (*now, *then))
+        scale = config.sigmas * sigma * max(abs(now_mps), abs(then_mps))
+        passed_s = max(now[-1].t_ns - then[-1].t_ns, 0) * 1e-9
+        return abs(now_mps - then_mps) <= config.change_mps + config.acceleration_mps2 * passed_s + scale
+
+
+def _newest(moved: list[_Moved], span_s: float) -> tuple[list[_Moved], list[_Moved]]:
+    """The last motions, of at least `span_s` together where there are so many, and those before them."""
+    total_s, k = 0.0, len(moved)
+    while k and total_s < (1.0 - _CLOCK_TOLERANCE) * span_s:
+        k -= 1
+        total_s += moved[k].dt_s
+    return moved[k:], moved[:k]
+
+
+def _speed_mps(moved: list[_Moved]) -> float:
+    return sum(entry.x_m for entry in moved) / sum(entry.dt_s for entry in moved)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
+
 from birdslam.motionwatch import MotionWatch, MotionWatchConfig
 from birdslam.se2 import SE2
 from birdslam.types import INVALIDATING, EgoEdge, Measurements, Status
@@ -46,3 +49,35 @@ def test_after_a_long_blindness_the_world_begins_anew() -> None:
     judged = [watch.judge(moved(frame, 10.0, blind if 5 <= frame < 15 else ())) for frame in range(1, 24)]
     assert [m.frame_id for m in judged if Status.MOTION_IMPLAUSIBLE in m.status] == list(range(10, 19))
     assert [m.frame_id for m in judged if m.cc is None] == [19]
+
+
+def at_33_hz(steps_m: list[float]) -> list[Measurements]:
+    out = []
+    for frame, step_m in enumerate(steps_m, start=1):
+        edge = EgoEdge(from_frame=frame - 1, to_frame=frame, T_from_to=SE2(step_m, 0.0, 0.0), cov=(0.0,) * 9)
+        t_ns = round(frame * 1e9 / 33.0)
+        out.append(Measurements(frame_id=frame, t_source_ns=t_ns, t_capture_ns=0, t_utc_ns=0, cc=edge))
+    return out
+
+
+def test_the_noise_of_single_motions_at_33_hz_is_believed() -> None:
+    """0.03 m of noise, 1-sigma, in each motion, as the shipped drive shows: 1 m/s in the speed of one of them."""
+    rng, watch = np.random.default_rng(3), MotionWatch(MotionWatchConfig())
+    drive = at_33_hz((10.0 / 33.0 + rng.normal(0.0, 0.03, 400)).tolist())
+    assert [watch.judge(m) for m in drive] == drive
+
+
+@pytest.mark.parametrize("speed_mps", [3.0, 10.0])
+def test_a_reversal_at_33_hz_is_found_within_a_span(speed_mps: float) -> None:
+    watch = MotionWatch(MotionWatchConfig())
+    judged = [watch.judge(m) for m in at_33_hz([speed_mps / 33.0 * (1.0 if k < 20 else -1.0) for k in range(60)])]
+    wrong = [m.frame_id for m in judged if Status.MOTION_IMPLAUSIBLE in m.status]
+    assert 21 <= wrong[0] <= 24
+    assert any(m.cc is None for m in judged)  # the world begins anew
+
+
+def test_a_jump_of_one_motion_at_33_hz_is_found_at_once() -> None:
+    watch = MotionWatch(MotionWatchConfig())
+    steps_m = [0.3] * 20 + [1.1] + [0.3] * 40
+    wrong = [m.frame_id for m in map(watch.judge, at_33_hz(steps_m)) if Status.MOTION_IMPLAUSIBLE in m.status]
+    assert wrong[0] == 21
