@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from birdslam.types import Estimate
-from perf.faulty_vehicle import PATIENCE_S, Vehicle, model_options
+from perf.faulty_vehicle import PATIENCE_S, Vehicle, model_options, record_options
 from perf.street import FRAME_M
 from perf.strikes import FAULTS, Fault
 from perf.witness import Witness
@@ -107,7 +107,7 @@ def main(arguments: list[str]) -> int:
     rows: list[Row] = []
     with (
         tempfile.TemporaryDirectory(prefix="faults") as place,
-        Vehicle(Path(place), *model_options(options.models)) as vehicle,
+        Vehicle(Path(place), *model_options(options.models), *record_options(Path(place))) as vehicle,
     ):
         for number, fault in enumerate(chosen):
             if number:

@@ -163,6 +163,13 @@ def _is_node(process: psutil.Process, name: str) -> bool:
         return False
 
 
+def record_options(place: Path) -> list[str]:
+    """A recording of each start."""
+    folder = place / "recordings"
+    folder.mkdir(exist_ok=True)
+    return ["--record", str(folder)]
+
+
 def model_options(folder: Path | None) -> list[str]:
     """Both networks, where the folder has them."""
     networks = {"detector": "yolox_nano_416.onnx", "segmenter": "twinlitenet_640x360.onnx"}

@@ -28,7 +28,7 @@ from typing import Any, Self
 import numpy as np
 import psutil
 
-from perf.faulty_vehicle import Vehicle, model_options
+from perf.faulty_vehicle import Vehicle, model_options, record_options
 
 WARM_S, SAMPLE_S, SAID_S = 60.0, 5.0, 30.0
 SPAN = 6  # samples at either end whose medians are compared: what a process holds swings by its garbage
@@ -179,7 +179,7 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="soak") as folder, Systemd(Path(folder)) as systemd:
         place = Path(folder)
-        recorded = ["--record", str(place / "soak.mcap")] if options.record else []
+        recorded = record_options(place) if options.record else []
         os.environ.update(systemd.environment)
         extra = [*model_options(options.models), *recorded]
         with Vehicle(place, *extra, rate_hz=options.rate, source=options.source) as vehicle:

@@ -87,12 +87,18 @@ def no_memory(node: str) -> Strike:
     return strike
 
 
-@contextlib.contextmanager
-def full_disk(vehicle: Vehicle) -> Iterator[None]:
-    """No file of the supervisor's grows any more."""
-    resource.prlimit(vehicle.process.pid, resource.RLIMIT_FSIZE, (1, resource.RLIM_INFINITY))
-    yield
-    resource.prlimit(vehicle.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+def full_disk(node: str) -> Strike:
+    """No file of the process's grows any more."""
+
+    @contextlib.contextmanager
+    def strike(vehicle: Vehicle) -> Iterator[None]:
+        process = vehicle.node(node)
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1, resource.RLIM_INFINITY))
+        yield
+        with contextlib.suppress(ProcessLookupError):  # the recorder ends of it
+            resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+
+    return strike
 
 
 @contextlib.contextmanager
@@ -222,7 +228,8 @@ def kill_everything(vehicle: Vehicle) -> Iterator[None]:
 def _faults() -> Iterator[Fault]:
     for node in NODES:
         yield Fault("kill -9", node, signalled(node, signal.SIGKILL), promise_s=PROMISE_S[node])
-    for node in (*NODES, "supervisor"):
+    yield Fault("kill -9", "record", signalled("record", signal.SIGKILL))
+    for node in (*NODES, "record", "supervisor"):
         yield Fault("SIGSTOP 2 s", node, signalled(node, signal.SIGSTOP, then=signal.SIGCONT), lasts_s=2.0)
     for node in NODES:
         yield Fault("no further memory", node, no_memory(node), lasts_s=2.0)
@@ -240,7 +247,9 @@ def _faults() -> Iterator[Fault]:
     yield Fault("flood of questions, 2 s", "supervisor", questions, lasts_s=2.0)
     yield Fault("a planner that stands still", "planner", slow_planner, lasts_s=3.0)
     yield Fault("kill -9 of everything, second start", "all", kill_everything)
-    yield Fault("full disk", "supervisor", full_disk, lasts_s=2.0)  # the last one: the run's results stay incomplete
+    # The last ones: the recording, then the run's results stay incomplete
+    for node in ("record", "supervisor"):
+        yield Fault("full disk", node, full_disk(node), lasts_s=2.0)
 
 
 FAULTS = tuple(_faults())

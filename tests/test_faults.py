@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from perf.faults import inflict, markdown, survived
-from perf.faulty_vehicle import Vehicle, model_options
+from perf.faulty_vehicle import Vehicle, model_options, record_options
 from perf.strikes import FAULTS
 from runtime.presence import ring_path
 from runtime.topology import NODES
@@ -61,7 +61,7 @@ def left_behind(vehicle: Vehicle) -> list[Path]:
 @pytest.mark.timeout(900)
 def test_every_fault(place: Path, models_dir_if_any: Path | None, capsys: pytest.CaptureFixture[str]) -> None:
     rows = []
-    with Vehicle(place, *model_options(models_dir_if_any)) as vehicle:
+    with Vehicle(place, *model_options(models_dir_if_any), *record_options(place)) as vehicle:
         for fault in FAULTS:
             vehicle.settle()
             rows.append(inflict(vehicle, fault))
@@ -73,12 +73,13 @@ def test_every_fault(place: Path, models_dir_if_any: Path | None, capsys: pytest
 def held(vehicle: Vehicle) -> dict[str, int]:
     """What a leak would add to."""
     supervisor = psutil.Process(vehicle.process.pid)
+    ring = ring_path(vehicle.vehicle, vehicle.runtime_dir)
     return {
         "descriptors of the supervisor": supervisor.num_fds(),
         "threads of the supervisor": supervisor.num_threads(),
         "processes": len(supervisor.children()),
         "files in the runtime directory": sum(1 for _ in vehicle.runtime_dir.rglob("*")),
-        "rings": len(list(Path("/dev/shm").glob(f"birdslam-{os.getuid()}-{vehicle.vehicle}-*"))),
+        "rings": len(list(ring.parent.glob(f"{ring.name}*"))),
         "descriptors of the planner": psutil.Process().num_fds(),
     }
 
