@@ -52,6 +52,7 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     cut_margin_rel: float = 0.1  # of the box's height, at the image's bottom: detectors draw an edge that the image
     cut_margin_side_rel: float = 0.05  # cuts off a little inside of it; and of its width, at the sides
     size_floor_rel: float = 0.02  # of a depth: vehicles are no cuboids
+    shape_floor_m: float = 0.1  # nor across the line of sight, and headed not quite as is thought
     max_above_road_rad: float = 0.06  # a box whose bottom lies so far above where its height puts it hangs in the air
     same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
     max_range_m: float = 100.0  # by the height of its class
@@ -85,6 +86,7 @@ class Observation:
     sigma_top: float
     cut_side: bool
     dimensions: Dimensions
+    sigma_cut: float | None = None  # of slope_bottom where the image cuts the bottom off: the true one is no less
 
     @property
     def bearing(self) -> float:
@@ -178,8 +180,10 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
     # An edge alone gives the centre as well as half of the outline is known; of a vehicle that leaves the image at its
     # side the nearest face is not seen
     lopsided = (of_left - of_right) / (of_left + of_right)
-    sigma_half = seen.dimensions.sigma_width_rel * seen.tan_width / 2.0
-    sigma_across = math.hypot(1.0 / math.sqrt(of_left + of_right), lopsided * sigma_half)
+    sigma_half = seen.dimensions.sigma_width_rel * max(seen.tan_width, max(outline) - min(outline)) / 2.0
+    sigma_across = math.hypot(
+        1.0 / math.sqrt(of_left + of_right), lopsided * sigma_half, config.shape_floor_m / max(x_m, 1.0)
+    )
     sigma_reach_m = reach_m * (1.0 if seen.cut_side else seen.dimensions.sigma_length_rel)
     along = x_m**2 * (var_depth + config.size_floor_rel**2) + sigma_reach_m**2
     across, slope = (x_m * sigma_across) ** 2, y_m / x_m
@@ -278,6 +282,7 @@ def _observe(
         sigma_top=sigma_px(height_px, cut_top, False) / camera.fy_px,
         cut_side=cut_left or cut_right,
         dimensions=config.vehicles[label],
+        sigma_cut=sigma_px(height_px, False, False) / camera.fy_px if cut_bottom else None,
     )
 
 

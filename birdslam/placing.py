@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erfcx
 
 from birdslam.association import NEAREST_M, in_ego
 from birdslam.depthplace import DepthPlace, PseudoLidarConfig, combined
@@ -88,7 +89,9 @@ class Placing:
             ]
         ).reshape(-1, 2)
         learned = self._sizes(bodies, centres, extents, turned, T_world_ego, horizon)
+        pitch_rad = horizon.ground.pitch_rad
         found = horizon.update(serials, seen, extents[:, 1], extents[:, 0], turned, learned)
+        found = no_farther_than_cut(found, seen, horizon, horizon.ground.pitch_rad - pitch_rad)
         by_boxes = [
             place(o, log_depth, variance, yaw, self.localisation)
             for o, log_depth, variance, yaw in zip(
@@ -133,3 +136,35 @@ class Placing:
         sights = sights_of(seen, centres_m, extents_m, turned_rad, roof_m2)
         serials = [body.serial for body in bodies]
         return self.parallax.update(serials, sights, T_world_ego, height_m, horizon.sigma_pitch_rad)
+
+
+def no_farther_than_cut(found: Depths, seen: Sequence[Observation], horizon: Horizon, tilted_rad: float) -> Depths:
+    """The depths (N,), given that a box that the image's border cuts reaches at least down to where it was drawn.
+
+    A vehicle's true bottom lies below the border, so that the nearest face of it is nearer than Eq. 1 makes of the
+    border: a bound as sure as that, whose product with the Gaussian has the moments of a probit. The road tilted by
+    `tilted_rad` since the slopes were taken.
+    """
+    bounds = {
+        k: (o.slope_bottom + tilted_rad, o.sigma_cut)
+        for k, o in enumerate(seen)
+        if o.sigma_cut is not None and o.slope_bottom + tilted_rad > 0.0
+    }
+    if not bounds:
+        return found
+    cut, (slope, sigma_cut) = list(bounds), np.array(list(bounds.values())).T
+    sigma_slope = np.hypot(sigma_cut, horizon.sigma_pitch_rad)
+    height_m = horizon.ground.height_m
+    doubt = np.square(sigma_slope / slope) + (horizon.config.sigma_kerb_m / height_m) ** 2
+    before = found.variance[cut]
+    total = before + doubt
+    inside = (np.log(height_m / slope) - found.log_depth[cut]) / np.sqrt(total)  # in sigmas; < 0: it was too far off
+    hazard = math.sqrt(2.0 / math.pi) / erfcx(-inside / math.sqrt(2.0))  # of the normal distribution
+    log_depth, variance, depth_per_height = (
+        array.copy() for array in (found.log_depth, found.variance, found.depth_per_height)
+    )
+    left = 1.0 - before / total * hazard * (hazard + inside)
+    log_depth[cut] -= before / np.sqrt(total) * hazard
+    variance[cut] *= left
+    depth_per_height[cut] *= left
+    return replace(found, log_depth=log_depth, variance=variance, depth_per_height=depth_per_height)

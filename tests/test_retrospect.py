@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from birdslam import bev
+from birdslam.evaluation import rms
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.graph import GraphConfig, PoseGraph
 from birdslam.localisation import DIMENSIONS
@@ -67,17 +68,16 @@ def errors(log: list[Measurements]) -> dict[str, tuple[float, float]]:
         for v in estimate.vehicles:
             if v.age_ns == 0:
                 live.setdefault(v.vehicle, {})[m.frame_id] = v.T_world_vehicle
-    found = {"parked": ([], []), "oncoming": ([], [])}  # type: ignore[var-annotated]
+    found: dict[str, tuple[list[float], list[float]]] = {"parked": ([], []), "oncoming": ([], [])}
     for (epoch, vehicle), poses in past.ways().items():
         assert epoch == 0
         assert poses.keys() == live[vehicle].keys()
         for k, pose in poses.items():
-            name, truth = min(
-                (("parked", PARKED), ("oncoming", oncoming(k))), key=lambda car, p=pose: abs(car[1].y_m - p.y_m)
-            )
+            beside_m = pose.y_m - (PARKED.y_m + oncoming(k).y_m) / 2.0  # the one parks farther to the left
+            name, truth = ("parked", PARKED) if beside_m > 0.0 else ("oncoming", oncoming(k))
             for gaps, at in zip(found[name], (live[vehicle][k], pose), strict=True):
                 gaps.append(math.hypot(at.x_m - truth.x_m, at.y_m - truth.y_m))
-    return {name: tuple(float(np.sqrt(np.mean(np.square(g)))) for g in gaps) for name, gaps in found.items()}  # type: ignore[misc]
+    return {name: (rms(np.array(at_once)), rms(np.array(later))) for name, (at_once, later) in found.items()}
 
 
 @pytest.mark.parametrize("parked_height_m", [1.38, 1.46, 1.68])

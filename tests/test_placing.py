@@ -1,0 +1,89 @@
+"""Vehicles that the image's border cuts: their true bottom lies below it, so that they are no farther than that."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from birdslam import bev
+from birdslam.depthplace import PseudoLidarConfig
+from birdslam.horizon import Depths, Horizon, HorizonConfig
+from birdslam.localisation import DIMENSIONS, LocalisationConfig, Observation, localise
+from birdslam.parallax import ParallaxConfig
+from birdslam.placing import Body, Placing, no_farther_than_cut
+from birdslam.se2 import SE2
+from tests.test_frontend import CAMERA
+
+Floats = NDArray[np.float64]
+CAR = DIMENSIONS["car"]
+CONFIG = LocalisationConfig()
+
+
+def seen_at(x_m: float, y_m: float, height_m: float = CAR.height_m) -> Observation:
+    """A car headed like the ego, as a detector draws what the image shows of it."""
+    half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
+    on_road = np.maximum(
+        np.array(half) + np.array([x_m, y_m]), [0.5, -99.0]
+    )  # what is behind the camera is not in the image
+    corners = np.vstack([np.column_stack([on_road, np.full(4, z)]) for z in (0.0, height_m)])
+    px = bev.ego_to_pixel(CAMERA, CAMERA.ground, corners)
+    low, high = np.zeros(2), np.array([CAMERA.width_px - 1.0, CAMERA.height_px - 1.0])
+    box = np.array([*np.clip(px.min(axis=0), low, high), *np.clip(px.max(axis=0), low, high)])
+    (found,) = localise(box[None], np.ones(1), ("car",), CAMERA, CAMERA.ground, CONFIG)
+    return found
+
+
+def depths(log_depth: float, sigma: float) -> Depths:
+    return Depths(*(np.array([value]) for value in (log_depth, sigma**2, 0.42, 0.0064, 0.9)))
+
+
+def test_only_a_bottom_that_the_image_cuts_is_a_bound() -> None:
+    assert seen_at(20.0, 2.0).sigma_cut is None
+    cut = seen_at(5.0, 1.0)
+    assert cut.sigma_cut is not None
+    assert cut.sigma_cut < 0.1 * cut.sigma_bottom
+    horizon, whole = Horizon(CAMERA, HorizonConfig()), depths(math.log(18.0), 0.1)
+    assert no_farther_than_cut(whole, [seen_at(20.0, 2.0)], horizon, 0.0) is whole
+
+
+@pytest.mark.parametrize(("depth_m", "sigma"), [(12.0, 0.5), (6.0, 0.3), (4.0, 0.2), (3.0, 1.5)])
+def test_the_moments_are_those_of_the_depth_given_the_bound(depth_m: float, sigma: float) -> None:
+    horizon, cut = Horizon(CAMERA, HorizonConfig()), seen_at(5.0, 1.0)
+    found = no_farther_than_cut(depths(math.log(depth_m), sigma), [cut], horizon, 0.0)
+    assert cut.sigma_cut is not None
+    doubt = math.hypot(cut.sigma_cut, horizon.sigma_pitch_rad) / cut.slope_bottom
+    doubt = math.hypot(doubt, horizon.config.sigma_kerb_m / CAMERA.height_m)
+    log_z = np.linspace(-12.0, 12.0, 400_001)
+    belief = np.exp(-0.5 * ((log_z - math.log(depth_m)) / sigma) ** 2)
+    belief *= ndtr((math.log(CAMERA.height_m / cut.slope_bottom) - log_z) / doubt)
+    mean = float((log_z * belief).sum() / belief.sum())
+    assert found.log_depth[0] == pytest.approx(mean, abs=1e-4)
+    assert found.variance[0] == pytest.approx(float(((log_z - mean) ** 2 * belief).sum() / belief.sum()), rel=1e-3)
+    assert found.depth_per_height[0] / 0.9 == pytest.approx(found.variance[0] / sigma**2)
+
+
+def test_a_depth_far_past_the_bound_gives_finite_numbers() -> None:
+    horizon, cut = Horizon(CAMERA, HorizonConfig()), seen_at(5.0, 1.0)
+    found = no_farther_than_cut(depths(8.0, 0.01), [cut], horizon, 0.0)
+    assert np.isfinite(found.log_depth).all()
+    assert found.log_depth[0] < 8.0
+    assert 0.0 < found.variance[0] < 1e-4
+
+
+def test_cars_beside_the_ego_are_not_thought_far_ahead() -> None:
+    errors = []
+    for x_m in np.arange(3.5, 7.0, 0.5):
+        for side in (-3.3, 3.3):
+            for height_m in (1.4, 1.53, 1.66):
+                placing = Placing(CONFIG, ParallaxConfig(), PseudoLidarConfig())
+                body = Body(0, None, seen_at(float(x_m), side, height_m))
+                assert body.seen.sigma_cut is not None
+                (where,) = placing.places([body], SE2(), Horizon(CAMERA, HorizonConfig()))
+                errors.append(where.centre_m[0] - x_m)
+                assert abs(errors[-1]) < 2.0 * math.sqrt(where.cov[0, 0])
+    assert abs(np.mean(errors)) < 1.0
+    assert np.sqrt(np.mean(np.square(errors))) < 1.5
