@@ -1,0 +1,77 @@
+"""What the soak calls well and what it does not; the drive itself is `python -m perf.soak`."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from perf import soak
+from perf.soak import Series, Systemd, faults, sample, table
+from tests.test_bus import until
+
+WELL: dict[str, Any] = {
+    "restarts": {"capture": 0, "perceive": 0},
+    "dropped_by": {"capture": 0, "perceive": 3},
+    "recording": {"restarts": 0, "dropped": 1},
+}
+
+
+@pytest.fixture
+def systemd(tmp_path: Path) -> Any:
+    with Systemd(tmp_path) as systemd:
+        yield systemd
+
+
+def series(mib: list[float], descriptors: list[int]) -> Series:
+    return Series(mib=mib, descriptors=descriptors, pids={1})
+
+
+def test_a_flat_drive_is_well(systemd: Systemd) -> None:
+    flat = series([100.0, 130.0, 100.2, 100.1, 100.3, 100.4] * 4, [30, 31, 30, 30, 29, 30] * 4)  # it swings
+    assert list(faults({"perceive": flat}, WELL, systemd)) == []
+    (row,) = [line for line in table({"perceive": flat}, WELL, systemd).splitlines() if line.startswith("| perceive")]
+    assert row.endswith("| 0 | 3 |")
+
+
+@pytest.mark.parametrize(
+    ("one", "said"),
+    [
+        (series([100.0 + 0.1 * number for number in range(30)], [30] * 30), "perceive grew by 2.4%"),
+        (series([100.0] * 24, [30] * 12 + [32, 33] * 6), "perceive holds 2 descriptors more"),
+        (Series(mib=[100.0] * 24, descriptors=[30] * 24, pids={1, 2}), "perceive was 2 processes, one after the other"),
+    ],
+)
+def test_what_grows_is_named(one: Series, said: str, systemd: Systemd) -> None:
+    assert list(faults({"perceive": one}, WELL, systemd)) == [said]
+
+
+def test_what_was_begun_anew_is_named(systemd: Systemd) -> None:
+    restarted = {**WELL, "restarts": {"capture": 2, "perceive": 0}, "recording": {"restarts": 1, "dropped": 0}}
+    assert list(faults({}, restarted, systemd)) == [
+        "capture was begun anew 2 times",
+        "record was begun anew 1 times",
+    ]
+
+
+def test_a_supervisor_that_is_silent_for_too_long_misses_its_watchdog(
+    systemd: Systemd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(soak, "WATCHDOG_S", 0.0)  # whatever comes second is late
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as supervisor:
+        for said in (b"READY=1", b"WATCHDOG=1\nSTATUS=x", b"STATUS=y", b"STOPPING=1", b"WATCHDOG=1"):
+            supervisor.sendto(said, systemd.environment["NOTIFY_SOCKET"])
+        until(lambda: systemd.missed == 1, "it is counted")
+    assert systemd.longest_s > 0.0
+    assert list(faults({}, WELL, systemd)) == ["the supervisor missed its watchdog 1 times"]
+
+
+def test_a_sample_is_of_the_process_itself() -> None:
+    into = {"this": Series()}
+    sample({"this": psutil.Process()}, into)
+    assert into["this"].mib[0] > 10.0
+    assert into["this"].descriptors[0] > 0
+    assert into["this"].pids == {psutil.Process().pid}
