@@ -99,3 +99,26 @@ def test_rate_max_awaits_all(made: Made) -> None:
         perception = pending.result()
         assert perception.ages == {"detector": 0, "segmenter": 0}
         assert perception.status == ()
+
+
+def test_what_runs_aside_begins_when_its_frame_is_over(made: Made) -> None:
+    detector, segmenter = Head("detector"), Head("segmenter")
+    with made(detector, segmenter, 1.0) as networks:
+        aside = networks.aside
+        assert aside is not None
+        networks.start(frame(0))
+        begun = threading.Event()
+        future = aside(begun.set)
+        assert not begun.wait(0.05)
+        networks.over()
+        future.result(timeout=5.0)
+        assert begun.is_set()
+        networks.start(frame(1))
+        last = aside(lambda: 7)  # a run that is closed ends without waiting for a frame that does not end
+    assert last.done()
+
+
+def test_at_rate_max_nothing_runs_aside(made: Made) -> None:
+    detector, segmenter = Head("detector"), Head("segmenter")
+    with made(detector, segmenter, 1.0, rate="max") as networks:
+        assert networks.aside is None
