@@ -27,6 +27,7 @@ ENVIRONMENT = {
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),  # the most that it takes
     "MALLOC_TRIM_THRESHOLD_": str(1 << 32),
     "MALLOC_TOP_PAD_": str(16 << 20),
+    "MALLOC_ARENA_MAX": "1",  # of one heap for all threads, whatever thread an image is made in
 }
 USER_ERROR_STATUS = 2  # of the program and of a node: what the user gave can't be used
 INTERRUPTED_STATUS = 130

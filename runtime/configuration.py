@@ -6,6 +6,7 @@ command-line option) and the key. Paths in a file are relative to that file.
 
 from __future__ import annotations
 
+import hashlib
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -72,6 +73,9 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     vehicle: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")] = "car"
     source: SourceConfig = SourceConfig()
     camera: Camera | None = None  # None: the recording's own; in a file: a table, or the path of a camera file
+    camera_sha256: Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")] = (
+        ""  # of the camera file, where it is pinned
+    )
     models: ModelsConfig = ModelsConfig()
     perceive: PerceiveConfig = PerceiveConfig()
     slam: SlamConfig = SlamConfig()
@@ -246,9 +250,17 @@ def _with_models_found(configuration: Configuration) -> Configuration:
 
 
 def _read_camera_file(tree: dict[str, Any]) -> None:
-    camera = tree.get("camera")
+    camera, pinned = tree.get("camera"), tree.get("camera_sha256")
     if not isinstance(camera, str):
+        if pinned:
+            raise ConfigurationError("camera_sha256: there is no camera file that it could pin")
         return
+    try:
+        found = hashlib.sha256(Path(camera).read_bytes()).hexdigest() if pinned else pinned
+    except OSError as error:
+        raise ConfigurationError(f"{camera}: {error.strerror}") from error
+    if found != pinned:
+        raise ConfigurationError(f"{camera}: its sha256 is {found}, camera_sha256 pins {pinned}: look what has changed")
     try:
         tree["camera"] = msgspec.to_builtins(load_camera(Path(camera)))
     except DatasetError as error:

@@ -19,6 +19,9 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of mallopt(3)
 _OBJECT_BYTES, _ANCHORED = 400, 256  # of Python's small objects, and how many in a row have one that stays
 _MIB = 1 << 20
 
+NODE_IMAGES = {"capture": 8, "perceive": 16}  # of the camera's size, in colour, that a node makes for a frame or so
+NODE_OBJECTS_MIB, NODE_HEAP_MIB = 4.0, 4.0
+
 _anchors: list[bytes] = []  # for ever: memory that holds one of these is not given back
 
 
@@ -44,6 +47,13 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
             yield "realtime.lock_memory: locking memory is not permitted (LimitMEMLOCK=infinity): it may be paged out"
         elif ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
             yield f"realtime.lock_memory: {os.strerror(ctypes.get_errno())}: memory may be paged out"
+
+
+def reserve_for(node: str, configuration: Configuration) -> None:
+    """`reserve` for what a node makes at work, when all that it loads is there."""
+    camera = configuration.camera
+    image_mib = 0.0 if camera is None else 3 * camera.width_px * camera.height_px / _MIB
+    reserve(NODE_OBJECTS_MIB, NODE_HEAP_MIB + NODE_IMAGES.get(node, 0) * image_mib)
 
 
 def reserve(objects_mib: float, heap_mib: float) -> None:

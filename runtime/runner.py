@@ -167,6 +167,7 @@ def main(arguments: list[str]) -> int:
     vitals = Vitals(int(vitals_fd))
     try:
         make = prepare(name, configuration)
+        realtime.reserve_for(name, configuration)
         give_back_memory()
         vitals.count(prepared=1)
         line = sys.stdin.buffer.readline()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import msgspec
@@ -97,6 +98,22 @@ def test_the_shipped_network_fills_what_is_left() -> None:
     assert list(load(None, paths).models.in_use()) == ["detector", "segmenter", "depth"]
     assert load(None, {"models.multitask.path": "own.onnx"}).models.in_use() == {"multitask": own}
     assert load(None, {"models.shipped": False}).models.in_use() == {}
+
+
+def test_a_camera_file_can_be_pinned(tmp_path: Path) -> None:
+    path = tmp_path / "front.toml"
+    path.write_text(CAMERA)
+    pin = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert load(None, {"camera": str(path), "camera_sha256": pin}).camera is not None
+    path.write_text(CAMERA.replace("1.5", "1.6"))
+    with pytest.raises(ConfigurationError, match=f"front.toml: its sha256 is .* camera_sha256 pins {pin}"):
+        load(None, {"camera": str(path), "camera_sha256": pin})
+    with pytest.raises(ConfigurationError, match="there is no camera file"):
+        load(None, {"camera_sha256": pin})
+    with pytest.raises(ConfigurationError, match="camera_sha256"):
+        load(None, {"camera": str(path), "camera_sha256": "not a hash"})
+    with pytest.raises(ConfigurationError, match=r"none\.toml"):
+        load(None, {"camera": str(tmp_path / "none.toml"), "camera_sha256": pin})
 
 
 def test_a_camera_file_that_is_wrong_is_named(tmp_path: Path) -> None:
