@@ -13,7 +13,8 @@ import re
 from pathlib import Path
 
 from birdslam.perception.completion import SHIPPED as COMPLETION
-from birdslam.perception.manifest import SHIPPED_NETWORKS, Glance, ModelError, find_as
+from birdslam.perception.manifest import SHIPPED_NETWORKS, ModelError
+from birdslam.perception.manifest_file import Glance, find_as
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from birdslam.camera import Camera
 from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
-from birdslam.perception.manifest import Glance, find_as
+from birdslam.perception.manifest_file import Glance, find_as
 from birdslam.perception.pointnet import load_pointnet
 from runtime import model_store
 from runtime.download import SCHEMES, download, on_terminal

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
-from birdslam.perception.manifest import Input, read_manifest
+from birdslam.perception.manifest import Input
+from birdslam.perception.manifest_file import read_manifest
 from birdslam.perception.multitask import OUTPUTS
 from birdslam.perception.views import Preparation, make_views
 from birdslam.training.augmentation import AugmentationConfig, photometric

@@ -30,7 +30,8 @@ from birdslam.camera import Camera
 from birdslam.datasets import DatasetError, load_camera
 from birdslam.graph import PoseGraph
 from birdslam.kitti import read_image, read_projection, read_times
-from birdslam.perception.manifest import Manifest, ModelError, read_manifest, shipped_manifests
+from birdslam.perception.manifest import Manifest, ModelError
+from birdslam.perception.manifest_file import read_manifest, shipped_manifests
 from birdslam.slam import SlamConfig
 from birdslam.types import INVALIDATING, FrameRef, Measurements
 from runtime.bus import Subscriber

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from birdslam.perception import ModelError, ModelSpec, load_network
-from birdslam.perception.manifest import shipped_manifests
+from birdslam.perception.manifest_file import shipped_manifests
 from tests import fuzz
 
 ROOT = Path(__file__).resolve().parent.parent

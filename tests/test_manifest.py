@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto
 
 from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
-from birdslam.perception.manifest import find_manifest, read_manifest
+from birdslam.perception.manifest_file import find_manifest, read_manifest
 from birdslam.perception.subnormal import without_tiny_weights
 
 SEGMENTER = """

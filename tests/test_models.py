@@ -18,7 +18,7 @@ from onnx import TensorProto, helper, numpy_helper
 from onnx.external_data_helper import set_external_data
 
 from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
-from birdslam.perception.manifest import read_manifest
+from birdslam.perception.manifest_file import read_manifest
 from birdslam.perception.onnx_file import has_weights_elsewhere
 from runtime import model_store, models
 from runtime.cli import _parser, main
@@ -264,7 +264,7 @@ def test_a_name_of_the_catalogue_is_fetched_and_pinned(
         shipped = tmp_path / "manifests"
         shipped.mkdir()
         (shipped / "one.toml").write_text(f'sha256 = "{sha256(network)}"\n{SEGMENTER}')
-        patch.setattr("birdslam.perception.manifest.SHIPPED_DIRECTORY", shipped)
+        patch.setattr("birdslam.perception.manifest_file.SHIPPED_DIRECTORY", shipped)
         catalogue(tmp_path, monkeypatch, server[1], network, manifest="one")
         main(["models", "list"])
         assert re.search("net +catalogue", capsys.readouterr().out)

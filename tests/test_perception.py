@@ -597,3 +597,34 @@ def test_grey_and_colour_alike_and_twice_the_same(data_dir: Path, models_dir: Pa
                 np.testing.assert_array_equal(value, vars(two or Perception())[key])
     assert network.sha256 == network.manifest.sha256
     assert msgspec.json.encode(network.describe())
+
+
+TILED = (
+    DETECTOR
+    + """
+[tiles]
+columns = 3
+overlap = 0.2
+"""
+)
+
+
+def test_a_square_detector_looks_at_each_tile_that_its_manifest_states(tmp_path: Path) -> None:
+    """A network that sees one box wherever it looks sees it once in each tile, enlarged as the tile is."""
+    box = np.array([[40.0, 10.0, 60.0, 40.0]])
+    path = tiny.constant(tmp_path / "a.onnx", (1, 3, SIZE_PX, SIZE_PX), encode(box, [0], [0.9])["output"])
+    image = np.full((SIZE_PX, 3 * SIZE_PX, 3), 9, np.uint8)
+    network = load_network("detector", write(path, TILED))
+    views = network.views(image)
+    assert [view.x0_px for view in views] == [0, 118, 236]
+    found = network.run(image)
+    assert found is not None
+    assert found.detections is not None
+    rx, ry = 148.0 / SIZE_PX, SIZE_PX / views[0].height_px  # tiles are 148 px wide: three, less their overlaps
+    expected = [[view.x0_px + 40.0 * rx, 10.0 * ry, view.x0_px + 60.0 * rx, 40.0 * ry] for view in views]
+    np.testing.assert_allclose(sorted(found.detections.boxes_px.tolist()), expected, atol=0.1)
+    assert network.describe()["tiles"] == 3
+    whole = load_network("detector", write(path, DETECTOR)).run(image)
+    assert whole is not None
+    assert whole.detections is not None
+    np.testing.assert_allclose(whole.detections.boxes_px[:, ::2], box[:, ::2] * 3.0, atol=0.1)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from birdslam.camera import Camera
 from birdslam.perception import ModelError, ModelSpec
-from birdslam.perception.pointnet import Points, frustum_of, load_pointnet
+from birdslam.perception.pointnet import frustum_of, load_pointnet
+from birdslam.perception.pointnet_manifest import Points
 
 CAMERA = Camera(width_px=640, height_px=192, fx_px=400.0, fy_px=400.0, cx_px=320.0, cy_px=96.0, height_m=1.6)
 BODY = """

@@ -4,7 +4,8 @@ from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.depth import DepthMap
 from birdslam.perception.detection import Detections
 from birdslam.perception.findings import Findings
-from birdslam.perception.manifest import Label, ModelError, shipped_manifests
+from birdslam.perception.manifest import Label, ModelError
+from birdslam.perception.manifest_file import shipped_manifests
 from birdslam.perception.network import ModelSpec, Network, load_network
 from birdslam.perception.schedule import ROLES, Networks, Pending, Perception, Ready
 from birdslam.perception.segmentation import Segmentation

@@ -1,19 +1,16 @@
 """Model manifests: a small TOML file says what a network takes and what each of its outputs means.
 
-A manifest is found by the first of these that exists: the one named explicitly (a path, or the name of a shipped one),
-the file beside the network with the same stem, the shipped one with the network's SHA-256, the shipped one with the
-network's stem. Unknown keys are errors.
+Unknown keys are errors. manifest_file.py says how a network's manifest is found.
 """
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal, Protocol, TypeVar, get_args
+from typing import Annotated, Literal, get_args
 
 import msgspec
 
-SHIPPED_DIRECTORY = Path(__file__).parent / "manifests"
 SHIPPED_NETWORKS = Path(__file__).parent / "shipped"  # each with its manifest beside it, but that of lane grids
 
 Role = Literal["detector", "segmenter", "depth", "multitask"]
@@ -23,26 +20,6 @@ Pixels = Annotated[int, msgspec.Meta(ge=8, le=8192)]
 Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Sha256 = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
-
-
-class Described(Protocol):
-    """What every manifest says, whatever its network takes."""
-
-    @property
-    def role(self) -> str: ...
-    @property
-    def sha256(self) -> str: ...
-
-
-Kind = TypeVar("Kind", bound=Described)
-
-
-class Glance(msgspec.Struct, frozen=True):
-    """What a manifest of any kind says of itself."""
-
-    role: str
-    title: str = ""
-    sha256: Sha256 = ""
 
 
 class ModelError(ValueError):
@@ -313,61 +290,3 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError(f"role: a {self.role} needs the table [{self.role}] and no other, got {given}")
         if self.tiles is not None and self.detector is None:
             raise ValueError(f"tiles: a {self.role} can't run on tiles, only a detector")
-
-
-def read_manifest(path: Path) -> Manifest:
-    """The manifest in a TOML file. Raises ModelError naming the file and the key."""
-    return read_as(path, Manifest)
-
-
-def read_as(path: Path, kind: type[Kind]) -> Kind:
-    """A manifest of some kind in a TOML file. Raises ModelError naming the file and the key."""
-    try:
-        return msgspec.toml.decode(path.read_bytes(), type=kind)
-    except OSError as error:
-        raise ModelError(f"{path}: the manifest can't be read: {error.strerror}") from error
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise ModelError(f"{path}: {error}") from error
-
-
-def shipped_manifests() -> dict[str, Path]:
-    """Name -> file of the manifests inside the package, in order of name."""
-    return {path.stem: path for path in sorted(SHIPPED_DIRECTORY.glob("*.toml"))}
-
-
-def find_manifest(network: Path, sha256: str, explicit: str = "") -> tuple[Manifest, Path]:
-    """The manifest of a network file with the given hash, and the file it came from (see the module's docstring).
-
-    Raises ModelError where there is none, where it can't be read, or where it pins another hash.
-    """
-    return find_as(network, sha256, explicit, Manifest)
-
-
-def find_as(network: Path, sha256: str, explicit: str, kind: type[Kind]) -> tuple[Kind, Path]:
-    """`find_manifest` for a manifest of another kind."""
-    path = _locate(network, sha256, explicit)
-    manifest = read_as(path, kind)
-    if manifest.sha256 and manifest.sha256 != sha256:
-        raise ModelError(f"{network}: sha256: the manifest {path} says {manifest.sha256}, the file has {sha256}")
-    return manifest, path
-
-
-def _locate(network: Path, sha256: str, explicit: str) -> Path:
-    shipped = shipped_manifests()
-    if explicit:
-        path = shipped.get(explicit, Path(explicit))
-        if not path.is_file():
-            raise ModelError(f"{network}: no manifest {explicit!r}: no such file, and shipped are {', '.join(shipped)}")
-        return path
-    beside = network.with_suffix(".toml")
-    if beside.is_file():
-        return beside
-    for path in shipped.values():
-        if read_manifest(path).sha256 == sha256:
-            return path
-    if network.stem in shipped:
-        return shipped[network.stem]
-    raise ModelError(
-        f"{network}: no manifest: none beside it ({beside.name}), none shipped with its SHA-256 {sha256} or its name "
-        f"(shipped: {', '.join(shipped)}); state one by manifest ="
-    )

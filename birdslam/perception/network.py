@@ -31,8 +31,8 @@ from birdslam.perception.manifest import (
     Role,
     Schedule,
     Yolox,
-    find_manifest,
 )
+from birdslam.perception.manifest_file import find_manifest
 from birdslam.perception.multitask import OUTPUTS, MultiTaskDecoder
 from birdslam.perception.onnx_file import has_weights_elsewhere
 from birdslam.perception.segmentation import ClassMapsDecoder

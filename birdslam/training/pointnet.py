@@ -19,7 +19,8 @@ from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from birdslam.camera import Camera
 from birdslam.perception.depth import DepthMap
-from birdslam.perception.pointnet import Body, Points, frustum_of
+from birdslam.perception.pointnet import frustum_of
+from birdslam.perception.pointnet_manifest import Body, Points
 from birdslam.simulation.truth import WorldFrame, WorldObject
 
 Floats = NDArray[np.float64]
