@@ -49,17 +49,17 @@ class Drift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class OdometryNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the image odometry does at 10 Hz, one motion between two frames (fitted, see the module)."""
 
-    tilt_rad: Drift = Drift(0.00055)  # rotation about the camera's x and z axes
-    turn_rad: Drift = Drift(0.00029, 0.000066, 31.0)  # rotation about its y axis: the yaw
-    turn_rel: NotNegative = 0.018  # ... and of the turn itself, the same for a whole drive (a focal length that is off)
-    rise_rad: Drift = Drift(0.0069, 0.0088, 23.0)  # direction of the translation, up and down
-    side_rad: Drift = Drift(0.009, 0.008, 46.0)  # ... and sideways, less what it has in common with the turn:
-    side_per_turn: float = -11.7  # a turn that is missed is taken for a sidestep
-    log_scale: Drift = Drift(0.023, 0.0125, 2.9)
-    ground_rad: Drift = Drift(0.0016, 0.0041, 6.6)  # pitch of the road as estimated from the images
-    landmarks: NotNegative = 20.0  # road tracks in sight of a frame
-    landmark_frames: Annotated[float, msgspec.Meta(ge=1.0)] = 6.3  # for how long one is followed
-    landmark_px: NotNegative = 0.37
+    tilt_rad: Drift = Drift(0.00043)  # rotation about the camera's x and z axes
+    turn_rad: Drift = Drift(0.00024, 0.000105, 1.7)  # rotation about its y axis: the yaw
+    turn_rel: NotNegative = 0.017  # ... and of the turn itself, the same for a whole drive (a focal length that is off)
+    rise_rad: Drift = Drift(0.0040, 0.0085, 25.0)  # direction of the translation, up and down
+    side_rad: Drift = Drift(0.0071, 0.0078, 19.0)  # ... and sideways, less what it has in common with the turn:
+    side_per_turn: float = 1.1  # a turn that is missed may be taken for a sidestep
+    log_scale: Drift = Drift(0.0193, 0.0114, 5.7)
+    ground_rad: Drift = Drift(0.0011, 0.0034, 6.0)  # pitch of the road as estimated from the images
+    landmarks: NotNegative = 26.0  # road tracks in sight of a frame
+    landmark_frames: Annotated[float, msgspec.Meta(ge=1.0)] = 5.6  # for how long one is followed
+    landmark_px: NotNegative = 0.39
 
 
 class SimulationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
