@@ -84,12 +84,19 @@ def _head(content: Mapping[str, Any]) -> str:
 def _configuration(benchmarks: Benchmarks) -> str:
     """What of the product's configuration bears on times; all of it is in report.json."""
     whole: Mapping[str, Any] = next((run["configuration"] for run in benchmarks.values() if "configuration" in run), {})
-    parts = (f"{key} = {whole[key]}" for key in ("source", "perceive", "models") if key in whole)
-    networks = (
-        f"{n['file']} {n['threads']} threads" for run in benchmarks.values() for n in run.get("networks", {}).values()
-    )
-    ran = ", ".join(dict.fromkeys(networks))
-    return "; ".join((*parts, *([f"ran: {ran}"] if ran else []), "the defaults else; whole in report.json"))
+    parts = [text for key in ("source", "perceive", "models") for text in _set(key, whole.get(key))]
+    networks = [network for run in benchmarks.values() for network in run.get("networks", {}).values()]
+    ran = dict.fromkeys(f"{n['file']} on {n['threads']} threads" for n in networks)
+    return "; ".join((*ran, ", ".join(parts), "whole in report.json"))
+
+
+def _set(key: str, value: object) -> Iterator[str]:
+    """KEY=VALUE of everything below a key that is not left to others."""
+    if isinstance(value, Mapping):
+        for name, below in value.items():
+            yield from _set(f"{key}.{name}", below)
+    elif value is not None:
+        yield f"{key}={_cell(value)}"
 
 
 def _system(benchmarks: Benchmarks) -> Iterator[str]:
@@ -168,8 +175,8 @@ def _accuracy(benchmarks: Benchmarks) -> Iterator[str]:
         ages = (_percentiles(row.get("age_ms", {}), ("p50", "p99")) for row in there)
         cells = ([row["name"], *(row.get(name) for name in titles), *age] for row, age in zip(there, ages, strict=True))
         yield from table(("run", *titles.values(), "age p50", "p99"), cells)
-        yield ""
-        yield from (f"- **{row['name']} is missing**: {row['missing']}" for row in rows if "missing" in row)
+        missing = [f"- **{row['name']} is missing**: {row['missing']}" for row in rows if "missing" in row]
+        yield from ["", *missing] if missing else []
         yield (
             "\nThe demo's networks are the shipped ones, the recordings' those of the command. Frames that a live run "
             "dropped hold the last pose. localisation and tracking read labelled boxes: no load changes them."
