@@ -335,6 +335,8 @@ class Odometry:
         return self._motion(frame_id, step, T_prev_curr, cov, [*status, Status.ODOMETRY_COASTING])
 
     def _motion(self, frame_id: int, step: Pose, T_prev_curr: SE2, cov: Floats, status: list[Status]) -> Motion:
+        if self._scale.unknown and Status.SCALE_INVALID not in status:
+            status = [*status, Status.SCALE_INVALID]  # standing or coasting, in metres that nobody knows
         return Motion(
             from_frame=self._base_frame if self._base_frame is not None else frame_id,
             to_frame=frame_id,

@@ -59,6 +59,11 @@ class MetricScale:
         return float(np.sqrt(self._filter.cov[0, 0]))
 
     @property
+    def unknown(self) -> bool:
+        """Too vague to be driven by."""
+        return self.sigma_rel > self.config.invalid_sigma_rel
+
+    @property
     def pitch_sigma_rad(self) -> float:
         return self._filter.chord[1]
 
@@ -111,7 +116,7 @@ class MetricScale:
         cfg, out = self.config, []
         if self._filter.carried_m > cfg.carried_after_m or not self._confirmed:
             out.append(Status.SCALE_CARRIED)
-        if self.sigma_rel > cfg.invalid_sigma_rel:
+        if self.unknown:
             out.append(Status.SCALE_INVALID)
         if self._refused >= cfg.violated_after:
             out.append(Status.GROUND_VIOLATED)

@@ -164,6 +164,35 @@ def test_a_frozen_and_a_dark_camera(recorded: tuple[Camera, list[Image]]) -> Non
     assert estimates[-1].valid
 
 
+def test_a_car_that_stands_where_nothing_was_ever_measured_knows_no_metres(
+    recorded: tuple[Camera, list[Image]],
+) -> None:
+    """One picture with the noise of a sensor: as of a parked car, or of a screen in front of the camera."""
+    camera, images = recorded
+    rng = np.random.default_rng(4)
+
+    def still(k: int, image: Image) -> Image:
+        return np.clip(images[0] + rng.normal(0.0, 1.5, image.shape), 0, 255).astype(np.uint8)
+
+    estimates = drive(camera, images[:20], still)
+    assert carrying(Status.STANDSTILL, estimates[4:])
+    assert all(e.scale_sigma_rel > 0.15 for e in estimates[1:])
+    assert carrying(Status.SCALE_INVALID, estimates[1:]) == list(range(1, 20))
+    assert not any(e.valid for e in estimates)
+
+
+def test_a_stop_keeps_the_metres_that_were_known(recorded: tuple[Camera, list[Image]]) -> None:
+    camera, images = recorded
+    rng = np.random.default_rng(4)
+
+    def stop(k: int, image: Image) -> Image:
+        return image if k < 20 else np.clip(images[20] + rng.normal(0.0, 1.5, image.shape), 0, 255).astype(np.uint8)
+
+    estimates = drive(camera, images[:32], stop)
+    assert set(range(23, 32)) <= set(carrying(Status.STANDSTILL, estimates))
+    assert all(e.valid for e in estimates[20:])
+
+
 # --- height: boxes made by the law that they are read by, with the spread of real cars ---
 
 
