@@ -317,6 +317,7 @@ def test_perfect_findings_get_the_best_grades() -> None:
     assert figures["flips"] == 0.0
     assert figures["yaw_median_deg"] < 0.1
     assert figures["centre_median_rel"] < 1e-3
+    assert figures["box_sigma_rel"] < 1e-3
     assert figures["road_iou"] > 0.97
     assert figures["depth_absrel"] < 0.1
 

@@ -16,6 +16,7 @@ from birdslam.simulation.truth import CLASSES, WorldFrame, WorldObject
 
 _ROAD, _LANE, _SKY = (CLASSES.index(name) for name in ("road", "lane", "sky"))
 _VEHICLES = ("car", "van", "truck", "bus")
+CLEAR = 0.9  # of a body is seen where its whole outline is
 
 
 class GradingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -50,6 +51,7 @@ class Grades:
     centre_rel: list[float] = field(default_factory=list)  # of the depth, at near_m to far_m
     size_rel: list[NDArray[np.float64]] = field(default_factory=list)
     depth_z: list[float] = field(default_factory=list)  # error over stated sigma
+    edge_rel: list[float] = field(default_factory=list)  # of each edge of a box that nothing hides, over its side
 
     def add(self, findings: Findings, frame: WorldFrame) -> None:
         """One frame. Findings are of its image at any network size."""
@@ -90,6 +92,9 @@ class Grades:
                     continue
                 self.scores.append(float(found.scores[row]))
                 self.hits.append(True)
+                if vehicles[best].visible > CLEAR and vehicles[best].truncated == 0.0:
+                    sides = np.tile(truth[best, 2:] - truth[best, :2], 2)
+                    self.edge_rel += (np.abs(found.boxes_px[row] - truth[best]) / sides).tolist()
                 if found.scores[row] >= config.score:
                     self._body(found, int(row), vehicles[best], frame)
             elif tall[row] and not box_ious(found.boxes_px[row : row + 1], people).max(initial=0.0) >= config.iou:
@@ -137,6 +142,7 @@ class Grades:
             "length_median_rel": _median(sizes[:, 0].tolist()),
             "width_median_rel": _median(sizes[:, 1].tolist()),
             "height_median_rel": _median(sizes[:, 2].tolist()),
+            "box_sigma_rel": 1.4826 * _median(self.edge_rel),  # a manifest's box_sigma, with the part in pixels in it
             "depth_sigma_ratio": 1.4826 * _median([abs(z) for z in self.depth_z]),
         }
 
