@@ -19,7 +19,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of mallopt(3)
 _OBJECT_BYTES, _ANCHORED = 400, 256  # of Python's small objects, and how many in a row have one that stays
 _MIB = 1 << 20
 
-NODE_IMAGES = {"capture": 8, "perceive": 16}  # of the camera's size, in colour, that a node makes for a frame or so
+NODE_IMAGES = {"capture": 8, "perceive": 40}  # of the camera's size, in colour, that a node has at once at its worst
 NODE_OBJECTS_MIB, NODE_HEAP_MIB = 4.0, 4.0
 
 _anchors: list[bytes] = []  # for ever: memory that holds one of these is not given back

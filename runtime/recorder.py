@@ -26,7 +26,7 @@ import msgspec
 import psutil
 
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
-from runtime import scene
+from runtime import realtime, scene
 from runtime.bus import Bus, Message
 from runtime.checkpoints import checkpoint_path, newest
 from runtime.child import LOG_FORMAT, die_with
@@ -49,6 +49,7 @@ HEALTH_NS = 1_000_000_000
 EVENTS = 256  # of liveliness that wait
 DISK_STATUS = 3
 NICENESS = 5  # the pipeline goes first
+INDEX_MIB = 8.0, 8.0  # of objects and of larger blocks: the index of an hour, and chunks with images
 
 log = logging.getLogger(__name__)
 
@@ -288,6 +289,7 @@ def main(arguments: list[str]) -> int:
     configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
     order = msgspec.json.decode(sys.stdin.buffer.readline(), type=Order)
     sys.setswitchinterval(configuration.runtime.switch_interval_s)
+    realtime.reserve(*INDEX_MIB)
     vitals = Vitals(int(vitals_fd))
     try:
         reason = record(configuration, order, vitals, stop)

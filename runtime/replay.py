@@ -89,6 +89,7 @@ class Comparison:
         self._maps: dict[int, MapUpdate] = {}
         self._alive = 0  # how often the optimizer came
         self._checkpoint = _checkpoint(recording)
+        self._since: list[Measurements] = []  # after it, for the first estimate that can be compared
         self._epoch: int | None = None
 
     def run(self) -> Verdict:
@@ -172,10 +173,11 @@ class Comparison:
         checkpoint = self._checkpoint
         if self._state is None:
             at_first = self.verdict.equal + self.verdict.unknown == 0 and checkpoint is None
-            if checkpoint is not None and now and estimate.epoch == checkpoint.epoch:
-                since = [m for m in (*open_, *now) if m.frame_id > checkpoint.frame_id]
-                if since and since[-1].frame_id == estimate.frame_id:
-                    yield _State(PoseGraph.restore(checkpoint.data, *self._back_end)), since, False
+            if checkpoint is not None:
+                self._since += [m for m in (*open_, *now) if m.frame_id > checkpoint.frame_id]
+                answered_in_time = bool(now and self._since) and self._since[-1].frame_id == estimate.frame_id
+                if answered_in_time and estimate.epoch == checkpoint.epoch:
+                    yield _State(PoseGraph.restore(checkpoint.data, *self._back_end)), self._since, False
             if new_world or at_first:
                 yield self._fresh(estimate), now, False
             return

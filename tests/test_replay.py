@@ -15,12 +15,14 @@ from hypothesis import strategies as st
 import perf.replay
 from birdslam.types import Estimate, Status
 from runtime import recording_commands, replay
+from runtime.checkpoints import checkpoint_path, newest
 from runtime.configuration import ConfigurationError
-from runtime.recording import Recording
+from runtime.recorder import about
+from runtime.recording import Alive, GraphCheckpoint, Recording, RecordingWriter
 from runtime.replay import compare
 from runtime.report_replay import told
 from runtime.verdict import Verdict
-from tests.taped_drive import Tape, measured
+from tests.taped_drive import CAMERA, Tape, measured
 
 
 def verdict_of(tape: Tape) -> Verdict:
@@ -174,6 +176,40 @@ def test_whatever_happens_nothing_differs(events: list[str], seed: int) -> None:
         assert verdict.equal + events.count("estimate lost") == len(tape.estimates)
         assert verdict.restarts == sum(event in ("restored", "new world") for event in events)
         assert verdict.unknown == 0
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_file_that_begins_in_the_middle_of_a_drive_replays_from_its_checkpoint(tmp_path: Path, late: bool) -> None:
+    tape, frames = Tape(tmp_path), measured(40)
+    for measurements in frames[:15]:
+        tape.step(measurements)
+    kept = newest(checkpoint_path(tape.configuration))
+    assert kept is not None
+    tape.writer.close({})
+    path = tmp_path / "drive-2.mcap"
+    tape.writer = RecordingWriter(path, about(tape.configuration, {}, restarts=1), CAMERA, 1e-3, sync=False)
+    tape.writer.draw("/alive", Alive(node="optimize", alive=True), tape._tick())
+    tape.writer.begin_from(GraphCheckpoint(frame_id=kept.frame_id, epoch=kept.epoch, data=kept.data), tape._tick())
+    if late:  # the first frame of the file is answered when the next one has been coasted over
+        tape.frame(frames[15])
+        coasted = tape.frame(frames[16])
+        first = tape.send(frames[15])
+        tape.coast(coasted)
+        tape.take(first)
+        tape.take(tape.send(frames[16]))
+    for measurements in frames[17 if late else 15 : 30]:
+        tape.step(measurements)
+    tape.restart(with_checkpoint=True)
+    for measurements in frames[30:]:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    recording = Recording(path)
+    verdict = compare(recording)
+    assert verdict.difference is None
+    assert verdict.same
+    assert verdict.unknown == (2 if late else 0)
+    assert verdict.equal == len(tape.estimates) - 15 - verdict.unknown
+    assert verdict.restarts == 1
 
 
 def test_a_recording_that_was_cut_off_replays_up_to_there(tmp_path: Path) -> None:
