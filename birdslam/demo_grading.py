@@ -12,13 +12,12 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from birdslam.camera import GroundPlane
 from birdslam.demo_drive import DemoRecording, TrueBody
 from birdslam.evaluation import compare, from_first
 from birdslam.se2 import SE2
-from birdslam.tracking_metrics import path_errors
+from birdslam.tracking_metrics import least_cost, path_errors
 from birdslam.trajectory import CameraTrajectory, as_poses, ego_pose, inverse, mount_pose, split_pose
 from birdslam.types import Estimate, VehicleEstimate
 
@@ -140,5 +139,5 @@ def match(estimate: Estimate, bodies: Sequence[TrueBody]) -> list[tuple[TrueBody
     goal = np.array([[body.T_ego_body.x_m, body.T_ego_body.y_m] for body in bodies])
     gates_m = np.maximum(GATE_M, GATE_REL * np.linalg.norm(goal, axis=1))
     distance = np.linalg.norm(goal[:, None] - at[None], axis=2) / gates_m[:, None]
-    rows, columns = linear_sum_assignment(np.minimum(distance, 1.0))
+    rows, columns = least_cost(np.minimum(distance, 1.0))
     return [(bodies[i], seen[j]) for i, j in zip(rows, columns, strict=True) if distance[i, j] < 1.0]

@@ -14,7 +14,6 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from birdslam.association import predicted_boxes_px, within_gate
 from birdslam.camera import Camera, GroundPlane
@@ -66,6 +65,9 @@ class Tracker:
         localisation: LocalisationConfig,
         pseudolidar: PseudoLidarConfig | None = None,
     ) -> None:
+        from scipy.optimize import linear_sum_assignment  # only who tracks holds its 9 MB: capture and optimize don't
+
+        self._assign = linear_sum_assignment
         self.camera = camera
         self.config = config
         self.localisation = localisation
@@ -161,7 +163,7 @@ class Tracker:
         possible = (overlap >= self.config.min_iou) & within_gate(
             self.tracks, observations, T_world_ego, self.config.gate_sigma
         )
-        rows, columns = linear_sum_assignment(np.where(possible, 1.0 - overlap, 2.0))
+        rows, columns = self._assign(np.where(possible, 1.0 - overlap, 2.0))
         return [(self.tracks[i], observations[j]) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
 
     def _correct(

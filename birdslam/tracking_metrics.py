@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from birdslam.evaluation import rms, rpe
 from birdslam.kitti_tracking import VEHICLE_KINDS, Label
@@ -39,9 +38,17 @@ class BoxFrame:
     overlap: Floats
 
 
+def least_cost(cost: Floats) -> tuple[Ints, Ints]:
+    """Rows and columns of the pairs of least total cost."""
+    from scipy.optimize import linear_sum_assignment  # only here: the supervisor of a drive would hold its 9 MB
+
+    rows, columns = linear_sum_assignment(cost)
+    return rows, columns
+
+
 def assign(overlap: Floats, least: float = MATCH_IOU) -> tuple[Ints, Ints]:
     """Rows and columns of the pairs of greatest total overlap, each at least `least`."""
-    rows, columns = linear_sum_assignment(-np.where(overlap >= least, overlap, 0.0))
+    rows, columns = least_cost(-np.where(overlap >= least, overlap, 0.0))
     keep = overlap[rows, columns] >= least
     return rows[keep].astype(np.int64), columns[keep].astype(np.int64)
 
@@ -105,7 +112,7 @@ def hota(frames: Sequence[BoxFrame]) -> float | None:
     for frame, rows, columns in _placed(frames, labels, tracks):
         if not frame.overlap.size:
             continue
-        i, j = linear_sum_assignment(-alignment[np.ix_(rows, columns)] * frame.overlap)
+        i, j = least_cost(-alignment[np.ix_(rows, columns)] * frame.overlap)
         for level, least in enumerate(HOTA_IOU):
             good = frame.overlap[i, j] >= least - 1e-9
             found[level] += good.sum()
@@ -125,7 +132,7 @@ def idf1(frames: Sequence[BoxFrame]) -> float | None:
     shared = np.zeros((len(labels), len(tracks)))
     for frame, rows, columns in _placed(frames, labels, tracks):
         shared[np.ix_(rows, columns)] += frame.overlap >= MATCH_IOU
-    rows, columns = linear_sum_assignment(-shared)
+    rows, columns = least_cost(-shared)
     return float(2.0 * shared[rows, columns].sum() / total)
 
 
