@@ -146,15 +146,23 @@ def segment_errors(truth: Pose, estimated: Pose) -> tuple[float, float] | None:
     return 100.0 * float(np.mean(strayed / length)), float(np.mean(turned_deg / length))
 
 
-def compare(sequence: str, truth: Pose | None, estimated: Pose, statuses: dict[str, int]) -> OdometryReport:
-    """The report of one sequence. Raises ValueError where the two don't have the same number of poses."""
+def compare(
+    sequence: str, truth: Pose | None, estimated: Pose, statuses: dict[str, int], compared: slice = slice(None)
+) -> OdometryReport:
+    """The report of one sequence; where not all are `compared`, of those, the first of them aligned.
+
+    Raises ValueError where the two don't have the same number of poses.
+    """
+    if truth is not None and len(truth) != len(estimated):
+        raise ValueError(f"sequence {sequence}: {len(estimated)} poses estimated for {len(truth)} frames")
+    if compared != slice(None):
+        estimated = from_first(estimated[compared])
+        truth = None if truth is None else from_first(truth[compared])
     path_estimated_m = path_length_m(estimated)
     if truth is None:
         return OdometryReport(
             sequence=sequence, frames=len(estimated), path_estimated_m=path_estimated_m, statuses=statuses
         )
-    if len(truth) != len(estimated):
-        raise ValueError(f"sequence {sequence}: {len(estimated)} poses estimated for {len(truth)} frames")
     path_m, error_m = path_length_m(truth), ate_m(truth, estimated)
     rpe_t_m, rpe_r_deg = rpe(truth, estimated)
     segments = segment_errors(truth, estimated)
@@ -183,11 +191,13 @@ def evaluate_odometry(
     run: Callable[[Recording], Iterable[Measurements | Estimate | MapUpdate]],
     directory: Path,
     summary: Mapping[str, Any] | None = None,
+    compared: slice = slice(None),
 ) -> list[OdometryReport]:
     """Run the pipeline over each recording, keep its results in `directory/NAME`, and compare them with the truth.
 
     `run` gives one Estimate a frame; before it the frame's Measurements, where the car ahead is to be compared with the
-    recording's LiDAR, and after it what the map gained. `summary` goes into each summary.json. Writes
+    recording's LiDAR, and after it what the map gained. `summary` goes into each summary.json. Of what was run,
+    the frames `compared` are held to the truth, aligned at the first of them. Writes
     `directory/report.json`, a list of OdometryReport. Raises ValueError before the first run where two recordings share
     a name, a truth file is torn or the directory can't be written to, and after a run that did not give one estimate a
     frame.
@@ -215,7 +225,7 @@ def evaluate_odometry(
         rows = as_poses(read_kitti(directory / recording.name / "ego.kitti.txt"))
         estimated = in_camera0(rows, recording.T_cam0_cam())
         goal = None if truth is None else from_first(as_poses(truth))
-        row = compare(recording.name, goal, estimated, dict(sorted(recorder.statuses.items())))
+        row = compare(recording.name, goal, estimated, dict(sorted(recorder.statuses.items())), compared)
         report.append(msgspec.structs.replace(row, car_ahead=ahead.report()) if ahead else row)
         encoded = msgspec.json.format(msgspec.json.encode(report), indent=2)
         (directory / "report.json").write_bytes(

@@ -100,6 +100,7 @@ def _parser() -> argparse.ArgumentParser:
     for command, what in (("evaluate odometry", odometry), ("evaluate car-ahead", ahead)):
         what.add_argument("sequences", nargs="+", metavar="SEQUENCE_DIR", help="a KITTI directory, or a source's URI")
         what.add_argument("--config", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
+        what.add_argument("--frames", default=":", metavar="FIRST:END", help="compare these alone; all are driven")
         _add_pipeline_options(what)
         what.set_defaults(command=command)
     tracking_options.add_commands(evaluate)

@@ -261,9 +261,26 @@ def _evaluate(options: argparse.Namespace) -> list[evaluation.OdometryReport]:
     if not configuration.models.in_use():
         print(supervisor.WITHOUT_MODELS)
     with _pipeline(configuration) as drive:
-        reports = evaluation.evaluate_odometry(recordings, drive, Path(configuration.output))
+        reports = evaluation.evaluate_odometry(
+            recordings, drive, Path(configuration.output), compared=_compared(options.frames, recordings)
+        )
     print(f"results in {configuration.output}")
     return reports
+
+
+def _compared(text: str, recordings: list[Recording]) -> slice:
+    """The frames FIRST:END (either may be missing) that are held to the truth; at least two of each recording."""
+    first, colon, end = text.partition(":")
+    numbers = [part for part in (first, end) if part]
+    if not colon or not all(part.isdecimal() for part in numbers):
+        raise ConfigurationError(f"--frames {text}: expected FIRST:END, such as 14: or 14:120")
+    frames = slice(int(first) if first else None, int(end) if end else None)
+    for recording in recordings:
+        if len(range(*frames.indices(len(recording)))) < 2:
+            raise ConfigurationError(
+                f"--frames {text}: fewer than two of the {len(recording)} frames of {recording.name}"
+            )
+    return frames
 
 
 def _odometry_table(reports: list[evaluation.OdometryReport]) -> str:

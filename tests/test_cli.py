@@ -95,3 +95,12 @@ def test_a_mistake_is_one_line(arguments: list[str], said: str, capsys: pytest.C
 def test_listening_to_nobody_ends_when_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["listen", "--vehicle", "nobody", "--runtime-dir", str(tmp_path), "--timeout", "0.2"]) == 1
     assert "no estimate of vehicle 'nobody' in 0.2 s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("text", "complaint"), [("14", "FIRST:END"), ("a:", "FIRST:END"), ("999:", "fewer than two")])
+def test_frames_that_cannot_be_compared_are_one_line(
+    text: str, complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["evaluate", "odometry", "demo", "--model", "none", "--frames", text, "--output", str(tmp_path)]
+    assert main(arguments if text != "999:" else [*arguments, "--stride", "50"]) == 2
+    assert complaint in capsys.readouterr().err

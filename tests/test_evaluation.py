@@ -137,6 +137,20 @@ def test_segments_do_not_see_what_the_first_pose_lacks() -> None:
     assert segment_errors(truth[:8], truth[:8]) is None
 
 
+def test_only_the_frames_asked_for_are_compared() -> None:
+    """A truth whose first pose is off by a degree turns the whole way; from the second frame on nothing is left."""
+    truth = drive(3)
+    estimated = truth.copy()
+    estimated[0, :3, :3] = Rotation.from_euler("y", 1.0, degrees=True).as_matrix()
+    whole = compare("s", truth, from_first(estimated), {})
+    rest = compare("s", truth, from_first(estimated), {}, slice(1, 30))
+    assert whole.ate_m is not None
+    assert whole.ate_m > 0.1
+    assert rest.frames == 29
+    assert rest.ate_m == pytest.approx(0.0, abs=1e-6)
+    assert rest.path_m == pytest.approx(float(np.linalg.norm(np.diff(truth[1:30, :3, 3], axis=0), axis=1).sum()))
+
+
 def test_an_estimate_that_never_moved() -> None:
     truth = drive(1)
     still = np.tile(np.eye(4), (len(truth), 1, 1))
