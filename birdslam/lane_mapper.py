@@ -61,6 +61,7 @@ class _Gathered:
     lanes: Ids
     stations: list[Station]
     made_out: bool  # the lanes too, and not only what this one frame saw
+    failed: bool  # their completion gave no usable numbers
 
 
 @dataclass(frozen=True)
@@ -178,7 +179,7 @@ class LaneMapper:
             tuple(LanePoint(x, y, lane) for (x, y), lane in zip(points, found.lanes.tolist(), strict=True)),
             edges,
             age,
-            status,
+            (*status, Status.NETWORK_FAILED) if found.failed else status,
         )
 
     def _gather(
@@ -204,7 +205,8 @@ class LaneMapper:
             seen_m = seen_m[cKDTree(points_m).query(seen_m)[0] > self._amodal.config.same_lane_m]
         seen_m = seen_m[: self.config.max_lane_points - len(points_m)]
         all_lanes = np.concatenate([lanes, np.full(len(seen_m), NO_LANE)])
-        return _Gathered(np.concatenate([points_m, seen_m]), all_lanes, found, due)
+        failed = due and self._amodal.completion_failed
+        return _Gathered(np.concatenate([points_m, seen_m]), all_lanes, found, due, failed)
 
     def _lanes_m(self, T_world_ego: SE2) -> tuple[Floats, Ids]:
         """(N, 2) points, in world, of the lanes ahead, and their lanes (N,): the middle of what lies in each cell.

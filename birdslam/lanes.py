@@ -80,6 +80,7 @@ class AmodalLanes:
     def __init__(self, config: LanesConfig, complete: Completion | None = None) -> None:
         self.config = config
         self.complete = complete
+        self.completion_failed = False  # the last time: it gave numbers that are none, and the grids stayed as seen
         self._frames: deque[tuple[SE2, Floats, Floats]] = deque(maxlen=config.window_frames)
         self.ids = LaneIds(config.same_lane_m, config.cell_m, config.remembered_m)
 
@@ -103,9 +104,11 @@ class AmodalLanes:
     def lanes(self, T_world_ego: SE2) -> tuple[LaneCloud, ...]:
         """The lanes around the ego at `T_world_ego`, each with its id."""
         grids = self.grids(T_world_ego)
-        if self.complete is None:
+        completed = None if self.complete is None else self.complete(grids)
+        self.completion_failed = completed is not None and not np.isfinite(completed).all()
+        if completed is None or self.completion_failed:
             return self.ids.name(T_world_ego, segregate(grids, self.config))
-        clouds = segregate(np.maximum(grids, self.complete(grids)), self.config)  # what was seen stays
+        clouds = segregate(np.maximum(grids, completed), self.config)  # what was seen stays
         seen = cv2.dilate(grids[BOUNDARY], np.ones((5, 5), dtype=np.uint8)) > 0.0
         known = [cloud for cloud in clouds if np.sum(seen[_cells_of(cloud, self.config)]) >= self.config.least_cells]
         return self.ids.name(T_world_ego, known)

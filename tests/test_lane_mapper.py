@@ -175,3 +175,11 @@ def test_what_a_frame_saw_is_told_of_the_next_ones_from_where_they_are() -> None
         assert [e.landmark for e in told.edges] == [e.landmark for e in seen.edges]
         assert [e.x_m + k * STEP_M for e in told.edges] == pytest.approx([e.x_m for e in seen.edges])
         assert {e.frame for e in told.edges} == {drive.frame}
+
+
+def test_a_completion_without_numbers_is_said_and_leaves_what_was_seen() -> None:
+    whole, broken = Driver(LaneHead(None, None, 3)), Driver(LaneHead(lambda grids: grids * np.nan, None, 3))
+    for k in range(9):
+        seen, said = whole.step(), broken.step()
+        assert said.status == ((Status.NETWORK_FAILED,) if k % 3 == 0 else ())
+        assert (said.points, said.edges, said.age) == (seen.points, seen.edges, seen.age)
