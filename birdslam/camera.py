@@ -86,6 +86,16 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """(3, 3) intrinsic matrix in pixels."""
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
 
+    def to_xy(self, px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 2) rays of z = 1 from pixels (N, 2)."""
+        out: NDArray[np.float64] = (px - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
+        return out
+
+    def to_px(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 2) pixels of rays (N, 2) of z = 1."""
+        out: NDArray[np.float64] = xy * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
+        return out
+
     @property
     def ground(self) -> GroundPlane:
         """The calibrated ground plane: what the online estimate starts from."""

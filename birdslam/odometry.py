@@ -17,9 +17,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.bundle import SlidingWindow, two_view
+from birdslam.bundle import two_view
 from birdslam.camera import Camera
 from birdslam.features import FeatureConfig, FeatureTracker, Tracks
+from birdslam.keywindow import KeyWindow, KeyWindowConfig
 from birdslam.motion import Motion, MotionConfig, coasting_cov, measured_cov, planar, standing_cov
 from birdslam.pose import Pose, rotation_exp, rotation_log
 from birdslam.roadalign import RoadFit
@@ -41,21 +42,13 @@ _STILL = Pose(np.eye(3), np.zeros(3))
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
 
 
-class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class OdometryConfig(KeyWindowConfig, frozen=True, forbid_unknown_fields=True):
     """One setting for every camera, road and frame rate."""
 
     features: FeatureConfig = FeatureConfig()
     road: RoadScaleConfig = RoadScaleConfig()
     motion: MotionConfig = MotionConfig()
-    # the window
-    key_images: Annotated[int, msgspec.Meta(ge=3)] = 8
-    held_images: Count = 2  # the oldest of them, which the adjustment leaves alone: they carry the unit of length
-    adjusted_landmarks: Count = 400
-    adjust_iterations: Count = 1  # each image adjusts again what the one before left
-    key_parallax_px: Positive = 8.0  # a new key image when the median landmark has moved so far, rotation taken out
-    key_distance_m: Positive = 0.7
-    sigma_track_px: Positive = 0.35
-    reject_px: Positive = 2.2
+    # where the window does not show the pose
     two_view_px: Positive = 0.7
     min_fitting: Count = 18  # landmarks that must agree before a pose counts as measured
     min_fitting_fraction: Positive = 0.35
@@ -94,7 +87,6 @@ class Odometry:
         self._tracker.reset()
         self._scale = MetricScale(self.camera, self.config.road)
         self._window = self._new_window()
-        self._provisional = False  # the window's newest image is no key image yet
         self._pose = _STILL  # of the base image, in the window's frame
         self._base_frame: int | None = None  # the last image whose motion was measured
         self._base_t_ns = 0
@@ -128,17 +120,17 @@ class Odometry:
         at = np.minimum(at, max(len(self._window.ids) - 1, 0))
         if len(self._window.ids):
             known = self._window.ids[at] == base.ids
-            px = self._to_px(self._window.predict_xy(pose)[at])
+            px = self.camera.to_px(self._window.predict_xy(pose)[at])
             known &= np.isfinite(px).all(axis=1)
             out[known] = px[known]
         return out
 
     def _default_prediction(self, px: Floats, step: Pose) -> Floats:
         """Where a corner of unknown depth goes: as if on the road below the horizon, as if endless above."""
-        rays = np.column_stack([self._to_xy(px), np.ones(len(px))])
+        rays = np.column_stack([self.camera.to_xy(px), np.ones(len(px))])
         rho = np.maximum(-(rays @ self._scale.ground.normal_cam) / self.camera.height_m, 0.0) * 0.5
         q = (rays - rho[:, None] * step.p) @ step.R
-        out = self._to_px(q[:, :2] / np.maximum(q[:, 2:], 0.2))
+        out = self.camera.to_px(q[:, :2] / np.maximum(q[:, 2:], 0.2))
         lost = (q[:, 2] < 0.3) | (np.abs(out - px) > 0.4 * self.camera.width_px).any(axis=1)
         out[lost] = px[lost]
         return out
@@ -169,7 +161,7 @@ class Odometry:
             return self._coasting(frame_id, dt_s, status)
 
         static = self._outside(tracks.px, boxes)
-        ids, xy = tracks.ids[static], self._to_xy(tracks.px[static])
+        ids, xy = tracks.ids[static], self.camera.to_xy(tracks.px[static])
         displacement = self._displacement(tracks, static)
         found = self._locate(ids, xy, dt_s, displacement)
         if found is None:
@@ -186,7 +178,7 @@ class Odometry:
             motion = self._standing(frame_id)
             self._velocity = _Velocity(np.zeros(3), np.zeros(3))
         else:
-            pose, info = self._extend_window(frame_id, pose, ids, xy, info)
+            pose, info = self._window.extend(frame_id, pose, ids, xy, info)
             step = self._pose.between(pose)
             self._scale.moved(step)
             factor = self._scale.compare(tracks.image, pose, boxes, road_mask)
@@ -206,8 +198,7 @@ class Odometry:
         self._window = self._new_window()
         self._pose = _STILL
         static = self._outside(tracks.px, boxes)
-        self._window.append(frame_id, self._pose, tracks.ids[static], self._to_xy(tracks.px[static]))
-        self._provisional = False
+        self._window.append(frame_id, self._pose, tracks.ids[static], self.camera.to_xy(tracks.px[static]))
         self._base_frame, self._base_t_ns = frame_id, t_source_ns
         self._scale.restart(tracks.image, self._pose, 0.3)
 
@@ -238,7 +229,7 @@ class Odometry:
         _, a, b = np.intersect1d(base.ids, ids, return_indices=True)
         if len(a) < cfg.min_fitting:
             return None
-        xy_a, xy_b = self._to_xy(base.px[a]), xy[b]
+        xy_a, xy_b = self.camera.to_xy(base.px[a]), xy[b]
         if float(np.median(displacement)) < cfg.standstill_px and float(np.quantile(displacement, 0.8)) < 1.5:
             return self._pose, np.eye(6) * 1e4
         found = two_view(xy_a, xy_b, self._focal_px, cfg.two_view_px)
@@ -250,48 +241,8 @@ class Odometry:
         frame = self._base_frame if self._base_frame is not None else 0
         self._window = self._new_window()
         self._window.append(frame, self._pose, base.ids[a], xy_a)
-        self._provisional = False
         self._scale.restart(base.image, self._pose, 0.2 if speed * dt_s > 0.05 else 1.0)
         return self._pose @ Pose(step.R, step.p * length), np.eye(6) * 1e4
-
-    def _extend_window(self, frame_id: int, pose: Pose, ids: Ints, xy: Floats, info: Floats) -> tuple[Pose, Floats]:
-        """Puts the present image into the window in place of a provisional one, and adjusts."""
-        cfg, window = self.config, self._window
-        if self._provisional:
-            newest = window.poses[-2].between(pose)
-            parallax = self._parallax_px(ids, xy, newest.R)
-            if parallax > cfg.key_parallax_px or float(np.linalg.norm(newest.p)) > cfg.key_distance_m:
-                # The provisional image becomes a key image only if it is itself far enough from the last.
-                held = window.poses[-2].between(window.poses[-1])
-                if float(np.linalg.norm(held.p)) < 0.5 * cfg.key_distance_m and parallax < 2.0 * cfg.key_parallax_px:
-                    window.drop(len(window.poses) - 1)
-            else:
-                window.drop(len(window.poses) - 1)
-        window.append(frame_id, pose, ids, xy)
-        self._provisional = True
-        while len(window.poses) > cfg.key_images + 1:
-            window.drop(0)
-        window.triangulate()
-        held_images = min(cfg.held_images, len(window.poses) - 1)
-        # The prior on steps: loose, but where a single image is held it alone carries the unit of length.
-        loose = 1.0 / 0.3**2
-        prior = np.array([loose, loose, loose, 1e2, 1e2, 1e2])
-        adjusted = window.adjust(held_images, cfg.adjust_iterations, cfg.adjusted_landmarks, prior)
-        if not np.isfinite(window.poses[-1].p).all():
-            window.poses[-1] = pose
-        elif adjusted.any():
-            info = adjusted
-        return window.poses[-1], info
-
-    def _parallax_px(self, ids: Ints, xy: Floats, R_key_curr: Floats) -> float:
-        window = self._window
-        at = np.minimum(np.searchsorted(window.ids, ids), max(len(window.ids) - 1, 0))
-        then = window.obs[len(window.poses) - 2, at]
-        both = (window.ids[at] == ids) & np.isfinite(then[:, 0])
-        if both.sum() < 10:
-            return np.inf
-        turned = np.column_stack([xy[both], np.ones(int(both.sum()))]) @ R_key_curr.T
-        return float(np.median(np.abs(turned[:, :2] / turned[:, 2:] - then[both]).max(axis=1))) * self._focal_px
 
     # --- standing, coasting ---
 
@@ -353,7 +304,7 @@ class Odometry:
 
     def _see_road_tracks(self, tracks: Tracks, boxes: Floats, road_mask: Bools | None) -> None:
         px = tracks.px
-        rays = np.column_stack([self._to_xy(px), np.ones(len(px))])
+        rays = np.column_stack([self.camera.to_xy(px), np.ones(len(px))])
         rho = -(rays @ self._scale.ground.normal_cam) / self.camera.height_m
         keep = (tracks.age > 0) & (rho > 1.0 / 30.0) & self._outside(px, boxes)
         if road_mask is not None:
@@ -366,18 +317,8 @@ class Odometry:
 
     # --- small geometry ---
 
-    def _new_window(self) -> SlidingWindow:
-        return SlidingWindow(self._focal_px, self.config.sigma_track_px, self.config.reject_px)
-
-    def _to_xy(self, px: Floats) -> Floats:
-        cam = self.camera
-        out: Floats = (px - [cam.cx_px, cam.cy_px]) / [cam.fx_px, cam.fy_px]
-        return out
-
-    def _to_px(self, xy: Floats) -> Floats:
-        cam = self.camera
-        out: Floats = xy * [cam.fx_px, cam.fy_px] + [cam.cx_px, cam.cy_px]
-        return out
+    def _new_window(self) -> KeyWindow:
+        return KeyWindow(self._focal_px, self.config)
 
     @staticmethod
     def _outside(px: Floats, boxes: Floats) -> Bools:
