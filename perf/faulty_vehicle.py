@@ -23,11 +23,13 @@ import psutil
 from birdslam.types import Estimate
 from perf.street import F_PX, FRAME_M, HEIGHT_M, HEIGHT_PX, WIDTH_PX, street_loop
 from runtime.client import Planner
-from runtime.topology import NODES, PROCESSES, RECORDER
+from runtime.topology import NODES, PROCESSES
+from runtime.vitals import COUNTERS
 
 ROOT = Path(__file__).resolve().parent.parent
 RATE_HZ = 15.0
 SETTLE_S, PATIENCE_S = 2.5, 20.0
+VITALS = "memfd:birdslam-vitals"
 
 
 class Vehicle:
@@ -103,9 +105,8 @@ class Vehicle:
         return min(found, key=lambda child: (child.create_time(), child.pid))
 
     def spares(self) -> int:
-        """Processes that stand by."""
-        children = psutil.Process(self.process.pid).children()
-        return sum(not _is_node(child, RECORDER.name) for child in children) - len(NODES)
+        """Processes that stand by, with all loaded."""
+        return sum(map(_is_prepared, psutil.Process(self.process.pid).children())) - len(NODES)
 
     def processes(self) -> dict[str, psutil.Process]:
         """All of them by name: the supervisor, the nodes, the spare of each, and the recorder where there is one."""
@@ -161,6 +162,18 @@ def _is_node(process: psutil.Process, name: str) -> bool:
         return name in process.cmdline()
     except psutil.Error:  # it has just ended
         return False
+
+
+def _is_prepared(process: psutil.Process) -> bool:
+    """By the counters that it shares with its supervisor (runtime/vitals.py); a recorder never is."""
+    try:
+        for descriptor in Path(f"/proc/{process.pid}/fd").iterdir():
+            if VITALS in os.readlink(descriptor):
+                counters = np.frombuffer(descriptor.read_bytes(), dtype=np.int64)
+                return bool(counters[COUNTERS.index("prepared")])
+    except OSError:  # it has just ended
+        return False
+    return False
 
 
 def record_options(place: Path) -> list[str]:
