@@ -32,7 +32,7 @@ every = 1
 threads = 2
 
 [multitask]
-score_threshold = {score:.2f} # where precision and recall are best together on held-out worlds
+score_threshold = {score:.2f} # where precision and recall are best together on held-out worlds, augmented
 depth_sigma_rel = {depth_sigma_rel:.2f}
 """
 
