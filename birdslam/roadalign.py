@@ -34,7 +34,8 @@ ROAD = 4  # log lambda, pitch, roll, curvature; behind them what odometry handed
 MOTION = 5  # the rotation's error (3), that of the direction of travel to the right and down (2)
 _LEAST_INFORMATION = (1.0, 10.0, 10.0, 1e4)
 _LARGEST_STEP = np.array([0.1, 0.1, 0.1, 0.005] + [0.1] * MOTION)  # of one iteration
-_STEP_UNITS = np.array([1.0, 1.0, 1.0, 0.05] + [1.0] * MOTION)  # a change of the curvature by this equals one by 1 rad
+# Changes that count like one by 1 rad; what odometry handed over need not be settled as well
+_STEP_UNITS = np.array([1.0, 1.0, 1.0, 0.05] + [3.0] * MOTION)
 _BEYOND_CREST = 0.01  # where a ray would miss the parabola: that is behind the crest
 
 

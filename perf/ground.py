@@ -36,6 +36,7 @@ from birdslam.frontend import FrontEnd, FrontEndConfig, Pending
 from birdslam.perception import Perception, Ready
 from birdslam.pose import rotation_exp
 from birdslam.results import claim_directory
+from birdslam.roadfilter import RoadScaleConfig
 from birdslam.trajectory import as_poses
 from birdslam.types import Frame, Measurements
 from perf.errors import PerfError
@@ -145,10 +146,10 @@ def _grade(axes: Any) -> dict[str, Any]:
     way = np.array([stand.way_m for stand in stands])
     up = np.array([stand.up_m for stand in stands])
     true_way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(way), np.diff(up)))])
-    # The plane that fits the road from 4 to 22 m ahead, against which the camera is pitched
-    ahead = np.linspace(4.0, 22.0, 19)
+    # The ground is told as the plane through the road under the camera and that `chord_m` ahead
+    chord_m = RoadScaleConfig().chord_m
     true_pitch = np.array(
-        [s.pitch_rad + math.atan(np.polyfit(ahead, road.up_m(s.way_m + ahead), 1)[0]) for s in stands]
+        [s.pitch_rad + math.atan((road.up_m(s.way_m + chord_m) - road.up_m(s.way_m)) / chord_m) for s in stands]
     )
     px = np.array([[STREET.cx_px, road.pixel_row(s, LOOK_AHEAD_M)] for s in stands])
     depth = {
