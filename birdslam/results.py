@@ -33,7 +33,7 @@ from birdslam.trajectory import CameraTrajectory, Pose, ego_pose, kitti_row, tum
 from birdslam.types import Attitude, Estimate, MapUpdate, Status, VehicleEstimate
 
 FILLED_FRAMES = 10_000  # a longer gap in the frame numbers is a new source, not dropped frames
-KEPT_POSES, KEPT_TRACK_POSES, KEPT_POINTS, KEPT_TRACKS = 4000, 400, 20_000, 1000  # in the picture
+KEPT_POSES, KEPT_TRACK_POSES, KEPT_POINTS, KEPT_TRACKS = 4000, 100, 20_000, 200  # in the picture; under 3 MB in all
 
 
 class ResultsError(ValueError):
