@@ -56,18 +56,27 @@ def reserve_for(node: str, configuration: Configuration) -> None:
     reserve(NODE_OBJECTS_MIB, NODE_HEAP_MIB + NODE_IMAGES.get(node, 0) * image_mib)
 
 
-def reserve(objects_mib: float, heap_mib: float) -> None:
-    """Takes memory for so much of small objects and of larger blocks now, for this process to fill later.
+def one_heap() -> None:
+    """All threads of this process take from one heap (glibc's), which keeps what is freed.
 
-    What grows up to a bound then grows into memory that is there, and its pages do not fault in the middle of a drive.
-    Call it before the process has threads: from then on all of them share one heap (glibc's; elsewhere it reserves
-    objects alone).
+    Call it before the process has threads: a heap that one of them has begun goes on growing. The nodes have it from
+    their environment (`cli.ENVIRONMENT`), which the process that sets it has read too early.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, 1)
         mallopt(_M_MMAP_THRESHOLD, 32 * _MIB)
         mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def reserve(objects_mib: float, heap_mib: float) -> None:
+    """Takes memory for so much of small objects and of larger blocks now, for this process to fill later.
+
+    What grows up to a bound then grows into memory that is there, and its pages do not fault in the middle of a drive.
+    It serves every thread where `one_heap` went before the first of them; elsewhere than in glibc it reserves objects
+    alone.
+    """
+    one_heap()
     small = [bytes(_OBJECT_BYTES) for _ in range(round(objects_mib * _MIB / _OBJECT_BYTES))]
     _anchors.extend(small[::_ANCHORED])
     del small
