@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from birdslam.types import Estimate
-from perf.faulty_vehicle import PATIENCE_S, Vehicle, model_options, record_options
+from perf.faulty_vehicle import PATIENCE_S, Vehicle, ends_with_its_vehicle, model_options, record_options
 from perf.street import FRAME_M
 from perf.strikes import FAULTS, Fault
 from perf.witness import Witness
@@ -103,6 +103,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--models", type=Path, help="folder of networks, for perceive to carry their weight")
     parser.add_argument("--markdown", type=Path, help="the table goes there too")
     options = parser.parse_args(arguments)
+    ends_with_its_vehicle()
     chosen = [f for f in FAULTS if not options.names or any(name in f"{f.name} {f.node}" for name in options.names)]
     rows: list[Row] = []
     with (

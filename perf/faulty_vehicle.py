@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -30,6 +31,11 @@ ROOT = Path(__file__).resolve().parent.parent
 RATE_HZ = 15.0
 SETTLE_S, PATIENCE_S = 2.5, 20.0
 VITALS = "memfd:birdslam-vitals"
+
+
+def ends_with_its_vehicle() -> None:
+    """A suite that is told to end (SIGTERM) takes its vehicle along, as on Ctrl-C."""
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
 
 
 class Vehicle:

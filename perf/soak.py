@@ -28,7 +28,7 @@ from typing import Any, Self
 import numpy as np
 import psutil
 
-from perf.faulty_vehicle import Vehicle, model_options, record_options
+from perf.faulty_vehicle import Vehicle, ends_with_its_vehicle, model_options, record_options
 
 WARM_S, SAMPLE_S, SAID_S = 60.0, 5.0, 30.0
 SPAN = 6  # samples at either end whose medians are compared: what a process holds swings by its garbage
@@ -177,6 +177,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--record", action="store_true", help="with a recorder beside it")
     parser.add_argument("--models", type=Path, help="folder of networks")
     options = parser.parse_args(arguments)
+    ends_with_its_vehicle()
     with tempfile.TemporaryDirectory(prefix="soak") as folder, Systemd(Path(folder)) as systemd:
         place = Path(folder)
         recorded = record_options(place) if options.record else []

@@ -199,7 +199,7 @@ def test_the_doctor_finds_what_is_wrong(tmp_path: Path, monkeypatch: pytest.Monk
     def with_realtime(**settings: object) -> Configuration:
         return msgspec.structs.replace(healthy, realtime=RealtimeConfig(**settings))  # type: ignore[arg-type]
 
-    cores = findings_of("cores", with_realtime(perceive=NodeScheduling(cpus=(0, 9999))))
+    cores = findings_of("cores", with_realtime(perceive=NodeScheduling(cpus=(min(os.sched_getaffinity(0)), 9999))))
     assert (cores.verdict, "perceive: 9999" in cores.found) == ("warning", True)
     many = msgspec.structs.replace(healthy, perceive=PerceiveConfig(opencv_threads=64))
     assert findings_of("threads", many).verdict == "warning"
