@@ -26,9 +26,9 @@ import msgspec
 import numpy as np
 
 from birdslam.camera import Camera
-from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
+from birdslam.perception import ModelError, ModelSpec, Network, load_network, shipped_manifests
 from birdslam.perception.manifest_file import Glance, find_as
-from birdslam.perception.pointnet import load_pointnet
+from birdslam.perception.pointnet import PointNet, load_pointnet
 from runtime import model_store
 from runtime.download import SCHEMES, download, on_terminal
 
@@ -196,15 +196,8 @@ def _examine_images(network: Path, manifest: str) -> list[str]:
     if found is None:
         raise ModelError(f"{network}: its outputs hold numbers that are not finite on a noise image")
     takes = model.manifest.input
-    return [
-        f"{network} fits its manifest",
-        f"  role      {model.role}: {model.manifest.title or '(no title)'}",
-        f"  input     {takes.name} {takes.width_px}x{takes.height_px}, {takes.layout}, {takes.colour}",
-        f"  outputs   {', '.join(f'{name} {shape}' for name, shape in model.output_shapes.items())}",
-        f"  schedule  every {model.schedule.every} frames, {model.schedule.threads} threads",
-        f"  test run  {took_ms:.1f} ms on a {TEST_IMAGE_PX[1]}x{TEST_IMAGE_PX[0]} image, all numbers finite",
-        f"  sha256    {model.sha256}",
-    ]
+    given = f"{takes.name} {takes.width_px}x{takes.height_px}, {takes.layout}, {takes.colour}"
+    return _fits(network, model, given, f"{took_ms:.1f} ms on a {TEST_IMAGE_PX[1]}x{TEST_IMAGE_PX[0]} image")
 
 
 def _examine_frusta(network: Path, manifest: str) -> list[str]:
@@ -218,13 +211,18 @@ def _examine_frusta(network: Path, manifest: str) -> list[str]:
     if found is None:
         raise ModelError(f"{network}: its outputs hold numbers that are not finite on a cloud of points")
     takes = model.manifest.points
+    given = f"{takes.name}, {takes.count} points a box, {takes.layout}: {' '.join(takes.features)}"
+    return _fits(network, model, given, f"{took_ms:.1f} ms on {TEST_BOXES} boxes of points")
+
+
+def _fits(network: Path, model: Network | PointNet, given: str, test_run: str) -> list[str]:
     return [
         f"{network} fits its manifest",
         f"  role      {model.role}: {model.manifest.title or '(no title)'}",
-        f"  input     {takes.name}, {takes.count} points a box, {takes.layout}: {' '.join(takes.features)}",
+        f"  input     {given}",
         f"  outputs   {', '.join(f'{name} {shape}' for name, shape in model.output_shapes.items())}",
         f"  schedule  every {model.schedule.every} frames, {model.schedule.threads} threads",
-        f"  test run  {took_ms:.1f} ms on {TEST_BOXES} boxes of points, all numbers finite",
+        f"  test run  {test_run}, all numbers finite",
         f"  sha256    {model.sha256}",
     ]
 

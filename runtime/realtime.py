@@ -20,8 +20,7 @@ _OBJECT_BYTES, _ANCHORED = 400, 256  # of Python's small objects, and how many i
 _MIB = 1 << 20
 
 NODE_IMAGES = {"capture": 8, "perceive": 40}  # of the camera's size, in colour, that a node has at once at its worst
-NODE_OBJECTS_MIB = {"capture": 4.0, "perceive": 7.0, "optimize": 4.0}  # tracks, lanes and corners at their most
-NODE_HEAP_MIB = 4.0
+NODE_OBJECTS_MIB, NODE_HEAP_MIB = 4.0, 4.0
 
 _anchors: list[bytes] = []  # for ever: memory that holds one of these is not given back
 
@@ -54,7 +53,7 @@ def reserve_for(node: str, configuration: Configuration) -> None:
     """`reserve` for what a node makes at work, when all that it loads is there."""
     camera = configuration.camera
     image_mib = 0.0 if camera is None else 3 * camera.width_px * camera.height_px / _MIB
-    reserve(NODE_OBJECTS_MIB[node], NODE_HEAP_MIB + NODE_IMAGES.get(node, 0) * image_mib)
+    reserve(NODE_OBJECTS_MIB, NODE_HEAP_MIB + NODE_IMAGES.get(node, 0) * image_mib)
 
 
 def one_heap() -> None:

@@ -16,44 +16,7 @@ from onnx import TensorProto
 from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
 from birdslam.perception.manifest_file import find_manifest, read_manifest
 from birdslam.perception.subnormal import without_tiny_weights
-
-SEGMENTER = """
-role = "segmenter"
-[input]
-name = "images"
-width_px = 32
-height_px = 16
-layout = "NCHW"
-colour = "RGB"
-resize = { mode = "stretch" }
-[segmenter]
-decoding = "class_maps"
-[[segmenter.maps]]
-meaning = "road"
-output = "output"
-channel = 1
-channels = 3
-"""
-
-DETECTOR = """
-role = "detector"
-[input]
-name = "images"
-width_px = 64
-height_px = 64
-layout = "NCHW"
-colour = "BGR"
-resize = { mode = "fit_pad" }
-[detector]
-decoding = "yolox"
-output = "output"
-strides = [8, 16, 32]
-classes = 2
-score_threshold = 0.3
-nms_iou = 0.5
-[detector.labels]
-0 = "car"
-"""
+from tests.tiny_networks import DETECTOR, SEGMENTER
 
 
 def write(network: Path, manifest: str) -> ModelSpec:

@@ -25,43 +25,7 @@ from runtime.cli import _parser, main
 from runtime.commands import configuration_of
 from runtime.configuration import ConfigurationError
 from runtime.download import DownloadError, download
-
-SEGMENTER = """
-role = "segmenter"
-[input]
-name = "images"
-width_px = 32
-height_px = 16
-layout = "NCHW"
-colour = "RGB"
-resize = { mode = "stretch" }
-[segmenter]
-decoding = "class_maps"
-[[segmenter.maps]]
-meaning = "road"
-output = "output"
-channel = 1
-channels = 3
-"""
-DETECTOR = """
-role = "detector"
-[input]
-name = "images"
-width_px = 64
-height_px = 64
-layout = "NCHW"
-colour = "BGR"
-resize = { mode = "fit_pad" }
-[detector]
-decoding = "yolox"
-output = "output"
-strides = [8, 16, 32]
-classes = 1
-score_threshold = 0.3
-nms_iou = 0.5
-[detector.labels]
-0 = "car"
-"""
+from tests.tiny_networks import DETECTOR, SEGMENTER
 
 
 class Quiet(SimpleHTTPRequestHandler):
@@ -101,7 +65,7 @@ def segmenter(directory: Path, name: str = "seg") -> Path:
 
 def detector(directory: Path, name: str = "det") -> Path:
     network = tiny.constant(directory / f"{name}.onnx", (1, 3, 64, 64), np.zeros((1, 84, 6), np.float32))
-    network.with_suffix(".toml").write_text(DETECTOR)
+    network.with_suffix(".toml").write_text(DETECTOR.replace("classes = 2", "classes = 1"))
     return network
 
 
@@ -200,7 +164,7 @@ def test_a_refused_network_leaves_nothing_and_names_the_reason(
 
 def test_a_network_without_numbers_is_refused(tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     network = tiny.constant(tmp_path / "nan.onnx", (1, 3, 64, 64), np.full((1, 84, 6), np.nan, np.float32))
-    network.with_suffix(".toml").write_text(DETECTOR)
+    network.with_suffix(".toml").write_text(DETECTOR.replace("classes = 2", "classes = 1"))
     assert "not finite" in refused(capsys, "add", str(network))
     assert "not finite" in refused(capsys, "check", str(network))
     assert left_in(store) == set()

@@ -1,4 +1,4 @@
-"""ONNX files of a few nodes, made by the tests that need one."""
+"""ONNX files of a few nodes, made by the tests that need one, and manifests that fit such."""
 
 from __future__ import annotations
 
@@ -9,6 +9,44 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper, save_model
 
 Shape = tuple[int | str | None, ...]
+
+SEGMENTER = """
+role = "segmenter"
+[input]
+name = "images"
+width_px = 32
+height_px = 16
+layout = "NCHW"
+colour = "RGB"
+resize = { mode = "stretch" }
+[segmenter]
+decoding = "class_maps"
+[[segmenter.maps]]
+meaning = "road"
+output = "output"
+channel = 1
+channels = 3
+"""
+
+DETECTOR = """
+role = "detector"
+[input]
+name = "images"
+width_px = 64
+height_px = 64
+layout = "NCHW"
+colour = "BGR"
+resize = { mode = "fit_pad" }
+[detector]
+decoding = "yolox"
+output = "output"
+strides = [8, 16, 32]
+classes = 2
+score_threshold = 0.3
+nms_iou = 0.5
+[detector.labels]
+0 = "car"
+"""
 
 
 def _save(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from birdslam.camera import Camera
 from birdslam.perception.manifest import Disparity, Input, MetricDepth, Misfit
 from birdslam.perception.views import View
+
+Table = TypeVar("Table", Disparity, MetricDepth)
 
 
 @dataclass(frozen=True)
@@ -76,13 +79,23 @@ class DepthMap:
         return replace(self, depth_m=self.depth_m * np.float32(factor), canonical_focal_rel=0.0)
 
 
-class DisparityDecoder:
-    """Reads sigmoid disparity (see `manifest.Disparity`)."""
+class _MapDecoder(Generic[Table]):
+    """Reads one map over the whole image."""
 
-    def __init__(self, table: Disparity, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    def __init__(self, table: Table, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
         """Raises Misfit where the output is no map."""
-        self.table, self.input = table, input
+        self.table: Table = table
+        self.input = input
         _check_map(table.output, shapes[table.output])
+
+    def merge(self, parts: Sequence[DepthMap], views: Sequence[View]) -> DepthMap:
+        """A depth network has one view."""
+        (part,) = parts
+        return part
+
+
+class DisparityDecoder(_MapDecoder[Disparity]):
+    """Reads sigmoid disparity (see `manifest.Disparity`)."""
 
     def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> DepthMap:
         """The depth of one run over the whole image."""
@@ -97,19 +110,9 @@ class DisparityDecoder:
             metric=table.metric,
         )
 
-    def merge(self, parts: Sequence[DepthMap], views: Sequence[View]) -> DepthMap:
-        """A depth network has one view."""
-        (part,) = parts
-        return part
 
-
-class MetricDepthDecoder:
+class MetricDepthDecoder(_MapDecoder[MetricDepth]):
     """Reads depth as it is (see `manifest.MetricDepth`)."""
-
-    def __init__(self, table: MetricDepth, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises Misfit where the output is no map."""
-        self.table, self.input = table, input
-        _check_map(table.output, shapes[table.output])
 
     def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> DepthMap:
         """The depth of one run over the whole image."""
@@ -122,11 +125,6 @@ class MetricDepthDecoder:
             sigma_rel=table.sigma_rel,
             canonical_focal_rel=table.canonical_focal_rel,
         )
-
-    def merge(self, parts: Sequence[DepthMap], views: Sequence[View]) -> DepthMap:
-        """A depth network has one view."""
-        (part,) = parts
-        return part
 
 
 def _check_map(output: str, shape: tuple[int, ...]) -> None:
