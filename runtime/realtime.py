@@ -7,6 +7,7 @@ loads must not go before the nodes at work.
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import resource
 from collections.abc import Iterator
@@ -20,7 +21,9 @@ _OBJECT_BYTES, _ANCHORED = 400, 256  # of Python's small objects, and how many i
 _MIB = 1 << 20
 
 NODE_IMAGES = {"capture": 8, "perceive": 40}  # of the camera's size, in colour, that a node has at once at its worst
-NODE_OBJECTS_MIB, NODE_HEAP_MIB = 4.0, 4.0
+NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, 4.0
+
+_TUPLE_SIZES, _TUPLES_KEPT = range(1, 21), 2_000  # what CPython keeps of freed ones, of each size
 
 _anchors: list[bytes] = []  # for ever: memory that holds one of these is not given back
 
@@ -82,6 +85,17 @@ def reserve(objects_mib: float, heap_mib: float) -> None:
     del small
     blocks = [bytearray(b"\1") * (_MIB // 4) for _ in range(round(4 * heap_mib))]
     del blocks
+
+
+def settle() -> None:
+    """What was built lives to the end and is never walked again; and Python's store of freed tuples is full.
+
+    CPython keeps freed tuples for later. A drive that fills this store alone, some 4 MiB, grows for half an hour.
+    """
+    gc.collect()
+    gc.freeze()
+    tuples = [tuple([None] * size) for size in _TUPLE_SIZES for _ in range(_TUPLES_KEPT)]
+    del tuples
 
 
 def _threads() -> list[int]:

@@ -8,7 +8,6 @@ the node fails at work: a camera that is gone, or a bug, with its traceback ther
 
 from __future__ import annotations
 
-import gc
 import logging
 import os
 import select
@@ -92,8 +91,7 @@ def run(
             if configuration.recording.file:
                 first_s = configuration.recording.ready_timeout_s
                 bus.wait_alive({RECORDER.name}, RECORDER_PATIENCE_S if assignment.restarts else first_s)
-            gc.collect()
-            gc.freeze()  # what was built lives to the end: never walk it again
+            realtime.settle()
             stop.at_work = True
             vitals.beat()  # before it is ready: who is ready without a beat is stalled
             vitals.count(ready=1)

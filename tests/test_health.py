@@ -333,3 +333,28 @@ def test_what_a_drive_fills_can_be_reserved() -> None:
     )
     assert plain > 1000
     assert reserved < plain / 4
+
+
+_SETTLED = """
+import sys
+from runtime import realtime
+if sys.argv[1] == "settled":
+    realtime.settle()
+before = sys.getallocatedblocks()
+for size in range(1, 21):
+    tuples = [tuple(range(size)) for _ in range(1_500)]
+    del tuples
+print(sys.getallocatedblocks() - before)
+"""
+
+
+def test_what_python_keeps_of_freed_tuples_is_there_from_the_start() -> None:
+    """Its store fills in the first half hour else, and looks like a leak."""
+    if platform.python_implementation() != "CPython":
+        pytest.skip("another Python keeps other things")
+    plain, settled = (
+        int(subprocess.run([sys.executable, "-c", _SETTLED, how], capture_output=True, check=True).stdout)
+        for how in ("plain", "settled")
+    )
+    assert plain > 15_000
+    assert abs(settled) < 1_500
