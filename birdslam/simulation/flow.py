@@ -21,6 +21,7 @@ from birdslam.simulation.fleet import (
     draw_truck,
     draw_vehicle,
 )
+from birdslam.simulation.parking import Lot, Row, kerb_rows
 from birdslam.simulation.street import Street
 
 Floats = NDArray[np.float64]
@@ -67,17 +68,18 @@ class Mover:
 
 
 def populate(
-    rng: np.random.Generator, street: Street, ego_s_m: float, ego_d_m: float, reach_m: float = 110.0
-) -> list[Mover]:
+    rng: np.random.Generator, street: Street, ego_s_m: float, ego_d_m: float, reach_m: float = 110.0,
+    lots: tuple[Lot, ...] = (),
+) -> list[Mover]:  # fmt: skip
     """Traffic, parked cars and people about the ego; nobody stands in anybody, nor where the ego is."""
     u = rng.random(8)
     dense = u[0] ** 1.3
     taken: list[tuple[float, float, float, float]] = [(ego_s_m - 1.0, ego_d_m, 3.5, 1.1)]
     out: list[Mover] = []
 
-    def add(mover: Mover, margin_m: float) -> bool:
+    def add(mover: Mover, margin_m: float, half_m: float | None = None) -> bool:
         cos, sin = abs(math.cos(mover.turn_rad)), abs(math.sin(mover.turn_rad))
-        hs = 0.5 * (cos * mover.length_m + sin * mover.width_m)
+        hs = 0.5 * (cos * mover.length_m + sin * mover.width_m) if half_m is None else half_m
         hd = 0.5 * (cos * mover.width_m + sin * mover.length_m)
         if any(
             abs(mover.s_m - s) < hs + rs + margin_m and abs(mover.d_m - d) < hd + rd + min(0.25, margin_m)
@@ -105,7 +107,9 @@ def populate(
                 if add(Mover(body, s, d, turn, own, own, d, phase_per_m=1.1), 1.5):
                     s += 0.5 * float(body.parameters[m.LENGTH])
             s += gap * rng.uniform(0.6, 1.4) + (0.0 if jam else 3.0)
-    _park(rng, street, ego_s_m, reach_m, add, u[3])
+    _park(rng, kerb_rows(rng, street, u[3], ego_s_m - 15.0, ego_s_m + reach_m), street, add)
+    if lots:
+        _park(rng.spawn(1)[0], [row for lot in lots for row in lot.rows], street, add)
     _cross(rng, street, ego_s_m, reach_m, add)
     _walk(rng, street, ego_s_m, reach_m, add, u[4])
     return out
@@ -124,34 +128,24 @@ def _pass(rng: np.random.Generator, street: Street, ego_s_m: float, ego_d_m: flo
         add(Mover(body, s, lane.d_m + rng.normal(0.0, 0.15), turn, speed, lane.speed_mps, lane.d_m), 0.3)
 
 
-def _park(rng, street: Street, ego_s_m: float, reach_m: float, add, full: float) -> None:  # type: ignore[no-untyped-def]
-    """Rows of parked cars on their strips, on pavements and in front yards; along, across or aslant."""
-    rows = [(d, direction, 0.5 + 0.5 * full) for d, direction in street.parking]
-    if street.kind in ("residential", "urban", "industrial", "alley"):
-        for edge, front, sign in ((street.right_m, street.front_right_m, -1), (street.left_m, street.front_left_m, 1)):
-            if rng.random() < 0.25:  # two wheels on the pavement
-                rows.append((edge + sign * 0.8, -sign, 0.15 + 0.5 * full))
-            if rng.random() < 0.25:
-                rows.append((front + sign * 3.2, 0, 0.4 * full))  # before houses, across
-    for d, direction, odds in rows:
-        aslant = direction == 0
-        gap = 2.8 if aslant else 6.2
-        turn = 0.0 if direction >= 0 else math.pi
-        s = ego_s_m - 15.0 + rng.uniform(0.0, gap)
-        while s < ego_s_m + reach_m:
-            side = 1 if d > 0 else -1
-            if rng.random() < odds and not street.in_crossing(s, 7.0, side):
+def _park(rng: np.random.Generator, rows: list[Row], street: Street, add) -> None:  # type: ignore[no-untyped-def]
+    """Cars in their rows: most along a kerb look where the traffic goes, those across either way."""
+    for row in rows:
+        pitch = row.pitch_m
+        s = row.s0_m + rng.uniform(0.0, pitch)
+        while s < row.s1_m:
+            side = 1 if row.d_m > 0 else -1
+            if rng.random() < row.odds and not street.in_crossing(s, 7.0, side):
                 body = draw_vehicle(rng, parked=True)
-                own = (
-                    (math.pi / 2 if rng.random() < 0.5 else -math.pi / 2)
-                    if aslant
-                    else (turn if rng.random() < 0.85 else turn + math.pi)
-                )
-                if not aslant or float(body.parameters[m.LENGTH]) < 5.2:
-                    mover = Mover(body, s, d + rng.normal(0.0, 0.08), own + rng.normal(0.0, 0.03))
-                    if add(mover, 0.4):
-                        s += 0.5 * (0.0 if aslant else float(body.parameters[m.LENGTH]) - 4.0)
-            s += gap * rng.uniform(0.9, 1.15)
+                length_m = float(body.parameters[m.LENGTH])
+                own = row.turn_rad + (math.pi if rng.random() < (0.15 if row.along else 0.5) else 0.0)
+                if row.along or length_m < 5.2:
+                    mover = Mover(body, s, row.d_m + rng.normal(0.0, 0.08), own + rng.normal(0.0, 0.03))
+                    # Of cars aslant the boxes about them overlap where they don't
+                    half_m = None if row.along else 0.5 * pitch - 0.45
+                    if add(mover, 0.4, half_m):
+                        s += 0.5 * (length_m - 4.0) if row.along else 0.0
+            s += pitch * rng.uniform(0.9, 1.15)
 
 
 def _cross(rng, street: Street, ego_s_m: float, reach_m: float, add) -> None:  # type: ignore[no-untyped-def]

@@ -14,6 +14,7 @@ import numpy as np
 from birdslam.camera import Camera
 from birdslam.simulation.flow import populate
 from birdslam.simulation.labels import frame_of
+from birdslam.simulation.parking import cleared, draw_lots
 from birdslam.simulation.photometrics import develop, draw_lens, draw_sky
 from birdslam.simulation.placement import furnish
 from birdslam.simulation.poses import ego_pose, moving, place
@@ -52,8 +53,10 @@ def sample(seed: int, width_px: int, height_px: int) -> WorldFrame:
         else (rng.normal(0.0, 1.2), rng.normal(0.0, 0.15))
     )
     d = float(np.clip(lane.d_m + aside, street.right_m + 1.0, street.left_m - 1.0))
-    standing = place(street, furnish(rng, street, config.ego_m - 12.0, config.ego_m + 150.0))
-    movers = populate(rng, street, config.ego_m, d)
+    lots_rng = rng.spawn(1)[0]
+    lots = draw_lots(lots_rng, street, config.ego_m)
+    standing = place(street, cleared(furnish(rng, street, config.ego_m - 12.0, config.ego_m + 150.0), lots, lots_rng))
+    movers = populate(rng, street, config.ego_m, d, lots=lots)
     renderer = Renderer(street, draw_sky(rng), config.samples)
     T_world_ego = ego_pose(street, config.ego_m, d, turned)
     scene = standing.plus(moving(street, movers))
