@@ -16,6 +16,7 @@ from birdslam.simulation.meshes import ball, begin, box, corner, limb, wheel
 
 STATIONS = 15
 RIBS = 8  # points of half a cross-section
+TRACK = 0.935  # over the tyres' outer sides, of a vehicle's width
 
 
 @njit(cache=True, nogil=True)
@@ -85,11 +86,14 @@ def loft(B, body, P):  # type: ignore[no-untyped-def]
         glass = top - belt
         shoulder = roof_half_width(P, x, top) if glass > 0.02 else 0.94 * w
         flat = 0.03 if glass < 0.02 else 0.0
+        # Below its wings a body is narrower than its track: the tyres stand under it, not beside it
+        sill = min(max(low + 0.35 * (belt - low), 1.7 * P[m.WHEEL_RADIUS]), low + 0.7 * (belt - low))
+        wing = min(max(low + 0.6 * (belt - low), sill + 0.1), low + 0.8 * (belt - low))
         rows = (
-            (0.86 * w, low),
-            (0.975 * w, low + 0.06),
-            (w, low + 0.5 * (belt - low)),
-            (0.985 * w, low + 0.86 * (belt - low)),
+            (0.8 * w, low),
+            ((0.9 + 0.07 * ends) * w, low + 0.06),
+            ((0.935 + 0.05 * ends) * w, sill),
+            (w, wing),
             (0.955 * w, belt - flat),
             (shoulder, belt + 0.88 * glass - 0.4 * flat),
             (0.8 * shoulder, belt + 0.985 * glass),
@@ -145,8 +149,8 @@ def vehicle(B, body, P):  # type: ignore[no-untyped-def]
     y, r = 0.5 * P[m.WIDTH], P[m.WHEEL_RADIUS]
     for side in range(2):
         s = 1.0 - 2.0 * side
-        wheel(B, body, m.WHEEL, P[m.X_FRONT_AXLE], s * y, s, r, 0.22)
-        wheel(B, body, m.WHEEL, P[m.X_REAR_AXLE], s * y, s, r, 0.22)
+        wheel(B, body, m.WHEEL, P[m.X_FRONT_AXLE], s * TRACK * y, s, r, 0.22)
+        wheel(B, body, m.WHEEL, P[m.X_REAR_AXLE], s * TRACK * y, s, r, 0.22)
         x = P[m.X_COWL] - 0.35
         inner, outer = s * 0.90 * y, s * (y + 0.1)
         z = P[m.BELT] + 0.02
@@ -176,7 +180,7 @@ def truck(B, body, P):  # type: ignore[no-untyped-def]
     axles = 3 if P[m.LENGTH] > 12.0 else (2 if P[m.LENGTH] > 8.5 else 1)
     for side in range(2):
         s = 1.0 - 2.0 * side
-        wheel(B, body, m.WHEEL, P[m.X_FRONT_AXLE], s * y, s, r, 0.3)
+        wheel(B, body, m.WHEEL, P[m.X_FRONT_AXLE], s * TRACK * y, s, r, 0.3)
         if P[m.LENGTH] > 12.0:
             wheel(B, body, m.WHEEL, P[m.LOFT_X0] - 0.6, s * y, s, r, 0.5)
         for axle in range(axles):

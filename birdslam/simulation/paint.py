@@ -33,6 +33,13 @@ def _plate(P, y, z, z_plate):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def apron(P):  # type: ignore[no-untyped-def]
+    """Height of the bare plastic below the bumper's lacquer, m: most cars have some."""
+    h = hashed(P[m.SEED], 3.0)
+    return 0.2 * max(h - 0.35, 0.0) / 0.65
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _end(P, x, y, z, front):  # type: ignore[no-untyped-def]
     """Lamps, plate, grille, bumper of a nose or tail: (kind, value); kind 0 none, 1 grey, 2 red lamp, 3 head lamp."""
     w = half_width(P, x) + 1e-3
@@ -73,11 +80,15 @@ def _end(P, x, y, z, front):  # type: ignore[no-untyped-def]
         return 2, 1.0
     if side > 0.75 and abs(z - low - 0.12) < 0.03:
         return 2, 0.4
+    if 0.25 < low < 0.36 and 1.72 < h < 2.0:  # the spare wheel of a jeep
+        q = math.hypot(y, z - 0.55 * h) / 0.36
+        if q < 1.0:
+            return 1, (0.02 if q > 0.62 or P[m.GLOSS] > 0.65 else 0.06 + 0.4 * P[m.RIM] * (q > 0.2))
     if abs(y) < 0.32 and abs(z - z_plate) < 0.085:
         return 1, 0.02
     if abs(z - 0.52 * P[m.BELT]) < 0.008 and tall:
         return 1, 0.01
-    if z < low + 0.16 and P[m.CLADDING] > 0.5:
+    if z < low + 0.1 + apron(P) + (0.16 if P[m.CLADDING] > 0.5 else 0.0):
         return 1, 0.02
     return 0, 0.0
 

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from birdslam.camera import Camera
 from birdslam.simulation import bodies, ground, scenery
 from birdslam.simulation import materials as m
+from birdslam.simulation.contact import contact_map
 from birdslam.simulation.meshes import new_buffer
 from birdslam.simulation.rasteriser import count_inside, project, rasterize, shadow_map
-from birdslam.simulation.shading import contact_map, plane_bases, shade_frame, wet_road
+from birdslam.simulation.shading import plane_bases, shade_frame, wet_road
 from birdslam.simulation.street import ASPHALT, CEMENT, COBBLES, Street
 from birdslam.simulation.textures import foliage_masks, noise_bank, pictures
 

@@ -9,6 +9,7 @@ from numba import njit
 
 from birdslam.simulation import materials as m
 from birdslam.simulation import paint, surfaces
+from birdslam.simulation.contact import contact_light
 from birdslam.simulation.ground import shade_ground
 from birdslam.simulation.light import mirrored, sky_colour, sunlit
 
@@ -47,6 +48,12 @@ def plane_bases(corners, count, bases):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+def tuck(P, z):  # type: ignore[no-untyped-def]
+    """How far a body's side leans in at the height z over the road: its normal's fall per its level part."""
+    return (0.5 + 0.9 * P[m.SEED]) * min(max(1.0 - (z - P[m.CLEARANCE]) / (0.25 + 0.2 * P[m.RIM]), 0.0), 1.0)
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
 def shade(  # type: ignore[no-untyped-def]
     t, depth, C, ray, bases, attributes, normals, material, owner, P_all, R_all, labels, bank, masks, pictures, sky,
     fine, coarse, lean, fine_origin, coarse_origin, per_m, bands, lines, crossings, marks, by_metre, edges, shade_map,
@@ -72,13 +79,15 @@ def shade(  # type: ignore[no-untyped-def]
     nx = R[0, 0] * lx + R[0, 1] * ly + R[0, 2] * lz
     ny = R[1, 0] * lx + R[1, 1] * ly + R[1, 2] * lz
     nz = R[2, 0] * lx + R[2, 1] * ly + R[2, 2] * lz
+    mat = material[t]
+    if mat == m.PAINT:  # bumpers and sills turn in towards the road
+        nz -= tuck(P, w) * math.sqrt(nx * nx + ny * ny)
     norm = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz + 1e-12)
     nx, ny, nz = nx * norm, ny * norm, nz * norm
     length = math.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
     ex, ey, ez = ray[0] / length, ray[1] / length, ray[2] / length
     facing = -(nx * ex + ny * ey + nz * ez)
     foot = depth * pixel_rad
-    mat = material[t]
     label = MATERIAL_CLASS[mat]
     mirror, light, bias, soft = 0.0, 0.0, 0.0, 0.0
     if mat == m.GROUND:
@@ -127,18 +136,22 @@ def shade(  # type: ignore[no-untyped-def]
         )
     up = 0.5 + 0.5 * nz
     open_sky = sky[21] * (1.0 if mat != m.GROUND else contact_light(shade_map, shade_frame_m, x, y))
-    if mat != m.GROUND and z < 0.8 and nz < 0.5:
-        open_sky *= 0.6 + 0.4 * max(z, 0.0) / 0.8
-    bounce = 0.18 * (1.0 - up)
-    ar = (
-        sky[6] * up * 0.6 + sky[9] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[3] * max(sky[2], 0.0) + sky[6])
-    ) * open_sky
-    ag = (
-        sky[7] * up * 0.6 + sky[10] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[4] * max(sky[2], 0.0) + sky[7])
-    ) * open_sky
-    ab = (
-        sky[8] * up * 0.6 + sky[11] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[5] * max(sky[2], 0.0) + sky[8])
-    ) * open_sky
+    high = w if mat == m.PAINT else z  # over the road
+    if mat != m.GROUND and high < 0.8 and nz < 0.5:
+        open_sky *= 0.6 + 0.4 * max(high, 0.0) / 0.8
+    bounce, lit_road = 0.18 * (1.0 - up), max(sky[2], 0.0)
+    if mat == m.PAINT and sky[4] > 0.0 and nz < 0.5:  # the road that a panel faces may lie in the body's own shadow
+        share = 0.0
+        for j in range(3):
+            away = 0.5 + 0.7 * j
+            share += sunlit(
+                fine, coarse, lean, fine_origin, coarse_origin, per_m, x + away * nx, y + away * ny, z - w,
+                0.0, 0.0, 1.0, 0.0,
+            )  # fmt: skip
+        lit_road *= share / 3.0
+    ar = (sky[6] * up * 0.6 + sky[9] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[3] * lit_road + sky[6])) * open_sky
+    ag = (sky[7] * up * 0.6 + sky[10] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[4] * lit_road + sky[7])) * open_sky
+    ab = (sky[8] * up * 0.6 + sky[11] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[5] * lit_road + sky[8])) * open_sky
     red = r * (ar + direct * sky[3]) + light * 2.0 * r * (sky[7] + 0.2 * sky[4])
     green = g * (ag + direct * sky[4]) + light * 2.0 * g * (sky[7] + 0.2 * sky[4])
     blue = bl * (ab + direct * sky[5]) + light * 2.0 * bl * (sky[7] + 0.2 * sky[4])
@@ -159,43 +172,6 @@ def shade(  # type: ignore[no-untyped-def]
     out[1] = green + (sky[13] - green) * haze
     out[2] = blue + (sky[14] - blue) * haze
     out[3] = label
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
-def contact_light(shade_map, frame_m, x, y):  # type: ignore[no-untyped-def]
-    """Share of the sky that the ground at (x, y) sees past the vehicles over it, from a map of the area ahead.
-
-    `frame_m` = (x of its first row, y of its first column, cells a metre).
-    """
-    u, v = (x - frame_m[0]) * frame_m[2], (y - frame_m[1]) * frame_m[2]
-    i, j = math.floor(u), math.floor(v)
-    if i < 0 or j < 0 or i >= shade_map.shape[0] - 1 or j >= shade_map.shape[1] - 1:
-        return 1.0
-    fu, fv = u - i, v - j
-    top = shade_map[i, j] * (1.0 - fv) + shade_map[i, j + 1] * fv
-    low = shade_map[i + 1, j] * (1.0 - fv) + shade_map[i + 1, j + 1] * fv
-    return top * (1.0 - fu) + low * fu
-
-
-@njit(cache=True, nogil=True)
-def contact_map(shade_map, x0, y0, cells_per_m, poses, sizes):  # type: ignore[no-untyped-def]
-    """Darken `shade_map` under each body: `poses` (n, 3) x y yaw, `sizes` (n, 2) length and width."""
-    shade_map[:] = 1.0
-    for k in range(poses.shape[0]):
-        hx, hy = 0.5 * sizes[k, 0], 0.5 * sizes[k, 1]
-        reach = math.hypot(hx, hy) + 0.8
-        i0 = max(0, int((poses[k, 0] - reach - x0) * cells_per_m))
-        i1 = min(shade_map.shape[0], int((poses[k, 0] + reach - x0) * cells_per_m) + 1)
-        j0 = max(0, int((poses[k, 1] - reach - y0) * cells_per_m))
-        j1 = min(shade_map.shape[1], int((poses[k, 1] + reach - y0) * cells_per_m) + 1)
-        cos, sin = math.cos(poses[k, 2]), math.sin(poses[k, 2])
-        for i in range(i0, i1):
-            for j in range(j0, j1):
-                dx, dy = x0 + i / cells_per_m - poses[k, 0], y0 + j / cells_per_m - poses[k, 1]
-                ox, oy = abs(cos * dx + sin * dy) - hx, abs(cos * dy - sin * dx) - hy
-                out = math.hypot(max(ox, 0.0), max(oy, 0.0)) + min(max(ox, oy), 0.0)
-                light = min(max(0.45 + out / 1.0, 0.06), 1.0)
-                shade_map[i, j] = min(shade_map[i, j], light)
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
