@@ -31,6 +31,7 @@ class Lens:
     saturation: float
     quality: int  # of JPEG, 0: none
     sharpen: float
+    whole: float = 0.0  # how much the upper image, sky and walls, counts when the exposure is metered
 
 
 def draw_sky(rng: np.random.Generator) -> NDArray[np.float64]:
@@ -69,9 +70,9 @@ def draw_lens(rng: np.random.Generator) -> Lens:
     """A camera that may be good, dark, overexposed, soft, noisy or grey."""
     u = rng.random(20)
     return Lens(
-        exposure=math.exp(rng.normal(0.0, 0.42)),
-        gamma=1.0 / ((1.7 if u[15] < 0.75 else 1.2) + 0.9 * u[0]),  # some cameras are nearly linear
-        contrast=0.75 + 0.7 * u[1],
+        exposure=math.exp(rng.normal(0.0, 0.48)),
+        gamma=1.0 / ((1.7 if u[15] < 0.7 else 1.2) + 0.9 * u[0]),  # some cameras are nearly linear
+        contrast=0.75 + 0.85 * u[1],
         tint=(0.88 + 0.24 * u[2], 1.0, 0.88 + 0.24 * u[3]),
         blur_px=0.25 + 1.3 * u[4] ** 3,
         noise=0.001 + 0.014 * u[5] ** 3,
@@ -81,17 +82,26 @@ def draw_lens(rng: np.random.Generator) -> Lens:
         saturation=0.0 if u[9] < 0.33 else 0.3 + 0.8 * u[10],
         quality=int(35 + 62 * u[11]) if u[12] < 0.5 else 0,
         sharpen=0.9 * u[13] if u[14] < 0.35 else 0.0,
+        whole=u[17] if u[16] < 0.4 else 0.0,
     )
+
+
+def _metered(light: Floats32, whole: float) -> float:
+    """The light that becomes middle grey: of the lower image without its brightest, or of all of it."""
+    height, width = light.shape[:2]
+    if height <= 8:
+        return 1.0
+    green = light[::3, ::3, 1]
+    lower = np.sort(light[height // 3 :: 3, ::3, 1], axis=None)[: int(0.9 * (height // 3) * width // 3)].mean()
+    # A pixel that is clipped tells the meter no more
+    everything = np.minimum(green, 4.0 * max(float(green.mean()), 1e-3)).mean() if whole > 0.0 else 0.0
+    return float((1.0 - whole) * lower + whole * everything)
 
 
 def develop(light: Floats32, lens: Lens, rng: np.random.Generator) -> NDArray[np.uint8]:
     """(H, W, 3) linear BGR light to the image that the camera delivers."""
     height, width = light.shape[:2]
-    metered = (
-        float(np.sort(light[height // 3 :: 3, ::3, 1], axis=None)[: int(0.9 * (height // 3) * width // 3)].mean())
-        if height > 8
-        else 1.0
-    )
+    metered = _metered(light, lens.whole)
     image = light * np.float32(0.2 * lens.exposure / max(metered, 1e-3))
     image *= np.array(lens.tint, np.float32)
     if lens.bloom > 0.02:
