@@ -125,7 +125,7 @@ def _played(bus: Bus, log: list[Measurements], rate_hz: float) -> Iterator[Messa
         record = msgspec.structs.replace(record, t_capture_ns=now_ns)
         first = Trace().after("capture", now_ns, now_ns)
         frames.put(FrameRef(**stamps(record), status=record.status), first)
-        second = first.sent(now_ns).after("perceive", now_ns, time.monotonic_ns())
+        second = first.sent(now_ns, number + 1).after("perceive", now_ns, time.monotonic_ns())
         measurements.put(record, second)
         yield _answer(estimates, record.frame_id, due_ns + round(1e9 / rate_hz))
 

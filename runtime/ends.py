@@ -63,6 +63,7 @@ class Publisher:
         self._topic, self._node = topic, node
         self._changed = threading.Condition()
         self._closed = False
+        self._sent = 0
         self._matched: bool | None = None  # kept here: zenoh is never asked while the lock is held
         self._publisher = session.declare_publisher(
             key,
@@ -106,8 +107,9 @@ class Publisher:
             raise TypeError(f"{self._topic.name} takes {self._topic.record.__name__}, not {type(record).__name__}")
         data = encode(record)
         now_ns = time.monotonic_ns()
-        sent = trace.sent(now_ns) if trace and trace.stages else Trace((Stage(self._node, now_ns, now_ns, now_ns),))
-        attachment = encode(sent)
+        self._sent += 1
+        begun = trace if trace and trace.stages else Trace((Stage(self._node, now_ns, now_ns),))
+        attachment = encode(begun.sent(now_ns, self._sent))
         if self._kept is not None:
             self._kept.add(data, attachment)
         try:
@@ -126,8 +128,9 @@ class Publisher:
 class Subscriber:
     """A bounded queue of one topic's messages; made by Bus.subscriber.
 
-    `newest` is the last message that came in, whether it was read or not. `dropped` counts the messages that a newer
-    one pushed out of the full queue, `malformed` those that were no valid record, or were sent to more keys than this.
+    `newest` is the last message that came in, whether it was read or not. `dropped` counts the messages that were lost
+    on the way here (its sender numbers them) and those that a newer one pushed out of the full queue, `malformed` those
+    that were no valid record, or were sent to more keys than this: on the lossy bus they may count as lost too.
     """
 
     def __init__(self, session: zenoh.Session, key: str, topic: Topic, depth: int, lossless: bool) -> None:
@@ -151,6 +154,7 @@ class Subscriber:
                 log.warning("%s: a malformed message is ignored, and all that follow: %s", self._key, error)
             return
         with self._arrived:
+            self.dropped += _lost_between(self.newest, message)
             self.dropped += len(self._queue) == self._queue.maxlen
             self.newest = message
             self._queue.append(message)
@@ -171,9 +175,8 @@ class Subscriber:
             if self._closed:
                 raise BusClosed(f"{self._topic.name}: the bus is closed")
             if self._lossless and self.dropped:
-                raise MessagesLost(
-                    f"{self._topic.name}: {self.dropped} messages lost behind {self._queue.maxlen} unread ones"
-                )
+                name, depth = self._topic.name, self._queue.maxlen
+                raise MessagesLost(f"{name}: {self.dropped} messages lost behind {depth} unread ones, or on the way")
             return self._queue.popleft() if self._queue else None
 
     def close(self) -> None:
@@ -184,3 +187,12 @@ class Subscriber:
             self._closed = True
             self._arrived.notify_all()
         self._subscriber.undeclare()
+
+
+def _lost_between(earlier: Message | None, later: Message) -> int:
+    """How many of their publisher's messages lie between two; none where it began anew, or is another one."""
+    if earlier is None or not (earlier.trace.stages and later.trace.stages and earlier.trace.number):
+        return 0
+    if earlier.trace.stages[-1].node != later.trace.stages[-1].node:
+        return 0
+    return max(0, later.trace.number - earlier.trace.number - 1)

@@ -45,15 +45,16 @@ class Trace(msgspec.Struct, frozen=True):
 
     stages: Annotated[tuple[Stage, ...], msgspec.Meta(max_length=8)] = ()  # in the order of the way
     left_ns: int | None = None  # of the budget end to end when an estimate was done; negative: it is late
+    number: _Count = 0  # of this message among its publisher's, from 1 on: a gap tells that some were lost
 
     def after(self, node: str, received_ns: int, done_ns: int) -> Trace:
         """The trace of what `node` made of this message: one stage more."""
         return Trace((*self.stages, Stage(node, received_ns, done_ns)))
 
-    def sent(self, sent_ns: int) -> Trace:
-        """The trace with the sending of its last stage stamped."""
+    def sent(self, sent_ns: int, number: int) -> Trace:
+        """The trace with the sending of its last stage stamped, as its publisher's message of this number."""
         *earlier, last = self.stages
-        return Trace((*earlier, Stage(last.node, last.received_ns, last.done_ns, sent_ns)), self.left_ns)
+        return Trace((*earlier, Stage(last.node, last.received_ns, last.done_ns, sent_ns)), self.left_ns, number)
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True):

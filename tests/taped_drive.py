@@ -100,7 +100,8 @@ class Tape:
     def take(self, message: Message, recorded: bool = True) -> None:
         """The optimizer takes something up."""
         for out in self.node.step(message.record):
-            trace = message.trace.after("optimize", self._tick(), self._tick()).sent(self._tick())
+            trace = message.trace.after("optimize", self._tick(), self._tick())
+            trace = trace.sent(self._tick(), number=0)
             if isinstance(out, Estimate):
                 self._told = message.record
                 self.estimates.append(out)

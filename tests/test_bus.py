@@ -180,6 +180,26 @@ def test_malformed_messages_are_counted_and_survived(join: Any, caplog: pytest.L
     assert sum("malformed" in record.message for record in caplog.records) == 1
 
 
+def test_messages_that_were_lost_on_the_way_are_counted(join: Any) -> None:
+    hub = join("supervisor", hub=True)
+    estimates = hub.subscriber("estimate", depth=16)
+    optimize = join("optimize", lossless=True)
+    out = optimize.publisher("estimate")
+    assert out.wait_matched(LIMIT_S)
+    key, data = key_of("car", "estimate"), encode(estimate(1))
+    numbers = [("optimize", n) for n in (4, 5, 9, 1, 2)]  # 6 to 8 are lost; then it begins anew
+    for node, number in [*numbers, ("another", 7), ("optimize", 3)]:
+        trace = Trace((Stage(node, 1, 2, 3),), number=number)
+        block, urgent = zenoh.CongestionControl.BLOCK, zenoh.Priority.REAL_TIME
+        optimize._session.put(key, data, attachment=encode(trace), congestion_control=block, priority=urgent)
+    assert [received(estimates).trace.number for _ in range(7)] == [4, 5, 9, 1, 2, 7, 3]
+    assert estimates.dropped == 3
+    for frame_id in range(3):
+        out.put(estimate(frame_id))
+    assert [received(estimates).trace.number for _ in range(3)] == [1, 2, 3]
+    assert estimates.dropped == 3
+
+
 def test_only_the_topics_own_records_are_sent(join: Any) -> None:
     hub = join("supervisor", hub=True)
     with pytest.raises(TypeError, match="estimate takes Estimate, not FrameRef"):

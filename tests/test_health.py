@@ -119,8 +119,8 @@ def test_a_node_s_health() -> None:
 
 
 def test_what_is_left_of_the_budget_stays_with_the_trace() -> None:
-    trace = Trace((Stage("optimize", 1, 2),), left_ns=-5).sent(9)
-    assert trace == Trace((Stage("optimize", 1, 2, 9),), left_ns=-5)
+    trace = Trace((Stage("optimize", 1, 2),), left_ns=-5).sent(9, 3)
+    assert trace == Trace((Stage("optimize", 1, 2, 9),), left_ns=-5, number=3)
     assert decode(encode(Trace((Stage("n", 1, 2, 3),))), Trace).left_ns is None
 
 
