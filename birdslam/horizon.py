@@ -45,6 +45,7 @@ ITERATIONS = 2
 DEPTH_UNKNOWN = 2.0  # 1-sigma of log z before a frame is seen
 UNUSED = 1e3  # 1-sigma of a cue that is not to be used
 _LEAST = 1e-12  # variance of what a class leaves no doubt of
+_SHORTEST_S = 1e-3
 
 
 class HorizonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -56,8 +57,8 @@ class HorizonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_pitch_blind_rad: float = 0.003  # a frame without odometry
     sigma_roll_rad: float = 0.01
     roll_memory_s: float = 20.0
-    sigma_kerb_m: float = 0.06  # how far the road under a vehicle in the ego's lane lies off the ego's plane
-    sigma_crown_rad: float = 0.01  # and the more the farther it stands to the side
+    sigma_kerb_m: float = 0.04  # how far the road under a vehicle in the ego's lane lies off the ego's plane
+    sigma_crown_rad: float = 0.007  # and the more the farther it stands to the side
     width_drift_rel: float = 0.002  # of the outline, a frame
     width_turn_rel: float = 1.0  # of the outline, a radian that the line of sight turned: the yaw is not known as well
     width_turned_rel: float = 0.6  # of a change of the outline that comes of a yaw newly learned
@@ -65,6 +66,7 @@ class HorizonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cues: tuple[Cue, ...] = ("bottom", "top", "width")
     gate_sigma: float = 2.0  # past it a cue is trusted the less the worse it fits
     image_pitch_frames: float = 5.0  # for how long the error of a pitch from the images lasts
+    box_memory_s: float = 0.5  # a box errs in the next frame as in this: no more is learned in this time than from one
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,7 @@ class Horizon:
         self.camera = camera
         self.config = config
         self._vehicles: list[int] = []
+        self._unseen_s = np.zeros(0)  # of each of them
         self._x = np.array([camera.pitch_rad, camera.roll_rad])
         self._P = np.diag([config.sigma_pitch_rad**2, config.sigma_roll_rad**2])
         self._image_ground = camera.ground
@@ -107,7 +110,8 @@ class Horizon:
     def road(self) -> Horizon:
         """The road alone, without vehicles, to be predicted on while this one stays."""
         road = copy.copy(self)
-        road._vehicles, road._x, road._P = [], self._x[:COMMON].copy(), self._P[:COMMON, :COMMON].copy()
+        road._vehicles, road._unseen_s = [], np.zeros(0)
+        road._x, road._P = self._x[:COMMON].copy(), self._P[:COMMON, :COMMON].copy()
         return road
 
     def predict(
@@ -118,6 +122,7 @@ class Horizon:
         `image_ground` is the road as the images show it, None where they don't.
         """
         config = self.config
+        self._unseen_s = self._unseen_s + dt_s
         calibrated = np.array([self.camera.pitch_rad, self.camera.roll_rad])
         sigma = np.array([config.sigma_pitch_rad, config.sigma_roll_rad])
         keep = np.exp(-dt_s / np.array([config.pitch_memory_s, config.roll_memory_s]))
@@ -149,6 +154,7 @@ class Horizon:
         for k, vehicle in enumerate(self._vehicles):
             if vehicle in wanted:
                 rows += range(COMMON + OWN * k, COMMON + OWN * (k + 1))
+        self._unseen_s = self._unseen_s[[vehicle in wanted for vehicle in self._vehicles]]
         self._vehicles = [vehicle for vehicle in self._vehicles if vehicle in wanted]
         self._x, self._P = self._x[rows], self._P[np.ix_(rows, rows)]
 
@@ -184,8 +190,9 @@ class Horizon:
         z = np.concatenate([slopes, tops, log_width - np.log(outlines_m)])
         R0 = np.concatenate([sigma_slope[:, 0] ** 2, sigma_slope[:, 1] ** 2, sigma_width**2])
         R0[np.repeat([cue not in self.config.cues for cue in CUES], n)] = UNUSED**2
-        log_z, P_z, P_zh = self._iterate(at, bearing, extents_m * self.config.roof_reach_rel, z, R0)
-        log_h, P_h = self._x[at], np.maximum(self._P[at, at], _LEAST)
+        log_z, P_z, log_h, P_h, P_zh = self._iterate(
+            at, bearing, extents_m * self.config.roof_reach_rel, z, R0, self._frames_alike(at)
+        )
         if learned is None:
             return Depths(log_z, P_z, log_h, P_h, P_zh / P_h)
         gap = learned.log_height - log_h[:, None]
@@ -196,10 +203,21 @@ class Horizon:
             P_zh / P_h,
         )
 
+    def _frames_alike(self, at: NDArray[np.intp]) -> Floats:
+        """(N,): how many frames in a row err alike, by how long ago each vehicle was last seen."""
+        rows = (at - COMMON) // OWN
+        alike: Floats = np.maximum(1.0, self.config.box_memory_s / np.maximum(self._unseen_s[rows], _SHORTEST_S))
+        self._unseen_s[rows] = 0.0
+        return alike
+
     def _iterate(
-        self, at: NDArray[np.intp], bearing: Floats, reach: Floats, z: Floats, R: Floats
-    ) -> tuple[Floats, Floats, Floats]:
-        """log z, its variances, and its covariances with log h of the same vehicles, (N,) each."""
+        self, at: NDArray[np.intp], bearing: Floats, reach: Floats, z: Floats, R: Floats, alike: Floats
+    ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """log z and its variances, log h and its variances, and their covariances, (N,) each.
+
+        They have this frame's boxes with their noise R. What is kept for the next frame has them with so much more that
+        errors which last are not averaged away.
+        """
         n, m = len(at), len(self._x)
         height_m = self._image_ground.height_m
         # First guess of the depth: by the prior height from the height of the box
@@ -237,15 +255,17 @@ class Horizon:
             PJt = P @ J.T
             S = J @ PJt
             innovation = z - expected - J @ (prior - x)
-            S[np.diag_indices_from(S)] += R
-            information = np.asarray(np.linalg.inv(S), dtype=np.float64)
+            of_frame = _inverse(S + np.diag(R))
             if iteration == ITERATIONS - 1:
-                information = self._doubt(information, innovation)
-            gain = PJt @ information
+                of_frame = self._doubt(of_frame, innovation)
+            gain = PJt @ of_frame
             x = prior + gain @ innovation
         P = P - gain @ PJt.T
-        self._x, self._P = x[:m], (P[:m, :m] + P[:m, :m].T) / 2.0
-        return x[m:], np.diag(P)[m:].copy(), P[range(m, m + n), at]
+        lasting = _inverse(S + np.diag(R * np.tile(alike, len(CUES))))
+        kept = PJt[:m] @ self._doubt(lasting, innovation)
+        kept_P = self._P - kept @ PJt[:m].T
+        self._x, self._P = prior[:m] + kept @ innovation, (kept_P + kept_P.T) / 2.0
+        return x[m:], np.diag(P)[m:].copy(), x[at], np.maximum(P[at, at], _LEAST), P[range(m, m + n), at]
 
     def _doubt(self, information: Floats, innovation: Floats) -> Floats:
         """The inverse of the innovations' covariance, (M, M), with each box's worst cue trusted less where it misfits.
@@ -269,6 +289,7 @@ class Horizon:
 
     def _begin(self, vehicle: int, seen: Observation) -> None:
         self._vehicles.append(vehicle)
+        self._unseen_s = np.append(self._unseen_s, self.config.box_memory_s)
         dimensions, config = seen.dimensions, self.config
         sigma_road_m = math.hypot(config.sigma_kerb_m, config.sigma_crown_rad * seen.bearing * seen.depth_by_height_m)
         self._x = np.append(self._x, [math.log(dimensions.height_m), 0.0, 0.0])
@@ -286,6 +307,10 @@ class Horizon:
         gain = self._P[:, 0] / (self._P[0, 0] + sigma_rad**2)
         self._x = self._x + gain * (pitch_rad - self._x[0])
         self._P = self._P - np.outer(gain, self._P[0])
+
+
+def _inverse(S: Floats) -> Floats:
+    return np.asarray(np.linalg.inv(S), dtype=np.float64)
 
 
 def _mixed(weight: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:

@@ -43,16 +43,15 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """How boxes become places; the class table also says which labels are vehicles."""
 
     vehicles: dict[str, Dimensions] = msgspec.field(default_factory=lambda: dict(DIMENSIONS))
-    sigma_box_rel: float = 0.02  # a detector's edges scatter with the size of the box
-    sigma_box_px: float = 1.0
+    sigma_box_rel: float = 0.02  # a detector's edges scatter with the size of the box,
+    sigma_box_px: float = 0.7  # and beside it as pixels do
     reach_rel: float = 1.0  # of the way from the nearest face to the centre; the paper stays at the face (0)
     sigma_cut_rel: float = 1.0  # an edge cut by the image says nothing within the whole box
     sigma_hidden_rel: float = 0.05  # an edge behind a nearer vehicle is the detector's guess
     cut_margin_px: float = 4.0
     cut_margin_rel: float = 0.1  # of the box's height, at the image's bottom: detectors draw an edge that the image
     cut_margin_side_rel: float = 0.05  # cuts off a little inside of it; and of its width, at the sides
-    size_floor_rel: float = 0.02  # of a depth: vehicles are no cuboids
-    shape_floor_m: float = 0.1  # nor across the line of sight, and headed not quite as is thought
+    shape_floor_m: float = 0.05  # across the line of sight: vehicles are no cuboids
     max_above_road_rad: float = 0.06  # a box whose bottom lies so far above where its height puts it hangs in the air
     same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
     max_range_m: float = 100.0  # by the height of its class
@@ -185,7 +184,7 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
         1.0 / math.sqrt(of_left + of_right), lopsided * sigma_half, config.shape_floor_m / max(x_m, 1.0)
     )
     sigma_reach_m = reach_m * (1.0 if seen.cut_side else seen.dimensions.sigma_length_rel)
-    along = x_m**2 * (var_depth + config.size_floor_rel**2) + sigma_reach_m**2
+    along = x_m**2 * var_depth + sigma_reach_m**2
     across, slope = (x_m * sigma_across) ** 2, y_m / x_m
     cov = np.array([[along, along * slope], [along * slope, along * slope**2 + across]])
     return Place(depth_m, np.array([x_m, y_m]), cov)
@@ -266,7 +265,7 @@ def _observe(
 
     def sigma_px(size_px: float, cut: bool, covered: bool) -> float:
         rel = cut_rel if cut else config.sigma_hidden_rel if covered else 0.0
-        return math.hypot(size_px * config.sigma_box_rel + config.sigma_box_px, size_px * rel)
+        return math.hypot(size_px * config.sigma_box_rel, config.sigma_box_px, size_px * rel)
 
     return Observation(
         label=label,

@@ -60,7 +60,7 @@ class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     drives_for_s: float = 20.0  # until it creeps
     change_mps: float = 2.0  # 1-sigma by which the velocity of a vehicle that moves changes within a second
     outline_drift_rel: float = 0.03  # of the outline's width, in a second: the yaw is not known as well
-    box_memory_s: float = 0.3  # a box errs in the next frame as in this: no more is learned in this time than from one
+    box_memory_s: float = 0.5  # a box errs in the next frame as in this: no more is learned in this time than from one
     view_memory_s: float = 1.5  # and so do, for longer, the pitch and what is taken for the nearest face
     sigma_scale_rel: float = 0.02  # of the odometry's metres
     sigma_face_m: float = 1.0  # edges of a box lie not all at its nearest face, and on others as it turns

@@ -16,6 +16,7 @@ from scipy.special import erfcx
 
 from birdslam.association import NEAREST_M, in_ego
 from birdslam.depthplace import DepthPlace, PseudoLidarConfig, combined
+from birdslam.heading import HeadingConfig, Headings, spread
 from birdslam.horizon import Depths, Horizon
 from birdslam.localisation import LocalisationConfig, Observation, Place, Taken, extent_m, place
 from birdslam.parallax import LearnedSize, Parallax, ParallaxConfig, sights_of
@@ -40,6 +41,15 @@ class Body:
             return self.by_depth.yaw_rad if self.by_depth is not None and self.by_depth.front_seen else 0.0
         return wrap(self.track.yaw_rad - T_world_ego.yaw_rad)
 
+    def yaw_doubt(self, config: HeadingConfig) -> tuple[float, float]:
+        """1-sigma of that yaw, and the probability that it is another one altogether."""
+        if self.track is None:
+            if self.by_depth is not None and self.by_depth.front_seen:
+                return self.by_depth.sigma_yaw_rad, config.astray_known
+        elif self.track.yaw_known:
+            return self.track.sigma_yaw_rad, config.astray_known
+        return config.sigma_along_road_rad, config.astray_unknown
+
     def expected_depth_m(self, T_world_ego: SE2) -> float:
         """Of the nearest face, before it is measured: as the track predicts it, or by the height of its class."""
         if self.track is None:
@@ -59,9 +69,14 @@ class Placing:
     """predict() once a frame, then places() of its bodies."""
 
     def __init__(
-        self, localisation: LocalisationConfig, parallax: ParallaxConfig, pseudolidar: PseudoLidarConfig
+        self,
+        localisation: LocalisationConfig,
+        parallax: ParallaxConfig,
+        pseudolidar: PseudoLidarConfig,
+        heading: HeadingConfig,
     ) -> None:
         self.localisation = localisation
+        self.heading = heading
         self.pseudolidar = pseudolidar
         self.parallax = Parallax(parallax)
 
@@ -98,12 +113,31 @@ class Placing:
                 seen, found.log_depth.tolist(), found.variance.tolist(), yaws, strict=True
             )
         ]
+        by_boxes = self._headed(by_boxes, bodies, found, yaws)
         where = [
             combined(by_box, body.by_depth, self.pseudolidar) for by_box, body in zip(by_boxes, bodies, strict=True)
         ]
         return [
             replace(whole, taken=self._taken(found, k, serials[k], float(whole.cov[0, 0] / by_box.cov[0, 0])))
             for k, (whole, by_box) in enumerate(zip(where, by_boxes, strict=True))
+        ]
+
+    def _headed(
+        self, places: Sequence[Place], bodies: Sequence[Body], depths: Depths, yaws_rad: Sequence[float]
+    ) -> list[Place]:
+        """The places with all that the doubt of the yaws makes of them."""
+        sigma_rad, astray = np.array([body.yaw_doubt(self.heading) for body in bodies]).reshape(-1, 2).T
+        shift_m, cov = spread(
+            [body.seen for body in bodies],
+            depths.log_depth,
+            depths.variance,
+            Headings(np.array(yaws_rad), sigma_rad, astray),
+            self.localisation,
+            self.heading,
+        )
+        return [
+            replace(where, centre_m=where.centre_m + d, cov=where.cov + C)
+            for where, d, C in zip(places, shift_m, cov, strict=True)
         ]
 
     def _taken(self, depths: Depths, k: int, serial: int, share: float) -> Taken:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from birdslam.association import predicted_boxes_px, within_gate
 from birdslam.camera import Camera, GroundPlane
 from birdslam.depthplace import DepthPlace, PseudoLidarConfig
+from birdslam.heading import HeadingConfig
 from birdslam.horizon import Horizon
 from birdslam.localisation import LocalisationConfig, Observation, Place, extent_m, iou, place
 from birdslam.parallax import ParallaxConfig
@@ -51,6 +52,7 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_yaw_unknown_rad: float = 0.2
     sigma_yaw_moving_rad: float = 0.1
     parallax: ParallaxConfig = ParallaxConfig()
+    heading: HeadingConfig = HeadingConfig()
     stands: float = 0.5  # the probability from which on a vehicle does, by its parallax: its yaw is kept
     late_sigma_m: float = 3.0  # a late detection that the velocity puts so far off is not shown in the present frame
 
@@ -71,7 +73,7 @@ class Tracker:
         self.camera = camera
         self.config = config
         self.localisation = localisation
-        self.placing = Placing(localisation, config.parallax, pseudolidar or PseudoLidarConfig())
+        self.placing = Placing(localisation, config.parallax, pseudolidar or PseudoLidarConfig(), config.heading)
         self.tracks: list[Track] = []
         self._next_id = 0
         self._next_serial = 0
@@ -267,11 +269,14 @@ class Tracker:
             for yaw_rad in (yaw_ego_rad, yaw_ego_rad - gain * turn)
         ]
         horizon.turn(track.serial, math.log(outlines[0] / outlines[1]))
-        turned = place(seen, math.log(depth_m), 0.0, yaw_ego_rad, self.localisation)
-        shift_m = T_world_ego.rotation() @ (turned.centre_m - track.place.centre_m)
+        after_m, before_m = (
+            place(seen, math.log(depth_m), 0.0, yaw_rad, self.localisation).centre_m
+            for yaw_rad in (yaw_ego_rad, yaw_ego_rad - gain * turn)
+        )
+        shift_m = T_world_ego.rotation() @ (after_m - before_m)
         track.state[:2] += shift_m
         track.first_m = track.first_m + shift_m
-        track.place = replace(track.place, depth_m=depth_m, centre_m=turned.centre_m)
+        track.place = replace(track.place, centre_m=track.place.centre_m + (after_m - before_m))
 
     def _has_moved(self, track: Track) -> bool:
         """Whether it left where it was first seen by more than a parked car seems to that is seen better and better."""

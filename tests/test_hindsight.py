@@ -205,12 +205,12 @@ def test_a_late_vehicle_whose_velocity_is_not_known_is_not_shown() -> None:
 
 def test_a_detector_that_is_less_sure_of_its_edges_gives_poorer_places() -> None:
     """`Detections.edge_sigma` takes the place of the configuration's own."""
-    covs = {}
-    for said in (None, (0.02, 1.0), (0.2, 10.0)):
+    covs, own = {}, (LocalisationConfig().sigma_box_rel, LocalisationConfig().sigma_box_px)
+    for said in (None, own, (0.2, 10.0)):
         front = hindsight()
         for k in range(4):
             front.begin(moment(k))
             tracks = front.see(replace(detections(k), edge_sigma=said), k)
         covs[said] = tracks[0].place.cov
-    np.testing.assert_array_equal(covs[None], covs[0.02, 1.0])
+    np.testing.assert_array_equal(covs[None], covs[own])
     assert np.linalg.eigvalsh(covs[0.2, 10.0] - covs[None]).min() > 0.0

@@ -11,6 +11,7 @@ from scipy.special import ndtr
 
 from birdslam import bev
 from birdslam.depthplace import PseudoLidarConfig
+from birdslam.heading import HeadingConfig
 from birdslam.horizon import Depths, Horizon, HorizonConfig
 from birdslam.localisation import DIMENSIONS, LocalisationConfig, Observation, localise
 from birdslam.parallax import ParallaxConfig
@@ -79,7 +80,7 @@ def test_cars_beside_the_ego_are_not_thought_far_ahead() -> None:
     for x_m in np.arange(3.5, 7.0, 0.5):
         for side in (-3.3, 3.3):
             for height_m in (1.4, 1.53, 1.66):
-                placing = Placing(CONFIG, ParallaxConfig(), PseudoLidarConfig())
+                placing = Placing(CONFIG, ParallaxConfig(), PseudoLidarConfig(), HeadingConfig())
                 body = Body(0, None, seen_at(float(x_m), side, height_m))
                 assert body.seen.sigma_cut is not None
                 (where,) = placing.places([body], SE2(), Horizon(CAMERA, HorizonConfig()))

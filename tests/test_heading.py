@@ -1,0 +1,91 @@
+"""What a yaw that is not known makes of a vehicle's place, on boxes that a known world projects."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from birdslam import bev
+from birdslam.camera import Camera
+from birdslam.heading import HeadingConfig, Headings, spread
+from birdslam.localisation import DIMENSIONS, LocalisationConfig, Observation, localise, place
+from birdslam.localisation_evaluation import INSIDE_2_SIGMA
+
+Floats = NDArray[np.float64]
+CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
+CAR = DIMENSIONS["car"]
+CONFIG, LOCALISATION = HeadingConfig(), LocalisationConfig()
+SIGMA_DEPTH = 0.03
+
+
+def car_at(centre_m: Floats, yaw_rad: float, noise_px: Floats, stretch: float = 1.0) -> tuple[Observation, float]:
+    """Its box, and the true depth of its nearest face; `stretch` of its length and width."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    half = np.array([(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]) * stretch
+    corners = centre_m + half @ np.array([[c, s], [-s, c]])
+    px = bev.ego_to_pixel(
+        CAMERA, CAMERA.ground, np.vstack([np.column_stack([corners, np.full(4, z)]) for z in (0, 1.5)])
+    )
+    box = np.array([*px.min(axis=0), *px.max(axis=0)]) + noise_px
+    (seen,) = localise(box[None], np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION)
+    return seen, float(corners[:, 0].min())
+
+
+def placed(
+    seen: Observation, depth_m: float, headings: Headings, localisation: LocalisationConfig = LOCALISATION
+) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+    """(centre, cov) without and with the doubt of the yaw."""
+    log_depth = math.log(depth_m)
+    sharp = place(seen, log_depth, SIGMA_DEPTH**2, float(headings.yaw_rad[0]), localisation)
+    shift, cov = spread([seen], np.array([log_depth]), np.array([SIGMA_DEPTH**2]), headings, localisation, CONFIG)
+    return (sharp.centre_m, sharp.cov), (sharp.centre_m + shift[0], sharp.cov + cov[0])
+
+
+def thought(yaw_rad: float, sigma_rad: float, astray: float) -> Headings:
+    return Headings(np.array([yaw_rad]), np.array([sigma_rad]), np.array([astray]))
+
+
+@pytest.mark.parametrize("yaw_rad", [-1.0, 0.0, 0.5, 2.0])
+def test_a_yaw_that_is_known_moves_nothing(yaw_rad: float) -> None:
+    seen, depth_m = car_at(np.array([15.0, 3.0]), yaw_rad, np.zeros(4))
+    (centre, cov), (mean, wide) = placed(seen, depth_m, thought(yaw_rad, 0.0, 0.0))
+    np.testing.assert_allclose(mean, centre, atol=1e-9)
+    np.testing.assert_allclose(wide, cov, atol=1e-9)
+
+
+def test_the_papers_point_is_the_same_for_every_yaw() -> None:
+    seen, depth_m = car_at(np.array([15.0, 3.0]), 0.7, np.zeros(4))
+    face = LocalisationConfig(reach_rel=0.0)
+    (centre, cov), (mean, wide) = placed(seen, depth_m, thought(0.0, 0.05, 0.25), face)
+    np.testing.assert_allclose(mean, centre, atol=1e-9)
+    np.testing.assert_allclose(wide, cov, atol=1e-9)
+
+
+def test_a_wide_box_is_of_a_car_that_stands_across() -> None:
+    """Its centre lies half of its width behind the nearest face; one turned by 60 degrees looks nearly as wide."""
+    truth = np.array([15.0, 0.0])
+    seen, depth_m = car_at(truth, math.pi / 2.0, np.zeros(4))
+    (centre, _), (mean, _) = placed(seen, depth_m, thought(0.0, 0.05, 0.25))
+    assert centre[0] - truth[0] > 1.0
+    assert abs(mean[0] - truth[0]) < 0.7
+
+
+def test_the_covariance_holds_cars_that_stand_as_they_like() -> None:
+    """A quarter is headed anywhere, as `HeadingConfig` has it, and the place is told for one headed like the ego."""
+    rng, squared = np.random.default_rng(2), []
+    for _ in range(600):
+        truth = np.array([rng.uniform(7.0, 20.0), 0.0])
+        truth[1] = rng.uniform(-0.35, 0.35) * truth[0]
+        yaw_rad = rng.uniform(-math.pi, math.pi) if rng.uniform() < 0.25 else 0.05 * rng.standard_normal()
+        noise_px = rng.standard_normal(4) * np.array([1.0, 0.0, 1.0, 0.0])
+        seen, depth_m = car_at(truth, yaw_rad, noise_px, math.exp(0.09 * rng.standard_normal()))
+        depth_m *= math.exp(SIGMA_DEPTH * rng.standard_normal())
+        both = placed(seen, depth_m, thought(0.0, 0.05, 0.25))
+        squared.append([(mean - truth) @ np.linalg.solve(cov, mean - truth) for mean, cov in both])
+    sharp, told = np.array(squared).T
+    assert np.mean(sharp) > 2.5  # two degrees of freedom
+    assert 1.0 < np.mean(told) < 2.0
+    assert np.mean(told <= INSIDE_2_SIGMA) > 0.95
