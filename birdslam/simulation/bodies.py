@@ -147,6 +147,11 @@ def vehicle(B, body, P):  # type: ignore[no-untyped-def]
     """Car, van or bus: the loft on four wheels with its mirrors."""
     loft(B, body, P)
     y, r = 0.5 * P[m.WIDTH], P[m.WHEEL_RADIUS]
+    # Exhaust, axles and tank: one doesn't look through under a car
+    box(
+        B, body, m.DARK, P[m.X_REAR_AXLE] - 0.6 * r, P[m.X_FRONT_AXLE], -0.6 * y, 0.6 * y,
+        (0.55 + 0.3 * P[m.SEED]) * P[m.CLEARANCE], P[m.CLEARANCE] + 0.12,
+    )  # fmt: skip
     for side in range(2):
         s = 1.0 - 2.0 * side
         wheel(B, body, m.WHEEL, P[m.X_FRONT_AXLE], s * TRACK * y, s, r, 0.22)

@@ -24,8 +24,12 @@ def contact_light(shade_map, frame_m, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def contact_map(shade_map, x0, y0, cells_per_m, poses, sizes):  # type: ignore[no-untyped-def]
-    """Darken `shade_map` under each body: `poses` (n, 3) x y yaw, `sizes` (n, 2) length and width."""
+def contact_map(shade_map, x0, y0, cells_per_m, poses, sizes, at_edge, reach_m):  # type: ignore[no-untyped-def]
+    """Darken `shade_map` under each body: `poses` (n, 3) x y yaw, `sizes` (n, 2) length and width.
+
+    `at_edge` is the share of the light that is left where a body's side stands over the ground; `reach_m` from there
+    all of it is.
+    """
     shade_map[:] = 1.0
     for k in range(poses.shape[0]):
         hx, hy = 0.5 * sizes[k, 0], 0.5 * sizes[k, 1]
@@ -40,5 +44,5 @@ def contact_map(shade_map, x0, y0, cells_per_m, poses, sizes):  # type: ignore[n
                 dx, dy = x0 + i / cells_per_m - poses[k, 0], y0 + j / cells_per_m - poses[k, 1]
                 ox, oy = abs(cos * dx + sin * dy) - hx, abs(cos * dy - sin * dx) - hy
                 out = math.hypot(max(ox, 0.0), max(oy, 0.0)) + min(max(ox, oy), 0.0)
-                light = min(max(0.45 + out / 1.0, 0.06), 1.0)
+                light = min(max(at_edge + out * (1.0 - at_edge) / reach_m, 0.06), 1.0)
                 shade_map[i, j] = min(shade_map[i, j], light)

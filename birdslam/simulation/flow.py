@@ -90,11 +90,11 @@ def populate(
         out.append(mover)
         return True
 
-    if u[5] < 0.18:
+    if u[5] < 0.25:
         _pass(rng.spawn(1)[0], street, ego_s_m, ego_d_m, add)
-    jam = u[1] < 0.18
+    jam = u[1] < 0.24
     for lane in street.lanes:
-        gap = (6.0 + 5.0 * u[2]) if jam else 14.0 + 60.0 * (1.0 - dense) * rng.uniform(0.5, 1.5)
+        gap = (5.5 + 5.0 * u[2]) if jam else 14.0 + 60.0 * (1.0 - dense) * rng.uniform(0.5, 1.5)
         speed = rng.uniform(0.0, 3.0) if jam else lane.speed_mps * rng.uniform(0.7, 1.1)
         s = ego_s_m - 25.0 + rng.uniform(0.0, gap)
         while s < ego_s_m + reach_m:

@@ -13,6 +13,7 @@ from birdslam.camera import Camera
 from birdslam.simulation import bodies, ground, scenery
 from birdslam.simulation import materials as m
 from birdslam.simulation.contact import contact_map
+from birdslam.simulation.light import hashed
 from birdslam.simulation.meshes import new_buffer
 from birdslam.simulation.rasteriser import count_inside, project, rasterize, shadow_map
 from birdslam.simulation.shading import plane_bases, shade_frame, wet_road
@@ -238,13 +239,14 @@ class Renderer:
             )
         return fine, coarse, lean, fine_origin, coarse_origin, np.array([_FINE_PER_M, _COARSE_PER_M])
 
-    @staticmethod
-    def _contact(scene: Bodies, R: Floats, t: Floats, moving: NDArray[np.int64]) -> tuple[Floats32, Floats]:
+    def _contact(self, scene: Bodies, R: Floats, t: Floats, moving: NDArray[np.int64]) -> tuple[Floats32, Floats]:
         shade_map = np.empty((280, 160), np.float32)
         wide = moving[np.isin(scene.kind[moving], (m.VEHICLE, m.TRUCK))]
         poses = np.column_stack([t[wide, 0], t[wide, 1], np.arctan2(R[wide, 1, 0], R[wide, 0, 0])])
         sizes = scene.parameters[wide][:, [m.LENGTH, m.WIDTH]].astype(np.float64)
-        contact_map(shade_map, -2.0, -16.0, 5.0, np.ascontiguousarray(poses), sizes)
+        seed = float(self._sky[18])  # how soft these shadows are differs from scene to scene
+        at_edge, reach_m = 0.35 + 0.3 * seed, 0.35 + 0.6 * hashed(seed, 5.0)
+        contact_map(shade_map, -2.0, -16.0, 5.0, np.ascontiguousarray(poses), sizes, at_edge, reach_m)
         return shade_map, np.array([-2.0, -16.0, 5.0])
 
 
