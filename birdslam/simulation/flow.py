@@ -116,16 +116,20 @@ def populate(
 
 
 def _pass(rng: np.random.Generator, street: Street, ego_s_m: float, ego_d_m: float, add) -> None:  # type: ignore[no-untyped-def]
-    """A truck, a bus or a van close beside the ego, so that the image's border cuts it."""
+    """Trucks, buses and vans close beside the ego, so that the image's border cuts them; some fill a side of it."""
     near = [lane for lane in street.lanes if 2.4 < abs(lane.d_m - ego_d_m) < 4.8]
     if near:
         lane = near[int(rng.integers(0, len(near)))]
-        pick = rng.random()
-        body = draw_truck(rng) if pick < 0.6 else draw_shape(rng, "bus" if pick < 0.75 else "big_van")
-        s = ego_s_m + rng.uniform(2.0, 9.0) + 0.5 * float(body.parameters[m.LENGTH])
-        turn = (0.0 if lane.direction > 0 else math.pi) + rng.normal(0.0, 0.015)
-        speed = lane.speed_mps * rng.uniform(0.0, 1.0)
-        add(Mover(body, s, lane.d_m + rng.normal(0.0, 0.15), turn, speed, lane.speed_mps, lane.d_m), 0.3)
+        s = ego_s_m + rng.uniform(-5.0, 9.0)
+        for _ in range(int(rng.integers(1, 4))):
+            pick = rng.random()
+            body = draw_truck(rng) if pick < 0.6 else draw_shape(rng, "bus" if pick < 0.75 else "big_van")
+            length_m = float(body.parameters[m.LENGTH])
+            turn = (0.0 if lane.direction > 0 else math.pi) + rng.normal(0.0, 0.015)
+            speed = lane.speed_mps * rng.uniform(0.0, 1.0)
+            d = lane.d_m + rng.normal(0.0, 0.15)
+            add(Mover(body, s + 0.5 * length_m, d, turn, speed, lane.speed_mps, lane.d_m), 0.3)
+            s += length_m + rng.uniform(1.5, 12.0)
 
 
 def _park(rng: np.random.Generator, rows: list[Row], street: Street, add) -> None:  # type: ignore[no-untyped-def]
