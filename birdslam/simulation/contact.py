@@ -6,8 +6,10 @@ import math
 
 from numba import njit
 
+from birdslam.simulation.compiled import inlined
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+
+@inlined
 def contact_light(shade_map, frame_m, x, y):  # type: ignore[no-untyped-def]
     """Share of the sky that the ground at (x, y) sees past the vehicles over it, from a map of the area ahead.
 

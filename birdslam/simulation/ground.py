@@ -8,6 +8,7 @@ from numba import njit
 
 from birdslam.simulation import materials as m
 from birdslam.simulation import street as st
+from birdslam.simulation.compiled import inlined, per_pixel
 from birdslam.simulation.light import hashed, noise
 from birdslam.simulation.meshes import begin, corner
 
@@ -62,7 +63,7 @@ def strips(B, body, stations, bands, crossings, base):  # type: ignore[no-untype
             t += 2
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+@inlined
 def crossing_at(crossings, s, d, right, left):  # type: ignore[no-untyped-def]
     """0 beside crossings, 1 on a side road, 2 on the main road within a crossing, 3 on a side road's kerb."""
     for k in range(crossings.shape[0]):
@@ -87,14 +88,14 @@ def crossing_at(crossings, s, d, right, left):  # type: ignore[no-untyped-def]
     return 0
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+@inlined
 def _coverage(off, half, footprint):  # type: ignore[no-untyped-def]
     """Share of a pixel `footprint` wide that a stripe of half width `half`, `off` away, covers."""
     lo, hi = max(off - 0.5 * footprint, -half), min(off + 0.5 * footprint, half)
     return max(0.0, hi - lo) / max(footprint, 1e-4)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+@inlined
 def _line_at(lines, s, d, footprint_d, footprint_s):  # type: ignore[no-untyped-def]
     """How much of the pixel lane lines cover, and which line that is; -1 for none."""
     best, which = 0.0, -1
@@ -125,7 +126,7 @@ def _line_at(lines, s, d, footprint_d, footprint_s):  # type: ignore[no-untyped-
     return best, which
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+@inlined
 def _mark_at(marks, by_metre, pictures, s, d):  # type: ignore[no-untyped-def]
     """(kind, strength) of the paint, patch or manhole at (s, d); kind -1 for none. `by_metre` lists marks by s."""
     metre = min(max(int(s), 0), by_metre.shape[0] - 1)
@@ -168,7 +169,7 @@ def _mark_at(marks, by_metre, pictures, s, d):  # type: ignore[no-untyped-def]
     return -1, 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def _surface(kind, tone, bank, s, d, foot, sky):  # type: ignore[no-untyped-def]
     """(r, g, b, class) of a surface without paint; `foot` is the pixel's width on it in metres."""
     t = foot * 256.0
@@ -228,7 +229,7 @@ def _surface(kind, tone, bank, s, d, foot, sky):  # type: ignore[no-untyped-def]
     return (0.05 + 0.06 * dry) * k, (0.085 + 0.02 * dry) * k, 0.028 * k, CLASS_GRASS
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+@inlined
 def shade_ground(bands, lines, crossings, marks, by_metre, edges, bank, pictures, sky, s, d, footprint_d, footprint_s):  # type: ignore[no-untyped-def]
     """(r, g, b, mirror, class) of the ground at (s, d) for a pixel that spans so many metres across and along."""
     foot = max(footprint_d, min(0.35 * footprint_s, 6.0 * footprint_d))

@@ -10,19 +10,19 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from birdslam.simulation.compiled import inlined, per_pixel
 
 SKY_SLOTS = 26
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def hashed(a, b):  # type: ignore[no-untyped-def]
     """A number in [0, 1) of two others, without pattern."""
     v = math.sin(a * 127.1 + b * 311.7) * 43758.5453
     return v - math.floor(v)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def noise(bank, channel, u, v, texels):  # type: ignore[no-untyped-def]
     """The channel at (u, v) in tiles, of the level whose texels are as large as the pixel (`texels` of level 0)."""
     level = 0
@@ -42,7 +42,7 @@ def noise(bank, channel, u, v, texels):  # type: ignore[no-untyped-def]
     return top * (1.0 - fy) + low * fy
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def sky_colour(sky, bank, x, y, z):  # type: ignore[no-untyped-def]
     """Light from the direction (x, y, z): a gradient, clouds, the glow about the sun."""
     t = max(z, 0.0) ** 0.5
@@ -62,7 +62,7 @@ def sky_colour(sky, bank, x, y, z):  # type: ignore[no-untyped-def]
     return r, g, b
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def mirrored(sky, bank, x, y, z):  # type: ignore[no-untyped-def]
     """What a glossy surface shows in the direction (x, y, z): sky, a skyline of houses and trees, the road."""
     line = 0.12 + 0.05 * noise(bank, 0, math.atan2(y, x) * 0.12 + sky[18], 0.37, 4.0)
@@ -76,7 +76,7 @@ def mirrored(sky, bank, x, y, z):  # type: ignore[no-untyped-def]
     return light + (r - light) * open_sky, light + (g - light) * open_sky, light + (b - light) * open_sky
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+@inlined
 def _lookup(highest, lean, origin, cells_per_m, x, y, z, bias):  # type: ignore[no-untyped-def]
     """Share of the sun that reaches (x, y, z): four neighbouring rays blended; -1 outside of the map."""
     u = (x - z * lean[0] - origin[0]) * cells_per_m
@@ -94,7 +94,7 @@ def _lookup(highest, lean, origin, cells_per_m, x, y, z, bias):  # type: ignore[
     return top + (c + (d - c) * fu - top) * fv
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+@inlined
 def sunlit(fine, coarse, lean, fine_origin, coarse_origin, per_m, x, y, z, nx, ny, nz, bias):  # type: ignore[no-untyped-def]
     """Share of the sun that reaches a point of a surface with this normal, from the fine map or the coarse one.
 

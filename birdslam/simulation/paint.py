@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from birdslam.simulation import materials as m
 from birdslam.simulation.bodies import half_width, profile, roof_half_width
+from birdslam.simulation.compiled import per_pixel
 from birdslam.simulation.light import hashed, noise
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def _plate(P, y, z, z_plate):  # type: ignore[no-untyped-def]
     """Brightness of the number plate at (y, z) of the tail or nose, -1 beside it."""
     u, v = y / 0.26, (z - z_plate) / 0.056
@@ -32,14 +31,14 @@ def _plate(P, y, z, z_plate):  # type: ignore[no-untyped-def]
     return 0.75
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def apron(P):  # type: ignore[no-untyped-def]
     """Height of the bare plastic below the bumper's lacquer, m: most cars have some."""
     h = hashed(P[m.SEED], 3.0)
     return 0.2 * max(h - 0.35, 0.0) / 0.65
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def _end(P, x, y, z, front):  # type: ignore[no-untyped-def]
     """Lamps, plate, grille, bumper of a nose or tail: (kind, value); kind 0 none, 1 grey, 2 red lamp, 3 head lamp."""
     w = half_width(P, x) + 1e-3
@@ -93,7 +92,7 @@ def _end(P, x, y, z, front):  # type: ignore[no-untyped-def]
     return 0, 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def _window(P, x, y, z, nx, ny):  # type: ignore[no-untyped-def]
     """0 no window, 1 glass, 2 its dark frame."""
     if z < P[m.BELT] + 0.015 and x < P[m.X_COWL] - 0.25:
@@ -129,7 +128,7 @@ def _window(P, x, y, z, nx, ny):  # type: ignore[no-untyped-def]
     return 0
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def bodywork(P, bank, x, y, z, nx, ny, nz, footprint):  # type: ignore[no-untyped-def]
     """Lacquer, windows, lamps, plates, gaps and wheel arches."""
     r, g, b = P[m.RED], P[m.GREEN], P[m.BLUE]
@@ -186,7 +185,7 @@ def bodywork(P, bank, x, y, z, nx, ny, nz, footprint):  # type: ignore[no-untype
     return r, g, b, (0.03 + 0.035 * P[m.GLOSS]) * (1.0 - dirt), 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def wheel(P, u, v, disc):  # type: ignore[no-untyped-def]
     """Tyre and rim; (u, v) from the hub in radii."""
     if disc < 0.5:
@@ -204,7 +203,7 @@ def wheel(P, u, v, disc):  # type: ignore[no-untyped-def]
     return 0.015, 0.015, 0.015, 0.0, 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def cargo(P, bank, pictures, u, v, face, footprint):  # type: ignore[no-untyped-def]
     """The load of a truck: (u, v) in metres on a box's face, or (angle, metres along) on a tank."""
     r, g, b = P[m.CARGO_RED], P[m.CARGO_GREEN], P[m.CARGO_BLUE]
@@ -238,7 +237,7 @@ def cargo(P, bank, pictures, u, v, face, footprint):  # type: ignore[no-untyped-
     return r, g, b, 0.035, 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def clothing(P, material, z, height_m):  # type: ignore[no-untyped-def]
     """Trousers, jacket, hands and face by how high the point is."""
     if material == m.CLOTH:

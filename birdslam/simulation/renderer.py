@@ -171,6 +171,7 @@ class Renderer:
             (bases, attributes, normals, material, owner, parameters, R, labels, ids),
             (noise_bank(), masks, pictures(), sky, maps, self._ground, contact, 1.0 / camera.fx_px),
             light, depth_m, classes, instances, seen,
+            (np.empty(3), np.empty(4), np.empty(f * f, np.int64), np.empty(f * f, np.int64), np.empty(f * f)),
         )  # fmt: skip
         if sky[16] > 0.0:
             wet_road(light, classes, float(sky[16]))

@@ -9,6 +9,7 @@ from numba import njit
 
 from birdslam.simulation import materials as m
 from birdslam.simulation import paint, surfaces
+from birdslam.simulation.compiled import inlined, per_pixel
 from birdslam.simulation.contact import contact_light
 from birdslam.simulation.ground import shade_ground
 from birdslam.simulation.light import mirrored, sky_colour, sunlit
@@ -18,7 +19,7 @@ MATERIAL_CLASS = np.array([1, 7, 7, 7, 4, 9, 5, 5, 6, 6, 8, 9, 4, 9, 9, 8], np.u
 VEHICLE_CLASS, PERSON_CLASS, OTHER_CLASS = 7, 8, 9
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+@inlined
 def hit(bases, t, C, ray):  # type: ignore[no-untyped-def]
     """Depth where the ray C + depth * ray meets the plane of triangle t; negative where it does not."""
     nx, ny, nz = bases[t, 0], bases[t, 1], bases[t, 2]
@@ -28,7 +29,7 @@ def hit(bases, t, C, ray):  # type: ignore[no-untyped-def]
     return (bases[t, 3] - nx * C[0] - ny * C[1] - nz * C[2]) / down
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def plane_bases(corners, count, bases):  # type: ignore[no-untyped-def]
     """`bases` (N, 12) of each triangle: its plane n.p = n0, then the weights of corners 1 and 2 as affine forms."""
     for t in range(count):
@@ -47,13 +48,13 @@ def plane_bases(corners, count, bases):  # type: ignore[no-untyped-def]
             bases[t, 7 + 4 * j] = -(gx * ax + gy * ay + gz * az)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+@inlined
 def tuck(P, z):  # type: ignore[no-untyped-def]
     """How far a body's side leans in at the height z over the road: its normal's fall per its level part."""
     return (0.5 + 0.9 * P[m.SEED]) * min(max(1.0 - (z - P[m.CLEARANCE]) / (0.25 + 0.2 * P[m.RIM]), 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
+@inlined
 def shade(  # type: ignore[no-untyped-def]
     t, depth, C, ray, bases, attributes, normals, material, owner, P_all, R_all, labels, bank, masks, pictures, sky,
     fine, coarse, lean, fine_origin, coarse_origin, per_m, bands, lines, crossings, marks, by_metre, edges, shade_map,
@@ -174,11 +175,14 @@ def shade(  # type: ignore[no-untyped-def]
     out[3] = label
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def shade_frame(nearest, owner, factor, R, C, K, scene, look, image, depth_m, classes, instances, visible):  # type: ignore[no-untyped-def]
+@per_pixel
+def shade_frame(  # type: ignore[no-untyped-def]
+    nearest, owner, factor, R, C, K, scene, look, image, depth_m, classes, instances, visible, spare
+):  # fmt: skip
     """Every pixel of samples `factor` x `factor`: image (H, W, 3) linear BGR, depth, classes, instances.
 
-    R turns camera to ego; K = (fx, fy, cx, cy) of pixels. `visible` counts the samples of each body.
+    R turns camera to ego; K = (fx, fy, cx, cy) of pixels. `visible` counts the samples of each body. `spare` is room
+    for a ray, an answer, and the triangles of one pixel's samples: whose, how many, and 1 / depth of the first.
     """
     height, width = depth_m.shape
     bases, attributes, normals, material, of_body, P_all, R_all, labels, ids = scene
@@ -186,25 +190,25 @@ def shade_frame(nearest, owner, factor, R, C, K, scene, look, image, depth_m, cl
     fine, coarse, lean, fine_origin, coarse_origin, per_m = maps
     bands, lines, crossings, marks, by_metre, edges = ground
     shade_map, shade_frame_m = contact
-    ray, out = np.empty(3), np.empty(4)
-    seen, counts = np.empty(16, np.int64), np.empty(16, np.int64)
+    ray, out, seen, counts, inverse = spare
     samples = factor * factor
     for row in range(height):
         for column in range(width):
             kinds = 0
-            for sample in range(samples):
-                t = owner[row * factor + sample // factor, column * factor + sample % factor]
-                if t >= 0:
-                    visible[of_body[t]] += 1
-                known = False
-                for j in range(kinds):
-                    if seen[j] == t:
-                        counts[j] += 1
-                        known = True
-                        break
-                if not known:
-                    seen[kinds], counts[kinds] = t, 1
-                    kinds += 1
+            for i in range(row * factor, (row + 1) * factor):
+                for k in range(column * factor, (column + 1) * factor):
+                    t = owner[i, k]
+                    if t >= 0:
+                        visible[of_body[t]] += 1
+                    known = False
+                    for j in range(kinds):
+                        if seen[j] == t:
+                            counts[j] += 1
+                            known = True
+                            break
+                    if not known:
+                        seen[kinds], counts[kinds], inverse[kinds] = t, 1, nearest[i, k]
+                        kinds += 1
             cu, cv = (column - K[2]) / K[0], (row - K[3]) / K[1]
             for j in range(3):
                 ray[j] = R[j, 0] * cu + R[j, 1] * cv + R[j, 2]
@@ -224,7 +228,7 @@ def shade_frame(nearest, owner, factor, R, C, K, scene, look, image, depth_m, cl
                 if same >= 0:
                     counts[same] += counts[j]
                 else:
-                    seen[merged], counts[merged] = seen[j], counts[j]
+                    seen[merged], counts[merged], inverse[merged] = seen[j], counts[j], inverse[j]
                     merged += 1
             most, label, depth = 0, 0, np.inf
             r = g = b = 0.0
@@ -239,11 +243,7 @@ def shade_frame(nearest, owner, factor, R, C, K, scene, look, image, depth_m, cl
                         most, label, depth, front = n, 0, np.inf, -1
                     continue
                 d = hit(bases, t, C, ray)
-                near = 0.0
-                for sample in range(samples):
-                    if owner[row * factor + sample // factor, column * factor + sample % factor] == t:
-                        near = 1.0 / nearest[row * factor + sample // factor, column * factor + sample % factor]
-                        break
+                near = 1.0 / inverse[j]
                 if d <= 0.0 or abs(d - near) > 0.15 * near:
                     d = near
                 shade(

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from birdslam.simulation import materials as m
+from birdslam.simulation.compiled import per_pixel
 from birdslam.simulation.light import hashed, noise
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def facade(P, bank, pictures, u, v, face, foot):  # type: ignore[no-untyped-def]
     """(r, g, b, mirror) of a house: windows in storeys, doors, shops, garages, plaster or brick, and its roof."""
     t = foot * 256.0
@@ -101,7 +100,7 @@ def facade(P, bank, pictures, u, v, face, foot):  # type: ignore[no-untyped-def]
     return r, g, b, 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def leaves(P, masks, u, v, mask):  # type: ignore[no-untyped-def]
     """(r, g, b) of leaves at (u, v) of a mask, and how far up the crown is lit."""
     i = min(max(int(u * masks.shape[2]), 0), masks.shape[2] - 1)
@@ -111,7 +110,7 @@ def leaves(P, masks, u, v, mask):  # type: ignore[no-untyped-def]
     return P[m.RED] * k, P[m.GREEN] * k, P[m.BLUE] * k
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def panel(P, pictures, u, v, face):  # type: ignore[no-untyped-def]
     """(r, g, b, light): traffic signs, boards, lights. (u, v) in -1..1 on a sign."""
     if P[9] == 3.0 and P[10] > 0.9:
@@ -140,7 +139,7 @@ def panel(P, pictures, u, v, face):  # type: ignore[no-untyped-def]
     return (0.75, 0.75, 0.75, 0.0) if ink else (P[m.RED], P[m.GREEN], P[m.BLUE], 0.0)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def traffic_light(P, u, v, face):  # type: ignore[no-untyped-def]
     """(r, g, b, light) of a signal's box: (u, v) in metres on its faces."""
     if face != 2.0 and face != 0.0:
@@ -156,7 +155,7 @@ def traffic_light(P, u, v, face):  # type: ignore[no-untyped-def]
     return 0.015, 0.015, 0.015, 0.0
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def plain(P, bank, pictures, material, u, v, face, foot):  # type: ignore[no-untyped-def]
     """(r, g, b, mirror) of the rest: bark, metal, fences, concrete, containers."""
     t = foot * 256.0
