@@ -7,12 +7,13 @@ import math
 import numpy as np
 from numba import njit
 
+from birdslam.simulation.compiled import per_pixel
 from birdslam.simulation.materials import FOLIAGE
 
 NEAR_M = 0.2  # what is nearer to the camera is cut off
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def _span(x0, y0, x1, y1, x2, y2, row):  # type: ignore[no-untyped-def]
     """Where a row enters and leaves the triangle; the first greater than the second where it misses it."""
     left, right = 1e9, -1e9
@@ -28,7 +29,7 @@ def _span(x0, y0, x1, y1, x2, y2, row):  # type: ignore[no-untyped-def]
     return left, right
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@per_pixel
 def _scan(x, y, w, i, j, k, triangle, nearest, owner, gaps, u, v, mask, masks):  # type: ignore[no-untyped-def]
     """Keep, at every sample inside the triangle of corners i j k, the greatest w and whose it is.
 
@@ -77,32 +78,40 @@ def _scan(x, y, w, i, j, k, triangle, nearest, owner, gaps, u, v, mask, masks): 
             value += wx
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def clip_near(tri, R, C, fx, fy, cx, cy, attributes, x, y, w, u, v):  # type: ignore[no-untyped-def]
-    """Project one triangle (3, 3) of ego; its part in front of NEAR_M is a fan of so many corners (0, 3 or 4)."""
-    pz = np.empty(3)
-    px = np.empty(3)
-    py = np.empty(3)
-    for c in range(3):
-        dx, dy, dz = tri[c, 0] - C[0], tri[c, 1] - C[1], tri[c, 2] - C[2]
-        px[c] = R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz
-        py[c] = R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz
-        pz[c] = R[2, 0] * dx + R[2, 1] * dy + R[2, 2] * dz
+@per_pixel
+def _to_camera(corners, t, c, R, C):  # type: ignore[no-untyped-def]
+    """Corner c of triangle t, in camera."""
+    dx, dy, dz = corners[t, c, 0] - C[0], corners[t, c, 1] - C[1], corners[t, c, 2] - C[2]
+    return (
+        R[0, 0] * dx + R[0, 1] * dy + R[0, 2] * dz,
+        R[1, 0] * dx + R[1, 1] * dy + R[1, 2] * dz,
+        R[2, 0] * dx + R[2, 1] * dy + R[2, 2] * dz,
+    )
+
+
+@per_pixel
+def clip_near(corners, t, R, C, K, attributes, x, y, w, u, v):  # type: ignore[no-untyped-def]
+    """Project triangle t of ego; its part in front of NEAR_M is a fan of so many corners (0, 3 or 4)."""
+    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
+    x0, y0, z0 = _to_camera(corners, t, 0, R, C)
+    x1, y1, z1 = _to_camera(corners, t, 1, R, C)
+    x2, y2, z2 = _to_camera(corners, t, 2, R, C)
+    px, py, pz = (x0, x1, x2), (y0, y1, y2), (z0, z1, z2)
     n = 0
     for c in range(3):
         d = (c + 1) % 3
         if pz[c] >= NEAR_M:
             w[n] = 1.0 / pz[c]
             x[n], y[n] = fx * px[c] * w[n] + cx, fy * py[c] * w[n] + cy
-            u[n], v[n] = attributes[c, 0], attributes[c, 1]
+            u[n], v[n] = attributes[t, c, 0], attributes[t, c, 1]
             n += 1
         if (pz[c] >= NEAR_M) != (pz[d] >= NEAR_M):
-            t = (NEAR_M - pz[c]) / (pz[d] - pz[c])
+            share = (NEAR_M - pz[c]) / (pz[d] - pz[c])
             w[n] = 1.0 / NEAR_M
-            x[n] = fx * (px[c] + t * (px[d] - px[c])) * w[n] + cx
-            y[n] = fy * (py[c] + t * (py[d] - py[c])) * w[n] + cy
-            u[n] = attributes[c, 0] + t * (attributes[d, 0] - attributes[c, 0])
-            v[n] = attributes[c, 1] + t * (attributes[d, 1] - attributes[c, 1])
+            x[n] = fx * (px[c] + share * (px[d] - px[c])) * w[n] + cx
+            y[n] = fy * (py[c] + share * (py[d] - py[c])) * w[n] + cy
+            u[n] = attributes[t, c, 0] + share * (attributes[t, d, 0] - attributes[t, c, 0])
+            v[n] = attributes[t, c, 1] + share * (attributes[t, d, 1] - attributes[t, c, 1])
             n += 1
     return n
 
@@ -112,7 +121,7 @@ def rasterize(first, last, corners, attributes, material, R, C, K, masks, neares
     """The triangles [first, last) into `nearest` (1 / depth) and `owner`, seen by K = (fx, fy, cx, cy) of samples."""
     x, y, w, u, v = np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     for t in range(first, last):
-        n = clip_near(corners[t], R, C, K[0], K[1], K[2], K[3], attributes[t], x, y, w, u, v)
+        n = clip_near(corners, t, R, C, K, attributes, x, y, w, u, v)
         if n < 3:
             continue
         gaps = material[t] == FOLIAGE
@@ -146,7 +155,7 @@ def project(first, last, corners, R, C, K):  # type: ignore[no-untyped-def]
     x, y, w, u, v = np.empty(4), np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     box = np.array([1e9, 1e9, -1e9, -1e9])
     for t in range(first, last):
-        n = clip_near(corners[t], R, C, K[0], K[1], K[2], K[3], corners[t], x, y, w, u, v)
+        n = clip_near(corners, t, R, C, K, corners, x, y, w, u, v)
         for c in range(n):
             box[0], box[1] = min(box[0], x[c]), min(box[1], y[c])
             box[2], box[3] = max(box[2], x[c]), max(box[3], y[c])
@@ -162,7 +171,7 @@ def count_inside(first, last, corners, R, C, K, stamp, mark):  # type: ignore[no
     height, width = stamp.shape
     total = 0
     for t in range(first, last):
-        n = clip_near(corners[t], R, C, K[0], K[1], K[2], K[3], corners[t], x, y, w, u, v)
+        n = clip_near(corners, t, R, C, K, corners, x, y, w, u, v)
         for part in range(n - 2):
             j, k = part + 1, part + 2
             area = (x[j] - x[0]) * (y[k] - y[0]) - (x[k] - x[0]) * (y[j] - y[0])
