@@ -74,19 +74,22 @@ def populate(
     """Traffic, parked cars and people about the ego; nobody stands in anybody, nor where the ego is."""
     u = rng.random(8)
     dense = u[0] ** 1.3
-    taken: list[tuple[float, float, float, float]] = [(ego_s_m - 1.0, ego_d_m, 3.5, 1.1)]
+    taken: list[tuple[float, float, float, float, Row | None]] = [(ego_s_m - 1.0, ego_d_m, 3.5, 1.1, None)]
     out: list[Mover] = []
 
-    def add(mover: Mover, margin_m: float, half_m: float | None = None) -> bool:
+    def add(mover: Mover, margin_m: float, row: Row | None = None) -> bool:
+        """Where cars stand aslant in a `row`, the boxes about them overlap: there it is the row that spaces them."""
         cos, sin = abs(math.cos(mover.turn_rad)), abs(math.sin(mover.turn_rad))
-        hs = 0.5 * (cos * mover.length_m + sin * mover.width_m) if half_m is None else half_m
+        hs = 0.5 * (cos * mover.length_m + sin * mover.width_m)
         hd = 0.5 * (cos * mover.width_m + sin * mover.length_m)
         if any(
-            abs(mover.s_m - s) < hs + rs + margin_m and abs(mover.d_m - d) < hd + rd + min(0.25, margin_m)
-            for s, d, rs, rd in taken
+            abs(mover.s_m - s) < hs + rs + margin_m
+            and abs(mover.d_m - d) < hd + rd + min(0.25, margin_m)
+            and not (row is not None and row is other)
+            for s, d, rs, rd, other in taken
         ):
             return False
-        taken.append((mover.s_m, mover.d_m, hs, hd))
+        taken.append((mover.s_m, mover.d_m, hs, hd, row))
         out.append(mover)
         return True
 
@@ -145,9 +148,7 @@ def _park(rng: np.random.Generator, rows: list[Row], street: Street, add) -> Non
                 own = row.turn_rad + (math.pi if rng.random() < (0.15 if row.along else 0.5) else 0.0)
                 if row.along or length_m < 5.2:
                     mover = Mover(body, s, row.d_m + rng.normal(0.0, 0.08), own + rng.normal(0.0, 0.03))
-                    # Of cars aslant the boxes about them overlap where they don't
-                    half_m = None if row.along else 0.5 * pitch - 0.45
-                    if add(mover, 0.4, half_m):
+                    if add(mover, 0.4, None if row.along else row):
                         s += 0.5 * (length_m - 4.0) if row.along else 0.0
             s += pitch * rng.uniform(0.9, 1.15)
 

@@ -1,0 +1,113 @@
+"""Parked cars of the built-in world: in rows beside the street, nobody in anybody, nothing built on a lot."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from birdslam.simulation import materials as m
+from birdslam.simulation.flow import Mover, populate
+from birdslam.simulation.parking import Lot, cleared, draw_lots
+from birdslam.simulation.placement import Standing, furnish
+from birdslam.simulation.street import Street, draw_street
+
+EGO_S_M, EGO_D_M = 30.0, -1.5
+
+Place = tuple[Street, tuple[Lot, ...], Standing, list[Mover]]
+
+
+@pytest.fixture(scope="module")
+def places() -> list[Place]:
+    out: list[Place] = []
+    for seed in range(60):
+        rng = np.random.default_rng([seed, 1])
+        street = draw_street(rng, 240.0, EGO_S_M)
+        lots_rng = rng.spawn(1)[0]
+        lots = draw_lots(lots_rng, street, EGO_S_M)
+        standing = cleared(furnish(rng, street, EGO_S_M - 12.0, EGO_S_M + 150.0), lots, lots_rng)
+        out.append((street, lots, standing, populate(rng, street, EGO_S_M, EGO_D_M, lots=lots)))
+    return out
+
+
+def _corners(mover: Mover) -> NDArray[np.float64]:
+    """(4, 2) of the footprint, a little within it."""
+    c, s = math.cos(mover.turn_rad), math.sin(mover.turn_rad)
+    along, across = 0.48 * mover.length_m, 0.48 * mover.width_m
+    signs = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * [along, across]
+    return signs @ np.array([[c, s], [-s, c]]) + [mover.s_m, mover.d_m]
+
+
+def _apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    """Two convex shapes are apart where a side of one has all of the other beyond it."""
+    for shape in (a, b):
+        for start, end in zip(shape, np.roll(shape, -1, axis=0), strict=True):
+            normal = np.array([start[1] - end[1], end[0] - start[0]])
+            if (a @ normal).max() <= (b @ normal).min() or (b @ normal).max() <= (a @ normal).min():
+                return True
+    return False
+
+
+def test_no_vehicle_stands_in_another(places: list[Place]) -> None:
+    pairs = 0
+    for *_, movers in places:
+        cars = [mover for mover in movers if mover.body.label in ("car", "van", "truck", "bus")]
+        shapes = [_corners(car) for car in cars]
+        for i, one in enumerate(cars):
+            for j in range(i):
+                reach = one.length_m + cars[j].length_m
+                if math.hypot(one.s_m - cars[j].s_m, one.d_m - cars[j].d_m) < reach:
+                    pairs += 1
+                    assert _apart(shapes[i], shapes[j])
+    assert pairs > 1000
+
+
+def test_lots_have_cars_aslant_and_across_that_hide_each_other(places: list[Place]) -> None:
+    tilts, counts = [], []
+    for _, lots, _, movers in places:
+        for lot in lots:
+            low, high = sorted((lot.near_m, lot.far_m))
+            on = [v for v in movers if lot.s0_m < v.s_m < lot.s1_m and low < v.d_m < high]
+            counts.append(len(on))
+            tilts += [abs(math.sin(v.turn_rad)) for v in on]
+    assert len(counts) > 20
+    assert np.median(counts) >= 4
+    assert 0.2 < np.mean(np.array(tilts) < 0.96) < 0.8  # aslant; the others across
+
+
+def test_nothing_is_built_on_a_lot_and_no_side_road_runs_through_it(places: list[Place]) -> None:
+    for street, lots, standing, _ in places:
+        for lot in lots:
+            side = 1 if lot.near_m > 0.0 else -1
+            low, high = sorted((lot.near_m, lot.far_m))
+            for s_m in np.arange(lot.s0_m, lot.s1_m, 4.0):
+                assert not street.in_crossing(float(s_m), 1.0, side)
+            for kind, s_m, d_m in zip(standing.kind, standing.s_m, standing.d_m, strict=True):
+                if kind in (m.BUILDING, m.TREE, m.CRATE):
+                    assert not (lot.s0_m < s_m < lot.s1_m and low < d_m < high)
+
+
+def test_what_is_off_the_lots_stays_and_posts_stay_everywhere() -> None:
+    lot = Lot(40.0, 60.0, 8.0, 16.0, (), 0.0)
+    standing = Standing([], [], [], [], [])
+    for kind, s_m, d_m in (
+        (m.BUILDING, 50.0, 12.0), (m.TREE, 50.0, 12.0), (m.POST, 50.0, 12.0), (m.BUILDING, 50.0, -12.0),
+    ):  # fmt: skip
+        standing.add(kind, s_m, d_m, 0.0, (10.0, 8.0, 6.0) if kind == m.BUILDING else (1.0, 1.0, 3.0))
+    out = cleared(standing, (lot,), np.random.default_rng(0))
+    kept = [(kind, d_m) for kind, d_m in zip(out.kind, out.d_m, strict=True) if kind != m.HEDGE]
+    house = next(d_m for kind, d_m in kept if kind == m.BUILDING and d_m > 0.0)
+    assert house - 4.0 >= lot.far_m
+    assert [row for row in kept if row != (m.BUILDING, house)] == [(m.POST, 12.0), (m.BUILDING, -12.0)]
+
+
+def test_the_same_seed_parks_the_same_cars() -> None:
+    def draw() -> list[tuple[float, float, float]]:
+        rng = np.random.default_rng(7)
+        street = draw_street(rng, 240.0, EGO_S_M, "residential")
+        movers = populate(rng, street, EGO_S_M, EGO_D_M, lots=draw_lots(rng.spawn(1)[0], street, EGO_S_M))
+        return [(v.s_m, v.d_m, v.turn_rad) for v in movers]
+
+    assert draw() == draw()
