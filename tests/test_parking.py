@@ -12,7 +12,8 @@ from birdslam.simulation import materials as m
 from birdslam.simulation.flow import Mover, populate
 from birdslam.simulation.parking import Lot, cleared, draw_lots
 from birdslam.simulation.placement import Standing, furnish
-from birdslam.simulation.street import Street, draw_street
+from birdslam.simulation.street import Street
+from birdslam.simulation.street_plan import draw_street
 
 EGO_S_M, EGO_D_M = 30.0, -1.5
 

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from birdslam.camera import Camera
+from birdslam.simulation.course import STEP_M, Course
 from birdslam.simulation.fleet import draw_cyclist, draw_pedestrian, draw_shape, draw_truck
 from birdslam.simulation.flow import Mover, populate, settle
 from birdslam.simulation.light import SKY_SLOTS
@@ -18,7 +19,8 @@ from birdslam.simulation.photometrics import Lens
 from birdslam.simulation.placement import furnish
 from birdslam.simulation.poses import place
 from birdslam.simulation.scenario import Scenario
-from birdslam.simulation.street import STEP_M, Course, Street, draw_street
+from birdslam.simulation.street import Street
+from birdslam.simulation.street_plan import draw_street
 from birdslam.simulation.truth import Floats
 
 RATE_HZ = 33.0

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from birdslam.camera import Camera
+from birdslam.simulation.course import SHARPEST, draw_course
 from birdslam.simulation.fleet import draw_shape
 from birdslam.simulation.flow import Mover, advance, populate, settle
 from birdslam.simulation.labels import frame_of
@@ -18,7 +19,8 @@ from birdslam.simulation.photometrics import Lens, develop, draw_lens, draw_sky
 from birdslam.simulation.placement import furnish
 from birdslam.simulation.poses import ego_pose, moving, place
 from birdslam.simulation.renderer import Bodies, Renderer
-from birdslam.simulation.street import SHARPEST, Street, draw_course, draw_street
+from birdslam.simulation.street import Street
+from birdslam.simulation.street_plan import draw_street
 from birdslam.simulation.truth import Floats, WorldFrame
 
 NS_PER_S = 1_000_000_000

@@ -20,7 +20,7 @@ from birdslam.simulation.placement import furnish
 from birdslam.simulation.poses import ego_pose, moving, place
 from birdslam.simulation.renderer import Renderer
 from birdslam.simulation.scenario import draw_scenario, drive
-from birdslam.simulation.street import draw_street
+from birdslam.simulation.street_plan import draw_street
 from birdslam.simulation.truth import WorldFrame
 
 
