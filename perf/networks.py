@@ -26,7 +26,7 @@ from birdslam.datasets import DatasetError, open_recording
 from birdslam.perception import Detections, Findings, ModelError, ModelSpec, Network, load_network
 from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perception.multitask import MultiTaskDecoder
-from birdslam.training.grading import Grades, box_ious, overlap
+from birdslam.training.grading import LONG, Grades, box_ious, extents, overlap
 from perf.errors import PerfError
 from perf.figures import Ledger
 from runtime.configuration import SHIPPED_MULTITASK
@@ -41,6 +41,7 @@ WHOLE_CURVE = 0.05  # the score from which on boxes count for the average precis
 MIN_SCORE = 0.4  # of the other detector's boxes
 MIN_HEIGHT_PX = 30.0
 SAME_IOU = 0.5
+BORDER_PX = 4.0  # a box that comes so near to the image's side may be cut off
 NEAREST_M = 2.0  # LiDAR returns nearer than this are the car's own
 
 
@@ -97,6 +98,7 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
     T_cam_cam0 = np.linalg.inv(recording.T_cam0_cam())
     road, lane, shares = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64), []
     agreed = np.zeros(4, dtype=np.int64)  # theirs found, theirs, ours confirmed, ours
+    sizes: list[NDArray[np.float64]] = []  # of ours over theirs, see `extents`
     depths: list[NDArray[np.float64]] = []  # (N, 3): said, LiDAR's, on the road
     for number, image in _images(recording.frames()):
         found = _findings(network, image)
@@ -115,6 +117,7 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
             # Nothing found is an answer too: an image in which one of the two sees nobody counts
             if found.detections is not None and theirs is not None and theirs.detections is not None:
                 agreed += _agreement(found.detections, theirs.detections)
+                sizes += _sizes(found.detections, theirs.detections, image.shape[1])
     figures: dict[str, float] = {"frames": len(recording)}
     if depths:
         figures |= _depth_figures(np.vstack(depths))
@@ -128,6 +131,15 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
             "vehicle_precision": float(agreed[2] / max(agreed[3], 1)),
             "vehicles": int(agreed[1]),
         }
+        widths, heights, aspects = np.array(sizes).reshape(-1, 3).T
+        ratios_of = {
+            "box_width_ratio": widths,
+            "box_height_ratio": heights,
+            "long_box_width_ratio": widths[aspects >= LONG],
+        }
+        for name, ratios in ratios_of.items():
+            if len(ratios):
+                figures[name] = float(np.median(ratios))
     return figures
 
 
@@ -193,6 +205,19 @@ def _agreement(ours: Detections, theirs: Detections) -> NDArray[np.int64]:
             np.count_nonzero(tall_ours),
         ]
     )
+
+
+def _sizes(ours: Detections, theirs: Detections, width_px: int) -> list[NDArray[np.float64]]:
+    """Of each vehicle that both see whole, over the bars: our box over theirs."""
+    ours, theirs = ours.only(VEHICLES), theirs.only(VEHICLES)
+    out = []
+    for box, score in zip(theirs.boxes_px, theirs.scores, strict=True):
+        tall = box[3] - box[1] > MIN_HEIGHT_PX
+        whole = box[0] > BORDER_PX and box[2] < width_px - BORDER_PX
+        shared = box_ious(box[None], ours.boxes_px)[0]
+        if score > MIN_SCORE and tall and whole and shared.max(initial=0.0) >= SAME_IOU:
+            out.append(extents(ours.boxes_px[np.argmax(shared)], box))
+    return out
 
 
 def _told(figures: dict[str, float]) -> str:

@@ -32,7 +32,7 @@ from birdslam.se2 import SE2
 from birdslam.simulation.truth import CLASSES as SURFACES
 from birdslam.simulation.truth import WorldFrame, WorldObject
 from birdslam.training.augmentation import AugmentationConfig
-from birdslam.training.grading import Grades, average_precision, best_score
+from birdslam.training.grading import Grades, average_precision, best_score, extents
 from birdslam.training.stream import StreamConfig, examples
 from birdslam.training.targets import COLUMN, Example, TargetsConfig, Window, encode
 from birdslam.types import Status
@@ -318,6 +318,8 @@ def test_perfect_findings_get_the_best_grades() -> None:
     assert figures["yaw_median_deg"] < 0.1
     assert figures["centre_median_rel"] < 1e-3
     assert figures["box_sigma_rel"] < 1e-3
+    assert figures["box_width_ratio"] == pytest.approx(1.0, abs=1e-3)
+    assert figures["box_height_ratio"] == pytest.approx(1.0, abs=1e-3)
     assert figures["road_iou"] > 0.97
     assert figures["depth_absrel"] < 0.1
 
@@ -521,3 +523,9 @@ def test_a_training_leaves_a_network_that_loads_and_is_done_when_asked_again(tmp
         assert load_network("multitask", ModelSpec(path=str(out / "multitask.onnx"))).role == "multitask"
     assert len((out / "curves.csv").read_text().splitlines()) == 4
     assert (out / "curves.png").stat().st_size > 1000
+
+
+def test_extents_tell_a_box_too_narrow_from_one_too_low() -> None:
+    true = np.array([10.0, 20.0, 110.0, 60.0])
+    assert extents(np.array([20.0, 20.0, 100.0, 60.0]), true) == pytest.approx([0.8, 1.0, 2.5])
+    assert extents(np.array([10.0, 20.0, 110.0, 56.0]), true) == pytest.approx([1.0, 0.9, 2.5])

@@ -17,6 +17,7 @@ from birdslam.simulation.truth import CLASSES, WorldFrame, WorldObject
 _ROAD, _LANE, _SKY = (CLASSES.index(name) for name in ("road", "lane", "sky"))
 _VEHICLES = ("car", "van", "truck", "bus")
 CLEAR = 0.9  # of a body is seen where its whole outline is
+LONG = 2.0  # width over height of the box of a vehicle that is seen from the side
 
 
 class GradingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -52,6 +53,7 @@ class Grades:
     size_rel: list[NDArray[np.float64]] = field(default_factory=list)
     depth_z: list[float] = field(default_factory=list)  # error over stated sigma
     edge_rel: list[float] = field(default_factory=list)  # of each edge of a box that nothing hides, over its side
+    extents: list[NDArray[np.float64]] = field(default_factory=list)  # of such boxes, see `extents`
 
     def add(self, findings: Findings, frame: WorldFrame) -> None:
         """One frame. Findings are of its image at any network size."""
@@ -95,6 +97,8 @@ class Grades:
                 if vehicles[best].visible > CLEAR and vehicles[best].truncated == 0.0:
                     sides = np.tile(truth[best, 2:] - truth[best, :2], 2)
                     self.edge_rel += (np.abs(found.boxes_px[row] - truth[best]) / sides).tolist()
+                    if found.scores[row] >= config.score:
+                        self.extents.append(extents(found.boxes_px[row], truth[best]))
                 if found.scores[row] >= config.score:
                     self._body(found, int(row), vehicles[best], frame)
             elif tall[row] and not box_ious(found.boxes_px[row : row + 1], people).max(initial=0.0) >= config.iou:
@@ -128,6 +132,7 @@ class Grades:
     def figures(self) -> dict[str, float]:
         """The rates; NaN where nothing was seen of a kind."""
         sizes = np.array(self.size_rel).reshape(-1, 3)
+        widths, heights, aspects = np.array(self.extents).reshape(-1, 3).T
         return {
             "frames": self.frames,
             "depth_absrel": _mean(self.absrel),
@@ -143,6 +148,9 @@ class Grades:
             "width_median_rel": _median(sizes[:, 1].tolist()),
             "height_median_rel": _median(sizes[:, 2].tolist()),
             "box_sigma_rel": 1.4826 * _median(self.edge_rel),  # a manifest's box_sigma, with the part in pixels in it
+            "box_width_ratio": _median(widths.tolist()),  # said over true: below 1 is too small
+            "box_height_ratio": _median(heights.tolist()),
+            "long_box_width_ratio": _median(widths[aspects >= LONG].tolist()),
             "depth_sigma_ratio": 1.4826 * _median([abs(z) for z in self.depth_z]),
         }
 
@@ -150,6 +158,13 @@ class Grades:
 def _boxes_of(bodies: Sequence[WorldObject]) -> NDArray[np.float64]:
     """(N, 4) in the coordinates of pixels' edges, as boxes found are."""
     return np.array([body.box_px for body in bodies], dtype=np.float64).reshape(-1, 4) + 0.5
+
+
+def extents(said: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) of two boxes: their widths' ratio, their heights', and the true box's width over its height."""
+    said_px, true_px = said[2:] - said[:2], true[2:] - true[:2]
+    out: NDArray[np.float64] = np.append(said_px / true_px, true_px[0] / true_px[1])
+    return out
 
 
 def overlap(guess: NDArray[np.bool_], truth: NDArray[np.bool_]) -> NDArray[np.int64]:
