@@ -166,7 +166,7 @@ def draw_truck(rng: np.random.Generator) -> Body:
     _paint(rng, P, "truck")
     cab_m, x1 = (2.1 + 0.3 * u[3]) if big else (1.7 + 0.3 * u[3]), 0.5 * length
     P[m.CARGO_X0], P[m.CARGO_X1] = -0.5 * length, x1 - cab_m - 0.35 - 0.3 * u[4]
-    P[m.CARGO_KIND] = rng.choice(6, p=[0.35, 0.25, 0.13, 0.1, 0.1, 0.07])
+    P[m.CARGO_KIND] = rng.choice(6, p=[0.32, 0.23, 0.18, 0.1, 0.1, 0.07])
     P[m.CARGO_Z0] = 1.1 if big else 0.85
     P[m.CARGO_RED : m.CARGO_BLUE + 1] = (
         rng.uniform(0.02, 0.75, 3) if u[5] < 0.5 else np.array([0.7, 0.7, 0.68]) * (0.6 + 0.4 * u[6])

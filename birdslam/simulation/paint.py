@@ -209,7 +209,18 @@ def cargo(P, bank, pictures, u, v, face, footprint):  # type: ignore[no-untyped-
     r, g, b = P[m.CARGO_RED], P[m.CARGO_GREEN], P[m.CARGO_BLUE]
     kind = int(P[m.CARGO_KIND])
     h = P[m.HEIGHT] - P[m.CARGO_Z0]
-    if kind in (2, 5):
+    if kind == 2:  # a tank: (angle from the right over the top, metres from its front)
+        right = u < 0.5 * math.pi or u > 1.5 * math.pi
+        up = (u if u < math.pi else u - 2.0 * math.pi) if right else math.pi - u
+        begin, long = 1.5 + 2.0 * P[m.SEED], 2.5 + 2.5 * P[m.RIM]
+        across = (v - begin) / long
+        if P[m.LAMPS] > 0.35 and abs(up) < 0.55 and 0.0 < across < 1.0:  # lettering
+            i, j = int((1.0 - across if right else across) * 63.9), int((0.5 - up / 1.1) * 63.9)
+            p = pictures[int(P[m.PICTURE]) % 16, j, i]
+            return p[0], p[1], p[2], 0.06, 0.0
+        seam = 0.7 if (v % (1.4 + P[m.GLOSS])) < 0.05 + footprint else 1.0
+        return r * seam, g * seam, b * seam, 0.1, 0.0
+    if kind == 5:
         return r, g, b, 0.1, 0.0
     if face == 2.0:  # the rear
         w = P[m.WIDTH]

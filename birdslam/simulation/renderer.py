@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from birdslam.camera import Camera
-from birdslam.simulation import bodies, ground, scenery
+from birdslam.simulation import bodies, ground, scenery, trucks
 from birdslam.simulation import materials as m
 from birdslam.simulation.contact import contact_map
 from birdslam.simulation.light import hashed
@@ -72,7 +72,7 @@ def _emit(B, kind, P, ranges):  # type: ignore[no-untyped-def]
         if what == m.VEHICLE:
             bodies.vehicle(B, k, P[k])
         elif what == m.TRUCK:
-            bodies.truck(B, k, P[k])
+            trucks.truck(B, k, P[k])
         elif what == m.PEDESTRIAN:
             bodies.pedestrian(B, k, P[k])
         elif what == m.CYCLIST:
