@@ -12,6 +12,7 @@ from birdslam.simulation import materials as m
 from birdslam.simulation.flow import Mover, populate
 from birdslam.simulation.parking import Lot, cleared, draw_lots
 from birdslam.simulation.placement import Standing, furnish
+from birdslam.simulation.poses import moving
 from birdslam.simulation.street import Street
 from birdslam.simulation.street_plan import draw_street
 
@@ -90,18 +91,19 @@ def test_nothing_is_built_on_a_lot_and_no_side_road_runs_through_it(places: list
                     assert not (lot.s0_m < s_m < lot.s1_m and low < d_m < high)
 
 
-def test_what_is_off_the_lots_stays_and_posts_stay_everywhere() -> None:
+def test_what_is_off_the_lots_stays_and_so_do_posts_at_their_edge() -> None:
     lot = Lot(40.0, 60.0, 8.0, 16.0, (), 0.0)
     standing = Standing([], [], [], [], [])
     for kind, s_m, d_m in (
-        (m.BUILDING, 50.0, 12.0), (m.TREE, 50.0, 12.0), (m.POST, 50.0, 12.0), (m.BUILDING, 50.0, -12.0),
+        (m.BUILDING, 50.0, 12.0), (m.TREE, 50.0, 12.0), (m.POST, 50.0, 8.3), (m.POST, 50.0, 12.0),
+        (m.BUILDING, 50.0, -12.0),
     ):  # fmt: skip
         standing.add(kind, s_m, d_m, 0.0, (10.0, 8.0, 6.0) if kind == m.BUILDING else (1.0, 1.0, 3.0))
     out = cleared(standing, (lot,), np.random.default_rng(0))
     kept = [(kind, d_m) for kind, d_m in zip(out.kind, out.d_m, strict=True) if kind != m.HEDGE]
     house = next(d_m for kind, d_m in kept if kind == m.BUILDING and d_m > 0.0)
     assert house - 4.0 >= lot.far_m
-    assert [row for row in kept if row != (m.BUILDING, house)] == [(m.POST, 12.0), (m.BUILDING, -12.0)]
+    assert [row for row in kept if row != (m.BUILDING, house)] == [(m.POST, 8.3), (m.BUILDING, -12.0)]
 
 
 def test_the_same_seed_parks_the_same_cars() -> None:
@@ -112,3 +114,18 @@ def test_the_same_seed_parks_the_same_cars() -> None:
         return [(v.s_m, v.d_m, v.turn_rad) for v in movers]
 
     assert draw() == draw()
+
+
+def test_who_stands_behind_a_kerb_stands_on_it(places: list[Place]) -> None:
+    raised = 0
+    for street, *_, movers in places:
+        scene = moving(street, movers)
+        for mover, (_, _, z_m) in zip(movers, scene.position_m, strict=True):
+            road_m = float(street.place(np.array(mover.s_m), np.array(mover.d_m))[2])
+            side = 1 if mover.d_m > 0.0 else -1
+            if street.right_m <= mover.d_m <= street.left_m or street.in_crossing(mover.s_m, 2.0, side):
+                assert z_m - road_m <= 0.14  # a median at the most
+            else:
+                raised += z_m - road_m > 0.03
+                assert 0.0 <= z_m - road_m < 0.2
+    assert raised > 100

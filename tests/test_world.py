@@ -30,7 +30,7 @@ def frames() -> list[WorldFrame]:
 def level() -> list[WorldFrame]:
     """Frames of level streets: there all of the road is the plane (a bend in a grade is none)."""
     flat = []
-    for seed in range(60):
+    for seed in range(150):
         frame = sample(seed, WIDTH, HEIGHT)
         heights = [o.base_cam_m @ frame.camera.ground.normal_cam + frame.camera.height_m for o in frame.objects]
         up = frame.T_world_cam[:3, :3] @ frame.camera.ground.normal_cam

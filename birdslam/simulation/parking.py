@@ -64,13 +64,16 @@ def draw_lots(rng: np.random.Generator, street: Street, ego_s_m: float) -> tuple
     if street.kind in ("country", "motorway"):
         return ()
     out: list[Lot] = []
-    for sign, front in ((-1.0, street.front_right_m), (1.0, street.front_left_m)):
+    sides = (-1.0, street.right_m, street.front_right_m), (1.0, street.left_m, street.front_left_m)
+    for sign, edge, front in sides:
         s = ego_s_m + float(rng.uniform(-8.0, 30.0))
         for _ in range(2):
             u = rng.random(8)
             s1 = s + 14.0 + 45.0 * float(u[0])
             rows = 1 if u[1] < 0.55 else int(rng.integers(2, 4))
             near = front + sign * (0.3 if u[2] < 0.6 else float(rng.uniform(1.0, 9.0)))
+            if u[4] < 0.4 and not any(d * sign > 0.0 for d, _ in street.parking):  # bays right beside the lanes
+                near = edge + sign * 0.3
             far = near + sign * (rows * _ROW_M + (rows - 1) * 0.6 * _AISLE_M + 1.0)
             if u[3] < 0.35 and _level(street, s, s1, far):
                 out.append(_lot(rng, s, s1, near, far, sign, rows))
@@ -114,7 +117,10 @@ def cleared(standing: Standing, lots: tuple[Lot, ...], rng: np.random.Generator)
         lot = next((lot for lot in lots if _on(lot, s_m, d_m, along, across)), None)
         if lot is not None and kind == m.BUILDING:
             d_m = lot.far_m + math.copysign(0.5 * across + float(rng.uniform(0.3, 4.0)), lot.far_m)
-        elif lot is not None and kind not in (m.POST, m.SIGN, m.LIGHTS, m.BRIDGE):
+        elif lot is not None and kind in (m.POST, m.SIGN):
+            if abs(d_m - lot.near_m) > 0.6:
+                continue
+        elif lot is not None and kind not in (m.LIGHTS, m.BRIDGE):
             continue
         out.kind.append(kind)
         out.s_m.append(s_m)

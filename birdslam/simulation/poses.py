@@ -46,6 +46,7 @@ def moving(street: Street, movers: list[Mover]) -> Bodies:
     turn = np.array([v.turn_rad for v in movers])
     x, y, z, yaw, slope = street.place(s, d)
     n = len(movers)
+    z = z + np.array([street.rise(v.s_m, v.d_m) for v in movers])
     return Bodies(
         np.array([v.body.kind for v in movers], np.int32),
         np.array([v.body.parameters for v in movers], np.float32).reshape(n, m.SLOTS),

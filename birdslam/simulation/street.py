@@ -74,6 +74,15 @@ class Street:
         rise = np.gradient(self.z_m, STEP_M)
         return x, y, z, yaw, rise[i] * (1.0 - f) + rise[i + 1] * f
 
+    def rise(self, s_m: float, d_m: float) -> float:
+        """How high over the road's plane the ground at (s, d) is: kerbs and what lies behind them."""
+        if self.in_crossing(s_m, 2.0, 1 if d_m > 0.0 else -1):
+            return 0.0
+        for d0, d1, z0, z1 in self.bands[:, :4].tolist():
+            if d0 <= d_m <= d1:
+                return float(z0 + (z1 - z0) * (d_m - d0) / max(d1 - d0, 1e-9))
+        return 0.0
+
     def along(self, course: Course) -> Street:
         """The same street on another centre line of the same length."""
         x, y, z, yaw = course.table()
