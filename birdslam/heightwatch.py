@@ -26,7 +26,7 @@ from birdslam.types import Status, VehicleEdge
 from birdslam.vehicleheight import Sight, sights_of
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-LOST = {Status.ODOMETRY_COASTING, Status.SCALE_CARRIED, Status.GROUND_VIOLATED}  # then the images' tilt is a guess
+LOST = {Status.ODOMETRY_COASTING, Status.SCALE_CARRIED, Status.SCALE_INVALID, Status.GROUND_VIOLATED}  # a guessed tilt
 
 
 class HeightWatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from birdslam.camera import Camera
 from birdslam.roadalign import ROAD, RoadAlignConfig, RoadFit, plane_normal, plane_tilt
+from birdslam.tiltwatch import TiltWatchConfig
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -53,10 +54,7 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mount_walk_rad_per_sqrt_m: Positive = 0.0007  # of the mean pitch and roll, as loads and tanks change
     carried_after_m: Positive = 6.0  # without a comparison, until the status says so
     invalid_sigma_rel: Positive = 0.15
-    drift_sigma: Positive = 3.0  # between the calibrated and the mean pitch or roll, until the status says so
-    drift_memory_m: Positive = 12.0  # distance over which that mean is taken
-    sigma_drift_pitch_rad: Positive = 0.005  # of the mean: bounces, load, and the grade of the way
-    sigma_drift_roll_rad: Positive = 0.012  # and the road's crown
+    watch: TiltWatchConfig = TiltWatchConfig()
 
 
 class RoadFilter:
@@ -72,7 +70,6 @@ class RoadFilter:
     def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:
         self.config = config
         self.x = np.array([0.0, camera.pitch_rad, camera.roll_rad, 0.0, camera.pitch_rad, camera.roll_rad])
-        self.recent = self.tilt.copy()  # the mean over a shorter way, in which a mount that was knocked shows
         mount, tilt = config.sigma_mount_rad**2, config.sigma_mount_rad**2 + config.sigma_bounce_rad**2
         self.cov: Floats = np.diag([1.0, tilt, tilt, config.sigma_curvature_per_m**2, mount, mount])
         self.cov[[1, 2, 4, 5], [4, 5, 1, 2]] = mount
@@ -126,7 +123,6 @@ class RoadFilter:
         if share > 0.0:
             noise = np.eye(2) * (cfg.sigma_bounce_rad**2 / share)
             self._update(self.x[4:] - self.tilt, np.eye(STATES)[1:3] - np.eye(STATES)[4:], noise)
-        self.recent = self.recent + min(1.0, travelled_m / cfg.drift_memory_m) * (self.tilt - self.recent)
 
     def _update(self, innovation: Floats, H: Floats, noise: Floats) -> None:
         gain = self.cov @ H.T @ np.linalg.inv(H @ self.cov @ H.T + noise)

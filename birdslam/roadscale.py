@@ -18,6 +18,7 @@ from birdslam.pose import Pose
 from birdslam.roadalign import ROAD, RoadAligner, RoadFit, RoadImage
 from birdslam.roadfilter import RoadFilter, RoadScaleConfig
 from birdslam.roadsearch import search_length
+from birdslam.tiltwatch import TiltWatch
 from birdslam.types import Status
 
 Floats = NDArray[np.float64]
@@ -43,6 +44,8 @@ class MetricScale:
         self.camera, self.config = camera, config
         self._aligner = RoadAligner(camera, config.align)
         self._filter = RoadFilter(camera, config)
+        self._watch = TiltWatch(camera, config.watch)
+        self._travelled_m = 0.0  # by the last motion
         self._kept: list[_Kept] = []
         self._confirmed = 0
         self._refused = 0
@@ -86,9 +89,9 @@ class MetricScale:
 
     def moved(self, step: Pose) -> None:
         """The camera moved by T_prev_curr, in the present unit of length."""
-        travelled_m = float(np.linalg.norm(step.p))
-        self._filter.predict(step.R, travelled_m)
-        self._filter.travel(step.R.T @ step.p, travelled_m)
+        self._travelled_m = float(np.linalg.norm(step.p))
+        self._filter.predict(step.R, self._travelled_m)
+        self._filter.travel(step.R.T @ step.p, self._travelled_m)
 
     def compare(self, grey: NDArray[np.uint8], pose: Pose, boxes_px: Floats, road_mask: Bools | None) -> float:
         """Compares the road with that of an earlier image; returns the factor on all lengths."""
@@ -104,6 +107,8 @@ class MetricScale:
             if len(px) >= cfg.align.min_samples:
                 T = past.pose.between(pose)
                 factor *= self._compare(past, image, Pose(T.R, T.p * factor), px)
+        measured = self._filter.carried_m == 0.0 and self._known()  # here, in metres
+        self._watch.see(self._filter.tilt, factor * self._travelled_m, measured)
         if factor != 1.0:
             centre = pose.p
             self._kept = [_Kept(k.image, Pose(k.pose.R, centre + factor * (k.pose.p - centre))) for k in self._kept]
@@ -120,9 +125,7 @@ class MetricScale:
             out.append(Status.SCALE_INVALID)
         if self._refused >= cfg.violated_after:
             out.append(Status.GROUND_VIOLATED)
-        away = self._filter.recent - np.array([self.camera.pitch_rad, self.camera.roll_rad])
-        sigma = np.hypot(self.camera.tilt_sigma_rad, [cfg.sigma_drift_pitch_rad, cfg.sigma_drift_roll_rad])
-        if np.abs(away / sigma).max() > cfg.drift_sigma:
+        if self._watch.drifted:
             out.append(Status.CALIBRATION_DRIFT)
         return out
 
