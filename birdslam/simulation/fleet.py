@@ -117,10 +117,10 @@ def draw_shape(rng: np.random.Generator, name: str) -> Body:
     P[m.LENGTH], P[m.HEIGHT] = length, height
     P[m.WIDTH] = shape.width_m[0] + (0.6 * u[0] + 0.4 * u[1]) * (shape.width_m[1] - shape.width_m[0])
     _paint(rng, P, shape.label)
-    jitter = 1.0 + 0.05 * (u[3:11] - 0.5)
+    jitter = 1.0 + 0.1 * (u[3:11] - 0.5)
     P[m.CLEARANCE] = shape.clearance_m * (0.85 + 0.3 * u[11])
     P[m.BELT] = shape.belt * height * jitter[0]
-    x = np.array([shape.cowl, shape.screen_top, shape.roof_end, shape.back_bottom]) + 0.025 * (u[12:16] - 0.5) * (
+    x = np.array([shape.cowl, shape.screen_top, shape.roof_end, shape.back_bottom]) + 0.04 * (u[12:16] - 0.5) * (
         shape.label == "car"
     )
     P[[m.X_COWL, m.X_SCREEN_TOP, m.X_ROOF_END, m.X_BACK_BOTTOM]] = (np.clip(x, 0.004, 0.99) - 0.5) * length

@@ -39,6 +39,40 @@ def apron(P):  # type: ignore[no-untyped-def]
 
 
 @per_pixel
+def _face(P, y, z, side):  # type: ignore[no-untyped-def]
+    """`_end` of a nose; `side` is |y| as a share of its half width. Makes differ in lamps, grille, intake, strips."""
+    style, low, top = P[m.LAMPS], P[m.CLEARANCE], P[m.Z_NOSE]
+    make_1, make_2, make_3 = hashed(P[m.SEED], 5.0), hashed(P[m.SEED], 6.0), hashed(P[m.SEED], 7.0)
+    z_lamp = top - 0.1 - 0.06 * style
+    plate = _plate(P, y, z, low + 0.34 * (top - low))
+    if plate >= 0.0:
+        return 1, plate
+    inner, half = 0.45 + 0.22 * make_1, 0.045 + 0.05 * make_2 + 0.02 * style
+    off = z - z_lamp - (0.25 * make_3 - 0.05) * (side - 0.8)
+    if side > inner and abs(off) < half:
+        if abs(off) > 0.8 * half:
+            return 1, 0.05
+        if make_3 > 0.6 and math.hypot((side - 0.5 * (1.0 + inner)) / (1.0 - inner), 0.3 * off / half) > 0.3:
+            return 1, 0.04  # round lamps in a dark housing
+        return 3, 0.35 + 0.65 * math.sin(26.0 * side) ** 2
+    if math.hypot(y, z - z_lamp) < 0.05:  # the badge
+        return 1, 0.6
+    z_grille, tall = z_lamp - 0.1 * make_2 * make_3, 0.04 + 0.1 * make_1 * (1.0 - style)
+    if side < 0.3 + 0.3 * make_2 and abs(z - z_grille) < tall:
+        rim = abs(z - z_grille) > tall - 0.015 or (make_1 > 0.5 and abs(z - z_grille) < 0.012)
+        return 1, (0.5 if P[m.GLOSS] > 0.55 and rim else 0.015)
+    if side < 0.4 + 0.45 * make_3 and low + 0.05 < z < low + 0.15 + 0.1 * style:
+        return 1, 0.015
+    if abs(side - 0.72) < 0.07 and abs(z - low - 0.16) < 0.035:  # fog lamps, or their place
+        return (3, 0.3) if make_1 > 0.5 else (1, 0.02)
+    if P[m.CLADDING] > 0.5 and abs(z - low - 0.5 * (top - low)) < 0.04:
+        return 1, 0.025
+    if z < low + 0.04 + 0.5 * apron(P):
+        return 1, 0.02
+    return 0, 0.0
+
+
+@per_pixel
 def _end(P, x, y, z, front):  # type: ignore[no-untyped-def]
     """Lamps, plate, grille, bumper of a nose or tail: (kind, value); kind 0 none, 1 grey, 2 red lamp, 3 head lamp."""
     w = half_width(P, x) + 1e-3
@@ -47,18 +81,7 @@ def _end(P, x, y, z, front):  # type: ignore[no-untyped-def]
     low, h = P[m.CLEARANCE], P[m.HEIGHT]
     tall = P[m.BELT] > 0.5 * h and h < 2.1
     if front:
-        top = P[m.Z_NOSE]
-        z_lamp = top - 0.11 - 0.05 * style
-        plate = _plate(P, y, z, low + 0.34 * (top - low))
-        if plate >= 0.0:
-            return 1, plate
-        if side > 0.58 and abs(z - z_lamp - 0.05 * (side - 0.7)) < 0.065 + 0.03 * style:
-            return 3, 0.5 + 0.5 * math.sin(40.0 * side)
-        if side < 0.5 and abs(z - z_lamp) < 0.05 + 0.05 * (1.0 - style):
-            return 1, (0.5 if P[m.GLOSS] > 0.6 and abs(z - z_lamp) > 0.045 else 0.015)
-        if side < 0.8 and low + 0.05 < z < low + 0.17 + 0.08 * style:
-            return 1, 0.015
-        return 0, 0.0
+        return _face(P, y, z, side)
     z_plate = 0.62 * P[m.BELT] if style < 0.65 else low + 0.25
     plate = _plate(P, y, z, z_plate)
     if plate >= 0.0:
