@@ -54,13 +54,13 @@ def draw_sky(rng: np.random.Generator) -> NDArray[np.float64]:
         sky[3:6] *= 0.25 * u[8] if u[8] > 0.4 else 0.0
         sky[6:9] = sky[9:12] = base * (1.4 + u[6]) * np.array([0.96, 0.98, 1.0])
         sky[17] = 0.2 * u[7]
-    elif u[21] < 0.45:  # a dark blue sky: what the sun doesn't reach is deep in shade
-        sky[6:12] *= 0.3 + 0.4 * u[22]
+    elif u[21] < 0.6:  # a dark blue sky gives a sixth of the sun's light and less: the rest is deep in shade
+        sky[6:12] *= 0.25 + 0.45 * u[22]
     sky[12:15] = sky[9:12] * 0.75
     sky[15] = math.exp(math.log(120.0) + u[9] * math.log(60.0)) if u[10] < 0.35 else 4000.0
     sky[16] = 0.25 + 0.75 * u[11] if u[12] < (0.35 if overcast else 0.07) else 0.0
     sky[18], sky[19] = u[13], 2.0 * u[14] * (not overcast)
-    sky[20], sky[21] = u[15], 0.65 + 0.45 * u[16]
+    sky[20], sky[21] = u[15], 0.5 + 0.55 * u[16]
     sky[22], sky[23] = u[17], u[18]
     sky[24], sky[25] = 0.4 * u[19] ** 2, u[20]
     return sky
