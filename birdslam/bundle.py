@@ -172,17 +172,19 @@ class SlidingWindow:
         self.rho[newest] = np.where(good, rho, np.nan)
         self.rho_sigma[newest] = np.where(good, sigma, np.inf)
 
-    def adjust(self, held: int, iterations: int, max_landmarks: int, prior: Floats) -> Floats:
-        """Joint adjustment of all poses but the first `held` and of the best `max_landmarks` depths.
+    def adjust(self, iterations: int, max_landmarks: int, prior: Floats) -> Floats:
+        """Joint adjustment of all poses but the oldest and of the best `max_landmarks` depths.
 
-        `prior` (6,) is the information of each step against where the pose was before: it damps, and carries the unit
-        of length where fewer than two poses are held. Returns the information (6, 6) of the newest pose, the others
-        free.
+        `prior` (6,) is the information of each step against where the pose was before. It damps, and it carries the
+        unit of length: no image says anything of that, so the least step leaves it where all poses together have it.
+        Two poses held would carry it as well, but from a short piece of way whose error all the others then take over.
+        Returns the information (6, 6) of the newest pose, the others free but the two oldest: the unit's doubt is told
+        elsewhere.
         """
         anchor = self.anchors()
         count = np.isfinite(self.obs[..., 0]).sum(axis=0)
         usable = np.isfinite(self.rho) & (count >= 2)
-        F, free = len(self.poses), len(self.poses) - held
+        F, free = len(self.poses), len(self.poses) - 1
         info_newest = np.zeros((6, 6))
         if usable.sum() < 8 or free < 1:
             return info_newest
@@ -236,25 +238,25 @@ class SlidingWindow:
                 A[:, :, i] += mixed.transpose(0, 2, 1)
             B = (J_rho[:, None] * J_seen).sum(axis=2)  # (F, 6, M)
             B[anchor, :, np.arange(len(anchor))] += (J_rho[:, None] * J_anchor).sum(axis=(0, 2)).T
-            B = B[held:].reshape(6 * free, -1).T
+            B = B[1:].reshape(6 * free, -1).T
             C = (J_rho**2).sum(axis=(0, 1)) + 1e-6
             gr = (J_rho * rw).sum(axis=(0, 1))
-            A_free = A[held:, :, held:].reshape(6 * free, 6 * free) + np.diag(np.tile(prior, free))
-            g_free = (g[held:] + prior * moved).reshape(-1)
+            A_free = A[1:, :, 1:].reshape(6 * free, 6 * free) + np.diag(np.tile(prior, free))
+            g_free = (g[1:] + prior * moved).reshape(-1)
             S = A_free - B.T @ (B / C[:, None])
             step = -np.linalg.solve(S, g_free - B.T @ (gr / C))
             if not np.isfinite(step).all():
                 return info_newest
             rho = np.maximum(rho - (gr + B @ step) / C, 0.0)
             steps = step.reshape(free, 6)
-            for at, (T, by) in enumerate(zip(self.poses[held:], steps, strict=True)):
-                self.poses[held + at] = Pose(rotation_exp(by[3:]) @ T.R, T.p + by[:3])
+            for at, (T, by) in enumerate(zip(self.poses[1:], steps, strict=True), start=1):
+                self.poses[at] = Pose(rotation_exp(by[3:]) @ T.R, T.p + by[:3])
             moved += steps
             if np.abs(steps).max() < 1e-5:
                 break
-        # The newest pose against all others free but the held ones.
-        n = 6 * (free - 1)
-        info_newest = S[n:, n:] - S[n:, :n] @ np.linalg.solve(S[:n, :n], S[:n, n:]) if n else S
+        newest, others_free = slice(6 * (free - 1), None), slice(6, max(6 * (free - 1), 6))
+        mixed = S[others_free, newest]
+        info_newest = S[newest, newest] - mixed.T @ np.linalg.solve(S[others_free, others_free], mixed)
         turn = np.kron(np.eye(2), self.poses[-1].R)  # to the newest camera's own axes
         info_newest = turn.T @ info_newest @ turn
         self.poses = [Pose(R, T.p) for R, T in zip(orthonormal(self._stacked()[0]), self.poses, strict=True)]

@@ -21,7 +21,6 @@ class KeyWindowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How many images, how far apart, and what is adjusted after each."""
 
     key_images: Annotated[int, msgspec.Meta(ge=3)] = 8
-    held_images: Count = 2  # the oldest of them, which the adjustment leaves alone: they carry the unit of length
     adjusted_landmarks: Count = 400
     adjust_iterations: Count = 1  # each image adjusts again what the one before left
     key_parallax_px: Positive = 8.0  # a new key image when the median landmark has moved so far, rotation taken out
@@ -56,11 +55,10 @@ class KeyWindow(SlidingWindow):
         while len(self.poses) > cfg.key_images + 1:
             self.drop(0)
         self.triangulate()
-        held_images = min(cfg.held_images, len(self.poses) - 1)
-        # The prior on steps: loose, but where a single image is held it alone carries the unit of length.
+        # The prior on steps: loose, but it alone carries the unit of length.
         loose = 1.0 / 0.3**2
         prior = np.array([loose, loose, loose, 1e2, 1e2, 1e2])
-        adjusted = self.adjust(held_images, cfg.adjust_iterations, cfg.adjusted_landmarks, prior)
+        adjusted = self.adjust(cfg.adjust_iterations, cfg.adjusted_landmarks, prior)
         if not np.isfinite(self.poses[-1].p).all():
             self.poses[-1] = pose
         elif adjusted.any():

@@ -1,0 +1,56 @@
+"""The unit of length of the window of key images: no image says anything of it, so nothing may move it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.keywindow import KeyWindow, KeyWindowConfig
+from birdslam.pose import Pose
+from birdslam.roadfilter import RoadScaleConfig
+
+Floats = NDArray[np.float64]
+
+FOCAL_PX, HALF_XY = 370.0, (0.86, 0.26)  # of the shipped drive's camera; half the image in normalised coordinates
+STEP_M = 0.45
+POINTS = 700
+EXACT = np.eye(6) * 1e4
+
+
+def unit_of_length(seed: int, way_m: float, sigma_px: float) -> Floats:
+    """Estimated over true length of pieces of a straight street between points at both sides, seen with noise.
+
+    The first two poses are the true ones, and nothing tells the unit of length afterwards.
+    """
+    rng = np.random.default_rng(seed)
+    side = rng.choice([-1.0, 1.0], POINTS)
+    points = np.column_stack(
+        [side * rng.uniform(3.0, 8.0, POINTS), rng.uniform(-4.0, 1.5, POINTS), rng.uniform(3.0, way_m + 50.0, POINTS)]
+    )
+    window = KeyWindow(FOCAL_PX, KeyWindowConfig())
+    step = Pose(np.eye(3), np.array([0.0, 0.0, STEP_M]))
+    poses = [Pose(np.eye(3), np.zeros(3))]
+    for frame in range(int(way_m / STEP_M)):
+        at = points - frame * step.p
+        near = np.flatnonzero((at[:, 2] > 3.0) & (at[:, 2] < 50.0))
+        xy = at[near, :2] / at[near, 2:]
+        seen = (np.abs(xy) < HALF_XY).all(axis=1)
+        ids, xy = near[seen], xy[seen] + rng.normal(0.0, sigma_px / FOCAL_PX, (int(seen.sum()), 2))
+        if frame == 0:
+            window.append(frame, poses[0], ids, xy)
+            continue
+        pose, info = poses[-1] @ step, EXACT
+        if frame > 1:
+            pose, _, info = window.locate(poses[-1] @ poses[-2].between(poses[-1]), ids, xy)
+        poses.append(window.extend(frame, pose, ids, xy, info)[0])
+    ways_m = [float(np.linalg.norm(b.p - a.p)) for a, b in zip(poses[9::3], poses[12::3], strict=False)]
+    return np.array(ways_m) / (3 * STEP_M)
+
+
+def test_the_unit_of_length_walks_no_faster_than_the_road_filter_is_told() -> None:
+    """Over 60 m of 8 streets: the root mean square of what it walked, in which a drift to one side would show too."""
+    way_m, walked = 60.0, []
+    for seed in range(8):
+        unit = np.log(unit_of_length(seed, way_m, 0.35))
+        walked.append(unit[-8:].mean() - unit[:8].mean())
+    assert np.sqrt(np.mean(np.square(walked))) < RoadScaleConfig().scale_walk_rel_per_sqrt_m * np.sqrt(way_m)
