@@ -12,7 +12,6 @@ from birdslam.simulation import materials as m
 from birdslam.simulation.flow import Mover, populate
 from birdslam.simulation.parking import Lot, cleared, draw_lots
 from birdslam.simulation.placement import Standing, furnish
-from birdslam.simulation.poses import moving
 from birdslam.simulation.street import Street
 from birdslam.simulation.street_plan import draw_street
 
@@ -117,6 +116,9 @@ def test_the_same_seed_parks_the_same_cars() -> None:
 
 
 def test_who_stands_behind_a_kerb_stands_on_it(places: list[Place]) -> None:
+    pytest.importorskip("numba", reason="bodies are put into the world beside the renderer (extra `train`)")
+    from birdslam.simulation.poses import moving
+
     raised = 0
     for street, *_, movers in places:
         scene = moving(street, movers)
