@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from birdslam.simulation.light import SKY_SLOTS
@@ -98,6 +99,24 @@ def _metered(light: Floats32, whole: float) -> float:
     return float((1.0 - whole) * lower + whole * everything)
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _expose(image, bank, i, j, k, shot, noise, coloured, table, out):  # type: ignore[no-untyped-def]
+    """Grain from `bank` (256, 256), begun at row i, column j, on the image (H, W, 3); then `table` of 1025 levels."""
+    zero, one, half, rest = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(0.85)
+    for row in range(image.shape[0]):
+        r0 = (row + i) & 255
+        r1 = (r0 + k) & 255
+        for column in range(image.shape[1]):
+            c0 = (column + j) & 255
+            first, third = bank[r0, c0], bank[r1, (c0 * 3 + k) & 255]
+            second = half * first + rest * third
+            for channel in range(3):
+                grain = first if channel == 0 or not coloured else (second if channel == 1 else third)
+                value = image[row, column, channel]
+                value += (math.sqrt(max(value, zero)) * shot + noise) * grain
+                out[row, column, channel] = table[int(min(max(value, zero), one) * np.float32(1024.0))]
+
+
 def develop(light: Floats32, lens: Lens, rng: np.random.Generator) -> NDArray[np.uint8]:
     """(H, W, 3) linear BGR light to the image that the camera delivers."""
     height, width = light.shape[:2]
@@ -118,18 +137,14 @@ def develop(light: Floats32, lens: Lens, rng: np.random.Generator) -> NDArray[np
         image = np.repeat(image @ np.array([0.114, 0.587, 0.299], np.float32), 3, axis=1).reshape(image.shape)
     bank = noise_bank()[GRAIN, 0]
     i, j, k = (int(v) for v in rng.integers(0, 256, 3))
-    rows, columns = (np.arange(height) * 1 + i) % 256, (np.arange(width) + j) % 256
-    grain = bank[rows][:, columns]
-    other = bank[(rows + k) % 256][:, (columns * 3 + k) % 256]
-    image += (np.sqrt(np.maximum(image, 0.0)) * np.float32(lens.shot) + np.float32(lens.noise)) * (
-        np.dstack([grain, 0.5 * grain + 0.85 * other, other]) if lens.saturation > 0.0 else grain[..., None]
-    )
     # An S-shaped tone curve that clips, as cameras do
     levels = np.linspace(0.0, 1.0, 1025)
     curve = np.power(np.clip(levels, 0.0, 1.0), lens.gamma)
     curve = 0.5 + (curve - 0.5) * lens.contrast + 0.05 * (lens.contrast - 1.0)
     table = np.clip(255.0 * curve, 0.0, 255.0).astype(np.uint8)
-    out: NDArray[np.uint8] = table[(np.clip(image, 0.0, 1.0) * 1024.0).astype(np.int32)]
+    out = np.empty(image.shape, np.uint8)
+    coloured = lens.saturation > 0.0
+    _expose(image, bank, i, j, k, np.float32(lens.shot), np.float32(lens.noise), coloured, table, out)
     if lens.saturation > 0.0 and abs(lens.saturation - 1.0) > 0.02:
         grey = cv2.cvtColor(out, cv2.COLOR_BGR2GRAY)[..., None].astype(np.float32)
         out = np.clip(grey + (out - grey) * lens.saturation, 0, 255).astype(np.uint8)
