@@ -55,8 +55,8 @@ class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     seed: int = 1
     stages: tuple[Stage, ...] = (
-        Stage(width_px=320, height_px=96, batch=16, steps=4000, rate=2e-3, looks=4),
-        Stage(width_px=640, height_px=192, batch=6, steps=12000, rate=1.2e-3, looks=6),
+        Stage(width_px=320, height_px=96, batch=16, steps=4000, rate=2e-3, looks=3),
+        Stage(width_px=640, height_px=192, batch=6, steps=12000, rate=1.2e-3, looks=3),
     )
     stream: StreamConfig = StreamConfig()
     teacher: TeacherConfig = TeacherConfig()

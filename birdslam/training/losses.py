@@ -25,7 +25,7 @@ class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lane: float = 1.3
     overlap: float = 0.5  # of a mask, by Dice
     heat: float = 1.0
-    box: float = 1.0
+    box: float = 2.0
     kind: float = 0.3
     offset: float = 0.3
     body_depth: float = 0.7
