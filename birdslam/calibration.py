@@ -7,9 +7,7 @@ covariance (Birge's ratio):
 - the direction of travel: on a straight way the epipole lies on the road's horizon, above a camera that looks down;
 - the vehicles: bottoms and heights of many boxes put the horizon where they meet (vehicleheight.py).
 
-The metric scale of one camera is its height: nothing in the images alone can tell whether that is right. What can is
-known from elsewhere: a speed or poses of the recording, or what vehicles measure; `height_checks` says what each
-of them makes of it, and how sure it is.
+What checks its height is in heightcheck.py.
 """
 
 from __future__ import annotations
@@ -24,6 +22,7 @@ from numpy.typing import NDArray
 
 from birdslam.camera import Camera
 from birdslam.frontend import FrontEnd, FrontEndConfig, Pending
+from birdslam.heightcheck import HeightCheck, HeightCheckConfig, KnownLength, Step, checks_by_length, checks_by_vehicles
 from birdslam.motion import Motion
 from birdslam.odometry import Odometry
 from birdslam.roadalign import RoadFit, plane_normal
@@ -43,6 +42,7 @@ class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     """What is believed of each witness."""
 
     vehicles: VehicleHeightConfig = VehicleHeightConfig()
+    height: HeightCheckConfig = HeightCheckConfig()
     min_path_m: Positive = 20.0  # of measured motion: less shows a few bounces of the car, not its mean
     min_fits: Annotated[int, msgspec.Meta(ge=3)] = 10
     bounce_m: Positive = 3.0  # for so long a bounce of the car lasts
@@ -57,8 +57,6 @@ class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     max_sigma_rad: Positive = 0.02  # of the result
     restart_rad: Positive = 0.01  # farther than this from where the drive began, it is driven again from there
     max_drives: Annotated[int, msgspec.Meta(ge=1)] = 3
-    section_m: Positive = 8.0  # over which an estimated length is compared with a known one
-    sigma_scale_rel: Positive = 0.015  # of the mean ratio of lengths
 
 
 class Witness(msgspec.Struct, frozen=True, kw_only=True):
@@ -70,15 +68,6 @@ class Witness(msgspec.Struct, frozen=True, kw_only=True):
     cov: tuple[float, ...]
     samples: int
     chi2: float = 0.0
-
-
-class HeightCheck(msgspec.Struct, frozen=True, kw_only=True):
-    """The camera's height as something of known size or speed has it."""
-
-    cue: str
-    height_m: float
-    sigma_m: float
-    samples: int
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True):
@@ -114,7 +103,7 @@ class _Seen:
 
     fits: list[tuple[RoadFit, float]] = field(default_factory=list)  # and the way since the one before
     directions: list[tuple[Floats, float]] = field(default_factory=list)  # of straight travel, and its length
-    steps: list[tuple[int, int, float]] = field(default_factory=list)  # from frame, to frame, length
+    steps: list[Step] = field(default_factory=list)
     sights: list[Sight] = field(default_factory=list)
     times_ns: dict[int, int] = field(default_factory=dict)
     frames: int = 0
@@ -125,7 +114,6 @@ class _Seen:
 
 
 Drive = Callable[[], Iterable[tuple[Frame, Pending]]]
-KnownLength = Callable[[int, int, int, int], float | None]  # (frames from, to; times from, to in ns) -> metres
 
 
 def calibrate(
@@ -163,7 +151,10 @@ def calibrate(
         camera=camera,
         cov=tuple(cov.ravel().tolist()),
         witnesses=witnesses,
-        height_checks=tuple(_height_checks(seen, camera, cov, config, lengths or {})),
+        height_checks=(
+            *checks_by_length(lengths or {}, seen.steps, seen.times_ns, camera, config.height),
+            *checks_by_vehicles(seen.sights, camera, cov, config.vehicles),
+        ),
         yaw_rad=_yaw_rad(seen),
         path_m=seen.path_m,
         frames=seen.frames,
@@ -282,51 +273,3 @@ def _yaw_rad(seen: _Seen) -> float | None:
     if not seen.directions:
         return None
     return float(np.median([np.arctan2(d[0], d[2]) for d, _ in seen.directions]))
-
-
-# --- height ---
-
-
-def _height_checks(
-    seen: _Seen, camera: Camera, cov: Floats, config: CalibrationConfig, lengths: dict[str, KnownLength]
-) -> Iterable[HeightCheck]:
-    for cue, known in lengths.items():
-        check = _by_length(cue, known, seen, camera, config)
-        if check is not None:
-            yield check
-    prior = np.array([camera.height_m, camera.pitch_rad, camera.roll_rad])
-    prior_cov = np.zeros((3, 3))
-    prior_cov[0, 0] = (0.5 * camera.height_m) ** 2
-    prior_cov[1:, 1:] = cov
-    stand = stand_of(seen.sights, prior, prior_cov, config.vehicles)
-    if stand is not None:
-        yield HeightCheck(
-            cue="vehicles",
-            height_m=float(stand.state[0]),
-            sigma_m=float(np.sqrt(stand.cov[0, 0])),
-            samples=stand.vehicles,
-        )
-
-
-def _by_length(
-    cue: str, known: KnownLength, seen: _Seen, camera: Camera, config: CalibrationConfig
-) -> HeightCheck | None:
-    """All lengths of the odometry are in proportion to the camera's height: so is the error of both."""
-    ratios, weights = [], []
-    estimated_m = true_m = 0.0
-    for start, end, length in seen.steps:
-        truth = known(start, end, seen.times_ns[start], seen.times_ns[end])
-        if truth is None:
-            continue
-        estimated_m, true_m = estimated_m + length, true_m + truth
-        if estimated_m > config.section_m:
-            ratios.append(np.log(max(true_m, 1e-3) / estimated_m))
-            weights.append(estimated_m)
-            estimated_m = true_m = 0.0
-    if len(ratios) < 2:
-        return None
-    mean = float(np.average(ratios, weights=weights))
-    scatter = float(np.sqrt(np.average((np.array(ratios) - mean) ** 2, weights=weights) / (len(ratios) - 1)))
-    sigma_rel = float(np.hypot(scatter, config.sigma_scale_rel))
-    height_m = camera.height_m * float(np.exp(mean))
-    return HeightCheck(cue=cue, height_m=height_m, sigma_m=height_m * sigma_rel, samples=len(ratios))

@@ -11,17 +11,11 @@ import cv2
 import msgspec
 import numpy as np
 
-from birdslam.calibration import (
-    Calibration,
-    CalibrationConfig,
-    CalibrationError,
-    HeightCheck,
-    KnownLength,
-    calibrate,
-)
+from birdslam.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
 from birdslam.camera import Camera
 from birdslam.datasets import DatasetError, Recording, load_camera, open_recording, read_speeds
 from birdslam.frontend import Pending
+from birdslam.heightcheck import HeightCheck, KnownLength
 from birdslam.intrinsics import Intrinsics, from_chessboard, read_intrinsics
 from birdslam.results import ResultsError
 from birdslam.types import Frame
