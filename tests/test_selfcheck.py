@@ -27,6 +27,7 @@ from birdslam.weights import WeightsConfig
 
 Image = np.ndarray
 Edit = Callable[[int, Image], Image]
+HEIGHT = HeightWatchConfig()
 PITCH_RAD, ROLL_RAD = 0.0165, 0.005  # of KITTI 06 as estimated from its frames: what its calibration would say
 
 
@@ -200,8 +201,8 @@ def _edge(vehicle: int, frame: int, box_px: tuple[float, float, float, float]) -
     return VehicleEdge(vehicle=vehicle, frame=frame, T_ego_vehicle=SE2(), cov=(1.0,) * 9, box_px=box_px)
 
 
-def _motion(frame: int, camera: Camera, *status: Status) -> Motion:
-    ground = GroundPlane(camera.height_m, camera.pitch_rad, camera.roll_rad)
+def _motion(frame: int, camera: Camera, tilt_error_rad: float, *status: Status) -> Motion:
+    ground = GroundPlane(camera.height_m, camera.pitch_rad + tilt_error_rad, camera.roll_rad)
     return Motion(
         from_frame=frame - 1,
         to_frame=frame,
@@ -217,9 +218,11 @@ def _motion(frame: int, camera: Camera, *status: Status) -> Motion:
     )
 
 
-def _watched(true_height_m: float, *status: Status) -> tuple[HeightWatch, list[bool]]:
+def _watched(
+    true_height_m: float, *status: Status, tilt_error_rad: float = 0.0, config: HeightWatchConfig = HEIGHT
+) -> tuple[HeightWatch, list[bool]]:
     camera = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65, pitch_rad=0.012)
-    watch = HeightWatch(camera, HeightWatchConfig(), LocalisationConfig())
+    watch = HeightWatch(camera, config, LocalisationConfig())
     rng = np.random.default_rng(11)
     told = []
     for vehicle in range(40):
@@ -234,7 +237,7 @@ def _watched(true_height_m: float, *status: Status) -> tuple[HeightWatch, list[b
             noise = rng.normal(0.0, 1.0, 4)
             box = (columns[0] + noise[0], rows[0] + noise[1], columns[1] + noise[2], rows[1] + noise[3])
             frame = 6 * vehicle + k
-            told.append(bool(watch.step([_edge(vehicle, frame, box)], _motion(frame, camera, *status))))
+            told.append(bool(watch.step([_edge(vehicle, frame, box)], _motion(frame, camera, tilt_error_rad, *status))))
     return watch, told
 
 
@@ -247,6 +250,19 @@ def test_the_height_by_the_vehicles(wrong: float) -> None:
     assert abs(math.log(ratio / wrong)) < 2.0 * sigma_rel
     assert told[-1] == (wrong != 1.0)
     assert not any(told[: 6 * 7])  # seven vehicles are no evidence
+
+
+@pytest.mark.parametrize("tilt_error_rad", [-0.005, 0.005])
+def test_an_error_of_the_tilt_is_not_taken_for_one_of_the_height(tilt_error_rad: float) -> None:
+    """At 17 m it is worth 5 % of the slope of a vehicle's bottom."""
+
+    def moved(config: HeightWatchConfig) -> float:
+        watches = [_watched(1.65, tilt_error_rad=e, config=config)[0] for e in (0.0, tilt_error_rad)]
+        return math.log(watches[1].estimate[0] / watches[0].estimate[0])
+
+    believed, doubted = moved(HeightWatchConfig(sigma_pitch_rad=1e-6)), moved(HeightWatchConfig())
+    assert abs(believed) > 0.04
+    assert abs(doubted) < 0.75 * abs(believed)
 
 
 def test_the_height_is_not_judged_without_a_known_tilt() -> None:
