@@ -46,5 +46,6 @@ def contact_map(shade_map, x0, y0, cells_per_m, poses, sizes, at_edge, reach_m):
                 dx, dy = x0 + i / cells_per_m - poses[k, 0], y0 + j / cells_per_m - poses[k, 1]
                 ox, oy = abs(cos * dx + sin * dy) - hx, abs(cos * dy - sin * dx) - hy
                 out = math.hypot(max(ox, 0.0), max(oy, 0.0)) + min(max(ox, oy), 0.0)
-                light = min(max(at_edge + out * (1.0 - at_edge) / reach_m, 0.06), 1.0)
+                light = at_edge + (out * (1.0 - at_edge) / reach_m if out > 0.0 else out)
+                light = min(max(light, 0.06), 1.0)
                 shade_map[i, j] = min(shade_map[i, j], light)

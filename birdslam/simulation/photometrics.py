@@ -32,6 +32,7 @@ class Lens:
     saturation: float
     quality: int  # of JPEG, 0: none
     sharpen: float
+    flare: float = 0.0  # of the mean light, that the glass spreads over all of the image: no black is darker
     whole: float = 0.0  # how much the upper image, sky and walls, counts when the exposure is metered
 
 
@@ -83,6 +84,7 @@ def draw_lens(rng: np.random.Generator) -> Lens:
         saturation=0.0 if u[9] < 0.33 else 0.3 + 0.8 * u[10],
         quality=int(35 + 62 * u[11]) if u[12] < 0.5 else 0,
         sharpen=0.9 * u[13] if u[14] < 0.35 else 0.0,
+        flare=0.06 * u[18] ** 1.5,
         whole=u[17] if u[16] < 0.4 else 0.0,
     )
 
@@ -127,6 +129,8 @@ def develop(light: Floats32, lens: Lens, rng: np.random.Generator) -> NDArray[np
         small = cv2.resize(np.minimum(image, 6.0), (width // 4, height // 4), interpolation=cv2.INTER_AREA)
         glow = cv2.resize(cv2.GaussianBlur(np.maximum(small - 0.7, 0.0), (0, 0), width / 80.0), (width, height))
         image += np.float32(lens.bloom) * glow
+    if lens.flare > 0.0:
+        image += np.float32(lens.flare) * np.minimum(image, np.float32(4.0)).mean()
     if lens.vignette > 0.03:
         x = np.linspace(-1.0, 1.0, width, dtype=np.float32)
         y = np.linspace(-height / width, height / width, height, dtype=np.float32)

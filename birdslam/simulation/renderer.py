@@ -246,7 +246,7 @@ class Renderer:
         poses = np.column_stack([t[wide, 0], t[wide, 1], np.arctan2(R[wide, 1, 0], R[wide, 0, 0])])
         sizes = scene.parameters[wide][:, [m.LENGTH, m.WIDTH]].astype(np.float64)
         seed = float(self._sky[18])  # how soft these shadows are differs from scene to scene
-        at_edge, reach_m = 0.35 + 0.3 * seed, 0.35 + 0.6 * hashed(seed, 5.0)
+        at_edge, reach_m = 0.3 + 0.3 * seed, 0.4 + 2.0 * hashed(seed, 5.0) ** 2
         contact_map(shade_map, -2.0, -16.0, 5.0, np.ascontiguousarray(poses), sizes, at_edge, reach_m)
         return shade_map, np.array([-2.0, -16.0, 5.0])
 
