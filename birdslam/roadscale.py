@@ -48,7 +48,9 @@ class MetricScale:
         self._travelled_m = 0.0  # by the last motion
         self._kept: list[_Kept] = []
         self._confirmed = 0
-        self._refused = 0
+        self._refused = 0.0  # comparisons in a row, each counted by what of it is new: those of one view err together
+        self._tries = 0  # and by number
+        self._since_m = 0.0  # travelled since the last comparison
         self.fit: RoadFit | None = None  # what the last image's comparison alone said, where it was taken over
 
     @property
@@ -135,7 +137,7 @@ class MetricScale:
             return None
         if self._in_doubt():
             # Lengths are not known: the longest there is, or, where that looked like nothing, the shortest, and so on.
-            return self._kept[-self._refused % len(self._kept)]
+            return self._kept[-self._tries % len(self._kept)]
         distance = np.array([np.linalg.norm(k.pose.p - pose.p) for k in self._kept])
         usable = np.flatnonzero(distance > cfg.min_baseline_m)
         if not len(usable):
@@ -152,6 +154,7 @@ class MetricScale:
         length = float(np.linalg.norm(T.p))
         if length < 1e-6:
             return 1.0
+        new, self._since_m = min(1.0, self._since_m / length), 0.0
         searched = 1.0
         fit = self._aligner.align(past.image, image, T, px, prior, prior_cov[:ROAD, :ROAD])
         if self._in_doubt():
@@ -170,9 +173,10 @@ class MetricScale:
             return 1.0
         expected = searched != 1.0 or not self._known() or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
         if fit.correlation < cfg.min_correlation or not expected:
-            self._refused += 1
+            self._refused += new
+            self._tries += 1
             return 1.0
-        self._refused = 0
+        self._refused, self._tries = 0.0, 0
         self.fit = fit
         filter_.cov = prior_cov
         factor = searched * filter_.accept(fit, min(1.0, filter_.carried_m / length))

@@ -298,6 +298,56 @@ def test_a_hidden_road_carries_the_scale_and_says_so() -> None:
     assert path_m(chained.values()) == pytest.approx(path_m(truth), rel=0.05)
 
 
+def test_a_view_that_contradicts_counts_once_however_often_it_is_looked_at() -> None:
+    """A dark that travels with the car, and has the grain of a road, lies on all of it for 0.4 m at a walking pace."""
+    steps = [(0.35, 0.0)] * 36 + [(0.03, 0.0)] * 14
+    truth = street(steps)
+    grain = 2.5 * cv2.resize(np.random.default_rng(5).normal(size=(30, 100)), (400, 90), interpolation=cv2.INTER_CUBIC)
+
+    def shade(k: int, image: np.ndarray) -> np.ndarray:
+        if k > 36:
+            image[98:188, 110:510] = np.clip(45.0 + grain, 0, 255)
+        return image
+
+    chained, motions = drive(truth, rate_hz=33.0, edit=shade)
+    assert all(Status.SCALE_INVALID not in m.status for m in motions if m.to_frame > 36)
+    assert path_m(chained[k] for k in range(36, 51)) == pytest.approx(0.42, rel=0.08)
+
+
+def test_which_masks_come_late_moves_the_length_by_no_more_than_is_told() -> None:
+    """Masks of a road that bends: of each frame; then of some frames before or none, as the networks' time has it."""
+    truth = street([(0.35, 0.003 * math.sin(k / 6.0)) for k in range(40)])
+    images = [render(pose, k) for k, pose in enumerate(truth)]
+    v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX]
+    rays = np.stack([(u - CAMERA.cx_px) / CAMERA.fx_px, (v - CAMERA.cy_px) / CAMERA.fy_px, np.ones(u.shape)], -1)
+    masks: list[np.ndarray | None] = []
+    for pose in truth:  # road no farther to the side than 3 m
+        d = rays @ pose.R.T
+        aside_m = pose.p[0] + d[..., 0] / np.maximum(d[..., 1], 1e-4) * 1.65
+        masks.append((d[..., 1] > 1e-2) & (np.abs(aside_m) < 3.0))
+
+    def driven(late: list[np.ndarray | None]) -> tuple[float, float]:
+        """The length in metres and its relative sigma, as told at the end."""
+        odometry, steps, sigma_rel = Odometry(CAMERA), [], 1.0
+        for k, (image, mask) in enumerate(zip(images, late, strict=True)):
+            motion = odometry.estimate(odometry.track(image), k, int(k * 1e9 / 33.0), NO_BOXES, mask)
+            if motion is not None:
+                steps.append(float(np.linalg.norm(motion.t_prev_curr_m)))
+                sigma_rel = motion.scale_sigma_rel
+        return sum(steps), sigma_rel
+
+    in_time_m, _ = driven(masks)
+    assert in_time_m == pytest.approx(path_m(truth), rel=0.03)
+    for seed in range(3):
+        rng, age = np.random.default_rng(seed), 0
+        late: list[np.ndarray | None] = []
+        for k in range(len(masks)):
+            age = 0 if rng.random() < 0.5 else min(age + 1, 5, k)
+            late.append(None if rng.random() < 0.1 else masks[k - age])
+        length_m, sigma_rel = driven(late)
+        assert abs(math.log(length_m / in_time_m)) < sigma_rel
+
+
 def test_first_images_that_show_nothing_give_no_motion() -> None:
     odometry, black = Odometry(CAMERA), np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8)
     for k in range(3):
