@@ -16,8 +16,9 @@ from typing import Annotated
 
 import msgspec
 
+from birdslam.answers import MapSnapshot, TimedPose, Trajectory, VehiclePath
 from birdslam.se2 import SE2, wrap
-from birdslam.types import Estimate, MapSnapshot, MapUpdate, TimedPose, Trajectory, VehicleEstimate, VehiclePath
+from birdslam.types import Estimate, MapUpdate, VehicleEstimate
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]

@@ -22,7 +22,6 @@ validated on decoding: a number that is not finite, a negative variance or a wro
 
 from __future__ import annotations
 
-import enum
 import math
 from dataclasses import dataclass
 from typing import Annotated
@@ -32,6 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.se2 import SE2
+from birdslam.status import INVALIDATING as INVALIDATING
+from birdslam.status import Status as Status
 
 Cov3 = Annotated[tuple[float, ...], msgspec.Meta(min_length=9, max_length=9)]
 Cov2 = Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)]
@@ -39,59 +40,7 @@ FrameId = Annotated[int, msgspec.Meta(ge=0)]
 BodyId = Annotated[int, msgspec.Meta(ge=0)]
 
 
-class Status(enum.StrEnum):
-    """Expected trouble, carried in the record; `INVALIDATING` says which make an estimate invalid."""
-
-    END_OF_SOURCE = "end_of_source"  # the source has no further frame; the last record of a run
-    FRAME_UNREADABLE = "frame_unreadable"  # the image was torn or missing: no pixels for this frame
-    FRAMES_DROPPED = "frames_dropped"  # frames between this one and the last never reached perceive
-    CAMERA_FROZEN = "camera_frozen"  # the image is bit for bit the one before
-    CAMERA_DARK = "camera_dark"  # too little contrast to see by
-    LOW_TEXTURE = "low_texture"  # too few feature tracks for a motion
-    ODOMETRY_COASTING = "odometry_coasting"  # the motion is predicted from the one before, not measured
-    SCALE_CARRIED = "scale_carried"  # no road seen: the metric scale is an older one
-    SCALE_INVALID = "scale_invalid"  # the metric scale has been carried for too long to trust
-    MOTION_IMPLAUSIBLE = "motion_implausible"  # a motion of no car, or a long blindness; until all is steady again
-    STANDSTILL = "standstill"  # the car stands: the pose is held
-    GROUND_VIOLATED = "ground_violated"  # the road does not fit the ground plane
-    CALIBRATION_DRIFT = "calibration_drift"  # the estimated pitch or height left the calibrated one
-    DETECTIONS_CARRIED = "detections_carried"  # the detector did not run on this frame
-    SEGMENTATION_CARRIED = "segmentation_carried"  # the segmenter did not run on this frame
-    DEPTH_CARRIED = "depth_carried"  # the depth network did not run on this frame
-    LANES_CARRIED = "lanes_carried"  # lanes were due to be made out, but their last run is not done yet
-    NETWORK_FAILED = "network_failed"  # a network gave no usable numbers on this frame
-    INPUT_STALE = "input_stale"  # the record in front of this one came later than it should
-    DEGRADED_RATE = "degraded_rate"  # short of time: the networks run on fewer frames
-    DEGRADED_BOXES = "degraded_boxes"  # short of time: the detector alone runs, no road and no lanes
-    DEGRADED_ODOMETRY = "degraded_odometry"  # short of time: no network runs, the ego alone is followed
-    COASTING = "coasting"  # short of time: nobody looked at this frame; the last pose, its covariance grown
-    COASTED_TOO_LONG = "coasted_too_long"  # no frame has been looked at for too long
-    PERCEPTION_LATE = "perception_late"  # perceive has not answered in time: the optimizer coasts from the last answer
-    GRAPH_RESET = "graph_reset"  # the optimizer began a new epoch on this frame
-    GRAPH_RESTORED = "graph_restored"  # the optimizer began anew from its last checkpoint: the epoch goes on
-    NOT_INITIALISED = "not_initialised"  # no motion has been measured yet
-    UNKNOWN = "unknown"  # a status that a newer sender knows and this reader does not
-
-    @classmethod
-    def _missing_(cls, value: object) -> Status | None:
-        return cls.UNKNOWN if isinstance(value, str) else None
-
-
-INVALIDATING = frozenset(
-    {
-        Status.END_OF_SOURCE,
-        Status.FRAME_UNREADABLE,
-        Status.CAMERA_FROZEN,
-        Status.CAMERA_DARK,
-        Status.SCALE_INVALID,
-        Status.MOTION_IMPLAUSIBLE,
-        Status.COASTED_TOO_LONG,
-        Status.NOT_INITIALISED,
-    }
-)
-
-
-def _check_finite(record: msgspec.Struct, *fields: str) -> None:
+def check_finite(record: msgspec.Struct, *fields: str) -> None:
     for name in fields:
         value = getattr(record, name)
         if not math.isfinite(sum(value) if isinstance(value, tuple) else value):
@@ -99,14 +48,14 @@ def _check_finite(record: msgspec.Struct, *fields: str) -> None:
 
 
 def _check_cov(record: msgspec.Struct, *fields: str) -> None:
-    _check_finite(record, *fields)
+    check_finite(record, *fields)
     for name in fields:
         cov = getattr(record, name)
         if min(cov[:: math.isqrt(len(cov)) + 1]) < 0.0:
             raise ValueError(f"{type(record).__name__}.{name} has a negative variance")
 
 
-def _check_points(record: msgspec.Struct, *points_m: tuple[float, float]) -> None:
+def check_points(record: msgspec.Struct, *points_m: tuple[float, float]) -> None:
     for x_m, y_m in points_m:
         if not math.isfinite(x_m + y_m):
             raise ValueError(f"{type(record).__name__} needs finite points, got ({x_m}, {y_m})")
@@ -183,8 +132,8 @@ class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True):
     delay_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # > 0: seen so long before this frame, and moved on to it
 
     def __post_init__(self) -> None:
-        _check_finite(self, "score", "box_px", "length_m", "width_m")
-        _check_finite(self, "log_height", "sigma_log_height", "depth_per_height", "standing")
+        check_finite(self, "score", "box_px", "length_m", "width_m")
+        check_finite(self, "log_height", "sigma_log_height", "depth_per_height", "standing")
         _check_cov(self, "cov")
 
 
@@ -217,7 +166,7 @@ class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     cov: Cov2
 
     def __post_init__(self) -> None:
-        _check_finite(self, "x_m", "y_m")
+        check_finite(self, "x_m", "y_m")
         _check_cov(self, "cov")
 
 
@@ -229,7 +178,7 @@ class LanePoint(msgspec.Struct, frozen=True, array_like=True):
     lane: int = -1  # points of one line share it, from frame to frame; -1: of no lane that is known
 
     def __post_init__(self) -> None:
-        _check_finite(self, "x_m", "y_m")
+        check_finite(self, "x_m", "y_m")
 
 
 class Attitude(msgspec.Struct, frozen=True, kw_only=True):
@@ -243,7 +192,7 @@ class Attitude(msgspec.Struct, frozen=True, kw_only=True):
     roll_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_finite(self, "z_m", "pitch_rad", "roll_rad")
+        check_finite(self, "z_m", "pitch_rad", "roll_rad")
 
 
 class Ground(msgspec.Struct, frozen=True, kw_only=True):
@@ -254,7 +203,7 @@ class Ground(msgspec.Struct, frozen=True, kw_only=True):
     roll_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_finite(self, "height_m", "pitch_rad", "roll_rad")
+        check_finite(self, "height_m", "pitch_rad", "roll_rad")
 
 
 class Measurements(msgspec.Struct, frozen=True, kw_only=True):
@@ -276,7 +225,7 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     status: tuple[Status, ...] = ()
 
     def __post_init__(self) -> None:
-        _check_finite(self, "scale_sigma_rel")
+        check_finite(self, "scale_sigma_rel")
 
 
 class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True):
@@ -298,7 +247,7 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True):
         cov, u = self.cov, self.velocity_cov
         total = sum(cov) + sum(u) + sum(self.velocity_mps) + self.length_m + self.width_m
         if not (math.isfinite(total) and min(cov[0], cov[4], cov[8], u[0], u[3]) >= 0.0):  # else no need to look closer
-            _check_finite(self, "velocity_mps", "length_m", "width_m")
+            check_finite(self, "velocity_mps", "length_m", "width_m")
             _check_cov(self, "cov", "velocity_cov")
 
 
@@ -323,7 +272,7 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     status: tuple[Status, ...] = ()  # expected trouble
 
     def __post_init__(self) -> None:
-        _check_finite(self, "scale_sigma_rel")
+        check_finite(self, "scale_sigma_rel")
         _check_cov(self, "cov")
 
 
@@ -339,52 +288,4 @@ class MapUpdate(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if len(self.lane_ids) not in (0, len(self.lanes_m)):
             raise ValueError(f"lane_ids has {len(self.lane_ids)} entries for {len(self.lanes_m)} points of lanes_m")
-        _check_points(self, *self.landmarks_m, *self.lanes_m)
-
-
-class TimedPose(msgspec.Struct, frozen=True, array_like=True):
-    """A body's pose in world at one frame."""
-
-    frame_id: FrameId
-    t_source_ns: int
-    T_world_body: SE2  # where it was
-
-
-class VehiclePath(msgspec.Struct, frozen=True, kw_only=True):
-    """Where one vehicle was seen, oldest first."""
-
-    vehicle: BodyId
-    poses: tuple[TimedPose, ...]
-    label: str = "car"
-    length_m: float = 4.0
-    width_m: float = 1.7
-
-
-class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to "where has everybody been": key poses in world of `epoch`, oldest first, the newest always last.
-
-    Thinned: poses are further apart the further back they are (see atlas.AtlasConfig).
-    """
-
-    epoch: int
-    frame_id: FrameId  # of the newest estimate that is in it
-    t_source_ns: int
-    ego: tuple[TimedPose, ...] = ()
-    vehicles: tuple[VehiclePath, ...] = ()  # those seen in that time
-
-
-class MapSnapshot(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to "what is the road like": all points of the map, in world of `epoch`, thinned to one in a cell."""
-
-    epoch: int
-    frame_id: FrameId  # of the newest update that is in it
-    landmarks_m: tuple[tuple[float, float], ...] = ()  # road points
-    lanes_m: tuple[tuple[float, float], ...] = ()  # points of lane lines
-    cell_m: float = 0.25  # the side of a cell near the car; far back they are larger
-    lane_ids: tuple[int, ...] = ()  # the lane of each of `lanes_m`, -1: of none; empty: of none at all
-
-    def __post_init__(self) -> None:
-        if len(self.lane_ids) not in (0, len(self.lanes_m)):
-            raise ValueError(f"lane_ids has {len(self.lane_ids)} entries for {len(self.lanes_m)} points of lanes_m")
-        _check_finite(self, "cell_m")
-        _check_points(self, *self.landmarks_m, *self.lanes_m)
+        check_points(self, *self.landmarks_m, *self.lanes_m)

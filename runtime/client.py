@@ -27,7 +27,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from birdslam.types import INVALIDATING, Estimate, MapSnapshot, Trajectory
+from birdslam.answers import MapSnapshot, Trajectory
+from birdslam.types import INVALIDATING, Estimate
 from runtime.bus import Bus, BusClosed, Message
 from runtime.parts import whole_map, whole_trajectory
 from runtime.wire import Health, Trace

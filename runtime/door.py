@@ -8,8 +8,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 
+from birdslam.answers import MapSnapshot, Trajectory
 from birdslam.atlas import Atlas
-from birdslam.types import Estimate, MapSnapshot, MapUpdate, Trajectory
+from birdslam.types import Estimate, MapUpdate
 from runtime.bus import Bus
 from runtime.configuration import Configuration, without_passwords
 from runtime.parts import map_parts, trajectory_parts

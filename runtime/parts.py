@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from birdslam.types import MapSnapshot, Trajectory, VehiclePath
+from birdslam.answers import MapSnapshot, Trajectory, VehiclePath
 
 PART_POINTS = 2_000  # of some 20 B each
 PART_POSES = 800  # of some 50 B each

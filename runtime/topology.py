@@ -14,7 +14,8 @@ from typing import Any
 
 import msgspec
 
-from birdslam.types import Estimate, FrameRef, MapSnapshot, MapUpdate, Measurements, Trajectory
+from birdslam.answers import MapSnapshot, Trajectory
+from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements
 from runtime.wire import Health
 
 VERSION = "v1"

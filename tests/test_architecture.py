@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 IMPURE = {"runtime", "perf", "zenoh", "time", "threading", "logging", "os", "multiprocessing", "subprocess", "psutil"}
 LAYERS = (  # each imports only from itself and from what stands before it
-    ("se2",),
+    ("se2", "status"),
     ("types",),
     ("camera", "bev"),
 )

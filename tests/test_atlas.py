@@ -12,11 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from birdslam.answers import MapSnapshot, Trajectory
 from birdslam.atlas import Atlas, AtlasConfig
 from birdslam.graph import GraphConfig, PoseGraph
 from birdslam.se2 import SE2
 from birdslam.simulation.drive import DriveConfig, drive
-from birdslam.types import Estimate, MapSnapshot, MapUpdate, Trajectory, VehicleEstimate
+from birdslam.types import Estimate, MapUpdate, VehicleEstimate
 from birdslam.weights import WeightsConfig
 
 SMALL = AtlasConfig(key_poses=32, octaves=4, vehicles=3, vehicle_poses=8, map_cells=50, map_octaves=3)

@@ -16,8 +16,9 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from birdslam.answers import MapSnapshot, TimedPose, Trajectory, VehiclePath
 from birdslam.se2 import SE2
-from birdslam.types import MapSnapshot, MapUpdate, TimedPose, Trajectory, VehiclePath
+from birdslam.types import MapUpdate
 from runtime.bus import Bus, BusClosed, BusError
 from runtime.client import Planner
 from runtime.configuration import Configuration, SourceConfig

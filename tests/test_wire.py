@@ -19,6 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from birdslam.answers import MapSnapshot, TimedPose, Trajectory, VehiclePath
 from birdslam.se2 import SE2
 from birdslam.types import (
     Attitude,
@@ -28,16 +29,12 @@ from birdslam.types import (
     Ground,
     LandmarkEdge,
     LanePoint,
-    MapSnapshot,
     MapUpdate,
     Measurements,
     MotionEdge,
     Status,
-    TimedPose,
-    Trajectory,
     VehicleEdge,
     VehicleEstimate,
-    VehiclePath,
 )
 from runtime.topology import NODES, PROCESSES, QUESTIONS, TOPICS, alive_key, check_name, key_of
 from runtime.wire import MAX_MESSAGE_BYTES, MAX_TRACE_BYTES, Health, Spread, Stage, Trace, WireError, decode, encode
