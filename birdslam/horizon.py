@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.camera import Camera, GroundPlane
+from birdslam.doubt import information
 from birdslam.localisation import Observation
 from birdslam.parallax import LearnedSize
 
@@ -255,37 +256,15 @@ class Horizon:
             PJt = P @ J.T
             S = J @ PJt
             innovation = z - expected - J @ (prior - x)
-            of_frame = _inverse(S + np.diag(R))
-            if iteration == ITERATIONS - 1:
-                of_frame = self._doubt(of_frame, innovation)
-            gain = PJt @ of_frame
+            gate_sigma = self.config.gate_sigma if iteration == ITERATIONS - 1 else math.inf
+            gain = PJt @ information(S + np.diag(R), innovation, len(CUES), gate_sigma)
             x = prior + gain @ innovation
         P = P - gain @ PJt.T
-        lasting = _inverse(S + np.diag(R * np.tile(alike, len(CUES))))
-        kept = PJt[:m] @ self._doubt(lasting, innovation)
+        lasting = S + np.diag(R * np.tile(alike, len(CUES)))
+        kept = PJt[:m] @ information(lasting, innovation, len(CUES), self.config.gate_sigma)
         kept_P = self._P - kept @ PJt[:m].T
         self._x, self._P = prior[:m] + kept @ innovation, (kept_P + kept_P.T) / 2.0
         return x[m:], np.diag(P)[m:].copy(), x[at], np.maximum(P[at, at], _LEAST), P[range(m, m + n), at]
-
-    def _doubt(self, information: Floats, innovation: Floats) -> Floats:
-        """The inverse of the innovations' covariance, (M, M), with each box's worst cue trusted less where it misfits.
-
-        What all the others say of a cue differs from it by (S^-1 v)_i / (S^-1)_ii, with the variance 1 / (S^-1)_ii.
-        """
-        of_each = np.diag(information)
-        misfit = np.abs(information @ innovation) / np.sqrt(of_each)
-        by_box = misfit.reshape(len(CUES), -1)
-        n = by_box.shape[1]
-        worst = by_box.argmax(axis=0) * n + np.arange(n)
-        worst = worst[misfit[worst] > self.config.gate_sigma]
-        if not len(worst):
-            return information
-        # Woodbury: noise added to a few measurements
-        more = ((misfit[worst] / self.config.gate_sigma) ** 4 - 1.0) / of_each[worst]
-        columns = information[:, worst]
-        inner = np.diag(1.0 / more) + columns[worst]
-        out: Floats = information - columns @ np.linalg.solve(inner, columns.T)
-        return out
 
     def _begin(self, vehicle: int, seen: Observation) -> None:
         self._vehicles.append(vehicle)
@@ -307,10 +286,6 @@ class Horizon:
         gain = self._P[:, 0] / (self._P[0, 0] + sigma_rad**2)
         self._x = self._x + gain * (pitch_rad - self._x[0])
         self._P = self._P - np.outer(gain, self._P[0])
-
-
-def _inverse(S: Floats) -> Floats:
-    return np.asarray(np.linalg.inv(S), dtype=np.float64)
 
 
 def _mixed(weight: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:
