@@ -5,8 +5,8 @@
 - a grade of 6 %, up over a crest and down: a street drawn by `graded_road`, whose true ground is known exactly;
 - a pitch step of 1.5 degrees, down and up: KITTI 00 with each image from frame 40 on turned by K R K^-1, which is exact
   for a rotation, so that the unedited drive is the truth;
-- a height stated 10 and 15 % too low and too high: KITTI 00 with another `height_m`. The scale follows it, since nothing in
-  the images can tell; the vehicles can (heightwatch.py), where a detector is given.
+- a height stated 10 and 15 % too low and too high: KITTI 00 with another `height_m`. The scale follows it, since
+  nothing in the images can tell; the vehicles can (heightwatch.py), where a detector is given.
 
 Writes ground.json and ground.png.
 """
