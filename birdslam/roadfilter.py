@@ -37,7 +37,7 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
     doubt_sigma_rel: Positive = 0.15  # less sure than this, lengths far from the present one are tried as well
     doubt_after: Annotated[int, msgspec.Meta(ge=1)] = 3  # refused comparisons in a row that begin such a search
-    violated_after: Annotated[int, msgspec.Meta(ge=1)] = 8  # refused comparisons in a row until the ground is in doubt
+    violated_after: Annotated[int, msgspec.Meta(ge=1)] = 5  # refused comparisons in a row until the ground is in doubt
     sigma_scale_floor_rel: Positive = 0.015  # one pair never knows the length better: the road is no perfect plane
     sigma_tilt_floor_rad: Positive = 0.004
     sigma_bounce_rad: Positive = 0.012  # pitch and roll of the body against their mean, seen once in bounce_m

@@ -94,6 +94,7 @@ class MetricScale:
         self._travelled_m = float(np.linalg.norm(step.p))
         self._filter.predict(step.R, self._travelled_m)
         self._filter.travel(step.R.T @ step.p, self._travelled_m)
+        self._since_m += self._travelled_m
 
     def compare(self, grey: NDArray[np.uint8], pose: Pose, boxes_px: Floats, road_mask: Bools | None) -> float:
         """Compares the road with that of an earlier image; returns the factor on all lengths."""
