@@ -299,8 +299,8 @@ def test_a_hidden_road_carries_the_scale_and_says_so() -> None:
 
 
 def test_a_view_that_contradicts_counts_once_however_often_it_is_looked_at() -> None:
-    """A dark that travels with the car, and has the grain of a road, lies on all of it for 0.4 m at a walking pace."""
-    steps = [(0.35, 0.0)] * 36 + [(0.03, 0.0)] * 14
+    """A dark that travels with the car, and has the grain of a road, lies on the road: for 0.4 m, then 12 m more."""
+    steps = [(0.35, 0.0)] * 36 + [(0.03, 0.0)] * 14 + [(0.35, 0.0)] * 36
     truth = street(steps)
     grain = 2.5 * cv2.resize(np.random.default_rng(5).normal(size=(30, 100)), (400, 90), interpolation=cv2.INTER_CUBIC)
 
@@ -310,8 +310,10 @@ def test_a_view_that_contradicts_counts_once_however_often_it_is_looked_at() -> 
         return image
 
     chained, motions = drive(truth, rate_hz=33.0, edit=shade)
-    assert all(Status.SCALE_INVALID not in m.status for m in motions if m.to_frame > 36)
+    told = {m.to_frame for m in motions if {Status.SCALE_INVALID, Status.GROUND_VIOLATED} & set(m.status)}
+    assert not told & set(range(37, 51))
     assert path_m(chained[k] for k in range(36, 51)) == pytest.approx(0.42, rel=0.08)
+    assert told & set(range(51, 87))
 
 
 def test_which_masks_come_late_moves_the_length_by_no_more_than_is_told() -> None:
