@@ -90,11 +90,10 @@ class Recorder:
         self._process.cpu_percent()
         self._said_ns, self._frames, self._frames_said = time.monotonic_ns(), 0, 0
         self._end_frame: int | None = None  # of END_OF_SOURCE
+        self._end_measured = False  # the measurements of it have come: another link, which may be the slower one
         self._map_frame = -1
         self._estimate_frame = -1
-        self._missed = (
-            0  # frames between what the recorder before this one brought to the disk and the first of this one
-        )
+        self._missed = 0  # frames between the last on the disk of the recorder before this one, and this one's first
         self._checkpoints: Path | None = None  # where a file that begins in the middle of a drive finds its graph
         if assignment.restarts:
             self._checkpoints = checkpoint_path(configuration)
@@ -136,8 +135,8 @@ class Recorder:
 
     @property
     def over(self) -> bool:
-        """The end of the source, and the map before it, have been written."""
-        return self._end_frame is not None and self._map_frame == self._end_frame
+        """The end of the source, its measurements, and the map before it have been written."""
+        return self._end_frame is not None and self._end_measured and self._map_frame == self._end_frame
 
     @property
     def ending(self) -> bool:
@@ -164,6 +163,7 @@ class Recorder:
         elif isinstance(record, Measurements):
             if self._first_measured is None:
                 self._first_measured = record.frame_id
+            self._end_measured = self._end_measured or Status.END_OF_SOURCE in record.status
             self._draw(scene.from_measurements(record, record.t_utc_ns), t_ns)
         elif isinstance(record, MapUpdate):
             self._map_frame = record.frame_id

@@ -115,9 +115,21 @@ class Comparison:
             self._answer(PATIENCE)
             if self.verdict.difference is not None:
                 return self.verdict
+        if not self._recording.complete:
+            self._leave_open_end()
         self._answer(0)
-        self.verdict.open_end = len(self._measurements)
+        self.verdict.open_end += len(self._measurements)
         return self.verdict
+
+    def _leave_open_end(self) -> None:
+        """A file that was cut off may have lost the measurements behind its last estimates, which came first."""
+        recorded = [m.trace.stages for m in self._measurements]
+        while self._estimates:
+            cause = self._estimates[-1].trace.stages[:-1]
+            if not cause or cause[-1].node != "perceive" or cause in recorded:
+                return
+            self._estimates.pop()
+            self.verdict.open_end += 1
 
     def _answer(self, patience: int) -> None:
         """Replays the estimates whose measurements are there; more than `patience` of them do not wait for theirs."""

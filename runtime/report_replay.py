@@ -19,7 +19,7 @@ def told(verdict: Verdict, recording: Recording) -> str:
     if verdict.unknown:
         lines.append(f"not compared, since the measurements behind them were not recorded: {verdict.unknown} estimates")
     if not recording.complete:
-        lines.append(f"the recording was cut off: {verdict.open_end} measurements at its end have no estimate")
+        lines.append(f"the recording was cut off: {verdict.open_end} records at its end lack their counterpart")
     if recording.damaged:
         lines.append(f"damaged chunks left out: {recording.damaged}")
     difference = verdict.difference

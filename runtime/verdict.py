@@ -29,7 +29,7 @@ class Verdict:
     epochs: int = 0
     restarts: int = 0  # of the optimizer
     difference: Difference | None = None
-    open_end: int = 0  # measurements at the end of a recording that was cut off
+    open_end: int = 0  # at the end of a recording that was cut off: measurements or estimates without the other
 
     @property
     def same(self) -> bool:

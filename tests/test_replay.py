@@ -227,6 +227,23 @@ def test_a_recording_that_was_cut_off_replays_up_to_there(tmp_path: Path) -> Non
     assert "was cut off" in told(verdict, recording)
 
 
+def test_the_last_estimates_of_a_file_that_was_cut_off_may_have_come_before_their_measurements(tmp_path: Path) -> None:
+    tape, frames = Tape(tmp_path), measured(20)
+    for measurements in frames[:10]:
+        tape.step(measurements)
+    for measurements in frames[10:12]:  # over the slower link, and the recorder was killed meanwhile
+        tape.frame(measurements)
+        tape.take(tape.send(measurements, recorded=False))
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(tape.path.read_bytes())
+    verdict = compare(Recording(cut))
+    assert verdict.same
+    assert (verdict.equal, verdict.unknown, verdict.open_end) == (10, 0, 2)
+    tape.close()
+    verdict = compare(Recording(tape.path))
+    assert (verdict.equal, verdict.unknown, verdict.open_end) == (10, 2, 0)  # nothing was cut off: they are missing
+
+
 def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tape, frames = Tape(tmp_path), measured(30)
     for measurements in frames:
