@@ -3,7 +3,8 @@
 `sky` holds: 0-2 towards the sun, 3-5 its light, 6-8 light from the zenith, 9-11 light from the horizon, 12-14 haze,
 15 metres of sight, 16 wetness of the road, 17 clouds, 18 seed, 19 glare about the sun, 20 leaves' translucence,
 21 light from a street canyon (ambient factor), 22 snow or dust on grass (brightness), 23 season's tint of grass,
-24 how coarse the grit of asphalt is, 25 how rough the grass is, 0 a mown lawn.
+24 how coarse the grit of asphalt is, 25 how rough the grass is, 0 a mown lawn, 26-34 the rotation from ego to world,
+in which clouds and skyline stay where they are while the ego turns.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 
 from birdslam.simulation.compiled import inlined, per_pixel
 
-SKY_SLOTS = 26
+SKY_SLOTS = 35
 
 
 @per_pixel
@@ -43,15 +44,25 @@ def noise(bank, channel, u, v, texels):  # type: ignore[no-untyped-def]
 
 
 @per_pixel
+def _in_world(sky, x, y, z):  # type: ignore[no-untyped-def]
+    return (
+        sky[26] * x + sky[27] * y + sky[28] * z,
+        sky[29] * x + sky[30] * y + sky[31] * z,
+        sky[32] * x + sky[33] * y + sky[34] * z,
+    )
+
+
+@per_pixel
 def sky_colour(sky, bank, x, y, z):  # type: ignore[no-untyped-def]
     """Light from the direction (x, y, z): a gradient, clouds, the glow about the sun."""
-    t = max(z, 0.0) ** 0.5
+    east, north, up = _in_world(sky, x, y, z)
+    t = max(up, 0.0) ** 0.5
     r = sky[9] + (sky[6] - sky[9]) * t
     g = sky[10] + (sky[7] - sky[10]) * t
     b = sky[11] + (sky[8] - sky[11]) * t
     if sky[17] > 0.02:
-        k = 0.35 / (max(z, 0.0) + 0.12)
-        c = 0.5 + 0.5 * noise(bank, 0, x * k * 0.5 + sky[18], y * k * 0.5, 0.0)
+        k = 0.35 / (max(up, 0.0) + 0.12)
+        c = 0.5 + 0.5 * noise(bank, 0, east * k * 0.5 + sky[18], north * k * 0.5, 0.0)
         c = min(max((c - 0.75 + sky[17]) * 1.6, 0.0), 1.0)
         white = 1.15 * (sky[9] + sky[10] + sky[11]) * 0.3333
         r, g, b = r + (white - r) * c, g + (white - g) * c, b + (white * 1.03 - b) * c
@@ -65,9 +76,11 @@ def sky_colour(sky, bank, x, y, z):  # type: ignore[no-untyped-def]
 @per_pixel
 def mirrored(sky, bank, x, y, z):  # type: ignore[no-untyped-def]
     """What a glossy surface shows in the direction (x, y, z): sky, a skyline of houses and trees, the road."""
-    line = 0.12 + 0.05 * noise(bank, 0, math.atan2(y, x) * 0.12 + sky[18], 0.37, 4.0)
+    east, north, _ = _in_world(sky, x, y, z)
+    bearing = math.atan2(north, east)
+    line = 0.12 + 0.05 * noise(bank, 0, bearing * 0.12 + sky[18], 0.37, 4.0)
     open_sky = min(max((z - line) * 6.0 + 0.5, 0.0), 1.0)
-    dark = 0.16 + 0.05 * noise(bank, 0, math.atan2(y, x) * 0.3, z * 0.4, 4.0)
+    dark = 0.16 + 0.05 * noise(bank, 0, bearing * 0.3, z * 0.4, 4.0)
     low = min(max(0.5 - z * 6.0, 0.0), 1.0)
     houses = (sky[7] + sky[4] * 0.2) * max(dark, 0.05)
     road = 0.12 * sky[7] + 0.08 * sky[4] * max(sky[2], 0.0)

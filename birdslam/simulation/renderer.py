@@ -125,6 +125,7 @@ class Renderer:
         R_ego_world = T_world_ego[:3, :3].T
         sky = self._sky.copy()
         sky[:3] = R_ego_world @ sky[:3]
+        sky[26:35] = T_world_ego[:3, :3].ravel()
         R, t = self._poses(scene, T_world_ego)
         B = new_buffer(_CAPACITY)
         corners, attributes, normals, material, owner, _ = B
