@@ -507,9 +507,49 @@ def test_a_network_that_sees_further_begins_as_the_one_before_it() -> None:
         before.begin(after.state())
 
 
+@needs_torch
+def test_borders_are_added_to_what_a_network_said_without_them() -> None:
+    import torch
+
+    from birdslam.training.teacher import Teacher, TeacherConfig
+
+    torch.manual_seed(6)
+    coarse, teacher = Teacher(TeacherConfig(), half=False), Teacher(TeacherConfig(), half=False)
+    state = coarse.state()
+    for name in ("network", "average"):
+        state[name] = {key: value for key, value in state[name].items() if "fine." not in key}
+    teacher.begin(state)
+    image = torch.rand(1, 3, 64, 128) * 2.0 - 1.0
+    for name, answer in coarse.answer(image).items():
+        torch.testing.assert_close(teacher.answer(image)[name], answer)
+    torch.nn.init.ones_(teacher.average.module.fine.say.weight)
+    for name, sharpened in {"segmentation": True, "depth": True, "heat": False, "body": False}.items():
+        assert torch.equal(teacher.answer(image)[name], coarse.answer(image)[name]) != sharpened
+
+
+@needs_torch
+def test_of_two_depths_that_an_outline_leaves_open_the_nearer_costs_less() -> None:
+    import torch
+
+    from birdslam.training.losses import Batch, LossConfig, _depth
+
+    near_m, far_m, share_near = 5.0, 20.0, 0.4
+    truth = torch.full((1, 10, 10), far_m).log()
+    truth[0, : int(10 * share_near)] = math.log(near_m)
+    batch = Batch(torch.zeros(0), torch.zeros(0), truth, torch.zeros(1, 10, 10, dtype=torch.bool), torch.zeros(0))
+
+    def cost(said_m: float, relative: float) -> float:
+        said = torch.full((1, 10, 10), said_m).log()
+        return float(_depth(said, batch, LossConfig(relative=relative, shape=0.0))["depth"])
+
+    assert cost(near_m, 1.0) < cost(far_m, 1.0)
+    assert cost(near_m, 0.0) > cost(far_m, 0.0)
+
+
 @pytest.mark.slow
 @needs_torch
 @pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs the extra [train]: numba")
+@pytest.mark.filterwarnings("ignore:You are using the legacy TorchScript-based ONNX export:DeprecationWarning")
 def test_a_training_leaves_a_network_that_loads_and_is_done_when_asked_again(tmp_path: Path) -> None:
     from runtime.train import main
 

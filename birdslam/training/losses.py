@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import msgspec
@@ -13,6 +14,7 @@ from birdslam.perception.multitask import CLASSES, MEAN_SIZE_M, body_slices
 from birdslam.training.targets import COLUMN
 
 _BODY = body_slices()
+_STEEP = 1.0  # of log depth: from there on an error costs in proportion
 
 
 class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -21,6 +23,7 @@ class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth: float = 4.0
     sky: float = 0.1
     shape: float = 0.5  # of the depth's error about its mean over the image
+    relative: float = 0.5  # of the depth's error over the truth; the rest is of its logarithm
     road: float = 1.5
     lane: float = 1.3
     overlap: float = 0.5  # of a mask, by Dice
@@ -64,7 +67,12 @@ def _depth(log_depth: Tensor, batch: Batch, config: LossConfig) -> dict[str, Ten
     error = log_depth - batch.log_depth
     total = weight.sum(dim=(1, 2))
     mean = (weight * error).sum(dim=(1, 2), keepdim=True) / total[:, None, None]
-    absolute = (weight * error.abs()).sum(dim=(1, 2)) / total
+    # Where an outline leaves both depths open, the logarithm says the more likely one; the share of the truth that is
+    # missed says the nearer. Its derivative is bounded: a pole before the sky is no reason to forget the rest.
+    over = torch.expm1(error.clamp(0.0, _STEEP)) + math.exp(_STEEP) * (error - _STEEP).clamp(min=0.0)
+    missed = over - torch.expm1(error.clamp(max=0.0))
+    blame = config.relative * missed + (1.0 - config.relative) * error.abs()
+    absolute = (weight * blame).sum(dim=(1, 2)) / total
     shape = (weight * (error - mean).abs()).sum(dim=(1, 2)) / total
     return {"depth": config.depth * (absolute.mean() + config.shape * shape.mean())}
 

@@ -20,6 +20,7 @@ class NetworkConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pyramid: int = 48
     context: int = 2  # blocks on the coarsest grid
     context_width: int = 96  # channels within such a block
+    fine: int = 16  # channels at half the image's size
 
 
 def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -45,6 +46,25 @@ class _Context(nn.Module):
         return functional.relu(x + self.norm(self.wide(self.narrow(x))))
 
 
+class _Fine(nn.Module):
+    """Borders at half the image's size: what the pyramid means, sharpened by the encoder's first grid.
+
+    Its answer is added to the masks' logits and to log depth. It begins as nothing: its last weights are 0.
+    """
+
+    def __init__(self, neck: int, first: int, width: int, answers: int) -> None:
+        super().__init__()
+        self.meaning = nn.Conv2d(neck, 4 * width, 1)
+        self.detail = nn.Conv2d(first, width, 1, bias=False)
+        self.mix = _convolution(width, width)
+        self.say = nn.Conv2d(width, answers, 1, bias=False)
+        nn.init.zeros_(self.say.weight)
+
+    def forward(self, merged: Tensor, first: Tensor) -> Tensor:
+        said: Tensor = self.say(self.mix(functional.pixel_shuffle(self.meaning(merged), 2) + self.detail(first)))
+        return said
+
+
 class MultiTask(nn.Module):
     """(B, 3, H, W) BGR in [-1, 1] -> `OUTPUTS`: see `perception.multitask` for what the channels mean.
 
@@ -65,6 +85,7 @@ class MultiTask(nn.Module):
         neck = config.pyramid
         self.segmentation = nn.Sequential(_convolution(neck, neck), nn.Conv2d(neck, 2 * 4, 1))
         self.depth = nn.Sequential(_convolution(neck, neck), nn.Conv2d(neck, 4, 1))
+        self.fine = _Fine(neck, config.widths[0], config.fine, 2 + 1)
         self.heat = nn.Sequential(_convolution(neck, neck), nn.Conv2d(neck, len(CLASSES), 1))
         self.body = nn.Sequential(_convolution(neck, neck), nn.Conv2d(neck, sum(BODY_CHANNELS.values()), 1))
         nn.init.constant_(self.heat[-1].bias, -4.0)  # nearly nothing is a centre
@@ -82,9 +103,10 @@ class MultiTask(nn.Module):
         for level in range(len(self.smooth) - 1, -1, -1):
             up = functional.interpolate(merged, scale_factor=2.0, mode="nearest")
             merged = self.smooth[level](self.lateral[level](levels[level + 1]) + up)
+        fine = self.fine(merged, levels[0])
         return (
-            functional.pixel_shuffle(self.segmentation(merged), 2),
-            functional.pixel_shuffle(self.depth(merged), 2),
+            functional.pixel_shuffle(self.segmentation(merged), 2) + fine[:, :2],
+            functional.pixel_shuffle(self.depth(merged), 2) + fine[:, 2:],
             self.heat(merged),
             self.body(merged),
         )
