@@ -549,7 +549,7 @@ def test_of_two_depths_that_an_outline_leaves_open_the_nearer_costs_less() -> No
 @pytest.mark.slow
 @needs_torch
 @pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs the extra [train]: numba")
-@pytest.mark.filterwarnings("ignore:You are using the legacy TorchScript-based ONNX export:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's, of its older ONNX export
 def test_a_training_leaves_a_network_that_loads_and_is_done_when_asked_again(tmp_path: Path) -> None:
     from runtime.train import main
 
