@@ -45,6 +45,7 @@ perf: setup
 train: $(TRAIN_VENV)/.ready
 	$(TRAIN_VENV)/bin/python -m runtime.train --output out/train
 	$(TRAIN_VENV)/bin/python -m runtime.quantise out/train/multitask.onnx
+	$(TRAIN_VENV)/bin/python -m runtime.train_lanes
 	$(TRAIN_VENV)/bin/python -m runtime.train_pointnet --output out/train/pointnet --ship
 	cp out/train/multitask.onnx out/train/multitask.toml out/train/multitask_int8.onnx out/train/multitask_int8.toml birdslam/perception/shipped/
 
