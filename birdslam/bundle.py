@@ -172,22 +172,19 @@ class SlidingWindow:
         self.rho[newest] = np.where(good, rho, np.nan)
         self.rho_sigma[newest] = np.where(good, sigma, np.inf)
 
-    def adjust(self, iterations: int, max_landmarks: int, prior: Floats) -> Floats:
+    def adjust(self, iterations: int, max_landmarks: int, prior: Floats) -> None:
         """Joint adjustment of all poses but the oldest and of the best `max_landmarks` depths.
 
         `prior` (6,) is the information of each step against where the pose was before. It damps, and it carries the
         unit of length: no image says anything of that, so the least step leaves it where all poses together have it.
         Two poses held would carry it as well, but from a short piece of way whose error all the others then take over.
-        Returns the information (6, 6) of the newest pose, the others free but the two oldest: the unit's doubt is told
-        elsewhere.
         """
         anchor = self.anchors()
         count = np.isfinite(self.obs[..., 0]).sum(axis=0)
         usable = np.isfinite(self.rho) & (count >= 2)
         F, free = len(self.poses), len(self.poses) - 1
-        info_newest = np.zeros((6, 6))
         if usable.sum() < 8 or free < 1:
-            return info_newest
+            return
         rank = np.lexsort((self.ids, -count))
         chosen = np.sort(rank[usable[rank]][:max_landmarks])
         chosen = chosen[np.argsort(anchor[chosen], kind="stable")]  # those of one anchor stand together
@@ -246,7 +243,7 @@ class SlidingWindow:
             S = A_free - B.T @ (B / C[:, None])
             step = -np.linalg.solve(S, g_free - B.T @ (gr / C))
             if not np.isfinite(step).all():
-                return info_newest
+                return
             rho = np.maximum(rho - (gr + B @ step) / C, 0.0)
             steps = step.reshape(free, 6)
             for at, (T, by) in enumerate(zip(self.poses[1:], steps, strict=True), start=1):
@@ -254,18 +251,12 @@ class SlidingWindow:
             moved += steps
             if np.abs(steps).max() < 1e-5:
                 break
-        newest, others_free = slice(6 * (free - 1), None), slice(6, max(6 * (free - 1), 6))
-        mixed = S[others_free, newest]
-        info_newest = S[newest, newest] - mixed.T @ np.linalg.solve(S[others_free, others_free], mixed)
-        turn = np.kron(np.eye(2), self.poses[-1].R)  # to the newest camera's own axes
-        info_newest = turn.T @ info_newest @ turn
         self.poses = [Pose(R, T.p) for R, T in zip(orthonormal(self._stacked()[0]), self.poses, strict=True)]
         self.rho[chosen] = rho
         self.rho_sigma[chosen] = 1.0 / np.sqrt(C)
         # What no longer fits is forgotten; if it is a landmark after all, it is triangulated anew.
         fits = (others & (norm < self.reject_px / self.sigma_px)).sum(axis=0)
         self.rho[chosen[2 * fits < others.sum(axis=0)]] = np.nan
-        return info_newest
 
     # --- geometry shared by the above ---
 

@@ -17,7 +17,7 @@ from birdslam.se2 import SE2
 from birdslam.traffic import Vehicle
 from birdslam.window import WindowState
 
-VERSION = 1
+VERSION = 2
 _MAGIC = b"BirdSLAM graph\n"
 _SUM_BYTES = 16
 _KINDS = {"<f8": np.float64, "<c16": np.complex128, "<i8": np.int64}
@@ -36,6 +36,7 @@ class Epoch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     t_ns: int
     t_before_ns: int
     motion: SE2
+    lasting_m: float
 
 
 class Checkpoint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -63,6 +63,8 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_landmarks: Count = 512
     max_pending_landmarks: Count = 10_000  # waiting for `map_update`
     max_pending_frames: Count = 1_000  # whose lane points wait for `map_update`
+    # What is common to many CC edges in a row, and so moves all that is in sight against the world's origin alone
+    scale_memory_m: Positive = 20.0  # the way over which the error of the metric scale lasts
     # Frames without a picture
     blind_mps: Positive = 1.0  # 1-sigma by which the ego's velocity may differ from the last one measured
     blind_radps: Positive = 0.1
@@ -113,6 +115,7 @@ class PoseGraph:
                 t_ns=self._t_ns,
                 t_before_ns=self._t_before_ns,
                 motion=self._motion,
+                lasting_m=self._lasting_m,
             )
         settings = plain(graph=self.config, weights=self.weights)
         return pack(Checkpoint(settings=settings, epoch=self.epoch, begun=begun, pending=self._map.state()))
@@ -139,6 +142,7 @@ class PoseGraph:
         graph._traffic = Traffic(config.forget_s, config.max_vehicles, config.detection_contradictions)
         graph._traffic.take_up(begun.vehicles)
         graph._t_ns, graph._t_before_ns, graph._motion = begun.t_ns, begun.t_before_ns, begun.motion
+        graph._lasting_m = begun.lasting_m
         return graph
 
     def _begin(self, m: Measurements, reset: bool) -> Window:
@@ -149,6 +153,9 @@ class PoseGraph:
         self._landmarks = Landmarks(config.max_landmarks)
         self._t_ns = self._t_before_ns = m.t_source_ns  # of the newest pose and of the one before
         self._motion = SE2()  # between them
+        self._lasting_m = (
+            0.0  # the way over which the present error of the scale has lasted, older parts of it counting less
+        )
         self._map.begin(self.epoch)
         return self._window
 
@@ -196,6 +203,8 @@ class PoseGraph:
             cov = np.zeros((3, 3)) if hold else edges.covs[0]
             self._motion = window.predict(edges.cc.T_from_to, cov, edges.cc.from_frame, m.frame_id, dt_s, growth)
             self._t_before_ns, self._t_ns = self._t_ns, m.t_source_ns
+            if not hold:
+                self._drift(window, m.scale_sigma_rel)
 
         key_frame = window.next_node == KEY_NODE
         seen = sightings(m.cp) if key_frame else None
@@ -223,6 +232,16 @@ class PoseGraph:
             window.place(np.array(at, dtype=np.int64), cv_poses[begun], cv_covs[begun], self._born(cv_covs[begun]))
         settled = [] if seen is None else self._landmarks.see(seen, window, config.landmark_least_frames)
         self._map.add(m.frame_id, settled, window.world, m.lanes)
+
+    def _drift(self, window: Window, scale_sigma_rel: float) -> None:
+        """The error of the metric scale lasts, so that of a step is the same as that of the way before it.
+
+        With a covariance sigma^2 exp(-way / scale_memory_m) between steps, each adds twice its own with all before.
+        """
+        step = complex(self._motion.x_m, self._motion.y_m)
+        if length_m := abs(step):
+            window.drift(step / length_m, 2.0 * scale_sigma_rel**2 * self._lasting_m * length_m)
+            self._lasting_m = math.exp(-length_m / self.config.scale_memory_m) * self._lasting_m + length_m
 
     def _born(self, covs: Floats) -> Floats:
         """(k, 3, 3) of the twists of vehicles first seen with `covs` (k, 3, 3), at rest for all that is known.

@@ -37,8 +37,8 @@ class KeyWindow(SlidingWindow):
         self.config = config
         self._provisional = False  # the newest image is no key image yet
 
-    def extend(self, frame_id: int, pose: Pose, ids: Ints, xy: Floats, info: Floats) -> tuple[Pose, Floats]:
-        """Puts the present image into the window in place of a provisional one, and adjusts."""
+    def extend(self, frame_id: int, pose: Pose, ids: Ints, xy: Floats) -> Pose:
+        """Puts the present image into the window in place of a provisional one, and adjusts; its pose after that."""
         cfg = self.config
         if self._provisional:
             newest = self.poses[-2].between(pose)
@@ -58,12 +58,10 @@ class KeyWindow(SlidingWindow):
         # The prior on steps: loose, but it alone carries the unit of length.
         loose = 1.0 / 0.3**2
         prior = np.array([loose, loose, loose, 1e2, 1e2, 1e2])
-        adjusted = self.adjust(cfg.adjust_iterations, cfg.adjusted_landmarks, prior)
+        self.adjust(cfg.adjust_iterations, cfg.adjusted_landmarks, prior)
         if not np.isfinite(self.poses[-1].p).all():
             self.poses[-1] = pose
-        elif adjusted.any():
-            info = adjusted
-        return self.poses[-1], info
+        return self.poses[-1]
 
     def _parallax_px(self, ids: Ints, xy: Floats, R_key_curr: Floats) -> float:
         at = np.minimum(np.searchsorted(self.ids, ids), max(len(self.ids) - 1, 0))

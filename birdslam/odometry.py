@@ -39,6 +39,7 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 _MIN_INTERVAL_S = 0.004
 _STILL = Pose(np.eye(3), np.zeros(3))
+_TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step that two images alone show: 1 cm, 0.25 deg
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
 
 
@@ -178,7 +179,7 @@ class Odometry:
             motion = self._standing(frame_id)
             self._velocity = _Velocity(np.zeros(3), np.zeros(3))
         else:
-            pose, info = self._window.extend(frame_id, pose, ids, xy, info)
+            pose = self._window.extend(frame_id, pose, ids, xy)
             step = self._pose.between(pose)
             self._scale.moved(step)
             factor = self._scale.compare(tracks.image, pose, boxes, road_mask)
@@ -231,7 +232,7 @@ class Odometry:
             return None
         xy_a, xy_b = self.camera.to_xy(base.px[a]), xy[b]
         if float(np.median(displacement)) < cfg.standstill_px and float(np.quantile(displacement, 0.8)) < 1.5:
-            return self._pose, np.eye(6) * 1e4
+            return self._pose, _TWO_VIEW_INFORMATION
         found = two_view(xy_a, xy_b, self._focal_px, cfg.two_view_px)
         if found is None or found[1].sum() < max(cfg.min_fitting, cfg.min_fitting_fraction * len(a)):
             return None
@@ -242,7 +243,7 @@ class Odometry:
         self._window = self._new_window()
         self._window.append(frame, self._pose, base.ids[a], xy_a)
         self._scale.restart(base.image, self._pose, 0.2 if speed * dt_s > 0.05 else 1.0)
-        return self._pose @ Pose(step.R, step.p * length), np.eye(6) * 1e4
+        return self._pose @ Pose(step.R, step.p * length), _TWO_VIEW_INFORMATION
 
     # --- standing, coasting ---
 

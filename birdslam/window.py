@@ -181,6 +181,13 @@ class Window:
         self.P, self.frame, self.next_node = P, to_frame, (node + 1) % self.nodes
         return T_ego_next
 
+    def drift(self, along: complex, variance: float) -> None:
+        """The ego, and with it all that is told from it, may have come this much further in the world than was told.
+
+        `along` is the direction in ego, of length 1, `variance` in m^2. Between what is in sight nothing changes.
+        """
+        self.P[:2, :2] += variance * np.outer((along.real, along.imag), (along.real, along.imag))
+
     @staticmethod
     def _against(G: Floats, at: Complexes) -> None:
         """To the first rows of each of `G` (N, 3 or more, 3): how poses `at` (N,) move when the ego that they are told

@@ -23,7 +23,7 @@ from birdslam.landmarks import sum_of_edges
 from birdslam.planar import between
 from birdslam.se2 import SE2
 from birdslam.simulation.drive import Drive, DriveConfig, drive
-from birdslam.types import Estimate, LanePoint, Measurements, Status
+from birdslam.types import EgoEdge, Estimate, LanePoint, Measurements, Status
 from birdslam.weights import WeightsConfig
 from perf import incremental, optimizer
 from perf.__main__ import main as perf_main
@@ -79,6 +79,55 @@ def test_velocity_is_the_motion_over_time() -> None:
                 if np.hypot(*(now - before)[:2]) < 5.0:
                     # the chord against the tangent at its end: equal to the first order in the turn
                     np.testing.assert_allclose(v.velocity_mps, (now - before)[:2] * 33.0, atol=0.15)
+
+
+# --- an error of the scale lasts ---
+
+
+def straight(frames: int, step_m: float, scale_sigma_rel: float, error_rel: Iterable[float]) -> list[Measurements]:
+    """A straight drive whose odometry says `error_rel` too much in each step, and states no noise of its own."""
+    out = []
+    for k, error in zip(range(frames), error_rel, strict=False):
+        cc = None
+        if k:
+            exact = tuple(np.eye(3).ravel() * 1e-12)
+            cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(step_m * (1.0 + error), 0.0, 0.0), cov=exact)
+        t_ns = k * 30_000_000
+        out.append(
+            Measurements(
+                frame_id=k, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=cc, scale_sigma_rel=scale_sigma_rel
+            )
+        )
+    return out
+
+
+def test_an_error_of_the_scale_that_lasts_is_told_in_the_ego_pose() -> None:
+    config, step_m, sigma, frames = GraphConfig(), 0.4, 0.02, 400
+    rng = np.random.default_rng(3)
+    keep = np.exp(-step_m / config.scale_memory_m)
+    ends = []
+    for _ in range(60):  # an error that wanders as the graph has it
+        error = [sigma * rng.standard_normal()]
+        for _ in range(frames):
+            error.append(keep * error[-1] + np.sqrt(1.0 - keep**2) * sigma * rng.standard_normal())
+        estimates = run(straight(frames, step_m, sigma, error), config)
+        last = estimates[-1]
+        ends.append((last.T_world_ego.x_m - (frames - 1) * step_m) ** 2 / last.cov[0])
+    assert 0.6 < np.mean(ends) < 1.5  # 60 squares of a normal number: 1 +- 0.18
+    variances = [estimate.cov[0] for estimate in estimates]
+    assert all(a < b for a, b in pairwise(variances))
+    assert last.cov[4] < 1e-3 * last.cov[0]  # to the side it does nothing
+
+
+def test_an_error_of_the_scale_moves_everybody_alike() -> None:
+    world = drive(DriveConfig(frames=60), seed=8)
+    sure = run(world.measurements, GraphConfig())
+    unsure = run([replace(m, scale_sigma_rel=0.05) for m in world.measurements], GraphConfig())
+    assert unsure[-1].cov[0] > 2.0 * sure[-1].cov[0]
+    for a, b in zip(sure, unsure, strict=True):
+        for v, w in zip(a.vehicles, b.vehicles, strict=True):
+            between_a, between_b = (e.T_world_ego.between(u.T_world_vehicle) for e, u in ((a, v), (b, w)))
+            np.testing.assert_allclose(numbers(between_b), numbers(between_a), atol=1e-6)
 
 
 # --- where the world begins does not matter ---
