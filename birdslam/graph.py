@@ -153,9 +153,7 @@ class PoseGraph:
         self._landmarks = Landmarks(config.max_landmarks)
         self._t_ns = self._t_before_ns = m.t_source_ns  # of the newest pose and of the one before
         self._motion = SE2()  # between them
-        self._lasting_m = (
-            0.0  # the way over which the present error of the scale has lasted, older parts of it counting less
-        )
+        self._lasting_m = 0.0  # the way that the present error of the scale is common to, its older parts less
         self._map.begin(self.epoch)
         return self._window
 
@@ -236,7 +234,8 @@ class PoseGraph:
     def _drift(self, window: Window, scale_sigma_rel: float) -> None:
         """The error of the metric scale lasts, so that of a step is the same as that of the way before it.
 
-        With a covariance sigma^2 exp(-way / scale_memory_m) between steps, each adds twice its own with all before.
+        With a covariance sigma^2 exp(-way / scale_memory_m) between steps, each adds twice its own with all before,
+        which are taken to lie in its own direction: in a bend that is too much along the way, too little across it.
         """
         step = complex(self._motion.x_m, self._motion.y_m)
         if length_m := abs(step):
