@@ -25,13 +25,10 @@ import torch
 from torch import distributed
 from torch.utils.data import DataLoader, IterableDataset
 
-from birdslam.perception.manifest import Input, MultiTask, Stretch
-from birdslam.perception.multitask import MultiTaskDecoder
-from birdslam.perception.views import Preparation, make_views
+from birdslam.perception.manifest import MultiTask
 from birdslam.simulation.truth import WorldFrame
-from birdslam.training.augmentation import photometric
-from birdslam.training.export import INPUT, manifest, to_onnx
-from birdslam.training.grading import Grades
+from birdslam.training.examination import examine
+from birdslam.training.export import manifest, to_onnx
 from birdslam.training.stream import StreamConfig, examples
 from birdslam.training.teacher import Teacher, TeacherConfig, as_tensors
 
@@ -186,38 +183,10 @@ class Training:
         partial.replace(self.output / "checkpoint.pt")
 
     def _grade(self, stage: Stage, number: int, frames: int) -> dict[str, float]:
-        """The figures of the average network on held-out worlds, as the decoder reads it.
-
-        The score from which a box counts is the best one on the same worlds under other eyes: a real camera is as
-        strange to the network as those are, and its scores are as low.
-        """
-        grades, strained = Grades(), Grades()
+        """The figures of the average network on held-out worlds, and its thresholds; into grades.csv too."""
+        size_px = (stage.width_px, stage.height_px)
         rng = np.random.default_rng([self.config.seed, number])
-        size = Input(
-            name=INPUT,
-            width_px=stage.width_px,
-            height_px=stage.height_px,
-            layout="NCHW",
-            colour="BGR",
-            resize=Stretch(),
-            scale=2.0 / 255.0,
-            mean=(1.0, 1.0, 1.0),
-        )
-        preparation, decoder = Preparation(size), None
-        for seed in range(frames):
-            frame = _render(seed, stage.width_px, stage.height_px)
-            (view,) = make_views(stage.width_px, stage.height_px, size, None)
-            strange = photometric(frame.image, self.config.stream.augmentation, rng)
-            for image, counted in ((frame.image, grades), (strange, strained)):
-                preparation.fill(image, view)
-                answer = self.teacher.answer(torch.from_numpy(preparation.tensor))
-                tensors = {name: tensor.numpy() for name, tensor in answer.items()}
-                if decoder is None:
-                    shapes = {name: tensor.shape for name, tensor in tensors.items()}
-                    decoder = MultiTaskDecoder(MultiTask(score_threshold=0.05), size, shapes)
-                counted.add(decoder.read(tensors, view), frame)
-        figures = grades.figures()
-        figures["vehicle_score"] = strained.figures()["vehicle_score"]
+        figures = examine(self.teacher.answer, _render, size_px, frames, self.config.stream.augmentation, rng)
         _append(self.output / "grades.csv", {"stage": number, "step": self.step, **figures})
         print("  ".join(f"{name} {value:.3f}" for name, value in figures.items()), flush=True)
         return figures
@@ -234,6 +203,7 @@ class Training:
             sha256=hashlib.sha256(content).hexdigest(),
             size_px=size_px,
             score=score,
+            lane_logit=figures["lane_logit"],
             depth_sigma_rel=ABSREL_TO_SIGMA * figures["depth_absrel"],
         )
         write_network(self.output, content, text)

@@ -32,6 +32,7 @@ from birdslam.se2 import SE2
 from birdslam.simulation.truth import CLASSES as SURFACES
 from birdslam.simulation.truth import WorldFrame, WorldObject
 from birdslam.training.augmentation import AugmentationConfig
+from birdslam.training.examination import examine
 from birdslam.training.grading import Grades, average_precision, best_score, extents
 from birdslam.training.stream import StreamConfig, examples
 from birdslam.training.targets import COLUMN, Example, TargetsConfig, Window, encode
@@ -324,6 +325,25 @@ def test_perfect_findings_get_the_best_grades() -> None:
     assert figures["depth_absrel"] < 0.1
 
 
+@pytest.mark.parametrize("certain", [-0.45, -0.75, -1.35])
+def test_an_examination_finds_the_threshold_of_markings_that_a_network_doubts(certain: float) -> None:
+    cam = camera()
+    frame = world(cam, vehicle(cam, SE2(14.0, 2.0, 0.2)))
+    example = encode(frame, WHOLE, WIDTH, HEIGHT, TargetsConfig())
+    said = perfect_answer(example)
+    said["segmentation"][0, 1] = np.where(example.masks[1] > 0.0, certain, certain - 0.3)
+
+    def answer(image: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+        assert image.shape == (1, 3, HEIGHT, WIDTH)
+        return said
+
+    rng = np.random.default_rng(3)
+    figures = examine(answer, lambda *_: frame, (WIDTH, HEIGHT), 2, AugmentationConfig(), rng)
+    assert certain - 0.3 < figures["lane_logit"] < certain
+    assert figures["lane_iou"] > 0.5  # by the threshold that was found
+    assert (figures["frames"], figures["vehicle_ap50"]) == (2, 1.0)
+
+
 def test_a_false_box_and_a_missed_one_cost_precision() -> None:
     cam = camera()
     frame = world(cam, vehicle(cam, SE2(14.0, 2.0, 0.2)), replace(vehicle(cam, SE2(14.0, -2.5, 0.2)), object_id=1))
@@ -497,12 +517,12 @@ def test_a_network_that_sees_further_begins_as_the_one_before_it() -> None:
     before = Teacher(TeacherConfig(network=NetworkConfig(context=0)), half=False)
     after = Teacher(TeacherConfig(), half=False)
     after.begin(before.state())
-    image = torch.rand(1, 3, 64, 128) * 2.0 - 1.0
+    image = torch.rand(1, 3, 64, 128).numpy() * 2.0 - 1.0
     for name, answer in before.answer(image).items():
-        torch.testing.assert_close(after.answer(image)[name], answer)
+        np.testing.assert_allclose(after.answer(image)[name], answer, rtol=1.3e-6, atol=1e-5)
     # What lies outside of a cell's own view counts once the new blocks have learnt anything
     torch.nn.init.ones_(after.average.module.context[0].norm.weight)
-    assert not torch.equal(after.answer(image)["depth"], before.answer(image)["depth"])
+    assert not np.array_equal(after.answer(image)["depth"], before.answer(image)["depth"])
     with pytest.raises(ValueError, match="context"):
         before.begin(after.state())
 
@@ -519,12 +539,12 @@ def test_borders_are_added_to_what_a_network_said_without_them() -> None:
     for name in ("network", "average"):
         state[name] = {key: value for key, value in state[name].items() if "fine." not in key}
     teacher.begin(state)
-    image = torch.rand(1, 3, 64, 128) * 2.0 - 1.0
+    image = torch.rand(1, 3, 64, 128).numpy() * 2.0 - 1.0
     for name, answer in coarse.answer(image).items():
-        torch.testing.assert_close(teacher.answer(image)[name], answer)
+        np.testing.assert_allclose(teacher.answer(image)[name], answer, rtol=1.3e-6, atol=1e-5)
     torch.nn.init.ones_(teacher.average.module.fine.say.weight)
     for name, sharpened in {"segmentation": True, "depth": True, "heat": False, "body": False}.items():
-        assert torch.equal(teacher.answer(image)[name], coarse.answer(image)[name]) != sharpened
+        assert np.array_equal(teacher.answer(image)[name], coarse.answer(image)[name]) != sharpened
 
 
 @needs_torch

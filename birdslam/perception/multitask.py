@@ -22,6 +22,7 @@ from birdslam.perception.segmentation import Segmentation
 from birdslam.perception.views import View
 
 CANONICAL_FOCAL = 0.58  # of the image's width
+INPUT = "image"
 OUTPUTS = ("segmentation", "depth", "heat", "body")
 MASKS = ("road", "lane")  # channels of "segmentation": logits
 CLASSES = ("vehicle", "person")  # channels of "heat": logits of "a box's centre is here"

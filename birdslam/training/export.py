@@ -6,10 +6,8 @@ import io
 
 import torch
 
-from birdslam.perception.multitask import OUTPUTS
+from birdslam.perception.multitask import INPUT, OUTPUTS
 from birdslam.training.network import MultiTask
-
-INPUT = "image"
 
 MANIFEST = """\
 # {title}, {parameters} parameters. Trained by `make train` on the built-in world alone.
@@ -33,6 +31,7 @@ threads = 2
 
 [multitask]
 score_threshold = {score:.2f} # where precision and recall are best together on held-out worlds, augmented
+lane_logit = {lane_logit:.1f} # where the markings' IoU is best on those
 depth_sigma_rel = {depth_sigma_rel:.2f}
 """
 
@@ -55,9 +54,15 @@ def to_onnx(network: MultiTask, width_px: int, height_px: int) -> bytes:
 
 
 def manifest(
-    title: str, parameters: int, sha256: str, size_px: tuple[int, int], score: float, depth_sigma_rel: float
+    title: str,
+    parameters: int,
+    sha256: str,
+    size_px: tuple[int, int],
+    score: float,
+    lane_logit: float,
+    depth_sigma_rel: float,
 ) -> str:
-    """The text of the manifest of an exported network; a detection counts from `score` on."""
+    """The text of the manifest of an exported network: vehicles count from `score` on, markings from `lane_logit`."""
     return MANIFEST.format(
         title=title,
         parameters=parameters,
@@ -65,5 +70,6 @@ def manifest(
         width_px=size_px[0],
         height_px=size_px[1],
         score=min(max(score, 0.05), 0.95),
+        lane_logit=lane_logit,
         depth_sigma_rel=min(max(depth_sigma_rel, 0.01), 0.99),
     )

@@ -7,7 +7,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -111,12 +113,12 @@ class Teacher:
                 raise ValueError(f"weights of another network: {', '.join(strange[:3])}")
 
     @torch.no_grad()
-    def answer(self, image: Tensor) -> dict[str, Tensor]:
+    def answer(self, image: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
         """What the average says of images (B, 3, H, W) in [-1, 1], by the names of the outputs."""
         self.average.eval()
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
-            outputs = self.average(image)
-        return dict(zip(OUTPUTS, (output.float() for output in outputs), strict=True))
+            outputs = self.average(torch.from_numpy(image))
+        return {name: output.float().numpy() for name, output in zip(OUTPUTS, outputs, strict=True)}
 
 
 def as_tensors(examples: Examples) -> tuple[Tensor, ...]:
