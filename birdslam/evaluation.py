@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from birdslam.car_ahead import CarAhead, CarAheadReport
+from birdslam.consistency import Consistency, ConsistencyReport
 from birdslam.datasets import Recording
 from birdslam.results import Recorder, claim_directory
 from birdslam.trajectory import Pose, as_poses, inverse, read_kitti
@@ -46,6 +47,7 @@ class OdometryReport(msgspec.Struct, frozen=True, kw_only=True):
     standing_drift_m: float | None = None  # how far the estimate strays while the truth stands; None: it never does
     statuses: dict[str, int] = {}  # how many frames carried each status
     car_ahead: CarAheadReport | None = None  # where the recording has LiDAR
+    ego: ConsistencyReport | None = None  # what the ego's covariance is worth; None where only some frames are compared
     segment_t_pct: float | None = None  # mean error of stretches of SEGMENTS_M, each aligned at its own first pose:
     segment_r_deg_per_m: float | None = None  # what the truth's first poses lack touches only those that begin there
 
@@ -210,13 +212,14 @@ def evaluate_odometry(
     claim_directory(directory)
     report = []
     for recording, truth in zip(recordings, truths, strict=True):
-        ahead = CarAhead.of(recording)
+        ahead, ego = CarAhead.of(recording), Consistency(recording.camera.ground)
         with Recorder(directory / recording.name, recording.camera) as recorder:
             for record in run(recording):
                 if isinstance(record, MapUpdate):
                     recorder.add_map(record)
                 elif isinstance(record, Estimate):
                     recorder.add(record)
+                    ego.add(record)
                     if ahead:
                         ahead.add_estimate(record)
                 elif ahead:
@@ -226,6 +229,9 @@ def evaluate_odometry(
         estimated = in_camera0(rows, recording.T_cam0_cam())
         goal = None if truth is None else from_first(as_poses(truth))
         row = compare(recording.name, goal, estimated, dict(sorted(recorder.statuses.items())), compared)
+        if goal is not None and compared == slice(None):
+            T_cam0_cam = recording.T_cam0_cam()
+            row = msgspec.structs.replace(row, ego=ego.report(inverse(T_cam0_cam) @ goal @ T_cam0_cam))
         report.append(msgspec.structs.replace(row, car_ahead=ahead.report()) if ahead else row)
         encoded = msgspec.json.format(msgspec.json.encode(report), indent=2)
         (directory / "report.json").write_bytes(

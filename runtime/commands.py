@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import msgspec
@@ -296,10 +296,19 @@ def _odometry_table(reports: list[evaluation.OdometryReport]) -> str:
         ("RPE deg", "rpe_r_deg", 4),
         ("segments %", "segment_t_pct", 2),
         ("standing m", "standing_drift_m", 3),
+        ("NEES", "ego.nees", 2),
+        ("inside 95 %", "ego.inside_95", 2),
     )
     lines = [f"{'sequence':16}" + "".join(f"{title:>12}" for title, _, _ in columns)]
     for report in reports:
-        values = [(getattr(report, field), digits) for _, field, digits in columns]
+        values = [(_field(report, name), digits) for _, name, digits in columns]
         cells = "".join(f"{'-' if value is None else format(value, f'.{digits}f'):>12}" for value, digits in values)
         lines.append(f"{report.sequence:16}{cells}")
     return "\n".join(lines)
+
+
+def _field(report: Any, name: str) -> float | None:
+    """A field of a report, or of a report in it: `ego.nees`; None where that is not there."""
+    for part in name.split("."):
+        report = None if report is None else getattr(report, part)
+    return cast("float | None", report)

@@ -245,7 +245,7 @@ def estimate(frame_id: int, T_world_ego: SE2, **fields: object) -> Estimate:
         t_capture_ns=0,
         t_utc_ns=0,
         T_world_ego=T_world_ego,
-        cov=COV3,
+        cov=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
         valid=True,
         **fields,  # type: ignore[arg-type]
     )
@@ -276,7 +276,10 @@ def test_evaluate_writes_results_and_report(tmp_path: Path) -> None:
     assert report[0].rpe_r_deg == pytest.approx(0.0, abs=1e-5)
     assert report[1].scale_error == pytest.approx(0.02, abs=1e-6)
     assert report[1].ate_sim3_m == pytest.approx(0.0, abs=1e-6)
-    assert (report[2].ate_m, report[2].path_m, report[2].frames) == (None, None, 40)
+    assert report[0].ego is not None
+    assert report[0].ego.frames == 40
+    assert report[0].ego.nees == pytest.approx(0.0, abs=1e-9)
+    assert (report[2].ate_m, report[2].path_m, report[2].frames, report[2].ego) == (None, None, 40, None)
     written = json.loads((tmp_path / "report.json").read_text())
     assert [row["sequence"] for row in written] == ["00", "01", "02"]
     assert set(written[0]) >= {

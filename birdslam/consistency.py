@@ -1,0 +1,69 @@
+"""Whether the ego's covariance is honest: its error over what was stated of it (NEES, Bar-Shalom et al. 2001, 5.4).
+
+One drive is one sample, however many frames it has: the errors of neighbouring frames are nearly the same error. So a
+drive's figure may well be 0.2 or 3 by chance; what tells is many drives.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.camera import GroundPlane
+from birdslam.se2 import SE2
+from birdslam.trajectory import Pose, ego_pose, inverse, mount_pose, split_pose
+from birdslam.types import Cov3, Estimate, Status
+
+DIMENSIONS = 3
+INSIDE_95 = 7.815  # chi-square of three degrees of freedom: 95 % of honest errors lie below
+CERTAIN_M = 0.01  # a pose known better than this is not held to a truth that isn't
+
+
+class ConsistencyReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Of the valid estimates that state at least `CERTAIN_M` of doubt."""
+
+    frames: int
+    nees: float | None = None  # mean of e' P^-1 e over its degrees of freedom: 1 is honest, more is too sure
+    inside_95: float | None = None  # share of the frames whose error lies within the stated 95 %
+
+
+class Consistency:
+    """Collects, frame by frame, what was stated of the ego's pose."""
+
+    def __init__(self, mount: GroundPlane) -> None:
+        self._mount = mount_pose(mount)
+        self._origin: Pose | None = None
+        self._stated: list[tuple[int, SE2, Cov3]] = []  # frame of the recording
+        self._frames = 0
+
+    def add(self, estimate: Estimate) -> None:
+        """The next frame's estimate; what comes at the source's end is of no frame."""
+        if Status.END_OF_SOURCE in estimate.status:
+            return
+        if self._origin is None:
+            self._origin = ego_pose(estimate.T_world_ego, estimate.attitude)
+        if estimate.valid:
+            self._stated.append((self._frames, estimate.T_world_ego, estimate.cov))
+        self._frames += 1
+
+    def report(self, truth: Pose) -> ConsistencyReport:
+        """Against `T_first_i` (N, 4, 4) of the camera, all frames of the recording, in its own axes."""
+        values = []
+        for frame, T_world_ego, cov in self._stated:
+            covariance = np.reshape(cov, (DIMENSIONS, DIMENSIONS))
+            if np.sqrt(np.trace(covariance[:2, :2])) >= CERTAIN_M:
+                error = T_world_ego.between(self._true_ego(truth[frame])).log()
+                values.append(float(error @ np.linalg.solve(covariance, error)))
+        if not values:
+            return ConsistencyReport(frames=0)
+        return ConsistencyReport(
+            frames=len(values),
+            nees=float(np.mean(values)) / DIMENSIONS,
+            inside_95=float(np.mean(np.less(values, INSIDE_95))),
+        )
+
+    def _true_ego(self, T_first_cam: NDArray[np.float64]) -> SE2:
+        """The ego's pose on the road where the camera is truly: both begin as one."""
+        assert self._origin is not None
+        return split_pose(self._origin @ self._mount @ T_first_cam @ inverse(self._mount))[0]
