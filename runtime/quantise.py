@@ -2,8 +2,9 @@
 
     python -m runtime.quantise NETWORK.onnx [--frames 128] [--output DIR]
 
-Ranges come of rendered frames that training doesn't draw. The last convolution of each head stays in fp32, or masks
-lose their edges; weights take seven bits (reduce_range), so that AVX2 without VNNI doesn't overflow. Needs [train].
+Ranges come of rendered frames that neither training draws nor the figures are of. The last convolution of each head
+stays in fp32, or masks lose their edges; weights take seven bits (reduce_range), so that AVX2 without VNNI
+doesn't overflow. Needs [train].
 """
 
 from __future__ import annotations
@@ -25,9 +26,8 @@ from birdslam.perception.manifest_file import read_manifest
 from birdslam.perception.multitask import OUTPUTS
 from birdslam.perception.views import Preparation, make_views
 from birdslam.training.augmentation import AugmentationConfig, photometric
+from birdslam.training.examination import STRANGE_SEEDS
 from runtime.train import write_network
-
-FIRST_SEED = 500_000  # of the frames that ranges come of: neither learnt from nor held out
 
 
 class Frames(CalibrationDataReader):
@@ -35,7 +35,7 @@ class Frames(CalibrationDataReader):
 
     def __init__(self, size: Input, count: int) -> None:
         self._size, self._preparation = size, Preparation(size)
-        self._seeds = iter(range(FIRST_SEED, FIRST_SEED + count))
+        self._seeds = iter(range(STRANGE_SEEDS, STRANGE_SEEDS + count))
 
     def get_next(self) -> dict[str, NDArray[np.float32]] | None:
         """The next input; None at the end."""

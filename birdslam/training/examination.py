@@ -19,7 +19,7 @@ Answer = Callable[[NDArray[np.float32]], Tensors]  # (1, 3, H, W) in [-1, 1] -> 
 
 LANE_LOGITS = (-1.5, -1.2, -0.9, -0.6, -0.3, 0.0)  # of a marking; the best is shipped
 LOW_SCORE = 0.05  # nearly every box: the figures choose
-STRANGE_SEEDS = HELD_OUT_SEEDS // 2  # held out too, but the figures are of others
+STRANGE_SEEDS = HELD_OUT_SEEDS // 2  # of worlds for thresholds and int8's ranges: not learnt from, not in the figures
 
 
 def examine(
