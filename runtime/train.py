@@ -1,6 +1,6 @@
 """`make train`: the shipped network from a seed. Workers render worlds, the teacher learns, its curves stay.
 
-    python -m runtime.train --output out/train [--config FILE.toml] [--start CHECKPOINT]
+    python -m runtime.train --output out/train [--config FILE.toml] [--start CHECKPOINT...]
 
 Needs the extra [train]. Everything of a run lies in its output: `curves.csv` and `.png`, `grades.csv` (on held-out
 worlds), `checkpoint.pt`, `multitask.onnx` with its manifest. A run that was cut off goes on with the same command.
@@ -105,7 +105,7 @@ def _one_thread(_: int) -> None:
 class Training:
     """One run in one folder."""
 
-    def __init__(self, config: TrainConfig, output: Path, start: Path | None, rank: int) -> None:
+    def __init__(self, config: TrainConfig, output: Path, start: Sequence[Path], rank: int) -> None:
         self.config, self.output, self.rank = config, output, rank
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.threads)
@@ -118,8 +118,8 @@ class Training:
             state = torch.load(checkpoint, weights_only=True)
             self.teacher.load(state["teacher"])
             self.stage, self.step = state["stage"], state["step"]
-        elif start is not None:
-            self.teacher.begin(torch.load(start, weights_only=True)["teacher"])
+        elif start:
+            self.teacher.begin(*(torch.load(path, weights_only=True)["teacher"] for path in start))
 
     def run(self) -> None:
         """The stages that are left, each from the step that is left."""
@@ -132,7 +132,8 @@ class Training:
             self._save()
         if self.rank == 0:
             self._export(self._grade(self.config.stages[-1], self.stage, self.config.final_frames))
-            draw_curves(self.output)
+            if (self.output / "curves.csv").exists():  # a mean of others has none
+                draw_curves(self.output)
 
     def _learn(self, stage: Stage, number: int) -> None:
         stream = msgspec.structs.replace(
@@ -249,7 +250,7 @@ def draw_curves(output: Path) -> None:
     pyplot.close(figure)
 
 
-def _learn(rank: int, config: TrainConfig, output: Path, start: Path | None, meeting: str | None) -> None:
+def _learn(rank: int, config: TrainConfig, output: Path, start: Sequence[Path], meeting: str | None) -> None:
     """One of the processes that learn side by side."""
     if meeting is not None:
         distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=config.processes)
@@ -262,7 +263,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m runtime.train", description="train the shipped network")
     parser.add_argument("--output", type=Path, default=Path("out/train"))
     parser.add_argument("--config", type=Path, help="TOML with what differs from the defaults")
-    parser.add_argument("--start", type=Path, help="a checkpoint whose weights to begin from")
+    parser.add_argument(
+        "--start", type=Path, nargs="+", default=[], help="checkpoints to begin from: the mean of their weights"
+    )
     options = parser.parse_args(arguments)
     os.environ["NUMBA_NUM_THREADS"] = "1"  # the workers are the parallelism
     config = TrainConfig()

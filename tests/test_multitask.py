@@ -548,6 +548,25 @@ def test_borders_are_added_to_what_a_network_said_without_them() -> None:
 
 
 @needs_torch
+def test_of_several_networks_one_begins_with_the_mean_of_their_weights() -> None:
+    import torch
+
+    from birdslam.training.network import NetworkConfig
+    from birdslam.training.teacher import Teacher, TeacherConfig
+
+    torch.manual_seed(7)
+    first, second, teacher = (Teacher(TeacherConfig(), half=False) for _ in range(3))
+    teacher.begin(first.state(), second.state())
+    for network in ("network", "average"):
+        for name, mean in teacher.state()[network].items():
+            one, other = first.state()[network][name], second.state()[network][name]
+            torch.testing.assert_close(mean, 0.5 * (one + other) if mean.is_floating_point() else other)
+    narrow = Teacher(TeacherConfig(network=NetworkConfig(context=0)), half=False)
+    with pytest.raises(ValueError, match="different networks"):
+        teacher.begin(first.state(), narrow.state())
+
+
+@needs_torch
 def test_of_two_depths_that_an_outline_leaves_open_the_nearer_costs_less() -> None:
     import torch
 
@@ -583,6 +602,10 @@ def test_a_training_leaves_a_network_that_loads_and_is_done_when_asked_again(tmp
         assert load_network("multitask", ModelSpec(path=str(out / "multitask.onnx"))).role == "multitask"
     assert len((out / "curves.csv").read_text().splitlines()) == 4
     assert (out / "curves.png").stat().st_size > 1000
+    path.write_text(path.read_text().replace("steps = 3", "steps = 0"))
+    start = str(out / "checkpoint.pt")
+    main(["--config", str(path), "--output", str(tmp_path / "mean"), "--start", start, start])
+    assert load_network("multitask", ModelSpec(path=str(tmp_path / "mean" / "multitask.onnx"))).role == "multitask"
 
 
 def test_extents_tell_a_box_too_narrow_from_one_too_low() -> None:

@@ -102,13 +102,19 @@ class Teacher:
         self.average.load_state_dict(state["average"])
         self.optimiser.load_state_dict(state["optimiser"])
 
-    def begin(self, state: dict[str, Any]) -> None:
-        """Takes over the weights of another's state, as far as that network has them; the optimiser begins anew.
+    def begin(self, *states: dict[str, Any]) -> None:
+        """Takes over the weights of others' states, as far as they have them; the optimiser begins anew.
 
-        Raises ValueError where the other has weights that this network has no place for.
+        Of several it is the mean of their weights: where runs began with the same weights, noise is what differs at
+        their ends, and the mean has less of it (Wortsman et al. 2022). Raises ValueError where they have weights that
+        this network has no place for, or not the same ones.
         """
         for name in ("network", "average"):
-            strange = getattr(self, name).load_state_dict(state[name], strict=False).unexpected_keys
+            weights = [state[name] for state in states]
+            if any(other.keys() != weights[0].keys() for other in weights):
+                raise ValueError("checkpoints of different networks have no mean")
+            mean = {key: _mean([other[key] for other in weights]) for key in weights[0]}
+            strange = getattr(self, name).load_state_dict(mean, strict=False).unexpected_keys
             if strange:
                 raise ValueError(f"weights of another network: {', '.join(strange[:3])}")
 
@@ -119,6 +125,11 @@ class Teacher:
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
             outputs = self.average(torch.from_numpy(image))
         return {name: output.float().numpy() for name, output in zip(OUTPUTS, outputs, strict=True)}
+
+
+def _mean(tensors: Sequence[Tensor]) -> Tensor:
+    """Of weights; of counters the last."""
+    return torch.stack(list(tensors)).mean(dim=0) if tensors[0].is_floating_point() else tensors[-1]
 
 
 def as_tensors(examples: Examples) -> tuple[Tensor, ...]:
