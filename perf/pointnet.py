@@ -112,7 +112,10 @@ def run(arguments: list[str]) -> None:
 def measured(looks: Iterator[Look], pointnet: PointNet) -> dict[tuple[str, float, float], Errors]:
     """Errors by method and range."""
     config, localisation = PseudoLidarConfig(), LocalisationConfig()
-    methods = ("Eq. 1", "geometric fit", "Frustum-PointNet", "Eq. 1 + PointNet", "multi-task body")
+    methods = (
+        *("Eq. 1", "geometric fit", "Frustum-PointNet", "Eq. 1 + PointNet"),
+        *("multi-task body", "Eq. 1 + multi-task body"),
+    )
     found = {(method, *range_m): Errors() for method in methods for range_m in RANGES_M}
     rng = np.random.default_rng(1)
     for look in looks:
@@ -127,6 +130,9 @@ def measured(looks: Iterator[Look], pointnet: PointNet) -> dict[tuple[str, float
             "Frustum-PointNet": by_net,
             "Eq. 1 + PointNet": [combined(a, b, config) for a, b in zip(by_box, by_net, strict=True)],
             "multi-task body": look.bodies,
+            "Eq. 1 + multi-task body": [
+                None if b is None else combined(a, b, config) for a, b in zip(by_box, look.bodies, strict=True)
+            ],
         }
         for method, answers in places.items():
             for answer, truth in zip(answers, look.truth, strict=True):
