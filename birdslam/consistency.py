@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.camera import GroundPlane
 from birdslam.se2 import SE2
 from birdslam.trajectory import Pose, ego_pose, inverse, mount_pose, split_pose
-from birdslam.types import Cov3, Estimate, Status
+from birdslam.types import Estimate, Status
 
 DIMENSIONS = 3
 INSIDE_95 = 7.815  # chi-square of three degrees of freedom: 95 % of honest errors lie below
@@ -33,27 +32,30 @@ class Consistency:
 
     def __init__(self, mount: GroundPlane) -> None:
         self._mount = mount_pose(mount)
-        self._origin: Pose | None = None
-        self._stated: list[tuple[int, SE2, Cov3]] = []  # frame of the recording
+        self._begins: dict[int, tuple[int, Pose]] = {}  # of an epoch: its first frame, and T_world_ego there
+        self._stated: list[tuple[int, Estimate]] = []  # with its frame of the recording
         self._frames = 0
 
     def add(self, estimate: Estimate) -> None:
         """The next frame's estimate; what comes at the source's end is of no frame."""
         if Status.END_OF_SOURCE in estimate.status:
             return
-        if self._origin is None:
-            self._origin = ego_pose(estimate.T_world_ego, estimate.attitude)
+        self._begins.setdefault(estimate.epoch, (self._frames, ego_pose(estimate.T_world_ego, estimate.attitude)))
         if estimate.valid:
-            self._stated.append((self._frames, estimate.T_world_ego, estimate.cov))
+            self._stated.append((self._frames, estimate))
         self._frames += 1
 
     def report(self, truth: Pose) -> ConsistencyReport:
-        """Against `T_first_i` (N, 4, 4) of the camera, all frames of the recording, in its own axes."""
+        """Against `T_first_i` (N, 4, 4) of the camera, all frames of the recording, in its own axes.
+
+        Each epoch's world begins with the truth at its own first frame.
+        """
         values = []
-        for frame, T_world_ego, cov in self._stated:
-            covariance = np.reshape(cov, (DIMENSIONS, DIMENSIONS))
+        for frame, estimate in self._stated:
+            covariance = np.reshape(estimate.cov, (DIMENSIONS, DIMENSIONS))
             if np.sqrt(np.trace(covariance[:2, :2])) >= CERTAIN_M:
-                error = T_world_ego.between(self._true_ego(truth[frame])).log()
+                begin, origin = self._begins[estimate.epoch]
+                error = estimate.T_world_ego.between(self._true_ego(origin, inverse(truth[begin]) @ truth[frame])).log()
                 values.append(float(error @ np.linalg.solve(covariance, error)))
         if not values:
             return ConsistencyReport(frames=0)
@@ -63,7 +65,6 @@ class Consistency:
             inside_95=float(np.mean(np.less(values, INSIDE_95))),
         )
 
-    def _true_ego(self, T_first_cam: NDArray[np.float64]) -> SE2:
+    def _true_ego(self, origin: Pose, T_begin_cam: Pose) -> SE2:
         """The ego's pose on the road where the camera is truly: both begin as one."""
-        assert self._origin is not None
-        return split_pose(self._origin @ self._mount @ T_first_cam @ inverse(self._mount))[0]
+        return split_pose(origin @ self._mount @ T_begin_cam @ inverse(self._mount))[0]

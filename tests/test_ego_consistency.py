@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -51,6 +51,7 @@ def camera_poses(egos: list[SE2]) -> NDArray[np.float64]:
 
 
 @given(told=st.floats(0.3, 3.0), seed=st.integers(0, 2**32 - 1))
+@example(told=1.0, seed=0)
 @settings(max_examples=20, deadline=None)
 def test_an_honest_covariance_has_a_nees_of_one_and_a_narrower_one_more(told: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -82,6 +83,16 @@ def test_what_is_invalid_or_certain_or_of_no_frame_is_not_held_to_the_truth() ->
     report = consistency.report(camera_poses(egos))
     assert (report.frames, report.inside_95) == (2, 1.0)
     assert report.nees == pytest.approx(0.5 / 3.0, rel=1e-6)
+
+
+def test_a_new_epoch_begins_at_the_truth() -> None:
+    egos = way(6)
+    again = SE2(1.0, 2.0, -0.4)  # where the second world has the ego at its begin
+    consistency = Consistency(MOUNT)
+    for index, ego in enumerate(egos):
+        epoch, pose = (0, ego) if index < 3 else (1, again @ egos[3].between(ego))
+        consistency.add(estimate(index, pose, np.eye(3), epoch=epoch))
+    assert consistency.report(camera_poses(egos)).nees == pytest.approx(0.0, abs=1e-9)
 
 
 def test_nothing_stated_is_nothing_judged() -> None:
