@@ -4,8 +4,8 @@
 
 `noisy`: the worlds' exact depth with the errors that depth networks make, in the bodies' own boxes, drawn a little
 wrong. `network`: depth and boxes as the shipped multi-task network finds them in the image. Eq. 1 stands on the true
-road, its pitch off by PITCH_ERROR_RAD; it knows no yaw and takes the vehicle to be headed as the ego, as a track
-begins. Needs the extra [train].
+road, its pitch off by PITCH_ERROR_RAD; it takes the vehicle to be headed as the ego, as a track begins without a look
+at its front, and with a multi-task body as that one says. Needs the extra [train].
 """
 
 from __future__ import annotations
@@ -81,6 +81,7 @@ class Look:
     seen: list[Observation]
     truth: list[WorldObject]
     bodies: list[DepthPlace | None]  # as the multi-task network says
+    localisation: LocalisationConfig  # with what the network says of its boxes' edges
 
 
 def run(arguments: list[str]) -> None:
@@ -111,7 +112,7 @@ def run(arguments: list[str]) -> None:
 
 def measured(looks: Iterator[Look], pointnet: PointNet) -> dict[tuple[str, float, float], Errors]:
     """Errors by method and range."""
-    config, localisation = PseudoLidarConfig(), LocalisationConfig()
+    config = PseudoLidarConfig()
     methods = (
         *("Eq. 1", "geometric fit", "Frustum-PointNet", "Eq. 1 + PointNet"),
         *("multi-task body", "Eq. 1 + multi-task body"),
@@ -122,7 +123,11 @@ def measured(looks: Iterator[Look], pointnet: PointNet) -> dict[tuple[str, float
         camera, true = look.frame.camera, look.frame.camera.ground
         pitch_rad = true.pitch_rad + float(rng.normal(0.0, PITCH_ERROR_RAD))
         ground = GroundPlane(true.height_m, pitch_rad, true.roll_rad)
-        by_box = [by_bottom(o, ground, localisation) for o in look.seen]
+        by_box = [by_bottom(o, ground, look.localisation) for o in look.seen]
+        headed = [
+            by_bottom(o, ground, look.localisation, body.yaw_rad if body is not None and body.front_seen else 0.0)
+            for o, body in zip(look.seen, look.bodies, strict=True)
+        ]
         by_net = localise_by_depth(look.seen, look.depth, camera, ground, config, network=pointnet)
         places: dict[str, Sequence[DepthPlace | Place | None]] = {
             "Eq. 1": by_box,
@@ -131,7 +136,7 @@ def measured(looks: Iterator[Look], pointnet: PointNet) -> dict[tuple[str, float
             "Eq. 1 + PointNet": [combined(a, b, config) for a, b in zip(by_box, by_net, strict=True)],
             "multi-task body": look.bodies,
             "Eq. 1 + multi-task body": [
-                None if b is None else combined(a, b, config) for a, b in zip(by_box, look.bodies, strict=True)
+                None if b is None else combined(a, b, config) for a, b in zip(headed, look.bodies, strict=True)
             ],
         }
         for method, answers in places.items():
@@ -159,18 +164,21 @@ def _count(
             errors.flipped.append(turn > math.pi / 2.0)
 
 
-def by_bottom(seen: Observation, ground: GroundPlane, config: LocalisationConfig) -> Place:
-    """Eq. 1 on the bottom edge of the box; the noise of its edge and of the pitch."""
+def by_bottom(seen: Observation, ground: GroundPlane, config: LocalisationConfig, yaw_rad: float = 0.0) -> Place:
+    """Eq. 1 on the bottom edge of the box of a vehicle with a yaw in ego; the noise of its edge and of the pitch."""
     slope = max(seen.slope_bottom, 1e-3)
     sigma = math.hypot(seen.sigma_bottom, PITCH_ERROR_RAD) / slope
-    return place(seen, math.log(ground.height_m / slope), sigma**2, 0.0, config)
+    return place(seen, math.log(ground.height_m / slope), sigma**2, yaw_rad, config)
 
 
 def _observed(
-    frame: WorldFrame, boxes_px: NDArray[np.float64], labels: Sequence[str], truth: Sequence[WorldObject]
+    frame: WorldFrame,
+    boxes_px: NDArray[np.float64],
+    labels: Sequence[str],
+    truth: Sequence[WorldObject],
+    config: LocalisationConfig,
 ) -> tuple[list[Observation], list[WorldObject], list[int]]:
     """What `localise` makes of boxes, with truth and rows that go with it."""
-    config = LocalisationConfig()
     seen = localise(boxes_px, np.full(len(boxes_px), 0.9), tuple(labels), frame.camera, frame.camera.ground, config)
     rows = [int(np.abs(boxes_px - np.array(o.box_px)).sum(axis=1).argmin()) for o in seen]
     return seen, [truth[row] for row in rows], rows
@@ -189,7 +197,7 @@ def _noisy(frames: int) -> Iterator[Look]:
         frustum_example,
     )
 
-    config, errors = FrustumConfig(), DepthErrorConfig()
+    config, errors, localisation = FrustumConfig(), DepthErrorConfig(), LocalisationConfig()
     for seed in range(FIRST_SEED, FIRST_SEED + frames):
         rng, frame = np.random.default_rng(seed), sample(seed, *MAP_PX)
         for body in chosen(frame, config):
@@ -198,9 +206,9 @@ def _noisy(frames: int) -> Iterator[Look]:
             rows, columns = (slice(at, at + n) for at, n in zip(example.corner, example.own.shape, strict=True))
             depth_m[rows, columns] = erred(example, errors, rng)
             box_px = box_of(example, errors, rng)[None]
-            seen, truth, _ = _observed(frame, box_px, [body.label], [body])
+            seen, truth, _ = _observed(frame, box_px, [body.label], [body], localisation)
             if seen:
-                yield Look(frame, DepthMap(depth_m, *MAP_PX), seen, truth, [None] * len(seen))
+                yield Look(frame, DepthMap(depth_m, *MAP_PX), seen, truth, [None] * len(seen), localisation)
 
 
 def _seen_by(network: Network, frames: int) -> Iterator[Look]:
@@ -217,9 +225,11 @@ def _seen_by(network: Network, frames: int) -> Iterator[Look]:
         overlap = iou(boxes, np.array([v.box_px for v in vehicles]))
         rows = [row for row in range(len(boxes)) if overlap[row].max() >= SAME_IOU]
         labels = [found.detections.labels[row] for row in rows]
-        seen, truth, kept = _observed(frame, boxes[rows], labels, [vehicles[overlap[row].argmax()] for row in rows])
+        localisation = LocalisationConfig().told(found.detections.edge_sigma)
+        matched = [vehicles[overlap[row].argmax()] for row in rows]
+        seen, truth, kept = _observed(frame, boxes[rows], labels, matched, localisation)
         bodies = found.detections.boxes3d
         said: list[DepthPlace | None] = [None] * len(seen)
         if bodies is not None and seen:
             said = places_of(bodies.take([rows[i] for i in kept]), seen, frame.camera, frame.camera.ground)
-        yield Look(frame, found.depth, seen, truth, said)
+        yield Look(frame, found.depth, seen, truth, said, localisation)
