@@ -23,6 +23,7 @@ from runtime.recording import Alive, RecordingWriter
 from runtime.restarts import FIRST, Assignment, Resume
 from runtime.wire import Stage, Trace
 
+DISK_S = 20.0
 CAMERA = Camera(640, 192, 360.0, 360.0, 320.0, 96.0, 1.65)
 
 
@@ -147,6 +148,13 @@ class Tape:
         )
         self.take(self.send(ended))
         self.close()
+
+    def killed(self, path: Path) -> None:
+        """Copies what a recorder that is killed now leaves, the disk having caught up with what it was handed."""
+        file = self.writer._file
+        with file._changed:
+            assert file._changed.wait_for(lambda: not file._waiting_bytes, DISK_S), "the disk does not catch up"
+        path.write_bytes(self.path.read_bytes())
 
     def close(self) -> None:
         self.writer.close({})

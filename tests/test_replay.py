@@ -235,7 +235,7 @@ def test_the_last_estimates_of_a_file_that_was_cut_off_may_have_come_before_thei
         tape.frame(measurements)
         tape.take(tape.send(measurements, recorded=False))
     cut = tmp_path / "cut.mcap"
-    cut.write_bytes(tape.path.read_bytes())
+    tape.killed(cut)
     verdict = compare(Recording(cut))
     assert verdict.same
     assert (verdict.equal, verdict.unknown, verdict.open_end) == (10, 0, 2)
