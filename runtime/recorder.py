@@ -93,6 +93,7 @@ class Recorder:
         self._end_measured = False  # the measurements of it have come: another link, which may be the slower one
         self._map_frame = -1
         self._estimate_frame = -1
+        self._handed: deque[tuple[int, int]] = deque()  # the file's length with them, and the frame that is next
         self._missed = 0  # frames between the last on the disk of the recorder before this one, and this one's first
         self._checkpoints: Path | None = None  # where a file that begins in the middle of a drive finds its graph
         if assignment.restarts:
@@ -122,7 +123,9 @@ class Recorder:
         self._vitals.count(frames=self._writer.messages, torn=self.torn, **self._counters())
         self._vitals.beat()
         if self._writer.flush_if_due(now_ns):
-            self._vitals.count(next_frame=self._estimate_frame + 1)
+            self._handed.append((self._writer.handed_bytes, self._estimate_frame + 1))
+        while self._handed and self._handed[0][0] <= self._writer.written_bytes:
+            self._vitals.count(next_frame=self._handed.popleft()[1])
         return bool(heard)
 
     def _begin_from_checkpoint(self, path: Path, first_frame: int, now_ns: int) -> None:

@@ -147,6 +147,11 @@ class RecordingWriter:
         """That are in the file."""
         return self._file.written_bytes
 
+    @property
+    def handed_bytes(self) -> int:
+        """That were handed to the disk; so many are written once it has caught up."""
+        return self._pending.taken_bytes
+
     def add(self, topic: str, record: msgspec.Struct, t_ns: int, trace: Trace | None = None) -> None:
         """A record of the bus, received at `t_ns`, and its trace where the topic has one recorded."""
         self._add(f"v1/{topic}", encode(record), t_ns)
@@ -190,15 +195,15 @@ class _Pending(io.BytesIO):
 
     def __init__(self) -> None:
         super().__init__()
-        self._taken_bytes = 0
+        self.taken_bytes = 0
 
     def tell(self) -> int:
-        return self._taken_bytes + super().tell()
+        return self.taken_bytes + super().tell()
 
     def take(self) -> bytes:
         """All of it; the file goes on behind."""
         piece = self.getvalue()
-        self._taken_bytes += len(piece)
+        self.taken_bytes += len(piece)
         self.seek(0)
         self.truncate()
         return piece

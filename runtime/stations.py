@@ -27,12 +27,16 @@ class Hearing:
         self._sent = self._taken = -1
         self._since_s = 0.0
 
-    def missed(self, sent: int, taken: int, now_s: float, limit_s: float) -> int:
-        """How many records in a row, where that has gone on for too long; else 0. Counters that fall begin anew."""
+    def missed(self, sent: int, taken: int, silent_s: float, now_s: float, limit_s: float) -> int:
+        """How many records in a row, where that has gone on for too long; else 0. Counters that fall begin anew.
+
+        A loop that has not beaten for half the limit is not deaf, it may be about to count as stalled.
+        """
         if taken != self._taken or sent < self._sent:
             self._sent, self._taken, self._since_s = sent, taken, now_s
         missed = sent - self._sent
-        return missed if missed >= DEAF_RECORDS and now_s - self._since_s > limit_s else 0
+        late = now_s - self._since_s > limit_s and silent_s <= limit_s / 2.0
+        return missed if missed >= DEAF_RECORDS and late else 0
 
 
 class Station:
@@ -100,17 +104,19 @@ class Station:
     def stalled(self, before: Station | None) -> str:
         """Why the process at work is to be ended, or nothing; `before` is the node that sends to it."""
         runtime, process = self._config.runtime, self.process
+        limit_s, now_s = runtime.watchdog_ms / 1e3, time.monotonic()
         if process.exit_status is not None or process.begun_s is None or self._kill_s is not None:
             return ""
-        if process.silent_s() * 1e3 > runtime.watchdog_ms:
+        silent_s = process.silent_s()
+        if silent_s > limit_s:
             return f"is stalled: its loop has shown no life for {runtime.watchdog_ms:g} ms"
         if before is not None and process.ready:
             sent = before.process.vitals["frames"]
             taken = sum(process.vitals[counter] for counter in ("frames", "torn", "outrun"))
-            missed = self._hearing.missed(sent, taken, time.monotonic(), runtime.watchdog_ms / 1e3)
+            missed = self._hearing.missed(sent, taken, silent_s, now_s, limit_s)
             if missed:
                 return f"is deaf: has taken up none of the last {missed} frames of {before.name}"
-        waited_s = time.monotonic() - process.begun_s
+        waited_s = now_s - process.begun_s
         if not process.ready and waited_s > runtime.ready_timeout_s + runtime.stop_timeout_s:
             return f"was not ready within {waited_s:.0f} s"
         return ""

@@ -25,7 +25,7 @@ from runtime.configuration import Configuration, ConfigurationError, RecordingCo
 from runtime.foxglove import CompressedImage, schema
 from runtime.recorder import about
 from runtime.recorder_station import choose_file
-from runtime.recording import JSON_CHANNELS, Recorded, Recording, RecordingError, RecordingWriter
+from runtime.recording import JSON_CHANNELS, Alive, Recorded, Recording, RecordingError, RecordingWriter
 from runtime.replay import compare
 from runtime.sources import open_source
 from runtime.wire import Health, decode, encode
@@ -209,6 +209,18 @@ def test_who_writes_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: pyte
     os.write(wrote, bytes(100))
     file.close()
     assert (tmp_path / "file").stat().st_size == 50_000
+
+
+def test_what_the_disk_has_not_taken_is_not_counted_as_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read, wrote = os.pipe()
+    monkeypatch.setattr(appendonly.os, "fdatasync", lambda fd: os.read(read, 1))
+    writer = RecordingWriter(tmp_path / "a.mcap", about(Configuration(), {}), None, 100.0)
+    writer.draw("/alive", Alive(node="optimize", alive=True), 1)
+    assert writer.flush_if_due(1)
+    assert writer.handed_bytes > writer.written_bytes
+    os.write(wrote, bytes(100))
+    writer.close({})
+    assert writer.handed_bytes == writer.written_bytes == (tmp_path / "a.mcap").stat().st_size
 
 
 def test_recordings_are_never_overwritten(tmp_path: Path) -> None:
