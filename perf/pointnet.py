@@ -27,6 +27,7 @@ from birdslam.localisation import LocalisationConfig, Observation, Place, iou, l
 from birdslam.perception import DepthMap, ModelError, ModelSpec, Network, load_network
 from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perception.pointnet import PointNet, load_pointnet
+from birdslam.placing import Body
 from birdslam.pseudolidar import localise_by_depth, places_of
 from birdslam.se2 import SE2
 from perf.errors import PerfError
@@ -125,7 +126,7 @@ def measured(looks: Iterator[Look], pointnet: PointNet) -> dict[tuple[str, float
         ground = GroundPlane(true.height_m, pitch_rad, true.roll_rad)
         by_box = [by_bottom(o, ground, look.localisation) for o in look.seen]
         headed = [
-            by_bottom(o, ground, look.localisation, body.yaw_rad if body is not None and body.front_seen else 0.0)
+            by_bottom(o, ground, look.localisation, Body(0, None, o, body).yaw_rad(SE2()))
             for o, body in zip(look.seen, look.bodies, strict=True)
         ]
         by_net = localise_by_depth(look.seen, look.depth, camera, ground, config, network=pointnet)
