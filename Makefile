@@ -43,10 +43,10 @@ perf: setup
 
 # The shipped networks from their seed, on the built-in world alone: hours on four cores; what was begun goes on
 train: $(TRAIN_VENV)/.ready
-	$(TRAIN_VENV)/bin/python -m runtime.train --output out/train
-	$(TRAIN_VENV)/bin/python -m runtime.quantise out/train/multitask.onnx
-	$(TRAIN_VENV)/bin/python -m runtime.train_lanes
-	$(TRAIN_VENV)/bin/python -m runtime.train_pointnet --output out/train/pointnet --ship
+	$(TRAIN_VENV)/bin/python -m birdslam.runtime.training.train --output out/train
+	$(TRAIN_VENV)/bin/python -m birdslam.runtime.training.quantise out/train/multitask.onnx
+	$(TRAIN_VENV)/bin/python -m birdslam.runtime.training.train_lanes
+	$(TRAIN_VENV)/bin/python -m birdslam.runtime.training.train_pointnet --output out/train/pointnet --ship
 	cp out/train/multitask.onnx out/train/multitask.toml out/train/multitask_int8.onnx out/train/multitask_int8.toml birdslam/perception/shipped/
 
 $(TRAIN_VENV)/.ready: pyproject.toml

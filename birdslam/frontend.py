@@ -9,30 +9,23 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera, GroundPlane
-from birdslam.depthplace import PseudoLidarConfig
-from birdslam.heightwatch import HeightWatch, HeightWatchConfig
-from birdslam.hindsight import Hindsight, HindsightConfig, Moment
-from birdslam.horizon import Horizon, HorizonConfig
-from birdslam.lane_edges import LaneEdgesConfig
-from birdslam.lane_mapper import LaneHead, LaneMapper
-from birdslam.lanes import LanesConfig
-from birdslam.localisation import LocalisationConfig
-from birdslam.odometry import Motion, Odometry, OdometryConfig
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
+from birdslam.mapping.lane_edges import LaneEdgesConfig
+from birdslam.mapping.lane_mapper import LaneHead, LaneMapper
+from birdslam.mapping.lanes import LanesConfig
+from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
 from birdslam.perception import Perception
-from birdslam.pseudolidar import FrustumNetwork
-from birdslam.se2 import SE2
-from birdslam.static_map import StaticMapConfig, landmark_edges
-from birdslam.tracking import Tracker, TrackingConfig
-from birdslam.types import (
-    Attitude,
-    EgoEdge,
-    Frame,
-    Ground,
-    Measurements,
-    Status,
-)
-from birdslam.vehicle_edges import Present, vehicle_edges
+from birdslam.types import Attitude, EgoEdge, Frame, Ground, Measurements, Status
+from birdslam.vehicles.depth_fusion import PseudoLidarConfig
+from birdslam.vehicles.ground_size_filter import Horizon, HorizonConfig
+from birdslam.vehicles.height_watch import HeightWatch, HeightWatchConfig
+from birdslam.vehicles.localisation import LocalisationConfig
+from birdslam.vehicles.out_of_sequence import Hindsight, HindsightConfig, Moment
+from birdslam.vehicles.pseudolidar import FrustumNetwork
+from birdslam.vehicles.tracking import Tracker, TrackingConfig
+from birdslam.vehicles.vehicle_edges import Present, vehicle_edges
 
 
 class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

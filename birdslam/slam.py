@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import msgspec
 
-from birdslam.camera import Camera
 from birdslam.frontend import FrontEnd, FrontEndConfig
-from birdslam.graph import GraphConfig, PoseGraph
-from birdslam.lane_mapper import LaneHead
+from birdslam.geometry.camera import Camera
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.mapping.lane_mapper import LaneHead
 from birdslam.perception import Networks
-from birdslam.pseudolidar import FrustumNetwork
 from birdslam.types import Estimate, Frame, MapUpdate, Measurements
-from birdslam.weights import WeightsConfig
+from birdslam.vehicles.pseudolidar import FrustumNetwork
 
 
 class SlamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

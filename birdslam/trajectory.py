@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from birdslam.camera import GroundPlane
-from birdslam.se2 import SE2
+from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.se2 import SE2
 from birdslam.types import Attitude
 
 Pose = NDArray[np.float64]  # (4, 4) homogeneous, metres

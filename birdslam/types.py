@@ -30,7 +30,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.se2 import SE2
+from birdslam.geometry.se2 import SE2
 from birdslam.status import INVALIDATING as INVALIDATING
 from birdslam.status import Status as Status
 
@@ -87,7 +87,7 @@ class FrameRef(msgspec.Struct, frozen=True, kw_only=True):
     t_capture_ns: int
     t_utc_ns: int
     slot: int = -1  # of the ring
-    sequence: int = 0  # the slot's sequence number when the frame was written (see runtime/frames.py)
+    sequence: int = 0  # the slot's sequence number when the frame was written (see runtime/transport/ring.py)
     ring_epoch: int = 0  # which incarnation of the ring
     width_px: int = 0  # of the image
     height_px: int = 0

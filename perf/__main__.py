@@ -7,18 +7,18 @@ import os
 import pkgutil
 import sys
 
-import perf
-from runtime.cli import ENVIRONMENT, INTERRUPTED_STATUS, USER_ERROR_STATUS
+from birdslam import perf
+from birdslam.runtime.environment import ENVIRONMENT, INTERRUPTED_STATUS, USER_ERROR_STATUS
 
 
 def main(arguments: list[str]) -> int:
     os.environ.update(ENVIRONMENT)  # before numpy is loaded: computes as the nodes do
-    from perf.errors import PerfError  # and what loads numpy only now
+    from birdslam.perf.errors import PerfError  # and what loads numpy only now
 
     names = [module.name for module in pkgutil.iter_modules(perf.__path__) if module.name[0] != "_"]
     wanted = arguments[:1] if arguments and arguments[0] in names else names  # one that is named needs no other
-    modules = [importlib.import_module(f"perf.{name}") for name in wanted]
-    benchmarks = {module.__name__.removeprefix("perf."): module for module in modules if hasattr(module, "label")}
+    modules = [importlib.import_module(f"{perf.__name__}.{name}") for name in wanted]
+    benchmarks = {module.__name__.rpartition(".")[2]: module for module in modules if hasattr(module, "label")}
     if arguments and arguments[0] in benchmarks:
         try:
             status: int | None = benchmarks[arguments[0]].run(arguments[1:])

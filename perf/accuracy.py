@@ -22,15 +22,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from birdslam.datasets import DatasetError, Recording, open_recording
-from birdslam.evaluation import OdometryReport, compare, from_first, in_camera0
-from birdslam.tracking_evaluation import EGO as EGO_BODY
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import DatasetError, Recording
+from birdslam.evaluation.odometry import OdometryReport, compare, from_first, in_camera0
+from birdslam.evaluation.tracking import EGO as EGO_BODY
+from birdslam.perf.errors import PerfError
+from birdslam.perf.figures import Ledger, numbers, spread
+from birdslam.perf.live import Ask, add_run_options, drive
+from birdslam.perf.machine import loaded
+from birdslam.perf.system import age_of
 from birdslam.trajectory import as_poses, read_kitti
-from perf.errors import PerfError
-from perf.figures import Ledger, numbers, spread
-from perf.live import Ask, add_run_options, drive
-from perf.machine import loaded
-from perf.system import age_of
 
 label = "errors of ego, vehicles and places offline, beside the live run under real-time load"
 
@@ -114,7 +115,7 @@ def _offline(options: argparse.Namespace, source: str, recording: Recording) -> 
 
 
 def _birdslam(*arguments: str) -> None:
-    command = [sys.executable, "-m", "runtime.cli", *arguments]
+    command = [sys.executable, "-m", "birdslam.runtime.cli.main", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise PerfError(done.stderr.strip())

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from perf import report
-from perf.figures import write_json
-from perf.machine import ROOT, describe
+from birdslam.perf import report
+from birdslam.perf.figures import write_json
+from birdslam.perf.machine import ROOT, describe
 
 label = "every benchmark, and their report"
 
@@ -108,7 +108,7 @@ def _run(step: Step, options: argparse.Namespace) -> str:
     """How it ended. What it prints goes to the terminal as it comes."""
     file = options.output / f"{step.file}.json"
     file.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "perf", step.benchmark, "--output", str(file)]
+    command = [sys.executable, "-m", "birdslam.perf", step.benchmark, "--output", str(file)]
     command += shlex.split(step.thorough if options.thorough else step.quick)
     if step.on == "source":
         command += ["--source", options.source, *(part for model in options.model for part in ("--model", model))]

@@ -20,10 +20,10 @@ from typing import Any, Protocol
 import numpy as np
 import zenoh
 
+from birdslam.runtime.transport.bus import Bus, BusClosed, Message
+from birdslam.runtime.transport.ring import FrameReader, FrameRing
+from birdslam.runtime.wire import Stage, Trace
 from birdslam.types import FrameRef, MapUpdate
-from runtime.bus import Bus, BusClosed, Message
-from runtime.frames import FrameReader, FrameRing
-from runtime.wire import Stage, Trace
 
 _STAMP = struct.Struct("<qq")  # when it was sent (CLOCK_MONOTONIC ns), and which it is
 _LENGTH = struct.Struct("<I")
@@ -54,7 +54,7 @@ def _shape(size: int) -> tuple[int, int, int]:
 
 
 class _RingListener:
-    """The pixels in shared memory, a FrameRef over zenoh: what capture and perceive do (runtime/frames.py, bus.py)."""
+    """The pixels in shared memory, a FrameRef over zenoh: what capture and perceive do (runtime/transport)."""
 
     def __init__(self, place: Path, size: int, arrived: Arrived) -> None:
         self._bus = Bus(_VEHICLE, "supervisor", hub=True, runtime_dir=place)

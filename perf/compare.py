@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.stats import binomtest, false_discovery_control, mannwhitneyu
 
-from perf.errors import PerfError
+from birdslam.perf.errors import PerfError
 
 label = "two reports: better, worse or not distinguishable"
 

@@ -21,19 +21,19 @@ import msgspec
 import numpy as np
 import psutil
 
+from birdslam.perf.errors import PerfError
+from birdslam.perf.figures import curve, noise, spread
+from birdslam.perf.machine import Steal
+from birdslam.runtime.configuration import Configuration, complete, load, parse_setting
+from birdslam.runtime.latency import stages
+from birdslam.runtime.nodes.capture import stamps
+from birdslam.runtime.nodes.sources import open_source
+from birdslam.runtime.process.restarts import FIRST
+from birdslam.runtime.supervision.processes import NodeLog, NodeProcess
+from birdslam.runtime.transport.bus import Bus, Message, Subscriber
+from birdslam.runtime.wire import Trace
 from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.types import FrameRef, Measurements
-from perf.errors import PerfError
-from perf.figures import curve, noise, spread
-from perf.machine import Steal
-from runtime.bus import Bus, Message, Subscriber
-from runtime.capture import stamps
-from runtime.configuration import Configuration, complete, load, parse_setting
-from runtime.latency import stages
-from runtime.processes import NodeLog, NodeProcess
-from runtime.restarts import FIRST
-from runtime.sources import open_source
-from runtime.wire import Trace
 
 _VEHICLE = "perf"
 _READY_S = 60.0

@@ -16,11 +16,11 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from birdslam.perf.faulty_vehicle import PATIENCE_S, Vehicle, ends_with_its_vehicle, model_options, record_options
+from birdslam.perf.street import FRAME_M
+from birdslam.perf.strikes import FAULTS, Fault
+from birdslam.perf.witness import Witness
 from birdslam.types import Estimate
-from perf.faulty_vehicle import PATIENCE_S, Vehicle, ends_with_its_vehicle, model_options, record_options
-from perf.street import FRAME_M
-from perf.strikes import FAULTS, Fault
-from perf.witness import Witness
 
 BEFORE_S, AFTER_S = 0.3, 1.5  # the witness looks on so long before and after, for a wrong pose that comes late
 

@@ -21,11 +21,11 @@ from typing import Self
 import numpy as np
 import psutil
 
+from birdslam.perf.street import F_PX, FRAME_M, HEIGHT_M, HEIGHT_PX, WIDTH_PX, street_loop
+from birdslam.runtime.client import Planner
+from birdslam.runtime.process.vitals import COUNTERS
+from birdslam.runtime.topology import NODES, PROCESSES
 from birdslam.types import Estimate
-from perf.street import F_PX, FRAME_M, HEIGHT_M, HEIGHT_PX, WIDTH_PX, street_loop
-from runtime.client import Planner
-from runtime.topology import NODES, PROCESSES
-from runtime.vitals import COUNTERS
 
 ROOT = Path(__file__).resolve().parent.parent
 RATE_HZ = 15.0
@@ -82,7 +82,7 @@ class Vehicle:
         with (self.place / "run.log").open("ab") as log:
             self.process = subprocess.Popen(
                 [
-                    *(sys.executable, "-P", "-m", "runtime.cli", "run", *self._input),
+                    *(sys.executable, "-P", "-m", "birdslam.runtime.cli.main", "run", *self._input),
                     *("--vehicle", self.vehicle, "--output", str(self.output)),
                     *(part for key, value in settings.items() for part in ("--set", f"{key}={value}")),
                     *self._options,
@@ -171,7 +171,7 @@ def _is_node(process: psutil.Process, name: str) -> bool:
 
 
 def _is_prepared(process: psutil.Process) -> bool:
-    """By the counters that it shares with its supervisor (runtime/vitals.py); a recorder never is."""
+    """By the counters that it shares with its supervisor (runtime/process/vitals.py); a recorder never is."""
     try:
         for descriptor in Path(f"/proc/{process.pid}/fd").iterdir():
             if VITALS in os.readlink(descriptor):

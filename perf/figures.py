@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perf.machine import Steal, describe
+from birdslam.perf.machine import Steal, describe
 
 BLOCKS = 10  # a series is cut into so many pieces one after the other; how they differ is its noise
 _LEVELS = (0.0, 1.0, 5.0, *range(10, 91, 10), 95.0, 98.0, 99.0, 99.5, 99.9, 99.99)  # percent, for the plots

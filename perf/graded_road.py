@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
 
 Floats = NDArray[np.float64]
 

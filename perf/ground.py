@@ -28,21 +28,22 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam import bev
-from birdslam.camera import Camera, GroundPlane
-from birdslam.datasets import DatasetError, Recording, open_recording
-from birdslam.evaluation import path_length_m
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import DatasetError, Recording
+from birdslam.evaluation.odometry import path_length_m
+from birdslam.evaluation.results import claim_directory
 from birdslam.frontend import FrontEnd, FrontEndConfig, Pending
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.pose import rotation_exp
+from birdslam.odometry.road_filter import RoadScaleConfig
 from birdslam.perception import Perception, Ready
-from birdslam.pose import rotation_exp
-from birdslam.results import claim_directory
-from birdslam.roadfilter import RoadScaleConfig
+from birdslam.perf.errors import PerfError
+from birdslam.perf.graded_road import GradedRoad, Stand
+from birdslam.runtime.configuration import Configuration, SourceConfig, load
+from birdslam.runtime.nodes.inference import Inference
 from birdslam.trajectory import as_poses
 from birdslam.types import Frame, Measurements
-from perf.errors import PerfError
-from perf.graded_road import GradedRoad, Stand
-from runtime.configuration import Configuration, SourceConfig, load
-from runtime.inference import Inference
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -29,14 +29,14 @@ import numpy as np
 from birdslam.baselines import batch_se2, batch_se3, nair
 from birdslam.baselines.batch_se2 import Solution
 from birdslam.baselines.trajectories import Trajectories
-from birdslam.camera import Camera
-from birdslam.graph import GraphConfig, PoseGraph
-from birdslam.se2 import SE2
+from birdslam.evaluation.tracking import PAPER, ours
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
 from birdslam.simulation.drive import Drive, DriveConfig, drive
 from birdslam.slam import SlamConfig
-from birdslam.tracking_evaluation import PAPER, ours
 from birdslam.types import Measurements
-from birdslam.weights import WeightsConfig
 
 label = "batch over incremental: time and accuracy on one sequence"
 

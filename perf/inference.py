@@ -3,7 +3,7 @@
     python -m perf inference [--source kitti:DIR] [--model detector=F.onnx --model segmenter=G.onnx] [--output F.json]
 
 Without `--model` these are the shipped ones, int8 and fp32. A network alone takes frame after frame. The perceive step
-is the product's (runtime/inference.py and FrontEnd), paced at `--rate` with the deadline and the schedule of the
+is the product's (runtime/nodes/inference.py and FrontEnd), paced at `--rate` with the deadline and the schedule of the
 configuration: networks that are carried don't hold it up. A quantised network is one more `--model` of its role.
 """
 
@@ -25,14 +25,14 @@ from numpy.typing import NDArray
 from birdslam.perception import ModelError, ModelSpec, Network, load_network
 from birdslam.perception.completion import GridCompletion
 from birdslam.perception.manifest import SHIPPED_NETWORKS
+from birdslam.perf.errors import PerfError
+from birdslam.perf.figures import Ledger, curve, noise, numbers, shown, spread
+from birdslam.perf.live import add_run_options
+from birdslam.runtime.configuration import Configuration, ConfigurationError, complete, load, parse_setting
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.runtime.nodes.nodes import front_end
+from birdslam.runtime.nodes.sources import SourceError, offline_frames, open_source
 from birdslam.types import Frame
-from perf.errors import PerfError
-from perf.figures import Ledger, curve, noise, numbers, shown, spread
-from perf.live import add_run_options
-from runtime.configuration import Configuration, ConfigurationError, complete, load, parse_setting
-from runtime.inference import Inference
-from runtime.nodes import front_end
-from runtime.sources import SourceError, offline_frames, open_source
 
 label = "every network, and the whole perceive step, by threads"
 

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.lanes import BOUNDARY, ROAD, LanesConfig
+from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig
 from birdslam.perception.completion import SHIPPED, GridCompletion
-from perf.errors import PerfError
+from birdslam.perf.errors import PerfError
 
 label = "amodal lanes in bird's-eye view, with and without their completion"
 
@@ -36,8 +36,8 @@ def overlap(grids: NDArray[np.float32], truth: NDArray[np.float32], config: Lane
 def measure(drives: int, path: Path = SHIPPED) -> dict[str, Any]:
     """IoU of `raw` and `completed` grids over `drives` worlds that no training saw."""
     try:
-        from runtime.train_lanes import HELD_OUT
-        from runtime.train_lanes import drives as render
+        from birdslam.runtime.training.train_lanes import HELD_OUT
+        from birdslam.runtime.training.train_lanes import drives as render
     except ImportError as error:
         raise PerfError(f"the built-in world needs the extra [train] ({error})") from error
     config = LanesConfig()

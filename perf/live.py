@@ -19,11 +19,11 @@ from typing import Any, Self
 import msgspec
 import psutil
 
+from birdslam.perf.errors import PerfError
+from birdslam.runtime.client import Planner
+from birdslam.runtime.topology import NODES
+from birdslam.runtime.transport.bus import Message
 from birdslam.types import Status
-from perf.errors import PerfError
-from runtime.bus import Message
-from runtime.client import Planner
-from runtime.topology import NODES
 
 START_S, END_S = 90.0, 120.0  # the shipped drive is graded and filmed at its end
 _SAMPLE_S = 1.0
@@ -53,7 +53,7 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
             *self.settings,
         ]
         return [
-            *(sys.executable, "-m", "runtime.cli", "run", *([self.config] if self.config else [])),
+            *(sys.executable, "-m", "birdslam.runtime.cli.main", "run", *([self.config] if self.config else [])),
             *("--source", self.source, "--rate", str(self.rate), "--vehicle", _VEHICLE, "--output", str(place / "out")),
             *(part for model in self.models for part in ("--model", model)),
             *(part for setting in settings for part in ("--set", setting)),
@@ -178,7 +178,16 @@ def _sample(pid: int, now_s: float, with_pss: bool) -> Sample:
 @contextlib.contextmanager
 def _planners(count: int, runtime_dir: Path) -> Iterator[None]:
     """Further planners in processes of their own, which take every estimate."""
-    command = [sys.executable, "-m", "runtime.cli", "listen", "--vehicle", _VEHICLE, "--runtime-dir", str(runtime_dir)]
+    command = [
+        sys.executable,
+        "-m",
+        "birdslam.runtime.cli.main",
+        "listen",
+        "--vehicle",
+        _VEHICLE,
+        "--runtime-dir",
+        str(runtime_dir),
+    ]
     others = [
         subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
         for _ in range(count)

@@ -15,7 +15,7 @@ from typing import Any
 
 import psutil
 
-from runtime.report import LIBRARIES
+from birdslam.runtime.environment import LIBRARIES
 
 ROOT = Path(__file__).resolve().parent.parent
 _STEAL = 7  # of /proc/stat's columns: user nice system idle iowait irq softirq steal guest guest_nice

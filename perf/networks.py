@@ -21,15 +21,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera
-from birdslam.datasets import DatasetError, open_recording
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import DatasetError
+from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections, Findings, ModelError, ModelSpec, Network, load_network
 from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perception.multitask import MultiTaskDecoder
+from birdslam.perf.errors import PerfError
+from birdslam.perf.figures import Ledger
+from birdslam.runtime.configuration import SHIPPED_MULTITASK
 from birdslam.training.grading import LONG, Grades, box_ious, extents, overlap
-from perf.errors import PerfError
-from perf.figures import Ledger
-from runtime.configuration import SHIPPED_MULTITASK
 
 label = "the shipped network: held-out worlds, and real frames beside LiDAR and two other networks"
 
@@ -78,7 +79,7 @@ def run(arguments: list[str]) -> None:
 
 def simulated(network: Network, frames: int, width_px: int, height_px: int) -> dict[str, float]:
     """The figures over held-out worlds: seeds from 0, which training doesn't draw."""
-    from birdslam.simulation.world import sample
+    from birdslam.rendered_world.world import sample
 
     grades = Grades()
     decoder = network.decoder

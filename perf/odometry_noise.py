@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from birdslam import bev
-from birdslam.datasets import Recording, open_recording
-from birdslam.evaluation import from_first
-from birdslam.motion import Motion
-from birdslam.odometry import Odometry
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import Recording
+from birdslam.evaluation.odometry import from_first
+from birdslam.geometry import bev
+from birdslam.odometry.motion import Motion
+from birdslam.odometry.odometry import Odometry
 from birdslam.simulation.odometry import OdometryNoise, fit_drift
 from birdslam.trajectory import Pose, as_poses, inverse
 

@@ -35,13 +35,13 @@ import numpy as np
 import psutil
 from msgspec.structs import replace
 
-from birdslam.graph import GraphConfig, PoseGraph
+from birdslam.baselines.smoothers import Smoother
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.perf.figures import curve, noise, spread, write_json
+from birdslam.perf.machine import Steal
 from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.types import Measurements
-from birdslam.weights import WeightsConfig
-from perf.figures import curve, noise, spread, write_json
-from perf.machine import Steal
-from perf.smoothers import Smoother
 
 label = "the pose graph's update against gtsam's smoothers"
 
@@ -97,7 +97,7 @@ def told(row: dict[str, Any]) -> str:
 def measure(contender: str, vehicles: int, log: Path, limit_s: float) -> dict[str, Any]:
     """One contender in a process of its own."""
     one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    command = [sys.executable, "-m", "perf.optimizer", contender, str(vehicles), str(log), str(limit_s)]
+    command = [sys.executable, "-m", "birdslam.perf.optimizer", contender, str(vehicles), str(log), str(limit_s)]
     done = subprocess.run(command, env=os.environ | one_thread, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{contender} with {vehicles} vehicles: {done.stderr}")

@@ -21,20 +21,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.camera import GroundPlane
-from birdslam.depthplace import DepthPlace, PseudoLidarConfig, combined
-from birdslam.localisation import LocalisationConfig, Observation, Place, iou, localise, place
+from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.se2 import SE2
 from birdslam.perception import DepthMap, ModelError, ModelSpec, Network, load_network
 from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perception.pointnet import PointNet, load_pointnet
-from birdslam.placing import Body
-from birdslam.pseudolidar import localise_by_depth, places_of
-from birdslam.se2 import SE2
-from perf.errors import PerfError
-from perf.figures import Ledger
+from birdslam.perf.errors import PerfError
+from birdslam.perf.figures import Ledger
+from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, combined
+from birdslam.vehicles.localisation import LocalisationConfig, Observation, Place, iou, localise, place
+from birdslam.vehicles.placing import Body
+from birdslam.vehicles.pseudolidar import localise_by_depth, places_of
 
 if TYPE_CHECKING:
-    from birdslam.simulation.truth import WorldFrame, WorldObject
+    from birdslam.rendered_world.truth import WorldFrame, WorldObject
 
 label = "vehicles' places by depth: Frustum-PointNet, geometric fit and Eq. 1 on held-out worlds"
 
@@ -187,7 +187,7 @@ def _observed(
 
 def _noisy(frames: int) -> Iterator[Look]:
     """Exact depth with a network's errors, each body's own."""
-    from birdslam.simulation.world import sample
+    from birdslam.rendered_world.world import sample
     from birdslam.training.pointnet import (
         FAR_M,
         DepthErrorConfig,
@@ -214,7 +214,7 @@ def _noisy(frames: int) -> Iterator[Look]:
 
 def _seen_by(network: Network, frames: int) -> Iterator[Look]:
     """Depth, boxes and bodies of the multi-task network; a box belongs to the vehicle that it overlaps most."""
-    from birdslam.simulation.world import sample
+    from birdslam.rendered_world.world import sample
     from birdslam.training.pointnet import FrustumConfig, chosen
 
     for seed in range(FIRST_SEED, FIRST_SEED + frames):

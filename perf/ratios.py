@@ -17,9 +17,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from birdslam.perf import optimizer, transport
+from birdslam.perf.figures import Ledger
 from birdslam.simulation.drive import DriveConfig
-from perf import optimizer, transport
-from perf.figures import Ledger
 
 label = "ours over its peers in one run, against the reference"
 

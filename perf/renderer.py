@@ -16,8 +16,8 @@ from pathlib import Path
 
 import cv2
 
-from perf.errors import PerfError
-from perf.figures import Ledger, noise, shown, spread
+from birdslam.perf.errors import PerfError
+from birdslam.perf.figures import Ledger, noise, shown, spread
 
 label = "the built-in world's renderer: frames a second a core (extra train)"
 
@@ -55,7 +55,7 @@ def run(arguments: list[str]) -> None:
 
 def _samples(width_px: int, height_px: int, count: int) -> Iterator[float]:
     """The time of one after the other (ms), the kernels compiled before the first."""
-    from birdslam.simulation.world import sample
+    from birdslam.rendered_world.world import sample
 
     sample(FIRST_SEED, width_px, height_px)
     for seed in range(FIRST_SEED + 1, FIRST_SEED + 1 + count):
@@ -66,7 +66,7 @@ def _samples(width_px: int, height_px: int, count: int) -> Iterator[float]:
 
 def _drive(width_px: int, height_px: int, count: int) -> Iterator[float]:
     """The time of each frame of a drive but the first, with which the street is built."""
-    from birdslam.simulation.world import World, WorldConfig
+    from birdslam.rendered_world.world import World, WorldConfig
 
     frames = World(FIRST_SEED, WorldConfig(width_px=width_px, height_px=height_px)).frames(count + 1)
     next(frames)

@@ -18,13 +18,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from perf.figures import Ledger
-from perf.live import Ask, Run, add_run_options, drive
-from perf.machine import Steal
-from runtime.recording import Recording
-from runtime.replay import compare
-from runtime.report_replay import told
-from runtime.wire import Health
+from birdslam.perf.figures import Ledger
+from birdslam.perf.live import Ask, Run, add_run_options, drive
+from birdslam.perf.machine import Steal
+from birdslam.runtime.recording.recording import Recording
+from birdslam.runtime.replay.replay import compare
+from birdslam.runtime.replay.report import told
+from birdslam.runtime.wire import Health
 
 label = "a recorded drive and its replay, bit for bit, and what recording costs"
 

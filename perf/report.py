@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from perf import plots
-from perf.machine import ROOT
+from birdslam.perf import plots
+from birdslam.perf.machine import ROOT
 
 FEW = 1000
 Benchmarks = Mapping[str, Mapping[str, Any]]

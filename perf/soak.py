@@ -28,7 +28,7 @@ from typing import Any, Self
 import numpy as np
 import psutil
 
-from perf.faulty_vehicle import Vehicle, ends_with_its_vehicle, model_options, record_options
+from birdslam.perf.faulty_vehicle import Vehicle, ends_with_its_vehicle, model_options, record_options
 
 WARM_S, SAMPLE_S, SAID_S = 60.0, 5.0, 30.0
 SPAN = 6  # samples at either end whose medians are compared: what a process holds swings by its garbage

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import psutil
 
-from perf.faulty_vehicle import ROOT, Vehicle
-from runtime.presence import ring_path
-from runtime.topology import NODES, QUESTIONS, key_of
+from birdslam.perf.faulty_vehicle import ROOT, Vehicle
+from birdslam.runtime.topology import NODES, QUESTIONS, key_of
+from birdslam.runtime.transport.presence import ring_path
 
 Strike = Callable[[Vehicle], contextlib.AbstractContextManager[None]]
 
@@ -122,7 +122,7 @@ _SENDER = """
 import sys, time
 from pathlib import Path
 import numpy as np
-from runtime.bus import Bus
+from birdslam.runtime.transport.bus import Bus
 key, size, count = sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
 random = np.random.default_rng(7)
 with Bus("faults", "intruder", runtime_dir=Path(sys.argv[1])) as bus:
@@ -153,7 +153,7 @@ _ASKER = """
 import sys
 from pathlib import Path
 import zenoh
-from runtime.bus import Bus
+from birdslam.runtime.transport.bus import Bus
 with Bus("faults", "asker", runtime_dir=Path(sys.argv[1])) as bus:
     assert not bus.wait_alive(("supervisor", "optimize"), 10.0)
     print("at work", flush=True)
@@ -196,7 +196,7 @@ def scribbler(vehicle: Vehicle) -> Iterator[None]:
 _SLOW = """
 import sys
 from pathlib import Path
-from runtime.client import Planner
+from birdslam.runtime.client import Planner
 with Planner("faults", Path(sys.argv[1])) as planner:
     planner.wait(10.0)
     print("at work", flush=True)

@@ -18,15 +18,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.perf import convoy
+from birdslam.perf.figures import BLOCKS, Ledger, curve, noise, numbers, shown, spread
+from birdslam.perf.live import Ask, Run, add_run_options, drive
+from birdslam.perf.machine import Steal, loaded
+from birdslam.runtime.configuration import BudgetsConfig
+from birdslam.runtime.latency import stages
+from birdslam.runtime.topology import NODES
+from birdslam.runtime.transport.bus import Message
 from birdslam.types import Status
-from perf import convoy
-from perf.figures import BLOCKS, Ledger, curve, noise, numbers, shown, spread
-from perf.live import Ask, Run, add_run_options, drive
-from perf.machine import Steal, loaded
-from runtime.bus import Message
-from runtime.configuration import BudgetsConfig
-from runtime.latency import stages
-from runtime.topology import NODES
 
 label = "age at the planner, rate, drops, CPU and memory of the real processes"
 

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from perf.carriers import CARRIERS
-from perf.figures import Ledger, curve, noise, numbers, shown, spread
-from perf.machine import Steal, loaded
+from birdslam.perf.carriers import CARRIERS
+from birdslam.perf.figures import Ledger, curve, noise, numbers, shown, spread
+from birdslam.perf.machine import Steal, loaded
 
 label = "pixels and messages across processes, by our ring and by its peers"
 
@@ -119,7 +119,7 @@ def measure(case: Case, seconds: float) -> dict[str, Any]:
 
 
 def _start(*arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "perf.carriers", *arguments]
+    command = [sys.executable, "-m", "birdslam.perf.carriers", *arguments]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
 
 

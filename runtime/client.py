@@ -1,6 +1,6 @@
 """The planner's door: live estimates, with alive, on time and valid kept apart.
 
-    from runtime.client import Planner
+    from birdslam.runtime.client import Planner
 
     with Planner("car") as planner:
         for reading in planner.estimates(max_age_ms=150):      # each as it comes, or that none came in time
@@ -27,11 +27,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from birdslam.answers import MapSnapshot, Trajectory
+from birdslam.queries import MapSnapshot, Trajectory
+from birdslam.runtime.transport.answer_parts import whole_map, whole_trajectory
+from birdslam.runtime.transport.bus import Bus, BusClosed, Message
+from birdslam.runtime.wire import Health, Trace
 from birdslam.types import INVALIDATING, Estimate
-from runtime.bus import Bus, BusClosed, Message
-from runtime.parts import whole_map, whole_trajectory
-from runtime.wire import Health, Trace
 
 _NO_TRACE = Trace()
 _number = itertools.count()  # tells the planners of one process apart

@@ -15,14 +15,14 @@ from typing import Annotated, Any
 
 import msgspec
 
-from birdslam.atlas import AtlasConfig
-from birdslam.camera import Camera
-from birdslam.datasets import DatasetError, load_camera
-from birdslam.motionwatch import MotionWatchConfig
+from birdslam.datasets.camera_file import load_camera
+from birdslam.datasets.recording import DatasetError
+from birdslam.geometry.camera import Camera
+from birdslam.mapping.atlas import AtlasConfig
+from birdslam.odometry.plausibility import MotionWatchConfig
 from birdslam.perception import ModelError, ModelSpec
-from birdslam.slam import SlamConfig
-from runtime import model_store
-from runtime.sections import (
+from birdslam.runtime import model_store
+from birdslam.runtime.sections import (
     SHIPPED_MULTITASK,
     BudgetsConfig,
     DegradationConfig,
@@ -34,6 +34,7 @@ from runtime.sections import (
     RuntimeConfig,
     SourceConfig,
 )
+from birdslam.slam import SlamConfig
 
 __all__ = [
     "FILE_SCHEMES",
@@ -111,7 +112,7 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     @property
     def runtime_dir(self) -> Path | None:
-        """Where sockets and locks go; None: the user's own place (runtime/presence.py)."""
+        """Where sockets and locks go; None: the user's own place (runtime/transport/presence.py)."""
         return Path(self.runtime.runtime_dir) if self.runtime.runtime_dir else None
 
     @property

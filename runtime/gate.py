@@ -1,6 +1,6 @@
 """The gate: planners outside the vehicle's own user read its estimates here, by mutual TLS, and write nothing.
 
-    python -m runtime.gate /etc/birdslam/vehicle.toml /etc/birdslam/gate.json5 --runtime-dir /run/birdslam
+    python -m birdslam.runtime.gate /etc/birdslam/vehicle.toml /etc/birdslam/gate.json5 --runtime-dir /run/birdslam
 
 A process of its own, so that what comes in from outside never touches one of the vehicle's. It is one zenoh session
 that forwards what its file allows (deploy/gate.json5: listening address, certificates, access control), with the
@@ -20,12 +20,12 @@ from typing import Any
 
 import zenoh
 
-from runtime.cli import USER_ERROR_STATUS
-from runtime.configuration import ConfigurationError, load
-from runtime.notify import Notifier
-from runtime.presence import runtime_dir_of, socket_path
-from runtime.topology import PROCESSES
-from runtime.wire import MAX_MESSAGE_BYTES
+from birdslam.runtime.configuration import ConfigurationError, load
+from birdslam.runtime.environment import USER_ERROR_STATUS
+from birdslam.runtime.process.notify import Notifier
+from birdslam.runtime.topology import PROCESSES
+from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
+from birdslam.runtime.wire import MAX_MESSAGE_BYTES
 
 _LOOK_S = 1.0
 _RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2}
@@ -133,7 +133,9 @@ def run(path: Path, vehicle: str, runtime_dir: Path | None) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point of the gate's process."""
-    parser = argparse.ArgumentParser(prog="runtime.gate", description="Lets planners beyond this machine read.")
+    parser = argparse.ArgumentParser(
+        prog="birdslam.runtime.gate", description="Lets planners beyond this machine read."
+    )
     parser.add_argument("config", type=Path, metavar="CONFIG.toml", help="of the vehicle")
     parser.add_argument("gate", type=Path, metavar="GATE.json5", help="zenoh's: addresses, certificates, access")
     parser.add_argument("--runtime-dir", type=Path, metavar="DIR", help="as runtime.runtime_dir of the run")

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from runtime.wire import Spread, Trace
+from birdslam.runtime.wire import Spread, Trace
 
 _LOWEST_MS = 1e-3
 _BINS_PER_FACTOR = 100  # within one factor e: a percentile is exact to 1 %

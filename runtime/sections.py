@@ -8,7 +8,7 @@ import msgspec
 
 from birdslam.perception import ModelSpec
 from birdslam.perception.manifest import SHIPPED_NETWORKS, Role
-from runtime.schedule import ScheduleConfig
+from birdslam.runtime.schedule import ScheduleConfig
 
 SHIPPED_MULTITASK = "multitask_int8.onnx"  # as good as the fp32 one in half the time; `--model multitask` is that
 
@@ -66,7 +66,7 @@ class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Processes, memory and time limits."""
 
-    runtime_dir: str = ""  # sockets, locks and vitals; "": the user's own (runtime/presence.py)
+    runtime_dir: str = ""  # sockets, locks and vitals; "": the user's own (runtime/transport/presence.py)
     models_dir: str = ""  # installed networks; "": the user's own (runtime/model_store.py)
     ring_slots: Annotated[int, msgspec.Meta(ge=2, le=64)] = 8
     in_flight_frames: PositiveInt = 4  # frames between capture and the estimate at rate "max"
@@ -132,7 +132,7 @@ class BudgetsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class DegradationConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """When perceive does less, to keep its budget, and when it does more again (runtime/degradation.py)."""
+    """When perceive does less, to keep its budget, and when it does more again (runtime/nodes/degradation.py)."""
 
     enabled: bool = True  # never at rate "max"
     window_frames: PositiveInt = 10  # judged together
@@ -145,7 +145,7 @@ class DegradationConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
 
 
 class RecordingConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is kept of a drive in one file (runtime/recording.py)."""
+    """What is kept of a drive in one file (runtime/recording/recording.py)."""
 
     file: str = ""  # FILE.mcap, which must not exist yet; a directory: a new file in it, named by the time; "": none
     images: bool = False  # the frames too, as JPEG
@@ -164,7 +164,7 @@ class NodeScheduling(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class RealtimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The scheduling of the nodes, where the system permits it (runtime/realtime.py); a line in the log where not."""
+    """The scheduling of the nodes, where the system permits it (process/realtime.py); a line in the log where not."""
 
     fifo: Literal["auto", "on", "off"] = "auto"  # SCHED_FIFO; "auto": with a live camera
     lock_memory: Literal["auto", "on", "off"] = "auto"  # nothing is paged out; "auto": with a live camera

@@ -14,9 +14,9 @@ from typing import Any
 
 import msgspec
 
-from birdslam.answers import MapSnapshot, Trajectory
+from birdslam.queries import MapSnapshot, Trajectory
+from birdslam.runtime.wire import Health
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements
-from runtime.wire import Health
 
 VERSION = "v1"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}")

@@ -26,20 +26,21 @@ import msgspec
 import numpy as np
 import zenoh
 
-from birdslam.camera import Camera
-from birdslam.datasets import DatasetError, load_camera
-from birdslam.graph import PoseGraph
-from birdslam.kitti import read_image, read_projection, read_times
+from birdslam.datasets.camera_file import load_camera
+from birdslam.datasets.kitti import read_image, read_projection, read_times
+from birdslam.datasets.recording import DatasetError
+from birdslam.geometry.camera import Camera
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.perception.manifest import Manifest, ModelError
 from birdslam.perception.manifest_file import read_manifest, shipped_manifests
+from birdslam.runtime.client import Planner
+from birdslam.runtime.configuration import Configuration, ConfigurationError, dump, load
+from birdslam.runtime.topology import TOPICS, key_of
+from birdslam.runtime.transport.bus import Subscriber
+from birdslam.runtime.transport.ring import FrameError, FrameReader, FrameRing
+from birdslam.runtime.wire import MAX_TRACE_BYTES, Trace, WireError, decode, encode
 from birdslam.slam import SlamConfig
 from birdslam.types import INVALIDATING, FrameRef, Measurements
-from runtime.bus import Subscriber
-from runtime.client import Planner
-from runtime.configuration import Configuration, ConfigurationError, dump, load
-from runtime.frames import FrameError, FrameReader, FrameRing
-from runtime.topology import TOPICS, key_of
-from runtime.wire import MAX_TRACE_BYTES, Trace, WireError, decode, encode
 from tests.mutations import Chance, mutated, mutated_text, with_other_fields
 from tests.test_wire import BY_NAME, EXAMPLES
 

@@ -8,20 +8,20 @@ from typing import Any
 
 import msgspec
 
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
+from birdslam.runtime.configuration import Configuration, RuntimeConfig
+from birdslam.runtime.nodes.capture import stamps
+from birdslam.runtime.nodes.checkpoints import CheckpointFile
+from birdslam.runtime.nodes.coasting import Overdue
+from birdslam.runtime.nodes.optimize import OptimizeNode
+from birdslam.runtime.nodes.recorder import about
+from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
+from birdslam.runtime.recording.recording import Alive, RecordingWriter
+from birdslam.runtime.transport.bus import Message
+from birdslam.runtime.transport.presence import runtime_dir_of
+from birdslam.runtime.wire import Stage, Trace
 from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
-from runtime.bus import Message
-from runtime.capture import stamps
-from runtime.checkpoints import CheckpointFile
-from runtime.coasting import Overdue
-from runtime.configuration import Configuration, RuntimeConfig
-from runtime.optimize import OptimizeNode
-from runtime.presence import runtime_dir_of
-from runtime.recorder import about
-from runtime.recording import Alive, RecordingWriter
-from runtime.restarts import FIRST, Assignment, Resume
-from runtime.wire import Stage, Trace
 
 DISK_S = 20.0
 CAMERA = Camera(640, 192, 360.0, 360.0, 320.0, 96.0, 1.65)

@@ -1,22 +1,37 @@
-"""The walls of the house: who may import what. There is no list of exceptions."""
+"""The walls of the house: who may import what. The table stands in CONTRIBUTING.md; there is no list of exceptions."""
 
 import ast
+import re
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
-IMPURE = {"runtime", "perf", "zenoh", "time", "threading", "logging", "os", "multiprocessing", "subprocess", "psutil"}
-LAYERS = (  # each imports only from itself and from what stands before it
-    ("se2", "status"),
-    ("types",),
-    ("camera", "bev"),
-)
-ON_TOP = (
-    *("frontend", "slam", "baselines", "evaluation"),
-    *("localisation_evaluation", "calibration", "demo_grading"),
-    *("tracking_metrics", "tracking_evaluation", "tracking_picture", "tracking_report", "ablation", "tables"),
-)
+FOLDERS = {"birdslam": "birdslam", "runtime": "birdslam.runtime", "perf": "birdslam.perf"}
+IMPURE = {"zenoh", "time", "threading", "logging", "os", "multiprocessing", "subprocess", "psutil", "asyncio", "socket"}
+ONLY_IN = {  # third-party library: the packages that may import it
+    "onnxruntime": {"perception", "runtime.training"},
+    "gtsam": {"baselines"},
+    "torch": {"training", "runtime.training", "perf"},
+    "numba": {"rendered_world", "training", "perf"},
+    "zenoh": {"runtime.transport", "runtime.gate", "perf"},
+}
+MOST_MODULES = 20  # that stand directly in birdslam/ and in runtime/
+
+
+def modules() -> dict[str, Path]:
+    """Every module by its full name, each once: birdslam/runtime and birdslam/perf are links."""
+    found = {}
+    for folder, name in FOLDERS.items():
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            parts = path.relative_to(ROOT / folder).with_suffix("").parts
+            found[".".join((name, *parts)).removesuffix(".__init__")] = path
+    return found
+
+
+MODULES = modules()
+HOUSE = [name for name in MODULES if name.count(".") > 1 or MODULES[name].name != "__init__.py"]
 
 
 def imports(path: Path) -> set[str]:
@@ -27,54 +42,83 @@ def imports(path: Path) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            found |= {node.module or ""} | {f"{node.module}.{alias.name}" for alias in node.names}
+            module = node.module or ""
+            found |= {name if (name := f"{module}.{alias.name}") in MODULES else module for alias in node.names}
     return found
 
 
-def modules(package: str) -> list[Path]:
-    return sorted((ROOT / package).rglob("*.py"))
+def package_of(module: str) -> str:
+    """The row of the table that a module belongs to: `geometry`, `runtime.nodes`, `types`."""
+    parts = module.split(".")[1:]
+    return ".".join(parts[: 2 if parts[0] == "runtime" else 1])
 
 
-def name_of(path: Path) -> str:
-    return path.relative_to(ROOT / "birdslam").parts[0].removesuffix(".py")
-
-
-@pytest.mark.parametrize("path", modules("birdslam"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_birdslam_is_pure(path: Path) -> None:
-    roots = {name.split(".")[0] for name in imports(path)}
-    assert not roots & IMPURE
-    if "onnxruntime" in roots:
-        assert name_of(path) == "perception"
-    if "gtsam" in roots:
-        assert name_of(path) in ("graph", "baselines")
-    if "torch" in roots:
-        assert name_of(path) == "training"
-    if "numba" in roots:
-        assert name_of(path) in ("simulation", "training")
-    calls = {
-        n.func.id
-        for n in ast.walk(ast.parse(path.read_text()))
-        if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)
+def table() -> dict[str, set[str]]:
+    """Package -> the packages that it may import, as CONTRIBUTING.md says it."""
+    rows = re.findall(r"^\| `([a-z_.]+)` \| [^|]* \| ([^|]*) \|$", (ROOT / "CONTRIBUTING.md").read_text(), re.M)
+    every = {name for name, _ in rows}
+    return {
+        name: every - {name} if may == "everything" else set(re.findall(r"`([a-z_.]+)`", may)) for name, may in rows
     }
-    assert "print" not in calls
 
 
-@pytest.mark.parametrize("path", modules("birdslam"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_imports_go_one_way(path: Path) -> None:
-    inside = {name.split(".")[1] for name in imports(path) if name.startswith("birdslam.")}
-    own = name_of(path)
-    allowed: set[str] = set()
-    for layer in LAYERS:
-        allowed |= set(layer)
-        if own in layer:
-            assert inside <= allowed
-    if own not in ON_TOP:
-        assert not inside & set(ON_TOP)
+TABLE = table()
 
 
-@pytest.mark.parametrize("path", modules("runtime"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_runtime_does_not_know_perf(path: Path) -> None:
-    assert "perf" not in {name.split(".")[0] for name in imports(path)}
+def inside(module: str) -> set[str]:
+    return {name for name in imports(MODULES[module]) if name in MODULES and name not in (module, "birdslam")}
+
+
+@pytest.mark.parametrize("module", HOUSE)
+def test_a_package_imports_what_the_table_says_and_nothing_else(module: str) -> None:
+    own = package_of(module)
+    assert own in TABLE, f"{own} has no row in CONTRIBUTING.md"
+    assert {package_of(name) for name in inside(module)} - {own} <= TABLE[own]
+
+
+def test_the_table_names_what_there_is_and_nothing_that_is_not_used() -> None:
+    used: dict[str, set[str]] = {package_of(module): set() for module in HOUSE}
+    for module in HOUSE:
+        used[package_of(module)] |= {package_of(name) for name in inside(module)} - {package_of(module)}
+    assert {name: may for name, may in used.items() if name != "perf"} == {
+        name: may for name, may in TABLE.items() if name != "perf"
+    }
+
+
+@pytest.mark.parametrize("graph", ["packages", "modules"])
+def test_there_is_no_circle(graph: str) -> None:
+    of = {module: inside(module) for module in HOUSE} if graph == "modules" else TABLE
+    try:
+        TopologicalSorter(of).prepare()
+    except CycleError as error:
+        pytest.fail(f"a circle: {error.args[1]}")
+
+
+@pytest.mark.parametrize("module", HOUSE)
+def test_libraries_stay_in_their_packages(module: str) -> None:
+    own = package_of(module)
+    roots = {name.split(".")[0] for name in imports(MODULES[module])}
+    for library, packages in ONLY_IN.items():
+        assert library not in roots or own in packages or own.split(".")[0] in packages, f"{module} imports {library}"
+    if not own.startswith(("runtime", "perf")):
+        assert not roots & IMPURE
+        called = {
+            node.func.id
+            for node in ast.walk(ast.parse(MODULES[module].read_text()))
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        }
+        assert "print" not in called
+
+
+def test_every_import_uses_the_name_that_the_wheel_installs() -> None:
+    """`runtime` and `perf` are folders of the checkout; their modules are birdslam.runtime and birdslam.perf."""
+    for path in (*MODULES.values(), *(ROOT / "tests").rglob("*.py"), *(ROOT / "docs").rglob("*.py")):
+        assert not {name.split(".")[0] for name in imports(path)} & {"runtime", "perf"}, path
+
+
+@pytest.mark.parametrize("folder", ["birdslam", "runtime"])
+def test_a_floor_holds_few_modules(folder: str) -> None:
+    assert len(list((ROOT / folder).glob("*.py"))) <= MOST_MODULES
 
 
 def test_no_machine_path_or_secret_host_in_the_tree() -> None:

@@ -11,8 +11,8 @@ import pytest
 
 from birdslam.baselines import batch_se3, cubeslam, nair, namdev
 from birdslam.baselines.trajectories import LiveTrajectories, Trajectories, dead_reckoned
-from birdslam.camera import Camera
-from birdslam.se2 import SE2
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
 from birdslam.simulation.drive import Drive, DriveConfig, drive
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
 

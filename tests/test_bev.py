@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam import bev
-from birdslam.camera import Camera, GroundPlane, Undistorter
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane, Undistorter
 
 KITTI_LIKE = {"width_px": 1242, "height_px": 375, "fx_px": 721.5, "fy_px": 721.5, "cx_px": 609.6, "cy_px": 172.9}
 grounds = st.builds(GroundPlane, st.floats(0.5, 3.0), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))

@@ -20,13 +20,13 @@ import psutil
 import pytest
 import zenoh
 
-from birdslam.se2 import SE2
+from birdslam.geometry.se2 import SE2
+from birdslam.runtime.client import Planner, Reading
+from birdslam.runtime.topology import key_of
+from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, MessagesLost, Subscriber
+from birdslam.runtime.transport.presence import VehicleBusy, VehicleLock, ring_path, runtime_dir_of, socket_path
+from birdslam.runtime.wire import MAX_MESSAGE_BYTES, Stage, Trace, encode
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
-from runtime.bus import Bus, BusClosed, BusError, MessagesLost, Subscriber
-from runtime.client import Planner, Reading
-from runtime.presence import VehicleBusy, VehicleLock, ring_path, runtime_dir_of, socket_path
-from runtime.topology import key_of
-from runtime.wire import MAX_MESSAGE_BYTES, Stage, Trace, encode
 
 ROOT = Path(__file__).parent.parent
 LIMIT_S = 20.0
@@ -229,7 +229,7 @@ def test_lossless_messages_all_arrive_at_a_slow_reader(join: Any) -> None:
 
 
 def test_a_lossless_queue_that_overflows_says_so(join: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("runtime.bus._LOSSLESS_DEPTH", 4)
+    monkeypatch.setattr("birdslam.runtime.transport.bus._LOSSLESS_DEPTH", 4)
     hub = join("supervisor", hub=True, lossless=True)
     frames = hub.subscriber("frame")
     out = join("capture", lossless=True).publisher("frame")
@@ -347,7 +347,7 @@ def test_close_wakes_everybody_and_leaves_nothing(base: Path) -> None:
 SEND = """
 import sys
 from pathlib import Path
-from runtime.bus import Bus
+from birdslam.runtime.transport.bus import Bus
 from tests.test_bus import estimate
 with Bus("car", "optimize", runtime_dir=Path(sys.argv[1])) as bus:
     out = bus.publisher("estimate")
@@ -361,8 +361,8 @@ with Bus("car", "optimize", runtime_dir=Path(sys.argv[1])) as bus:
 HUB = """
 import sys
 from pathlib import Path
-from runtime.bus import Bus
-from runtime.presence import VehicleLock
+from birdslam.runtime.transport.bus import Bus
+from birdslam.runtime.transport.presence import VehicleLock
 base = Path(sys.argv[1])
 with VehicleLock("car", base), Bus("car", "supervisor", hub=True, runtime_dir=base):
     print("ready", flush=True)

@@ -12,14 +12,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.calibration import CalibrationConfig, CalibrationError, calibrate
-from birdslam.datasets import DatasetError, load_camera, read_speeds
+from birdslam.calibration.calibration import CalibrationConfig, CalibrationError, calibrate
+from birdslam.calibration.intrinsics import from_chessboard, read_intrinsics
+from birdslam.datasets.camera_file import load_camera
+from birdslam.datasets.recording import DatasetError
+from birdslam.datasets.speed_file import read_speeds
 from birdslam.frontend import FrontEndConfig
-from birdslam.intrinsics import from_chessboard, read_intrinsics
 from birdslam.perception import Perception, Ready
+from birdslam.runtime.cli.main import main
 from birdslam.types import Frame
-from birdslam.vehicleheight import Sight, VehicleHeightConfig, stand_of
-from runtime.cli import main
+from birdslam.vehicles.camera_height import Sight, VehicleHeightConfig, stand_of
 from tests.test_odometry import CAMERA, PITCH_RAD, render, street
 
 ROS = """image_width: 640

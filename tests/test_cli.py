@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from birdslam.perception import ModelSpec
-from runtime.cli import _parser, main
-from runtime.commands import configuration_of
-from runtime.configuration import ConfigurationError
+from birdslam.runtime.cli.commands import configuration_of
+from birdslam.runtime.cli.main import _parser, main
+from birdslam.runtime.configuration import ConfigurationError
 
 NOWHERE = "kitti:/nowhere/at/all"
 

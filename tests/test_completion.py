@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tiny_networks import echo
 
-from birdslam.lanes import BOUNDARY, ROAD, LanesConfig
+from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig
 from birdslam.perception.completion import SHIPPED, GridCompletion
 from birdslam.perception.manifest import ModelError
 

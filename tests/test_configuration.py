@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
 from birdslam.perception import ModelSpec
-from runtime.configuration import Configuration, ConfigurationError, complete, dump, load, parse_setting
+from birdslam.runtime.configuration import Configuration, ConfigurationError, complete, dump, load, parse_setting
 
 ROOT = Path(__file__).resolve().parent.parent
 CAMERA = "width_px = 64\nheight_px = 32\nfx_px = 50\nfy_px = 50\ncx_px = 32\ncy_px = 16\nheight_m = 1.5\n"

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from birdslam.baselines.batch_se2 import Solution, ego_key, solve, vehicle_key
-from birdslam.camera import Camera
-from birdslam.graph import GraphConfig, PoseGraph
-from birdslam.planar import between
-from birdslam.roadalign import RoadFit
-from birdslam.roadfilter import RoadFilter, RoadScaleConfig
-from birdslam.se2 import SE2
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.planar import between
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.odometry.road_alignment import RoadFit
+from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
 from birdslam.simulation.drive import Drive, DriveConfig, drive
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
-from birdslam.weights import WeightsConfig
 
 Floats = NDArray[np.float64]
 

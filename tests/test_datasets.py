@@ -8,15 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from birdslam.camera import Camera
-from birdslam.datasets import (
-    DatasetError,
-    KittiRecording,
-    RecordedFrame,
-    Recording,
-    load_camera,
-    open_recording,
-)
+from birdslam.datasets.camera_file import load_camera
+from birdslam.datasets.kitti import KittiRecording
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import DatasetError, RecordedFrame, Recording
+from birdslam.geometry.camera import Camera
 from birdslam.trajectory import kitti_row
 
 WIDTH, HEIGHT = 64, 32

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from birdslam.frontend import FrontEnd
 from birdslam.perception import Detections, Findings, ModelSpec, Segmentation
 from birdslam.perception.manifest import Schedule
+from birdslam.runtime.configuration import Configuration, DegradationConfig, ModelsConfig, SourceConfig
+from birdslam.runtime.nodes import inference
+from birdslam.runtime.nodes.degradation import Degradation, Mode, modes
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.runtime.nodes.nodes import PerceiveNode
+from birdslam.runtime.process.restarts import FIRST
 from birdslam.types import INVALIDATING, Frame, FrameRef, Measurements, Status
-from runtime import inference
-from runtime.configuration import Configuration, DegradationConfig, ModelsConfig, SourceConfig
-from runtime.degradation import Degradation, Mode, modes
-from runtime.inference import Inference
-from runtime.nodes import PerceiveNode
-from runtime.restarts import FIRST
 
 CONFIG = DegradationConfig(window_frames=4, late_share=0.5, calm_frames=6, calm_share=0.5)
 BOTH = ("detector", "segmenter")

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from birdslam import bev
-from birdslam.camera import GroundPlane
-from birdslam.datasets import DatasetError, open_recording
-from birdslam.demo_drive import COLUMNS, DIRECTORY, DemoRecording, write_drive
-from runtime.configuration import load
-from runtime.sources import open_source
+from birdslam.datasets.demo import COLUMNS, DIRECTORY, DemoRecording, write_drive
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import DatasetError
+from birdslam.geometry import bev
+from birdslam.geometry.camera import GroundPlane
+from birdslam.runtime.configuration import load
+from birdslam.runtime.nodes.sources import open_source
 
 
 @pytest.fixture(scope="module")

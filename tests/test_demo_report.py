@@ -10,15 +10,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.datasets import open_recording
-from birdslam.demo_drive import DemoRecording
-from birdslam.demo_grading import VEHICLES, grade, match, mount_pose_of, true_egos
-from birdslam.se2 import SE2
-from birdslam.side_by_side import SideBySide
+from birdslam.datasets.demo import DemoRecording
+from birdslam.datasets.opening import open_recording
+from birdslam.evaluation.demo import VEHICLES, grade, match, mount_pose_of, true_egos
+from birdslam.evaluation.video import SideBySide
+from birdslam.geometry.se2 import SE2
+from birdslam.runtime.configuration import load
+from birdslam.runtime.supervision.demo_report import Witness, rows
 from birdslam.trajectory import as_poses, inverse, split_pose
 from birdslam.types import Estimate, VehicleEstimate
-from runtime.configuration import load
-from runtime.demo_report import Witness, rows
 
 FRAMES = range(0, 90, 3)
 COV = (0.0,) * 9

@@ -79,14 +79,14 @@ def wheel(folder: Path) -> Path:
     """The checkout as a wheel without dependencies: they come from the packages that this Python has."""
     path, info = folder / "birdslam-0.1.0-py3-none-any.whl", "birdslam-0.1.0.dist-info"
     with zipfile.ZipFile(path, "w") as archive:
-        for package in ("birdslam", "runtime"):
-            for file in sorted((ROOT / package).rglob("*")):
+        for folder_of, name in (("birdslam", "birdslam"), ("runtime", "birdslam/runtime")):
+            for file in sorted((ROOT / folder_of).rglob("*")):
                 if file.suffix in {".py", ".toml", ".onnx"}:
-                    archive.write(file, file.relative_to(ROOT))
+                    archive.write(file, Path(name) / file.relative_to(ROOT / folder_of))
         archive.writestr("packages.pth", "/srv/packages\n")
         archive.writestr(f"{info}/METADATA", "Metadata-Version: 2.1\nName: birdslam\nVersion: 0.1.0\n")
         archive.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
-        archive.writestr(f"{info}/entry_points.txt", "[console_scripts]\nbirdslam = runtime.cli:main\n")
+        archive.writestr(f"{info}/entry_points.txt", "[console_scripts]\nbirdslam = birdslam.runtime.cli.main:main\n")
         archive.writestr(f"{info}/RECORD", "")
     return path
 

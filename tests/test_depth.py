@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
 from birdslam.perception import ModelError, ModelSpec, load_network
 from birdslam.perception.depth import DepthMap
 from birdslam.perception.manifest import Disparity, MetricDepth

@@ -16,17 +16,17 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.answers import MapSnapshot, TimedPose, Trajectory, VehiclePath
-from birdslam.se2 import SE2
+from birdslam.geometry.se2 import SE2
+from birdslam.queries import MapSnapshot, TimedPose, Trajectory, VehiclePath
+from birdslam.runtime.client import Planner
+from birdslam.runtime.configuration import Configuration, SourceConfig
+from birdslam.runtime.supervision.query_server import Door
+from birdslam.runtime.topology import QUESTIONS, TOPICS, key_of
+from birdslam.runtime.transport.answer_parts import map_parts, trajectory_parts, whole_map, whole_trajectory
+from birdslam.runtime.transport.bus import Bus, BusClosed, BusError
+from birdslam.runtime.transport.queries import WAITING_QUESTIONS, Refusal, positive
+from birdslam.runtime.wire import Health, Part, encode
 from birdslam.types import MapUpdate
-from runtime.bus import Bus, BusClosed, BusError
-from runtime.client import Planner
-from runtime.configuration import Configuration, SourceConfig
-from runtime.door import Door
-from runtime.parts import map_parts, trajectory_parts, whole_map, whole_trajectory
-from runtime.questions import WAITING_QUESTIONS, Refusal, positive
-from runtime.topology import QUESTIONS, TOPICS, key_of
-from runtime.wire import Health, Part, encode
 from tests.test_bus import LIMIT_S, estimate, measurements, until
 
 CONFIGURATION = Configuration(source=SourceConfig(uri="rtsp://driver:secret@10.0.0.7/front"))

@@ -9,9 +9,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.camera import GroundPlane
-from birdslam.consistency import CERTAIN_M, Consistency
-from birdslam.se2 import SE2
+from birdslam.evaluation.consistency import CERTAIN_M, Consistency
+from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import ego_pose, inverse, mount_pose
 from birdslam.types import Attitude, Estimate, Status
 

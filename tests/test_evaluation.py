@@ -14,10 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from birdslam.camera import Camera, GroundPlane
-from birdslam.car_ahead import CarAhead, lidar_distance_m, near_face_m
-from birdslam.datasets import KittiRecording, RecordedFrame, Recording, open_recording
-from birdslam.evaluation import (
+from birdslam.datasets.kitti import KittiRecording
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import RecordedFrame, Recording
+from birdslam.evaluation.car_ahead import CarAhead, lidar_distance_m, near_face_m
+from birdslam.evaluation.odometry import (
     GROUND_AXES,
     ate_aligned_m,
     ate_m,
@@ -31,19 +32,11 @@ from birdslam.evaluation import (
     segment_errors,
     standing_drift_m,
 )
-from birdslam.results import ResultsError
-from birdslam.se2 import SE2
+from birdslam.evaluation.results import ResultsError
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import Pose, inverse, mount_pose, split_pose
-from birdslam.types import (
-    Attitude,
-    Estimate,
-    Ground,
-    MapUpdate,
-    Measurements,
-    Status,
-    VehicleEdge,
-    VehicleEstimate,
-)
+from birdslam.types import Attitude, Estimate, Ground, MapUpdate, Measurements, Status, VehicleEdge, VehicleEstimate
 
 CAMERA = Camera(640, 192, 400.0, 400.0, 320.0, 96.0, 1.65)
 COV3, COV2 = (0.0,) * 9, (0.0,) * 4

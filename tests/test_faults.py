@@ -11,11 +11,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from perf.faults import inflict, markdown, survived
-from perf.faulty_vehicle import Vehicle, model_options, record_options
-from perf.strikes import FAULTS
-from runtime.presence import ring_path
-from runtime.topology import NODES
+from birdslam.perf.faults import inflict, markdown, survived
+from birdslam.perf.faulty_vehicle import Vehicle, model_options, record_options
+from birdslam.perf.strikes import FAULTS
+from birdslam.runtime.topology import NODES
+from birdslam.runtime.transport.presence import ring_path
 
 SHORT = (
     *("kill -9 perceive", "kill -9 optimize", "camera gone 1.5 s capture", "malformed measurements messages optimize"),

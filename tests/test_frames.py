@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from birdslam.runtime.transport.ring import FrameError, FrameReader, FrameRing
 from birdslam.types import FrameRef
-from runtime.frames import FrameError, FrameReader, FrameRing
 
 ROOT = Path(__file__).parent.parent
 HEIGHT_PX, WIDTH_PX = 37, 53
@@ -205,7 +205,7 @@ WRITER = """
 import os, signal, sys
 from pathlib import Path
 import numpy as np
-from runtime import frames
+from birdslam.runtime.transport import ring as frames
 
 path, die_at = Path(sys.argv[1]), int(sys.argv[2])
 ring = frames.FrameRing(path, 96, 128, slots=2)

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from birdslam import bev
-from birdslam.camera import Camera, GroundPlane
 from birdslam.frontend import DeadReckoning, FrontEnd, FrontEndConfig
-from birdslam.odometry import Motion
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.odometry.odometry import Motion
 from birdslam.perception import Detections, Perception, Ready, Segmentation
-from birdslam.se2 import SE2
 from birdslam.types import Frame, Measurements, Status
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65, pitch_rad=0.01)

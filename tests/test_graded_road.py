@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from birdslam import bev
-from birdslam.camera import Camera
-from perf.graded_road import GradedRoad
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera
+from birdslam.perf.graded_road import GradedRoad
 
 CAMERA = Camera(320, 120, 190.0, 190.0, 160.3, 55.2, height_m=1.65, pitch_rad=0.01)
 

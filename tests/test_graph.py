@@ -18,16 +18,16 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from birdslam.graph import GraphConfig, PoseGraph
-from birdslam.landmarks import sum_of_edges
-from birdslam.planar import between
-from birdslam.se2 import SE2
+from birdslam.geometry.planar import between
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.landmarks import sum_of_edges
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.perf import incremental, optimizer
+from birdslam.perf.__main__ import main as perf_main
+from birdslam.perf.optimizer import CONTENDERS
 from birdslam.simulation.drive import Drive, DriveConfig, drive
 from birdslam.types import EgoEdge, Estimate, LanePoint, Measurements, Status
-from birdslam.weights import WeightsConfig
-from perf import incremental, optimizer
-from perf.__main__ import main as perf_main
-from perf.optimizer import CONTENDERS
 
 Floats = NDArray[np.float64]
 
@@ -455,9 +455,9 @@ def test_no_more_vehicles_than_configured_the_freshest_stay() -> None:
 
 REPLAY = """
 import hashlib, msgspec
-from birdslam.graph import GraphConfig, PoseGraph
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.simulation.drive import DriveConfig, drive
-from birdslam.weights import WeightsConfig
+from birdslam.graph.weights import WeightsConfig
 graph = PoseGraph(GraphConfig(), WeightsConfig(leave_out=()))
 world = drive(DriveConfig(frames=150, wild=0.05, drop=0.1), seed=17)
 print(hashlib.sha256(b"".join(msgspec.msgpack.encode(graph.update(m)) for m in world.measurements)).hexdigest())

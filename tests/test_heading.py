@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from birdslam import bev
-from birdslam.camera import Camera
-from birdslam.heading import HeadingConfig, Headings, spread
-from birdslam.localisation import DIMENSIONS, LocalisationConfig, Observation, localise, place
-from birdslam.localisation_evaluation import INSIDE_2_SIGMA
+from birdslam.evaluation.localisation import INSIDE_2_SIGMA
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera
+from birdslam.vehicles.heading import HeadingConfig, Headings, spread
+from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, localise, place
 
 Floats = NDArray[np.float64]
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)

@@ -15,13 +15,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.camera import Camera
-from birdslam.se2 import SE2
-from birdslam.types import Estimate, MapUpdate, Status
-from runtime import doctor, realtime
-from runtime.bus import Bus
-from runtime.cli import ENVIRONMENT, main
-from runtime.configuration import (
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.runtime.cli import doctor
+from birdslam.runtime.cli.main import main
+from birdslam.runtime.configuration import (
     BudgetsConfig,
     Configuration,
     ConfigurationError,
@@ -33,13 +31,17 @@ from runtime.configuration import (
     complete,
     load,
 )
-from runtime.latency import Recent
-from runtime.live import LiveLine
-from runtime.logbook import Logbook
-from runtime.meter import PERIOD_NS, Meter
-from runtime.restarts import Assignment
-from runtime.topology import NODES
-from runtime.wire import Health, Spread, Stage, Trace, decode, encode
+from birdslam.runtime.environment import ENVIRONMENT
+from birdslam.runtime.latency import Recent
+from birdslam.runtime.nodes.meter import PERIOD_NS, Meter
+from birdslam.runtime.process import realtime
+from birdslam.runtime.process.restarts import Assignment
+from birdslam.runtime.supervision.live import LiveLine
+from birdslam.runtime.supervision.logbook import Logbook
+from birdslam.runtime.topology import NODES
+from birdslam.runtime.transport.bus import Bus
+from birdslam.runtime.wire import Health, Spread, Stage, Trace, decode, encode
+from birdslam.types import Estimate, MapUpdate, Status
 
 CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
 MS = 1_000_000
@@ -310,7 +312,7 @@ def test_a_frame_s_images_cost_no_page_of_the_kernel() -> None:
 
 _RESERVED = """
 import resource, sys, threading
-from runtime import realtime
+from birdslam.runtime.process import realtime
 if sys.argv[1] == "reserved":
     realtime.reserve(12.0, 4.0)
 def drive():
@@ -337,7 +339,7 @@ def test_what_a_drive_fills_can_be_reserved() -> None:
 
 _SETTLED = """
 import sys
-from runtime import realtime
+from birdslam.runtime.process import realtime
 if sys.argv[1] == "settled":
     realtime.settle()
 before = sys.getallocatedblocks()

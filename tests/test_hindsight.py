@@ -8,18 +8,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from birdslam import bev
-from birdslam.camera import GroundPlane
 from birdslam.frontend import FrontEnd, FrontEndConfig
-from birdslam.graph import GraphConfig, PoseGraph
-from birdslam.hindsight import Hindsight, HindsightConfig, Moment
-from birdslam.horizon import Horizon, HorizonConfig
-from birdslam.localisation import DIMENSIONS, LocalisationConfig, iou
+from birdslam.geometry import bev
+from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections, Perception, Ready
-from birdslam.se2 import SE2
-from birdslam.tracking import Tracker, TrackingConfig
 from birdslam.types import Measurements
-from birdslam.weights import WeightsConfig
+from birdslam.vehicles.ground_size_filter import Horizon, HorizonConfig
+from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, iou
+from birdslam.vehicles.out_of_sequence import Hindsight, HindsightConfig, Moment
+from birdslam.vehicles.tracking import Tracker, TrackingConfig
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
 
 CAR = DIMENSIONS["car"]

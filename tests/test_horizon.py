@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from birdslam import bev
-from birdslam.camera import Camera, GroundPlane
-from birdslam.horizon import Horizon, HorizonConfig
-from birdslam.localisation import DIMENSIONS, LocalisationConfig, Observation, extent_m, localise
-from birdslam.parallax import LearnedSize
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.vehicles.ground_size_filter import Horizon, HorizonConfig
+from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, extent_m, localise
+from birdslam.vehicles.parallax import LearnedSize
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 CAR = DIMENSIONS["car"]

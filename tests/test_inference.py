@@ -12,10 +12,10 @@ import pytest
 
 from birdslam.perception import Detections, Findings, ModelSpec, Segmentation
 from birdslam.perception.manifest import Schedule
+from birdslam.runtime.configuration import Configuration, ModelsConfig, PerceiveConfig, SourceConfig
+from birdslam.runtime.nodes import inference
+from birdslam.runtime.nodes.inference import Inference
 from birdslam.types import Frame, Status
-from runtime import inference
-from runtime.configuration import Configuration, ModelsConfig, PerceiveConfig, SourceConfig
-from runtime.inference import Inference
 
 IMAGE = np.zeros((4, 4), dtype=np.uint8)
 

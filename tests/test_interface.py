@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
+from birdslam.perf.faulty_vehicle import Vehicle
+from birdslam.runtime.cli.interface import page
+from birdslam.runtime.cli.main import main
+from birdslam.runtime.topology import QUESTIONS, TOPICS
+from birdslam.runtime.transport.presence import socket_path
 from birdslam.types import INVALIDATING, Status
-from perf.faulty_vehicle import Vehicle
-from runtime.cli import main
-from runtime.interface import page
-from runtime.presence import socket_path
-from runtime.topology import QUESTIONS, TOPICS
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "docs" / "examples"

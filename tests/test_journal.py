@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from runtime.journal import Journal, Priority, journal_behind
-from runtime.live import LiveLine
+from birdslam.runtime.supervision.journal import Journal, Priority, journal_behind
+from birdslam.runtime.supervision.live import LiveLine
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_what_a_node_says_is_a_warning_of_that_node(
     reader: tuple[socket.socket, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     end, address = reader
-    monkeypatch.setattr("runtime.live.journal_behind", lambda stream: Journal(address))
+    monkeypatch.setattr("birdslam.runtime.supervision.live.journal_behind", lambda stream: Journal(address))
     with (tmp_path / "out").open("w+") as stream:
         line = LiveLine(stream)
         for text in ("capture: the camera is late", "optimize was killed by SIGKILL", "all is written"):

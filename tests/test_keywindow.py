@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.keywindow import KeyWindow, KeyWindowConfig
-from birdslam.pose import Pose
-from birdslam.roadfilter import RoadScaleConfig
+from birdslam.geometry.pose import Pose
+from birdslam.odometry.keyframes import KeyWindow, KeyWindowConfig
+from birdslam.odometry.road_filter import RoadScaleConfig
 
 Floats = NDArray[np.float64]
 

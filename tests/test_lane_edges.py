@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera
-from birdslam.graph import GraphConfig, PoseGraph
-from birdslam.lane_edges import LaneEdgesConfig, Station, lane_stations, stations
-from birdslam.se2 import SE2
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig, weighted
+from birdslam.mapping.lane_edges import LaneEdgesConfig, Station, lane_stations, stations
 from birdslam.types import LANE_LANDMARKS, EgoEdge, LandmarkEdge, Measurements
-from birdslam.weights import WeightsConfig, weighted
 
 CONFIG = LaneEdgesConfig()
 CAMERA = Camera(

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from birdslam import bev
-from birdslam.camera import Camera
-from birdslam.lane_edges import LaneEdgesConfig
-from birdslam.lane_mapper import LaneHead, LaneMapper, LaneNews
-from birdslam.lanes import Grids
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.mapping.landmark_edges import StaticMapConfig
+from birdslam.mapping.lane_edges import LaneEdgesConfig
+from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneNews
+from birdslam.mapping.lanes import Grids
 from birdslam.perception import Segmentation
-from birdslam.se2 import SE2
-from birdslam.static_map import StaticMapConfig
 from birdslam.types import LANE_LANDMARKS, Status
 
 CAMERA = Camera(

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam import bev
-from birdslam.camera import Camera
-from birdslam.lane_ids import LaneCloud
-from birdslam.lanes import (
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.mapping.lane_ids import LaneCloud
+from birdslam.mapping.lanes import (
     BOUNDARY,
     ROAD,
     AmodalLanes,
@@ -25,7 +26,6 @@ from birdslam.lanes import (
     segregate,
 )
 from birdslam.perception import Segmentation
-from birdslam.se2 import SE2
 
 CONFIG = LanesConfig()
 CAMERA = Camera(

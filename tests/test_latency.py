@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.latency import Distribution, stages
-from runtime.live import LiveLine
-from runtime.vitals import Vitals
-from runtime.wire import Trace
+from birdslam.runtime.latency import Distribution, stages
+from birdslam.runtime.process.vitals import Vitals
+from birdslam.runtime.supervision.live import LiveLine
+from birdslam.runtime.wire import Trace
 
 MS = 1_000_000
 

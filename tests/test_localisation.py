@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam import bev
-from birdslam.camera import Camera, GroundPlane
-from birdslam.localisation import (
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.vehicles.localisation import (
     DIMENSIONS,
     LocalisationConfig,
     Observation,
@@ -20,7 +21,6 @@ from birdslam.localisation import (
     localise,
     place,
 )
-from birdslam.se2 import SE2
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 GROUND = GroundPlane(1.65, 0.01, 0.0)

@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from birdslam.camera import Camera
-from birdslam.frontend import FrontEndConfig
-from birdslam.kitti_tracking import Label, TrackingSequence, open_tracking, read_detections
-from birdslam.localisation_evaluation import (
+from birdslam.datasets.kitti_tracking import Label, TrackingSequence, open_tracking, read_detections
+from birdslam.evaluation.localisation import (
     INSIDE_1_SIGMA,
     INSIDE_2_SIGMA,
     PAPER,
@@ -19,6 +17,8 @@ from birdslam.localisation_evaluation import (
     drive,
     report,
 )
+from birdslam.frontend import FrontEndConfig
+from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)

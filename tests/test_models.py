@@ -20,11 +20,12 @@ from onnx.external_data_helper import set_external_data
 from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
 from birdslam.perception.manifest_file import read_manifest
 from birdslam.perception.onnx_file import has_weights_elsewhere
-from runtime import model_store, models
-from runtime.cli import _parser, main
-from runtime.commands import configuration_of
-from runtime.configuration import ConfigurationError
-from runtime.download import DownloadError, download
+from birdslam.runtime import model_store
+from birdslam.runtime.cli import models
+from birdslam.runtime.cli.commands import configuration_of
+from birdslam.runtime.cli.download import DownloadError, download
+from birdslam.runtime.cli.main import _parser, main
+from birdslam.runtime.configuration import ConfigurationError
 from tests.tiny_networks import DETECTOR, SEGMENTER
 
 

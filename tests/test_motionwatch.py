@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from birdslam.motionwatch import MotionWatch, MotionWatchConfig
-from birdslam.se2 import SE2
+from birdslam.geometry.se2 import SE2
+from birdslam.odometry.plausibility import MotionWatch, MotionWatchConfig
 from birdslam.types import INVALIDATING, EgoEdge, Measurements, Status
 
 FRAME_NS = 100_000_000

@@ -15,7 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
 from birdslam.perception import Detections, Findings, ModelSpec, Networks, Segmentation, load_network
 from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, Misfit, MultiTask, Schedule, Stretch
 from birdslam.perception.multitask import (
@@ -28,9 +29,8 @@ from birdslam.perception.multitask import (
     body_slices,
 )
 from birdslam.perception.views import make_views
-from birdslam.se2 import SE2
-from birdslam.simulation.truth import CLASSES as SURFACES
-from birdslam.simulation.truth import WorldFrame, WorldObject
+from birdslam.rendered_world.truth import CLASSES as SURFACES
+from birdslam.rendered_world.truth import WorldFrame, WorldObject
 from birdslam.training.augmentation import AugmentationConfig
 from birdslam.training.examination import examine
 from birdslam.training.grading import Grades, average_precision, best_score, extents
@@ -590,7 +590,7 @@ def test_of_two_depths_that_an_outline_leaves_open_the_nearer_costs_less() -> No
 @pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs the extra [train]: numba")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's, of its older ONNX export
 def test_a_training_leaves_a_network_that_loads_and_is_done_when_asked_again(tmp_path: Path) -> None:
-    from runtime.train import main
+    from birdslam.runtime.training.train import main
 
     path, out = tmp_path / "a.toml", tmp_path / "out"
     path.write_text(

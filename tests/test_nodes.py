@@ -13,20 +13,20 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.camera import Camera
-from birdslam.datasets import RecordedFrame
-from birdslam.se2 import SE2
+from birdslam.datasets.recording import RecordedFrame
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.runtime.configuration import Configuration, RuntimeConfig, SourceConfig
+from birdslam.runtime.nodes import capture
+from birdslam.runtime.nodes.capture import CaptureNode
+from birdslam.runtime.nodes.optimize import OptimizeNode
+from birdslam.runtime.nodes.sources import SourceError
+from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
+from birdslam.runtime.transport.bus import Message
+from birdslam.runtime.transport.presence import ring_path
+from birdslam.runtime.transport.ring import FrameReader
+from birdslam.runtime.wire import Trace
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
-from runtime import capture
-from runtime.bus import Message
-from runtime.capture import CaptureNode
-from runtime.configuration import Configuration, RuntimeConfig, SourceConfig
-from runtime.frames import FrameReader
-from runtime.optimize import OptimizeNode
-from runtime.presence import ring_path
-from runtime.restarts import FIRST, Assignment, Resume
-from runtime.sources import SourceError
-from runtime.wire import Trace
 
 CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
 

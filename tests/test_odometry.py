@@ -12,11 +12,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.camera import Camera, GroundPlane
-from birdslam.datasets import open_recording
-from birdslam.motion import planar
-from birdslam.odometry import Motion, Odometry, OdometryConfig
-from birdslam.pose import Pose, rotation_exp, rotation_log
+from birdslam.datasets.opening import open_recording
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
+from birdslam.odometry.motion import planar
+from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
 from birdslam.types import Status
 
 WIDTH_PX, HEIGHT_PX = 620, 188

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from perf.faulty_vehicle import model_options
-from perf.live import Ask, drive
-from perf.machine import Steal
-from perf.system import WARM_UP_S, figures, table
+from birdslam.perf.faulty_vehicle import model_options
+from birdslam.perf.live import Ask, drive
+from birdslam.perf.machine import Steal
+from birdslam.perf.system import WARM_UP_S, figures, table
 
 SECONDS = 25.0
 BUDGET_FACTOR = 1.5  # over the configuration's

@@ -12,16 +12,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from birdslam.graph import PoseGraph
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.runtime.configuration import (
+    BudgetsConfig,
+    Configuration,
+    DegradationConfig,
+    RuntimeConfig,
+    SourceConfig,
+)
+from birdslam.runtime.nodes.checkpoints import MOST_BYTES, CheckpointFile, newest
+from birdslam.runtime.nodes.coasting import Announced, Overdue, deadline_ns, unmeasured
+from birdslam.runtime.nodes.optimize import OptimizeNode
+from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
+from birdslam.runtime.transport.bus import Message
+from birdslam.runtime.wire import Trace
 from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.types import INVALIDATING, Estimate, FrameRef, Measurements, Status
-from runtime.bus import Message
-from runtime.checkpoints import MOST_BYTES, CheckpointFile, newest
-from runtime.coasting import Announced, Overdue, deadline_ns, unmeasured
-from runtime.configuration import BudgetsConfig, Configuration, DegradationConfig, RuntimeConfig, SourceConfig
-from runtime.optimize import OptimizeNode
-from runtime.restarts import FIRST, Assignment, Resume
-from runtime.wire import Trace
 
 MS = 1_000_000
 DRIVE = drive(DriveConfig(frames=60, vehicles=3, traffic="convoy"), 1).measurements

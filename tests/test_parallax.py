@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from birdslam.parallax import UNKNOWN, LearnedSize, Parallax, ParallaxConfig, Sights
-from birdslam.se2 import SE2
+from birdslam.geometry.se2 import SE2
+from birdslam.vehicles.parallax import UNKNOWN, LearnedSize, Parallax, ParallaxConfig, Sights
 
 HEIGHT_M = 1.65  # of the camera
 REACH_M = 2.0

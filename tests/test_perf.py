@@ -14,17 +14,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.se2 import SE2
+from birdslam.geometry.se2 import SE2
+from birdslam.perf import all as everything
+from birdslam.perf import compare, convoy, optimizer, ratios, report, system, transport
+from birdslam.perf.__main__ import main
+from birdslam.perf.errors import PerfError
+from birdslam.perf.figures import BLOCKS, Ledger, curve, noise, spread
+from birdslam.perf.live import Run, Sample
+from birdslam.runtime.transport.bus import Message
+from birdslam.runtime.wire import Stage, Trace
 from birdslam.simulation.drive import DriveConfig
 from birdslam.types import Estimate, Status
-from perf import all as everything
-from perf import compare, convoy, optimizer, ratios, report, system, transport
-from perf.__main__ import main
-from perf.errors import PerfError
-from perf.figures import BLOCKS, Ledger, curve, noise, spread
-from perf.live import Run, Sample
-from runtime.bus import Message
-from runtime.wire import Stage, Trace
 
 MS = 1_000_000
 

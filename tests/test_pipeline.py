@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 import pytest
 
+from birdslam.runtime.client import Planner
+from birdslam.runtime.transport.bus import Bus
+from birdslam.runtime.transport.presence import ring_path
 from birdslam.types import INVALIDATING, Status
-from runtime.bus import Bus
-from runtime.client import Planner
-from runtime.presence import ring_path
 
 FRAMES, WIDTH, HEIGHT, F_PX, HEIGHT_M = 12, 480, 160, 260.0, 1.65
 LIMIT_S = 60.0
@@ -111,7 +111,7 @@ class Run:
 
 
 def command(*arguments: str) -> list[str]:
-    return [sys.executable, "-P", "-m", "runtime.cli", *arguments]
+    return [sys.executable, "-P", "-m", "birdslam.runtime.cli.main", *arguments]
 
 
 def call(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from birdslam import bev
-from birdslam.depthplace import PseudoLidarConfig
-from birdslam.heading import HeadingConfig
-from birdslam.horizon import Depths, Horizon, HorizonConfig
-from birdslam.localisation import DIMENSIONS, LocalisationConfig, Observation, localise
-from birdslam.parallax import ParallaxConfig
-from birdslam.placing import Body, Placing, no_farther_than_cut
-from birdslam.se2 import SE2
+from birdslam.geometry import bev
+from birdslam.geometry.se2 import SE2
+from birdslam.vehicles.depth_fusion import PseudoLidarConfig
+from birdslam.vehicles.ground_size_filter import Depths, Horizon, HorizonConfig
+from birdslam.vehicles.heading import HeadingConfig
+from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, localise
+from birdslam.vehicles.parallax import ParallaxConfig
+from birdslam.vehicles.placing import Body, Placing, no_farther_than_cut
 from tests.test_frontend import CAMERA
 
 Floats = NDArray[np.float64]

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
 from birdslam.perception import ModelError, ModelSpec
 from birdslam.perception.pointnet import frustum_of, load_pointnet
 from birdslam.perception.pointnet_manifest import Points

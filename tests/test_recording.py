@@ -16,19 +16,28 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from birdslam.datasets import DatasetError, load_camera
+from birdslam.datasets.camera_file import load_camera
+from birdslam.datasets.recording import DatasetError
+from birdslam.runtime.client import Planner
+from birdslam.runtime.configuration import Configuration, ConfigurationError, RecordingConfig, SourceConfig
+from birdslam.runtime.nodes.recorder import about
+from birdslam.runtime.nodes.sources import open_source
+from birdslam.runtime.recording import append_only as appendonly
+from birdslam.runtime.recording import scene
+from birdslam.runtime.recording.append_only import AppendOnlyFile
+from birdslam.runtime.recording.foxglove import CompressedImage, schema
+from birdslam.runtime.recording.recording import (
+    JSON_CHANNELS,
+    Alive,
+    Recorded,
+    Recording,
+    RecordingError,
+    RecordingWriter,
+)
+from birdslam.runtime.replay.replay import compare
+from birdslam.runtime.supervision.recorder_station import choose_file
+from birdslam.runtime.wire import Health, decode, encode
 from birdslam.types import Estimate, Measurements
-from runtime import appendonly, scene
-from runtime.appendonly import AppendOnlyFile
-from runtime.client import Planner
-from runtime.configuration import Configuration, ConfigurationError, RecordingConfig, SourceConfig
-from runtime.foxglove import CompressedImage, schema
-from runtime.recorder import about
-from runtime.recorder_station import choose_file
-from runtime.recording import JSON_CHANNELS, Alive, Recorded, Recording, RecordingError, RecordingWriter
-from runtime.replay import compare
-from runtime.sources import open_source
-from runtime.wire import Health, decode, encode
 from tests.taped_drive import CAMERA, Tape, measured
 from tests.test_pipeline import F_PX, HEIGHT, LIMIT_S, WIDTH, Run, call, road_image
 

@@ -12,16 +12,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import perf.replay
+from birdslam.perf import replay as perf_replay
+from birdslam.runtime.cli import recording_commands
+from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest
+from birdslam.runtime.nodes.recorder import about
+from birdslam.runtime.recording.recording import Alive, GraphCheckpoint, Recording, RecordingWriter
+from birdslam.runtime.replay import replay
+from birdslam.runtime.replay.replay import compare
+from birdslam.runtime.replay.report import told
+from birdslam.runtime.replay.verdict import Verdict
 from birdslam.types import Estimate, Status
-from runtime import recording_commands, replay
-from runtime.checkpoints import checkpoint_path, newest
-from runtime.configuration import ConfigurationError
-from runtime.recorder import about
-from runtime.recording import Alive, GraphCheckpoint, Recording, RecordingWriter
-from runtime.replay import compare
-from runtime.report_replay import told
-from runtime.verdict import Verdict
 from tests.taped_drive import CAMERA, Tape, measured
 
 
@@ -275,4 +276,4 @@ def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureF
 def test_a_long_recording_of_the_running_system_replays(data_dir: Path, tmp_path: Path) -> None:
     clip = data_dir / "kitti_odometry" / "sequences" / "00"
     options = ("--source", f"kitti:{clip}", "--minutes", "1.5", "--beside", "0", "--images")
-    assert perf.replay.run([*options, "--output", str(tmp_path / "replay.json")]) == 0
+    assert perf_replay.run([*options, "--output", str(tmp_path / "replay.json")]) == 0

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.configuration import Configuration, RuntimeConfig, SourceConfig
-from runtime.notify import Notifier
-from runtime.restarts import EpochFile, Restarts, Resume
-from runtime.stations import DEAF_RECORDS, Hearing
-from runtime.vitals import Vitals
+from birdslam.runtime.configuration import Configuration, RuntimeConfig, SourceConfig
+from birdslam.runtime.process.notify import Notifier
+from birdslam.runtime.process.restarts import EpochFile, Restarts, Resume
+from birdslam.runtime.process.vitals import Vitals
+from birdslam.runtime.supervision.stations import DEAF_RECORDS, Hearing
 
 CONFIG = RuntimeConfig(restarts_max=3, restart_window_s=10.0, restart_backoff_ms=100.0, restart_backoff_max_ms=150.0)
 

@@ -9,16 +9,16 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from birdslam import bev
-from birdslam.evaluation import rms
+from birdslam.evaluation.odometry import rms
 from birdslam.frontend import FrontEnd, FrontEndConfig
-from birdslam.graph import GraphConfig, PoseGraph
-from birdslam.localisation import DIMENSIONS
+from birdslam.geometry import bev
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections, Perception, Ready
-from birdslam.retrospect import Retrospect, RetrospectConfig, Sight, way
-from birdslam.se2 import SE2
 from birdslam.types import Measurements, Status, VehicleEdge
-from birdslam.weights import WeightsConfig
+from birdslam.vehicles.localisation import DIMENSIONS
+from birdslam.vehicles.rts_smoother import Retrospect, RetrospectConfig, Sight, way
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
 
 Floats = NDArray[np.float64]

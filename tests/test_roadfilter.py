@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from birdslam.camera import Camera
-from birdslam.pose import Pose, rotation_exp
-from birdslam.roadalign import RoadAlignConfig, RoadAligner, RoadFit
-from birdslam.roadfilter import RoadFilter, RoadScaleConfig
-from perf.graded_road import CURVE_M, GradedRoad, Stand
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.pose import Pose, rotation_exp
+from birdslam.odometry.road_alignment import RoadAlignConfig, RoadAligner, RoadFit
+from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
+from birdslam.perf.graded_road import CURVE_M, GradedRoad, Stand
 
 CAMERA = Camera(931, 282, 540.0, 540.0, 456.3, 139.2, height_m=1.65)
 GRADE = 0.06

@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections, Findings, ModelSpec, Perception, Segmentation
 from birdslam.perception.manifest import Schedule
-from birdslam.types import Frame, Status
-from runtime import inference
-from runtime.configuration import (
+from birdslam.runtime.configuration import (
     Configuration,
     ConfigurationError,
     ModelsConfig,
@@ -23,8 +21,10 @@ from runtime.configuration import (
     complete,
     load,
 )
-from runtime.inference import Inference
-from runtime.schedule import NetworkTurn, ScheduleConfig, Turn
+from birdslam.runtime.nodes import inference
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.runtime.schedule import NetworkTurn, ScheduleConfig, Turn
+from birdslam.types import Frame, Status
 
 CAMERA = Camera(640, 192, 370.0, 370.0, 320.0, 88.0, 1.6)
 IMAGE = np.zeros((4, 4), dtype=np.uint8)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from birdslam.se2 import SE2, wrap
+from birdslam.geometry.se2 import SE2, wrap
 
 metres = st.floats(-1e3, 1e3)
 angles = st.floats(-math.pi, math.pi, exclude_max=True)

@@ -23,15 +23,15 @@ from typing import Any
 import pytest
 import zenoh
 
+from birdslam.runtime.client import Planner
+from birdslam.runtime.configuration import load
+from birdslam.runtime.gate import GateError, gate_config
+from birdslam.runtime.supervision.query_server import Door
+from birdslam.runtime.topology import PROCESSES, QUESTIONS, TOPICS, alive_key, key_of
+from birdslam.runtime.transport.bus import Bus, Publisher, Subscriber
+from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
+from birdslam.runtime.wire import MAX_TRACE_BYTES, Health, Trace, WireError, decode, encode
 from birdslam.types import Estimate, MapUpdate
-from runtime.bus import Bus, Publisher, Subscriber
-from runtime.client import Planner
-from runtime.configuration import load
-from runtime.door import Door
-from runtime.gate import GateError, gate_config
-from runtime.presence import runtime_dir_of, socket_path
-from runtime.topology import PROCESSES, QUESTIONS, TOPICS, alive_key, key_of
-from runtime.wire import MAX_TRACE_BYTES, Health, Trace, WireError, decode, encode
 from tests.mutations import Chance, mutated
 from tests.test_bus import estimate, measurements, until
 
@@ -156,7 +156,7 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Ite
         publishers = {t: nodes[TOPICS[t].producer].publisher(t) for t in TOPICS if t != "frame"}
         gate = subprocess.Popen(
             [
-                *(sys.executable, "-P", "-m", "runtime.gate", str(base / "car.toml"), str(path)),
+                *(sys.executable, "-P", "-m", "birdslam.runtime.gate", str(base / "car.toml"), str(path)),
                 *("--runtime-dir", str(base)),
             ],
             stdout=subprocess.PIPE,
@@ -458,7 +458,7 @@ def test_a_gate_that_would_be_open_does_not_start(
 def test_a_gate_says_what_is_wrong_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "car.toml").write_text("")
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "runtime.gate", str(tmp_path / "car.toml"), str(tmp_path / "none.json5")],
+        [sys.executable, "-P", "-m", "birdslam.runtime.gate", str(tmp_path / "car.toml"), str(tmp_path / "none.json5")],
         capture_output=True,
         text=True,
         timeout=LIMIT_S,

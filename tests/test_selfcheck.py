@@ -12,20 +12,20 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.camera import Camera, GroundPlane
-from birdslam.datasets import open_recording
+from birdslam.datasets.kitti_tracking import open_tracking, read_detections
+from birdslam.datasets.opening import open_recording
+from birdslam.evaluation.localisation import drive as drive_boxes
 from birdslam.frontend import FrontEnd, FrontEndConfig
-from birdslam.graph import GraphConfig, PoseGraph
-from birdslam.heightwatch import HeightWatch, HeightWatchConfig
-from birdslam.kitti_tracking import open_tracking, read_detections
-from birdslam.localisation import LocalisationConfig
-from birdslam.localisation_evaluation import drive as drive_boxes
-from birdslam.motion import Motion
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.pose import rotation_exp
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.odometry.motion import Motion
 from birdslam.perception import Perception, Ready, Segmentation
-from birdslam.pose import rotation_exp
-from birdslam.se2 import SE2
 from birdslam.types import Estimate, Frame, Status, VehicleEdge
-from birdslam.weights import WeightsConfig
+from birdslam.vehicles.height_watch import HeightWatch, HeightWatchConfig
+from birdslam.vehicles.localisation import LocalisationConfig
 
 Image = np.ndarray
 Edit = Callable[[int, Image], Image]

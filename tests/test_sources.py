@@ -13,11 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.camera import Camera, Undistorter
-from birdslam.datasets import DatasetError, RecordedFrame, Recording
-from birdslam.types import Status
-from runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
-from runtime.sources import (
+from birdslam.datasets.recording import DatasetError, RecordedFrame, Recording
+from birdslam.geometry.camera import Camera, Undistorter
+from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
+from birdslam.runtime.nodes.sources import (
     EndOfSource,
     Pacer,
     ReadAhead,
@@ -27,6 +26,7 @@ from runtime.sources import (
     open_source,
     to_frame,
 )
+from birdslam.types import Status
 
 CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
 PERIOD_NS = 100_000_000

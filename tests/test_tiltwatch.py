@@ -9,8 +9,8 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera
-from birdslam.tiltwatch import TiltWatch, TiltWatchConfig
+from birdslam.geometry.camera import Camera
+from birdslam.odometry.tilt_watch import TiltWatch, TiltWatchConfig
 
 Floats = NDArray[np.float64]
 STEP_M = 0.8

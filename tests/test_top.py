@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from birdslam.se2 import SE2
+from birdslam.geometry.se2 import SE2
+from birdslam.runtime.cli.top import CLEAR, Watch, top
+from birdslam.runtime.configuration import BudgetsConfig, Configuration
+from birdslam.runtime.topology import NODES
+from birdslam.runtime.transport.bus import Bus
+from birdslam.runtime.wire import Health, Spread, Stage, Trace
 from birdslam.types import Estimate, Status
-from runtime.bus import Bus
-from runtime.configuration import BudgetsConfig, Configuration
-from runtime.top import CLEAR, Watch, top
-from runtime.topology import NODES
-from runtime.wire import Health, Spread, Stage, Trace
 
 LIMIT_S = 10.0
 

@@ -6,14 +6,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from birdslam import bev
-from birdslam.camera import Camera, GroundPlane
-from birdslam.depthplace import DepthPlace
-from birdslam.horizon import Horizon, HorizonConfig
-from birdslam.localisation import LocalisationConfig, localise
-from birdslam.se2 import SE2, wrap
-from birdslam.track import Track
-from birdslam.tracking import Tracker, TrackingConfig
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2, wrap
+from birdslam.vehicles.depth_fusion import DepthPlace
+from birdslam.vehicles.ground_size_filter import Horizon, HorizonConfig
+from birdslam.vehicles.localisation import LocalisationConfig, localise
+from birdslam.vehicles.track import Track
+from birdslam.vehicles.tracking import Tracker, TrackingConfig
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 GROUND = GroundPlane(1.65)

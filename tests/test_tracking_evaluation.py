@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 import tracking_world
 
-from birdslam import ablation, tables
-from birdslam.camera import Camera
-from birdslam.datasets import DatasetError
+from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
+from birdslam.datasets.recording import DatasetError
+from birdslam.evaluation import ablation, tables
+from birdslam.evaluation.tables import Published, read_published
+from birdslam.evaluation.tracking import EGO, PAPER, Row, Truth, make_log, methods, ours, run_trial, summarise
 from birdslam.frontend import FrontEndConfig
-from birdslam.kitti_tracking import TrackingSequence, open_tracking, read_detections
+from birdslam.geometry.camera import Camera
 from birdslam.perception import Perception, Ready
+from birdslam.runtime.cli.evaluate_tracking import PUBLISHED, evaluate
+from birdslam.runtime.cli.tracking_job import frames_of
+from birdslam.runtime.cli.tracking_options import METHODS, add_commands
+from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig, Walk, fit_drift
 from birdslam.slam import SlamConfig
-from birdslam.tables import Published, read_published
-from birdslam.tracking_evaluation import EGO, PAPER, Row, Truth, make_log, methods, ours, run_trial, summarise
 from birdslam.types import Measurements
-from runtime.configuration import Configuration, ConfigurationError
-from runtime.evaluate_tracking import PUBLISHED, evaluate
-from runtime.tracking_job import frames_of
-from runtime.tracking_options import METHODS, add_commands
 
 FRAMES = range(40)
 

@@ -9,9 +9,9 @@ import pytest
 from evo.core import metrics
 from evo.core.trajectory import PosePath3D
 
-from birdslam.kitti_tracking import Label
-from birdslam.se2 import SE2
-from birdslam.tracking_metrics import BoxFrame, count_boxes, hota, idf1, match_vehicles, path_errors
+from birdslam.datasets.kitti_tracking import Label
+from birdslam.evaluation.tracking_metrics import BoxFrame, count_boxes, hota, idf1, match_vehicles, path_errors
+from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import ego_pose
 from birdslam.types import Attitude
 

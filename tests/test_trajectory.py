@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from birdslam.camera import GroundPlane
-from birdslam.se2 import SE2
+from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import (
     CameraTrajectory,
     Pose,

@@ -5,7 +5,7 @@ import math
 import msgspec
 import pytest
 
-from birdslam.se2 import SE2
+from birdslam.geometry.se2 import SE2
 from birdslam.types import INVALIDATING, EgoEdge, Estimate, LandmarkEdge, MapUpdate, Status, VehicleEdge
 
 EYE3 = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runtime import scene
-from runtime.configuration import RecordingConfig
-from runtime.recording import Latency, Recording
+from birdslam.runtime.configuration import RecordingConfig
+from birdslam.runtime.recording import scene
+from birdslam.runtime.recording.recording import Latency, Recording
 from tests.taped_drive import Tape, measured
 from tests.test_pipeline import call
 
@@ -37,7 +37,7 @@ def tape(tmp_path: Path) -> Tape:
 
 @needs_rerun
 def test_a_recording_becomes_a_file_of_reruns(tape: Tape, tmp_path: Path) -> None:
-    from runtime import view
+    from birdslam.runtime.cli import view
 
     file = tmp_path / "drive.rrd"
     assert view.recorded(Recording(tape.path), file) == 0
@@ -50,7 +50,7 @@ def test_a_recording_becomes_a_file_of_reruns(tape: Tape, tmp_path: Path) -> Non
 @needs_rerun
 def test_everything_of_a_drive_is_sent(tape: Tape) -> None:
     """What goes to the stream, entity by entity."""
-    from runtime import view
+    from birdslam.runtime.cli import view
 
     class Stream:
         def __init__(self) -> None:

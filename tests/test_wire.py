@@ -19,8 +19,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from birdslam.answers import MapSnapshot, TimedPose, Trajectory, VehiclePath
-from birdslam.se2 import SE2
+from birdslam.geometry.se2 import SE2
+from birdslam.queries import MapSnapshot, TimedPose, Trajectory, VehiclePath
+from birdslam.runtime.topology import NODES, PROCESSES, QUESTIONS, TOPICS, alive_key, check_name, key_of
+from birdslam.runtime.wire import (
+    MAX_MESSAGE_BYTES,
+    MAX_TRACE_BYTES,
+    Health,
+    Spread,
+    Stage,
+    Trace,
+    WireError,
+    decode,
+    encode,
+)
 from birdslam.types import (
     Attitude,
     EgoEdge,
@@ -36,8 +48,6 @@ from birdslam.types import (
     VehicleEdge,
     VehicleEstimate,
 )
-from runtime.topology import NODES, PROCESSES, QUESTIONS, TOPICS, alive_key, check_name, key_of
-from runtime.wire import MAX_MESSAGE_BYTES, MAX_TRACE_BYTES, Health, Spread, Stage, Trace, WireError, decode, encode
 
 GOLDEN = Path(__file__).parent / "golden"
 

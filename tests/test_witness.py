@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera
 from birdslam.frontend import FrontEnd, FrontEndConfig
-from birdslam.graph import GraphConfig, PoseGraph
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Perception, Ready
-from birdslam.se2 import SE2
+from birdslam.perf import street
+from birdslam.perf.faulty_vehicle import RATE_HZ
+from birdslam.perf.witness import Witness
 from birdslam.types import Estimate, Frame
-from birdslam.weights import WeightsConfig
-from perf import street
-from perf.faulty_vehicle import RATE_HZ
-from perf.witness import Witness
 
 FRAMES, SETTLED = 75, 4
 

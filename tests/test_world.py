@@ -8,13 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from birdslam import bev
-from birdslam.camera import Camera
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera
 
 pytest.importorskip("numba", reason="the built-in world is rendered with numba (extra `train`)")
 
-from birdslam.simulation.truth import CLASSES, WorldFrame
-from birdslam.simulation.world import World, WorldConfig, sample
+from birdslam.rendered_world.truth import CLASSES, WorldFrame
+from birdslam.rendered_world.world import World, WorldConfig, sample
 
 WIDTH, HEIGHT = 320, 96
 ROAD, LANE = CLASSES.index("road"), CLASSES.index("lane")

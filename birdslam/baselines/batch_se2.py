@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.baselines.trajectories import Trajectories, dead_reckoned
-from birdslam.camera import Camera
-from birdslam.graph import GraphConfig
-from birdslam.planar import between, compose, log
-from birdslam.se2 import SE2
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.planar import between, compose, log
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import GraphConfig
+from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.types import LandmarkEdge, Measurements, VehicleEdge
-from birdslam.weights import WeightsConfig, weighted
 
 Floats = NDArray[np.float64]
 

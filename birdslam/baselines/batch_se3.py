@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from birdslam.baselines.posegraph3 import BatchConfig, optimise
 from birdslam.baselines.trajectories import Trajectories
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
 from birdslam.types import Measurements
 
 label = "Batch SE(3), unscaled odometry"

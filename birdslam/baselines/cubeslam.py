@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from birdslam.baselines.posegraph3 import BatchConfig, optimise
 from birdslam.baselines.trajectories import Trajectories
-from birdslam.camera import Camera
-from birdslam.se2 import SE2
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.weights import WeightsConfig
 from birdslam.types import Measurements, VehicleEdge
-from birdslam.weights import WeightsConfig
 
 Floats = NDArray[np.float64]
 

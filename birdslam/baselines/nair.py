@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from birdslam.baselines.posegraph3 import BatchConfig, optimise
 from birdslam.baselines.trajectories import Trajectories
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
 from birdslam.types import Measurements
 
 label = "Nair et al. (IV 2020)"

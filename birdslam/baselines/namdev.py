@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.baselines.trajectories import Trajectories, dead_reckoned
-from birdslam.camera import Camera
-from birdslam.se2 import SE2
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
 from birdslam.types import Measurements, VehicleEdge
 
 Floats = NDArray[np.float64]

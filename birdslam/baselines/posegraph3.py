@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.baselines.trajectories import Trajectories
-from birdslam.se2 import SE2
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.trajectory import ego_pose, inverse, split_pose
 from birdslam.types import Attitude, LandmarkEdge, Measurements
-from birdslam.weights import WeightsConfig, weighted
 
 Floats = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from birdslam.se2 import SE2
+from birdslam.geometry.se2 import SE2
 from birdslam.types import Estimate, Measurements
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera, GroundPlane
+from birdslam.geometry.camera import Camera, GroundPlane
 
 
 @dataclass(frozen=True)

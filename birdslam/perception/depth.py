@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
 from birdslam.perception.manifest import Disparity, Input, MetricDepth, Misfit
 from birdslam.perception.views import View
 
@@ -23,7 +23,7 @@ class DepthMap:
     It lies over the whole undistorted image but may be coarser; `image_width_px`, `image_height_px` are the image's.
     With `canonical_focal_rel` > 0 the numbers are those of a camera whose focal length is so many times its image's
     width: `in_metres` makes them the camera's own. Without `metric` they are known up to one factor, which the road
-    gives (birdslam/pseudolidar.py).
+    gives (birdslam/vehicles/pseudolidar.py).
     """
 
     depth_m: NDArray[np.float32]

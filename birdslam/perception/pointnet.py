@@ -19,7 +19,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
 from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.manifest import Misfit, ModelError, Schedule
 from birdslam.perception.manifest_file import find_as

@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.planar import between, compose, exp
-from birdslam.se2 import SE2, wrap
+from birdslam.geometry.planar import between, compose, exp
+from birdslam.geometry.se2 import SE2, wrap
 from birdslam.types import EgoEdge, LandmarkEdge, LanePoint, Measurements, MotionEdge, Status, VehicleEdge
 
 Floats = NDArray[np.float64]

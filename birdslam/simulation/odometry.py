@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from birdslam import bev
-from birdslam.camera import Camera, GroundPlane
-from birdslam.motion import Motion, planar
-from birdslam.pose import Pose as Step
-from birdslam.se2 import SE2
-from birdslam.static_map import StaticMapConfig, landmark_edges
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.pose import Pose as Step
+from birdslam.geometry.se2 import SE2
+from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
+from birdslam.odometry.motion import Motion, planar
 from birdslam.trajectory import Pose, inverse
 from birdslam.types import LandmarkEdge, Status
 

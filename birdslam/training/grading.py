@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.perception import Detections, Findings
-from birdslam.simulation.truth import CLASSES, WorldFrame, WorldObject
+from birdslam.rendered_world.truth import CLASSES, WorldFrame, WorldObject
 
 _ROAD, _LANE, _SKY = (CLASSES.index(name) for name in ("road", "lane", "sky"))
 _VEHICLES = ("car", "van", "truck", "bus")

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from birdslam.camera import GroundPlane
-from birdslam.lanes import AmodalLanes, LanesConfig, points_of
+from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.mapping.lanes import AmodalLanes, LanesConfig, points_of
 from birdslam.perception import Segmentation
-from birdslam.se2 import SE2
-from birdslam.simulation.truth import CLASSES, WorldFrame
+from birdslam.rendered_world.truth import CLASSES, WorldFrame
 
 Floats = NDArray[np.float64]
 

@@ -17,11 +17,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
-from birdslam.camera import Camera
+from birdslam.geometry.camera import Camera
 from birdslam.perception.depth import DepthMap
 from birdslam.perception.pointnet import frustum_of
 from birdslam.perception.pointnet_manifest import Body, Points
-from birdslam.simulation.truth import WorldFrame, WorldObject
+from birdslam.rendered_world.truth import WorldFrame, WorldObject
 
 Floats = NDArray[np.float64]
 

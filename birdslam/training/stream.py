@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.simulation.truth import WorldFrame
+from birdslam.rendered_world.truth import WorldFrame
 from birdslam.training.augmentation import AugmentationConfig, draw_window, photometric
 from birdslam.training.targets import Example, TargetsConfig, encode
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.perception.multitask import CANONICAL_FOCAL, CLASSES, KINDS
-from birdslam.simulation.truth import CLASSES as SURFACES
-from birdslam.simulation.truth import WorldFrame, WorldObject
+from birdslam.rendered_world.truth import CLASSES as SURFACES
+from birdslam.rendered_world.truth import WorldFrame, WorldObject
 
 MAX_OBJECTS = 24  # of one example; the largest stay
 _ROAD, _LANE, _SKY = (SURFACES.index(name) for name in ("road", "lane", "sky"))

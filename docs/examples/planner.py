@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from runtime.client import Planner
+from birdslam.runtime.client import Planner
 
 vehicle = sys.argv[1] if len(sys.argv) > 1 else "car"
 runtime_dir = Path(sys.argv[2]) if len(sys.argv) > 2 else None

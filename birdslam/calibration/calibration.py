@@ -1,0 +1,282 @@
+"""How a camera stands in its car, from a drive: pitch and roll over the road, and a check of its height.
+
+Three witnesses, each with its own covariance, and the least-squares mean of them with the disagreement in its
+covariance (Birge's ratio):
+
+- the road's image: the homography of the road plane between two images gives pitch and roll (roadalign.py);
+- the direction of travel: on a straight way the epipole lies on the road's horizon, above a camera that looks down;
+- the vehicles: bottoms and heights of many boxes put the horizon where they meet (vehicleheight.py).
+
+What checks its height is in heightcheck.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.calibration.height_check import (
+    HeightCheck,
+    HeightCheckConfig,
+    KnownLength,
+    Step,
+    checks_by_length,
+    checks_by_vehicles,
+)
+from birdslam.frontend import FrontEnd, FrontEndConfig, Pending
+from birdslam.geometry.camera import Camera
+from birdslam.odometry.motion import Motion
+from birdslam.odometry.odometry import Odometry
+from birdslam.odometry.road_alignment import RoadFit, plane_normal
+from birdslam.types import Frame, Status
+from birdslam.vehicles.camera_height import Sight, VehicleHeightConfig, sights_of, stand_of
+
+Floats = NDArray[np.float64]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+WIDE = 10.0  # rad, 1-sigma: not seen at all
+
+
+class CalibrationError(ValueError):
+    """A drive that does not determine the camera; the message says what it lacks."""
+
+
+class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is believed of each witness."""
+
+    vehicles: VehicleHeightConfig = VehicleHeightConfig()
+    height: HeightCheckConfig = HeightCheckConfig()
+    min_path_m: Positive = 20.0  # of measured motion: less shows a few bounces of the car, not its mean
+    min_fits: Annotated[int, msgspec.Meta(ge=3)] = 10
+    bounce_m: Positive = 3.0  # for so long a bounce of the car lasts
+    sigma_bounce_rad: Positive = 0.012
+    sigma_fit_rad: Positive = 0.004  # of one comparison of the road: it is no perfect plane
+    sigma_length_rel: Positive = 0.02  # of the running scale
+    sigma_curvature_per_m: Positive = 0.0006  # of roads along the way
+    sigma_road_rad: Positive = 0.002  # of their mean: crown and grade of the way driven
+    straight_rad_per_m: Positive = 0.005
+    sigma_direction_rad: Positive = 0.012  # of the direction of travel over one metre
+    sigma_travel_rad: Positive = 0.003  # of its mean: a car squats on its springs, and climbs a little
+    max_sigma_rad: Positive = 0.02  # of the result
+    restart_rad: Positive = 0.01  # farther than this from where the drive began, it is driven again from there
+    max_drives: Annotated[int, msgspec.Meta(ge=1)] = 3
+
+
+class Witness(msgspec.Struct, frozen=True, kw_only=True):
+    """(pitch_rad, roll_rad) as one cue sees them, cov (2, 2); `chi2` of its distance from the mean of all."""
+
+    cue: str
+    pitch_rad: float
+    roll_rad: float | None  # None: it does not see the roll
+    cov: tuple[float, ...]
+    samples: int
+    chi2: float = 0.0
+
+
+class Calibration(msgspec.Struct, frozen=True, kw_only=True):
+    """The camera found, with cov (2, 2) of (pitch_rad, roll_rad) and all that it rests on."""
+
+    camera: Camera
+    cov: tuple[float, ...]
+    witnesses: tuple[Witness, ...]
+    height_checks: tuple[HeightCheck, ...]
+    yaw_rad: float | None  # of the optical axis left of the direction of travel; for the reader, no part of the file
+    path_m: float
+    frames: int
+
+
+class _Witnessed(Odometry):
+    """The odometry of the front end, whose last motion can be asked for."""
+
+    motion: Motion | None = None
+
+    def estimate(self, *arguments: Any, **named: Any) -> Motion | None:
+        self.motion = super().estimate(*arguments, **named)
+        return self.motion
+
+    def take(self) -> Motion | None:
+        """The motion of the frame at hand, once."""
+        motion, self.motion = self.motion, None
+        return motion
+
+
+@dataclass
+class _Seen:
+    """What one drive showed."""
+
+    fits: list[tuple[RoadFit, float]] = field(default_factory=list)  # and the way since the one before
+    directions: list[tuple[Floats, float]] = field(default_factory=list)  # of straight travel, and its length
+    steps: list[Step] = field(default_factory=list)
+    sights: list[Sight] = field(default_factory=list)
+    times_ns: dict[int, int] = field(default_factory=dict)
+    frames: int = 0
+
+    @property
+    def path_m(self) -> float:
+        return sum(length for _, _, length in self.steps)
+
+
+Drive = Callable[[], Iterable[tuple[Frame, Pending]]]
+
+
+def calibrate(
+    drive: Drive,
+    camera: Camera,
+    frontend: FrontEndConfig,
+    config: CalibrationConfig,
+    lengths: dict[str, KnownLength] | None = None,
+) -> Calibration:
+    """From all frames of a drive, which is begun anew where it started with a tilt too far off.
+
+    `lengths` names what else knows the way between two frames. Raises CalibrationError.
+    """
+    for _ in range(config.max_drives):
+        seen = _watch(drive, camera, frontend, config)
+        if seen.path_m < config.min_path_m:
+            raise CalibrationError(
+                f"too little motion: {seen.path_m:.1f} m measured in {seen.frames} frames, "
+                f"{config.min_path_m:g} m are needed"
+            )
+        tilt, cov, witnesses = _mean(_witnesses(seen, camera, config))
+        moved = float(np.abs(tilt - [camera.pitch_rad, camera.roll_rad]).max())
+        sigma = np.sqrt(np.diag(cov))
+        camera = msgspec.structs.replace(
+            camera, pitch_rad=float(tilt[0]), roll_rad=float(tilt[1]), tilt_sigma_rad=float(sigma.max())
+        )
+        if moved < config.restart_rad:
+            break
+    if sigma.max() > config.max_sigma_rad:
+        raise CalibrationError(
+            f"pitch and roll are known to {sigma[0]:.3f} and {sigma[1]:.3f} rad only, {config.max_sigma_rad:g} is the "
+            "limit: too little of the road was seen"
+        )
+    return Calibration(
+        camera=camera,
+        cov=tuple(cov.ravel().tolist()),
+        witnesses=witnesses,
+        height_checks=(
+            *checks_by_length(lengths or {}, seen.steps, seen.times_ns, camera, config.height),
+            *checks_by_vehicles(seen.sights, camera, cov, config.vehicles),
+        ),
+        yaw_rad=_yaw_rad(seen),
+        path_m=seen.path_m,
+        frames=seen.frames,
+    )
+
+
+def _watch(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: CalibrationConfig) -> _Seen:
+    odometry, seen = _Witnessed(camera, frontend.odometry), _Seen()
+    front = FrontEnd(camera, frontend, odometry)
+    since_m = 0.0
+    for frame, pending in drive():
+        measurements = front.step(frame, pending)
+        seen.frames += 1
+        seen.times_ns[frame.frame_id] = frame.t_source_ns
+        seen.sights += sights_of(measurements.cv, camera, frontend.localisation)
+        motion = odometry.take()
+        if motion is None or {Status.ODOMETRY_COASTING, Status.SCALE_INVALID, Status.STANDSTILL} & set(motion.status):
+            continue
+        length = float(np.linalg.norm(motion.t_prev_curr_m))
+        since_m += length
+        if odometry.road_fit is not None:
+            seen.fits.append((odometry.road_fit, since_m))
+            since_m = 0.0
+        if Status.SCALE_CARRIED in motion.status:
+            continue
+        seen.steps.append((motion.from_frame, motion.to_frame, length))
+        if length > 0.05 and abs(motion.T_prev_curr.yaw_rad) < config.straight_rad_per_m * length:
+            seen.directions.append((motion.R_prev_curr.T @ motion.t_prev_curr_m / length, length))
+    return seen
+
+
+# --- pitch and roll ---
+
+
+def _witnesses(seen: _Seen, camera: Camera, config: CalibrationConfig) -> list[Witness]:
+    found = [_by_road(seen, config), _by_travel(seen, camera, config), _by_vehicles(seen, camera, config)]
+    witnesses = [witness for witness in found if witness is not None]
+    if not witnesses:
+        raise CalibrationError("neither the road nor a straight way nor vehicles were seen: nothing shows the tilt")
+    return witnesses
+
+
+def _by_road(seen: _Seen, config: CalibrationConfig) -> Witness | None:
+    """The mean of the comparisons of the road; those of one bounce of the car are one sample."""
+    if len(seen.fits) < config.min_fits:
+        return None
+    # Each knows the tilt together with the length of its step, which the running scale knows better than it does, and
+    # with the road's curvature, which is little in the mean.
+    known = np.diag([config.sigma_length_rel**-2, 0.0, 0.0, config.sigma_curvature_per_m**-2])
+    own = np.linalg.inv([fit.cov for fit, _ in seen.fits])
+    cov = np.linalg.inv(own + known)
+    tilt = np.einsum("nij,njk,nk->ni", cov, own, [fit.state for fit, _ in seen.fits])[:, 1:3]
+    noise = cov[:, 1:3, 1:3]
+    noise = noise + np.eye(2) * (config.sigma_fit_rad**2 + config.sigma_bounce_rad**2)
+    share = np.array([min(1.0, way_m / config.bounce_m) for _, way_m in seen.fits])
+    info = np.linalg.inv(noise) * share[:, None, None]
+    mean = np.median(tilt, axis=0)
+    weights = np.ones(len(tilt))
+    for _ in range(10):
+        total = np.einsum("n,nij->ij", weights, info)
+        mean = np.linalg.solve(total, np.einsum("n,nij,nj->i", weights, info, tilt))
+        away = np.sqrt(np.einsum("ni,nij,nj->n", tilt - mean, np.linalg.inv(noise), tilt - mean))
+        weights = 1.0 / np.maximum(1.0, away / 1.5)  # Huber
+    of_mean = np.linalg.inv(total) + np.eye(2) * config.sigma_road_rad**2
+    return _witness("road", mean, of_mean, len(tilt))
+
+
+def _by_travel(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness | None:
+    """A car travels along the road: normal . direction = 0, solved for the pitch at the roll known so far."""
+    length = np.array([length for _, length in seen.directions])
+    if length.sum() < config.min_path_m:
+        return None
+    directions = np.array([d for d, _ in seen.directions])
+    normal, by_pitch, _ = plane_normal(camera.pitch_rad, camera.roll_rad)
+    pitch = camera.pitch_rad - (directions @ normal) / (directions @ by_pitch)
+    order = np.argsort(pitch)
+    cumulated = np.cumsum(length[order])
+    centre = float(pitch[order[np.searchsorted(cumulated, 0.5 * cumulated[-1])]])  # the weighted median
+    # A bounce comes and goes within bounce_m and turns the direction of the camera's travel back and forth
+    variance = config.sigma_direction_rad**2 * max(1.0, config.bounce_m) / length.sum() + config.sigma_travel_rad**2
+    return _witness("travel", np.array([centre, 0.0]), np.diag([variance, WIDE**2]), len(pitch), sees_roll=False)
+
+
+def _by_vehicles(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness | None:
+    prior = np.array([camera.height_m, camera.pitch_rad, camera.roll_rad])
+    stand = stand_of(seen.sights, prior, np.diag([(0.3 * camera.height_m) ** 2, 0.1**2, 0.1**2]), config.vehicles)
+    if stand is None:
+        return None
+    return _witness("vehicles", stand.state[1:], stand.cov[1:, 1:], stand.vehicles)
+
+
+def _witness(cue: str, tilt: Floats, cov: Floats, samples: int, sees_roll: bool = True) -> Witness:
+    return Witness(
+        cue=cue,
+        pitch_rad=float(tilt[0]),
+        roll_rad=float(tilt[1]) if sees_roll else None,
+        cov=tuple(np.ravel(cov).tolist()),
+        samples=samples,
+    )
+
+
+def _mean(witnesses: list[Witness]) -> tuple[Floats, Floats, tuple[Witness, ...]]:
+    """Least squares over all witnesses; the covariance is wider by as much as they disagree."""
+    covs = [np.reshape(w.cov, (2, 2)) for w in witnesses]
+    states = [np.array([w.pitch_rad, 0.0 if w.roll_rad is None else w.roll_rad]) for w in witnesses]
+    cov: Floats = np.linalg.inv(np.sum([np.linalg.inv(c) for c in covs], axis=0))
+    mean: Floats = cov @ np.sum([np.linalg.solve(c, s) for c, s in zip(covs, states, strict=True)], axis=0)
+    chi2 = [float((s - mean) @ np.linalg.solve(c, s - mean)) for c, s in zip(covs, states, strict=True)]
+    freedom = sum(1 if w.roll_rad is None else 2 for w in witnesses) - 2
+    if freedom > 0:
+        cov = cov * max(1.0, sum(chi2) / freedom)
+    return mean, cov, tuple(msgspec.structs.replace(w, chi2=c) for w, c in zip(witnesses, chi2, strict=True))
+
+
+def _yaw_rad(seen: _Seen) -> float | None:
+    if not seen.directions:
+        return None
+    return float(np.median([np.arctan2(d[0], d[2]) for d, _ in seen.directions]))

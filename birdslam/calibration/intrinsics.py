@@ -1,0 +1,195 @@
+"""Intrinsics from what others measured: KITTI calibration files, camera_info YAML of ROS and OpenCV, chessboard images.
+
+Everything here raises DatasetError, which names the file and what is wrong with it. The numbers themselves are checked
+by `camera.Camera`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from birdslam.datasets.kitti import read_image, read_projection
+from birdslam.datasets.recording import DatasetError
+
+Floats = NDArray[np.float64]
+
+DISTORTIONS = ("plumb_bob", "rational_polynomial", "radtan", "")  # of ROS; OpenCV's own files name none
+FEWEST_BOARDS = 6
+MAX_REPROJECTION_PX = 1.0  # root mean square: past it something else than the lens was measured
+MAX_SIGMA_FOCAL_REL = 0.02
+MIN_TILT_DEG = 10.0  # between two of the boards: those that all stand alike leave the focal length open
+KITTI_KEYS = ("P0", "P2", "P_rect_00", "P_rect_02")
+
+
+class Intrinsics(msgspec.Struct, frozen=True, kw_only=True):
+    """A camera without its place in the car; `width_px` is None where the file does not say."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+    width_px: int | None = None
+    height_px: int | None = None
+    source: str = ""
+    reprojection_px: float | None = None  # root mean square of a chessboard's corners
+    sigma_focal_px: float | None = None
+
+
+def read_intrinsics(path: Path, key: str | None = None) -> Intrinsics:
+    """Of a calibration file: YAML (.yaml, .yml) of ROS or OpenCV, else KITTI's text with a projection matrix `key`."""
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return _read_yaml(path)
+    keys = (key,) if key else KITTI_KEYS
+    reason = ""
+    for name in keys:
+        try:
+            P = read_projection(path, name)
+        except DatasetError as error:
+            if "has no" not in str(error):
+                raise
+            reason = str(error)
+            continue
+        return Intrinsics(
+            fx_px=P[0, 0], fy_px=P[1, 1], cx_px=P[0, 2], cy_px=P[1, 2], source=f"{path} ({name}, rectified)"
+        )
+    raise DatasetError(reason if key else f"{path}: has none of {', '.join(KITTI_KEYS)}: no KITTI calibration, no YAML")
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain YAML, and OpenCV's matrices as mappings."""
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, True))
+
+
+def _read_yaml(path: Path) -> Intrinsics:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: can't be read: {getattr(error, 'strerror', None) or 'not UTF-8'}") from None
+    if text.startswith("%YAML"):  # OpenCV writes "%YAML:1.0", which YAML does not know
+        text = text.partition("\n")[2]
+    try:
+        # the first document: `rostopic echo` ends each message by "---"
+        tree = next((document for document in yaml.load_all(text, _Loader) if document is not None), None)
+    except yaml.YAMLError as error:
+        raise DatasetError(f"{path}: no YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(tree, dict):
+        raise DatasetError(f"{path}: holds no camera: expected a mapping with camera_matrix or K")
+    K = _numbers(path, tree, ("camera_matrix", "K", "k", "Camera_Matrix"))
+    if K is None:
+        raise DatasetError(f"{path}: has neither camera_matrix nor K")
+    if len(K) != 9:
+        raise DatasetError(f"{path}: its camera matrix has {len(K)} numbers, not 9")
+    if max(abs(K[i]) for i in (1, 3, 6, 7)) > 1e-6 * max(abs(K[0]), 1.0) or K[8] != 1.0:
+        raise DatasetError(f"{path}: its camera matrix has a skew, or is none: {K}")
+    keys = ("distortion_coefficients", "D", "d", "Distortion_Coefficients", "distortion")
+    distortion = _numbers(path, tree, keys) or []
+    model = str(tree.get("distortion_model") or "")
+    if model not in DISTORTIONS and any(distortion):
+        raise DatasetError(f"{path}: distortion_model {model} is not supported (only {', '.join(DISTORTIONS[:3])})")
+    return Intrinsics(
+        fx_px=K[0],
+        fy_px=K[4],
+        cx_px=K[2],
+        cy_px=K[5],
+        distortion=tuple(distortion) if any(distortion) else (),
+        width_px=_size(path, tree, "width"),
+        height_px=_size(path, tree, "height"),
+        source=str(path),
+    )
+
+
+def _numbers(path: Path, tree: Mapping[str, Any], keys: Iterable[str]) -> list[float] | None:
+    for key in keys:
+        value = tree.get(key)
+        if value is None:
+            continue
+        data = value.get("data") if isinstance(value, dict) else value
+        try:
+            numbers = np.array(data, dtype=np.float64).ravel()
+        except (TypeError, ValueError):
+            raise DatasetError(f"{path}: {key} holds something that is no number") from None
+        if not np.isfinite(numbers).all():
+            raise DatasetError(f"{path}: {key} has numbers that are not finite")
+        out: list[float] = numbers.tolist()
+        return out
+    return None
+
+
+def _size(path: Path, tree: Mapping[str, Any], what: str) -> int | None:
+    value = tree.get(f"image_{what}", tree.get(what))
+    if value is None:
+        return None
+    if not isinstance(value, int) or value < 1:
+        raise DatasetError(f"{path}: the image's {what} is {value!r}")
+    return value
+
+
+def from_chessboard(folder: Path, columns: int, rows: int, square_m: float) -> Intrinsics:
+    """By `cv2.calibrateCamera` from all images of a folder that show the board of `columns` x `rows` inner corners."""
+    if columns < 3 or rows < 3 or not 0.0 < square_m < 10.0:
+        raise DatasetError(f"chessboard of {columns}x{rows} inner corners, {square_m} m a square: is none")
+    if not folder.is_dir():
+        raise DatasetError(f"{folder}: {'is no directory' if folder.exists() else 'no such directory'}")
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
+    if not paths:
+        raise DatasetError(f"{folder}: no images in it (.png or .jpg)")
+    corners, size, first = [], (0, 0), paths[0]
+    for path in paths:
+        try:
+            image = read_image(path)
+        except ValueError as error:
+            raise DatasetError(f"{path}: {error}") from None
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        if size == (0, 0):
+            size, first = (grey.shape[1], grey.shape[0]), path
+        if (grey.shape[1], grey.shape[0]) != size:
+            raise DatasetError(f"{path}: is {grey.shape[1]}x{grey.shape[0]}, but {first.name} is {size[0]}x{size[1]}")
+        found, at = cv2.findChessboardCornersSB(grey, (columns, rows), flags=cv2.CALIB_CB_ACCURACY)
+        if found:
+            corners.append(np.asarray(at, np.float32).reshape(-1, 1, 2))
+    if len(corners) < FEWEST_BOARDS:
+        raise DatasetError(
+            f"{folder}: the board of {columns}x{rows} inner corners was found in {len(corners)} of {len(paths)} "
+            f"images, {FEWEST_BOARDS} are needed"
+        )
+    board = np.zeros((columns * rows, 3), np.float32)
+    board[:, :2] = np.mgrid[0:columns, 0:rows].T.reshape(-1, 2) * square_m
+    rms, K, distortion, turns, _, sigma, _, _ = cv2.calibrateCameraExtended(
+        [board] * len(corners), corners, size, np.eye(3), np.zeros(5)
+    )
+    sigma_focal_px = float(np.max(sigma[:2]))
+    if not np.isfinite(rms) or rms > MAX_REPROJECTION_PX:
+        raise DatasetError(
+            f"{folder}: the corners miss the calibrated camera by {rms:.2f} px (root mean square), more than "
+            f"{MAX_REPROJECTION_PX} px: blurred images, a bent board, or not {columns}x{rows} inner corners"
+        )
+    normals = np.array([cv2.Rodrigues(np.asarray(turn))[0][:, 2] for turn in turns])
+    tilt_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
+    if tilt_deg < MIN_TILT_DEG or sigma_focal_px > MAX_SIGMA_FOCAL_REL * K[0, 0]:
+        raise DatasetError(
+            f"{folder}: the boards differ by {tilt_deg:.0f} degrees of tilt, and the focal length {K[0, 0]:.0f} px is "
+            f"known to {sigma_focal_px:.1f} px: tilt the board more ({MIN_TILT_DEG:g} degrees)"
+        )
+    return Intrinsics(
+        fx_px=float(K[0, 0]),
+        fy_px=float(K[1, 1]),
+        cx_px=float(K[0, 2]),
+        cy_px=float(K[1, 2]),
+        distortion=tuple(np.ravel(distortion).tolist()),
+        width_px=size[0],
+        height_px=size[1],
+        source=f"{len(corners)} chessboards in {folder}",
+        reprojection_px=float(rms),
+        sigma_focal_px=sigma_focal_px,
+    )

@@ -1,0 +1,21 @@
+"""Camera files: TOML whose keys are the fields of `Camera`."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import msgspec
+
+from birdslam.datasets.recording import DatasetError
+from birdslam.geometry.camera import Camera
+
+
+def load_camera(path: Path) -> Camera:
+    """The camera of a TOML file whose keys are the fields of `Camera`. Raises DatasetError naming file and key."""
+    try:
+        return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), Camera)
+    except OSError as error:
+        raise DatasetError(f"camera file {path}: can't be read: {error.strerror}") from None
+    except (ValueError, msgspec.ValidationError) as error:  # ValueError: no UTF-8, or no TOML
+        raise DatasetError(f"camera file {path}: {error}") from None

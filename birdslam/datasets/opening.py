@@ -1,0 +1,29 @@
+"""Recorded drives by their URI: KITTI odometry, tracking, raw drives and clips, video files, and the shipped drive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from birdslam.datasets.demo import DemoRecording
+from birdslam.datasets.kitti import KittiRecording
+from birdslam.datasets.recording import DatasetError, Recording
+from birdslam.datasets.video import VideoRecording
+from birdslam.geometry.camera import Camera
+
+
+def open_recording(uri: str, camera: Camera | None = None, stride: int = 1) -> Recording:
+    """Open `kitti:DIR`, `video:FILE` or `demo`, the drive that ships with birdslam, every `stride`-th frame of it.
+
+    `camera` goes before the recording's own calibration.
+
+    Raises DatasetError where it can't be used.
+    """
+    scheme, _, rest = uri.partition(":")
+    if stride < 1:
+        raise DatasetError(f"{uri}: the stride must be 1 or more, got {stride}")
+    if scheme == "demo" and not rest:
+        return DemoRecording(camera, stride)
+    if not rest or scheme not in ("kitti", "video"):
+        raise DatasetError(f"{uri}: no recording; expected kitti:DIR, video:FILE or demo")
+    path = Path(rest).expanduser()
+    return KittiRecording(path, camera, stride) if scheme == "kitti" else VideoRecording(path, camera, stride)

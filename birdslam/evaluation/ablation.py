@@ -1,0 +1,75 @@
+"""The paper's ablations as variants of the incremental method (its Tables 3 and 4) and of the batch (Table 5).
+
+A variant is a change of weights, so that it runs on the same log. "Without" is weight zero: CC keeps its motion as the
+guess that the graph starts from, CV the first sight of a vehicle, as nothing else says where they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+from msgspec.structs import replace as restruct
+
+from birdslam.baselines import batch_se3
+from birdslam.baselines.trajectories import Trajectories
+from birdslam.evaluation.tracking import Live, Method
+from birdslam.geometry.camera import Camera
+from birdslam.graph.weights import EdgeType
+from birdslam.types import Measurements
+
+NO_WEIGHT = 1e-3  # an edge whose variance is past any reason would be taken for a broken one
+CP_WEIGHTS = MappingProxyType({"cp_low": 0.01, "cp_medium": 1.0, "cp_high": 100.0})  # against CC's own
+DEPTHS_M = MappingProxyType(
+    {"depth_12": 12.0, "depth_15": 15.0, "depth_18": 18.0, "depth_20": 20.0, "depth_none": None}
+)
+FARTHEST_LANDMARK_M = 200.0  # the front end's own limit must not stand in for the threshold
+
+
+def constraint_variants(base: Live) -> dict[str, Live]:
+    """Table 3: without one type of edge each, and with all."""
+    return {
+        "without_cc": _leave_out(base, "cc"),
+        "without_cv": _without_cv(base),
+        "without_vv": replace(_leave_out(base, "vv"), graph=restruct(base.graph, constant_velocity=False)),
+        "without_cp": _leave_out(base, "cp"),
+        "all": base,
+    }
+
+
+def landmark_variants(base: Live) -> dict[str, Live]:
+    """Table 4: the weight of CP against CC's, and the depth from which on landmarks are left out."""
+    out = {}
+    for name, factor in CP_WEIGHTS.items():
+        if base.weights.mode == "paper":
+            out[name] = replace(base, weights=restruct(base.weights, cp=factor * base.weights.cc))
+        else:
+            out[name] = replace(base, cp_inflation=1.0 / factor)
+    for name, depth_m in DEPTHS_M.items():
+        out[name] = replace(base, weights=restruct(base.weights, depth_threshold_m=depth_m))
+    return out
+
+
+def lane_variants() -> dict[str, Method]:
+    """Table 5: the batch before and after lane constraints."""
+    return {"before_lanes": _Batch("Batch SE(3) before lane constraints", False), "after_lanes": batch_se3}
+
+
+@dataclass(frozen=True)
+class _Batch:
+    label: str
+    lanes: bool
+
+    def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
+        return batch_se3.run(log, camera, self.lanes)
+
+
+def _leave_out(base: Live, edge: EdgeType) -> Live:
+    return replace(base, weights=restruct(base.weights, leave_out=tuple({*base.weights.left_out, edge})))
+
+
+def _without_cv(base: Live) -> Live:
+    if base.weights.mode == "paper":
+        return replace(base, weights=restruct(base.weights, cv_near=NO_WEIGHT, cv_far=NO_WEIGHT))
+    return replace(base, cv_inflation=1.0 / NO_WEIGHT)

@@ -1,0 +1,281 @@
+"""The paper's benchmark: every method on one log of measurements, held to KITTI tracking's labels and poses.
+
+A *log* is what the front end says of a drive. It is made once for each seed and given to every method, so that methods
+differ in nothing else. Track ids are our own tracker's; a label's track in a frame is the one whose box overlaps it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from birdslam.baselines import batch_se3, cubeslam, nair, namdev
+from birdslam.baselines.trajectories import LiveTrajectories, Trajectories
+from birdslam.datasets.kitti import KITTI_RATE_HZ
+from birdslam.datasets.kitti_tracking import VEHICLE_KINDS, TrackingSequence
+from birdslam.evaluation.tracking_metrics import (
+    BoxFrame,
+    PathErrors,
+    count_boxes,
+    hota,
+    idf1,
+    match_vehicles,
+    path_errors,
+)
+from birdslam.frontend import EgoMotion, FrontEnd, FrontEndConfig, Pending
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.simulation.odometry import SimulatedOdometry
+from birdslam.slam import SlamConfig
+from birdslam.trajectory import NS_PER_S
+from birdslam.types import Frame, Measurements
+from birdslam.vehicles.rts_smoother import Retrospect, RetrospectConfig
+
+EGO = "ego"
+LEAST_FRAMES = 5  # a vehicle matched in fewer is left out of the report, unless the paper names it
+
+NO_IMAGE = np.zeros((1, 1), dtype=np.uint8)  # for an odometry that looks at none
+
+
+class Method(Protocol):
+    """A module of baselines/, `Live` or `Final`."""
+
+    @property
+    def label(self) -> str: ...
+
+    def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories: ...
+
+
+@dataclass(frozen=True)
+class Live:
+    """Our incremental pose graph: the live estimate of each frame, which knows nothing of later ones."""
+
+    label: str
+    weights: WeightsConfig
+    graph: GraphConfig
+    cv_inflation: float = 1.0  # of the variances in the log
+    cp_inflation: float = 1.0
+
+    def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
+        """One update for each record."""
+        graph, live = PoseGraph(self.graph, self.weights), LiveTrajectories()
+        for measurements in log:
+            live.add(graph.update(self._reweighed(measurements)))
+        return live.result
+
+    def _reweighed(self, m: Measurements) -> Measurements:
+        if self.cv_inflation == self.cp_inflation == 1.0:
+            return m
+        cv = [replace(e, cov=tuple(self.cv_inflation * v for v in e.cov)) for e in m.cv]
+        cp = [replace(e, cov=tuple(self.cp_inflation * v for v in e.cov)) for e in m.cp]
+        return replace(m, cv=tuple(cv), cp=tuple(cp))
+
+
+@dataclass(frozen=True)
+class Final:
+    """The vehicles' ways as our system knows them at the end of the log, beside the ego's live one.
+
+    A batch, and the paper's graph, which keeps every pose, answer for each frame with all of them: so does this.
+    """
+
+    label: str
+    live: Live
+    retrospect: RetrospectConfig
+
+    def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
+        """One update for each record, and a look back."""
+        graph, live = PoseGraph(self.live.graph, self.live.weights), LiveTrajectories()
+        past = Retrospect(self.retrospect)
+        for measurements in log:
+            estimate = graph.update(measurements)
+            live.add(estimate)
+            past.add(measurements, estimate)
+        out = Trajectories(ego=live.result.ego)
+        for (epoch, vehicle), way in past.ways().items():
+            for frame, pose in way.items():
+                out.put_vehicle(vehicle, frame, live.T_first_world[epoch] @ pose)
+        return out
+
+
+PAPER = Live("BirdSLAM as published", WeightsConfig(mode="paper"), GraphConfig(constant_velocity=False))
+
+
+def ours(config: SlamConfig) -> Live:
+    """The method as configured: what a planner gets."""
+    return Live("BirdSLAM (this system), live", config.weights, config.graph)
+
+
+def methods(config: SlamConfig) -> dict[str, Method]:
+    """Every method by its name; `config` is that of `birdslam`."""
+    return {
+        "birdslam": Final("BirdSLAM (this system)", ours(config), RetrospectConfig()),
+        "birdslam_live": ours(config),
+        "paper": PAPER,
+        "batch_se3": batch_se3,
+        "nair": nair,
+        "namdev": namdev,
+        "cubeslam": cubeslam,
+    }
+
+
+def make_log(
+    sequence: TrackingSequence,
+    frames: range,
+    odometry: EgoMotion | None,
+    perceive: Callable[[int, NDArray[np.uint8]], Pending],
+    images: Callable[[int], NDArray[np.uint8] | None] | None,
+    config: FrontEndConfig,
+) -> list[Measurements]:
+    """The front end's measurements of `frames`; frame ids are KITTI's.
+
+    `images` gives a frame's image, None where it is unreadable; without `images` the odometry looks at none.
+    """
+    frontend, log = FrontEnd(sequence.camera, config, odometry), []
+    for index in frames:
+        image = NO_IMAGE if images is None else images(index)
+        t_ns = round(index / KITTI_RATE_HZ * NS_PER_S)
+        pending = perceive(index, NO_IMAGE if image is None else image)
+        m = frontend.step(Frame(index, t_ns, t_ns, t_ns, image), pending)
+        if isinstance(odometry, SimulatedOdometry) and m.ground is not None:
+            ground = GroundPlane(m.ground.height_m, m.ground.pitch_rad, m.ground.roll_rad)
+            m = replace(m, cp=odometry.landmarks(index, ground, config.static_map))
+        log.append(m)
+    return log
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a log is held to: poses in the world of its first frame, and each frame's label -> track of ours."""
+
+    ego: dict[int, SE2]
+    vehicles: dict[int, dict[int, SE2]]  # label's id -> frame -> pose
+    kinds: dict[int, str]
+    matches: dict[int, dict[int, int]]  # frame -> label's id -> vehicle
+    boxes: list[BoxFrame]
+
+    @staticmethod
+    def of(sequence: TrackingSequence, log: Sequence[Measurements]) -> Truth:
+        """Raises ValueError for an empty log."""
+        if not log:
+            raise ValueError(f"sequence {sequence.name}: no frames to evaluate")
+        first = log[0].frame_id
+        ego = sequence.ego_truth(first)
+        out = Truth({m.frame_id: ego[m.frame_id] for m in log}, {}, {}, {}, [])
+        for m in log:
+            labels = sequence.labels_of(m.frame_id)
+            ids, boxes_px = [edge.vehicle for edge in m.cv], np.array([edge.box_px for edge in m.cv]).reshape(-1, 4)
+            for label in labels:
+                if label.kind in VEHICLE_KINDS:
+                    pose = sequence.vehicle_truth(label, first)
+                    out.vehicles.setdefault(label.track, {})[m.frame_id] = pose
+                    out.kinds[label.track] = label.kind
+            out.matches[m.frame_id] = match_vehicles(labels, ids, boxes_px)
+            out.boxes.append(count_boxes(labels, ids, boxes_px))
+        return out
+
+    def found(self, label: int, result: Trajectories) -> dict[int, SE2]:
+        """A label's poses as a method estimated them, through whichever track held it in each frame."""
+        out = {}
+        for frame, match in self.matches.items():
+            pose = result.vehicles.get(match.get(label, -1), {}).get(frame)
+            if pose is not None:
+                out[frame] = pose
+        return out
+
+    def errors(self, result: Trajectories) -> dict[str, PathErrors | None]:
+        """Errors of "ego" and of every labelled vehicle; None for one that was never found."""
+        out = {EGO: path_errors(self.ego, result.ego)}
+        for label in sorted(self.vehicles):
+            out[str(label)] = path_errors(self.vehicles[label], self.found(label, result))
+        return out
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """One body in one sequence by one method: medians over the seeds, and the standard deviation of `ate_m`."""
+
+    sequence: str
+    method: str
+    body: str  # "ego", or the label's id
+    frames: float  # that count: the body has a label and an estimate
+    frames_labelled: int
+    seeds: int
+    ate_m: float | None = None
+    ate_m_spread: float | None = None
+    rpe_t_m: float | None = None
+    rpe_r_deg: float | None = None
+    motion_error_m: float | None = None
+    hota: float | None = None  # of the sequence's cars, in the rows of the ego; the same tracks for every method
+    idf1: float | None = None
+    odometry: str = ""
+    detections: str = ""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One seed: errors by method and body, and the tracks' quality in the image."""
+
+    errors: Mapping[str, Mapping[str, PathErrors | None]]
+    frames_labelled: Mapping[str, int]
+    hota: float | None
+    idf1: float | None
+
+
+def run_trial(sequence: TrackingSequence, log: Sequence[Measurements], chosen: Mapping[str, Method]) -> Trial:
+    """Every method on one log."""
+    truth = Truth.of(sequence, log)
+    labelled = {EGO: len(truth.ego)} | {str(label): len(poses) for label, poses in truth.vehicles.items()}
+    errors = {name: truth.errors(method.run(log, sequence.camera)) for name, method in chosen.items()}
+    return Trial(errors, labelled, hota(truth.boxes), idf1(truth.boxes))
+
+
+def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odometry: str, detections: str) -> list[Row]:
+    """The rows of one sequence from its trials, one for each seed; bodies in `keep` stay however little was seen."""
+    rows, keep = [], set(keep) | {EGO}
+    for method in trials[0].errors:
+        for body, labelled in trials[0].frames_labelled.items():
+            found = [trial.errors[method].get(body) for trial in trials]
+            seen = [errors for errors in found if errors is not None]
+            frames = float(np.median([0 if errors is None else errors.frames for errors in found]))
+            if frames < LEAST_FRAMES and body not in keep:
+                continue
+            whole = body == EGO
+            rows.append(
+                Row(
+                    sequence=sequence,
+                    method=method,
+                    body=body,
+                    frames=frames,
+                    frames_labelled=labelled,
+                    seeds=len(trials),
+                    ate_m=_median([errors.ate_m for errors in seen]),
+                    ate_m_spread=float(np.std([errors.ate_m for errors in seen])) if seen else None,
+                    rpe_t_m=_median([errors.rpe_t_m for errors in seen]),
+                    rpe_r_deg=_median([errors.rpe_r_deg for errors in seen]),
+                    motion_error_m=_median([errors.motion_error_m for errors in seen]),
+                    hota=_median([trial.hota for trial in trials]) if whole else None,
+                    idf1=_median([trial.idf1 for trial in trials]) if whole else None,
+                    odometry=odometry,
+                    detections=detections,
+                )
+            )
+    return rows
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    numbers = [value for value in values if value is not None]
+    return float(np.median(numbers)) if numbers else None
+
+
+def mean_ate_m(rows: Iterable[Row], method: str, bodies: Mapping[str, Iterable[str]]) -> float | None:
+    """Mean of `ate_m` over bodies by sequence; None where one of them is missing, or there are none."""
+    of = {(row.sequence, row.body): row.ate_m for row in rows if row.method == method}
+    errors = [of.get((sequence, body)) for sequence, names in bodies.items() for body in names]
+    return float(np.mean([e for e in errors if e is not None])) if errors and None not in errors else None

@@ -1,0 +1,163 @@
+"""A frame of the drive's video: the camera's image with the vehicles' boxes beside the ego's bird's-eye view.
+
+Where the truth is known, thin white outlines show it in the bird's-eye view. All arrays are BGR.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.evaluation.picture import (
+    EGO,
+    EGO_AXLE_M,
+    EGO_LENGTH_M,
+    EGO_WIDTH_M,
+    FAINT,
+    GRID,
+    INK,
+    LANDMARK,
+    LANE,
+    PAPER,
+    colour_of,
+)
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.types import Estimate, MapUpdate, VehicleEstimate
+
+Image = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+
+IMAGE_SCALE = 1.5  # of the camera's image
+STRIP_PX, PANEL_PX = 96, 368  # height of the strip of text below the image, width of the bird's-eye view
+AHEAD_M, BEHIND_M = 50.0, 10.0  # shown of the bird's-eye view
+BOX_HEIGHT_M = 1.5  # estimates have none
+KEPT_POINTS, KEPT_POSES = 12_000, 400
+SHIFT = 4  # OpenCV's fractional bits: outlines don't jump from pixel to pixel
+RING_M = 10.0
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def _bgr(colour: str) -> tuple[int, int, int]:
+    return int(colour[5:7], 16), int(colour[3:5], 16), int(colour[1:3], 16)
+
+
+class SideBySide:
+    """Draws frame after frame; what the map gained is added as it came."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._image_px = (round(camera.width_px * IMAGE_SCALE), round(camera.height_px * IMAGE_SCALE))
+        self.size_px = self._image_px[0] + PANEL_PX, self._image_px[1] + STRIP_PX  # width, height; both even
+        self.size_px = self.size_px[0] // 2 * 2, self.size_px[1] // 2 * 2
+        self._per_m = self.size_px[1] / (AHEAD_M + BEHIND_M)
+        self._epoch: int | None = None
+        self._lanes: deque[tuple[float, float]] = deque(maxlen=KEPT_POINTS)
+        self._landmarks: deque[tuple[float, float]] = deque(maxlen=KEPT_POINTS)
+        self._way: deque[tuple[float, float]] = deque(maxlen=KEPT_POSES)
+
+    def add_map(self, update: MapUpdate) -> None:
+        """Points in world of the update's epoch."""
+        self._enter(update.epoch)
+        self._lanes.extend(update.lanes_m)
+        self._landmarks.extend(update.landmarks_m)
+
+    def draw(self, image: Image, estimate: Estimate, true_outlines: Sequence[Floats], words: Sequence[str]) -> Image:
+        """(H, W, 3) of `size_px`, from the undistorted `image`; `true_outlines` are (4, 2) footprints in ego."""
+        self._enter(estimate.epoch)
+        self._way.append((estimate.T_world_ego.x_m, estimate.T_world_ego.y_m))
+        canvas = np.full((self.size_px[1], self.size_px[0], 3), _bgr(PAPER), np.uint8)
+        width_px, height_px = self._image_px
+        canvas[:height_px, :width_px] = self._camera_view(image, estimate)
+        for line, text in enumerate(words):
+            at = 14, height_px + 24 + 24 * line
+            colour = _bgr(INK if line == 0 else FAINT)
+            cv2.putText(canvas, text, at, FONT, 0.5, colour, 1, cv2.LINE_AA)
+        canvas[:, width_px:] = self._from_above(estimate, true_outlines)[:, : canvas.shape[1] - width_px]
+        return canvas
+
+    def _enter(self, epoch: int) -> None:
+        if epoch != self._epoch:  # nothing is known of where the old world lies in the new one
+            self._lanes.clear()
+            self._landmarks.clear()
+            self._way.clear()
+            self._epoch = epoch
+
+    def _camera_view(self, image: Image, estimate: Estimate) -> Image:
+        view: Image = cv2.resize(image, self._image_px, interpolation=cv2.INTER_LINEAR)  # type: ignore[assignment]
+        ground = self._camera.ground
+        if estimate.ground is not None:
+            ground = GroundPlane(estimate.ground.height_m, estimate.ground.pitch_rad, estimate.ground.roll_rad)
+        for vehicle in estimate.vehicles:
+            if vehicle.age_ns:
+                continue
+            foot = outline(estimate.T_world_ego.between(vehicle.T_world_vehicle), vehicle.length_m, vehicle.width_m)
+            corners = np.vstack([np.column_stack([foot, np.full(4, z_m)]) for z_m in (0.0, BOX_HEIGHT_M)])
+            if corners[:, 0].min() < 1.0:  # reaches behind the image plane
+                continue
+            px = (bev.ego_to_pixel(self._camera, ground, corners) + 0.5) * IMAGE_SCALE - 0.5
+            low, high = _fixed(px[:4]), _fixed(px[4:])
+            colour = _colour_of(vehicle)
+            cv2.polylines(view, [low, high], True, colour, 1, cv2.LINE_AA, SHIFT)
+            for a, b in zip(low.tolist(), high.tolist(), strict=True):
+                cv2.line(view, a, b, colour, 1, cv2.LINE_AA, SHIFT)
+            at = np.clip(px[4:].min(axis=0), -1e4, 1e4)
+            text = f"{vehicle.vehicle}  {foot[:, 0].min():.0f} m"
+            cv2.putText(view, text, (int(at[0]), int(at[1]) - 4), FONT, 0.4, colour, 1, cv2.LINE_AA)
+        return view
+
+    def _from_above(self, estimate: Estimate, true_outlines: Sequence[Floats]) -> Image:
+        panel = np.full((self.size_px[1], PANEL_PX, 3), _bgr(PAPER), np.uint8)
+        T_ego_world = estimate.T_world_ego.inverse()
+        origin = self._panel_px(np.zeros((1, 2)))[0]
+        for ring in range(1, int(AHEAD_M / RING_M) + 1):
+            radius = round(ring * RING_M * self._per_m)
+            cv2.circle(panel, (int(origin[0]), int(origin[1])), radius, _bgr(GRID), 1, cv2.LINE_AA)
+        for points, colour in ((self._landmarks, LANDMARK), (self._lanes, LANE)):
+            if points:
+                at = np.rint(self._panel_px(T_ego_world @ np.array(points))).astype(np.int64)
+                at = at[((at >= 0) & (at < [PANEL_PX, self.size_px[1]])).all(axis=1)]
+                panel[at[:, 1], at[:, 0]] = _bgr(colour)
+        way = _fixed(self._panel_px(T_ego_world @ np.array(self._way)))
+        cv2.polylines(panel, [way], False, _bgr(EGO), 2, cv2.LINE_AA, SHIFT)
+        for vehicle in estimate.vehicles:
+            pose = estimate.T_world_ego.between(vehicle.T_world_vehicle)
+            px = self._panel_px(outline(pose, vehicle.length_m, vehicle.width_m))
+            if vehicle.age_ns == 0:
+                cv2.fillPoly(panel, [_fixed(px)], _colour_of(vehicle), cv2.LINE_AA, SHIFT)
+            cv2.polylines(panel, [_fixed(px)], True, _colour_of(vehicle), 1, cv2.LINE_AA, SHIFT)
+            u, v = px.max(axis=0)
+            if 0 <= u < PANEL_PX and 0 <= v < len(panel):
+                cv2.putText(panel, f"{vehicle.vehicle}", (int(u) + 2, int(v)), FONT, 0.35, _bgr(INK), 1, cv2.LINE_AA)
+        for true in true_outlines:
+            cv2.polylines(panel, [_fixed(self._panel_px(true))], True, (255, 255, 255), 1, cv2.LINE_AA, SHIFT)
+        own = outline(SE2(EGO_AXLE_M - EGO_LENGTH_M / 2.0, 0.0, 0.0), EGO_LENGTH_M, EGO_WIDTH_M)
+        cv2.fillPoly(panel, [_fixed(self._panel_px(own))], _bgr(EGO), cv2.LINE_AA, SHIFT)
+        return panel
+
+    def _panel_px(self, points: Floats) -> Floats:
+        """Of points (N, 2) in ego: forward up, left to the left."""
+        out: Floats = np.column_stack(
+            [PANEL_PX / 2.0 - points[:, 1] * self._per_m, (AHEAD_M - points[:, 0]) * self._per_m]
+        )
+        return out
+
+
+def outline(pose: SE2, length_m: float, width_m: float) -> Floats:
+    """Corners (4, 2) of a footprint whose centre is `pose`."""
+    x_m, y_m = length_m / 2.0, width_m / 2.0
+    return pose @ np.array([[x_m, y_m], [x_m, -y_m], [-x_m, -y_m], [-x_m, y_m]])
+
+
+def _colour_of(vehicle: VehicleEstimate) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * share) for share in colour_of(vehicle.vehicle))
+    return blue, green, red
+
+
+def _fixed(px: Floats) -> NDArray[np.int32]:
+    return np.rint(np.clip(px, -1e5, 1e5) * 2**SHIFT).astype(np.int32)

@@ -1,0 +1,79 @@
+"""Single-view metrology: pixels of the road to metres in bird's-eye view, and back (paper, Eq. 1).
+
+Eq. 1 is stated for a normal n and a height H in camera axes; the points leave here in ego (x forward, y left), the
+frame at the camera's foot.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera, GroundPlane
+
+MAX_RANGE_M = 200.0  # past it a pixel row covers tens of metres: such a point says nothing
+
+
+def road_point_cam(camera: Camera, ground: GroundPlane, px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Road points in camera axes, (N, 3) in metres, of pixels (N, 2); NaN where the ray misses the road (Eq. 1)."""
+    px = np.atleast_2d(np.asarray(px, dtype=np.float64))
+    rays = np.column_stack(
+        [(px[:, 0] - camera.cx_px) / camera.fx_px, (px[:, 1] - camera.cy_px) / camera.fy_px, np.ones(len(px))]
+    )
+    descent = rays @ ground.normal_cam
+    with np.errstate(divide="ignore", invalid="ignore"):
+        points = -ground.height_m * rays / descent[:, None]  # Eq. 1
+    points[(descent >= 0.0) | (points[:, 2] > MAX_RANGE_M)] = np.nan
+    return points
+
+
+def pixel_to_ego(camera: Camera, ground: GroundPlane, px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Road points in ego, (N, 2) in metres, of pixels (N, 2); NaN above the horizon or past MAX_RANGE_M."""
+    return (road_point_cam(camera, ground, px) @ ground.R_ego_cam.T)[:, :2]
+
+
+def ego_to_pixel(camera: Camera, ground: GroundPlane, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels (N, 2) of points in ego, (N, 2) on the road or (N, 3); NaN behind the camera."""
+    points = np.atleast_2d(np.asarray(points, dtype=np.float64))
+    if points.shape[1] == 2:
+        points = np.column_stack([points, np.zeros(len(points))])
+    cam = (points - np.array([0.0, 0.0, ground.height_m])) @ ground.R_ego_cam
+    with np.errstate(divide="ignore", invalid="ignore"):
+        px = cam[:, :2] / cam[:, 2:] * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+    px[cam[:, 2] <= 0.0] = np.nan
+    return px
+
+
+def road_point_cov(
+    camera: Camera,
+    ground: GroundPlane,
+    px: NDArray[np.float64],
+    sigma_px: NDArray[np.float64] | float,
+    sigma_pitch_rad: float = 0.0,
+    sigma_height_rel: float = 0.0,
+) -> NDArray[np.float64]:
+    """Covariances (N, 2, 2) in m^2 of `pixel_to_ego`, to first order.
+
+    `sigma_px` is the pixel noise, one for all, or (2,) for u and v. Pitch and height errors are common to all points of
+    a frame; they are added to each point as if they were its own.
+    """
+    px = np.atleast_2d(np.asarray(px, dtype=np.float64))
+    sigma_u, sigma_v = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (2,))
+    step_px, step_rad = 0.5, 1e-4
+
+    def slope(d_px: list[float]) -> NDArray[np.float64]:
+        ahead, behind = (pixel_to_ego(camera, ground, px + s * np.array(d_px)) for s in (1.0, -1.0))
+        return (ahead - behind) / (2.0 * step_px)
+
+    def tilted(d_rad: float) -> NDArray[np.float64]:
+        return pixel_to_ego(camera, GroundPlane(ground.height_m, ground.pitch_rad + d_rad, ground.roll_rad), px)
+
+    columns = [
+        slope([step_px, 0.0]) * sigma_u,
+        slope([0.0, step_px]) * sigma_v,
+        (tilted(step_rad) - tilted(-step_rad)) / (2.0 * step_rad) * sigma_pitch_rad,
+        pixel_to_ego(camera, ground, px) * sigma_height_rel,
+    ]
+    J = np.stack(columns, axis=-1)  # (N, 2, 4), already scaled by the sigmas
+    out: NDArray[np.float64] = J @ np.swapaxes(J, 1, 2)
+    return out

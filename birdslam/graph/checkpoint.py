@@ -1,0 +1,98 @@
+"""A pose graph as bytes, to be taken up by a later process: MessagePack, with a sum over it and its configuration.
+
+Whole arrays go as their raw bytes, so that a graph taken up again gives the very bytes that it would have given.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.landmarks import LandmarksState, PendingState
+from birdslam.graph.vehicles import Vehicle
+from birdslam.graph.window import WindowState
+
+VERSION = 2
+_MAGIC = b"BirdSLAM graph\n"
+_SUM_BYTES = 16
+_KINDS = {"<f8": np.float64, "<c16": np.complex128, "<i8": np.int64}
+
+
+class CheckpointError(ValueError):
+    """The bytes are no checkpoint that this graph can go on from; the message says why."""
+
+
+class Epoch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """All that a graph knows since its world began."""
+
+    window: WindowState
+    vehicles: list[Vehicle]
+    landmarks: LandmarksState
+    t_ns: int
+    t_before_ns: int
+    motion: SE2
+    lasting_m: float
+
+
+class Checkpoint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A graph between two frames; without `begun` it has seen none."""
+
+    settings: dict[str, Any]  # what it was made with, plain
+    epoch: int
+    begun: Epoch | None
+    pending: PendingState
+
+
+def pack(checkpoint: Checkpoint) -> bytes:
+    """The checkpoint as bytes: a mark with the version, the sum of what follows, and MessagePack."""
+    body = _ENCODER.encode(checkpoint)
+    return b"".join([_MAGIC, bytes([VERSION]), _sum(body), body])
+
+
+def unpack(data: bytes, settings: dict[str, Any]) -> Checkpoint:
+    """The checkpoint of these bytes, if it was made with the same `settings`. Raises CheckpointError."""
+    head = len(_MAGIC) + 1
+    if data[: len(_MAGIC)] != _MAGIC:
+        raise CheckpointError("is no checkpoint of a pose graph")
+    if data[len(_MAGIC) : head] != bytes([VERSION]):
+        raise CheckpointError(f"is a checkpoint of version {[*data[len(_MAGIC) : head]]}, expected [{VERSION}]")
+    body = data[head + _SUM_BYTES :]
+    if data[head : head + _SUM_BYTES] != _sum(body):
+        raise CheckpointError("is torn: its sum is not that of its content")
+    try:
+        checkpoint: Checkpoint = _DECODER.decode(body)
+    except (ValueError, msgspec.DecodeError) as error:  # whole, but made by other code under the same version
+        raise CheckpointError(f"can't be read: {error}") from None
+    for name in sorted({*settings, *checkpoint.settings}):
+        theirs, ours = checkpoint.settings.get(name), settings.get(name)
+        if theirs != ours:
+            raise CheckpointError(f"was made with {name} = {theirs}, here it is {ours}")
+    return checkpoint
+
+
+def plain(**structs: msgspec.Struct) -> dict[str, Any]:
+    """Every setting by its full name, "graph.ego_nodes", as it comes back from bytes."""
+    tree = msgspec.msgpack.decode(msgspec.msgpack.encode(structs))
+    return {f"{part}.{name}": value for part, values in tree.items() for name, value in values.items()}
+
+
+def _sum(body: bytes) -> bytes:
+    return hashlib.blake2b(body, digest_size=_SUM_BYTES).digest()
+
+
+def _encode_array(array: Any) -> Any:
+    return array.dtype.str, array.shape, array.tobytes()
+
+
+def _decode_array(kind: Any, parts: Any) -> NDArray[Any]:
+    dtype, shape, data = parts
+    return np.frombuffer(data, _KINDS[dtype]).reshape(shape).copy()
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_encode_array)
+_DECODER = msgspec.msgpack.Decoder(Checkpoint, dec_hook=_decode_array)

@@ -1,0 +1,236 @@
+"""The whole drive, kept beside the graph's window: everybody's way and the map, in memory that is bounded.
+
+What is recent is kept finely and what is long past coarsely. Both are kept in octaves: each is twice as coarse as the
+one before, what no longer fits into one falls into the next, and out of the last one it is forgotten. So every call of
+`add` costs the same, however long the drive is, and the defaults reach back over 500 km of way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import chain, repeat
+from typing import Annotated
+
+import msgspec
+
+from birdslam.geometry.se2 import SE2, wrap
+from birdslam.queries import MapSnapshot, TimedPose, Trajectory, VehiclePath
+from birdslam.types import Estimate, MapUpdate, VehicleEstimate
+
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+Points = Iterable[tuple[float, float]]
+
+_FARTHEST_M = 1e7  # a point beyond it is none of a road
+_FRESH_NS = 10**9  # a vehicle's newest pose is a key pose at least once in so long
+
+
+class AtlasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How finely and how far back the drive is kept. A snapshot of either record stays under a mebibyte."""
+
+    key_pose_m: Positive = 0.5  # apart, in the finest octave
+    key_pose_rad: Positive = 0.1
+    key_poses: Count = 1024  # in each octave
+    octaves: Count = 10
+    vehicles: Count = 64  # whose paths are kept; the longest out of sight go first
+    vehicle_poses: Count = 64  # the newest of each
+    map_cell_m: Positive = 0.25
+    map_cells: Count = 4096  # in each octave, of landmarks and of lanes each
+    map_octaves: Count = 5
+    epochs: Count = 3  # the newest; of an older one nothing is kept
+
+
+class Atlas:
+    """`add` takes what the graph gives for a frame; `trajectory` and `map` give records of all that was added."""
+
+    def __init__(self, config: AtlasConfig) -> None:
+        self._config = config
+        self._chapters: dict[int, _Chapter] = {}  # by epoch
+        self._newest: _Chapter | None = None
+
+    @property
+    def epochs(self) -> tuple[int, ...]:
+        """Those that can be asked for, oldest first."""
+        return tuple(self._chapters)
+
+    def add(self, estimate: Estimate, map_update: MapUpdate | None = None) -> None:
+        """One frame. An estimate that is not valid leaves no pose behind."""
+        chapter = self._newest = self._chapter(estimate.epoch)
+        if estimate.valid:
+            chapter.walk(estimate)
+        if map_update is not None:
+            self._chapter(map_update.epoch).draw(map_update)
+
+    def trajectory(self, last_s: float | None = None, epoch: int | None = None) -> Trajectory | None:
+        """The key poses of the last `last_s` of source time, or all; of the newest epoch if none is named.
+
+        None where nothing is known of the epoch.
+        """
+        chapter = self._newest if epoch is None else self._chapters.get(epoch)
+        return None if chapter is None else chapter.trajectory(last_s)
+
+    def map(self, epoch: int | None = None) -> MapSnapshot | None:
+        """All of the map; of the newest epoch if none is named. None where nothing is known of the epoch."""
+        chapter = self._newest if epoch is None else self._chapters.get(epoch)
+        return None if chapter is None else chapter.map()
+
+    def _chapter(self, epoch: int) -> _Chapter:
+        chapter = self._chapters.get(epoch)
+        if chapter is None:
+            chapter = self._chapters[epoch] = _Chapter(self._config, epoch)
+            while len(self._chapters) > self._config.epochs:
+                del self._chapters[next(iter(self._chapters))]
+        return chapter
+
+
+class _Chapter:
+    """One epoch."""
+
+    def __init__(self, config: AtlasConfig, epoch: int) -> None:
+        self._config = config
+        self._epoch = epoch
+        self._frame_id = self._map_frame_id = 0
+        self._t_ns = 0
+        self._ego = _Way(config)
+        self._paths: dict[int, _Path] = {}  # by vehicle, the longest out of sight first
+        self._landmarks, self._lanes = _Cells(config), _Cells(config)
+
+    def walk(self, estimate: Estimate) -> None:
+        """Everybody's poses of one frame."""
+        frame_id, t_ns = self._frame_id, self._t_ns = estimate.frame_id, estimate.t_source_ns
+        self._ego.add(TimedPose(frame_id, t_ns, estimate.T_world_ego))
+        for v in estimate.vehicles:
+            if v.age_ns == 0:
+                path = self._paths.pop(v.vehicle, None) or _Path(v, deque(maxlen=self._config.vehicle_poses))
+                path.add(v, TimedPose(frame_id, t_ns, v.T_world_vehicle), self._config)
+                self._paths[v.vehicle] = path
+        while len(self._paths) > self._config.vehicles:
+            del self._paths[next(iter(self._paths))]
+
+    def draw(self, update: MapUpdate) -> None:
+        """What the map gained."""
+        self._map_frame_id = update.frame_id
+        self._landmarks.add(update.landmarks_m)
+        self._lanes.add(update.lanes_m, update.lane_ids)
+
+    def trajectory(self, last_s: float | None) -> Trajectory:
+        since_ns = -math.inf if last_s is None else self._t_ns - last_s * 1e9
+        paths = []
+        for vehicle, path in sorted(self._paths.items()):
+            poses = tuple(pose for pose in path.taken() if pose.t_source_ns >= since_ns)
+            if poses:
+                v = path.newest
+                sizes = {"label": v.label, "length_m": v.length_m, "width_m": v.width_m}
+                paths.append(VehiclePath(vehicle=vehicle, poses=poses, **sizes))  # type: ignore[arg-type]
+        return Trajectory(
+            epoch=self._epoch,
+            frame_id=self._frame_id,
+            t_source_ns=self._t_ns,
+            ego=tuple(pose for pose in self._ego.taken() if pose.t_source_ns >= since_ns),
+            vehicles=tuple(paths),
+        )
+
+    def map(self) -> MapSnapshot:
+        lanes_m, lane_ids = self._lanes.taken()
+        return MapSnapshot(
+            epoch=self._epoch,
+            frame_id=self._map_frame_id,
+            landmarks_m=self._landmarks.taken()[0],
+            lanes_m=lanes_m,
+            cell_m=self._config.map_cell_m,
+            lane_ids=lane_ids if any(lane >= 0 for lane in lane_ids) else (),
+        )
+
+
+def _apart(a: SE2, b: SE2, least_m: float, least_rad: float) -> bool:
+    return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) >= least_m or abs(wrap(a.yaw_rad - b.yaw_rad)) >= least_rad
+
+
+class _Way:
+    """The ego's key poses, in octaves."""
+
+    def __init__(self, config: AtlasConfig) -> None:
+        self._config = config
+        self._octaves: list[deque[TimedPose]] = [deque() for _ in range(config.octaves)]  # the finest first
+        self._newest: TimedPose | None = None
+
+    def add(self, pose: TimedPose) -> None:
+        self._newest = pose
+        coarser, config = 1.0, self._config
+        for octave in self._octaves:
+            apart = config.key_pose_m * coarser, config.key_pose_rad * coarser
+            if octave and not _apart(octave[-1].T_world_body, pose.T_world_body, *apart):
+                return
+            octave.append(pose)
+            if len(octave) <= config.key_poses:
+                return
+            pose, coarser = octave.popleft(), 2.0 * coarser
+
+    def taken(self) -> list[TimedPose]:
+        poses = list(chain.from_iterable(reversed(self._octaves)))
+        if self._newest is not None and (not poses or poses[-1] != self._newest):
+            poses.append(self._newest)
+        return poses
+
+
+@dataclass(slots=True)
+class _Path:
+    """One vehicle's newest key poses."""
+
+    newest: VehicleEstimate
+    poses: deque[TimedPose]
+    last: TimedPose | None = None
+
+    def add(self, v: VehicleEstimate, pose: TimedPose, config: AtlasConfig) -> None:
+        self.newest, self.last = v, pose
+        before = self.poses[-1] if self.poses else None
+        if (
+            before is None
+            or pose.t_source_ns - before.t_source_ns >= _FRESH_NS
+            or _apart(before.T_world_body, pose.T_world_body, config.key_pose_m, config.key_pose_rad)
+        ):
+            self.poses.append(pose)
+
+    def taken(self) -> list[TimedPose]:
+        poses = list(self.poses)
+        return poses if self.last is None or self.last == poses[-1] else [*poses, self.last]
+
+
+@dataclass(slots=True)
+class _Cells:
+    """Points of the road, one for each cell that any fell into: their mean, and the newest id among them (-1: none).
+
+    In octaves of the cell's side.
+    """
+
+    config: AtlasConfig
+    octaves: list[dict[tuple[int, int], tuple[float, float, int, int]]] = field(init=False)  # sums, count, id
+
+    def __post_init__(self) -> None:
+        self.octaves = [{} for _ in range(self.config.map_octaves)]
+
+    def add(self, points_m: Points, ids: Iterable[int] = ()) -> None:
+        config = self.config
+        for (x_m, y_m), own in zip(points_m, chain(ids, repeat(-1)), strict=False):
+            if abs(x_m) + abs(y_m) > _FARTHEST_M:
+                continue
+            moment, side_m = (x_m, y_m, 1, own), config.map_cell_m
+            for cells in self.octaves:
+                x, y, n, lane = moment
+                key = math.floor(x / n / side_m), math.floor(y / n / side_m)
+                before = cells.pop(key, None)  # and back in as the newest
+                if before is not None:
+                    newest = lane if lane >= 0 else before[3]
+                    moment = before[0] + x, before[1] + y, before[2] + n, newest
+                cells[key] = moment
+                if len(cells) <= config.map_cells:
+                    break
+                moment, side_m = cells.pop(next(iter(cells))), 2.0 * side_m
+
+    def taken(self) -> tuple[tuple[tuple[float, float], ...], tuple[int, ...]]:
+        """The points, oldest first, and their ids."""
+        cells = [moment for octave in reversed(self.octaves) for moment in octave.values()]
+        return tuple((x / n, y / n) for x, y, n, _ in cells), tuple(lane for *_, lane in cells)

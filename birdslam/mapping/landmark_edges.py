@@ -1,0 +1,57 @@
+"""Landmarks of the road plane: feature tracks on the road, back-projected by Eq. 1 (paper, static map initialization).
+
+Lanes, the other static features, are lane_mapper.py's.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.types import LandmarkEdge
+
+
+class StaticMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which points of the road become landmarks and lane points."""
+
+    max_landmarks: int = 40
+    landmark_range_m: float = 20.0  # the paper's depth threshold T
+    sigma_landmark_px: float = 1.0
+    sigma_height_rel: float = 0.02
+    max_lane_points: int = 64
+    lane_range_m: float = 20.0
+    lane_cell_m: float = 0.5  # one point for each cell
+    attitude_memory_m: float = 1000.0  # roads are level on average: tilt is forgotten over this distance
+
+
+def landmark_edges(
+    ids: NDArray[np.int64],
+    px: NDArray[np.float64],
+    frame_id: int,
+    camera: Camera,
+    ground: GroundPlane,
+    sigma_pitch_rad: float,
+    config: StaticMapConfig,
+) -> tuple[LandmarkEdge, ...]:
+    """CP edges of feature tracks (N,) at pixels (N, 2) that lie on the road: the nearest ones."""
+    points = bev.pixel_to_ego(camera, ground, px)  # Eq. 1
+    with np.errstate(invalid="ignore"):
+        near = np.flatnonzero(points[:, 0] < config.landmark_range_m)
+    near = near[np.argsort(points[near, 0], kind="stable")][: config.max_landmarks]
+    covs = bev.road_point_cov(
+        camera, ground, px[near], config.sigma_landmark_px, sigma_pitch_rad, config.sigma_height_rel
+    )
+    return tuple(
+        LandmarkEdge(
+            landmark=int(ids[i]),
+            frame=frame_id,
+            x_m=float(points[i, 0]),
+            y_m=float(points[i, 1]),
+            cov=tuple(cov.ravel().tolist()),
+        )
+        for i, cov in zip(near, covs, strict=True)
+        if np.isfinite(cov).all()
+    )

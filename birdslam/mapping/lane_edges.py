@@ -1,0 +1,113 @@
+"""CP edges of lanes: where this frame's own markings lie across the lanes that earlier frames left on the map (Eq. 3).
+
+A point of a line has no place along it, so a landmark is a *station*: where a lane crosses a line of world's grid, the
+same place whenever that lane is seen. What the edge tells is where the lane lies across its direction; along it the
+point is the odometry's own, so that its covariance says nothing along the lane. Only what this very frame saw goes in:
+the completed lanes are of many frames, laid together by the odometry itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.types import LANE_LANDMARKS, LandmarkEdge
+
+Floats = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+_CELLS = 1 << 20  # stations of one lane along one axis, before their numbers come round
+_FULL = 0.7  # of a station's stretch that its points must span: the line through fewer is led by their noise
+
+
+class LaneEdgesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What of a lane becomes CP edges, and how sure they are."""
+
+    station_m: float = 4.0  # between two of a lane's landmarks
+    least_points: int = 8  # of a station
+    sigma_px: float = 1.0  # of the markings' mask
+    sigma_across_m: float = 0.1  # where in its width a marking is found: half of a painted line's
+    sigma_along_m: float = 10.0  # nothing is known
+    bend_m: float = 0.25  # points of a station that lie further off their line are of something else
+    max_edges: int = 16  # of a frame, the nearest
+    # What one frame saw is told of so many more, moved on by the odometry: a segmenter that rests between two frames
+    # need not meet the graph's key frames. Fewer than are between two of those: none is told of twice
+    carried_frames: int = 3
+
+
+@dataclass(frozen=True)
+class Station:
+    """A point of a lane in world with its covariance (2, 2), and the id of its landmark."""
+
+    landmark: int
+    point_m: Floats
+    cov: Floats
+
+    def edge(self, frame_id: int, T_world_ego: SE2) -> LandmarkEdge:
+        """As the ego at `T_world_ego` has it."""
+        x_m, y_m = (T_world_ego.inverse() @ self.point_m).tolist()
+        R = T_world_ego.rotation()
+        cov = tuple((R.T @ self.cov @ R).ravel().tolist())
+        return LandmarkEdge(landmark=self.landmark, frame=frame_id, x_m=x_m, y_m=y_m, cov=cov)
+
+
+def stations(points_m: Floats, lanes: Ids, config: LaneEdgesConfig) -> list[tuple[int, Floats, Floats]]:
+    """(landmark, point (2,), direction (2,)) of points (N, 2) in world, each known to be on a lane of `lanes` (N,).
+
+    Stations lie on lines of constant x or y, whichever the lane crosses more squarely.
+    """
+    found = []
+    for lane in np.unique(lanes[lanes >= 0]).tolist():
+        points = points_m[lanes == lane]
+        spread = points - points.mean(axis=0)
+        axis = int(np.argmax(np.abs(np.linalg.svd(spread, full_matrices=False)[2][0])))
+        cells = np.floor(points[:, axis] / config.station_m).astype(np.int64)
+        for cell in np.unique(cells).tolist():
+            along, across = points[cells == cell][:, [axis, 1 - axis]].T
+            middle_m = (cell + 0.5) * config.station_m
+            if len(along) < config.least_points or np.ptp(along) < _FULL * config.station_m:
+                continue
+            slope, at_m = np.polyfit(along - middle_m, across, 1)
+            if np.std(across - at_m - slope * (along - middle_m)) > config.bend_m:
+                continue
+            point, direction = np.array([middle_m, at_m]), np.array([1.0, slope]) / np.hypot(1.0, slope)
+            landmark = LANE_LANDMARKS + (2 * int(lane) + axis) * _CELLS + cell % _CELLS
+            found.append((landmark, *((point, direction) if axis == 0 else (point[::-1], direction[::-1]))))
+    return found
+
+
+def lane_stations(
+    points_m: Floats,
+    lanes: Ids,
+    T_world_ego: SE2,
+    camera: Camera,
+    ground: GroundPlane,
+    sigma_pitch_rad: float,
+    sigma_height_rel: float,
+    config: LaneEdgesConfig,
+) -> list[Station]:
+    """The stations of what one frame saw, nearest first; `points_m` (N, 2) in world, the rest is of that frame."""
+    T_ego_world = T_world_ego.inverse()
+    seen = [
+        (T_ego_world @ point, landmark, point, along) for landmark, point, along in stations(points_m, lanes, config)
+    ]
+    seen = sorted((s for s in seen if s[0][0] > 0.0), key=lambda s: float(s[0][0]))[: config.max_edges]
+    if not seen:
+        return []
+    px = bev.ego_to_pixel(camera, ground, np.array([s[0] for s in seen]))
+    by_image = bev.road_point_cov(camera, ground, px, config.sigma_px, sigma_pitch_rad, sigma_height_rel)
+    R = T_world_ego.rotation()
+    out = []
+    for (_, landmark, point, along), cov_ego in zip(seen, by_image, strict=True):
+        across = np.array([-along[1], along[0]])
+        variance = float(across @ R @ cov_ego @ R.T @ across) + config.sigma_across_m**2
+        if np.isfinite(variance):
+            cov = np.outer(across, across) * variance + np.outer(along, along) * config.sigma_along_m**2
+            out.append(Station(landmark, point, cov))
+    return out

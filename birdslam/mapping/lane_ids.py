@@ -1,0 +1,83 @@
+"""Lanes keep their ids from frame to frame, by where in the world they were."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from birdslam.geometry.se2 import SE2
+
+Floats = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+NO_LANE = -1  # of a point: of none that is known
+
+
+@dataclass(frozen=True)
+class LaneCloud:
+    """The cells of one lane boundary: `points_m` (N, 2) in ego, `lane` its id."""
+
+    lane: int
+    points_m: Floats
+
+
+def cell_keys(points_m: Floats, cell_m: float) -> Ids:
+    """(N,) one number for each cell that points (N, 2) lie in, in the order of x and then y."""
+    out: Ids = np.floor(points_m / cell_m).astype(np.int64) @ np.array([1 << 32, 1])
+    return out
+
+
+class LaneIds:
+    """Gives the clouds of each frame the ids that they had: a lane is the one whose points, in world, lie nearest."""
+
+    def __init__(self, same_lane_m: float, cell_m: float, remembered_m: float) -> None:
+        """A lane seen again lies within `same_lane_m` of where it was; past `remembered_m` it is forgotten."""
+        self._same_lane_m, self._cell_m, self._remembered_m = same_lane_m, cell_m, remembered_m
+        self._next = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Where the lanes were."""
+        self._points = np.zeros((0, 2))  # remembered, in world
+        self._lanes = np.zeros(0, dtype=np.int64)
+
+    def of(self, points_m: Floats) -> Ids:
+        """(N,) the lanes that points (N, 2) in world lie on, NO_LANE where none is known to be."""
+        out: Ids = np.full(len(points_m), NO_LANE)
+        if len(self._points) and len(points_m):
+            distance, at = cKDTree(self._points).query(points_m, distance_upper_bound=self._same_lane_m)
+            near = np.isfinite(distance)
+            out[near] = self._lanes[at[near]]
+        return out
+
+    def name(self, T_world_ego: SE2, clouds: list[Floats]) -> tuple[LaneCloud, ...]:
+        """Clouds (N, 2) in ego, each with an id; no two have the same."""
+        in_world = [T_world_ego @ cloud for cloud in clouds]
+        votes: list[tuple[int, int, int]] = []  # (how many points, the cloud, the lane)
+        if len(self._points):
+            tree = cKDTree(self._points)
+            for k, points in enumerate(in_world):
+                distance, at = tree.query(points, distance_upper_bound=self._same_lane_m)
+                seen, counts = np.unique(self._lanes[at[np.isfinite(distance)]], return_counts=True)
+                votes += [(int(n), k, int(lane)) for n, lane in zip(counts, seen, strict=True)]
+        lane_of: dict[int, int] = {}
+        for _, k, lane in sorted(votes, key=lambda vote: (-vote[0], vote[1:])):
+            if k not in lane_of and lane not in lane_of.values():
+                lane_of[k] = lane
+        for k in range(len(clouds)):
+            if k not in lane_of:
+                lane_of[k], self._next = self._next, self._next + 1
+        self._remember(T_world_ego, in_world, [lane_of[k] for k in range(len(clouds))])
+        return tuple(LaneCloud(lane_of[k], cloud) for k, cloud in enumerate(clouds))
+
+    def _remember(self, T_world_ego: SE2, clouds: list[Floats], lanes: list[int]) -> None:
+        """The newest points stand for a lane's cell, `cell_m` wide, that was seen before."""
+        points = np.concatenate([*clouds, self._points]) if clouds else self._points
+        ids = np.concatenate([np.repeat(lanes, [len(c) for c in clouds]), self._lanes]) if clouds else self._lanes
+        near = np.linalg.norm(points - [T_world_ego.x_m, T_world_ego.y_m], axis=1) < self._remembered_m
+        points, ids = points[near], ids[near]
+        _, first = np.unique(cell_keys(points, self._cell_m), return_index=True)
+        self._points, self._lanes = points[first], ids[first].astype(np.int64)

@@ -1,0 +1,101 @@
+"""The record of one ego-motion: a camera's motion in space, that of its foot on the road, and its covariance."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.pose import Pose
+from birdslam.geometry.se2 import SE2
+from birdslam.types import Status
+
+Floats = NDArray[np.float64]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+
+
+class MotionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a motion is known to: measured, standing, or coasting."""
+
+    covariance_inflation: Positive = 1.5  # of variances: tracks of neighbouring corners err together
+    sigma_floor_m: Positive = 0.002
+    sigma_floor_rad: Positive = 0.0004
+    sigma_yaw_rad_per_m: Positive = 0.0004
+    sigma_path_rel: Positive = 0.012  # of the direction of travel and of the length, beside the scale
+    standing_sigma_m: Positive = 0.0005
+    standing_sigma_rad: Positive = 0.0001
+    coast_acceleration_mps2: Positive = 3.0
+    coast_yaw_acceleration_radps2: Positive = 0.5
+    coast_speed_mps: Positive = 0.3  # uncertainty of the last measured speed
+    coast_yaw_rate_radps: Positive = 0.01
+    unknown_speed_mps: Positive = 10.0  # where none was ever measured
+
+
+class Motion(msgspec.Struct, frozen=True):
+    """The camera's motion between two images, in metres; `from_frame` is the last whose motion was measured.
+
+    R_prev_curr (3, 3) and t_prev_curr_m (3,) in camera axes (x right, y down, z forward), p_prev = R p_curr + t.
+    T_prev_curr is the same on the road plane (REP-103) and `cov` (3, 3) the covariance of its tangent (x_m, y_m,
+    yaw_rad), with the scale's uncertainty in it. `ground` is the present camera over the road.
+    """
+
+    from_frame: int
+    to_frame: int
+    R_prev_curr: Floats
+    t_prev_curr_m: Floats
+    T_prev_curr: SE2
+    cov: Floats
+    scale_sigma_rel: float
+    ground: GroundPlane
+    pitch_sigma_rad: float
+    standstill: bool
+    status: tuple[Status, ...]
+
+
+def planar(step: Pose, ground: GroundPlane) -> SE2:
+    """The motion of ego on the road, given T_prev_curr of the camera and the road under the present one."""
+    to_ego = ground.R_ego_cam @ step.R.T  # previous camera's axes -> present ego's, whose plane is the same road
+    forward_prev = to_ego[:, 2]
+    yaw = -math.atan2(forward_prev[1], forward_prev[0])
+    t = to_ego @ step.p
+    c, s = math.cos(yaw), math.sin(yaw)
+    return SE2(float(c * t[0] - s * t[1]), float(s * t[0] + c * t[1]), yaw)
+
+
+def measured_cov(
+    config: MotionConfig, info: Floats, motion: SE2, ground: GroundPlane, scale_sigma_rel: float
+) -> Floats:
+    """(3, 3) from the information (6, 6) of the camera's step, in its own axes: (translation, rotation)."""
+    cov6 = np.linalg.inv(info + np.eye(6) * 1e-3) * config.covariance_inflation
+    G = np.zeros((3, 6))
+    G[:2, :3] = ground.R_ego_cam[:2]
+    G[2, 3:] = ground.R_ego_cam[2]
+    xy = np.array([motion.x_m, motion.y_m, 0.0])
+    path = config.sigma_floor_m**2 + config.sigma_path_rel**2 * float(xy @ xy)
+    yaw = config.sigma_floor_rad**2 + config.sigma_yaw_rad_per_m**2 * float(xy @ xy)
+    cov = G @ cov6 @ G.T + np.diag([path, path, yaw]) + scale_sigma_rel**2 * np.outer(xy, xy)
+    out: Floats = 0.5 * (cov + cov.T)
+    return out
+
+
+def standing_cov(config: MotionConfig) -> Floats:
+    """(3, 3) of a pose that is held: small, since all images of one stop are compared with the same one."""
+    return np.diag([config.standing_sigma_m**2, config.standing_sigma_m**2, config.standing_sigma_rad**2])
+
+
+def coasting_cov(
+    config: MotionConfig, motion: SE2, dt_s: float, speed_known: bool, scale_sigma_rel: float
+) -> Floats:  # fmt: skip
+    """(3, 3) of a motion that is the last velocity over `dt_s`: what accelerations could have changed it."""
+    speed = config.coast_speed_mps if speed_known else config.unknown_speed_mps
+    length = math.hypot(motion.x_m, motion.y_m)
+    along = 0.5 * config.coast_acceleration_mps2 * dt_s**2 + speed * dt_s
+    yaw = 0.5 * config.coast_yaw_acceleration_radps2 * dt_s**2 + config.coast_yaw_rate_radps * dt_s
+    lateral = 0.2 * along + length * yaw
+    xy = np.array([motion.x_m, motion.y_m, 0.0])
+    out: Floats = np.diag([along**2, lateral**2, yaw**2 + config.sigma_floor_rad**2])
+    return out + scale_sigma_rel**2 * np.outer(xy, xy)

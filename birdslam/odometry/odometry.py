@@ -1,0 +1,329 @@
+"""Ego-motion of one forward camera in metres.
+
+    corners followed (features.py) -> the pose among landmarks, adjusted over a window of key images (bundle.py)
+    -> the length of it from the road under the camera (roadscale.py) -> Motion
+
+The paper takes this from an off-the-shelf SLAM and scales it by road points and a moving median (Sec. 3.1,
+scale-unambiguous ego-motion initialisation). A standing car holds its pose exactly: the image that the car stopped in
+stays the one that all later ones are compared with until they differ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
+from birdslam.geometry.se2 import SE2
+from birdslam.odometry.bundle_adjustment import two_view
+from birdslam.odometry.features import FeatureConfig, FeatureTracker, Tracks
+from birdslam.odometry.keyframes import KeyWindow, KeyWindowConfig
+from birdslam.odometry.motion import Motion, MotionConfig, coasting_cov, measured_cov, planar, standing_cov
+from birdslam.odometry.road_alignment import RoadFit
+from birdslam.odometry.road_filter import RoadScaleConfig
+from birdslam.odometry.road_scale import MetricScale
+from birdslam.types import Status
+
+__all__ = ["Motion", "Odometry", "OdometryConfig", "Tracks"]
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+_MIN_INTERVAL_S = 0.004
+_STILL = Pose(np.eye(3), np.zeros(3))
+_TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step that two images alone show: 1 cm, 0.25 deg
+_NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
+
+
+class OdometryConfig(KeyWindowConfig, frozen=True, forbid_unknown_fields=True):
+    """One setting for every camera, road and frame rate."""
+
+    features: FeatureConfig = FeatureConfig()
+    road: RoadScaleConfig = RoadScaleConfig()
+    motion: MotionConfig = MotionConfig()
+    # where the window does not show the pose
+    two_view_px: Positive = 0.7
+    min_fitting: Count = 18  # landmarks that must agree before a pose counts as measured
+    min_fitting_fraction: Positive = 0.35
+    max_speed_mps: Positive = 70.0
+    max_coast_s: Positive = 1.0  # after that the window begins anew
+    # standstill
+    standstill_px: Positive = 0.35  # median displacement against the image that the car stopped in
+    standstill_m: Positive = 0.012
+    standstill_rad: Positive = 0.002
+
+
+@dataclass(frozen=True)
+class _Velocity:
+    """The last measured motion, as a rate."""
+
+    linear_mps: Floats  # (3,) camera axes
+    angular_radps: Floats  # (3,)
+
+
+class Odometry:
+    """From images of one undistorted, calibrated camera to metric motion, image by image.
+
+    `track` needs only the image and can run beside the networks; `estimate` then takes what they saw. Deterministic;
+    raises ValueError for an image of another size, never for what the image shows.
+    """
+
+    def __init__(self, camera: Camera, config: OdometryConfig | None = None) -> None:
+        self.camera = camera
+        self.config = config if config is not None else OdometryConfig()
+        self._focal_px = 0.5 * (camera.fx_px + camera.fy_px)
+        self._tracker = FeatureTracker(camera.width_px, camera.height_px, self.config.features)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets everything but the camera; track ids go on counting."""
+        self._tracker.reset()
+        self._scale = MetricScale(self.camera, self.config.road)
+        self._window = self._new_window()
+        self._pose = _STILL  # of the base image, in the window's frame
+        self._base_frame: int | None = None  # the last image whose motion was measured
+        self._base_t_ns = 0
+        self._velocity: _Velocity | None = None
+        self._interval_s = 0.1
+        self._road_tracks: tuple[Ints, Floats] = _NO_TRACKS
+
+    @property
+    def road_tracks(self) -> tuple[Ints, Floats]:
+        """(ids (N,), px (N, 2)): followed corners of the present image that lie on the road (paper, Sec. 3.1)."""
+        return self._road_tracks
+
+    @property
+    def road_fit(self) -> RoadFit | None:
+        """What the road's image alone said of the last motion, where it was of use."""
+        return self._scale.fit
+
+    # --- feature tracking ---
+
+    def track(self, image: NDArray[np.uint8]) -> Tracks:
+        """Follows the corners into an image, (H, W) grey or (H, W, 3) BGR uint8, undistorted."""
+        return self._tracker.track(image, self._predict_px)
+
+    def _predict_px(self, base: Tracks) -> Floats:
+        if self._velocity is None:
+            return base.px
+        step = self._predicted_step(self._interval_s)
+        pose = self._pose @ step
+        out = self._default_prediction(base.px, step)
+        at = np.searchsorted(self._window.ids, base.ids)
+        at = np.minimum(at, max(len(self._window.ids) - 1, 0))
+        if len(self._window.ids):
+            known = self._window.ids[at] == base.ids
+            px = self.camera.to_px(self._window.predict_xy(pose)[at])
+            known &= np.isfinite(px).all(axis=1)
+            out[known] = px[known]
+        return out
+
+    def _default_prediction(self, px: Floats, step: Pose) -> Floats:
+        """Where a corner of unknown depth goes: as if on the road below the horizon, as if endless above."""
+        rays = np.column_stack([self.camera.to_xy(px), np.ones(len(px))])
+        rho = np.maximum(-(rays @ self._scale.ground.normal_cam) / self.camera.height_m, 0.0) * 0.5
+        q = (rays - rho[:, None] * step.p) @ step.R
+        out = self.camera.to_px(q[:, :2] / np.maximum(q[:, 2:], 0.2))
+        lost = (q[:, 2] < 0.3) | (np.abs(out - px) > 0.4 * self.camera.width_px).any(axis=1)
+        out[lost] = px[lost]
+        return out
+
+    # --- motion ---
+
+    def estimate(
+        self, tracks: Tracks, frame_id: int, t_source_ns: int, vehicle_boxes_px: Floats, road_mask: Bools | None = None
+    ) -> Motion | None:
+        """The motion since the last measured image; None for the very first image, and before one could be used.
+
+        `vehicle_boxes_px` (N, 4) is x1, y1, x2, y2; `road_mask` (H, W) may be some images old.
+        """
+        boxes = np.asarray(vehicle_boxes_px, dtype=np.float64).reshape(-1, 4)
+        status: list[Status] = []
+        if tracks.dark:
+            status.append(Status.CAMERA_DARK)
+        if tracks.frozen:
+            status.append(Status.CAMERA_FROZEN)
+        if self._base_frame is None:
+            if not status:
+                self._begin(tracks, frame_id, t_source_ns, boxes)
+            return None
+        dt_s = (t_source_ns - self._base_t_ns) * 1e-9
+        if dt_s < _MIN_INTERVAL_S:  # a clock that stands or steps back must not make a speed
+            dt_s = self._interval_s
+        if status:
+            return self._coasting(frame_id, dt_s, status)
+
+        static = self._outside(tracks.px, boxes)
+        ids, xy = tracks.ids[static], self.camera.to_xy(tracks.px[static])
+        displacement = self._displacement(tracks, static)
+        found = self._locate(ids, xy, dt_s, displacement)
+        if found is None:
+            status.append(Status.LOW_TEXTURE)
+            motion = self._coasting(frame_id, dt_s, status)
+            if dt_s > self.config.max_coast_s or len(displacement) < self.config.min_fitting:
+                # Nothing links this image to the base any more: the window begins anew here, at the coasted pose.
+                self._begin(tracks, frame_id, t_source_ns, boxes)
+                self._scale.turned_unseen()
+            return motion
+        pose, info = found
+        if self._stands(self._pose.between(pose), displacement):
+            # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.
+            motion = self._standing(frame_id)
+            self._velocity = _Velocity(np.zeros(3), np.zeros(3))
+        else:
+            pose = self._window.extend(frame_id, pose, ids, xy)
+            step = self._pose.between(pose)
+            self._scale.moved(step)
+            factor = self._scale.compare(tracks.image, pose, boxes, road_mask)
+            self._window.rescale(factor)
+            self._pose = pose
+            self._tracker.accept(tracks)
+            step = Pose(step.R, step.p * factor)
+            motion = self._moving(frame_id, step, info)
+            self._velocity, self._interval_s = _Velocity(step.p / dt_s, rotation_log(step.R) / dt_s), dt_s
+        self._base_frame, self._base_t_ns = frame_id, t_source_ns
+        self._see_road_tracks(tracks, boxes, road_mask)
+        return motion
+
+    def _begin(self, tracks: Tracks, frame_id: int, t_source_ns: int, boxes: Floats) -> None:
+        """A new window that holds this image alone."""
+        self._tracker.accept(tracks)
+        self._window = self._new_window()
+        self._pose = _STILL
+        static = self._outside(tracks.px, boxes)
+        self._window.append(frame_id, self._pose, tracks.ids[static], self.camera.to_xy(tracks.px[static]))
+        self._base_frame, self._base_t_ns = frame_id, t_source_ns
+        self._scale.restart(tracks.image, self._pose, 0.3)
+
+    def _locate(self, ids: Ints, xy: Floats, dt_s: float, displacement: Floats) -> tuple[Pose, Floats] | None:
+        """The present image's pose in the window's frame and its information (6, 6); None where it is not known."""
+        cfg, window = self.config, self._window
+        guesses = [self._pose @ self._predicted_step(dt_s), self._pose]
+        best: tuple[int, Pose, Bools, Floats] | None = None
+        known = np.isfinite(window.rho)
+        shared = int(np.isin(ids, window.ids[known]).sum())
+        if shared >= cfg.min_fitting:
+            for guess in guesses:
+                pose, fits, info = window.locate(guess, ids, xy)
+                if best is None or fits.sum() > best[0]:
+                    best = (int(fits.sum()), pose, fits, info)
+                if best[0] > 0.7 * shared:
+                    break
+        if best is not None and best[0] >= max(cfg.min_fitting, cfg.min_fitting_fraction * shared):
+            travelled_m = float(np.linalg.norm(best[1].p - self._pose.p))
+            if travelled_m <= cfg.max_speed_mps * dt_s + 0.1:
+                return best[1], best[3]
+        return self._locate_two_view(ids, xy, dt_s, displacement)
+
+    def _locate_two_view(self, ids: Ints, xy: Floats, dt_s: float, displacement: Floats) -> tuple[Pose, Floats] | None:
+        """Starts the window anew from the base image and this one."""
+        cfg = self.config
+        base = self._tracker.base
+        _, a, b = np.intersect1d(base.ids, ids, return_indices=True)
+        if len(a) < cfg.min_fitting:
+            return None
+        xy_a, xy_b = self.camera.to_xy(base.px[a]), xy[b]
+        if float(np.median(displacement)) < cfg.standstill_px and float(np.quantile(displacement, 0.8)) < 1.5:
+            return self._pose, _TWO_VIEW_INFORMATION
+        found = two_view(xy_a, xy_b, self._focal_px, cfg.two_view_px)
+        if found is None or found[1].sum() < max(cfg.min_fitting, cfg.min_fitting_fraction * len(a)):
+            return None
+        step, _ = found
+        speed = float(np.linalg.norm(self._velocity.linear_mps)) if self._velocity is not None else 0.0
+        length = speed * dt_s if speed * dt_s > 0.05 else 0.5
+        frame = self._base_frame if self._base_frame is not None else 0
+        self._window = self._new_window()
+        self._window.append(frame, self._pose, base.ids[a], xy_a)
+        self._scale.restart(base.image, self._pose, 0.2 if speed * dt_s > 0.05 else 1.0)
+        return self._pose @ Pose(step.R, step.p * length), _TWO_VIEW_INFORMATION
+
+    # --- standing, coasting ---
+
+    def _displacement(self, tracks: Tracks, static: Bools) -> Floats:
+        """(N,) px: how far the corners outside vehicles have moved since the base image."""
+        base = self._tracker.base
+        _, a, b = np.intersect1d(base.ids, tracks.ids[static], return_indices=True)
+        out: Floats = np.sqrt(((tracks.px[static][b] - base.px[a]) ** 2).sum(axis=1))
+        return out
+
+    def _stands(self, step: Pose, displacement: Floats) -> bool:
+        cfg = self.config
+        if len(displacement) < cfg.min_fitting or float(np.median(displacement)) > cfg.standstill_px:
+            return False
+        if float(np.quantile(displacement, 0.8)) < cfg.standstill_px:
+            return True  # four corners of five have not moved: what the others make of the pose does not count
+        turn = float(np.linalg.norm(rotation_log(step.R)))
+        return float(np.linalg.norm(step.p)) < cfg.standstill_m and turn < cfg.standstill_rad
+
+    def _predicted_step(self, dt_s: float) -> Pose:
+        if self._velocity is None:
+            return _STILL
+        return Pose(rotation_exp(self._velocity.angular_radps * dt_s), self._velocity.linear_mps * dt_s)
+
+    def _moving(self, frame_id: int, step: Pose, info: Floats) -> Motion:
+        T_prev_curr = planar(step, self._scale.ground)
+        cov = measured_cov(self.config.motion, info, T_prev_curr, self._scale.ground, self._scale.sigma_rel)
+        return self._motion(frame_id, step, T_prev_curr, cov, self._scale.status())
+
+    def _standing(self, frame_id: int) -> Motion:
+        return self._motion(frame_id, _STILL, SE2(), standing_cov(self.config.motion), [Status.STANDSTILL])
+
+    def _coasting(self, frame_id: int, dt_s: float, status: list[Status]) -> Motion:
+        """The last velocity goes on; the base image stays."""
+        self._road_tracks = _NO_TRACKS  # those of the last measured image would say that the car has not moved since
+        step = self._predicted_step(dt_s)
+        T_prev_curr = planar(step, self._scale.ground)
+        cov = coasting_cov(
+            self.config.motion, T_prev_curr, dt_s, self._velocity is not None, self._scale.sigma_rel
+        )  # fmt: skip
+        return self._motion(frame_id, step, T_prev_curr, cov, [*status, Status.ODOMETRY_COASTING])
+
+    def _motion(self, frame_id: int, step: Pose, T_prev_curr: SE2, cov: Floats, status: list[Status]) -> Motion:
+        if self._scale.unknown and Status.SCALE_INVALID not in status:
+            status = [*status, Status.SCALE_INVALID]  # standing or coasting, in metres that nobody knows
+        return Motion(
+            from_frame=self._base_frame if self._base_frame is not None else frame_id,
+            to_frame=frame_id,
+            R_prev_curr=step.R,
+            t_prev_curr_m=step.p,
+            T_prev_curr=T_prev_curr,
+            cov=cov,
+            scale_sigma_rel=self._scale.sigma_rel,
+            ground=self._scale.ground,
+            pitch_sigma_rad=self._scale.pitch_sigma_rad,
+            standstill=Status.STANDSTILL in status,
+            status=tuple(status),
+        )
+
+    def _see_road_tracks(self, tracks: Tracks, boxes: Floats, road_mask: Bools | None) -> None:
+        px = tracks.px
+        rays = np.column_stack([self.camera.to_xy(px), np.ones(len(px))])
+        rho = -(rays @ self._scale.ground.normal_cam) / self.camera.height_m
+        keep = (tracks.age > 0) & (rho > 1.0 / 30.0) & self._outside(px, boxes)
+        if road_mask is not None:
+            at = np.round(px).astype(np.int64)
+            at = np.clip(at, 0, [road_mask.shape[1] - 1, road_mask.shape[0] - 1])
+            keep &= road_mask[at[:, 1], at[:, 0]]
+        else:
+            keep &= np.abs(rays[:, 0]) < self.config.road.align.half_width_m * rho
+        self._road_tracks = (tracks.ids[keep], px[keep])
+
+    # --- small geometry ---
+
+    def _new_window(self) -> KeyWindow:
+        return KeyWindow(self._focal_px, self.config)
+
+    @staticmethod
+    def _outside(px: Floats, boxes: Floats) -> Bools:
+        out = np.ones(len(px), bool)
+        for x1, y1, x2, y2 in boxes:
+            out &= ~((px[:, 0] > x1 - 3) & (px[:, 0] < x2 + 3) & (px[:, 1] > y1 - 3) & (px[:, 1] < y2 + 6))
+        return out

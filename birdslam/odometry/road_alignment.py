@@ -1,0 +1,290 @@
+"""The road of two images compared as a whole: what their difference says about length, pitch and roll.
+
+Points followed on the road by optical flow give a length that is always short: the tracker's window sees a strong
+change of perspective there. So the earlier image is warped by the homography of the road plane,
+K (R + lambda t n(pitch, roll)^T / H) K^-1, against the present one, over the length's factor lambda, the pitch and the
+roll together: in one pair of images the three are correlated, and a wrong pitch biases the length by several per cent.
+
+So does a plane where the road bends: over a crest of 1000 m radius it lies 0.2 m below its tangent 20 m ahead, which a
+camera 1.65 m above it takes for 12 % of the distance. The road is therefore a parabola along the direction of travel,
+s^2 / 2 times `curvature` (1/m, > 0 in a sag) above the plane that touches it at the camera's foot; the tilt is of that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.pose import Pose, middle, rotation_exp
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Grey = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+
+_MARGIN_PX = 4  # from the image's edge, for the warp and the smoothing
+ROAD = 4  # log lambda, pitch, roll, curvature; behind them what odometry handed over wrongly and the brightness
+MOTION = 5  # the rotation's error (3), that of the direction of travel to the right and down (2)
+_LEAST_INFORMATION = (1.0, 10.0, 10.0, 1e4)
+_LARGEST_STEP = np.array([0.1, 0.1, 0.1, 0.005] + [0.1] * MOTION)  # of one iteration
+# Changes that count like one by 1 rad; what odometry handed over need not be settled as well
+_STEP_UNITS = np.array([1.0, 1.0, 1.0, 0.05] + [3.0] * MOTION)
+_BEYOND_CREST = 0.01  # where a ray would miss the parabola: that is behind the crest
+
+
+class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is compared on the road, and how much it is believed."""
+
+    near_m: Positive = 4.0
+    far_m: Positive = 22.0
+    half_width_m: Positive = 3.2  # of the strip in front of the car; past it come crown, kerb and parked cars
+    lane_half_width_m: Positive = 2.0  # of the strip where no road mask is given: the car's own lane
+    max_samples: Annotated[int, msgspec.Meta(ge=200)] = 2600
+    min_samples: Annotated[int, msgspec.Meta(ge=50)] = 250
+    contrast_window_px: Annotated[int, msgspec.Meta(ge=3)] = 13  # over which brightness and contrast are evened out
+    contrast_floor_grey: Positive = 2.0
+    effective_sample_fraction: Positive = 0.013  # neighbouring pixels, and the road's shape, err together
+    sigma_rotation_rad: Positive = 0.0005  # of the relative rotation that odometry hands over
+    sigma_direction_rad: Positive = 0.007  # of the direction of its translation
+    max_iterations: Annotated[int, msgspec.Meta(ge=3)] = 7
+    coarse_step: Annotated[int, msgspec.Meta(ge=1)] = 4  # every so-manieth sample comes near to the answer
+    coarse_tolerance: Positive = 2e-3
+    tolerance: Positive = 1e-3
+
+
+@dataclass(frozen=True)
+class RoadFit:
+    """What one comparison alone says: (log lambda, pitch_rad, roll_rad, curvature_per_m) and its covariance (4, 4)."""
+
+    state: Floats
+    cov: Floats
+    correlation: float
+    samples: int
+
+
+@dataclass(frozen=True)
+class _View:
+    """Samples of the present image: their rays (3, N), those turned into the past camera (3, N), their grey (N,)."""
+
+    rays: Floats
+    turned: Floats
+    grey: Floats
+
+
+def _brightness(there: Floats, here: Floats) -> tuple[float, float]:
+    """Bias and gain by which the present image becomes the past one."""
+    gain = float(np.clip(((there - there.mean()) * (here - here.mean())).mean() / max(here.var(), 1e-6), 0.5, 2.0))
+    return float(there.mean() - gain * here.mean()), gain
+
+
+def _correlation(there: Floats, here: Floats, weights: Floats) -> float:
+    w = weights / weights.sum()
+    a, b = there - w @ there, here - w @ here
+    return float((w * a) @ b / np.sqrt(max(float((w * a) @ a * ((w * b) @ b)), 1e-12)))
+
+
+def _translation(T_past_present: Pose, x: Floats) -> Floats:
+    """(3,) in metres, its direction corrected by what x says of it."""
+    t, (right, down) = T_past_present.p, x[ROAD + 3 : ROAD + MOTION]
+    out: Floats = np.exp(x[0]) * (t + float(np.linalg.norm(t)) * np.array([right, down, 0.0]))
+    return out
+
+
+def plane_normal(pitch_rad: float, roll_rad: float) -> tuple[Floats, Floats, Floats]:
+    """The road's upward unit normal in camera axes and its derivatives by pitch and by roll, (3,) each."""
+    cp, sp, cr, sr = np.cos(pitch_rad), np.sin(pitch_rad), np.cos(roll_rad), np.sin(roll_rad)
+    return (
+        np.array([-cp * sr, -cp * cr, -sp]),
+        np.array([sp * sr, sp * cr, -cp]),
+        np.array([-cp * cr, cp * sr, 0.0]),
+    )
+
+
+def plane_tilt(normal: Floats) -> tuple[float, float]:
+    """(pitch_rad, roll_rad) of a unit normal in camera axes: the inverse of `plane_normal`."""
+    return float(-np.arcsin(np.clip(normal[2], -1.0, 1.0))), float(np.arctan2(-normal[0], -normal[1]))
+
+
+class RoadImage:
+    """The part of a grey image that can show road, its brightness and contrast evened out: made once for each image.
+
+    Without that the edges of shadows, and of the dark below other cars, which travels with them, outweigh the road's
+    own grain.
+    """
+
+    def __init__(self, grey: NDArray[np.uint8], top_px: int, config: RoadAlignConfig) -> None:
+        self.top_px = top_px
+        smooth = cv2.GaussianBlur(grey[top_px:], (5, 5), 1.0)
+        window = (config.contrast_window_px, config.contrast_window_px)
+        mean = cv2.boxFilter(smooth, cv2.CV_32F, window)
+        contrast = cv2.sqrBoxFilter(smooth, cv2.CV_32F, window)
+        cv2.subtract(contrast, cv2.multiply(mean, mean), dst=contrast)
+        cv2.sqrt(np.maximum(contrast, 0.0, out=contrast), dst=contrast)
+        np.add(contrast, np.float32(config.contrast_floor_grey), out=contrast)
+        difference = cv2.subtract(smooth, mean, dst=mean, dtype=cv2.CV_32F)
+        self.grey: Grey = cv2.divide(difference, contrast, dst=mean, scale=10.0)  # type: ignore[assignment]
+        self._slopes: tuple[Grey, Grey] | None = None
+
+    @property
+    def slopes(self) -> tuple[Grey, Grey]:
+        """d grey / du and d grey / dv, grey levels per pixel."""
+        if self._slopes is None:
+            self._slopes = (
+                cv2.Scharr(self.grey, cv2.CV_32F, 1, 0, scale=1.0 / 32.0),
+                cv2.Scharr(self.grey, cv2.CV_32F, 0, 1, scale=1.0 / 32.0),
+            )  # type: ignore[assignment]
+        assert self._slopes is not None
+        return self._slopes
+
+
+class RoadAligner:
+    """Compares two images of the road of one camera."""
+
+    def __init__(self, camera: Camera, config: RoadAlignConfig) -> None:
+        self.camera, self.config = camera, config
+        # The nearest row that could show road at far_m with the nose up by 3 degrees.
+        horizon = camera.cy_px + camera.fy_px * (camera.height_m / config.far_m - 0.05)
+        self.top_px = int(np.clip(horizon, 0, camera.height_px - 32))
+        # Every second row and third column: below it lie rows of one another's blur.
+        v = np.arange(self.top_px + _MARGIN_PX, camera.height_px - _MARGIN_PX, 2)[:, None]
+        u = np.arange(_MARGIN_PX, camera.width_px - _MARGIN_PX, 3)[None, :]
+        self._grid = (u, v, (u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px)
+
+    def image(self, grey: NDArray[np.uint8]) -> RoadImage:
+        return RoadImage(grey, self.top_px, self.config)
+
+    def samples(self, tilt: tuple[float, float], boxes_px: Floats, road_mask: Bools | None) -> Ints:
+        """Pixels (N, 2) of the present image that show road: of the mask, else of a strip in front, less vehicles."""
+        cam, cfg = self.camera, self.config
+        normal, _, _ = plane_normal(*tilt)
+        u, v, x, y = self._grid
+        rho = -(normal[0] * x + (normal[1] * y + normal[2])) / cam.height_m  # Eq. 1 is X = ray / rho
+        half_width_m = cfg.half_width_m if road_mask is not None else cfg.lane_half_width_m
+        keep = (np.abs(x) < half_width_m * rho) & (rho > 1.0 / cfg.far_m) & (rho < 1.0 / cfg.near_m)
+        if road_mask is not None:
+            keep &= road_mask[v, u]
+        for x1, y1, x2, y2 in boxes_px:
+            grow_x, grow_y = 4.0 + 0.04 * (x2 - x1), 4.0 + 0.12 * (y2 - y1)  # a box ends above the shadow of its car
+            rows = slice(*np.searchsorted(v[:, 0], [y1 - grow_y, y2 + grow_y]))
+            cols = slice(*np.searchsorted(u[0], [x1 - grow_x, x2 + grow_x]))
+            keep[rows, cols] = False
+        at = np.flatnonzero(keep.ravel())
+        if len(at) > cfg.max_samples:
+            at = at[(np.arange(cfg.max_samples) * (len(at) / cfg.max_samples)).astype(np.int64)]
+        return np.column_stack([np.broadcast_to(u, keep.shape).ravel()[at], np.broadcast_to(v, keep.shape).ravel()[at]])
+
+    def align(
+        self, past: RoadImage, present: RoadImage, T_past_present: Pose, px: Ints, prior: Floats, prior_cov: Floats
+    ) -> RoadFit | None:  # fmt: skip
+        """Fits (log lambda, pitch, roll, curvature) of the present camera, joined with the prior; None: no help.
+
+        `T_past_present` is the motion with its length in the odometry's own unit, lambda times it are metres.
+        """
+        cfg = self.config
+        if len(px) < cfg.min_samples:
+            return None
+        fine = self._view(present, px, T_past_present)
+        coarse = _View(*(part[..., :: cfg.coarse_step] for part in (fine.rays, fine.turned, fine.grey)))
+        x = np.concatenate([prior, np.zeros(MOTION)])
+        mean, weight_prior = x.copy(), np.zeros((ROAD + MOTION, ROAD + MOTION))
+        weight_prior[:ROAD, :ROAD] = np.linalg.inv(prior_cov)
+        weight_prior[ROAD:, ROAD:] = np.diag(
+            np.repeat([cfg.sigma_rotation_rad**-2, cfg.sigma_direction_rad**-2], [3, 2])
+        )
+        light = None  # bias and gain of the brightness
+        # Few samples come near to the answer, all of them settle it.
+        for view, share, tolerance, iterations in (
+            (coarse, cfg.coarse_step, cfg.coarse_tolerance, cfg.max_iterations - 2),
+            (fine, 1, cfg.tolerance, 3),
+        ):
+            for _ in range(iterations):
+                seen, there = self._look(view, past, T_past_present, x)
+                if share * int(seen.sum()) < cfg.min_samples:
+                    return None
+                if light is None:
+                    light = _brightness(there[0][seen], view.grey[seen])
+                r = there[0] - light[1] * view.grey - light[0]
+                J = self._derivative(view, there, T_past_present, x)
+                sigma = 1.4826 * middle(np.abs(r[seen])) + 0.5
+                w = np.where(seen, 1.0 / np.maximum(1.0, np.abs(r) * (1.0 / (1.5 * sigma))), 0.0)
+                w *= share * cfg.effective_sample_fraction / sigma**2
+                Jw = J * w
+                A, g = Jw @ J.T, Jw @ r
+                A[:-2, :-2] += weight_prior
+                g[:-2] += weight_prior @ (x - mean)
+                A[-2, -2] += 1e-9
+                A[-1, -1] += 1e-6
+                step = -np.linalg.solve(A, g)
+                x = x + np.clip(step[:-2], -_LARGEST_STEP, _LARGEST_STEP)
+                light = (light[0] + step[-2], light[1] + step[-1])
+                if (np.abs(step[:-2]) < tolerance * _STEP_UNITS).all():
+                    break
+        correlation = _correlation(there[0], fine.grey, w)
+        # What the images alone say: the prior that guided the fit is taken out again. A direction that they do not see
+        # keeps a variance far above what roads have, so that it is harmless.
+        data = A.copy()
+        data[:ROAD, :ROAD] -= weight_prior[:ROAD, :ROAD]
+        mixed = data[:ROAD, ROAD:]
+        info = data[:ROAD, :ROAD] - mixed @ np.linalg.solve(data[ROAD:, ROAD:], mixed.T) + np.diag(_LEAST_INFORMATION)
+        cov: Floats = np.asarray(np.linalg.inv(0.5 * (info + info.T)), np.float64)
+        measured: Floats = x[:ROAD] + cov @ weight_prior[:ROAD, :ROAD] @ (x[:ROAD] - prior)
+        return RoadFit(measured, cov, correlation, int(seen.sum()))
+
+    def _view(self, present: RoadImage, px: Ints, T_past_present: Pose) -> _View:
+        cam = self.camera
+        rays = np.stack(
+            [(px[:, 0] - cam.cx_px) / cam.fx_px, (px[:, 1] - cam.cy_px) / cam.fy_px, np.ones(len(px))]
+        )  # fmt: skip
+        grey = present.grey[px[:, 1] - present.top_px, px[:, 0]].astype(np.float64)
+        return _View(rays, T_past_present.R @ rays, grey)
+
+    def _look(self, view: _View, past: RoadImage, T_past_present: Pose, x: Floats) -> tuple[Bools, tuple[Floats, ...]]:
+        """Which samples the past image shows; its grey there, its slopes by q_x, q_y, q_z, 1 / depth, and its root."""
+        cam = self.camera
+        # Eq. 1 is X = rays / rho; with the curvature rho solves H rho^2 - below rho - curvature / 2 = 0
+        below = -(plane_normal(x[1], x[2])[0] @ view.rays)
+        root = np.sqrt(np.maximum(below**2 + 2.0 * cam.height_m * x[3], _BEYOND_CREST * below**2))
+        rho = (below + root) * (0.5 / cam.height_m)
+        q = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned + rho * _translation(T_past_present, x)[:, None]
+        by_z = 1.0 / np.maximum(q[2], 1e-3)
+        px, py = q[0] * by_z, q[1] * by_z
+        u = (cam.fx_px * px + cam.cx_px).astype(np.float32)
+        v = (cam.fy_px * py + (cam.cy_px - past.top_px)).astype(np.float32)
+        rows, cols = past.grey.shape
+        seen = (u > 1) & (u < cols - 2) & (v > 1) & (v < rows - 2) & (q[2] > 0.05)
+        grey, by_u, by_v = (
+            cv2.remap(image, u, v, cv2.INTER_LINEAR).ravel().astype(np.float64) for image in (past.grey, *past.slopes)
+        )
+        by_x, by_y = by_u * (cam.fx_px * by_z), by_v * (cam.fy_px * by_z)
+        return seen, (grey, by_x, by_y, -(by_x * px + by_y * py), rho, root)
+
+    def _derivative(
+        self, view: _View, there: tuple[Floats, ...], T_past_present: Pose, x: Floats
+    ) -> Floats:  # fmt: skip
+        """(11, N) of the residual by (log lambda, pitch, roll, curvature, errors of the motion, bias, gain)."""
+        _, gx, gy, gz, rho, root = there
+        _, by_pitch, by_roll = plane_normal(x[1], x[2])
+        t = _translation(T_past_present, x)
+        rx, ry, rz = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned
+        along = gx * t[0] + gy * t[1] + gz * t[2]
+        J = np.empty((ROAD + MOTION + 2, len(gx)))
+        np.multiply(along, rho, out=J[0])
+        np.divide(along, root, out=along)
+        np.multiply(along, 0.5, out=J[3])
+        along *= -rho
+        np.multiply(along, by_pitch @ view.rays, out=J[1])
+        np.multiply(along, by_roll @ view.rays, out=J[2])
+        J[4], J[5], J[6] = ry * gz - rz * gy, rz * gx - rx * gz, rx * gy - ry * gx
+        by_length = rho * float(np.linalg.norm(t))
+        np.multiply(gx, by_length, out=J[7])
+        np.multiply(gy, by_length, out=J[8])
+        J[9] = -1.0
+        np.negative(view.grey, out=J[10])
+        return J

@@ -1,0 +1,167 @@
+"""The road under the camera as a Kalman filter holds it: tilt, curvature, mount, and the length of what is travelled.
+
+One comparison of two images (roadalign.py) knows some combination of length, pitch, roll and curvature. What joins them
+from frame to frame: the camera's own rotation, the road's curvature, the direction of travel, which lies in the road,
+and the mount, about which the car bounces.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.odometry.road_alignment import ROAD, RoadAlignConfig, RoadFit, plane_normal, plane_tilt
+from birdslam.odometry.tilt_watch import TiltWatchConfig
+
+Floats = NDArray[np.float64]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+
+STATES = ROAD + 2  # log lambda, pitch, roll, curvature; the mount's pitch and roll
+
+
+class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How comparisons of the road become a running scale and tilt."""
+
+    align: RoadAlignConfig = RoadAlignConfig()
+    min_baseline_m: Positive = 0.35  # travelled between the two images; shorter says too little
+    target_baseline_m: Positive = 1.1
+    kept_images: Annotated[int, msgspec.Meta(ge=2)] = 8
+    min_correlation: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.35
+    max_innovation_sigma: Positive = 4.0  # a comparison farther from what was expected is refused
+    confirmations: Annotated[int, msgspec.Meta(ge=1)] = (
+        3  # comparisons in a row before an unknown scale counts as known
+    )
+    doubt_sigma_rel: Positive = 0.15  # less sure than this, lengths far from the present one are tried as well
+    doubt_after: Annotated[int, msgspec.Meta(ge=1)] = 3  # refused comparisons in a row that begin such a search
+    violated_after: Annotated[int, msgspec.Meta(ge=1)] = 5  # refused comparisons in a row until the ground is in doubt
+    sigma_scale_floor_rel: Positive = 0.015  # one pair never knows the length better: the road is no perfect plane
+    sigma_tilt_floor_rad: Positive = 0.004
+    sigma_bounce_rad: Positive = 0.012  # pitch and roll of the body against their mean, seen once in bounce_m
+    bounce_m: Positive = 3.0
+    sigma_travel_rad: Positive = 0.012  # direction of travel against the road, over one metre
+    sigma_mount_rad: Positive = 0.02  # of the calibrated pitch and roll
+    sigma_unseen_rad: Positive = 0.03  # of the tilt after a gap in which nobody saw how the camera turned
+    scale_walk_rel_per_sqrt_m: Positive = 0.004  # drift of the visual scale
+    tilt_walk_rad_per_sqrt_m: Positive = 0.003  # crown and grade of the road
+    sigma_curvature_per_m: Positive = 0.0006  # of roads along the way: town streets have radii of 500 m and more
+    curvature_memory_m: Positive = 30.0  # so far a crest or a sag reaches
+    sigma_curvature_floor_per_m: Positive = 0.0001
+    chord_m: Positive = 15.0  # the ground is reported as the plane that meets the road at the foot and so far ahead
+    mount_walk_rad_per_sqrt_m: Positive = 0.0007  # of the mean pitch and roll, as loads and tanks change
+    carried_after_m: Positive = 6.0  # without a comparison, until the status says so
+    invalid_sigma_rel: Positive = 0.15
+    watch: TiltWatchConfig = TiltWatchConfig()
+
+
+class RoadFilter:
+    """The running estimate of (log lambda, pitch, roll, curvature, pitch and roll in the mean), and its covariance.
+
+    Pitch and roll are against the plane that touches the road under the camera: as the way goes on over a crest or
+    through a sag, that plane turns by curvature times the way, and so, in the mean, does the car. What they are in the
+    mean, about which the car bounces, is the mount: a state like the others, or what it learned of a tilt would be
+    believed twice. The visual scale is rescaled after each update, so log lambda is 0 between updates; only its
+    variance runs.
+    """
+
+    def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:
+        self.config = config
+        self.x = np.array([0.0, camera.pitch_rad, camera.roll_rad, 0.0, camera.pitch_rad, camera.roll_rad])
+        mount, tilt = config.sigma_mount_rad**2, config.sigma_mount_rad**2 + config.sigma_bounce_rad**2
+        self.cov: Floats = np.diag([1.0, tilt, tilt, config.sigma_curvature_per_m**2, mount, mount])
+        self.cov[[1, 2, 4, 5], [4, 5, 1, 2]] = mount
+        self.owed_log = 0.0  # correction of log lambda that the caller has not applied yet
+        self.carried_m = 0.0  # travelled since a comparison held
+
+    @property
+    def tilt(self) -> Floats:
+        """(pitch_rad, roll_rad) of the camera against the plane that touches the road under it."""
+        out: Floats = self.x[1:3]
+        return out
+
+    @property
+    def chord(self) -> tuple[Floats, float]:
+        """(pitch, roll) against the plane through the foot and the road chord_m ahead, and 1-sigma of the pitch."""
+        half_m = 0.5 * self.config.chord_m
+        H = np.array([1.0, half_m])
+        return self.tilt + np.array([self.x[3] * half_m, 0.0]), float(np.sqrt(H @ self.cov[1:4:2, 1:4:2] @ H))
+
+    def forget_scale(self, sigma_rel: float) -> None:
+        """The unit of length was lost (the window began anew) or doubted."""
+        self.cov[0, :] = self.cov[:, 0] = 0.0
+        self.cov[0, 0] = sigma_rel**2
+
+    def turned_unseen(self) -> None:
+        """The camera turned and nobody saw by how much: all that is known of the tilt is what the mount gives."""
+        cfg = self.config
+        self.cov[1:ROAD, :] = self.cov[:, 1:ROAD] = 0.0
+        self.x[3] = 0.0
+        self.cov[range(1, ROAD), range(1, ROAD)] = np.square(
+            [cfg.sigma_unseen_rad, cfg.sigma_unseen_rad, cfg.sigma_curvature_per_m]
+        )
+
+    def predict(self, R_prev_curr: Floats, travelled_m: float) -> None:
+        """The camera turned by R_prev_curr over a road that bends a little on the way."""
+        cfg = self.config
+        normal = R_prev_curr.T @ plane_normal(*self.tilt)[0]
+        keep = float(np.exp(-travelled_m / cfg.curvature_memory_m))
+        pitch_rad, roll_rad = plane_tilt(normal)
+        self.x[1:ROAD] = pitch_rad + self.x[3] * travelled_m, roll_rad, keep * self.x[3]
+        F = np.eye(STATES)
+        F[1, 3], F[3, 3] = travelled_m, keep
+        walk = cfg.tilt_walk_rad_per_sqrt_m**2 * travelled_m + 1e-8
+        mount = cfg.mount_walk_rad_per_sqrt_m**2 * travelled_m
+        bend = (1.0 - keep**2) * cfg.sigma_curvature_per_m**2
+        self.cov = F @ self.cov @ F.T + np.diag([0.0, walk, walk, bend, mount, mount])
+        self.cov[0, 0] = min(self.cov[0, 0] + cfg.scale_walk_rel_per_sqrt_m**2 * travelled_m, 1.0)
+        self.carried_m += travelled_m
+        # The road under the car is, in the mean, where the mount says: holds the tilt where no comparison does.
+        share = travelled_m / cfg.bounce_m
+        if share > 0.0:
+            noise = np.eye(2) * (cfg.sigma_bounce_rad**2 / share)
+            self._update(self.x[4:] - self.tilt, np.eye(STATES)[1:3] - np.eye(STATES)[4:], noise)
+
+    def _update(self, innovation: Floats, H: Floats, noise: Floats) -> None:
+        gain = self.cov @ H.T @ np.linalg.inv(H @ self.cov @ H.T + noise)
+        self.x = self.x + gain @ innovation
+        self.owed_log += float(self.x[0])  # what is now known of the tilt says something of earlier comparisons too
+        self.x[0] = 0.0
+        keep = np.eye(STATES) - gain @ H
+        self.cov = keep @ self.cov @ keep.T + gain @ noise @ gain.T
+
+    def travel(self, t_prev_curr: Floats, travelled_m: float) -> None:
+        """A car travels along the road, not into it: the direction of travel lies in the plane, in the mean."""
+        length = float(np.linalg.norm(t_prev_curr))
+        if length < 0.05:
+            return
+        normal, by_pitch, by_roll = plane_normal(*self.tilt)
+        d = t_prev_curr / length
+        H = np.zeros((1, STATES))
+        H[0, 1:3] = by_pitch @ d, by_roll @ d
+        share = travelled_m / 1.0
+        noise = np.array([[self.config.sigma_travel_rad**2 / share]])
+        self._update(np.array([-(normal @ d)]), H, noise)
+
+    def innovation(self, fit: RoadFit) -> tuple[Floats, Floats, float]:
+        """What a comparison says beyond what was expected, its noise (4, 4), and how many sigma that is away."""
+        cfg = self.config
+        tilt_rad = cfg.sigma_tilt_floor_rad
+        floor = np.array([cfg.sigma_scale_floor_rel, tilt_rad, tilt_rad, cfg.sigma_curvature_floor_per_m])
+        noise = fit.cov + np.diag(floor**2)
+        beyond = fit.state - self.x[:ROAD]
+        return beyond, noise, float(np.sqrt(beyond @ np.linalg.solve(self.cov[:ROAD, :ROAD] + noise, beyond)))
+
+    def accept(self, fit: RoadFit, share: float = 1.0) -> float:
+        """Takes a comparison over and returns lambda, by which the visual scale is to be multiplied.
+
+        `share` of it is new: comparisons over the same piece of way err together.
+        """
+        beyond, noise, _ = self.innovation(fit)
+        owed = self.owed_log
+        self._update(beyond, np.eye(STATES)[:ROAD], noise / max(share, 1e-3))
+        step, self.owed_log = self.owed_log - owed, owed
+        self.carried_m = 0.0
+        return float(np.exp(np.clip(step, -0.7, 0.7)))

@@ -1,0 +1,190 @@
+"""Metric scale: what the known camera height over the road says about the length of a motion; and the road's tilt.
+
+The paper scales ego-motion by road points of known metric depth (Eq. 1, camera height H) under a moving median
+(Sec. 3.1, scale-unambiguous ego-motion initialisation). Here a filter over (log lambda, pitch, roll, curvature) takes
+the place of the median: one comparison (roadalign.py) knows only some combination of the four, and the filter knows
+which.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.pose import Pose
+from birdslam.odometry.road_alignment import ROAD, RoadAligner, RoadFit, RoadImage
+from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
+from birdslam.odometry.road_search import search_length
+from birdslam.odometry.tilt_watch import TiltWatch
+from birdslam.types import Status
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_LENGTHS_M = np.geomspace(0.03, 6.0, 84)  # tried where the length is not known at all
+
+
+@dataclass(frozen=True)
+class _Kept:
+    image: RoadImage
+    pose: Pose  # in the odometry's frame and unit
+
+
+class MetricScale:
+    """Turns the odometry's unit of length into metres, image by image.
+
+    Poses come in the odometry's own frame. By the factor that `compare` returns the caller multiplies all its lengths,
+    about the present camera, and so does this.
+    """
+
+    def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:
+        self.camera, self.config = camera, config
+        self._aligner = RoadAligner(camera, config.align)
+        self._filter = RoadFilter(camera, config)
+        self._watch = TiltWatch(camera, config.watch)
+        self._travelled_m = 0.0  # by the last motion
+        self._kept: list[_Kept] = []
+        self._confirmed = 0
+        self._refused = 0.0  # comparisons in a row, each counted by what of it is new: those of one view err together
+        self._tries = 0  # and by number
+        self._since_m = 0.0  # travelled since the last comparison
+        self.fit: RoadFit | None = None  # what the last image's comparison alone said, where it was taken over
+
+    @property
+    def ground(self) -> GroundPlane:
+        """The present camera over the road; the height is the calibrated one, by which all lengths are measured."""
+        pitch_rad, roll_rad = self._filter.chord[0]
+        return GroundPlane(self.camera.height_m, float(pitch_rad), float(roll_rad))
+
+    @property
+    def sigma_rel(self) -> float:
+        return float(np.sqrt(self._filter.cov[0, 0]))
+
+    @property
+    def unknown(self) -> bool:
+        """Too vague to be driven by."""
+        return self.sigma_rel > self.config.invalid_sigma_rel
+
+    @property
+    def pitch_sigma_rad(self) -> float:
+        return self._filter.chord[1]
+
+    def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
+        """The odometry begins anew with this image; its unit of length is known to `sigma_rel`."""
+        self._kept = [_Kept(self._aligner.image(grey), pose)]
+        self.forget(sigma_rel)
+
+    def turned_unseen(self) -> None:
+        """The odometry lost sight of how the camera turned."""
+        self._filter.turned_unseen()
+
+    def forget(self, sigma_rel: float) -> None:
+        """The unit of length is only known to `sigma_rel` from here on."""
+        if not self._confirmed:
+            sigma_rel = 1.0
+        self._filter.forget_scale(sigma_rel)
+        if sigma_rel > self.config.doubt_sigma_rel:
+            self._confirmed = 0
+
+    def moved(self, step: Pose) -> None:
+        """The camera moved by T_prev_curr, in the present unit of length."""
+        self._travelled_m = float(np.linalg.norm(step.p))
+        self._filter.predict(step.R, self._travelled_m)
+        self._filter.travel(step.R.T @ step.p, self._travelled_m)
+        self._since_m += self._travelled_m
+
+    def compare(self, grey: NDArray[np.uint8], pose: Pose, boxes_px: Floats, road_mask: Bools | None) -> float:
+        """Compares the road with that of an earlier image; returns the factor on all lengths."""
+        cfg = self.config
+        self.fit = None
+        image = self._aligner.image(grey)
+        factor = float(np.exp(np.clip(self._filter.owed_log, -0.1, 0.1)))
+        self._filter.owed_log = 0.0
+        past = self._past(pose)
+        if past is not None:
+            ground = self.ground
+            px = self._aligner.samples((ground.pitch_rad, ground.roll_rad), boxes_px, road_mask)
+            if len(px) >= cfg.align.min_samples:
+                T = past.pose.between(pose)
+                factor *= self._compare(past, image, Pose(T.R, T.p * factor), px)
+        measured = self._filter.carried_m == 0.0 and self._known()  # here, in metres
+        self._watch.see(self._filter.tilt, factor * self._travelled_m, measured)
+        if factor != 1.0:
+            centre = pose.p
+            self._kept = [_Kept(k.image, Pose(k.pose.R, centre + factor * (k.pose.p - centre))) for k in self._kept]
+        newest = self._kept[-1] if self._kept else None
+        if newest is None or float(np.linalg.norm(newest.pose.p - pose.p)) > 0.5 * cfg.min_baseline_m:
+            self._kept = [*self._kept[1 - cfg.kept_images :], _Kept(image, pose)]
+        return factor
+
+    def status(self) -> list[Status]:
+        cfg, out = self.config, []
+        if self._filter.carried_m > cfg.carried_after_m or not self._confirmed:
+            out.append(Status.SCALE_CARRIED)
+        if self.unknown:
+            out.append(Status.SCALE_INVALID)
+        if self._refused >= cfg.violated_after:
+            out.append(Status.GROUND_VIOLATED)
+        if self._watch.drifted:
+            out.append(Status.CALIBRATION_DRIFT)
+        return out
+
+    def _past(self, pose: Pose) -> _Kept | None:
+        cfg = self.config
+        if not self._kept:
+            return None
+        if self._in_doubt():
+            # Lengths are not known: the longest there is, or, where that looked like nothing, the shortest, and so on.
+            return self._kept[-self._tries % len(self._kept)]
+        distance = np.array([np.linalg.norm(k.pose.p - pose.p) for k in self._kept])
+        usable = np.flatnonzero(distance > cfg.min_baseline_m)
+        if not len(usable):
+            return None
+        return self._kept[int(usable[np.argmin(np.abs(np.log(distance[usable] / cfg.target_baseline_m)))])]
+
+    def _in_doubt(self) -> bool:
+        return self.sigma_rel > self.config.doubt_sigma_rel or self._refused >= self.config.doubt_after
+
+    def _compare(self, past: _Kept, image: RoadImage, T: Pose, px: NDArray[np.int64]) -> float:
+        cfg, filter_ = self.config, self._filter
+        prior, prior_cov = filter_.x[:ROAD].copy(), filter_.cov.copy()
+        tilt = (self.ground.pitch_rad, self.ground.roll_rad)
+        length = float(np.linalg.norm(T.p))
+        if length < 1e-6:
+            return 1.0
+        new, self._since_m = min(1.0, self._since_m / length), 0.0
+        searched = 1.0
+        fit = self._aligner.align(past.image, image, T, px, prior, prior_cov[:ROAD, :ROAD])
+        if self._in_doubt():
+            found = search_length(self.camera, past.image, image, T, px, tilt, _LENGTHS_M) / length
+            loose = prior_cov.copy()
+            loose[0, :] = loose[:, 0] = 0.0
+            loose[0, 0] = 0.3**2
+            if self._refused >= cfg.doubt_after:
+                loose[1:3, 1:3] += np.eye(2) * cfg.sigma_unseen_rad**2
+            other = self._aligner.align(past.image, image, Pose(T.R, T.p * found), px, prior, loose[:ROAD, :ROAD])
+            # What was confirmed before has to be beaten clearly: the dark below a car ahead agrees with standing still.
+            lead = 0.02 if not self._confirmed else 0.1
+            if other is not None and (fit is None or other.correlation > fit.correlation + lead):
+                fit, searched, prior_cov = other, found, loose
+        if fit is None:
+            return 1.0
+        expected = searched != 1.0 or not self._known() or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
+        if fit.correlation < cfg.min_correlation or not expected:
+            self._refused += new
+            self._tries += 1
+            return 1.0
+        self._refused, self._tries = 0.0, 0
+        self.fit = fit
+        filter_.cov = prior_cov
+        factor = searched * filter_.accept(fit, min(1.0, filter_.carried_m / length))
+        self._confirmed = 1 if abs(np.log(factor)) > 0.3 else self._confirmed + 1
+        if not self._known():
+            filter_.cov[0, 0] = max(filter_.cov[0, 0], (1.1 * cfg.doubt_sigma_rel) ** 2)
+        return factor
+
+    def _known(self) -> bool:
+        return self._confirmed >= self.config.confirmations

@@ -1,0 +1,57 @@
+"""The length of a motion of known direction, where nothing is known of it: those tried, compared on the road.
+
+An alignment (roadalign.py) reaches only as far as the road's grain; from here it starts near enough.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.pose import Pose
+from birdslam.odometry.road_alignment import RoadImage, plane_normal
+
+Floats = NDArray[np.float64]
+
+
+def search_length(
+    camera: Camera,
+    past: RoadImage,
+    present: RoadImage,
+    T_past_present: Pose,
+    px: NDArray[np.int64],
+    tilt: tuple[float, float],
+    lengths: Floats,
+) -> float:
+    """The one of `lengths` at which the road, a plane here, fits best, over a few pitches about `tilt`."""
+    f32 = np.float32
+    px = px[:: max(1, len(px) // 900)]
+    rays = np.stack(
+        [(px[:, 0] - camera.cx_px) / camera.fx_px, (px[:, 1] - camera.cy_px) / camera.fy_px, np.ones(len(px))]
+    ).astype(f32)  # fmt: skip
+    here = present.grey[px[:, 1] - present.top_px, px[:, 0]]
+    direction = (T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9)).astype(f32)
+    turned = T_past_present.R.astype(f32) @ rays
+    rows, cols = past.grey.shape
+    best = (float(lengths[0]), -1.0)
+    for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01):
+        rho = (plane_normal(pitch_rad, tilt[1])[0].astype(f32) @ rays) * f32(-1.0 / camera.height_m)
+        way = lengths.astype(f32)[:, None] * rho  # (lengths, samples); what a sample moves, over its depth
+        by_z = f32(1.0) / np.maximum(turned[2] + way * direction[2], f32(1e-3))
+        u = (turned[0] + way * direction[0]) * by_z * f32(camera.fx_px) + f32(camera.cx_px)
+        v = (turned[1] + way * direction[1]) * by_z * f32(camera.fy_px) + f32(camera.cy_px - past.top_px)
+        there = cv2.remap(past.grey, u, v, cv2.INTER_LINEAR)
+        inside = ((u > 0) & (u < cols - 1) & (v > 0) & (v < rows - 1)).astype(f32)
+        count = np.maximum(inside.sum(axis=1), 1.0)
+        a, b = there * inside, here * inside
+        mean_a, mean_b = a.sum(axis=1) / count, b.sum(axis=1) / count
+        ab, aa, bb = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (a, a), (b, b)))
+        variances = (aa - count * mean_a**2) * (bb - count * mean_b**2)
+        correlation = (ab - count * mean_a * mean_b) / np.sqrt(np.maximum(variances, 1e-9))
+        correlation[count < 0.5 * len(px)] = -1.0
+        k = int(correlation.argmax())
+        if correlation[k] > best[1]:
+            best = (float(lengths[k]), float(correlation[k]))
+    return best[0]

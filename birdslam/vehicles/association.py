@@ -1,0 +1,103 @@
+"""Which box may be which vehicle: where tracks are expected in the image, and how far off a box may be on the road."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.vehicles.localisation import Observation
+from birdslam.vehicles.track import Track
+
+HEIGHT_SHOWS_REL = 0.2  # 1-sigma of a box's height; past it the box says nothing of a size
+NEAREST_M, FAR_M = 1.0, 1e4  # a nearer box is out of the image; from there one looks at the horizon
+
+
+def predicted_boxes_px(
+    tracks: Sequence[Track], camera: Camera, T_world_ego: SE2, ground: GroundPlane
+) -> NDArray[np.float64]:
+    """(N, 4): where each track's last box is expected in the current image; NaN behind the camera.
+
+    The box's distance to the horizon and its size go with the inverse of the depth, whatever the ground plane.
+    """
+    boxes = np.full((len(tracks), 4), np.nan)
+    if not tracks:
+        return boxes
+    centres = np.array([track.state[:2] for track in tracks])
+    then = np.array([in_ego(track.T_world_ego, track.state[:2]) for track in tracks])
+    now = T_world_ego.inverse() @ centres
+    depth = np.array([track.place.depth_m for track in tracks])
+    bearing = np.array([track.observation.bearing for track in tracks])
+    near = np.column_stack([depth, depth * bearing]) + now - then
+    ahead = near[:, 0] >= NEAREST_M
+    slopes = np.concatenate([bearing[ahead], near[ahead, 1] / near[ahead, 0]])
+    horizon = bev.ego_to_pixel(camera, ground, FAR_M * np.column_stack([np.ones(len(slopes)), slopes]))
+    horizon_then, horizon_now = np.split(horizon, 2)
+    last = np.array([track.observation.box_px for track in tracks])[ahead]
+    scale = depth[ahead] / near[ahead, 0]
+    half_px = (last[:, 2] - last[:, 0]) / 2.0 * scale
+    rows = horizon_now[:, 1, None] + (last[:, [1, 3]] - horizon_then[:, 1, None]) * scale[:, None]
+    boxes[ahead] = np.column_stack([horizon_now[:, 0] - half_px, rows[:, 0], horizon_now[:, 0] + half_px, rows[:, 1]])
+    return boxes
+
+
+def within_gate(
+    tracks: Sequence[Track], observations: Sequence[Observation], T_world_ego: SE2, gate_sigma: float
+) -> NDArray[np.bool_]:
+    """(tracks, observations): within the gate, by the height of the box and the track's learned size; no road."""
+    depth, bearing, sigma_rel, turned_m = np.array([_rough(observation) for observation in observations]).T
+    lengths = np.array([observation.dimensions.length_m for observation in observations])
+    sigma_sides = np.array([max(observation.sigma_left, observation.sigma_right) for observation in observations])
+    learned = np.array([_learned_height_m(track) for track in tracks])[:, None]
+    of_class = np.array([observation.dimensions.height_m for observation in observations])
+    x_m = np.where(np.isnan(learned), 1.0, learned / of_class) * depth + lengths / 2.0
+    along = np.square(x_m * sigma_rel) + np.square(turned_m)
+    across = np.square(x_m * sigma_sides) + np.square(turned_m / 2.0)
+    R = T_world_ego.rotation()
+    centres = T_world_ego @ np.stack([x_m, bearing * x_m], axis=-1).reshape(-1, 2)
+    covs = np.empty((*x_m.shape, 2, 2))
+    covs[..., 0, 0] = along
+    covs[..., 0, 1] = covs[..., 1, 0] = along * bearing
+    covs[..., 1, 1] = along * np.square(bearing) + across
+    S = np.array([track.cov[:2, :2] for track in tracks])[:, None] + R @ covs @ R.T
+    gap = centres.reshape(*x_m.shape, 2) - np.array([track.state[:2] for track in tracks])[:, None]
+    out: NDArray[np.bool_] = _squared_mahalanobis(gap, S) <= gate_sigma**2
+    return out
+
+
+def _learned_height_m(track: Track) -> float:
+    """What made it look as tall as it last did from where it was placed; NaN where its height did not show."""
+    seen = track.observation
+    return track.place.depth_m * seen.tan_height if _sigma_height_rel(seen) < HEIGHT_SHOWS_REL else math.nan
+
+
+def _rough(seen: Observation) -> tuple[float, float, float, float]:
+    """Depth (m) by the height of its class, bearing, 1-sigma of the depth (relative), what its yaw may hide (m)."""
+    dimensions = seen.dimensions
+    turned_m = dimensions.length_m / (2.0 if seen.cut_side else 4.0)  # its yaw is not known here
+    sigma_rel = math.hypot(_sigma_height_rel(seen), dimensions.sigma_height_rel)
+    return seen.depth_by_height_m, seen.bearing, sigma_rel, turned_m
+
+
+def _sigma_height_rel(seen: Observation) -> float:
+    return math.hypot(seen.sigma_top, seen.sigma_bottom) / max(seen.tan_height, 1e-3)
+
+
+def in_ego(T_world_ego: SE2, point: NDArray[np.float64]) -> tuple[float, float]:
+    """A point (2,) of the world in ego, without the cost of arrays."""
+    c, s = math.cos(T_world_ego.yaw_rad), math.sin(T_world_ego.yaw_rad)
+    x, y = float(point[0]) - T_world_ego.x_m, float(point[1]) - T_world_ego.y_m
+    return c * x + s * y, c * y - s * x
+
+
+def _squared_mahalanobis(gap: NDArray[np.float64], S: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(...): of gaps (..., 2) with covariances (..., 2, 2)."""
+    x, y = gap[..., 0], gap[..., 1]
+    xx, xy, yy = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
+    out: NDArray[np.float64] = (yy * x**2 - 2.0 * xy * x * y + xx * y**2) / (xx * yy - xy**2)
+    return out

@@ -1,0 +1,106 @@
+"""A vehicle's place by its depth, and what it makes of the place by Eq. 1: the two sources of Fig. 2 become one.
+
+By covariance, or by the paper's rule: this one where the vehicle is near, Eq. 1 where it is far.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.vehicles.localisation import Observation, Place
+
+Floats = NDArray[np.float64]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+
+
+class PseudoLidarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How depth becomes a place, and what it counts beside Eq. 1."""
+
+    rule: Literal["covariance", "paper", "off"] = "covariance"
+    near_m: Positive = 20.0  # by the paper's rule: nearer, the depth map alone; farther, Eq. 1 alone
+    top_rel: float = 0.35  # of a box's height: the band of rows in which a vehicle's body shows, and neither
+    bottom_rel: float = 0.8  # its windows nor the road before it
+    columns: Annotated[int, msgspec.Meta(ge=4, le=64)] = 16  # of the box, each with one depth
+    yaws: Annotated[int, msgspec.Meta(ge=4, le=180)] = 36  # of the fan, over half a turn
+    sigma_shape_rel: Positive = 0.03  # of a depth: how well the map keeps a vehicle's shape, columns apart
+    sigma_shape_m: Positive = 0.25  # vehicles are no cuboids
+    independent_columns: Positive = 4.0  # errors of neighbouring columns go together
+    outlier_sigma: Positive = 3.0  # past it a column is taken to show something else
+    least_columns: Annotated[int, msgspec.Meta(ge=2)] = 5
+    least_points: Annotated[int, msgspec.Meta(ge=1)] = 40  # of a frustum that the network is asked about
+    max_range_m: Positive = 60.0
+    gate_sigma: Positive = 3.0  # places that differ by more are both believed less
+    road_near_m: Positive = 5.0  # of the road that gives an unscaled map its metres
+    road_far_m: Positive = 25.0
+
+
+@dataclass(frozen=True)
+class DepthPlace:
+    """Where the depth map puts a vehicle, in ego: its footprint's centre (2,) and yaw, with their covariances.
+
+    The yaw is of the axis, in (-pi/2, pi/2], where `flip` is 0.5: which end is the front is then not known. `flip` is
+    the probability that the front is the rear.
+    """
+
+    centre_m: Floats
+    cov: Floats  # (2, 2)
+    yaw_rad: float
+    sigma_yaw_rad: float
+    flip: float = 0.5
+    size_m: tuple[float, float, float] | None = None  # length, width, height, where they were measured
+
+    @property
+    def front_seen(self) -> bool:
+        """Whether the yaw is of the front, in all likelihood, and not of the axis alone."""
+        return self.flip < 0.5
+
+    @property
+    def front_logit(self) -> float:
+        """Of the yaw's end being the front."""
+        return math.log(1.0 - self.flip) - math.log(max(self.flip, 1e-6))
+
+
+def combined(by_box: Place, by_depth: DepthPlace | None, config: PseudoLidarConfig) -> Place:
+    """One place of the two sources.
+
+    By covariance, with both believed less where they contradict each other by more than `gate_sigma`; or by the paper's
+    rule, which asks the depth. The nearest face moves with the centre.
+    """
+    if by_depth is None or config.rule == "off":
+        return by_box
+    if config.rule == "paper":
+        if by_box.depth_m > config.near_m:
+            return by_box
+        return _moved(by_box, by_depth.centre_m, by_depth.cov)
+    # Across the line of sight both rest on the same edges of the box: the depth is all that is new
+    apart_m = float(by_depth.centre_m[0] - by_box.centre_m[0])
+    variance = float(by_box.cov[0, 0] + by_depth.cov[0, 0])
+    doubt = max(1.0, apart_m**2 / variance / config.gate_sigma**2)
+    gain = by_box.cov[:, 0] / variance
+    cov = by_box.cov - np.outer(gain, by_box.cov[0])
+    return _moved(by_box, by_box.centre_m + gain * apart_m, doubt * cov)
+
+
+def _moved(place: Place, centre_m: Floats, cov: Floats) -> Place:
+    depth_m = max(place.depth_m + float(centre_m[0] - place.centre_m[0]), 0.1)
+    return Place(depth_m, centre_m, (cov + cov.T) / 2.0)
+
+
+def across_var(seen: Observation, x_m: float) -> float:
+    """Variance of the centre across the line of sight: each edge is half an outline away from it."""
+    of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
+    lopsided = (of_left - of_right) / (of_left + of_right)
+    half_m = lopsided * seen.dimensions.sigma_width_rel * seen.tan_width * x_m / 2.0
+    return x_m**2 / (of_left + of_right) + half_m**2
+
+
+def along_sight(x_m: float, y_m: float, along: float, across: float) -> Floats:
+    """(2, 2) of variances of x_m along the line of sight and of y_m at that x_m."""
+    slope = y_m / x_m
+    return np.array([[along, along * slope], [along * slope, along * slope**2 + across]])

@@ -1,0 +1,103 @@
+"""What a vehicle's yaw, where it is not known well, makes of its place.
+
+A box says how wide a vehicle looks beside how far it is, and so how much it is turned, though not to which side. Each
+yaw of a fan puts the footprint's centre elsewhere; how much each is to be believed, by what was thought of the yaw
+before and by the width, gives the centre's mean and covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.vehicles.localisation import CENTRE_STEPS, LocalisationConfig, Observation
+
+Floats = NDArray[np.float64]
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+_NEAR = np.array([0.0, math.sqrt(3.0), -math.sqrt(3.0)])  # Gauss-Hermite points of a normal distribution, in sigmas
+_NEAR_WEIGHT = np.array([2.0, 0.5, 0.5]) / 3.0
+_LEAST_BELIEF = 1e-12
+
+
+class HeadingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How vehicles stand on roads, and what the width of a box says of it."""
+
+    astray_unknown: Share = 0.25  # of the vehicles whose yaw nothing has shown yet are headed anywhere
+    astray_known: Share = 0.1  # and of those whose motion or body seemed to show it
+    sigma_along_road_rad: float = 0.05  # of the others of the first kind: they are headed like the ego
+    sigma_width_rel: float = 0.09  # of the outline of a footprint, among vehicles of a class
+    fan: Annotated[int, msgspec.Meta(ge=4, le=90)] = 12  # yaws over half a turn: a heading and its opposite look alike
+
+
+@dataclass(frozen=True)
+class Headings:
+    """What is thought of the yaws (N,) of a frame's vehicles, against the ego: normal but for those gone `astray`."""
+
+    yaw_rad: Floats
+    sigma_rad: Floats
+    astray: Floats
+
+
+def spread(
+    seen: Sequence[Observation],
+    log_depth: Floats,
+    variance: Floats,
+    headings: Headings,
+    localisation: LocalisationConfig,
+    config: HeadingConfig,
+) -> tuple[Floats, Floats]:
+    """(N, 2) m in ego: how far the mean centre lies from that of the yaw as told, and the cov (N, 2, 2) about it.
+
+    `log_depth` (N,) is of the nearest faces, with its `variance`.
+    """
+    if not seen:
+        return np.zeros((0, 2)), np.zeros((0, 2, 2))
+    n, fan = len(seen), config.fan
+    anywhere = np.broadcast_to(np.arange(fan) * (math.pi / fan), (n, fan))
+    yaws = np.hstack([headings.yaw_rad[:, None] + headings.sigma_rad[:, None] * _NEAR, anywhere])  # (N, M)
+    astray = headings.astray[:, None]
+    prior = np.hstack([(1.0 - astray) * _NEAR_WEIGHT, np.broadcast_to(astray / fan, (n, fan))])
+    left, right, var_left, var_right, half_l, half_w = np.array(
+        [
+            (
+                o.left,
+                o.right,
+                o.sigma_left**2,
+                o.sigma_right**2,
+                o.dimensions.length_m / 2.0,
+                o.dimensions.width_m / 2.0,
+            )
+            for o in seen
+        ]
+    ).T[..., None]
+
+    # Corners about the centre, (4, N, M): the last two are opposite to the first
+    c, s = np.cos(yaws), np.sin(yaws)
+    ahead = np.stack([half_l * c - half_w * s, half_l * c + half_w * s])
+    aside = np.stack([half_l * s + half_w * c, half_l * s - half_w * c])
+    ahead, aside = (np.concatenate([half, -half]) * localisation.reach_rel for half in (ahead, aside))
+    depth_m = np.exp(log_depth)[:, None]
+    x_m = depth_m + ahead.max(axis=0)
+    far_m = np.maximum(x_m + ahead, 0.1)
+    y_m = (left + right) / 2.0 * x_m
+    of_left, of_right = 1.0 / var_left, 1.0 / var_right
+    for _ in range(CENTRE_STEPS):  # as `place` does
+        outline = (y_m + aside) / far_m
+        widest, least = outline.max(axis=0), outline.min(axis=0)
+        y_m = y_m + ((left - widest) * of_left + (right - least) * of_right) / (of_left + of_right) * x_m
+
+    misfit = np.log(np.maximum(left - right, 1e-3) / np.maximum(widest - least, 1e-3))
+    noise = variance[:, None] + config.sigma_width_rel**2 + (var_left + var_right) / (left - right) ** 2
+    belief = prior * np.exp(-0.5 * misfit**2 / noise) + prior * _LEAST_BELIEF
+    belief /= belief.sum(axis=1, keepdims=True)
+    centres = np.stack([x_m, y_m], axis=-1)
+    mean = (belief[..., None] * centres).sum(axis=1)
+    away = centres - mean[:, None]
+    return mean - centres[:, 0], (belief[..., None] * away).swapaxes(1, 2) @ away

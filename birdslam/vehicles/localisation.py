@@ -1,0 +1,291 @@
+"""Vehicles in bird's-eye view from their boxes (paper, dynamic object localization).
+
+A box becomes an `Observation`: slopes and bearings against the road as it is known, with honest sigmas. An edge that
+the image cuts off is no measurement, one that a nearer vehicle hides a poor one. Depths come of all boxes of a frame
+together (horizon.py); `place` then puts the footprint's centre where the box's edges and the vehicle's yaw want it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera, GroundPlane
+
+
+class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a class of vehicle measures, and how much its members differ (1-sigma, as a fraction)."""
+
+    length_m: float
+    width_m: float
+    height_m: float
+    sigma_length_rel: float = 0.12
+    sigma_width_rel: float = 0.2  # of the outline across the line of sight: the length shows too where it is oblique
+    sigma_height_rel: float = 0.08
+
+
+DIMENSIONS = {
+    "car": Dimensions(3.9, 1.63, 1.53),
+    "van": Dimensions(5.0, 1.9, 2.1, sigma_height_rel=0.12),
+    "truck": Dimensions(7.0, 2.4, 3.0, sigma_length_rel=0.3, sigma_height_rel=0.2),
+    "bus": Dimensions(11.0, 2.5, 3.1, sigma_length_rel=0.2, sigma_height_rel=0.1),
+    "motorcycle": Dimensions(2.1, 0.8, 1.6, sigma_height_rel=0.12),
+}
+CENTRE_STEPS = 3  # each leaves about a tenth of the error
+HIDING_FRACTION = 0.1  # of a box's side: a nearer box that covers less hides nothing
+
+
+class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How boxes become places; the class table also says which labels are vehicles."""
+
+    vehicles: dict[str, Dimensions] = msgspec.field(default_factory=lambda: dict(DIMENSIONS))
+    sigma_box_rel: float = 0.02  # a detector's edges scatter with the size of the box,
+    sigma_box_px: float = 0.7  # and beside it as pixels do
+    reach_rel: float = 1.0  # of the way from the nearest face to the centre; the paper stays at the face (0)
+    sigma_cut_rel: float = 1.0  # an edge cut by the image says nothing within the whole box
+    sigma_hidden_rel: float = 0.05  # an edge behind a nearer vehicle is the detector's guess
+    cut_margin_px: float = 4.0
+    cut_margin_rel: float = 0.1  # of the box's height, at the image's bottom: detectors draw an edge that the image
+    cut_margin_side_rel: float = 0.05  # cuts off a little inside of it; and of its width, at the sides
+    shape_floor_m: float = 0.05  # across the line of sight: vehicles are no cuboids
+    max_above_road_rad: float = 0.06  # a box whose bottom lies so far above where its height puts it hangs in the air
+    same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
+    max_range_m: float = 100.0  # by the height of its class
+
+    def told(self, edge_sigma: tuple[float, float] | None) -> LocalisationConfig:
+        """With what a detector itself says of its boxes' edges, where it does (see `perception.Detections`)."""
+        if edge_sigma is None:
+            return self
+        rel, px = edge_sigma
+        return msgspec.structs.replace(self, sigma_box_rel=rel, sigma_box_px=px)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One vehicle's box in one frame.
+
+    `left` and `right` are the bearings (y/x in ego) of its edges; slopes fall from the plane of the road, so that Eq. 1
+    is H / slope_bottom. All sigmas are of these numbers.
+    """
+
+    label: str
+    score: float
+    box_px: tuple[float, float, float, float]
+    left: float
+    sigma_left: float
+    right: float
+    sigma_right: float
+    slope_bottom: float
+    sigma_bottom: float
+    slope_top: float
+    sigma_top: float
+    cut_side: bool
+    dimensions: Dimensions
+    sigma_cut: float | None = None  # of slope_bottom where the image cuts the bottom off: the true one is no less
+
+    @property
+    def bearing(self) -> float:
+        """Of its middle column."""
+        return (self.left + self.right) / 2.0
+
+    @property
+    def tan_width(self) -> float:
+        """Its width at a depth of 1."""
+        return self.left - self.right
+
+    @property
+    def tan_height(self) -> float:
+        """Its height at a depth of 1."""
+        return self.slope_bottom - self.slope_top
+
+    @property
+    def depth_by_height_m(self) -> float:
+        """Of a vehicle as tall as its class."""
+        return self.dimensions.height_m / max(self.tan_height, 1e-3)
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What a vehicle was taken for when it was placed: later frames may know better (retrospect.py).
+
+    `depth_per_height` says by how much the logarithm of its depth went with `log_height`, that of its height in metres.
+    """
+
+    log_height: float
+    sigma_log_height: float
+    depth_per_height: float
+    standing: float  # the probability that it stands
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an observed vehicle is in ego: its nearest face's depth, its footprint's centre (2,), and cov (2, 2)."""
+
+    depth_m: float
+    centre_m: NDArray[np.float64]
+    cov: NDArray[np.float64]
+    taken: Taken | None = None
+
+
+def iou(a_px: NDArray[np.float64], b_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Intersection over union, (A, B), of boxes (A, 4) and (B, 4) given as x1, y1, x2, y2."""
+    a, b = np.reshape(a_px, (-1, 1, 4)), np.reshape(b_px, (1, -1, 4))
+    span = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0.0, None)
+    shared = span[..., 0] * span[..., 1]
+    area_a = (a[..., 2] - a[..., 0]) * (a[..., 3] - a[..., 1])
+    area_b = (b[..., 2] - b[..., 0]) * (b[..., 3] - b[..., 1])
+    out: NDArray[np.float64] = shared / np.maximum(area_a + area_b - shared, 1e-9)
+    return out
+
+
+def corners_of(dimensions: Dimensions, yaw_rad: float) -> list[tuple[float, float]]:
+    """The footprint's corners about its centre, in ego's axes; `yaw_rad` is the vehicle's against the ego."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    half_l, half_w = dimensions.length_m / 2.0, dimensions.width_m / 2.0
+    return [(sl * half_l * c - sw * half_w * s, sl * half_l * s + sw * half_w * c) for sl in (-1, 1) for sw in (-1, 1)]
+
+
+def extent_m(dimensions: Dimensions, yaw_rad: float, depth_m: float, bearing: float) -> tuple[float, float]:
+    """What a vehicle measures along ego's x, and how wide its outline is where it is as far as its nearest face."""
+    corners = corners_of(dimensions, yaw_rad)
+    reach_m = -min(x for x, _ in corners)
+    x_m = depth_m + reach_m
+    y_m = bearing * x_m
+    outline = [(y_m + y) / max(x_m + x, 0.1) for x, y in corners]
+    return 2.0 * reach_m, (max(outline) - min(outline)) * depth_m
+
+
+def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float, config: LocalisationConfig) -> Place:
+    """The observation's place in ego at a depth with its variance, both of the logarithm; yaw against the ego.
+
+    The middle of an oblique vehicle's outline is not the column of its centre: the centre is moved sideways until the
+    bearings of its outermost corners have those of the box's edges, each weighted by its information.
+    """
+    depth_m = math.exp(log_depth)
+    corners = [(config.reach_rel * x, config.reach_rel * y) for x, y in corners_of(seen.dimensions, yaw_rad)]
+    reach_m = -min(x for x, _ in corners)
+    x_m = depth_m + reach_m
+    y_m = seen.bearing * x_m
+    of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
+    for _ in range(CENTRE_STEPS):
+        outline = [(y_m + y) / max(x_m + x, 0.1) for x, y in corners]
+        error = (seen.left - max(outline)) * of_left + (seen.right - min(outline)) * of_right
+        y_m += error / (of_left + of_right) * x_m
+
+    # An edge alone gives the centre as well as half of the outline is known; of a vehicle that leaves the image at its
+    # side the nearest face is not seen
+    lopsided = (of_left - of_right) / (of_left + of_right)
+    sigma_half = seen.dimensions.sigma_width_rel * max(seen.tan_width, max(outline) - min(outline)) / 2.0
+    sigma_across = math.hypot(
+        1.0 / math.sqrt(of_left + of_right), lopsided * sigma_half, config.shape_floor_m / max(x_m, 1.0)
+    )
+    sigma_reach_m = reach_m * (1.0 if seen.cut_side else seen.dimensions.sigma_length_rel)
+    along = x_m**2 * var_depth + sigma_reach_m**2
+    across, slope = (x_m * sigma_across) ** 2, y_m / x_m
+    cov = np.array([[along, along * slope], [along * slope, along * slope**2 + across]])
+    return Place(depth_m, np.array([x_m, y_m]), cov)
+
+
+def localise(
+    boxes_px: NDArray[np.float64],
+    scores: NDArray[np.float64],
+    labels: tuple[str, ...],
+    camera: Camera,
+    ground: GroundPlane,
+    config: LocalisationConfig,
+) -> list[Observation]:
+    """The vehicles among the boxes (N, 4), best score first.
+
+    A box that hangs over the road or lies past `max_range_m` is no vehicle on it and is left out.
+    """
+    vehicles = np.array([label in config.vehicles for label in labels], dtype=np.bool_).reshape(-1)
+    sizes = boxes_px[:, 2:] - boxes_px[:, :2]
+    candidates = np.flatnonzero(vehicles & (sizes >= 1.0).all(axis=1))
+    candidates = candidates[np.argsort(-scores[candidates], kind="stable")]
+    overlap = iou(boxes_px[candidates], boxes_px[candidates])
+    kept: list[int] = []  # rows of `overlap`
+    for row in range(len(candidates)):
+        if not kept or overlap[row, kept].max() <= config.same_vehicle_iou:
+            kept.append(row)
+    chosen = candidates[kept]
+    boxes = boxes_px[chosen]
+    hidden = hidden_edges(boxes)
+    slopes = _slopes(camera, ground, boxes)
+    found = (
+        _observe(box, float(scores[i]), labels[i], camera, slope, edges, config)
+        for i, box, slope, edges in zip(chosen, boxes.tolist(), slopes.tolist(), hidden.tolist(), strict=True)
+    )
+    return [seen for seen in found if _is_on_road(seen, camera, ground, config)]
+
+
+def hidden_edges(boxes_px: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N, 3): whether the left, right and bottom edge of each box lie behind a nearer one, whose bottom is lower."""
+    x1, y1, x2, y2 = (boxes_px[:, k, None] for k in range(4))
+    n1, m1, n2, m2 = (boxes_px[None, :, k] for k in range(4))
+    nearer = m2 > y2
+    rows = np.clip(np.minimum(y2, m2) - np.maximum(y1, m1), 0.0, None) > HIDING_FRACTION * (y2 - y1)
+    columns = np.clip(np.minimum(x2, n2) - np.maximum(x1, n1), 0.0, None) > HIDING_FRACTION * (x2 - x1)
+    left = nearer & rows & (n1 < x1) & (n2 > x1)
+    right = nearer & rows & (n1 < x2) & (n2 > x2)
+    bottom = nearer & columns & (m1 < y2)
+    out: NDArray[np.bool_] = np.column_stack([edge.any(axis=1) for edge in (left, right, bottom)])
+    return out
+
+
+def _slopes(camera: Camera, ground: GroundPlane, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 4): bearings of the left and right edge at the bottom, slopes of bottom and top (the rays Eq. 1 scales)."""
+    px = np.concatenate([boxes_px[:, [0, 3]], boxes_px[:, [2, 3]], boxes_px[:, [0, 1]]])
+    rays = np.column_stack([(px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px], np.ones(len(px))])
+    x, y, z = (rays @ ground.R_ego_cam.T).T
+    bearing, slope = (y / x).reshape(3, -1), (-z / x).reshape(3, -1)
+    return np.column_stack([bearing[0], bearing[1], slope[0], slope[2]])
+
+
+def _observe(
+    box: list[float],
+    score: float,
+    label: str,
+    camera: Camera,
+    slopes: list[float],
+    hidden: list[bool],
+    config: LocalisationConfig,
+) -> Observation:
+    x1, y1, x2, y2 = box
+    width_px, height_px = x2 - x1, y2 - y1
+    margin_px, cut_rel = config.cut_margin_px, config.sigma_cut_rel
+    side_margin_px = margin_px + config.cut_margin_side_rel * width_px
+    cut_left, cut_right = x1 < side_margin_px, x2 > camera.width_px - side_margin_px
+    cut_top = y1 < margin_px
+    cut_bottom = y2 > camera.height_px - margin_px - config.cut_margin_rel * height_px
+    hidden_left, hidden_right, hidden_bottom = hidden
+
+    def sigma_px(size_px: float, cut: bool, covered: bool) -> float:
+        rel = cut_rel if cut else config.sigma_hidden_rel if covered else 0.0
+        return math.hypot(size_px * config.sigma_box_rel, config.sigma_box_px, size_px * rel)
+
+    return Observation(
+        label=label,
+        score=score,
+        box_px=(x1, y1, x2, y2),
+        left=slopes[0],
+        sigma_left=sigma_px(width_px, cut_left, hidden_left) / camera.fx_px,
+        right=slopes[1],
+        sigma_right=sigma_px(width_px, cut_right, hidden_right) / camera.fx_px,
+        slope_bottom=slopes[2],
+        sigma_bottom=sigma_px(height_px, cut_bottom, hidden_bottom) / camera.fy_px,
+        slope_top=slopes[3],
+        sigma_top=sigma_px(height_px, cut_top, False) / camera.fy_px,
+        cut_side=cut_left or cut_right,
+        dimensions=config.vehicles[label],
+        sigma_cut=sigma_px(height_px, False, False) / camera.fy_px if cut_bottom else None,
+    )
+
+
+def _is_on_road(seen: Observation, camera: Camera, ground: GroundPlane, config: LocalisationConfig) -> bool:
+    depth_m = seen.depth_by_height_m
+    hangs = seen.slope_bottom < ground.height_m / depth_m - config.max_above_road_rad - 3.0 * seen.sigma_bottom
+    return depth_m < config.max_range_m and not hangs

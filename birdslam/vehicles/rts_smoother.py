@@ -1,0 +1,171 @@
+"""Where vehicles were, as known in the end: their ways once their sizes are learned and their later motion is seen.
+
+The live estimate of a frame knows nothing of later ones. Its largest error is common to many frames: a car taken for
+taller than it is stands too far off in all of them. Each CV edge says for what height the vehicle was taken and how its
+depth goes with that; once the height is known better, every earlier sight moves along its line of sight:
+
+    log z = log z_then + (d log z / d log h) (log h_now - log h_then)
+
+which is the smoother of a state that does not change (Rauch, Tung and Striebel 1965). The sights, rid of that error, go
+through a smoother of constant velocity; where a vehicle stands in all likelihood, its velocity is nothing. Whether it
+stood is smoothed too: what drives now hardly stood a moment before. And it has to be borne out by the sights: the way
+with stops is kept where it foretells them as well as the way without.
+
+The ego's way is the live one: CC edges alone tell it, and later ones say nothing of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.se2 import SE2
+from birdslam.types import Estimate, Measurements, VehicleEdge
+from birdslam.vehicles.localisation import Dimensions, corners_of
+
+Floats = NDArray[np.float64]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+
+STANDS = 0.5  # the probability from which on a vehicle does
+LEAST_OF_COV = 0.1  # of a sight's variance along its line: not all of it is the size's
+LEAST_DEPTH_M = 1.0
+CERTAIN = 1e-3  # of a probability: nothing is surer
+
+
+class RetrospectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How vehicles move and stop, and how long a detector errs alike."""
+
+    change_mps: Positive = 2.0  # 1-sigma by which a velocity changes within a second
+    birth_mps: Positive = 12.0  # 1-sigma of the velocity of a vehicle seen for the first time
+    standing_mps: Positive = 0.05  # 1-sigma of that of one that stands
+    stands_for_s: Positive = 60.0  # on average
+    moves_for_s: Positive = 15.0
+    box_memory_s: Positive = 0.3  # a box errs in the next frame as in this
+    gate_sigma: Positive = 4.0  # past it a sight is trusted the less
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A vehicle in one frame: its CV edge, the ego's pose then, and the vehicle's as the live graph had it."""
+
+    frame_id: int
+    t_s: float
+    edge: VehicleEdge
+    T_world_ego: SE2
+    T_world_vehicle: SE2
+
+
+class Retrospect:
+    """add() each frame with its live estimate; ways() at any time."""
+
+    def __init__(self, config: RetrospectConfig) -> None:
+        self.config = config
+        self._sights: dict[tuple[int, int], list[Sight]] = {}  # by epoch and vehicle
+
+    def add(self, measurements: Measurements, estimate: Estimate) -> None:
+        """One frame's edges, and where they left everybody."""
+        poses = {v.vehicle: v.T_world_vehicle for v in estimate.vehicles}
+        for edge in measurements.cv:
+            if edge.vehicle in poses:
+                sight = Sight(
+                    estimate.frame_id, estimate.t_source_ns * 1e-9, edge, estimate.T_world_ego, poses[edge.vehicle]
+                )
+                self._sights.setdefault((estimate.epoch, edge.vehicle), []).append(sight)
+
+    def ways(self) -> dict[tuple[int, int], dict[int, SE2]]:
+        """(epoch, vehicle) -> frame -> T_world_vehicle in that epoch's world, in the frames in which it was seen."""
+        return {key: way(sights, self.config) for key, sights in self._sights.items()}
+
+
+def way(sights: Sequence[Sight], config: RetrospectConfig) -> dict[int, SE2]:
+    """frame -> T_world_vehicle of one vehicle; its yaw is the live one."""
+    t_s = np.array([sight.t_s for sight in sights])
+    places, covs = _resized(sights)
+    stood = _stood(np.array([sight.edge.standing for sight in sights]), np.diff(t_s), config)
+    gaps_s = np.maximum(np.diff(t_s, prepend=t_s[0] - config.box_memory_s), 1e-3)
+    covs = covs * np.maximum(1.0, config.box_memory_s / gaps_s)[:, None, None]
+    found, log_likelihood = _smoothed(t_s, places, covs, np.zeros(len(t_s), np.bool_), config)
+    still = stood > STANDS
+    if still.any():
+        stopping, stopping_log_likelihood = _smoothed(t_s, places, covs, still, config)
+        if stopping_log_likelihood + _logit(float(stood[still].mean())) > log_likelihood:
+            found = stopping
+    return {
+        sight.frame_id: SE2(x_m, y_m, sight.T_world_vehicle.yaw_rad)
+        for sight, (x_m, y_m) in zip(sights, found.tolist(), strict=True)
+    }
+
+
+def _resized(sights: Sequence[Sight]) -> tuple[Floats, Floats]:
+    """Centres (N, 2) in world, had each been placed with the last height, and (N, 2, 2): how they err one by one."""
+    places, covs = np.zeros((len(sights), 2)), np.zeros((len(sights), 2, 2))
+    log_height = sights[-1].edge.log_height
+    for k, sight in enumerate(sights):
+        edge, T = sight.edge, sight.edge.T_ego_vehicle
+        centre = np.array([T.x_m, T.y_m])
+        reach_m = max(x for x, _ in corners_of(Dimensions(edge.length_m, edge.width_m, 1.0), T.yaw_rad))
+        depth_m = max(T.x_m - reach_m, LEAST_DEPTH_M)
+        sight_line = centre / max(T.x_m, LEAST_DEPTH_M) * depth_m  # how the centre moves with log z
+        growth = math.exp(edge.depth_per_height * (log_height - edge.log_height)) - 1.0
+        R = SE2(yaw_rad=T.yaw_rad).rotation()
+        cov = R @ np.reshape(edge.cov, (3, 3))[:2, :2] @ R.T  # an edge's is told in the vehicle's axes
+        of_height = (edge.depth_per_height * edge.sigma_log_height) ** 2
+        most = (1.0 - LEAST_OF_COV) * float(cov[0, 0]) / max(sight_line[0] ** 2, 1e-9)
+        cov = cov - min(of_height, most) * np.outer(sight_line, sight_line)
+        R_world_ego = sight.T_world_ego.rotation()
+        places[k] = sight.T_world_ego @ (centre + growth * sight_line)
+        covs[k] = R_world_ego @ cov @ R_world_ego.T
+    return places, covs
+
+
+def _stood(standing: Floats, gaps_s: Floats, config: RetrospectConfig) -> Floats:
+    """(N,) the probability that it stood, all sights given, from what was known of it then (N,)."""
+    out = standing.copy()
+    for k in range(len(out) - 2, -1, -1):
+        starts, stops = (1.0 - math.exp(-gaps_s[k] / t_s) for t_s in (config.stands_for_s, config.moves_for_s))
+        joint = np.array([[1.0 - starts, starts], [stops, 1.0 - stops]]) * [[standing[k]], [1.0 - standing[k]]]
+        given_next = joint[0] / np.maximum(joint.sum(axis=0), 1e-12)
+        out[k] = given_next @ [out[k + 1], 1.0 - out[k + 1]]
+    return out
+
+
+def _smoothed(
+    t_s: Floats, places: Floats, covs: Floats, still: NDArray[np.bool_], config: RetrospectConfig
+) -> tuple[Floats, float]:
+    """Places (N, 2) by all the others, and the logarithm of how likely they are, each by those before it."""
+    n = len(t_s)
+    x, P = np.zeros((n, 4)), np.zeros((n, 4, 4))
+    x_before, P_before, F = np.zeros((n, 4)), np.zeros((n, 4, 4)), np.tile(np.eye(4), (n, 1, 1))
+    gate, log_likelihood = config.gate_sigma**2, 0.0
+    for k in range(n):
+        if k == 0:
+            x[0, :2], P[0, :2, :2] = places[0], covs[0]
+            P[0, 2:, 2:] = np.eye(2) * config.birth_mps**2
+        else:
+            dt_s = t_s[k] - t_s[k - 1]
+            F[k, 0, 2] = F[k, 1, 3] = dt_s
+            Q = np.kron([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]], np.eye(2)) * config.change_mps**2
+            x_before[k], P_before[k] = F[k] @ x[k - 1], F[k] @ P[k - 1] @ F[k].T + Q
+            gap, S = places[k] - x_before[k, :2], P_before[k, :2, :2] + covs[k]
+            distance = float(gap @ np.linalg.solve(S, gap))
+            log_likelihood -= 0.5 * (min(distance, 2.0 * gate) + math.log(float(np.linalg.det(S))))
+            S = S + covs[k] * (max(1.0, distance / gate) ** 2 - 1.0)
+            gain = P_before[k, :, :2] @ np.linalg.inv(S)
+            x[k], P[k] = x_before[k] + gain @ gap, P_before[k] - gain @ P_before[k, :2]
+        if still[k]:
+            gain = P[k, :, 2:] @ np.linalg.inv(P[k, 2:, 2:] + np.eye(2) * config.standing_mps**2)
+            x[k], P[k] = x[k] - gain @ x[k, 2:], P[k] - gain @ P[k, 2:]
+    for k in range(n - 2, -1, -1):
+        x[k] += P[k] @ F[k + 1].T @ np.linalg.solve(P_before[k + 1], x[k + 1] - x_before[k + 1])
+    return x[:, :2], log_likelihood
+
+
+def _logit(probability: float) -> float:
+    p = min(max(probability, CERTAIN), 1.0 - CERTAIN)
+    return math.log(p / (1.0 - p))

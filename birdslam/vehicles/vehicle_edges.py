@@ -1,0 +1,122 @@
+"""The CV and VV edges of a frame (paper, Eq. 2), from the tracks that its detections, or late ones of before, show.
+
+Edges end in the frame at hand. A vehicle that was seen in an earlier one is moved on by its velocity, and is the less
+certain for it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.types import MotionEdge, VehicleEdge
+from birdslam.vehicles.association import predicted_boxes_px
+from birdslam.vehicles.track import Shown, Track
+from birdslam.vehicles.tracking import TrackingConfig
+
+
+@dataclass(frozen=True)
+class Present:
+    """The frame that edges end in."""
+
+    frame_id: int
+    t_source_ns: int
+    T_world_ego: SE2
+    ground: GroundPlane
+
+
+def vehicle_edges(
+    tracks: list[Track], present: Present, camera: Camera, config: TrackingConfig
+) -> tuple[tuple[VehicleEdge, ...], tuple[MotionEdge, ...]]:
+    """The CV and the VV edges of tracks that were seen in the present frame or, all of them, in an earlier one."""
+    cv, vv = [], []
+    for seen in tracks:
+        track = seen if seen.seen_frame == present.frame_id else _moved_on(seen, present, camera, config)
+        if track is None:
+            continue
+        cv.append(_vehicle_edge(track, present.t_source_ns - seen.seen_ns, config))
+        if track.motion is not None:
+            vv.append(track.motion)
+        seen.shown = Shown(present.frame_id, present.t_source_ns, track.pose())
+    return tuple(cv), tuple(vv)
+
+
+def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> VehicleEdge:
+    seen, place = track.observation, track.place
+    yaw_rad = track.T_world_ego.between(track.pose()).yaw_rad
+    cov = np.zeros((3, 3))
+    R_vehicle_ego = SE2(yaw_rad=-yaw_rad).rotation()
+    cov[:2, :2] = R_vehicle_ego @ place.cov @ R_vehicle_ego.T  # the tangent at the vehicle's pose
+    sigma_yaw_rad = math.hypot(config.sigma_yaw_moving_rad, track.sigma_yaw_rad)
+    cov[2, 2] = (sigma_yaw_rad if track.yaw_known else config.sigma_yaw_unknown_rad) ** 2
+    return VehicleEdge(
+        vehicle=track.vehicle,
+        frame=track.seen_frame,
+        T_ego_vehicle=SE2(float(place.centre_m[0]), float(place.centre_m[1]), yaw_rad),
+        cov=tuple(cov.ravel().tolist()),
+        label=track.label,
+        score=seen.score,
+        box_px=seen.box_px,
+        length_m=seen.dimensions.length_m,
+        width_m=seen.dimensions.width_m,
+        delay_ns=max(delay_ns, 0),
+        **({} if place.taken is None else vars(place.taken)),
+    )
+
+
+def _moved_on(track: Track, present: Present, camera: Camera, config: TrackingConfig) -> Track | None:
+    """The track as it would be had it been seen now where its velocity puts it.
+
+    None where it has left the view, or its velocity is not known well enough to say where it is.
+    """
+    dt_s = (present.t_source_ns - track.seen_ns) * 1e-9
+    velocity, drift = track.state[2:], _drift(track, dt_s, config)
+    if float(np.linalg.eigvalsh(drift)[-1]) > config.late_sigma_m**2:
+        return None
+    moved = replace(track, state=np.concatenate([track.state[:2] + velocity * dt_s, velocity]))
+    (box,) = predicted_boxes_px([moved], camera, present.T_world_ego, present.ground)
+    if not np.isfinite(box).all():
+        return None
+    R_world_then, R_now_world = track.T_world_ego.rotation(), present.T_world_ego.rotation().T
+    # The velocity errs with the place that it was corrected by: K R of a Kalman filter is the posterior's block
+    cov_world = R_world_then @ track.place.cov @ R_world_then.T + drift
+    cov_world += dt_s * (track.cov[2:, :2] + track.cov[:2, 2:])
+    centre = present.T_world_ego.inverse() @ (track.T_world_ego @ track.place.centre_m + velocity * dt_s)
+    moved.place = replace(track.place, centre_m=centre, cov=R_now_world @ cov_world @ R_now_world.T)
+    moved.observation = replace(track.observation, box_px=tuple(box.tolist()))
+    moved.seen_frame, moved.seen_ns, moved.T_world_ego = present.frame_id, present.t_source_ns, present.T_world_ego
+    if track.motion is not None:
+        moved.motion = _motion_on(track.motion, track, present.frame_id, velocity * dt_s, drift, config, dt_s)
+    return moved
+
+
+def _drift(track: Track, dt_s: float, config: TrackingConfig) -> NDArray[np.float64]:
+    """(2, 2) in world: how far off its velocity puts it after `dt_s`."""
+    out: NDArray[np.float64] = track.cov[2:, 2:] * dt_s**2 + np.eye(2) * (config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
+    return out
+
+
+def _motion_on(
+    motion: MotionEdge,
+    track: Track,
+    frame_id: int,
+    step_m: NDArray[np.float64],
+    drift: NDArray[np.float64],
+    config: TrackingConfig,
+    dt_s: float,
+) -> MotionEdge:
+    """VV, to a later frame by the same velocity."""
+    R_vehicle_world = SE2(yaw_rad=track.yaw_rad).rotation().T
+    ahead_m, left_m = (R_vehicle_world @ step_m).tolist()
+    cov = np.reshape(motion.cov, (3, 3)).copy()
+    cov[:2, :2] += R_vehicle_world @ drift @ R_vehicle_world.T
+    cov[2, 2] += (config.sigma_yaw_rate_radps * dt_s) ** 2
+    return msgspec.structs.replace(
+        motion, to_frame=frame_id, T_from_to=motion.T_from_to @ SE2(ahead_m, left_m), cov=tuple(cov.ravel().tolist())
+    )

@@ -1,0 +1,210 @@
+"""`birdslam calibrate`: a camera file from a drive."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from birdslam.calibration.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
+from birdslam.calibration.height_check import HeightCheck, KnownLength
+from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
+from birdslam.datasets.camera_file import load_camera
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import DatasetError, Recording
+from birdslam.datasets.speed_file import read_speeds
+from birdslam.evaluation.results import ResultsError
+from birdslam.frontend import Pending
+from birdslam.geometry.camera import Camera
+from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
+from birdslam.types import Frame
+
+UNKNOWN_HEIGHT_M = 1.5  # where none was given: all lengths are in proportion to it, and it is replaced
+MAX_SIGMA_HEIGHT_REL = 0.1
+AGREES_SIGMA = 2.0
+
+
+def run(options: argparse.Namespace, configuration: Configuration) -> int:
+    """Writes the camera file, prints what it rests on; gives the exit status."""
+    uri = options.source if options.source.partition(":")[0] in FILE_SCHEMES else f"kitti:{options.source}"
+    lens, height_m = _lens(options)
+    recording = _open(uri, lens, height_m, options)
+    known_height = height_m is not None or lens is None  # KITTI's own cameras stand where datasets.py says
+    cv2.setNumThreads(configuration.perceive.opencv_threads)
+    rate_max = msgspec.structs.replace(configuration.source, rate="max")
+    configuration = msgspec.structs.replace(configuration, source=rate_max)
+    with Inference(configuration) as inference:
+
+        def drive() -> Iterator[tuple[Frame, Pending]]:
+            for frame in offline_frames(RecordedSource(recording, configuration.source)):
+                yield frame, inference.start(frame)
+
+        try:
+            found = calibrate(
+                drive, recording.camera, configuration.slam.frontend, CalibrationConfig(), _lengths(recording, options)
+            )
+        except CalibrationError as error:
+            raise CalibrationError(f"{uri}: {error}") from None
+    camera, chosen = _with_height(found, known_height, uri)
+    report = [*_report(found, camera, chosen, uri, lens)]
+    _write(Path(options.output), camera, report)
+    print("\n".join(report))
+    print(f"camera file: {options.output}")
+    return 0
+
+
+# --- what is given ---
+
+
+def _lens(options: argparse.Namespace) -> tuple[Intrinsics | None, float | None]:
+    """Intrinsics from elsewhere than the recording, and the height that the user states."""
+    height_m = options.height
+    if height_m is not None and not 0.2 < height_m < 5.0:
+        raise ConfigurationError(f"--height {height_m:g}: is no height of a camera over the road (0.2 to 5 m)")
+    if options.camera is not None:
+        old = load_camera(Path(options.camera))
+        numbers = {name: getattr(old, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")}
+        lens = Intrinsics(**numbers, width_px=old.width_px, height_px=old.height_px, source=options.camera)
+        return lens, height_m or old.height_m
+    if options.intrinsics is not None:
+        return read_intrinsics(options.intrinsics), height_m
+    if options.chessboard is not None:
+        board = re.fullmatch(r"(\d+)x(\d+)", options.board)
+        if board is None:
+            raise ConfigurationError(f"--board {options.board}: expected COLSxROWS, as 9x6")
+        return from_chessboard(options.chessboard, int(board[1]), int(board[2]), options.square_mm / 1000.0), height_m
+    return None, height_m
+
+
+def _open(uri: str, lens: Intrinsics | None, height_m: float | None, options: argparse.Namespace) -> Recording:
+    stride = options.stride or 1
+    if lens is None:
+        recording = open_recording(uri, stride=stride)
+        if height_m is not None:
+            recording.camera = msgspec.structs.replace(recording.camera, height_m=height_m)
+        return recording
+    width_px, height_px = lens.width_px, lens.height_px
+    if width_px is None or height_px is None:
+        if not uri.startswith("kitti:"):
+            raise DatasetError(f"{lens.source}: does not say for which size of image it is")
+        own = open_recording(uri, stride=stride).camera
+        width_px, height_px = own.width_px, own.height_px
+    try:
+        camera = Camera(
+            width_px,
+            height_px,
+            lens.fx_px,
+            lens.fy_px,
+            lens.cx_px,
+            lens.cy_px,
+            height_m=height_m or UNKNOWN_HEIGHT_M,
+            distortion=lens.distortion,
+        )
+    except ValueError as error:
+        raise DatasetError(f"{lens.source}: {error}") from None
+    return open_recording(uri, camera, stride)
+
+
+def _lengths(recording: Recording, options: argparse.Namespace) -> dict[str, KnownLength]:
+    """What else knows the way between two frames: the recording's poses, a speed file."""
+    out: dict[str, KnownLength] = {}
+    truth = recording.truth_poses()
+    if truth is not None:
+        at = truth[:, :, 3]
+
+        def by_poses(start: int, end: int, start_ns: int, end_ns: int) -> float:
+            return float(np.linalg.norm(np.diff(at[start : end + 1], axis=0), axis=1).sum())
+
+        out["poses"] = by_poses
+    if options.speed is not None:
+        t_s, speed_mps = read_speeds(options.speed).T
+        way_m = np.concatenate([[0.0], np.cumsum(np.diff(t_s) * 0.5 * (speed_mps[1:] + speed_mps[:-1]))])
+
+        def by_speed(start: int, end: int, start_ns: int, end_ns: int) -> float | None:
+            if start_ns * 1e-9 < t_s[0] or end_ns * 1e-9 > t_s[-1]:
+                return None
+            return float(np.interp(end_ns * 1e-9, t_s, way_m) - np.interp(start_ns * 1e-9, t_s, way_m))
+
+        first, last = recording_span_s(recording)
+        if t_s[-1] < first or t_s[0] > last:
+            raise DatasetError(
+                f"{options.speed}: its times {t_s[0]:g} to {t_s[-1]:g} s lie outside the recording's, "
+                f"{first:g} to {last:g} s"
+            )
+        out["speed"] = by_speed
+    return out
+
+
+def recording_span_s(recording: Recording) -> tuple[float, float]:
+    """Times of the first and the last frame, by the recording's clock."""
+    times = [frame.t_source_ns * 1e-9 for frame in recording.frames()]
+    return times[0], times[-1]
+
+
+# --- what is found ---
+
+
+def _with_height(found: Calibration, known: bool, uri: str) -> tuple[Camera, HeightCheck | None]:
+    """The camera with the height that was stated, else with the surest that was estimated."""
+    if known:
+        return found.camera, None
+    checks = sorted(found.height_checks, key=lambda check: check.sigma_m)
+    if not checks or checks[0].sigma_m > MAX_SIGMA_HEIGHT_REL * checks[0].height_m:
+        raise CalibrationError(
+            f"{uri}: the camera's height is not known, and nothing here tells it: measure it (--height M), or give the "
+            "car's speed (--speed FILE)"
+        )
+    try:
+        return msgspec.structs.replace(found.camera, height_m=checks[0].height_m), checks[0]
+    except ValueError as error:
+        raise CalibrationError(f"{uri}: by {checks[0].cue}: {error}") from None
+
+
+def _report(
+    found: Calibration, camera: Camera, chosen: HeightCheck | None, uri: str, lens: Intrinsics | None
+) -> Iterator[str]:
+    yield f"from {uri}: {found.frames} frames, {found.path_m:.0f} m"
+    source = "the recording" if lens is None else lens.source
+    error = "" if lens is None or lens.reprojection_px is None else f", reprojection {lens.reprojection_px:.2f} px"
+    yield f"intrinsics: {source}{error}"
+    sigma = np.degrees(np.sqrt(np.diag(np.reshape(found.cov, (2, 2)))))
+    pitch_deg, roll_deg = np.degrees([camera.pitch_rad, camera.roll_rad])
+    yield f"pitch {pitch_deg:+.2f} +- {sigma[0]:.2f} deg, roll {roll_deg:+.2f} +- {sigma[1]:.2f} deg"
+    for witness in found.witnesses:
+        own = np.degrees(np.sqrt(np.diag(np.reshape(witness.cov, (2, 2)))))
+        roll = "" if witness.roll_rad is None else f", roll {np.degrees(witness.roll_rad):+.2f} +- {own[1]:.2f} deg"
+        yield (
+            f"  by {witness.cue}: pitch {np.degrees(witness.pitch_rad):+.2f} +- {own[0]:.2f} deg{roll} "
+            f"(of {witness.samples}, chi2 {witness.chi2:.1f})"
+        )
+    if found.yaw_rad is not None:
+        yield f"optical axis {np.degrees(found.yaw_rad):+.2f} deg left of the way driven (for information)"
+    stated = "as stated" if chosen is None else f"by {chosen.cue}, +- {chosen.sigma_m:.2f} m"
+    yield f"height {camera.height_m:.3f} m, {stated}"
+    for check in found.height_checks:
+        if check is chosen:
+            continue
+        away = abs(check.height_m - camera.height_m) / check.sigma_m
+        verdict = "agrees" if away < AGREES_SIGMA else f"DISAGREES ({away:.1f} sigma)"
+        yield f"  by {check.cue}: {check.height_m:.2f} +- {check.sigma_m:.2f} m (of {check.samples}): {verdict}"
+    if not found.height_checks:
+        yield "  not checked: neither poses nor a speed nor enough vehicles were there"
+
+
+def _write(path: Path, camera: Camera, report: list[str]) -> None:
+    numbers = msgspec.to_builtins(camera)
+    numbers["distortion"] = list(camera.distortion)
+    lines = [f"# {line}" for line in ("A camera file of BirdSLAM, by `birdslam calibrate`", *report)]
+    lines += [f"{key} = {value!r}" for key, value in numbers.items()]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ResultsError(f"camera file {path}: {error.strerror}") from None

@@ -1,0 +1,125 @@
+"""`birdslam evaluate tracking` and `birdslam evaluate ablation`: the paper's tables on KITTI tracking.
+
+One process a sequence, each with everything that its sequence needs; the numbers come from birdslam/, the clock and the
+files are here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+import msgspec
+
+from birdslam.datasets.recording import DatasetError
+from birdslam.evaluation import tables
+from birdslam.evaluation.results import claim_directory
+from birdslam.evaluation.tracking import Row
+from birdslam.evaluation.tracking_picture import draw_runtime
+from birdslam.evaluation.tracking_report import Outcome, Setting, write
+from birdslam.runtime.cli.tracking_job import Job, run_sequence
+from birdslam.runtime.cli.tracking_options import METHODS
+from birdslam.runtime.configuration import Configuration, ConfigurationError
+
+PUBLISHED = Path(tables.__file__).with_name("published.toml")
+
+
+def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
+    """Both commands; gives the exit status."""
+    jobs = _jobs(options, configuration)
+    output = Path(options.output)
+    claim_directory(output)
+    outcomes = sorted(_run_all(jobs, max(1, options.jobs)), key=lambda outcome: outcome.sequence)
+    rows = [row for outcome in outcomes for row in outcome.rows]
+    variants = [row for outcome in outcomes for row in outcome.ablation]
+    job = jobs[0]
+    _write_json(output / "report.json", rows if job.methods else variants)
+    if job.methods and variants:
+        _write_json(output / "ablation.json", variants)
+    longest = max(outcomes, key=lambda outcome: len(outcome.frames))
+    draw_runtime(longest.updates_ms, output / "runtime.png")
+    setting = Setting(job.frames, job.methods, job.odometry, job.detections, job.seeds)
+    report = write(setting, job.published, outcomes)
+    (output / "report.md").write_text(report, encoding="utf-8")
+    print(report)
+    print(f"results in {output}")
+    return 0
+
+
+# --- what is asked for ---
+
+
+def _jobs(options: argparse.Namespace, configuration: Configuration) -> list[Job]:
+    root, published = options.root, tables.read_published(PUBLISHED)
+    if not (root / "label_02").is_dir():
+        raise DatasetError(f"{root}: is no KITTI tracking folder: it has no label_02")
+    known = sorted(path.stem for path in (root / "label_02").glob("*.txt"))
+    taken = [name for name in known if options.frames != "paper" or name in published.sequences]
+    sequences = options.sequences.split(",") if options.sequences else taken
+    missing = [name for name in sequences if name not in known]
+    if missing or not sequences:
+        raise ConfigurationError(f"--sequences: {root} has no {', '.join(missing) or 'sequences'}")
+    if options.seeds < 1:
+        raise ConfigurationError(f"--seeds {options.seeds}: needs 1 or more")
+    compare = options.command == "evaluate tracking"
+    chosen = tuple(options.methods.split(",")) if compare else ()
+    unknown = [name for name in chosen if name not in METHODS]
+    if unknown:
+        raise ConfigurationError(f"--methods: there is no {', '.join(unknown)}; there are {', '.join(METHODS)}")
+    with_images = all((root / "image_02" / name).is_dir() for name in sequences)
+    odometry = options.odometry or ("images" if with_images else "simulate")
+    detections = options.detections or ("rrc" if (root / "det_02_rrc").is_dir() else "network")
+    if odometry == "images" and not with_images:
+        raise ConfigurationError(f"--odometry images: {root} has no image_02 of every sequence")
+    if detections == "network":
+        if not with_images:
+            raise ConfigurationError(f"--detections network: {root} has no image_02 of every sequence")
+        if configuration.models.detector is None:
+            raise ConfigurationError("--detections network: needs --model detector=PATH")
+    return [
+        Job(
+            root=root,
+            sequence=name,
+            frames=options.frames,
+            methods=chosen,
+            odometry=odometry,
+            detections=detections,
+            seeds=options.seeds if odometry == "simulate" else 1,
+            output=Path(options.output),
+            configuration=configuration,
+            published=published,
+        )
+        for name in dict.fromkeys(sequences)
+    ]
+
+
+def _run_all(jobs: Sequence[Job], processes: int) -> list[Outcome]:
+    """Every job in a process of its own, and a line for each that is done."""
+    if processes == 1 or len(jobs) == 1:
+        return [_shown(run_sequence(job), k, jobs) for k, job in enumerate(jobs, start=1)]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
+        running = [pool.submit(run_sequence, job) for job in jobs]
+        try:
+            return [_shown(done.result(), k, jobs) for k, done in enumerate(as_completed(running), start=1)]
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _shown(outcome: Outcome, number: int, jobs: Sequence[Job]) -> Outcome:
+    print(
+        f"sequence {outcome.sequence}: {len(outcome.frames)} frames, {jobs[0].seeds} seeds done "
+        f"({number} of {len(jobs)})",
+        file=sys.stderr,
+        flush=True,
+    )
+    return outcome
+
+
+def _write_json(path: Path, rows: Sequence[Row]) -> None:
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(rows), indent=2) + b"\n")

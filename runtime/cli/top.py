@@ -1,0 +1,148 @@
+"""`birdslam top`: the nodes of a running vehicle as a table, from what they say of themselves once a second.
+
+On a terminal it is refreshed in place; elsewhere (a pipe, a dumb terminal) a table follows the other.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any, TextIO
+
+import msgspec
+
+from birdslam.runtime.configuration import BudgetsConfig
+from birdslam.runtime.topology import NODES, PROCESSES
+from birdslam.runtime.transport.bus import Bus, BusError, Message, Subscriber
+from birdslam.runtime.wire import Health
+from birdslam.types import Estimate
+
+PERIOD_S = 1.0
+STALE_PERIODS = 3.0  # a health as old as that says nothing of now
+CLEAR = "\x1b[H\x1b[2J"
+COLUMNS = (
+    *(("node", 10), ("state", 9), ("mode", 9), ("Hz", 6)),
+    *(("wait p50/p99", 14), ("step p50/p99", 14), ("budget", 7), ("age p50/p99/max ms", 20)),
+    *(("over", 6), ("late", 6), ("drop", 6), ("torn", 5), ("again", 6), ("cpu %", 6), ("MB", 6)),
+)
+
+
+class Watch:
+    """What can be known of a vehicle from outside."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._healths = {name: bus.subscriber(f"health/{name}") for name in PROCESSES}
+        self._estimates: Subscriber = bus.subscriber("estimate")
+        self._budgets: BudgetsConfig | None = None
+
+    def wait(self, timeout_s: float) -> None:
+        """Until each node has said what it said last, or for so long."""
+        until_s = time.monotonic() + timeout_s
+        self._bus.wait_alive(NODES, timeout_s)
+        self._bus.catch_up("estimate", self._estimates)
+        for name, subscriber in self._healths.items():
+            self._bus.catch_up(f"health/{name}", subscriber)
+        for name in self._bus.alive & set(PROCESSES):
+            if self._healths[name].newest is None:
+                self._healths[name].recv(max(0.0, until_s - time.monotonic()))
+
+    def pause(self, timeout_s: float) -> None:
+        """Until the optimizer, the last of the nodes, says something again, or for so long."""
+        self._healths["optimize"].recv(timeout_s)
+
+    @property
+    def anybody(self) -> bool:
+        """Whether a node of this vehicle is there."""
+        return bool(self._bus.alive & set(PROCESSES))
+
+    def table(self, now_ns: int) -> str:
+        """Everything, as lines."""
+        if self._budgets is None:
+            self._budgets = _budgets(self._bus)
+        head = _line_of(tuple(title for title, _ in COLUMNS))
+        rows = [self._row(name, now_ns) for name in PROCESSES if name in NODES or self._healths[name].newest]
+        causes = [
+            f"{name} was begun anew {health.restarts} times, at last since it {health.cause}"
+            for name in PROCESSES
+            if (health := self._health(name)) is not None and health.restarts
+        ]
+        return "\n".join([self._line(now_ns), head, *rows, *causes])
+
+    def _health(self, name: str) -> Health | None:
+        message = self._healths[name].newest
+        return message.record if message else None
+
+    def _row(self, name: str, now_ns: int) -> str:
+        alive, health = name in self._bus.alive, self._health(name)
+        if health is None:
+            return _line_of((name, _state(alive, stale=True)))
+        stale = now_ns - health.t_ns > STALE_PERIODS * PERIOD_S * 1e9
+        budget = "" if self._budgets is None or name not in NODES else f"{self._budgets.step_ms(name):g}"
+        cells = (
+            *(name, _state(alive, stale, health), health.mode, f"{health.rate_hz:.1f}"),
+            *(_pair(health.wait.p50_ms, health.wait.p99_ms), _pair(health.step.p50_ms, health.step.p99_ms), budget),
+            f"{health.age.p50_ms:.0f} / {health.age.p99_ms:.0f} / {health.age.max_ms:.0f}",
+            *(str(n) for n in (health.overruns, health.late, health.dropped, health.torn, health.restarts)),
+            *(f"{health.cpu_percent:.0f}", f"{health.rss_bytes / 2**20:.0f}"),
+        )
+        return _line_of(cells)
+
+    def _line(self, now_ns: int) -> str:
+        """The newest estimate."""
+        message: Message | None = self._estimates.newest
+        if message is None:
+            return f"{self._bus.vehicle}: no estimate"
+        estimate: Estimate = message.record
+        age_ms = (now_ns - estimate.t_capture_ns) / 1e6
+        left_ns = message.trace.left_ns
+        left = "" if left_ns is None else f"  {left_ns / 1e6:.0f} ms of its budget left"
+        return (
+            f"{self._bus.vehicle}: frame {estimate.frame_id}  epoch {estimate.epoch}  "
+            f"{'valid' if estimate.valid else 'NOT VALID'}  {age_ms:.0f} ms old{left}  "
+            f"tracks {len(estimate.vehicles)}  {' '.join(estimate.status)}"
+        ).rstrip()
+
+
+def _state(alive: bool, stale: bool, health: Health | None = None) -> str:
+    if not alive:
+        return "GONE"
+    if stale:
+        return "SILENT"
+    return "stale" if health is not None and health.status else "alive"
+
+
+def _pair(p50_ms: float, p99_ms: float) -> str:
+    return f"{p50_ms:.1f} / {p99_ms:.1f}"
+
+
+def _line_of(cells: tuple[str, ...]) -> str:
+    return "".join(f"{text:<{width - 1}} " for text, (_, width) in zip(cells, COLUMNS, strict=False)).rstrip()
+
+
+def _budgets(bus: Bus) -> BudgetsConfig | None:
+    """Of the run, where the supervisor answers."""
+    try:
+        for configuration in bus.ask("configuration", PERIOD_S):
+            budgets: Any = configuration["budgets"] if isinstance(configuration, dict) else configuration.budgets
+            return msgspec.convert(budgets, BudgetsConfig)
+    except (BusError, KeyError, msgspec.ValidationError):
+        return None
+    return None
+
+
+def top(vehicle: str, runtime_dir: Path | None, once: bool, out: TextIO = sys.stdout) -> int:
+    """A table once a second, until Ctrl-C; with `once` a single one, and 1 where there is no node."""
+    in_place = out.isatty() and os.environ.get("TERM", "dumb") != "dumb" and not once
+    with Bus(vehicle, f"top-{os.getpid()}", runtime_dir=runtime_dir) as bus:
+        watch = Watch(bus)
+        watch.wait(PERIOD_S)
+        while True:
+            text = watch.table(time.monotonic_ns())
+            out.write(f"{CLEAR}{text}\n" if in_place else f"{text}\n")
+            out.flush()
+            if once:
+                return int(not watch.anybody)
+            watch.pause(PERIOD_S)

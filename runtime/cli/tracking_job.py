@@ -1,0 +1,213 @@
+"""One sequence of KITTI tracking in a process of its own: all methods, the ablations, the clock and the picture."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.baselines import batch_se3
+from birdslam.datasets.kitti import find_images, read_image
+from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
+from birdslam.datasets.recording import DatasetError
+from birdslam.evaluation import ablation
+from birdslam.evaluation.tables import Published
+from birdslam.evaluation.tracking import (
+    PAPER,
+    Method,
+    Row,
+    Trial,
+    Truth,
+    make_log,
+    methods,
+    ours,
+    run_trial,
+    summarise,
+)
+from birdslam.evaluation.tracking_picture import draw_sequence
+from birdslam.evaluation.tracking_report import Outcome
+from birdslam.frontend import EgoMotion, FrontEndConfig, Pending
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.perception import Perception, Ready
+from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.simulation.odometry import EXACT, SimulatedOdometry, SimulationConfig
+from birdslam.trajectory import as_poses, inverse, read_kitti
+from birdslam.types import Measurements
+
+
+@dataclass(frozen=True)
+class Job:
+    """All that one sequence's process is told."""
+
+    root: Path
+    sequence: str
+    frames: str  # "all", "paper" or "A:B"
+    methods: tuple[str, ...]  # those of Tables 1 and 2; none: the ablations alone
+    odometry: str
+    detections: str
+    seeds: int
+    output: Path
+    configuration: Configuration
+    published: Published
+
+
+def frames_of(text: str, sequence: TrackingSequence, published: Published) -> range:
+    """The frames that `--frames` names. Raises ConfigurationError."""
+    if text == "all":
+        return range(len(sequence))
+    if text == "paper":
+        paper = published.sequences.get(sequence.name)
+        if paper is None:
+            raise ConfigurationError(f"--frames paper: the paper has no sequence {sequence.name}")
+        return range(min(paper.frames, len(sequence)))
+    first, colon, last = text.partition(":")
+    try:
+        frames = range(int(first or 0), int(last or len(sequence)))
+    except ValueError:
+        frames = range(0)
+    if not colon or not 0 <= frames.start < frames.stop <= len(sequence):
+        raise ConfigurationError(
+            f"--frames {text}: expected all, paper or A:B within the {len(sequence)} frames of {sequence.name}"
+        )
+    return frames
+
+
+def run_sequence(job: Job) -> Outcome:
+    """All methods and ablations on one sequence."""
+    cv2.setNumThreads(1)
+    sequence = open_tracking(job.root, job.sequence)
+    frames = frames_of(job.frames, sequence, job.published)
+    slam = job.configuration.slam
+    chosen: dict[str, Method] = {name: methods(slam)[name] for name in job.methods}
+    variants = _variants(job)
+    trials, ablations, log = [], [], []
+    with ExitStack() as stack:
+        make = _log_maker(job, sequence, frames, stack)
+        for seed in range(job.seeds):
+            log = make(seed, slam.frontend)
+            if chosen:
+                trials.append(run_trial(sequence, log, chosen))
+            if variants:
+                far = msgspec.structs.replace(slam.frontend.static_map, landmark_range_m=ablation.FARTHEST_LANDMARK_M)
+                far_log = make(seed, msgspec.structs.replace(slam.frontend, static_map=far))
+                ablations.append(run_trial(sequence, far_log, variants))
+    if chosen:
+        name = next(iter(chosen))
+        truth, result = Truth.of(sequence, log), chosen[name].run(log, sequence.camera)
+        title = f"KITTI tracking {sequence.name}, {chosen[name].label}, odometry: {job.odometry}"
+        draw_sequence(title, truth, result, job.output / f"bev_{sequence.name}.png")
+    updates_ms = {"all vehicles": _updates_ms(log, job), "one vehicle": _updates_ms(_one_vehicle(log), job)}
+    start = time.perf_counter()
+    batch_se3.run(log, sequence.camera)
+    paper = job.published.sequences.get(sequence.name)
+    bodies = () if paper is None else paper.bodies
+
+    def rows_of(trials: Sequence[Trial]) -> list[Row]:
+        return summarise(sequence.name, trials, bodies, job.odometry, job.detections) if trials else []
+
+    return Outcome(
+        sequence=sequence.name,
+        frames=frames,
+        rows=rows_of(trials),
+        ablation=rows_of(ablations),
+        incremental_s=float(updates_ms["all vehicles"].sum()) / 1e3,
+        batch_s=time.perf_counter() - start,
+        updates_ms=updates_ms,
+    )
+
+
+def _variants(job: Job) -> dict[str, Method]:
+    """The ablations by "METHOD/VARIANT"; of Table 5 by the variant alone."""
+    out: dict[str, Method] = {}
+    for name, base in (("paper", PAPER), ("birdslam", ours(job.configuration.slam))):
+        if not job.methods or name in job.methods:
+            for part in (ablation.constraint_variants(base), ablation.landmark_variants(base)):
+                out |= {f"{name}/{variant}": live for variant, live in part.items()}
+    if not job.methods or "batch_se3" in job.methods:
+        out |= ablation.lane_variants()
+    return out
+
+
+def _log_maker(
+    job: Job, sequence: TrackingSequence, frames: range, stack: ExitStack
+) -> Callable[[int, FrontEndConfig], list[Measurements]]:
+    """Gives the log of a seed."""
+    paths = {} if sequence.images is None else find_images(sequence.images)
+    looks = job.odometry == "images" or job.detections == "network"
+
+    def image_of(frame: int) -> NDArray[np.uint8] | None:
+        try:
+            return read_image(paths[frame])
+        except (KeyError, ValueError):
+            return None
+
+    network = job.detections == "network"
+    folder = job.root / "det_02_rrc" if job.detections == "rrc" else Path(job.detections)
+    found = [] if network else read_detections(folder, sequence.name, len(sequence))
+
+    def given(frame: int, image: NDArray[np.uint8]) -> Pending:
+        return Ready(Perception(found[frame], None, {"detector": 0}, ()))
+
+    def make(seed: int, config: FrontEndConfig) -> list[Measurements]:
+        perceive: Callable[[int, NDArray[np.uint8]], Pending] = given
+        if network:
+            lossless = msgspec.structs.replace(job.configuration.source, rate="max")
+            configuration = msgspec.structs.replace(job.configuration, source=lossless)
+            perceive = stack.enter_context(Inference(configuration)).networks.start
+        odometry = _odometry(job, sequence, frames, np.random.default_rng([seed, *sequence.name.encode()]))
+        return make_log(sequence, frames, odometry, perceive, image_of if looks else None, config)
+
+    return make
+
+
+def _odometry(job: Job, sequence: TrackingSequence, frames: range, rng: np.random.Generator) -> EgoMotion | None:
+    """None: the front end's own, from the images."""
+    truth = sequence.camera_poses
+    if job.odometry == "images":
+        return None
+    if job.odometry in ("simulate", "truth"):
+        config = SimulationConfig() if job.odometry == "simulate" else EXACT
+        return SimulatedOdometry(sequence.camera, truth, config, rng)
+    path = Path(job.odometry)
+    if path.is_dir():
+        path = path / f"{sequence.name}.txt"
+    try:
+        rows = as_poses(read_kitti(path))
+    except ValueError as error:
+        raise DatasetError(str(error)) from None
+    if len(rows) == len(frames) < len(sequence):  # of the frames asked for alone
+        rows = np.concatenate([np.tile(rows[:1], (frames.start, 1, 1)), rows])
+    if len(rows) < frames.stop:
+        raise DatasetError(f"{path}: {len(rows)} poses for {len(frames)} frames of sequence {sequence.name}")
+    poses = inverse(sequence.T_cam0_cam2) @ rows @ sequence.T_cam0_cam2
+    return SimulatedOdometry(sequence.camera, poses, EXACT, rng, true_poses=truth)
+
+
+def _one_vehicle(log: Sequence[Measurements]) -> list[Measurements]:
+    """The log with the vehicle alone that is seen most."""
+    seen = [edge.vehicle for m in log for edge in m.cv]
+    kept = max(sorted(set(seen)), key=seen.count, default=-1)
+    return [
+        msgspec.structs.replace(
+            m, cv=tuple(e for e in m.cv if e.vehicle == kept), vv=tuple(e for e in m.vv if e.vehicle == kept)
+        )
+        for m in log
+    ]
+
+
+def _updates_ms(log: Sequence[Measurements], job: Job) -> NDArray[np.float64]:
+    slam, took = job.configuration.slam, []
+    graph = PoseGraph(slam.graph, slam.weights)
+    for measurements in log:
+        start = time.perf_counter()
+        graph.update(measurements)
+        took.append((time.perf_counter() - start) * 1e3)
+    return np.array(took)

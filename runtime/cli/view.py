@@ -1,0 +1,327 @@
+"""A drive in rerun (https://rerun.io): the image with its boxes, the world, the road from above, the latencies.
+
+| entity                  | what                                                                          |
+|-------------------------|-------------------------------------------------------------------------------|
+| camera, camera/boxes    | the image as recorded or in shared memory, and the boxes of the tracks        |
+| world/ego, world/path   | where the ego is and was, with its 2-sigma ellipse                            |
+| world/vehicles          | the others as boxes, their velocities and ellipses                            |
+| world/map               | lane points and landmarks of the epoch                                        |
+| bev                     | all of it from above, in ego: x forward is up                                 |
+| latency/*, ego/*        | age and stages in ms; speed and 1-sigma of the pose                           |
+| status                  | the statuses of each frame that has any                                       |
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.latency import stages
+from birdslam.runtime.recording.foxglove import CompressedImage
+from birdslam.runtime.recording.recording import Latency, Recording
+from birdslam.runtime.recording.scene import VEHICLE_HEIGHT_M, ellipse
+from birdslam.runtime.transport.bus import Bus, BusError
+from birdslam.runtime.transport.presence import ring_path
+from birdslam.runtime.transport.ring import FrameReader
+from birdslam.runtime.wire import decode
+from birdslam.trajectory import ego_pose, mount_pose
+from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status, VehicleEstimate
+
+try:
+    import rerun as rr
+    import rerun.blueprint as blueprint
+except ImportError as error:
+    raise ConfigurationError(f"view: needs rerun: pip install 'birdslam[view]' ({error})") from None
+
+APPLICATION = "BirdSLAM"
+BLOCK_FRAMES = 100  # of path and map that are sent again as they grow; those before stay as they are
+JPEG_QUALITY = 80
+QUEUE, IMAGES = 64, 2
+TURN_S = 0.2
+EGO, SEEN, UNSEEN, ROAD = (30, 100, 230), (230, 110, 30), (150, 150, 150), (220, 220, 120)
+READ = ("v1/frame", "v1/measurements", "v1/estimate", "v1/map", "/latency", "/camera/image")
+
+
+class Viewer:
+    """Sends records to a rerun stream as they come; one frame is one point on its time line."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self._epoch: int | None = None
+        self._block = -1
+        self._path: list[tuple[float, float, float]] = []
+        self._points: list[tuple[float, float, float]] = []
+        self._last: Estimate | None = None
+        self._height_m = 0.0
+        self._stream.send_blueprint(_blueprint())
+        self._stream.log("world", rr.ViewCoordinates.FLU, static=True)
+
+    def at(self, frame_id: int, t_source_ns: int) -> None:
+        """What is logged from now on is of this frame."""
+        self._stream.set_time("frame", sequence=frame_id)
+        self._stream.set_time("drive", duration=t_source_ns / 1e9)
+
+    def camera(self, camera: Camera) -> None:
+        """The calibrated camera, where it rides on the ego."""
+        mount = mount_pose(camera.ground)
+        rides = rr.Transform3D(translation=mount[:3, 3], mat3x3=mount[:3, :3])
+        size = {"width": camera.width_px, "height": camera.height_px}
+        self._stream.log("world/ego/camera", rides, rr.Pinhole(image_from_camera=camera.K, **size), static=True)
+
+    def image(self, jpeg: bytes) -> None:
+        """The frame's picture."""
+        self._stream.log("camera", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
+
+    def measurements(self, measurements: Measurements) -> None:
+        """Boxes in the image; what was seen of the road, from above."""
+        if Status.END_OF_SOURCE in measurements.status:
+            return
+        self.at(measurements.frame_id, measurements.t_source_ns)
+        boxes = np.array([edge.box_px for edge in measurements.cv]).reshape(-1, 4)
+        labels = [f"{edge.label} {edge.vehicle}" for edge in measurements.cv]
+        shown = rr.Boxes2D(array=boxes, array_format=rr.Box2DFormat.XYXY, labels=labels, colors=SEEN)
+        self._stream.log("camera/boxes", shown)
+        lanes = np.array([(p.x_m, p.y_m) for p in measurements.lanes]).reshape(-1, 2)
+        self._stream.log("bev/lanes", rr.Points2D(_above(lanes), radii=0.15, colors=ROAD))
+
+    def estimate(self, estimate: Estimate) -> None:
+        """Where everybody is."""
+        if Status.END_OF_SOURCE in estimate.status:
+            return
+        self.at(estimate.frame_id, estimate.t_source_ns)
+        if estimate.epoch != self._epoch:
+            self._begin(estimate)
+        T_world_ego = ego_pose(estimate.T_world_ego, estimate.attitude)
+        self._height_m = estimate.attitude.z_m
+        self._stream.log("world/ego", rr.Transform3D(translation=T_world_ego[:3, 3], mat3x3=T_world_ego[:3, :3]))
+        self._stream.log("world/ego_ellipse", self._loops([ellipse(estimate.T_world_ego, estimate.cov)], EGO))
+        self._grow(estimate.frame_id)
+        self._path.append(tuple(T_world_ego[:3, 3].tolist()))
+        self._stream.log(f"world/path/{self._block}", rr.LineStrips3D([self._path], colors=EGO))
+        self._vehicles(estimate.vehicles)
+        self._from_above(estimate)
+        self._plots(estimate)
+        self._last = estimate
+
+    def latency(self, latency: Latency) -> None:
+        """Where the time of the frame went."""
+        self._stream.set_time("frame", sequence=latency.frame_id)
+        for name, ms in (("age", latency.age_ms), ("left", latency.left_ms), *latency.stages_ms.items()):
+            if ms is not None:
+                self._stream.log(f"latency/{name.replace(' -> ', '_to_')}", rr.Scalars(ms))
+
+    def map(self, update: MapUpdate) -> None:
+        """What the map gained."""
+        if update.epoch != self._epoch:
+            return
+        self._grow(update.frame_id)
+        self._points += [(x, y, self._height_m) for x, y in (*update.landmarks_m, *update.lanes_m)]
+        self._stream.log(f"world/map/{self._block}", rr.Points3D(self._points, radii=0.1, colors=ROAD))
+
+    def _begin(self, estimate: Estimate) -> None:
+        """A new world: nothing of the old one is where it was."""
+        self._stream.log("world", rr.Clear(recursive=True))
+        self._stream.log("status", rr.TextLog(f"epoch {estimate.epoch} begins", level="WARN"))
+        self._epoch, self._block, self._last = estimate.epoch, -1, None
+        self._path, self._points = [], []
+
+    def _grow(self, frame_id: int) -> None:
+        block = frame_id // BLOCK_FRAMES
+        if block != self._block:
+            self._block, self._path, self._points = block, self._path[-1:], []
+
+    def _vehicles(self, vehicles: tuple[VehicleEstimate, ...]) -> None:
+        middle_m = self._height_m + VEHICLE_HEIGHT_M / 2.0
+        centers = np.array([(v.T_world_vehicle.x_m, v.T_world_vehicle.y_m, middle_m) for v in vehicles]).reshape(-1, 3)
+        colors = [SEEN if v.age_ns == 0 else UNSEEN for v in vehicles]
+        speeds_mps = [math.hypot(*v.velocity_mps) for v in vehicles]
+        boxes = rr.Boxes3D(
+            centers=centers,
+            sizes=[(v.length_m, v.width_m, VEHICLE_HEIGHT_M) for v in vehicles],
+            quaternions=[_turned(v.T_world_vehicle.yaw_rad) for v in vehicles],
+            labels=[f"{v.label} {v.vehicle}  {mps:.1f} m/s" for v, mps in zip(vehicles, speeds_mps, strict=True)],
+            colors=colors,
+        )
+        self._stream.log("world/vehicles", boxes)
+        velocities = [(*v.velocity_mps, 0.0) for v in vehicles]
+        self._stream.log("world/vehicles/velocity", rr.Arrows3D(vectors=velocities, origins=centers, colors=colors))
+        self._stream.log(
+            "world/vehicles/ellipse", self._loops([ellipse(v.T_world_vehicle, v.cov) for v in vehicles], SEEN)
+        )
+
+    def _loops(self, outlines_m: list[NDArray[np.float64]], color: tuple[int, int, int]) -> Any:
+        loops = [np.vstack([outline, outline[:1]]) for outline in outlines_m]
+        strips = [np.column_stack([loop, np.full(len(loop), self._height_m)]) for loop in loops]
+        return rr.LineStrips3D(strips, colors=color)
+
+    def _from_above(self, estimate: Estimate) -> None:
+        T_ego_world = estimate.T_world_ego.inverse()
+        footprints, ellipses = [_footprint(SE2(), 4.0, 1.7)], []
+        for vehicle in estimate.vehicles:
+            T_ego_vehicle = T_ego_world @ vehicle.T_world_vehicle
+            footprints.append(_footprint(T_ego_vehicle, vehicle.length_m, vehicle.width_m))
+            ellipses.append(ellipse(T_ego_vehicle, vehicle.cov))
+        colors = [EGO, *(SEEN if v.age_ns == 0 else UNSEEN for v in estimate.vehicles)]
+        labels = ["ego", *(f"{v.label} {v.vehicle}" for v in estimate.vehicles)]
+        shown = [_above(np.vstack([outline, outline[:1]])) for outline in footprints]
+        self._stream.log("bev/bodies", rr.LineStrips2D(shown, colors=colors, labels=labels))
+        around = [_above(np.vstack([outline, outline[:1]])) for outline in ellipses]
+        self._stream.log("bev/ellipses", rr.LineStrips2D(around, colors=UNSEEN))
+
+    def _plots(self, estimate: Estimate) -> None:
+        if self._last is not None and estimate.t_source_ns > self._last.t_source_ns:
+            step = self._last.T_world_ego.between(estimate.T_world_ego)
+            speed_mps = math.hypot(step.x_m, step.y_m) * 1e9 / (estimate.t_source_ns - self._last.t_source_ns)
+            self._stream.log("ego/speed_mps", rr.Scalars(speed_mps))
+        for name, variance in zip(("x_m", "y_m", "yaw_rad"), estimate.cov[::4], strict=True):
+            self._stream.log(f"ego/sigma_{name}", rr.Scalars(math.sqrt(max(variance, 0.0))))
+        if estimate.status or not estimate.valid:
+            text = f"{'' if estimate.valid else 'NOT VALID '}{' '.join(estimate.status)}"
+            self._stream.log("status", rr.TextLog(text, level="INFO" if estimate.valid else "WARN"))
+
+
+def _turned(yaw_rad: float) -> tuple[float, float, float, float]:
+    """As a quaternion x, y, z, w."""
+    return 0.0, 0.0, math.sin(yaw_rad / 2.0), math.cos(yaw_rad / 2.0)
+
+
+def _footprint(T_ego_body: SE2, length_m: float, width_m: float) -> NDArray[np.float64]:
+    corners = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0)]) * (length_m / 2.0, width_m / 2.0)
+    return T_ego_body @ corners
+
+
+def _above(points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points of ego on a picture in which x, forward, is up and y, left, is left."""
+    return np.column_stack([-points_m[:, 1], -points_m[:, 0]])
+
+
+def _blueprint() -> Any:
+    return blueprint.Blueprint(
+        blueprint.Horizontal(
+            blueprint.Vertical(
+                blueprint.Spatial2DView(origin="camera", name="camera"),
+                blueprint.TimeSeriesView(origin="latency", name="latency, ms"),
+                blueprint.TimeSeriesView(origin="ego", name="ego"),
+                blueprint.TextLogView(origin="status", name="status"),
+            ),
+            blueprint.Spatial3DView(origin="world", name="world"),
+            blueprint.Spatial2DView(origin="bev", name="from above"),
+        )
+    )
+
+
+def _stream(save: Path | None) -> Any:
+    """Where it goes: a file, or the viewer, which is started. Raises ConfigurationError where neither can be."""
+    stream = rr.RecordingStream(APPLICATION)
+    try:
+        if save is not None:
+            stream.save(save)
+        else:
+            stream.spawn()
+    except (RuntimeError, OSError) as error:
+        raise ConfigurationError(f"view: {error}; without a display: --save FILE.rrd") from None
+    return stream
+
+
+def recorded(recording: Recording, save: Path | None) -> int:
+    """A whole recording."""
+    stream = _stream(save)
+    show(recording, Viewer(stream))
+    stream.flush()
+    stream.disconnect()
+    return 0
+
+
+def show(recording: Recording, viewer: Viewer) -> None:
+    """Sends all of a recording."""
+    if recording.camera is not None:
+        viewer.camera(recording.camera)
+    for message in recording.messages(READ):
+        if message.channel == "v1/frame":
+            ref = decode(message.data, FrameRef)
+            viewer.at(ref.frame_id, ref.t_source_ns)
+        elif message.channel == "/camera/image":
+            viewer.image(msgspec.json.decode(message.data, type=CompressedImage).data)
+        elif message.channel == "/latency":
+            viewer.latency(msgspec.json.decode(message.data, type=Latency))
+        elif message.channel == "v1/measurements":
+            viewer.measurements(decode(message.data, Measurements))
+        elif message.channel == "v1/estimate":
+            viewer.estimate(decode(message.data, Estimate))
+        else:
+            viewer.map(decode(message.data, MapUpdate))
+
+
+def live(vehicle: str, runtime_dir: Path | None, save: Path | None, seconds: float | None) -> int:
+    """What goes on now, until the source ends, or for some seconds; 1 where nothing came."""
+    stream = _stream(save)
+    viewer = Viewer(stream)
+    with Bus(vehicle, f"view-{os.getpid()}", runtime_dir=runtime_dir) as bus:
+        _ask_camera(bus, viewer)
+        seen = False
+        for record in _heard(bus, FrameReader(ring_path(vehicle, runtime_dir)), seconds):
+            if isinstance(record, bytes):
+                viewer.image(record)
+            elif isinstance(record, FrameRef):
+                viewer.at(record.frame_id, record.t_source_ns)
+            elif isinstance(record, Measurements):
+                viewer.measurements(record)
+            elif isinstance(record, MapUpdate):
+                viewer.map(record)
+            elif isinstance(record, Latency):
+                viewer.latency(record)
+            else:
+                seen = True
+                viewer.estimate(record)
+    stream.flush()
+    stream.disconnect()
+    return int(not seen)
+
+
+def _ask_camera(bus: Bus, viewer: Viewer) -> None:
+    """The camera of the run, where it answers."""
+    try:
+        for configuration in bus.ask("configuration"):
+            viewer.camera(msgspec.convert(configuration["camera"], Camera))
+    except (BusError, KeyError, msgspec.ValidationError):
+        return
+
+
+def _heard(bus: Bus, ring: FrameReader, seconds: float | None) -> Iterator[Any]:
+    estimates = bus.subscriber("estimate", QUEUE)
+    others = [bus.subscriber(topic, depth) for topic, depth in (("measurements", QUEUE), ("map", QUEUE))]
+    frames = bus.subscriber("frame", IMAGES)
+    until_s = None if seconds is None else time.monotonic() + seconds
+    while until_s is None or time.monotonic() < until_s:
+        message = estimates.recv(TURN_S)
+        while (reference := frames.recv(0.0)) is not None:
+            yield reference.record
+            image = ring.read(reference.record)
+            if image is not None:
+                yield cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1].tobytes()
+        for subscriber in others:
+            while (other := subscriber.recv(0.0)) is not None:
+                yield other.record
+        while message is not None:
+            estimate: Estimate = message.record
+            if Status.END_OF_SOURCE in estimate.status:
+                return
+            yield estimate
+            yield Latency(
+                frame_id=estimate.frame_id,
+                age_ms=(message.t_received_ns - estimate.t_capture_ns) / 1e6,
+                stages_ms=dict(stages(message.trace, message.t_received_ns)),
+            )
+            message = estimates.recv(0.0)

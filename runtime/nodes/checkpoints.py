@@ -1,0 +1,101 @@
+"""The optimizer's last checkpoints, in a file of the vehicle's runtime directory that outlives a kill -9 of it.
+
+The file is mapped, so that a store is a copy in memory. Two places take turns, and a place's number is written last:
+whatever a kill cuts short, the other one is whole. (What is inside is checked by `PoseGraph.restore`.)
+"""
+
+from __future__ import annotations
+
+import logging
+import mmap
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.transport.presence import runtime_dir_of
+
+MOST_BYTES = 1 << 20
+_PLACES, _HEAD_BYTES = 2, 64
+_TURN, _FRAME, _EPOCH, _BYTES = range(4)  # words of a head; _TURN is 0 where there is nothing
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A checkpoint: the last frame that is in it, and the epoch that it is of."""
+
+    frame_id: int
+    epoch: int
+    data: bytes
+
+
+def checkpoint_path(configuration: Configuration) -> Path:
+    """Where the checkpoints of this vehicle lie."""
+    return runtime_dir_of(configuration.vehicle, configuration.runtime_dir) / "checkpoint"
+
+
+class CheckpointFile:
+    """Written by the optimizer at work, read once by the one after it. Raises OSError where there is no room for it."""
+
+    def __init__(self, path: Path) -> None:
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            size = _PLACES * (_HEAD_BYTES + MOST_BYTES)
+            os.posix_fallocate(fd, 0, size)
+            memory = mmap.mmap(fd, size)
+        finally:
+            os.close(fd)
+        places = np.frombuffer(memory, dtype=np.uint8).reshape(_PLACES, _HEAD_BYTES + MOST_BYTES)
+        self._heads = [place[:_HEAD_BYTES].view(np.int64) for place in places]
+        self._bodies = [place[_HEAD_BYTES:] for place in places]
+        self._turn = max(int(head[_TURN]) for head in self._heads)
+
+    def store(self, frame_id: int, epoch: int, data: bytes) -> bool:
+        """One more, over the older of the two; False where it is too large."""
+        if len(data) > MOST_BYTES:
+            log.warning("a checkpoint of %d B is over %d B: a restart will begin a new epoch", len(data), MOST_BYTES)
+            return False
+        self._turn += 1
+        head, body = self._heads[self._turn % _PLACES], self._bodies[self._turn % _PLACES]
+        head[_TURN] = 0
+        body[: len(data)] = np.frombuffer(data, dtype=np.uint8)
+        head[_FRAME], head[_EPOCH], head[_BYTES] = frame_id, epoch, len(data)
+        head[_TURN] = self._turn
+        return True
+
+    def take(self) -> list[Kept]:
+        """What there is, the newest first. It is gone then: what a checkpoint brings about, it does not do twice."""
+        found = []
+        for head, body in sorted(zip(self._heads, self._bodies, strict=True), key=lambda place: -int(place[0][_TURN])):
+            if head[_TURN] > 0 and 0 < head[_BYTES] <= MOST_BYTES:
+                found.append(Kept(int(head[_FRAME]), int(head[_EPOCH]), body[: int(head[_BYTES])].tobytes()))
+            head[_TURN] = 0
+        return found
+
+
+def newest(path: Path) -> Kept | None:
+    """The newest whole checkpoint in the file, as another process sees it; None where there is none now."""
+    size = _HEAD_BYTES + MOST_BYTES
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return None
+    try:
+        heads = [(_head(fd, place * size), place) for place in range(_PLACES)]
+        (turn, frame_id, epoch, length), place = max(heads, key=lambda found: found[0][_TURN])
+        if turn <= 0 or not 0 < length <= MOST_BYTES:
+            return None
+        data = os.pread(fd, length, place * size + _HEAD_BYTES)
+        whole = len(data) == length and _head(fd, place * size)[_TURN] == turn  # else the optimizer is writing there
+        return Kept(frame_id, epoch, data) if whole else None
+    finally:
+        os.close(fd)
+
+
+def _head(fd: int, start: int) -> list[int]:
+    words = np.frombuffer(os.pread(fd, _HEAD_BYTES, start).ljust(_HEAD_BYTES, b"\0"), dtype=np.int64)
+    return [int(word) for word in words[: _BYTES + 1]]

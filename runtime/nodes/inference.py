@@ -1,0 +1,148 @@
+"""The networks on threads of their own: side by side, never two runs of one at once, and awaited to a deadline."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Any, Self
+
+from birdslam.frontend import Pending
+from birdslam.mapping.lane_mapper import LaneHead
+from birdslam.perception import Networks, Perception, Ready, load_network
+from birdslam.perception.completion import GridCompletion, shipped_completion
+from birdslam.perception.manifest import Role
+from birdslam.perception.pointnet import PointNet, load_pointnet
+from birdslam.perception.schedule import ROLES
+from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.nodes.degradation import Mode
+from birdslam.types import Frame
+
+Run = Callable[..., Any]
+
+
+class Inference:
+    """The configured networks, checked against their manifests and warm. A context manager.
+
+    At rate "max" every network is awaited, so that a run can be repeated. Else a frame waits for those that are worth
+    it (`ModelSpec.awaited`) until its deadline, which counts from its capture: a frame that comes late waits less, and
+    the delay does not grow. What is not there by then is carried, with its age. Nor does a frame wait for the lanes
+    then, which come with a later one. Raises perception.ModelError.
+    """
+
+    def __init__(self, configuration: Configuration) -> None:
+        schedule = configuration.perceive.schedule
+        heads = [load_network(role, schedule.of(role, spec)) for role, spec in configuration.models.in_use().items()]
+        self._lanes_every = schedule.lanes.every or 1
+        pointnet = configuration.models.pointnet
+        self.frustum_network: PointNet | None = None if pointnet is None else load_pointnet(pointnet)
+        self.completion: GridCompletion | None = None  # of lane grids, where there are lanes to see
+        if configuration.models.completion and any("segmenter" in ROLES.get(h.role, (h.role,)) for h in heads):
+            self.completion = shipped_completion(configuration.slam.frontend.lanes.shape)
+        self._deadline_ns = configuration.deadline_ns
+        self._awaited: frozenset[Run] = frozenset(head.run for head in heads if head.schedule.awaited)
+        self._rate_divisor = configuration.degradation.rate_divisor
+        self._ran_frame = -self._rate_divisor  # the last frame that networks were offered
+        self._started: list[Future[Any]] = []  # for the frame at hand, and awaited
+        self._threads = ThreadPoolExecutor(max(1, len(heads)), thread_name_prefix="network")
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="beside")
+        self._frame_over = threading.Event()
+        self.networks = Networks(heads, self._submit, None if self._deadline_ns is None else 0.0)
+
+    def _submit(self, run: Run, *arguments: Any) -> Future[Any]:
+        future = self._threads.submit(run, *arguments)
+        if run in self._awaited:
+            self._started.append(future)
+        return future
+
+    @property
+    def aside(self) -> Run | None:
+        """Runs a function on a thread of its own; None at rate "max", where nothing may depend on the clock.
+
+        It begins when the frame at hand is over: it would take the interpreter's lock from what goes out.
+        """
+        return None if self._deadline_ns is None else self._run_aside
+
+    def _run_aside(self, run: Run, *arguments: Any) -> Future[Any]:
+        def when_over() -> Any:
+            self._frame_over.wait()
+            return run(*arguments)
+
+        return self._beside.submit(when_over)
+
+    def over(self) -> None:
+        """What the frame at hand gave is sent."""
+        self._frame_over.set()
+
+    @property
+    def lane_head(self) -> LaneHead:
+        """Lanes, on their schedule."""
+        return LaneHead(self.completion, self.aside, self._lanes_every)
+
+    @property
+    def roles(self) -> frozenset[str]:
+        """Those that a network fills."""
+        return frozenset(head.role for head in self.networks.heads)
+
+    def start(self, frame: Frame, mode: Mode = Mode.FULL) -> Pending:
+        """Starts the networks that are due on a frame, and that the mode allows."""
+        self._started = []
+        self._frame_over.clear()
+        if mode in (Mode.ODOMETRY, Mode.COASTING):
+            return Ready(Perception())
+        image = frame.image
+        only: tuple[Role, ...] | None = None
+        if mode is Mode.RATE and frame.frame_id - self._ran_frame < self._rate_divisor:
+            image = None
+        elif mode is Mode.BOXES:
+            only = ("detector",)
+        pending = self.networks.start(frame.frame_id, image, only)
+        if image is not None:
+            self._ran_frame = frame.frame_id
+        if mode is Mode.BOXES:
+            pending = _BoxesOnly(pending)
+        if self._deadline_ns is None:
+            return pending
+        return _UntilDeadline(pending, self._started, frame.t_capture_ns + self._deadline_ns)
+
+    def close(self) -> None:
+        """Ends the threads, after the runs at hand."""
+        self._frame_over.set()
+        self._beside.shutdown(wait=True, cancel_futures=True)
+        self._threads.shutdown(wait=True, cancel_futures=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+@dataclass(frozen=True)
+class _BoxesOnly:
+    """A pending perception whose road and lanes are too old to be used."""
+
+    pending: Pending
+
+    def result(self) -> Perception:
+        perception = self.pending.result()
+        ages = {name: age for name, age in perception.ages.items() if name != "segmenter"}
+        return replace(perception, segmentation=None, ages=ages)
+
+
+@dataclass(frozen=True)
+class _UntilDeadline:
+    """A pending perception that is awaited to a point in time, and then taken as it is."""
+
+    pending: Pending
+    awaited: list[Future[Any]]
+    deadline_ns: int  # CLOCK_MONOTONIC
+
+    def result(self) -> Perception:
+        wait(self.awaited, timeout=max(0.0, (self.deadline_ns - time.monotonic_ns()) / 1e9))
+        return self.pending.result()

@@ -1,0 +1,75 @@
+"""What a node measures of itself, and says once a second (wire.Health)."""
+
+from __future__ import annotations
+
+import time
+
+import psutil
+
+from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.latency import Recent
+from birdslam.runtime.process.restarts import Assignment
+from birdslam.runtime.wire import Health, Trace
+from birdslam.types import Status
+
+PERIOD_NS = 1_000_000_000
+
+
+class Meter:
+    """Counts and measures the frames of one node; of fixed size, whatever the drive."""
+
+    def __init__(self, node: str, configuration: Configuration, assignment: Assignment) -> None:
+        self.frames = 0
+        self.node, self._assignment = node, assignment
+        self._budget_ms = configuration.budgets.step_ms(node)
+        self._hop_ms = configuration.budgets.hop_ms(node)
+        self._stale_ns = round(configuration.runtime.stale_ms * 1e6)
+        self._wait, self._step, self._age = Recent(), Recent(), Recent()
+        self._overruns = self._late = 0
+        self._process = psutil.Process()
+        self._process.cpu_percent()
+        self._heard_ns = self._said_ns = time.monotonic_ns()
+        self._frames_said = 0
+
+    def heard(self, now_ns: int) -> None:
+        """Something came in."""
+        self._heard_ns = now_ns
+
+    def frame(self, t_capture_ns: int, trace: Trace, taken_ns: int, done_ns: int) -> None:
+        """A frame is done; `trace` is that of the message that brought it."""
+        self.frames += 1
+        sent_ns = trace.stages[-1].sent_ns if trace.stages else t_capture_ns
+        wait_ms = max(0.0, (taken_ns - sent_ns) / 1e6)
+        self._wait.add(wait_ms, done_ns)
+        self._late += self._hop_ms is not None and wait_ms > self._hop_ms
+        step_ms = (done_ns - taken_ns) / 1e6
+        self._step.add(step_ms, done_ns)
+        self._age.add(max(0.0, (done_ns - t_capture_ns) / 1e6), done_ns)
+        self._overruns += step_ms > self._budget_ms
+
+    def due(self, now_ns: int) -> bool:
+        """Whether a second has passed."""
+        return now_ns - self._said_ns >= PERIOD_NS
+
+    def health(self, now_ns: int, mode: str, counters: dict[str, int]) -> Health:
+        """What to say now."""
+        rate_hz = (self.frames - self._frames_said) * 1e9 / (now_ns - self._said_ns)
+        self._said_ns, self._frames_said = now_ns, self.frames
+        return Health(
+            node=self.node,
+            t_ns=now_ns,
+            frames=self.frames,
+            rate_hz=rate_hz,
+            wait=self._wait.spread(now_ns),
+            step=self._step.spread(now_ns),
+            age=self._age.spread(now_ns),
+            overruns=self._overruns,
+            late=self._late,
+            rss_bytes=self._process.memory_info().rss,
+            cpu_percent=self._process.cpu_percent(),
+            mode=mode,
+            restarts=self._assignment.restarts,
+            cause=self._assignment.cause[:200],
+            status=(Status.INPUT_STALE,) if now_ns - self._heard_ns > self._stale_ns else (),
+            **counters,
+        )

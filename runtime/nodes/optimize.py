@@ -1,0 +1,189 @@
+"""What the optimize process does: measurements into the pose graph, estimates out of it, for every frame in time."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Iterator
+
+import msgspec
+
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.checkpoint import CheckpointError
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.nodes.capture import stamps
+from birdslam.runtime.nodes.checkpoints import CheckpointFile, checkpoint_path
+from birdslam.runtime.nodes.coasting import ANNOUNCED_FRAMES, TOLD_AGAIN, Announced, Overdue, deadline_ns, unmeasured
+from birdslam.runtime.nodes.degradation import Mode
+from birdslam.runtime.process.restarts import FIRST, Assignment, EpochFile
+from birdslam.runtime.transport.bus import Bus, Message
+from birdslam.runtime.transport.presence import runtime_dir_of
+from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
+
+log = logging.getLogger(__name__)
+
+
+class OptimizeNode:
+    """Measurements -> Estimate, MapUpdate: the pose graph.
+
+    Frame numbers never fall: measurements that come after their frame was given up correct the graph, and the newest
+    frame that was told of is told of again. After a restart the graph goes on from its last checkpoint, with what
+    perceive still has of the measurements since (GRAPH_RESTORED), or in a new epoch (GRAPH_RESET).
+    """
+
+    def __init__(self, configuration: Configuration, bus: Bus, assignment: Assignment = FIRST) -> None:
+        self.ended = False
+        self._measurements = bus.subscriber("measurements")
+        self._announced = Announced(deadline_ns(configuration))
+        self._frames = None if configuration.lossless else bus.subscriber("frame", ANNOUNCED_FRAMES)
+        self._coast_max_ns = round(configuration.degradation.coast_max_ms * 1e6)
+        self._last: Estimate | None = None  # that rests on measurements
+        self._coasted: FrameRef | None = None  # the newest frame that was given up
+        self._coasted_frames = self._outrun = 0
+        self._told_frame = -1 if assignment.resume is None else assignment.resume.next_frame - 1
+        self._told_before = self._told_frame  # by the process before this one
+        self._missed: deque[Message] = deque()  # measurements since the checkpoint
+        self._missed_frame = -1  # the last of them
+        self._epochs: EpochFile | None = None
+        self._checkpoints: CheckpointFile | None = None
+        self._checkpoint_ns, self._due_ns = round(configuration.runtime.checkpoint_ms * 1e6), 0
+        if not configuration.lossless:  # a run at rate "max" gives the same bytes each time
+            directory = runtime_dir_of(configuration.vehicle, configuration.runtime_dir)
+            self._epochs = EpochFile(directory / "epoch")
+            self._checkpoints = CheckpointFile(checkpoint_path(configuration))
+        epoch = 0 if self._epochs is None else self._epochs.last + 1
+        self._untold = (Status.GRAPH_RESET,) if epoch else ()  # planners may know an older world
+        restored = self._restored(configuration, bus, assignment)
+        self._graph = restored or PoseGraph(configuration.slam.graph, configuration.slam.weights, epoch)
+
+    def _restored(self, configuration: Configuration, bus: Bus, assignment: Assignment) -> PoseGraph | None:
+        """The graph of the last checkpoint of this run, if its epoch is still the newest that planners know of."""
+        if self._checkpoints is None or self._epochs is None:
+            return None
+        for kept in self._checkpoints.take():
+            if not assignment.restarts or kept.epoch != self._epochs.last:
+                continue
+            try:
+                graph = PoseGraph.restore(kept.data, configuration.slam.graph, configuration.slam.weights)
+            except CheckpointError as error:
+                log.warning("the checkpoint of frame %d is of no use: it %s", kept.frame_id, error)
+                continue
+            wait_s = configuration.runtime.catch_up_ms / 1e3
+            if not bus.wait_alive({"perceive"}, wait_s):
+                missed = bus.kept("measurements", wait_s)
+                self._missed.extend(message for message in missed if message.record.frame_id > kept.frame_id)
+            if self._missed:
+                self._missed_frame = self._missed[-1].record.frame_id
+            log.warning("goes on from the checkpoint of frame %d, with %d since", kept.frame_id, len(self._missed))
+            self._untold = (Status.GRAPH_RESTORED,)
+            return graph
+        return None
+
+    @property
+    def mode(self) -> str:
+        return Mode.COASTING if self._coasts else Mode.FULL
+
+    @property
+    def _coasts(self) -> bool:
+        return self._coasted is not None and self._coasted.frame_id == self._told_frame
+
+    def receive(self, timeout_s: float) -> Message | None:
+        """The next measurements; or the frame whose measurements are overdue by now."""
+        if self._missed:
+            return self._missed.popleft()
+        until_s = time.monotonic() + timeout_s
+        while True:
+            self._hear_of_frames()
+            left_s = max(0.0, until_s - time.monotonic())
+            message = self._measurements.recv(min(left_s, self._announced.wait_s(time.monotonic_ns())))
+            if message is not None and message.record.frame_id <= self._missed_frame:
+                continue  # taken up already
+            if message is not None:
+                self._announced.answered(message.record.frame_id)
+                return message
+            late = self._announced.overdue(time.monotonic_ns())
+            if late is not None or time.monotonic() >= until_s:
+                return late
+
+    def _hear_of_frames(self) -> None:
+        while self._frames is not None and (message := self._frames.recv(0.0)) is not None:
+            self._announced.add(message)
+
+    def step(self, record: Measurements | Overdue) -> Iterator[Estimate | MapUpdate]:
+        if isinstance(record, Overdue):
+            self._coasted = record.ref
+            self._coasted_frames += 1
+            yield self._told(self._coast(record.ref))
+            return
+        if Status.END_OF_SOURCE in record.status:
+            self.ended = True
+            yield from self._end(record)
+            return
+        estimate = self._last = self._graph.update(record)
+        if estimate.frame_id <= self._told_before:
+            self._graph.map_update()  # told as well
+            return
+        if estimate.frame_id >= self._told_frame:
+            yield self._told(estimate)
+        else:
+            self._outrun += 1
+            self._untold = (*self._untold, *(s for s in estimate.status if s in TOLD_AGAIN))
+            if self._coasted is not None and self._coasts:
+                yield self._told(self._coast(self._coasted))
+        gained = self._graph.map_update()
+        if gained is not None:
+            yield gained
+        self._keep(record.frame_id)  # when all is sent, so that nobody waits for it
+
+    def _keep(self, frame_id: int) -> None:
+        """A checkpoint, when one is due."""
+        now_ns = time.monotonic_ns()
+        if self._checkpoints is not None and now_ns >= self._due_ns:
+            self._checkpoints.store(frame_id, self._graph.epoch, self._graph.checkpoint())
+            self._due_ns = now_ns + self._checkpoint_ns
+
+    def _coast(self, ref: FrameRef) -> Estimate:
+        """Of a frame without measurements; the graph stays as it is."""
+        return self._graph.update(unmeasured(ref, self._last, self._coast_max_ns))
+
+    def _told(self, estimate: Estimate) -> Estimate:
+        """What goes out, with what planners have yet to hear."""
+        if self._untold:
+            status = tuple(dict.fromkeys((*estimate.status, *self._untold)))
+            estimate, self._untold = msgspec.structs.replace(estimate, status=status), ()
+        self._told_frame = estimate.frame_id
+        if self._epochs is not None:
+            self._epochs.store(estimate.epoch)
+        return estimate
+
+    def _end(self, measurements: Measurements) -> Iterator[Estimate | MapUpdate]:
+        """The map is complete before the estimate that ends the run; its update bears the number of the end."""
+        epoch = self._graph.epoch
+        gained = self._graph.map_update() or MapUpdate(epoch=epoch, frame_id=measurements.frame_id)
+        yield msgspec.structs.replace(gained, frame_id=measurements.frame_id)
+        yield farewell(measurements, epoch, self._last)
+
+    def drain(self) -> None:
+        """Ends with END_OF_SOURCE, as ever."""
+
+    def counters(self) -> dict[str, int]:
+        taken = self._measurements
+        counted = {"coasted": self._coasted_frames, "outrun": self._outrun}
+        return {"dropped": taken.dropped, "malformed": taken.malformed, **counted}
+
+    def close(self) -> None:
+        """Holds nothing open."""
+
+
+def farewell(measurements: Measurements, epoch: int, last: Estimate | None) -> Estimate:
+    """The estimate that ends a run, after the last one."""
+    return Estimate(
+        **stamps(measurements),
+        epoch=epoch,
+        T_world_ego=last.T_world_ego if last else SE2(),
+        cov=last.cov if last else (0.0,) * 9,
+        valid=False,
+        status=measurements.status,
+    )

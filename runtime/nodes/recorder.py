@@ -1,0 +1,313 @@
+"""The recorder: one more process that listens, and writes a drive down (recording/recording.py); nobody waits for it.
+
+`python -m birdslam.runtime.nodes.recorder record VITALS_FD PARENT_PID`, on standard input the configuration as a line
+of JSON, then an `Order` as another. It ends by itself when the end of the source has come through, or in order on
+SIGTERM. Exit status: 0 when the recording is complete; 2 where the file can't be made, 3 where the disk failed it,
+each with one ERROR line; 1 for a bug. One that died or stalled is begun anew in a file of its own
+(recorder_station.py), which bears the optimizer's graph as it is then: it replays from there.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import logging
+import os
+import platform
+import signal
+import sys
+import time
+from collections import deque
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import cv2
+import msgspec
+import psutil
+
+from birdslam.runtime.configuration import Configuration, dump, without_passwords
+from birdslam.runtime.environment import LIBRARIES, USER_ERROR_STATUS
+from birdslam.runtime.latency import stages
+from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest
+from birdslam.runtime.process import realtime
+from birdslam.runtime.process.child import LOG_FORMAT, die_with
+from birdslam.runtime.process.restarts import FIRST, Assignment
+from birdslam.runtime.process.vitals import Vitals
+from birdslam.runtime.recording import scene
+from birdslam.runtime.recording.recording import EXACT, About, Alive, GraphCheckpoint, Latency, RecordingWriter
+from birdslam.runtime.topology import NODES, RECORDER
+from birdslam.runtime.transport.bus import Bus, Message
+from birdslam.runtime.transport.presence import ring_path
+from birdslam.runtime.transport.ring import FrameError, FrameReader
+from birdslam.runtime.wire import Health
+from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
+
+TURN_S = 0.05  # what has come is written at least so often
+QUIET_S = 0.2  # at the end: nothing more has come for so long
+END_S = 2.0  # after END_OF_SOURCE, for the rest of the map
+HEALTH_NS = 1_000_000_000
+EVENTS = 256  # of liveliness that wait
+DISK_STATUS = 3
+NICENESS = 5  # the pipeline goes first
+INDEX_MIB = 8.0, 8.0  # of objects and of larger blocks: the index of an hour, and chunks with images
+
+log = logging.getLogger(__name__)
+
+
+class Order(msgspec.Struct, frozen=True):
+    """What the recorder is told beside the configuration: the networks with their hashes, its file, who was before."""
+
+    models: dict[str, Any]
+    file: str
+    assignment: Assignment = FIRST
+
+
+class Recorder:
+    """From the bus into the file, turn by turn."""
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        bus: Bus,
+        writer: RecordingWriter,
+        vitals: Vitals,
+        assignment: Assignment = FIRST,
+    ) -> None:
+        config = configuration.recording
+        self._writer, self._vitals, self._assignment = writer, vitals, assignment
+        self._estimates = bus.subscriber("estimate", config.queue)
+        others = (*(topic for topic in EXACT if topic != "estimate"), *(f"health/{name}" for name in NODES))
+        self._others = {topic: bus.subscriber(topic, config.queue) for topic in others}
+        self._health = bus.publisher("health/record")
+        self._events: deque[tuple[int, Alive]] = deque(maxlen=EVENTS)
+        bus.on_alive(lambda node, alive: self._events.append((time.monotonic_ns(), Alive(node=node, alive=alive))))
+        self._ring: FrameReader | None = None
+        if config.images:
+            self._ring = FrameReader(ring_path(configuration.vehicle, configuration.runtime_dir))
+        self._jpeg_quality = config.jpeg_quality
+        self.images = self.torn = 0
+        self._process = psutil.Process()
+        self._process.cpu_percent()
+        self._said_ns, self._frames, self._frames_said = time.monotonic_ns(), 0, 0
+        self._end_frame: int | None = None  # of END_OF_SOURCE
+        self._end_measured = False  # the measurements of it have come: another link, which may be the slower one
+        self._map_frame = -1
+        self._estimate_frame = -1
+        self._handed: deque[tuple[int, int]] = deque()  # the file's length with them, and the frame that is next
+        self._missed = 0  # frames between the last on the disk of the recorder before this one, and this one's first
+        self._checkpoints: Path | None = None  # where a file that begins in the middle of a drive finds its graph
+        if assignment.restarts:
+            self._checkpoints = checkpoint_path(configuration)
+        self._first_measured: int | None = None  # the frame of the first measurements in this file
+        if configuration.camera is not None:
+            self._draw(scene.from_camera(configuration.camera, time.time_ns()), time.monotonic_ns())
+
+    def turn(self, timeout_s: float) -> bool:
+        """Writes what has come; whether anything has."""
+        first = self._estimates.recv(timeout_s)
+        heard = [("estimate", first)] if first else []
+        for topic, subscriber in (("estimate", self._estimates), *self._others.items()):
+            while (message := subscriber.recv(0.0)) is not None:
+                heard.append((topic, message))
+        while self._events:
+            t_ns, event = self._events.popleft()
+            self._writer.draw("/alive", event, t_ns)
+        heard.sort(key=lambda pair: pair[1].t_received_ns)
+        for topic, message in heard:
+            self._take(topic, message)
+        now_ns = time.monotonic_ns()
+        if now_ns - self._said_ns >= HEALTH_NS:
+            self._say(now_ns)
+        if self._checkpoints is not None and self._first_measured is not None:
+            self._begin_from_checkpoint(self._checkpoints, self._first_measured, now_ns)
+        self._vitals.count(frames=self._writer.messages, torn=self.torn, **self._counters())
+        self._vitals.beat()
+        if self._writer.flush_if_due(now_ns):
+            self._handed.append((self._writer.handed_bytes, self._estimate_frame + 1))
+        while self._handed and self._handed[0][0] <= self._writer.written_bytes:
+            self._vitals.count(next_frame=self._handed.popleft()[1])
+        return bool(heard)
+
+    def _begin_from_checkpoint(self, path: Path, first_frame: int, now_ns: int) -> None:
+        """As soon as there is one from which on all measurements are in this file."""
+        kept = newest(path)
+        if kept is not None and kept.frame_id >= first_frame - 1:
+            checkpoint = GraphCheckpoint(frame_id=kept.frame_id, epoch=kept.epoch, data=kept.data)
+            self._writer.begin_from(checkpoint, now_ns)
+            self._checkpoints = None
+
+    @property
+    def over(self) -> bool:
+        """The end of the source, its measurements, and the map before it have been written."""
+        return self._end_frame is not None and self._end_measured and self._map_frame == self._end_frame
+
+    @property
+    def ending(self) -> bool:
+        """The end of the source has been written."""
+        return self._end_frame is not None
+
+    def dropped(self) -> dict[str, int]:
+        """Messages that were pushed out of the queues unwritten, by topic."""
+        subscribers = {"estimate": self._estimates, **self._others}
+        return {topic: subscriber.dropped for topic, subscriber in subscribers.items() if subscriber.dropped}
+
+    def _counters(self) -> dict[str, int]:
+        malformed = self._estimates.malformed + sum(s.malformed for s in self._others.values())
+        return {"dropped": sum(self.dropped().values()) + self._missed, "malformed": malformed}
+
+    def _take(self, topic: str, message: Message) -> None:
+        record, t_ns = message.record, message.t_received_ns
+        if topic in EXACT:
+            self._writer.add(topic, record, t_ns, message.trace)
+        if isinstance(record, Health):
+            self._writer.draw(f"/{topic}", record, t_ns)
+        elif isinstance(record, FrameRef):
+            self._take_image(record, t_ns)
+        elif isinstance(record, Measurements):
+            if self._first_measured is None:
+                self._first_measured = record.frame_id
+            self._end_measured = self._end_measured or Status.END_OF_SOURCE in record.status
+            self._draw(scene.from_measurements(record, record.t_utc_ns), t_ns)
+        elif isinstance(record, MapUpdate):
+            self._map_frame = record.frame_id
+            self._draw(scene.from_map(record, time.time_ns()), t_ns)
+        elif isinstance(record, Estimate):
+            if Status.END_OF_SOURCE in record.status:
+                self._end_frame = record.frame_id
+                return
+            resume = self._assignment.resume
+            if resume is not None and self._estimate_frame < 0:
+                self._missed = max(0, record.frame_id - resume.next_frame)
+            self._estimate_frame = record.frame_id
+            self._frames += 1
+            self._writer.draw("/estimate", record, t_ns)
+            self._writer.draw("/latency", _latency(record, message), t_ns)
+            self._draw(scene.from_estimate(record, record.t_utc_ns), t_ns)
+
+    def _take_image(self, ref: FrameRef, t_ns: int) -> None:
+        if self._ring is None or ref.slot < 0:
+            return
+        try:
+            image = self._ring.read(ref)
+        except FrameError as error:
+            log.warning("frame %d is not recorded: %s", ref.frame_id, error)
+            image = None
+        if image is None:
+            self.torn += 1
+            return
+        self._draw([scene.from_image(image, self._jpeg_quality, ref.t_utc_ns)], t_ns)
+        self.images += 1
+
+    def _draw(self, drawn: Any, t_ns: int) -> None:
+        for channel, message in drawn:
+            self._writer.draw(channel, message, t_ns)
+
+    def _say(self, now_ns: int) -> None:
+        rate_hz = (self._frames - self._frames_said) * 1e9 / (now_ns - self._said_ns)
+        self._said_ns, self._frames_said = now_ns, self._frames
+        counters = self._counters()
+        health = Health(
+            node=RECORDER.name,
+            t_ns=now_ns,
+            frames=self._frames,
+            torn=self.torn,
+            rate_hz=rate_hz,
+            rss_bytes=self._process.memory_info().rss,
+            cpu_percent=self._process.cpu_percent(),
+            dropped=counters["dropped"],
+            malformed=counters["malformed"],
+            restarts=self._assignment.restarts,
+            cause=self._assignment.cause[:200],
+        )
+        self._health.put(health)
+        self._writer.draw("/health/record", health, now_ns)
+
+    def end(self) -> dict[str, str]:
+        """What the file says of its end."""
+        counts = {"estimates": self._frames, "images": self.images, "images_torn": self.torn, "missed": self._missed}
+        counts |= self._counters()
+        dropped = {f"dropped {topic}": n for topic, n in self.dropped().items()}
+        return {name: str(count) for name, count in {**counts, **dropped}.items()}
+
+
+def _latency(estimate: Estimate, message: Message) -> Latency:
+    left_ns = message.trace.left_ns
+    return Latency(
+        frame_id=estimate.frame_id,
+        age_ms=(message.t_received_ns - estimate.t_capture_ns) / 1e6,
+        left_ms=None if left_ns is None else left_ns / 1e6,
+        stages_ms=dict(stages(message.trace, message.t_received_ns)),
+    )
+
+
+def about(configuration: Configuration, models: dict[str, Any], restarts: int = 0) -> About:
+    """Of a recording that begins now."""
+    versions = {"python": platform.python_version(), **{name: importlib.metadata.version(name) for name in LIBRARIES}}
+    utc_offset_ns = time.time_ns() - time.monotonic_ns()
+    return About(
+        configuration=dump(without_passwords(configuration)),
+        models=models,
+        versions=versions,
+        utc_offset_ns=utc_offset_ns,
+        restarts=restarts,
+    )
+
+
+def record(configuration: Configuration, order: Order, vitals: Vitals, stop: list[int]) -> str:
+    """A whole recording; why it ended early, or nothing. Raises OSError where the file can't be made."""
+    config = configuration.recording
+    described = about(configuration, order.models, order.assignment.restarts)
+    writer = RecordingWriter(Path(order.file), described, configuration.camera, config.flush_ms, config.sync)
+    with Bus(configuration.vehicle, RECORDER.name, runtime_dir=configuration.runtime_dir) as bus:
+        recorder = Recorder(configuration, bus, writer, vitals, order.assignment)
+        vitals.beat()
+        vitals.count(ready=1)
+        bus.declare_alive()
+        end_s = None
+        while writer.error is None and not stop and not recorder.over and (end_s is None or time.monotonic() < end_s):
+            recorder.turn(TURN_S)
+            if recorder.ending and end_s is None:
+                end_s = time.monotonic() + END_S
+        while writer.error is None and not recorder.over and recorder.turn(QUIET_S):
+            pass
+        vitals.count(ready=0)  # no beat any more: it waits for the disk
+        writer.close(recorder.end())
+    error = writer.error
+    return f"{error.strerror}: {order.file} ends with what was written until then" if error else ""
+
+
+def main(arguments: list[str]) -> int:
+    """Entry point of the recorder's process."""
+    _, vitals_fd, parent_pid = arguments
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=LOG_FORMAT)
+    stop: list[int] = []
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        stop.append(number)
+
+    signal.signal(signal.SIGTERM, ask)
+    die_with(int(parent_pid))
+    os.nice(NICENESS)
+    cv2.setNumThreads(1)
+    configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
+    order = msgspec.json.decode(sys.stdin.buffer.readline(), type=Order)
+    sys.setswitchinterval(configuration.runtime.switch_interval_s)
+    realtime.reserve(*INDEX_MIB)
+    vitals = Vitals(int(vitals_fd))
+    try:
+        reason = record(configuration, order, vitals, stop)
+    except OSError as error:
+        log.error("%s can't be made: %s", order.file, error.strerror)
+        return USER_ERROR_STATUS
+    except Exception:
+        log.exception("%s failed", RECORDER.name)
+        return 1
+    if reason:
+        log.error("the recording has ended: %s", reason)
+        return DISK_STATUS
+    vitals.count(ended=1)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,186 @@
+"""The one loop of every node: receive, step, send, measure, beat.
+
+`python -m birdslam.runtime.nodes.runner NODE VITALS_FD PARENT_PID`, on standard input the configuration as a line of
+JSON, and then, when its work is to begin, its assignment as another: until then it is a spare. Exit status: 0 at the
+end of the source or when told to end; 2 where what the user gave can't be used, with one ERROR line on stderr; 1
+where the node fails at work: a camera that is gone, or a bug, with its traceback there.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable
+from types import FrameType
+from typing import TypeGuard
+
+import cv2
+import msgspec
+
+from birdslam.datasets.recording import DatasetError
+from birdslam.perception import ModelError
+from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.environment import USER_ERROR_STATUS
+from birdslam.runtime.nodes.coasting import Overdue
+from birdslam.runtime.nodes.meter import Meter
+from birdslam.runtime.nodes.nodes import Node, prepare
+from birdslam.runtime.nodes.sources import SourceError
+from birdslam.runtime.process import realtime
+from birdslam.runtime.process.child import LOG_FORMAT, die_with, give_back_memory
+from birdslam.runtime.process.restarts import Assignment
+from birdslam.runtime.process.vitals import Vitals
+from birdslam.runtime.topology import NODES, RECORDER, TOPICS
+from birdslam.runtime.transport.bus import Bus, Publisher
+from birdslam.runtime.wire import Health
+from birdslam.types import Estimate, FrameRef, Measurements, Status
+
+log = logging.getLogger(__name__)
+
+USER_ERRORS = (ConfigurationError, DatasetError, ModelError, SourceError)
+RECORDER_PATIENCE_S = 0.2  # of a node begun anew: its first records are worth so much, no more
+DOWNSTREAM = {"capture": "perceive", "perceive": "optimize", "optimize": "supervisor"}  # who must be there to receive
+
+
+class Stop:
+    """The signals of the supervisor. SIGTERM: end after the step at hand (at once while still building). SIGINT: drain,
+    the source ends here and all frames in flight are processed.
+    """
+
+    def __init__(self) -> None:
+        self.at_work = False
+        self.asked = False
+        self.draining = False
+        self._event = os.eventfd(0)
+        signal.signal(signal.SIGTERM, self._handle)
+        signal.signal(signal.SIGINT, self._handle)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if not self.at_work:
+            raise SystemExit(0)
+        self.draining = True
+        self.asked = self.asked or number == signal.SIGTERM
+        os.eventfd_write(self._event, 1)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Sleeps to a deadline (exact to some 50 us), or until a signal; says whether one has come."""
+        select.select([self._event], [], [], timeout_s)
+        return self.draining
+
+
+def run(
+    name: str,
+    configuration: Configuration,
+    make: Callable[[Bus, Callable[[float], object], Assignment], Node],
+    assignment: Assignment,
+    vitals: Vitals,
+    stop: Stop,
+) -> None:
+    """One node from the beginning of its work to its end."""
+    runtime = configuration.runtime
+    with Bus(
+        configuration.vehicle, name, runtime_dir=configuration.runtime_dir, lossless=configuration.lossless
+    ) as bus:
+        node = make(bus, stop.wait, assignment)
+        try:
+            publishers = {TOPICS[topic].record: bus.publisher(topic) for topic in NODES[name].sends}
+            _await_downstream(name, bus, publishers, runtime.ready_timeout_s)
+            if configuration.recording.file:
+                first_s = configuration.recording.ready_timeout_s
+                bus.wait_alive({RECORDER.name}, RECORDER_PATIENCE_S if assignment.restarts else first_s)
+            realtime.settle()
+            stop.at_work = True
+            vitals.beat()  # before it is ready: who is ready without a beat is stalled
+            vitals.count(ready=1)
+            bus.declare_alive()
+            _loop(node, publishers, Meter(name, configuration, assignment), vitals, stop, configuration)
+        finally:
+            node.close()
+
+
+def _await_downstream(name: str, bus: Bus, publishers: dict[type, Publisher], timeout_s: float) -> None:
+    """Readiness goes upstream, supervisor to capture, so that the first frame finds everyone listening."""
+    until_s = time.monotonic() + timeout_s
+    missing = bus.wait_alive({DOWNSTREAM[name]}, timeout_s)
+    main = publishers[TOPICS[NODES[name].sends[0]].record]
+    if missing or not main.wait_matched(max(0.0, until_s - time.monotonic())):
+        raise TimeoutError(f"{DOWNSTREAM[name]} was not ready to receive within {timeout_s:g} s")
+
+
+def _is_frame(record: msgspec.Struct) -> TypeGuard[FrameRef | Measurements | Estimate]:
+    return isinstance(record, FrameRef | Measurements | Estimate) and Status.END_OF_SOURCE not in record.status
+
+
+def _loop(
+    node: Node,
+    publishers: dict[type, Publisher],
+    meter: Meter,
+    vitals: Vitals,
+    stop: Stop,
+    configuration: Configuration,
+) -> None:
+    name, beat_s = meter.node, configuration.runtime.beat_s
+    budget_ns = round(configuration.budgets.end_to_end_ms * 1e6)
+    while not (node.ended or stop.asked):
+        vitals.beat()
+        if stop.draining:
+            node.drain()
+        message = node.receive(beat_s)
+        now_ns = time.monotonic_ns()
+        if message is not None:
+            taken_ns = now_ns  # waiting in the queue belongs to the hop, not to the step
+            if not isinstance(message.record, Overdue):
+                meter.heard(taken_ns)
+            for record in node.step(message.record):
+                now_ns = time.monotonic_ns()
+                trace = message.trace.after(name, taken_ns, now_ns)
+                if _is_frame(record):
+                    vitals.count(
+                        next_frame=record.frame_id + 1,
+                        t_source_ns=record.t_source_ns,
+                        t_capture_ns=record.t_capture_ns,
+                    )
+                    if Status.PERCEPTION_LATE not in record.status:
+                        meter.frame(record.t_capture_ns, message.trace, taken_ns, now_ns)
+                    if isinstance(record, Estimate):
+                        trace = msgspec.structs.replace(trace, left_ns=record.t_capture_ns + budget_ns - now_ns)
+                publishers[type(record)].put(record, trace)
+        vitals.count(frames=meter.frames, ended=node.ended, **node.counters())
+        if meter.due(now_ns):
+            publishers[Health].put(meter.health(now_ns, node.mode, node.counters()))
+
+
+def main(arguments: list[str]) -> int:
+    """Entry point of a node's process."""
+    name, vitals_fd, parent_pid = arguments
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=LOG_FORMAT)
+    stop = Stop()
+    die_with(int(parent_pid))
+    configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
+    sys.setswitchinterval(configuration.runtime.switch_interval_s)
+    cv2.setNumThreads(1)  # perceive sets its own
+    vitals = Vitals(int(vitals_fd))
+    try:
+        make = prepare(name, configuration)
+        realtime.reserve_for(name, configuration)
+        give_back_memory()
+        vitals.count(prepared=1)
+        line = sys.stdin.buffer.readline()
+        if line:  # else this spare is needed no more
+            for refused in realtime.apply(name, configuration):
+                log.warning("%s", refused)
+            run(name, configuration, make, msgspec.json.decode(line, type=Assignment), vitals, stop)
+    except USER_ERRORS as error:
+        log.error("%s", error)
+        return 1 if stop.at_work else USER_ERROR_STATUS
+    except Exception:
+        log.exception("%s failed", name)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,317 @@
+"""Frames from recordings and live cameras: opening, pacing, reading ahead, and the one way from pixels to a `Frame`."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Generator, Iterator
+from dataclasses import replace
+from itertools import count, islice
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import RecordedFrame, Recording
+from birdslam.geometry.camera import Camera, Undistorter
+from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, SourceConfig
+from birdslam.types import Frame, Status
+
+SOURCES = "kitti:DIR, video:FILE, mcap:FILE, demo, v4l2:/dev/videoN or rtsp://HOST/PATH"
+LIVE_RATE_HZ = 30.0  # of a camera that does not say
+
+log = logging.getLogger(__name__)
+
+
+class SourceError(RuntimeError):
+    """A camera or stream that can't be opened or delivers nothing more; the message names it."""
+
+
+class Source(Protocol):
+    """Frames of one camera. A `live` one stamps them with CLOCK_MONOTONIC and doesn't wait for its reader."""
+
+    name: str
+    camera: Camera
+    rate_hz: float
+    live: bool
+
+    def frames(self) -> Generator[RecordedFrame]: ...
+
+    def resume(self, frame_id: int, t_source_ns: int) -> None:
+        """Told before `frames` is asked for: a capture before this one died, and the next frame is `frame_id`."""
+
+
+def open_source(configuration: Configuration, must_open: bool = True) -> Source:
+    """The source that the configuration names; without `must_open` a camera may be gone for now.
+
+    Raises ConfigurationError or datasets.DatasetError where it can't be one, SourceError where a camera does not open.
+    """
+    source = configuration.source
+    scheme, colon, address = source.uri.partition(":")
+    if colon and scheme == "mcap" and address:
+        from birdslam.runtime.recording.recorded_images import (
+            RecordedImages,  # only where it is needed: Foxglove's types and mcap
+        )
+
+        images = RecordedImages(Path(address).expanduser(), configuration.camera, source.stride)
+        return RecordedSource(images, source)
+    if scheme in FILE_SCHEMES and (colon or scheme == "demo"):
+        return RecordedSource(open_recording(source.uri, configuration.camera, source.stride), source)
+    if colon and scheme in ("v4l2", "rtsp") and address:
+        if configuration.camera is None:
+            raise ConfigurationError(f"{source.uri}: a live camera needs a camera file (--camera FILE)")
+        if source.rate == "max":
+            raise ConfigurationError(f'{source.uri}: rate "max" is for recordings; a live camera has its own')
+        return CameraSource(source, configuration.camera, must_open)
+    if not source.uri:
+        raise ConfigurationError(f"no source: give --source {SOURCES}")
+    raise ConfigurationError(f"source {source.uri!r}: expected {SOURCES}")
+
+
+class RecordedSource:
+    """A recording, once or in a loop whose time stamps go on."""
+
+    live = False
+
+    def __init__(self, recording: Recording, config: SourceConfig) -> None:
+        self.recording = recording
+        self.name = recording.name
+        self.camera = recording.camera
+        self.rate_hz = recording.rate_hz
+        self._config = config
+        self._start = 0
+        self._resume_ns = 0
+
+    def resume(self, frame_id: int, t_source_ns: int) -> None:
+        """A recording goes on at its frame of that number; in a loop its time goes on too."""
+        self._start, self._resume_ns = frame_id, t_source_ns
+
+    def frames(self) -> Generator[RecordedFrame]:
+        """Every frame in order, with growing time stamps."""
+        left = self._config.frames
+        with contextlib.closing(self._passes()) as passes:
+            yield from islice(passes, left if left is None else max(0, left - self._start))
+
+    def _passes(self) -> Generator[RecordedFrame]:
+        loops, start = (
+            divmod(self._start, len(self.recording)) if self._config.loop and self._start else (0, self._start)
+        )
+        shift_ns: int | None = None if loops else 0
+        while True:
+            first_ns = last_ns = None
+            for frame in self.recording.frames(start) if start else self.recording.frames():
+                if shift_ns is None:
+                    shift_ns = self._resume_ns - frame.t_source_ns
+                first_ns = frame.t_source_ns if first_ns is None else first_ns
+                last_ns = frame.t_source_ns
+                yield replace(frame, t_source_ns=frame.t_source_ns + shift_ns)
+            if not self._config.loop or first_ns is None or last_ns is None or shift_ns is None:
+                return
+            if start:  # the next pass begins at frame 0, whose time lies before this pass's first
+                first_ns, start = next(iter(self.recording.frames())).t_source_ns, 0
+            shift_ns += last_ns - first_ns + round(1e9 / self.rate_hz)
+
+
+class CameraSource:
+    """A camera of this computer (v4l2) or of the network (rtsp), through OpenCV."""
+
+    live = True
+
+    def __init__(self, config: SourceConfig, camera: Camera, must_open: bool = True) -> None:
+        """Raises SourceError where it does not open; without `must_open` that is a camera that is gone for now."""
+        self.name = self._uri = config.uri
+        self.camera = camera
+        self.rate_hz = config.rate if isinstance(config.rate, float) else LIVE_RATE_HZ
+        self._config = config
+        self._closing = threading.Event()
+        self._capture: cv2.VideoCapture | None = None
+        try:
+            self._capture = self._open()
+        except SourceError:
+            if must_open:
+                raise
+
+    def _open(self) -> cv2.VideoCapture:
+        scheme, _, address = self._uri.partition(":")
+        timeout_ms = round(self._config.camera_timeout_s * 1e3)
+        if scheme == "v4l2":
+            if not Path(address).exists():
+                raise SourceError(f"{self._uri}: there is no device {address}")
+            capture = cv2.VideoCapture(address, cv2.CAP_V4L2)
+            if capture.isOpened():
+                capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.camera.width_px)
+                capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.camera.height_px)
+                if isinstance(self._config.rate, float):
+                    capture.set(cv2.CAP_PROP_FPS, self._config.rate)
+                capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an older image is worth less than a lost one
+        else:
+            limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms]
+            capture = cv2.VideoCapture(self._uri, cv2.CAP_FFMPEG, limits)
+        if not capture.isOpened():
+            raise SourceError(f"{self._uri}: does not open as a camera or video stream")
+        size = tuple(int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if size != (self.camera.width_px, self.camera.height_px):
+            capture.release()
+            raise SourceError(
+                f"{self._uri}: delivers {size[0]}x{size[1]} px, the camera file is for "
+                f"{self.camera.width_px}x{self.camera.height_px}"
+            )
+        self.rate_hz = capture.get(cv2.CAP_PROP_FPS) or self.rate_hz
+        return capture
+
+    def frames(self) -> Generator[RecordedFrame]:
+        """Frames by CLOCK_MONOTONIC; while the camera is gone, frames without an image, until it opens again."""
+        try:
+            for index in islice(count(), self._config.frames):
+                if self._capture is None or not self._capture.grab():
+                    self._reopen()
+                    yield RecordedFrame(index, time.monotonic_ns(), None, f"{self._uri}: delivers no frame")
+                    continue
+                t_ns = time.monotonic_ns()
+                ok, image = self._capture.retrieve()
+                if ok:
+                    yield RecordedFrame(index, t_ns, np.asarray(image, dtype=np.uint8), None)
+                else:
+                    yield RecordedFrame(index, t_ns, None, f"{self._uri}: frame {index} does not decode")
+        finally:
+            self.close()
+
+    def _reopen(self) -> None:
+        """One try; where it fails, a pause, so that planners hear of the loss at a fitting rate."""
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+        try:
+            self._capture = self._open()
+        except SourceError:
+            self._closing.wait(self._config.reopen_ms / 1e3)
+
+    def resume(self, frame_id: int, t_source_ns: int) -> None:
+        """A camera just goes on."""
+
+    def close(self) -> None:
+        """Lets the camera go."""
+        self._closing.set()
+        if self._capture is not None:
+            self._capture.release()
+
+
+def to_frame(
+    undistort: Undistorter, frame_id: int, recorded: RecordedFrame, t_capture_ns: int, t_utc_ns: int = 0
+) -> Frame:
+    """The one way from a source to the front end, live and in `evaluate`: an undistorted frame, or its status."""
+    image: NDArray[np.uint8] | None = None
+    error = recorded.error
+    if recorded.image is not None:
+        try:
+            image = undistort(recorded.image)
+        except ValueError as unfit:
+            error = str(unfit)
+    if image is None:
+        log.warning("frame %d is unreadable: %s", frame_id, error)
+    status = (Status.FRAME_UNREADABLE,) if image is None else ()
+    return Frame(frame_id, recorded.t_source_ns, t_capture_ns, t_utc_ns, image, status)
+
+
+def offline_frames(source: Source) -> Iterator[Frame]:
+    """All frames of a recording for one process; captured, so to say, when the source says."""
+    undistort = Undistorter(source.camera)
+    for frame_id, recorded in enumerate(source.frames()):
+        yield to_frame(undistort, frame_id, recorded, recorded.t_source_ns)
+
+
+class Pacer:
+    """When each frame of a recording is due on CLOCK_MONOTONIC: deadlines from the first one on, so nothing drifts."""
+
+    def __init__(self, rate: float | str | None) -> None:
+        self._rate = rate
+        self._start_ns: int | None = None
+        self._first_source_ns = 0
+
+    def due_ns(self, frame_id: int, t_source_ns: int, now_ns: int) -> int:
+        """The deadline of a frame; the first one asked for is due now."""
+        if self._rate == "max":
+            return now_ns
+        if self._start_ns is None:
+            self._start_ns, self._first_source_ns, self._first_frame = now_ns, t_source_ns, frame_id
+        if isinstance(self._rate, str) or self._rate is None:
+            return self._start_ns + t_source_ns - self._first_source_ns
+        return self._start_ns + round((frame_id - self._first_frame) * 1e9 / self._rate)
+
+
+class ReadAhead:
+    """Reads a source in a thread of its own, so that neither decoding nor a slow reader holds up the other.
+
+    `capacity` frames wait. Of a live source the oldest gives way to a new one and is counted in `dropped`; a recording
+    waits instead. Numbers the frames from `first_frame` on, the dropped ones too.
+    """
+
+    def __init__(self, source: Source, capacity: int, first_frame: int = 0) -> None:
+        self.dropped = 0
+        self._first_frame = first_frame
+        self.read = 0
+        self._source = source
+        self._capacity = capacity
+        self._waiting: deque[tuple[int, RecordedFrame]] = deque()
+        self._changed = threading.Condition()
+        self._ended = False
+        self._closed = False
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="read-ahead", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            with contextlib.closing(self._source.frames()) as frames:
+                for frame_id, recorded in enumerate(frames, self._first_frame):
+                    with self._changed:
+                        self.read += 1
+                        if self._source.live and len(self._waiting) == self._capacity:
+                            self._waiting.popleft()
+                            self.dropped += 1
+                        self._changed.wait_for(lambda: self._closed or len(self._waiting) < self._capacity)
+                        if self._closed:
+                            return
+                        self._waiting.append((frame_id, recorded))
+                        self._changed.notify_all()
+        except Exception as error:  # handed to the reader, who raises it
+            self._error = error
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def next(self, timeout_s: float) -> tuple[int, RecordedFrame] | None:
+        """The next frame and its number; None where none came in time.
+
+        Raises EndOfSource when there is no further one, and whatever the source raised.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._waiting) or self._ended, timeout_s)
+            if self._waiting:
+                item = self._waiting.popleft()
+                self._changed.notify_all()
+                return item
+            if not self._ended:
+                return None
+        if self._error is not None:
+            raise self._error
+        raise EndOfSource
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Ends the thread; one that is stuck in a camera's driver is left to the end of the process."""
+        with self._changed:
+            self._closed = True
+            self._waiting.clear()
+            self._changed.notify_all()
+        self._thread.join(timeout_s)
+
+
+class EndOfSource(Exception):
+    """The source has no further frame."""

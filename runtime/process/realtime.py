@@ -1,0 +1,115 @@
+"""Scheduling and memory of a node's process, as far as the system permits; called when its work begins.
+
+It holds for the threads that exist (the networks', OpenCV's), and later ones inherit it (zenoh's): a spare that still
+loads must not go before the nodes at work.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import resource
+from collections.abc import Iterator
+
+from birdslam.runtime.configuration import Configuration
+
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_CAP_IPC_LOCK = 14
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of mallopt(3)
+_OBJECT_BYTES, _ANCHORED = 400, 256  # of Python's small objects, and how many in a row have one that stays
+_MIB = 1 << 20
+
+NODE_IMAGES = {"capture": 8, "perceive": 40}  # of the camera's size, in colour, that a node has at once at its worst
+NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, 4.0
+
+_TUPLE_SIZES, _TUPLES_KEPT = range(1, 21), 2_000  # what CPython keeps of freed ones, of each size
+
+_anchors: list[bytes] = []  # for ever: memory that holds one of these is not given back
+
+
+def apply(node: str, configuration: Configuration) -> Iterator[str]:
+    """Sets what is configured, and gives a line for each thing that was not to be had."""
+    realtime, live = configuration.realtime, configuration.live
+    scheduling = realtime.of(node)
+    if scheduling.cpus:
+        try:
+            for thread in _threads():
+                os.sched_setaffinity(thread, scheduling.cpus)
+        except OSError as error:
+            cpus = ", ".join(map(str, scheduling.cpus))
+            yield f"realtime.{node}.cpus: can't run on cores {cpus} ({error.strerror}): runs on any"
+    if realtime.fifo == "on" or (realtime.fifo == "auto" and live):
+        try:
+            for thread in _threads():
+                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(scheduling.priority))
+        except PermissionError:
+            yield "realtime.fifo: SCHED_FIFO is not permitted (LimitRTPRIO=, CAP_SYS_NICE): runs at normal priority"
+    if realtime.lock_memory == "on" or (realtime.lock_memory == "auto" and live):
+        if not may_lock_memory():
+            yield "realtime.lock_memory: locking memory is not permitted (LimitMEMLOCK=infinity): it may be paged out"
+        elif ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
+            yield f"realtime.lock_memory: {os.strerror(ctypes.get_errno())}: memory may be paged out"
+
+
+def reserve_for(node: str, configuration: Configuration) -> None:
+    """`reserve` for what a node makes at work, when all that it loads is there."""
+    camera = configuration.camera
+    image_mib = 0.0 if camera is None else 3 * camera.width_px * camera.height_px / _MIB
+    reserve(NODE_OBJECTS_MIB, NODE_HEAP_MIB + NODE_IMAGES.get(node, 0) * image_mib)
+
+
+def one_heap() -> None:
+    """All threads of this process take from one heap (glibc's), which keeps what is freed.
+
+    Call it before the process has threads: a heap that one of them has begun goes on growing. The nodes have it from
+    their environment (`cli.ENVIRONMENT`), which the process that sets it has read too early.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_ARENA_MAX, 1)
+        mallopt(_M_MMAP_THRESHOLD, 32 * _MIB)
+        mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def reserve(objects_mib: float, heap_mib: float) -> None:
+    """Takes memory for so much of small objects and of larger blocks now, for this process to fill later.
+
+    What grows up to a bound then grows into memory that is there, and its pages do not fault in the middle of a drive.
+    It serves every thread where `one_heap` went before the first of them; elsewhere than in glibc it reserves objects
+    alone.
+    """
+    one_heap()
+    small = [bytes(_OBJECT_BYTES) for _ in range(round(objects_mib * _MIB / _OBJECT_BYTES))]
+    _anchors.extend(small[::_ANCHORED])
+    del small
+    blocks = [bytearray(b"\1") * (_MIB // 4) for _ in range(round(4 * heap_mib))]
+    del blocks
+
+
+def settle() -> None:
+    """What was built lives to the end and is never walked again; and Python's store of freed tuples is full.
+
+    CPython keeps freed tuples for later. A drive that fills this store alone, some 4 MiB, grows for half an hour.
+    """
+    gc.collect()
+    gc.freeze()
+    tuples = [tuple([None] * size) for size in _TUPLE_SIZES for _ in range(_TUPLES_KEPT)]
+    del tuples
+
+
+def _threads() -> list[int]:
+    return [int(name) for name in os.listdir("/proc/self/task")]
+
+
+def may_lock_memory() -> bool:
+    """Without a limit: under one, a locked process would fail where it first needs more."""
+    return resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or _has(_CAP_IPC_LOCK)
+
+
+def _has(capability: int) -> bool:
+    with open("/proc/self/status") as status:
+        for line in status:
+            if line.startswith("CapEff:"):
+                return bool(int(line.split()[1], 16) >> capability & 1)
+    return False

@@ -1,0 +1,184 @@
+"""What a drive looks like: its records as messages that Foxglove draws.
+
+Frames: `world` (of the epoch at hand), `ego`, `camera`; z is up in the first two, as everywhere in types.py.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.runtime.recording.foxglove import (
+    ALL,
+    LINE_LOOP,
+    LINE_STRIP,
+    CameraCalibration,
+    Color,
+    CompressedImage,
+    CubePrimitive,
+    FoxglovePose,
+    FrameTransform,
+    ImageAnnotations,
+    LinePrimitive,
+    Point2,
+    PointCloud,
+    PointsAnnotation,
+    PoseInFrame,
+    Quaternion,
+    SceneEntity,
+    SceneEntityDeletion,
+    SceneUpdate,
+    TextAnnotation,
+    TextPrimitive,
+    Time,
+    Vector3,
+)
+from birdslam.trajectory import NS_PER_S, Pose, ego_pose, mount_pose
+from birdslam.types import Attitude, Estimate, MapUpdate, Measurements, VehicleEstimate
+
+VEHICLE_HEIGHT_M = 1.5  # drawn; no height is estimated
+ELLIPSE_POINTS = 24
+EGO, VEHICLE, UNSEEN = Color(0.1, 0.4, 0.9), Color(0.9, 0.4, 0.1), Color(0.6, 0.6, 0.6)
+
+CHANNELS: dict[str, type[msgspec.Struct]] = {
+    "/tf": FrameTransform,
+    "/ego": PoseInFrame,
+    "/scene": SceneUpdate,
+    "/road": PointCloud,
+    "/map": PointCloud,
+    "/camera/boxes": ImageAnnotations,
+    "/camera/calibration": CameraCalibration,
+    "/camera/image": CompressedImage,
+}
+
+Drawn = tuple[str, msgspec.Struct]  # channel, message
+
+
+def timestamp(t_ns: int) -> Time:
+    """Nanoseconds since 1970."""
+    sec, nsec = divmod(max(t_ns, 0), NS_PER_S)
+    return Time(sec, nsec)
+
+
+def from_estimate(estimate: Estimate, t_ns: int) -> Iterator[Drawn]:
+    """Where everybody is; the ellipses are of 2 sigma."""
+    t, T_world_ego = timestamp(t_ns), ego_pose(estimate.T_world_ego, estimate.attitude)
+    at = _pose(T_world_ego)
+    yield (
+        "/tf",
+        FrameTransform(
+            timestamp=t, parent_frame_id="world", child_frame_id="ego", translation=at.position, rotation=at.orientation
+        ),
+    )
+    yield "/ego", PoseInFrame(timestamp=t, frame_id="world", pose=at)
+    z_m = estimate.attitude.z_m
+    outline = _ellipse(estimate.T_world_ego, estimate.cov, z_m, EGO if estimate.valid else UNSEEN)
+    entities = [SceneEntity(timestamp=t, frame_id="world", id="ego", lines=(outline,))]
+    entities += [_entity(vehicle, t, z_m) for vehicle in estimate.vehicles]
+    gone = SceneEntityDeletion(timestamp=t, type=ALL)
+    yield "/scene", SceneUpdate(deletions=(gone,), entities=tuple(entities))
+
+
+def from_measurements(measurements: Measurements, t_ns: int) -> Iterator[Drawn]:
+    """The boxes in the image, and what was seen of the road in this frame, in ego."""
+    t = timestamp(t_ns)
+    boxes, texts = [], []
+    for edge in measurements.cv:
+        x1, y1, x2, y2 = edge.box_px
+        corners = tuple(Point2(x, y) for x, y in ((x1, y1), (x2, y1), (x2, y2), (x1, y2)))
+        boxes.append(PointsAnnotation(timestamp=t, points=corners, outline_color=VEHICLE))
+        text = f"{edge.label} {edge.vehicle}  {math.hypot(edge.T_ego_vehicle.x_m, edge.T_ego_vehicle.y_m):.1f} m"
+        texts.append(TextAnnotation(timestamp=t, position=Point2(x1, y1), text=text))
+    yield "/camera/boxes", ImageAnnotations(points=tuple(boxes), texts=tuple(texts))
+    seen = [(point.x_m, point.y_m) for point in measurements.lanes]
+    seen += [(edge.x_m, edge.y_m) for edge in measurements.cp]
+    yield "/road", PointCloud(timestamp=t, frame_id="ego", data=_packed(seen))
+
+
+def from_map(update: MapUpdate, t_ns: int) -> Iterator[Drawn]:
+    """What the map gained, in world."""
+    points = [*update.landmarks_m, *update.lanes_m]
+    if points:
+        yield "/map", PointCloud(timestamp=timestamp(t_ns), frame_id="world", data=_packed(points))
+
+
+def from_camera(camera: Camera, t_ns: int) -> Iterator[Drawn]:
+    """The calibrated camera over the road; images are recorded without their distortion."""
+    t, mount = timestamp(t_ns), _pose(mount_pose(camera.ground))
+    K = tuple(camera.K.ravel().tolist())
+    P = tuple(np.hstack([camera.K, np.zeros((3, 1))]).ravel().tolist())
+    width, height = camera.width_px, camera.height_px
+    yield (
+        "/camera/calibration",
+        CameraCalibration(timestamp=t, frame_id="camera", width=width, height=height, K=K, P=P),
+    )
+    yield (
+        "/tf",
+        FrameTransform(
+            timestamp=t,
+            parent_frame_id="ego",
+            child_frame_id="camera",
+            translation=mount.position,
+            rotation=mount.orientation,
+        ),
+    )
+
+
+def from_image(image: NDArray[np.uint8], jpeg_quality: int, t_ns: int) -> Drawn:
+    """An image (H, W) grey or (H, W, 3) BGR as JPEG."""
+    _, jpeg = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality))
+    data = jpeg.tobytes()
+    return "/camera/image", CompressedImage(timestamp=timestamp(t_ns), frame_id="camera", data=data, format="jpeg")
+
+
+def ellipse(T_world_body: SE2, cov: tuple[float, ...], sigmas: float = 2.0) -> NDArray[np.float64]:
+    """(ELLIPSE_POINTS, 2) in world: where the body lies, by its covariance in the tangent at its pose."""
+    place = np.array(cov).reshape(3, 3)[:2, :2]
+    spread, axes = np.linalg.eigh((place + place.T) / 2.0)
+    angle = np.linspace(0.0, 2.0 * math.pi, ELLIPSE_POINTS, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    around: NDArray[np.float64] = T_world_body @ (sigmas * circle * np.sqrt(np.maximum(spread, 0.0)) @ axes.T)
+    return around
+
+
+def _ellipse(body: SE2, cov: tuple[float, ...], z_m: float, color: Color) -> LinePrimitive:
+    points = tuple(Vector3(x, y, z_m) for x, y in ellipse(body, cov).tolist())
+    return LinePrimitive(type=LINE_LOOP, points=points, color=color)
+
+
+def _entity(vehicle: VehicleEstimate, t: Time, z_m: float) -> SceneEntity:
+    pose = _pose(ego_pose(vehicle.T_world_vehicle, Attitude(z_m=z_m + VEHICLE_HEIGHT_M / 2.0)))
+    at, (vx, vy) = pose.position, vehicle.velocity_mps
+    color = VEHICLE if vehicle.age_ns == 0 else UNSEEN
+    above = FoxglovePose(Vector3(at.x, at.y, z_m + VEHICLE_HEIGHT_M + 0.8))
+    in_a_second = LinePrimitive(type=LINE_STRIP, points=(at, Vector3(at.x + vx, at.y + vy, at.z)), color=color)
+    return SceneEntity(
+        timestamp=t,
+        frame_id="world",
+        id=f"vehicle {vehicle.vehicle}",
+        cubes=(
+            CubePrimitive(pose=pose, size=Vector3(vehicle.length_m, vehicle.width_m, VEHICLE_HEIGHT_M), color=color),
+        ),
+        lines=(_ellipse(vehicle.T_world_vehicle, vehicle.cov, z_m, color), in_a_second),
+        texts=(TextPrimitive(pose=above, text=f"{vehicle.label} {vehicle.vehicle}  {math.hypot(vx, vy):.1f} m/s"),),
+    )
+
+
+def _pose(T_a_b: Pose) -> FoxglovePose:
+    x, y, z, w = Rotation.from_matrix(T_a_b[:3, :3]).as_quat().tolist()
+    return FoxglovePose(Vector3(*T_a_b[:3, 3].tolist()), Quaternion(x, y, z, w))
+
+
+def _packed(points_m: list[tuple[float, float]]) -> bytes:
+    flat = np.zeros((len(points_m), 3), dtype="<f4")
+    if points_m:
+        flat[:, :2] = points_m
+    return flat.tobytes()

@@ -1,0 +1,293 @@
+"""A recording's measurements through the back end alone, without a network or a camera.
+
+`compare` gives the recorded estimates bit for bit, or the first that differs. What the optimizer was given, and in
+which order, stands in the traces: each estimate bears the one of the message that it answers, so nothing is guessed
+from the clock. What a recording can leave open, it is held to one by one, and the next estimate decides, bit for bit:
+
+- measurements that no estimate answers: the optimizer never had them, or its estimate was lost on its way here;
+- a restart of the optimizer (the recording has it come alive again): in a new epoch, or from its last checkpoint, from
+  which on it was given all measurements.
+
+Where measurements are missing that the optimizer had, its graph is not known any more: nothing is compared until a new
+epoch begins, and that is counted. A file that begins in the middle of a drive, since the recorder died, has in it the
+graph of one frame, from which on it is compared. `estimates` is the same with another configuration, as a new result.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+
+from birdslam.graph.checkpoint import CheckpointError
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.runtime.configuration import DegradationConfig
+from birdslam.runtime.nodes.coasting import TOLD_AGAIN, unmeasured
+from birdslam.runtime.nodes.optimize import farewell
+from birdslam.runtime.recording.recording import CHECKPOINT, Alive, GraphCheckpoint, Recording, RecordingError
+from birdslam.runtime.replay.verdict import Difference, Verdict, differing
+from birdslam.runtime.wire import Trace, WireError, decode, encode
+from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
+
+BackEnd = tuple[GraphConfig, WeightsConfig]
+PATIENCE = 64  # estimates that wait for measurements which were written after them
+KEPT_FRAMES = 256  # references of frames, for those that the optimizer coasted over
+COMPARED = (
+    *("v1/frame", "v1/measurements", "v1/measurements/trace", "v1/estimate", "v1/estimate/trace"),
+    *("v1/map", "/alive"),
+)
+
+
+class _Message(msgspec.Struct):
+    data: bytes
+    trace: Trace
+
+
+@dataclass
+class _State:
+    """The optimizer, as far as estimates follow from it."""
+
+    graph: PoseGraph
+    last: Estimate | None = None  # that rests on measurements
+    untold: tuple[Status, ...] = ()
+    maps: list[MapUpdate] = field(default_factory=list)
+
+    def measure(self, measurements: Measurements) -> Estimate:
+        """One frame's, as OptimizeNode.step."""
+        if Status.END_OF_SOURCE in measurements.status:
+            return farewell(measurements, self.graph.epoch, self.last)
+        self.last = self.graph.update(measurements)
+        gained = self.graph.map_update()
+        self.maps = [gained] if gained else []
+        return self.last
+
+    def tell(self, estimate: Estimate) -> Estimate:
+        """With what had yet to be told."""
+        if not self.untold:
+            return estimate
+        status = tuple(dict.fromkeys((*estimate.status, *self.untold)))
+        self.untold = ()
+        return msgspec.structs.replace(estimate, status=status)
+
+
+class Comparison:
+    """Goes through a recording once."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.verdict = Verdict()
+        self._recording = recording
+        self._back_end = back_end(recording)
+        self._coast_max_ns = round(recording.part("degradation", DegradationConfig).coast_max_ms * 1e6)
+        self._state: _State | None = None
+        self._measurements: deque[_Message] = deque()
+        self._estimates: deque[_Message] = deque()
+        self._frames: dict[int, FrameRef] = {}
+        self._maps: dict[int, MapUpdate] = {}
+        self._alive = 0  # how often the optimizer came
+        self._checkpoint = _checkpoint(recording)
+        self._since: list[Measurements] = []  # after it, for the first estimate that can be compared
+        self._epoch: int | None = None
+
+    def run(self) -> Verdict:
+        """Raises RecordingError where the recording holds something that is no record."""
+        data = b""
+        for message in self._recording.messages(COMPARED):
+            if message.channel in ("v1/measurements", "v1/estimate"):
+                data = message.data
+            elif message.channel == "v1/measurements/trace":
+                self._measurements.append(_Message(data, _record(message.data, Trace)))
+            elif message.channel == "v1/estimate/trace":
+                self._estimates.append(_Message(data, _record(message.data, Trace)))
+            elif message.channel == "v1/frame":
+                ref = _record(message.data, FrameRef)
+                self._frames[ref.frame_id] = ref
+                if len(self._frames) > KEPT_FRAMES:
+                    del self._frames[next(iter(self._frames))]
+            elif message.channel == "v1/map":
+                self._compare_map(_record(message.data, MapUpdate))
+            else:
+                event = msgspec.json.decode(message.data, type=Alive)
+                self._alive += event.alive and event.node == "optimize"
+            self._answer(PATIENCE)
+            if self.verdict.difference is not None:
+                return self.verdict
+        if not self._recording.complete:
+            self._leave_open_end()
+        self._answer(0)
+        self.verdict.open_end += len(self._measurements)
+        return self.verdict
+
+    def _leave_open_end(self) -> None:
+        """A file that was cut off may have lost the measurements behind its last estimates, which came first."""
+        recorded = [m.trace.stages for m in self._measurements]
+        while self._estimates:
+            cause = self._estimates[-1].trace.stages[:-1]
+            if not cause or cause[-1].node != "perceive" or cause in recorded:
+                return
+            self._estimates.pop()
+            self.verdict.open_end += 1
+
+    def _answer(self, patience: int) -> None:
+        """Replays the estimates whose measurements are there; more than `patience` of them do not wait for theirs."""
+        while self._estimates and self.verdict.difference is None:
+            message = self._estimates[0]
+            cause = message.trace.stages[:-1]
+            by_measurements = bool(cause) and cause[-1].node == "perceive"
+            place = next((i for i, m in enumerate(self._measurements) if m.trace.stages == cause), None)
+            if by_measurements and place is None and len(self._estimates) <= patience:
+                return
+            self._estimates.popleft()
+            estimate = _record(message.data, Estimate)
+            self.verdict.epochs += estimate.epoch != self._epoch
+            self._epoch = estimate.epoch
+            if not by_measurements:
+                self._replay(estimate, message.data, [], None)
+            elif place is None:  # the optimizer had measurements that the recording has not
+                self._state = None
+                self.verdict.unknown += 1
+            else:
+                given = [_record(self._measurements.popleft().data, Measurements) for _ in range(place + 1)]
+                self.verdict.unanswered += place
+                self._replay(estimate, message.data, given[:-1], given[-1])
+
+    def _replay(
+        self, estimate: Estimate, data: bytes, open_: list[Measurements], answered: Measurements | None
+    ) -> None:
+        """One estimate by each of the ways in which it may have come about; shown is the last, where none gives it."""
+        likeliest: Estimate | None = None
+        for state, given, restarted in self._ways(estimate, open_, answered):
+            replayed = self._through(state, given, estimate)
+            if replayed is None:
+                continue
+            likeliest = replayed
+            if _canonical(replayed) == data:
+                self._state = state
+                self._maps |= {gained.frame_id: gained for gained in state.maps}
+                self.verdict.equal += 1
+                self.verdict.coasted += answered is None
+                self.verdict.restarts += restarted
+                return
+        if likeliest is None:
+            self.verdict.unknown += 1
+        else:
+            self.verdict.difference = Difference(estimate.frame_id, differing(estimate, likeliest))
+
+    def _ways(
+        self, estimate: Estimate, open_: list[Measurements], answered: Measurements | None
+    ) -> Iterator[tuple[_State, list[Measurements], bool]]:
+        """(state before, measurements given to it, whether the optimizer was begun anew)."""
+        now = [] if answered is None else [answered]
+        new_world = Status.GRAPH_RESET in estimate.status
+        checkpoint = self._checkpoint
+        if self._state is None:
+            at_first = self.verdict.equal + self.verdict.unknown == 0 and checkpoint is None
+            if checkpoint is not None:
+                self._since += [m for m in (*open_, *now) if m.frame_id > checkpoint.frame_id]
+                answered_in_time = bool(now and self._since) and self._since[-1].frame_id == estimate.frame_id
+                if answered_in_time and estimate.epoch == checkpoint.epoch:
+                    yield _State(PoseGraph.restore(checkpoint.data, *self._back_end)), self._since, False
+            if new_world or at_first:
+                yield self._fresh(estimate), now, False
+            return
+        came_again = self._alive - 1 > self.verdict.restarts
+        if came_again and new_world:
+            yield self._fresh(estimate), now, True
+        if came_again and Status.GRAPH_RESTORED in estimate.status:
+            for last in (self._state.last, None):
+                restored = self._copy()
+                restored.last, restored.untold = last, (Status.GRAPH_RESTORED,)
+                yield restored, [*open_, *now], True
+        if open_:
+            yield self._copy(), now, False
+        yield self._state, [*open_, *now], False
+
+    def _copy(self) -> _State:
+        """The state at hand, so that it can be gone on from in several ways."""
+        assert self._state is not None
+        graph = PoseGraph.restore(self._state.graph.checkpoint(), *self._back_end)
+        return _State(graph, self._state.last, self._state.untold)
+
+    def _fresh(self, estimate: Estimate) -> _State:
+        """A new graph; planners are told where they may know an older one."""
+        untold = (Status.GRAPH_RESET,) if Status.GRAPH_RESET in estimate.status else ()
+        return _State(PoseGraph(*self._back_end, estimate.epoch), untold=untold)
+
+    def _through(self, state: _State, given: list[Measurements], estimate: Estimate) -> Estimate | None:
+        """What comes out for the frame of `estimate`; None where it can't be known."""
+        replayed = None
+        for measurements in given:
+            replayed = state.measure(measurements)
+        if replayed is not None and replayed.frame_id < estimate.frame_id:  # late: a newer frame had been coasted over
+            state.untold = (*state.untold, *(s for s in replayed.status if s in TOLD_AGAIN))
+        if replayed is None or replayed.frame_id != estimate.frame_id:
+            ref = self._frames.get(estimate.frame_id)
+            if ref is None:
+                return None
+            replayed = state.graph.update(unmeasured(ref, state.last, self._coast_max_ns))
+        if Status.END_OF_SOURCE in replayed.status:
+            return replayed
+        return state.tell(replayed)
+
+    def _compare_map(self, recorded: MapUpdate) -> None:
+        """What the map gained with a frame that was equal must be equal too; it is written after its estimate."""
+        self._answer(PATIENCE)
+        replayed = self._maps.pop(recorded.frame_id, None)
+        if replayed is None:
+            return
+        if _canonical(replayed) == encode(recorded):
+            self.verdict.maps += 1
+        elif self.verdict.difference is None:
+            self.verdict.difference = Difference(recorded.frame_id, differing(recorded, replayed))
+
+
+def _checkpoint(recording: Recording) -> GraphCheckpoint | None:
+    """The graph that a file begins with whose beginning another one has. Raises RecordingError."""
+    if not recording.about.restarts:
+        return None
+    for message in recording.messages((CHECKPOINT,)):
+        try:
+            checkpoint = msgspec.msgpack.decode(message.data, type=GraphCheckpoint)
+            PoseGraph.restore(checkpoint.data, *back_end(recording))
+        except (msgspec.DecodeError, CheckpointError) as error:
+            raise RecordingError(f"{recording.path}: its checkpoint {error}") from None
+        return checkpoint
+    return None
+
+
+def compare(recording: Recording) -> Verdict:
+    """Whether the back end gives the recorded estimates, bit for bit."""
+    return Comparison(recording).run()
+
+
+def back_end(recording: Recording) -> BackEnd:
+    """What the graph was made with. Raises RecordingError where it is of another version."""
+    return recording.part("slam.graph", GraphConfig), recording.part("slam.weights", WeightsConfig)
+
+
+def estimates(recording: Recording, config: BackEnd) -> Iterator[Estimate | MapUpdate]:
+    """What the back end makes of the recorded measurements with another configuration."""
+    graph = PoseGraph(*config)
+    for message in recording.messages(("v1/measurements",)):
+        measurements = _record(message.data, Measurements)
+        if Status.END_OF_SOURCE in measurements.status:
+            continue
+        yield graph.update(measurements)
+        gained = graph.map_update()
+        if gained is not None:
+            yield gained
+
+
+def _canonical(record: msgspec.Struct) -> bytes:
+    """The bytes of the record as whoever received it would send it on."""
+    return encode(decode(encode(record), type(record)))
+
+
+def _record(data: bytes, kind: type[Any]) -> Any:
+    try:
+        return decode(data, kind)
+    except WireError as error:
+        raise RecordingError(f"the recording holds no valid {kind.__name__}: {error}") from None

@@ -1,0 +1,34 @@
+"""What a replay came to, for a person."""
+
+from __future__ import annotations
+
+from birdslam.runtime.recording.recording import Recording
+from birdslam.runtime.replay.verdict import Verdict
+
+SHOWN_FIELDS = 12
+
+
+def told(verdict: Verdict, recording: Recording) -> str:
+    """The verdict for a person."""
+    lines = [
+        f"equal bit for bit: {verdict.equal} estimates ({verdict.coasted} of them coasted), {verdict.maps} map updates",
+        f"epochs: {verdict.epochs}, restarts of the optimizer: {verdict.restarts}",
+    ]
+    if verdict.unanswered:
+        lines.append(f"measurements without an estimate: {verdict.unanswered}")
+    if verdict.unknown:
+        lines.append(f"not compared, since the measurements behind them were not recorded: {verdict.unknown} estimates")
+    if not recording.complete:
+        lines.append(f"the recording was cut off: {verdict.open_end} records at its end lack their counterpart")
+    if recording.damaged:
+        lines.append(f"damaged chunks left out: {recording.damaged}")
+    difference = verdict.difference
+    if difference is not None:
+        lines.append(f"frame {difference.frame_id} DIFFERS, the first that does:")
+        shown = difference.fields[:SHOWN_FIELDS]
+        lines += [f"  {where}: recorded {recorded}, replayed {replayed}" for where, recorded, replayed in shown]
+        if len(difference.fields) > SHOWN_FIELDS:
+            lines.append(f"  and {len(difference.fields) - SHOWN_FIELDS} more")
+    elif not verdict.equal:
+        lines.append("nothing could be compared")
+    return "\n".join(lines)

@@ -1,0 +1,72 @@
+"""What a person sees of a run: a refreshed line on a terminal, entries in systemd's journal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from typing import TextIO
+
+from birdslam.runtime.supervision.journal import Priority, journal_behind
+from birdslam.runtime.topology import NODES
+
+JOURNAL_PERIOD_S = 60.0  # of the status in the journal; `systemctl status` has the newest
+
+
+class LiveLine:
+    """A status line that lines of text may interrupt. Where `stream` is no terminal, the status is a line a second.
+
+    In the journal it is an entry a minute, and what a node says is a warning with the field BIRDSLAM_NODE.
+    A line that can't be written (a full disk) is counted in `lost`, and the vehicle drives on; a closed pipe is
+    BrokenPipeError.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self.terminal = stream.isatty()
+        self._journal = journal_behind(stream)
+        self.period_s = 0.2 if self.terminal else JOURNAL_PERIOD_S if self._journal else 1.0
+        self.lost = 0
+        self._shown = False
+        self._due_s = 0.0
+
+    def update(self, status: str) -> None:
+        """Shows the status, if it is time for it."""
+        now_s = time.monotonic()
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + self.period_s
+        if self._journal:
+            self._journal.send(status, Priority.INFO, BIRDSLAM_EVENT="status")
+        elif self.terminal:
+            width = shutil.get_terminal_size().columns - 1
+            self._write(f"\r\x1b[K{status[:width]}")
+            self._shown = True
+        else:
+            self._write(f"{status}\n")
+
+    def say(self, text: str) -> None:
+        """A line that stays."""
+        self.clear()
+        if self._journal:
+            about = text.partition(" ")[0].rstrip(":")
+            if about in NODES:
+                self._journal.send(text, Priority.WARNING, BIRDSLAM_EVENT="warning", BIRDSLAM_NODE=about)
+            else:
+                self._journal.send(text, Priority.NOTICE, BIRDSLAM_EVENT="run")
+            return
+        self._write(f"{text}\n")
+
+    def clear(self) -> None:
+        """Takes the status away."""
+        if self._shown:
+            self._write("\r\x1b[K")
+            self._shown = False
+
+    def _write(self, text: str) -> None:
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except BrokenPipeError:
+            raise
+        except OSError:
+            self.lost += 1

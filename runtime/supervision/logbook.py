@@ -1,0 +1,156 @@
+"""The supervisor's ear: records every estimate and map update, and keeps the figures of the run."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, TypeVar
+
+from birdslam.runtime.latency import Distribution, stages
+from birdslam.runtime.transport.bus import Bus, BusClosed, Message
+from birdslam.types import Estimate, MapUpdate, Status
+
+QUEUE_FRAMES = 1024  # a disk that stalls for half a minute costs no row
+MAP_WAIT_S = 2.0  # for the last of the map, which optimize sends before the end
+RECENT_FRAMES = 32
+
+
+_Record = TypeVar("_Record", Estimate, MapUpdate)
+
+
+class Results(Protocol):
+    """What birdslam.results.Recorder does while a drive goes on."""
+
+    def add(self, estimate: Estimate) -> None: ...
+    def add_map(self, map_update: MapUpdate) -> None: ...
+
+
+class Logbook:
+    """Listens in a thread of its own from construction on; stands at a planner's place, so its ages are a planner's.
+
+    `event_fd` becomes readable when END_OF_SOURCE came back (`ended`), or recording failed (`error`). A `tolerant` one
+    goes on without recording where the disk fails it (`unwritten` says why): the vehicle drives on. `listeners` too
+    get all of it.
+    """
+
+    def __init__(self, bus: Bus, results: Results, tolerant: bool = False, listeners: Sequence[Results] = ()) -> None:
+        self.event_fd = os.eventfd(0)
+        self.ended = False
+        self.error: Exception | None = None
+        self.unwritten: OSError | None = None
+        self._tolerant = tolerant
+        self.recorded = 0
+        self.age = Distribution()
+        self.stages: dict[str, Distribution] = {}
+        self.statuses: Counter[str] = Counter()
+        self._results = results
+        self._listeners = tuple(listeners)
+        self._bus = bus
+        self._estimates = bus.subscriber("estimate", depth=QUEUE_FRAMES)
+        self._map = bus.subscriber("map", depth=QUEUE_FRAMES)
+        self._first_ns = self._last_ns = 0
+        self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT_FRAMES)  # received (ns), age (ms)
+        self._latest: Estimate | None = None
+        self._map_frame = -1  # of the newest map update
+        self._thread = threading.Thread(target=self._run, name="logbook", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            while not self.ended:
+                message = self._estimates.recv()
+                if message is not None:
+                    self._take(message)
+        except BusClosed:
+            return
+        except Exception as error:  # a full disk: the supervisor's to report
+            self.error = error
+        finally:
+            os.eventfd_write(self.event_fd, 1)
+
+    def _take(self, message: Message) -> None:
+        estimate: Estimate = message.record
+        if Status.END_OF_SOURCE in estimate.status:
+            self._take_map(until_frame=estimate.frame_id)
+            self.ended = True
+            return
+        self.statuses.update(status.value for status in estimate.status)
+        self._latest = estimate
+        if Status.PERCEPTION_LATE in estimate.status:  # nothing was measured: no row, and no frame that was processed
+            return
+        for listener in self._listeners:
+            listener.add(estimate)
+        self._write(self._results.add, estimate)
+        self._take_map()
+        age_ms = (message.t_received_ns - estimate.t_capture_ns) / 1e6
+        self.age.add(age_ms)
+        for name, ms in stages(message.trace, message.t_received_ns):
+            self.stages.setdefault(name, Distribution()).add(ms)
+        self._first_ns = self._first_ns or message.t_received_ns
+        self._last_ns = message.t_received_ns
+        self._recent.append((message.t_received_ns, age_ms))
+        self.recorded += 1
+
+    def _write(self, add: Callable[[_Record], None], record: _Record) -> None:
+        if self.unwritten is not None:
+            return
+        try:
+            add(record)
+        except OSError as error:
+            if not self._tolerant:
+                raise
+            self.unwritten = error
+
+    def _take_map(self, until_frame: int | None = None) -> None:
+        """What has arrived of the map; with `until_frame`, all up to the update of that frame."""
+        until_s = time.monotonic() + (MAP_WAIT_S if until_frame is not None else 0.0)
+        while self._map_frame != until_frame:
+            message = self._map.recv(max(0.0, until_s - time.monotonic()))
+            if message is None:
+                return
+            for listener in self._listeners:
+                listener.add_map(message.record)
+            self._write(self._results.add_map, message.record)
+            self._map_frame = message.record.frame_id
+
+    @property
+    def rate_hz(self) -> float:
+        """Over the whole run."""
+        span_ns = self._last_ns - self._first_ns
+        return (self.recorded - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
+
+    def status_line(self) -> str:
+        """What goes on now: rate, age, tracks and warnings of the newest frames."""
+        recent, latest = tuple(self._recent), self._latest
+        if latest is None or not recent:
+            return "waiting for the first frame"
+        span_ns = recent[-1][0] - recent[0][0]
+        rate_hz = (len(recent) - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
+        ages = sorted(age for _, age in recent)
+        trouble = " ".join(status.value for status in latest.status)
+        return (
+            f"frame {latest.frame_id}  {rate_hz:.1f} Hz  age {ages[len(ages) // 2]:.0f} ms (max {ages[-1]:.0f})  "
+            f"tracks {len(latest.vehicles)}  {'valid' if latest.valid else 'NOT VALID'}  {trouble}"
+        ).rstrip()
+
+    def figures(self) -> dict[str, Any]:
+        """For summary.json."""
+        return {
+            "rate_hz": round(self.rate_hz, 3),
+            "age_ms": self.age.summary(),
+            "stages_ms": {name: distribution.summary() for name, distribution in self.stages.items()},
+            "statuses": dict(sorted(self.statuses.items())),
+        }
+
+    def wait_over(self, timeout_s: float) -> None:
+        """Until the end was taken in, or recording failed."""
+        self._thread.join(timeout_s)
+
+    def close(self) -> None:
+        """Leaves the bus, which ends the thread."""
+        self._bus.close()
+        self._thread.join()
+        os.close(self.event_fd)

@@ -1,0 +1,144 @@
+"""A node's process as the supervisor holds it: started, watched by a pidfd, and asked for its last words."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+
+from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.environment import ENVIRONMENT, USER_ERROR_STATUS
+from birdslam.runtime.process.vitals import Vitals
+
+_SHOWN_LEVELS = (" WARNING ", " ERROR ", " CRITICAL ")
+
+
+class NodeLog:
+    """`logs/<node>.log`: what all processes of a node print, one after the other."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._read = 0
+        path.write_bytes(b"")
+
+    def new_warnings(self) -> list[str]:
+        """Lines that were logged as warnings or worse since the last call."""
+        with self.path.open("rb") as log:
+            log.seek(self._read)
+            whole, newline, _ = log.read().rpartition(b"\n")
+        self._read += len(whole) + len(newline)
+        lines = whole.decode(errors="replace").splitlines()
+        return [_message(line) for line in lines if any(level in line for level in _SHOWN_LEVELS)]
+
+    def size(self) -> int:
+        """In bytes, now."""
+        return self.path.stat().st_size
+
+    def lines(self, start: int) -> list[str]:
+        """The lines from byte `start` on, without empty ones."""
+        with self.path.open("rb") as log:
+            log.seek(start)
+            return [line for line in log.read().decode(errors="replace").splitlines() if line.strip()]
+
+
+class NodeProcess:
+    """One process of a node: it loads what it needs at once, and waits for `begin`."""
+
+    def __init__(
+        self, name: str, configuration: Configuration, log: NodeLog, module: str = "birdslam.runtime.nodes.runner"
+    ) -> None:
+        self.name = name
+        self.vitals = Vitals()
+        self.begun_s: float | None = None
+        self._log, self._log_start = log, log.size()
+        with log.path.open("ab") as output:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", module, name, str(self.vitals.fd), str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **ENVIRONMENT},
+                pass_fds=(self.vitals.fd,),
+                start_new_session=True,  # Ctrl-C at the terminal goes to the supervisor alone, which relays it
+            )
+        self.pidfd = os.pidfd_open(self._process.pid)
+        self._tell(configuration)
+
+    def begin(self, assignment: msgspec.Struct) -> None:
+        """Its work begins, with nothing more to be told."""
+        self.begun_s = time.monotonic()
+        self._tell(assignment)
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.close()
+        except BrokenPipeError:
+            return  # it died at once: its pidfd says so
+
+    def _tell(self, what: msgspec.Struct) -> None:
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(msgspec.json.encode(what) + b"\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            return  # it died at once: its pidfd says so
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def exit_status(self) -> int | None:
+        """As of Popen.returncode: negative for a signal; None while it runs."""
+        return self._process.poll()
+
+    @property
+    def ready(self) -> bool:
+        """It has said, once, that it is at work."""
+        return bool(self.vitals["ready"])
+
+    def silent_s(self) -> float:
+        """How long its loop has shown no life; 0 before it is ready."""
+        return (time.monotonic_ns() - self.vitals["beat_ns"]) / 1e9 if self.ready else 0.0
+
+    def send(self, number: signal.Signals) -> None:
+        """A signal, where it still runs."""
+        if self.exit_status is None:
+            self._process.send_signal(number)
+
+    def how(self) -> str:
+        """How it ended."""
+        status = self.exit_status
+        if status is not None and status < 0:
+            return f"was killed by {signal.Signals(-status).name}"
+        return f"failed with exit status {status}" if status else "ended before its source did"
+
+    def failure(self) -> str:
+        """Why it ended, for a person: exit status or signal, and its last words."""
+        lines = self._log.lines(self._log_start)
+        if self.exit_status == USER_ERROR_STATUS:
+            errors = [line for line in lines if " ERROR " in line]
+            return _message(errors[-1]) if errors else f"{self.name} can't use its configuration"
+        last = f"; its last line: {_message(lines[-1].strip())}" if lines else ""
+        return f"{self.name} {self.how()}{last} (log: {self._log.path})"
+
+    def close(self) -> None:
+        """Kills what still runs, and lets go of it."""
+        self.send(signal.SIGKILL)
+        self._process.wait()
+        if self.begun_s is None and self._process.stdin is not None:
+            self._process.stdin.close()
+        os.close(self.pidfd)
+        self.vitals.close()
+
+
+def _message(line: str) -> str:
+    """A log line without its date and level."""
+    for level in _SHOWN_LEVELS:
+        if level in line:
+            return line.partition(level)[2]
+    return line

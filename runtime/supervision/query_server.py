@@ -1,0 +1,59 @@
+"""The planner's door at the supervisor: the whole map, everybody's way so far, the configuration, for who asks.
+
+It lives through restarts of the nodes. Answers go in parts that each fit a message.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+
+from birdslam.mapping.atlas import Atlas
+from birdslam.queries import MapSnapshot, Trajectory
+from birdslam.runtime.configuration import Configuration, without_passwords
+from birdslam.runtime.transport.answer_parts import map_parts, trajectory_parts
+from birdslam.runtime.transport.bus import Bus
+from birdslam.runtime.transport.queries import Refusal, positive
+from birdslam.types import Estimate, MapUpdate
+
+
+class Door:
+    """Takes what comes out of the optimizer, and answers questions about all of it; until its bus is closed."""
+
+    def __init__(self, configuration: Configuration, bus: Bus) -> None:
+        self._configuration = configuration
+        self._atlas = Atlas(configuration.atlas)
+        self._newest: Estimate | None = None
+        self._turn = threading.Lock()  # one thread adds, another asks
+        bus.desk({"map": self._map, "trajectory": self._trajectory, "configuration": self._settings})
+
+    def add(self, estimate: Estimate) -> None:
+        """One frame's."""
+        with self._turn:
+            self._atlas.add(estimate)
+            self._newest = estimate
+
+    def add_map(self, update: MapUpdate) -> None:
+        """What the map gained with a frame whose estimate was added before."""
+        with self._turn:
+            if self._newest is not None:
+                self._atlas.add(self._newest, update)
+
+    def _map(self, parameters: Mapping[str, str]) -> Sequence[MapSnapshot]:
+        with self._turn:
+            snapshot = self._atlas.map()
+        if snapshot is None:
+            raise Refusal("there is no map yet: nothing has been estimated")
+        return map_parts(snapshot)
+
+    def _trajectory(self, parameters: Mapping[str, str]) -> Sequence[Trajectory]:
+        last_s = positive(parameters, "last_s")
+        with self._turn:
+            trajectory = self._atlas.trajectory(last_s)
+        if trajectory is None:
+            raise Refusal("there is no trajectory yet: nothing has been estimated")
+        return trajectory_parts(trajectory)
+
+    def _settings(self, parameters: Mapping[str, str]) -> Sequence[Configuration]:
+        """With nothing that lets anybody in: a camera's address may bear a password."""
+        return (without_passwords(self._configuration),)

@@ -1,0 +1,102 @@
+"""What is said of a run at its end: summary.json, and a table for a person."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from birdslam.runtime.configuration import Configuration, dump
+from birdslam.runtime.environment import LIBRARIES
+from birdslam.runtime.supervision.demo_report import rows as truth_rows
+from birdslam.runtime.supervision.logbook import Logbook
+from birdslam.runtime.supervision.stations import Station
+from birdslam.runtime.topology import NODES
+
+
+def summarise(
+    configuration: Configuration,
+    stations: Mapping[str, Station],
+    logbook: Logbook,
+    models: dict[str, Any],
+    ended: str,
+) -> dict[str, Any]:
+    """What summary.json says of the run, beside the recorder's counts."""
+    sent = {name: stations[name].total("frames") for name in NODES}
+    by = {
+        "capture": stations["capture"].total("dropped"),
+        "perceive": sent["capture"] - sent["perceive"],
+        "optimize": sent["perceive"] - sent["optimize"],
+        "supervisor": sent["optimize"] - logbook.recorded,
+    }
+    return {
+        "ended": ended,
+        "source": configuration.source.uri,
+        "frames_in": sent["capture"] + by["capture"],
+        "frames_processed": logbook.recorded,
+        "frames_dropped": sum(by.values()),
+        "dropped_by": by,
+        "torn": stations["perceive"].total("torn"),
+        "malformed": sum(station.total("malformed") for station in stations.values()),
+        "restarts": {name: station.restarts.count for name, station in stations.items()},
+        **logbook.figures(),
+        "budget": _budget(configuration, logbook),
+        "models": models,
+        "configuration": dump(configuration),
+        "versions": {"python": platform.python_version(), **{n: importlib.metadata.version(n) for n in LIBRARIES}},
+    }
+
+
+def _budget(configuration: Configuration, logbook: Logbook) -> dict[str, Any]:
+    """Whether the whole kept what was promised of it."""
+    budgets = configuration.budgets
+    age_ms = logbook.age.percentile(budgets.percentile)
+    return {
+        "percentile": budgets.percentile,
+        "end_to_end_ms": budgets.end_to_end_ms,
+        "age_ms": round(age_ms, 3) if logbook.age.count else None,
+        "kept": bool(logbook.age.count) and age_ms <= budgets.end_to_end_ms,
+    }
+
+
+def table(summary: dict[str, Any], output: Path) -> str:
+    """The figures of a run for a person."""
+
+    def spread(figures: dict[str, float]) -> str:
+        if not figures:
+            return "-"
+        return f"p50 {figures['p50']:.1f}  p99 {figures['p99']:.1f}  max {figures['max']:.1f} ms"
+
+    whole = summary["budget"]
+    budget = f"p{whole['percentile']:g} within {whole['end_to_end_ms']:g} ms: {'kept' if whole['kept'] else 'NOT KEPT'}"
+    dropped = {name: n for name, n in summary["dropped_by"].items() if n}
+    by = f" ({', '.join(f'{n} by {name}' for name, n in dropped.items())})" if dropped else ""
+    rows = [
+        ("ended", summary["ended"]),
+        (
+            "frames",
+            f"{summary['frames_in']} in, {summary['frames_processed']} processed, "
+            f"{summary['frames_dropped']} dropped{by}",
+        ),
+        ("rate", f"{summary['rate_hz']:.2f} Hz"),
+        ("age at the planner", spread(summary["age_ms"])),
+        ("  of its budget", budget),
+        *((f"  {name}", spread(figures)) for name, figures in summary["stages_ms"].items()),
+        *((f"  {name} begun anew", f"{n} times") for name, n in summary["restarts"].items() if n),
+        *((f"  {status}", f"{n} frames") for status, n in summary["statuses"].items()),
+        *truth_rows(summary),
+        *(("recorded", _recorded(recording)) for recording in [summary.get("recording")] if recording),
+        ("results in", str(output)),
+    ]
+    return "\n".join(f"{name:24}{value}" for name, value in rows)
+
+
+def _recorded(recording: dict[str, Any]) -> str:
+    lost = recording["dropped"] + recording["images_torn"]
+    state = "" if recording["complete"] else ", CUT OFF"
+    if recording["restarts"]:
+        state = f", begun anew {recording['restarts']} times"
+    size = f"{recording['messages']} messages, {lost} lost, {recording['bytes'] / 1e6:.1f} MB"
+    return f"{', '.join(recording['files'])}: {size}{state}"

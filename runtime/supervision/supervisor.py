@@ -1,0 +1,315 @@
+"""`birdslam run`: checks what it was given, starts the three processes, watches them, and writes down what came out.
+
+Exit status: 0 at the end of the source, and after SIGTERM (a service's ordered stop); 130 after Ctrl-C; in each case
+the frames in flight are processed and the results written. 1 where a node failed for good, 2 where what the user gave
+can't be used; the reason is one line on standard error. Everything here waits by events: pidfds, signals, the logbook.
+"""
+
+from __future__ import annotations
+
+import selectors
+import signal
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import msgspec
+
+from birdslam.evaluation.results import Recorder, claim_directory
+from birdslam.perception import load_network
+from birdslam.perception.pointnet import load_pointnet
+from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
+from birdslam.runtime.environment import INTERRUPTED_STATUS, USER_ERROR_STATUS
+from birdslam.runtime.nodes.sources import CameraSource, open_source
+from birdslam.runtime.process import realtime
+from birdslam.runtime.process.child import give_back_memory
+from birdslam.runtime.process.notify import Notifier
+from birdslam.runtime.supervision.demo_report import Witness
+from birdslam.runtime.supervision.live import LiveLine
+from birdslam.runtime.supervision.logbook import Logbook, Results
+from birdslam.runtime.supervision.query_server import Door
+from birdslam.runtime.supervision.recorder_station import RecorderStation, choose_file
+from birdslam.runtime.supervision.report import summarise, table
+from birdslam.runtime.supervision.stations import Station
+from birdslam.runtime.topology import NODES
+from birdslam.runtime.transport.bus import Bus
+from birdslam.runtime.transport.presence import VehicleLock, runtime_dir_of, socket_path
+
+START_ORDER = ("optimize", "perceive", "capture")  # each awaits the one before it (runner.py)
+BEFORE = {"perceive": "capture", "optimize": "perceive"}  # who sends to whom
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+WITHOUT_MODELS = "no networks: odometry only, without vehicles and lanes"
+CHECK_S = 0.1  # watchdogs are looked after at least so often
+WARNINGS_SHOWN = 5  # at a time; the log has all of them
+DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come to in a long drive among lane lines
+
+
+def run(configuration: Configuration) -> int:
+    """A whole run; gives the exit status. Raises what a user has to mend before anything is started."""
+    realtime.one_heap()  # before networks are looked at, which begins threads
+    configuration, models = check(configuration)
+    give_back_memory()  # the networks that were looked at
+    output = Path(configuration.output)
+    realtime.reserve(*DRIVE_MIB)
+    live = LiveLine(sys.stdout)
+    with ExitStack() as stack:
+        stack.enter_context(VehicleLock(configuration.vehicle, configuration.runtime_dir))
+        claim_directory(output / "logs")
+        if not models:
+            live.say(WITHOUT_MODELS)
+        assert configuration.camera is not None
+        recorder = Recorder(output, configuration.camera)
+        bus = stack.enter_context(
+            Bus(
+                configuration.vehicle,
+                "supervisor",
+                hub=True,
+                runtime_dir=configuration.runtime_dir,
+                lossless=configuration.lossless,
+            )
+        )
+        witness = Witness.of(configuration)
+        listeners: list[Results] = [Door(configuration, bus), *([witness] if witness else [])]
+        logbook = Logbook(bus, recorder, tolerant=configuration.restarts, listeners=listeners)
+        stack.callback(logbook.close)
+        bus.declare_alive()
+        recording = None
+        if configuration.recording.file:
+            recording = stack.enter_context(closing(RecorderStation(configuration, models, output / "logs")))
+        supervisor = Supervisor(configuration, logbook, live, recording)
+        supervisor.run(output / "logs")
+        if recording is not None:
+            recording.finish(configuration.runtime.stop_timeout_s)
+    live.clear()
+    summary = summarise(configuration, supervisor.stations, logbook, models, supervisor.ended)
+    if recording is not None:
+        summary["recording"] = recording.figures()
+        for line in recording.news():
+            live.say(line)
+    try:
+        if witness is not None:
+            summary |= witness.finish(output)
+        recorder.finish(summary)
+    except OSError as error:
+        supervisor.fail(f"results can't be written: {error}", 1)
+    if logbook.unwritten is not None:
+        supervisor.fail(f"results are incomplete: {logbook.unwritten}", 1)
+    live.say(table(summary, output))
+    if supervisor.failure:
+        print(f"birdslam: {supervisor.failure}", file=sys.stderr)
+    return supervisor.exit_status
+
+
+def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any]]:
+    """Everything that can be wrong before a process is started; fills in the source's own camera.
+
+    Gives the networks' descriptions too. Raises ConfigurationError, SourceError, datasets.DatasetError or
+    perception.ModelError.
+    """
+    check_runtime_dir(configuration.vehicle, configuration.runtime_dir)
+    source = open_source(configuration)
+    configuration = complete(configuration, source.camera, source.rate_hz)
+    if isinstance(source, CameraSource):
+        source.close()  # capture opens it for itself
+    recording = configuration.recording
+    if recording.file:
+        file = choose_file(recording, configuration.vehicle)
+        configuration = msgspec.structs.replace(configuration, recording=msgspec.structs.replace(recording, file=file))
+    models: dict[str, Any] = {
+        role: load_network(role, spec).describe() for role, spec in configuration.models.in_use().items()
+    }
+    if configuration.models.pointnet is not None:
+        models["pointnet"] = load_pointnet(configuration.models.pointnet).describe()
+    return configuration, models
+
+
+def check_runtime_dir(vehicle: str, runtime_dir: Path | None) -> None:
+    """Raises ConfigurationError where sockets can't lie there."""
+    try:
+        for name in NODES:
+            socket_path(runtime_dir_of(vehicle, runtime_dir), name)
+    except (ValueError, OSError) as error:
+        raise ConfigurationError(f"vehicle {vehicle!r}, runtime directory: {error}") from error
+
+
+class Supervisor:
+    """The nodes of one run, from their start to their end."""
+
+    def __init__(
+        self, configuration: Configuration, logbook: Logbook, live: LiveLine, recording: RecorderStation | None = None
+    ) -> None:
+        self.failure = ""
+        self.exit_status = 0
+        self._config = configuration
+        self._logbook = logbook
+        self._live = live
+        self._recording = recording
+        self._notifier = Notifier()
+        self._disk_said = False
+        self.stations: dict[str, Station] = {}
+        self._stopped_by: signal.Signals | None = None
+        self._deadline_s: float | None = None  # of a stop that was asked for
+        self._selector = selectors.DefaultSelector()
+
+    def run(self, logs: Path) -> None:
+        """Starts all nodes; returns when all have ended."""
+        with _signals() as signals, self._selector, ExitStack() as stack:
+            self._selector.register(signals, selectors.EVENT_READ, self._signal)
+            self._selector.register(self._logbook.event_fd, selectors.EVENT_READ, self._logbook_event)
+            for name in START_ORDER:
+                station = self.stations[name] = Station(name, self._config, logs)
+                stack.callback(station.close)
+                self._selector.register(station.process.pidfd, selectors.EVENT_READ, self._node_ended)
+            while any(station.working for station in self.stations.values()):
+                for key, _ in self._selector.select(min(self._live.period_s, CHECK_S)):
+                    key.data(key.fileobj)
+                self._watch()
+                self._show()
+            if not self.failure and self.stations["capture"].process.ready:
+                self._logbook.wait_over(self._config.runtime.drain_timeout_s)
+            self._show()
+            self._notifier.once("STOPPING=1")
+        if not self.failure and not self._logbook.ended and self._stopped_by is None:
+            self.fail("all nodes ended, but the end of the source never came back", 1)
+
+    def _signal(self, signals: socket.socket) -> None:
+        for number in signals.recv(64):
+            if self._stopped_by is not None:  # asked twice: no more patience
+                self._send_all(signal.SIGTERM)
+                continue
+            self._stopped_by = signal.Signals(number)
+            self._notifier.once("STOPPING=1")
+            self.exit_status = self.exit_status or (INTERRUPTED_STATUS if number == signal.SIGINT else 0)
+            capture = self.stations.get("capture")
+            if capture is not None and capture.process.ready and capture.process.exit_status is None:
+                capture.process.send(signal.SIGINT)  # END_OF_SOURCE then runs through all
+            else:
+                self._send_all(signal.SIGTERM)
+            self._stop_by(self._config.runtime.stop_timeout_s)
+
+    def _stop_by(self, timeout_s: float) -> None:
+        self._deadline_s = time.monotonic() + timeout_s
+        for station in self.stations.values():
+            station.due_s = None  # none is begun anew
+
+    def _logbook_event(self, event_fd: int) -> None:
+        self._selector.unregister(event_fd)
+        if self._logbook.error is not None:
+            self.fail(f"recording failed: {self._logbook.error}", 1)
+        elif self._deadline_s is None:
+            self._stop_by(self._config.runtime.stop_timeout_s)
+
+    def _node_ended(self, pidfd: int) -> None:
+        self._selector.unregister(pidfd)
+        station = next(station for station in self.stations.values() if station.process.pidfd == pidfd)
+        process = station.process
+        status, at_first = process.exit_status, not process.ready and not station.restarts.count
+        if self._deadline_s is not None or (status == 0 and process.vitals["ended"]):
+            told = status == -signal.SIGTERM  # before it could handle the signal
+            if status not in (0, None) and not told:
+                self.fail(process.failure(), 1)
+        elif at_first or not self._config.restarts:
+            self.fail(process.failure(), USER_ERROR_STATUS if status == USER_ERROR_STATUS else 1)
+        elif station.died(station.stall or process.how()):
+            self._live.say(f"{process.failure()}; it is begun anew")
+            if station.due_s is not None and station.due_s <= time.monotonic():
+                self._begin_again(station)
+        else:
+            window_s = self._config.runtime.restart_window_s
+            again = f"{self._config.runtime.restarts_max + 1} times in {window_s:g} s: it is not begun anew"
+            self.fail(f"{process.failure()}, {again}", 1)
+
+    def _begin_again(self, station: Station) -> None:
+        station.begin_again()
+        self._selector.register(station.process.pidfd, selectors.EVENT_READ, self._node_ended)
+
+    def _watch(self) -> None:
+        now_s = time.monotonic()
+        stations = self.stations.values()
+        for station in stations:
+            before = self.stations.get(BEFORE.get(station.name, ""))
+            stall = "" if self.failure else station.stalled(before)
+            if stall and not self._config.restarts:
+                self.fail(f"{station.name} {stall}", 1)
+            if stall:
+                station.end(stall)
+            station.enforce()
+            if station.due_s is not None and station.due_s <= now_s:
+                self._begin_again(station)
+        if self._recording is not None:
+            self._recording.watch(may_begin_again=self._config.restarts and self._deadline_s is None)
+        if self._deadline_s is None and all(station.process.ready for station in stations):
+            self._notifier.once("READY=1")
+            if self._config.spares:  # one after the other, so that loading them takes one core at the most
+                all(station.keep_spare() for station in stations)
+        if self._deadline_s is not None and now_s > self._deadline_s:
+            still = [station.name for station in stations if station.process.exit_status is None]
+            if still:
+                limit_s = self._config.runtime.stop_timeout_s
+                self.fail(f"{', '.join(still)} did not end within {limit_s:g} s of being told to", 1)
+            self._send_all(signal.SIGKILL)
+
+    def fail(self, reason: str, exit_status: int) -> None:
+        """The first failure is the reason; what follows is its consequence."""
+        if self.failure:
+            return
+        self.failure, self.exit_status = reason, exit_status
+        self._notifier.once("STOPPING=1")
+        self._stop_by(self._config.runtime.stop_timeout_s)
+        self._send_all(signal.SIGTERM)
+
+    def _send_all(self, number: signal.Signals) -> None:
+        for station in self.stations.values():
+            station.process.send(number)
+
+    def _show(self) -> None:
+        for station in self.stations.values():
+            warnings = station.log.new_warnings()
+            for line in warnings[:WARNINGS_SHOWN]:
+                self._live.say(f"{station.name}: {line}")
+            if len(warnings) > WARNINGS_SHOWN:
+                self._live.say(f"{station.name}: {len(warnings) - WARNINGS_SHOWN} more warnings in {station.log.path}")
+        if self._logbook.unwritten is not None and not self._disk_said:
+            self._disk_said = True
+            self._live.say(f"results are not written any more: {self._logbook.unwritten}")
+        status = self._logbook.status_line()
+        if self._recording is not None:
+            for line in self._recording.news():
+                self._live.say(line)
+            status = f"{status}  {self._recording.status()}"
+        self._live.update(status)
+        self._notifier.alive(status)
+
+    @property
+    def ended(self) -> str:
+        """How the run ended, for the summary."""
+        if self.failure:
+            return self.failure
+        if self._stopped_by is not None:
+            return self._stopped_by.name
+        return "end of source" if self._logbook.ended else "cut short"
+
+
+@contextmanager
+def _signals() -> Iterator[socket.socket]:
+    """A socket from which the numbers of these signals are read, instead of what they do otherwise."""
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        writer.setblocking(False)
+        before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        handlers = {number: signal.signal(number, _ignore) for number in STOP_SIGNALS}
+        try:
+            yield reader
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+            signal.set_wakeup_fd(before)
+
+
+def _ignore(number: int, frame: FrameType | None) -> None:
+    """The wake-up socket has it."""

@@ -1,0 +1,220 @@
+"""The bus: one node's zenoh session, with typed publishers, bounded subscribers and liveliness.
+
+    with Bus("car", "perceive") as bus:
+        frames, out = bus.subscriber("frame"), bus.publisher("measurements")
+        bus.declare_alive()
+        message = frames.recv(timeout_s=0.5)                       # Message | None
+        out.put(record, message.trace.after("perceive", message.t_received_ns, done_ns))
+
+Everything stays on this machine: unix sockets in a directory of the vehicle (0700), no TCP, no multicast, no shared
+memory of zenoh's. The hub (the supervisor) listens on `hub.sock`, every node of the topology on a socket of its own,
+and they find each other by gossip through the hub; all others (planners) only connect. Nobody needs to be the first.
+
+Never fork after a Bus was opened (spawn instead), and always close it: zenoh's threads live until then.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import zenoh
+
+from birdslam.runtime.topology import PROCESSES, QUESTIONS, TOPICS, alive_key, check_name, key_of
+from birdslam.runtime.transport.endpoints import (
+    BusClosed,
+    BusError,
+    Message,
+    MessagesLost,
+    Publisher,
+    Subscriber,
+    attached,
+    message_of,
+)
+from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
+from birdslam.runtime.transport.queries import Answer, Desk
+from birdslam.runtime.transport.session import session_config
+from birdslam.runtime.wire import Part, WireError, decode
+
+_LOSSLESS_DEPTH = 4_096
+_ANSWER_S, _ANSWERS = 2.0, 256  # how long a question waits, and how many messages its answer may have
+
+__all__ = ["Bus", "BusClosed", "BusError", "Message", "MessagesLost", "Publisher", "Subscriber"]
+
+
+class Bus:
+    """One node's session on its vehicle's bus. A context manager; `close` it always.
+
+    `hub` is the supervisor's: the socket that everybody connects to. `lossless` sends with back pressure and queues
+    deep, for runs in which every frame counts (`--rate max`): all nodes and readers of such a run must be lossless.
+    Raises ValueError for a bad vehicle or node name, BusError where the sockets can't be made.
+    """
+
+    def __init__(
+        self, vehicle: str, node: str, *, hub: bool = False, runtime_dir: Path | None = None, lossless: bool = False
+    ) -> None:
+        self.vehicle, self.node, self._lossless = check_name("vehicle", vehicle), check_name("node", node), lossless
+        self._publishers: list[Publisher] = []
+        self._subscribers: list[Subscriber] = []
+        self._desks: list[Desk] = []
+        self._alive: set[str] = set()
+        self._alive_changed = threading.Condition()
+        self._alive_callbacks: list[Callable[[str, bool], None]] = []
+        self._token: zenoh.LivelinessToken | None = None
+        self._closed = False
+
+        directory = runtime_dir_of(vehicle, runtime_dir)
+        hub_socket, own_socket = socket_path(directory, "hub"), socket_path(directory, node)
+        listen = [hub_socket] if hub else [own_socket] if node in PROCESSES else []
+        try:
+            self._session = zenoh.open(session_config(listen, [] if hub else [hub_socket], lossless))
+        except zenoh.ZError as error:
+            where = ", ".join(map(str, listen)) or hub_socket
+            raise BusError(f"{node} can't join the bus of vehicle {vehicle!r} ({where}): {error}") from error
+        callback = zenoh.handlers.Callback(self._liveliness_changed, indirect=False)
+        key = alive_key(vehicle, "*")
+        self._liveliness = self._session.liveliness().declare_subscriber(key, callback, history=True)
+
+    def publisher(self, topic: str) -> Publisher:
+        """A publisher of `topic`. Raises KeyError for a topic that the topology does not have."""
+        self._check_open()
+        key, spec = key_of(self.vehicle, topic), TOPICS[topic]
+        self._publishers.append(Publisher(self._session, key, spec, self.node, self._lossless))
+        return self._publishers[-1]
+
+    def subscriber(self, topic: str, depth: int | None = None) -> Subscriber:
+        """A subscriber of `topic`; `depth` replaces the topology's. Raises KeyError for an unknown topic."""
+        self._check_open()
+        key, spec = key_of(self.vehicle, topic), TOPICS[topic]
+        depth = spec.depth if depth is None else depth
+        depth = max(depth, _LOSSLESS_DEPTH) if self._lossless else depth
+        if depth < 1:
+            raise ValueError(f"{topic}: a queue needs a depth of at least 1, got {depth}")
+        self._subscribers.append(Subscriber(self._session, key, spec, depth, self._lossless))
+        return self._subscribers[-1]
+
+    def catch_up(self, topic: str, subscriber: Subscriber) -> None:
+        """Gives a subscriber that came late the topic's last message, when it comes; waits for nothing."""
+        self._check_open()
+        callback = zenoh.handlers.Callback(subscriber._receive_kept, indirect=False)
+        self._session.get(key_of(self.vehicle, topic), callback, timeout=_ANSWER_S)
+
+    def kept(self, topic: str, timeout_s: float = _ANSWER_S) -> list[Message]:
+        """The topic's kept messages (Topic.kept), oldest first; empty where nobody answers in time.
+
+        Raises BusError where one is no such record.
+        """
+        key, record = key_of(self.vehicle, topic), TOPICS[topic].record
+        try:
+            return [message_of(sample, key, record) for sample in self._get(key, timeout_s)]
+        except WireError as error:
+            raise BusError(f"{topic}: a kept message is malformed: {error}") from error
+
+    def ask(self, question: str, timeout_s: float = _ANSWER_S, **parameters: float) -> list[Any]:
+        """The parts of the answer to one of topology.QUESTIONS, in order; empty where nobody answers in time.
+
+        Raises BusError with the reason where the question is refused, or where the answer is incomplete or malformed.
+        """
+        spec, key = QUESTIONS[question], key_of(self.vehicle, question)
+        asked = {name: f"{value:g}" for name, value in parameters.items()}
+        parts: dict[int, Any] = {}
+        of = 0
+        try:
+            for sample in self._get(zenoh.Selector(key, asked), timeout_s):
+                part = attached(sample, Part) or Part()
+                parts[part.number], of = decode(bytes(sample.payload), spec.record), part.of
+        except WireError as error:
+            raise BusError(f"{question}: the answer is malformed: {error}") from error
+        if sorted(parts) != list(range(of)):
+            raise BusError(f"{question}: {len(parts)} of the answer's {of} parts came")
+        return [parts[number] for number in range(of)]
+
+    def _get(self, selector: str | zenoh.Selector, timeout_s: float) -> Iterator[zenoh.Sample]:
+        self._check_open()
+        replies = self._session.get(
+            selector,
+            zenoh.handlers.FifoChannel(_ANSWERS),
+            timeout=timeout_s,
+            consolidation=zenoh.ConsolidationMode.NONE,  # all of them, not the last one alone
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                yield reply.ok
+            elif reply.err is not None:
+                raise BusError(f"{selector}: {bytes(reply.err.payload).decode(errors='replace')}")
+
+    def desk(self, answers: Mapping[str, Answer]) -> Desk:
+        """Answers the questions of these names (topology.QUESTIONS) until the bus is closed."""
+        self._check_open()
+        desk = Desk(self._session, {key_of(self.vehicle, name): answer for name, answer in answers.items()})
+        self._desks.append(desk)
+        return desk
+
+    def declare_alive(self) -> None:
+        """Says that this node is ready for work; taken back by close, or by the death of the process."""
+        self._check_open()
+        if self._token is None:
+            self._token = self._session.liveliness().declare_token(alive_key(self.vehicle, self.node))
+
+    @property
+    def alive(self) -> frozenset[str]:
+        """The nodes that are alive now, as far as this session has heard."""
+        with self._alive_changed:
+            return frozenset(self._alive)
+
+    def wait_alive(self, nodes: Iterable[str], timeout_s: float) -> set[str]:
+        """Waits until all of `nodes` are alive at once; gives those still missing. Raises BusClosed."""
+        wanted = set(nodes)
+        with self._alive_changed:
+            self._alive_changed.wait_for(lambda: self._closed or wanted <= self._alive, timeout_s)
+            self._check_open()
+            return wanted - self._alive
+
+    def on_alive(self, callback: Callable[[str, bool], None]) -> None:
+        """Calls `callback(node, True)` for each node that is alive now, and `callback(node, alive)` at each change from
+        now on, on zenoh's thread: it must be quick.
+        """
+        with self._alive_changed:
+            self._alive_callbacks.append(callback)
+            known = sorted(self._alive)
+        for node in known:
+            callback(node, True)
+
+    def _liveliness_changed(self, sample: zenoh.Sample) -> None:
+        node, alive = str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT
+        with self._alive_changed:
+            (self._alive.add if alive else self._alive.discard)(node)
+            self._alive_changed.notify_all()
+            callbacks = tuple(self._alive_callbacks)
+        for callback in callbacks:
+            callback(node, alive)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise BusClosed(f"the bus of vehicle {self.vehicle!r} is closed")
+
+    def close(self) -> None:
+        """Leaves the bus and wakes whoever waits on it, with BusClosed; a second call does nothing."""
+        with self._alive_changed:
+            if self._closed:
+                return
+            self._closed = True
+            self._alive_changed.notify_all()
+        for publisher in self._publishers:
+            publisher._close()
+        for subscriber in self._subscribers:
+            subscriber.close()
+        for desk in self._desks:
+            desk.close()
+        self._session.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,135 @@
+"""Where a vehicle's sockets and rings lie, and the lock that lets only one instance of it run.
+
+The runtime directory of a vehicle is `$XDG_RUNTIME_DIR/birdslam/<vehicle>`, or `/tmp/birdslam-<uid>/<vehicle>` where
+there is no such variable. It belongs to one user alone (0700), and holds the sockets, the lock, and where there is no
+/dev/shm the frames too.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import socket
+import stat
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from birdslam.runtime.topology import check_name
+
+_MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux, without its final zero
+_SHARED_MEMORY = Path("/dev/shm")
+
+
+class VehicleBusy(RuntimeError):
+    """Another instance runs under this vehicle's name; says which process, and by which file."""
+
+
+def runtime_dir_of(vehicle: str, runtime_dir: Path | None = None) -> Path:
+    """The vehicle's directory inside `runtime_dir`, made where it does not exist.
+
+    Raises ValueError for a bad vehicle name, PermissionError where the directory is open to other users.
+    """
+    check_name("vehicle", vehicle)
+    if runtime_dir is None:
+        session_dir = os.environ.get("XDG_RUNTIME_DIR")
+        runtime_dir = Path(session_dir, "birdslam") if session_dir else Path(f"/tmp/birdslam-{os.getuid()}")
+        runtime_dir.mkdir(mode=0o700, exist_ok=True)
+        _check_private(runtime_dir)
+    directory = runtime_dir / vehicle
+    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    _check_private(directory)
+    return directory.resolve()
+
+
+def _check_private(directory: Path) -> None:
+    state = directory.lstat()
+    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or state.st_mode & 0o077:
+        raise PermissionError(
+            f"the runtime directory {directory} must be a directory of user {os.getuid()} alone (mode 0700); "
+            f"it is {stat.filemode(state.st_mode)} of user {state.st_uid}"
+        )
+
+
+def socket_path(directory: Path, name: str) -> Path:
+    """The path of a unix socket in a runtime directory. Raises ValueError where it is too long for one."""
+    path = directory / f"{name}.sock"
+    if (size := len(os.fsencode(path))) > _MAX_SOCKET_PATH_BYTES:
+        raise ValueError(
+            f"the socket {path} has a path of {size} B, over the {_MAX_SOCKET_PATH_BYTES} B of a unix socket: "
+            "choose a shorter runtime directory"
+        )
+    return path
+
+
+def ring_path(vehicle: str, runtime_dir: Path | None = None) -> Path:
+    """Where the ring of a vehicle's frames lies: in shared memory, else in its runtime directory."""
+    directory = runtime_dir_of(vehicle, runtime_dir)
+    if not os.access(_SHARED_MEMORY, os.W_OK):
+        return directory / "frames.ring"
+    place = hashlib.sha256(os.fsencode(directory)).hexdigest()[:8]  # two runtime directories, two rings
+    return _SHARED_MEMORY / f"birdslam-{os.getuid()}-{vehicle}-{place}.ring"
+
+
+class VehicleLock:
+    """One running instance for each vehicle name. A context manager, held by the supervisor.
+
+    The kernel frees it with its process, by kill -9 too. Whoever gets it removes what dead processes left behind.
+    Raises VehicleBusy where another process holds it. A forked child would hold it on: spawn instead.
+    """
+
+    def __init__(self, vehicle: str, runtime_dir: Path | None = None) -> None:
+        directory = runtime_dir_of(vehicle, runtime_dir)
+        self.path = directory / "lock"
+        self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = os.pread(self._fd, 32, 0).decode(errors="replace").strip() or "unknown"
+            os.close(self._fd)
+            raise VehicleBusy(f"vehicle {vehicle!r} already runs: process {holder}, lock file {self.path}") from error
+        os.ftruncate(self._fd, 0)
+        os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
+        self._directory, self._ring = directory, ring_path(vehicle, runtime_dir)
+        self._clean()
+
+    def _clean(self) -> None:
+        _remove_dead_sockets(self._directory)
+        self._ring.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Removes what nodes that had to be killed left behind, and frees the name; a second call does nothing."""
+        if self._fd >= 0:
+            self._clean()
+            os.ftruncate(self._fd, 0)
+            os.close(self._fd)
+            self._fd = -1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _remove_dead_sockets(directory: Path) -> None:
+    """Removes the sockets on which nobody listens any more; a process that outlived its supervisor keeps its own."""
+    for path in directory.glob("*.sock"):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            try:
+                probe.connect(os.fsencode(path))
+            except (ConnectionRefusedError, FileNotFoundError):
+                _remove_socket(path)
+
+
+def remove_socket(directory: Path, name: str) -> None:
+    """Removes the socket of a process that is known to be dead."""
+    _remove_socket(socket_path(directory, name))
+
+
+def _remove_socket(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.with_name(path.name + ".lock").unlink(missing_ok=True)
