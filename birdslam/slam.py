@@ -40,7 +40,7 @@ class BirdSLAM:
     def step(self, frame: Frame) -> tuple[Measurements, Estimate]:
         """One undistorted frame (paper, Fig. 2): the networks run beside the feature tracking, then the back end."""
         measurements = self.frontend.step(frame, self.networks.start(frame.frame_id, frame.image))
-        return measurements, self.graph.update(measurements)
+        return measurements, self.graph.optimise(measurements)
 
     def map_update(self) -> MapUpdate | None:
         """What the map gained since the last call."""

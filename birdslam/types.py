@@ -22,6 +22,7 @@ validated on decoding: a number that is not finite, a negative variance or a wro
 
 from __future__ import annotations
 
+import enum
 import math
 from dataclasses import dataclass
 from typing import Annotated
@@ -150,13 +151,20 @@ class MotionEdge(msgspec.Struct, frozen=True, kw_only=True):
         _check_cov(self, "cov")
 
 
-LANE_LANDMARKS = 1 << 48  # landmarks from this number on are stations of lanes, those below it corners of the road
+class LandmarkKind(enum.IntEnum):
+    """What a landmark of the static map is."""
+
+    ROAD_POINT = 0  # a feature on the road's surface
+    LANE_STATION = 1  # where a lane crosses a fixed line of world: known across the lane alone
+
+
+_STATION_IDS = 1 << 48  # stations' ids began here in records that had no `kind` yet
 
 
 class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """CP: a static point of the road seen from the ego (camera-point edge, Eq. 3), back-projected by Eq. 1.
+    """CP: a landmark of the static map seen from the ego (camera-point edge, Eq. 3), back-projected by Eq. 1.
 
-    From LANE_LANDMARKS on it is where a lane crosses a fixed line of the world: sure across the lane alone.
+    It is known by `kind` and `landmark` together: each kind numbers its own.
     """
 
     landmark: BodyId
@@ -164,10 +172,14 @@ class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     x_m: float  # in ego
     y_m: float
     cov: Cov2
+    kind: LandmarkKind = LandmarkKind.ROAD_POINT  # a feature on the road (0) or a station of a lane (1)
 
     def __post_init__(self) -> None:
         check_finite(self, "x_m", "y_m")
         _check_cov(self, "cov")
+        if self.landmark >= _STATION_IDS and self.kind is LandmarkKind.ROAD_POINT:  # an older record
+            msgspec.structs.force_setattr(self, "kind", LandmarkKind.LANE_STATION)
+            msgspec.structs.force_setattr(self, "landmark", self.landmark - _STATION_IDS)
 
 
 class LanePoint(msgspec.Struct, frozen=True, array_like=True):

@@ -102,7 +102,7 @@ def time_rows(log: Sequence[Measurements]) -> list[dict[str, Any]]:
 
 
 def _updates_s(graph: PoseGraph, log: Sequence[Measurements]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    return np.array([_seconds(lambda m=m: graph.update(m)) for m in log])  # type: ignore[misc]
+    return np.array([_seconds(lambda m=m: graph.optimise(m)) for m in log])  # type: ignore[misc]
 
 
 def _seconds(work: Callable[[], object]) -> float:
@@ -138,7 +138,7 @@ def _errors(world: Drive, lag: int) -> list[tuple[str, str, float]]:
     """(who, body, metres) at the sampled frames; all that `WHO` names know of the same poses."""
     log, out = world.measurements, []
     graph = PoseGraph(*EQ_6)
-    live = [graph.update(m) for m in log]
+    live = [graph.optimise(m) for m in log]
     whole = batch_se2.solve(log, *EQ_6)
     for k in np.linspace(0, len(log) - 1 - lag, SAMPLES + 1).astype(int)[1:].tolist():
         so_far, later = (batch_se2.solve(log[: n + 1], *EQ_6) for n in (k, k + lag))

@@ -7,7 +7,7 @@ four, on ours' key frames, so that ours uses them all: as one edge between key f
 landmark.
 
 What is timed is one frame from decoded record to the poses and covariances of the newest ego and of every vehicle in
-Python: for ours the whole `PoseGraph.update`, with lanes, velocities and the finished `Estimate` besides.
+Python: for ours the whole `PoseGraph.optimise`, with lanes, velocities and the finished `Estimate` besides.
 `BatchFixedLagSmoother` gives no covariances. A contender that takes longer than `--limit-s` is stopped; its `frames`
 say how far it got. One that raises begins anew on the next frame. `kinds_us` tells frames with CP edges, frames in
 which vehicles came or went, and the others apart. `steal_percent` is what the hypervisor took meanwhile, `preempted`
@@ -171,7 +171,7 @@ def _drive_through(contender: str, vehicles: int, log: Path, limit_s: float) -> 
 class _Ours:
     def __init__(self, config: GraphConfig, weights: WeightsConfig) -> None:
         self.graph = PoseGraph(config, weights)
-        self.step = self.graph.update
+        self.step = self.graph.optimise
 
     def between(self) -> None:
         """The node publishes the map beside the estimate; it is not part of the update."""

@@ -206,7 +206,7 @@ def optimizer() -> Door:
             measurements = decode(msgpack.packb(plain), Measurements)
         except WireError:
             return False
-        encode(graph.update(measurements))
+        encode(graph.optimise(measurements))
         return True
 
     return door

@@ -44,7 +44,7 @@ def car(vehicle: int, pose: SE2, age_ns: int = 0) -> VehicleEstimate:
 def test_a_drive_comes_back_as_it_was_estimated() -> None:
     graph, atlas, estimates = PoseGraph(GraphConfig(), WeightsConfig()), Atlas(AtlasConfig()), {}
     for m in drive(DriveConfig(frames=300, vehicles=4), seed=3).measurements:
-        estimate = estimates[m.frame_id] = graph.update(m)
+        estimate = estimates[m.frame_id] = graph.optimise(m)
         atlas.add(estimate, graph.map_update())
     way = atlas.trajectory()
     assert way is not None

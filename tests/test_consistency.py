@@ -40,7 +40,7 @@ def off(estimate: SE2, truth: SE2 | Floats) -> Floats:
 
 def run(measurements: Iterable[Measurements], config: GraphConfig, weights: WeightsConfig) -> list[Estimate]:
     graph = PoseGraph(config, weights)
-    return [graph.update(m) for m in measurements]
+    return [graph.optimise(m) for m in measurements]
 
 
 # --- gtsam ---
@@ -143,7 +143,7 @@ def test_a_yaw_that_turns_out_to_be_another_one_leaves_the_place_where_it_is(tur
         t_ns = k * 100_000_000
         yaw_rad = place.yaw_rad if k < 5 else place.yaw_rad + turn_rad
         m = Measurements(frame_id=k, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=cc, cv=(sight(k, yaw_rad),))
-        estimate = graph.update(m).vehicles[0]
+        estimate = graph.optimise(m).vehicles[0]
         away = np.hypot(estimate.T_world_vehicle.x_m - place.x_m, estimate.T_world_vehicle.y_m - place.y_m)
         assert away < 0.02
     assert abs(estimate.T_world_vehicle.yaw_rad - place.yaw_rad - turn_rad) < 0.5 * abs(turn_rad)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.landmarks import sum_of_edges
+from birdslam.graph.factors import sum_of_points
 from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perf import incremental, optimizer
@@ -40,7 +40,7 @@ def run(
     measurements: Iterable[Measurements], config: GraphConfig = EQ_6, weights: WeightsConfig = ALL_EDGES
 ) -> list[Estimate]:
     graph = PoseGraph(config, weights)
-    return [graph.update(m) for m in measurements]
+    return [graph.optimise(m) for m in measurements]
 
 
 def numbers(pose: SE2) -> Floats:
@@ -343,7 +343,7 @@ def test_landmark_edges_sum_exactly_to_one_at_their_centroid(n: int, seed: int) 
     gaps, A = rng.normal(size=(n, 2)) * 3.0, rng.normal(size=(n, 2, 2))
     covs = A @ A.transpose(0, 2, 1) + 0.01 * np.eye(2)
     xx, xy, yy = covs[:, 0, 0], covs[:, 0, 1], covs[:, 1, 1]
-    centroid, mean, deviator = sum_of_edges(gaps[:, 0] + 1j * gaps[:, 1], 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy)
+    centroid, mean, deviator = sum_of_points(gaps[:, 0] + 1j * gaps[:, 1], 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy)
     g = np.array([centroid.real, centroid.imag])
     C = np.array([[mean + deviator.real, deviator.imag], [deviator.imag, mean - deviator.real]])
 
@@ -389,7 +389,7 @@ def test_the_map_holds_what_was_seen() -> None:
     assert graph.map_update() is None
     landmarks: list[tuple[float, float]] = []
     for m in world.measurements:
-        graph.update(m)
+        graph.optimise(m)
         gained = graph.map_update()
         assert gained is not None
         assert gained.frame_id == m.frame_id
@@ -412,12 +412,12 @@ def test_lane_points_keep_their_lanes() -> None:
         msgspec.structs.replace(m, lanes=(LanePoint(1.0, 0.5, k), LanePoint(2.0, 0.5)))
         for k, m in zip((-1, 7, 9, 7), world, strict=True)
     )
-    graph.update(plain)
+    graph.optimise(plain)
     gained = graph.map_update()
     assert gained is not None
     assert gained.lane_ids == ()
     for m in named:
-        graph.update(m)
+        graph.optimise(m)
     gained = graph.map_update()
     assert gained is not None
     assert gained.lane_ids == (7, -1, 9, -1, 7, -1)
@@ -433,7 +433,7 @@ def test_three_thousand_frames_grow_nothing() -> None:
     graph = PoseGraph(config, WeightsConfig())
     rows, landmarks = [], []
     for m in world.measurements:
-        estimate = graph.update(m)
+        estimate = graph.optimise(m)
         assert estimate.epoch == 0
         rows.append(len(graph._window.P))  # type: ignore[union-attr]
         landmarks.append(len(graph._landmarks))
@@ -460,7 +460,7 @@ from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.graph.weights import WeightsConfig
 graph = PoseGraph(GraphConfig(), WeightsConfig(leave_out=()))
 world = drive(DriveConfig(frames=150, wild=0.05, drop=0.1), seed=17)
-print(hashlib.sha256(b"".join(msgspec.msgpack.encode(graph.update(m)) for m in world.measurements)).hexdigest())
+print(hashlib.sha256(b"".join(msgspec.msgpack.encode(graph.optimise(m)) for m in world.measurements)).hexdigest())
 """
 
 
@@ -504,7 +504,7 @@ def test_any_small_world_gives_sound_estimates(
         WeightsConfig(mode=mode, leave_out=()),  # type: ignore[arg-type]
     )
     for m in world.measurements:
-        estimate = graph.update(m)
+        estimate = graph.optimise(m)
         assert estimate.frame_id == m.frame_id
         assert estimate.epoch == 0
         assert {e.vehicle for e in m.cv} <= {v.vehicle for v in estimate.vehicles}
@@ -572,7 +572,7 @@ def test_the_benchmark_gives_every_contender_the_same_edges(tmp_path: Path) -> N
         assert bool(m.cp) == (k % GraphConfig().ego_nodes == 0)
         data = ours.graph.checkpoint()  # type: ignore[attr-defined]
         settings = ours.graph.config, ours.graph.weights  # type: ignore[attr-defined]
-        blind = PoseGraph.restore(data, *settings).update(without)
+        blind = PoseGraph.restore(data, *settings).optimise(without)
         assert (ours.step(m) != blind) == (k > 0 and bool(m.cp))
 
 

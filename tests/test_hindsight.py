@@ -191,7 +191,7 @@ def test_late_edges_end_in_the_frame_at_hand_and_carry_on_from_one_another() -> 
 @pytest.mark.parametrize("delay", [0, 2])
 def test_an_estimate_says_how_old_the_sights_are_that_tell_of_it(delay: int) -> None:
     graph = PoseGraph(GraphConfig(), WeightsConfig())
-    estimates = [graph.update(m) for m in drive(delay, 0, 0.0, (CAR.height_m,) * 3)]
+    estimates = [graph.optimise(m) for m in drive(delay, 0, 0.0, (CAR.height_m,) * 3)]
     assert len(estimates[-1].vehicles) == 3
     for estimate in estimates:
         assert {v.age_ns + v.delay_ns for v in estimate.vehicles} <= {delay * PERIOD_NS}

@@ -15,7 +15,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.mapping.lane_edges import LaneEdgesConfig, Station, lane_stations, stations
-from birdslam.types import LANE_LANDMARKS, EgoEdge, LandmarkEdge, Measurements
+from birdslam.types import EgoEdge, Estimate, LandmarkEdge, LandmarkKind, Measurements
 
 CONFIG = LaneEdgesConfig()
 CAMERA = Camera(
@@ -45,7 +45,7 @@ def test_a_station_is_the_same_point_of_the_world_whoever_sees_it(
         ego = at.inverse() @ world
         near = ego[(ego[:, 0] > 4.0) & (ego[:, 0] < 20.0)]
         for station in found(at, near):
-            assert station.landmark >= LANE_LANDMARKS
+            assert station.edge(0, at).kind is LandmarkKind.LANE_STATION
             if station.landmark in seen:
                 np.testing.assert_allclose(station.point_m, seen[station.landmark], atol=1e-9)
             seen[station.landmark] = station.point_m
@@ -105,7 +105,7 @@ def drive(seed: int, edges: bool, weights: WeightsConfig, frames: int = 120) -> 
                 near[:, 1] += own_m[lane] + 0.02 * common_m * aside_m
                 seen += [s.edge(k, odometry) for s in found(odometry, near, lane)]
             cp = tuple(seen)
-        estimate = graph.update(
+        estimate = graph.optimise(
             Measurements(frame_id=k, t_source_ns=k * 10**8, t_capture_ns=0, t_utc_ns=0, cc=cc, cp=cp)
         )
         if k:
@@ -134,6 +134,26 @@ def test_left_out_lanes_leave_the_corners() -> None:
     assert weighted(record, WeightsConfig(leave_out=("cp",))).cp == ()
 
 
+def test_a_station_and_a_corner_of_one_number_are_two_landmarks() -> None:
+    """Told apart by their kind alone: the graph ties both, and says the same as with numbers of their own."""
+
+    def estimates(station_id: int) -> list[Estimate]:
+        graph, out = PoseGraph(GraphConfig(ego_nodes=1), WeightsConfig()), []
+        for k in range(4):
+            cov = tuple(np.diag([1e-2] * 3).ravel().tolist())
+            cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(1.0), cov=cov) if k else None
+            corner = LandmarkEdge(landmark=7, frame=k, x_m=9.1 - k, y_m=1.0, cov=(0.01, 0.0, 0.0, 0.01))
+            station = LandmarkEdge(
+                landmark=station_id, frame=k, x_m=7.0 - k, y_m=-1.0, cov=(0.01, 0.0, 0.0, 0.01), kind=LandmarkKind(1)
+            )
+            m = Measurements(frame_id=k, t_source_ns=k * 10**8, t_capture_ns=0, t_utc_ns=0, cc=cc, cp=(corner, station))
+            out.append(graph.optimise(m))
+        assert len(graph._landmarks) == 2
+        return out
+
+    assert estimates(7) == estimates(8)
+
+
 def test_a_lane_is_no_corner_on_the_map() -> None:
     graph = PoseGraph(GraphConfig(ego_nodes=1, landmark_least_frames=1), WeightsConfig())
     for k in range(6):
@@ -142,7 +162,7 @@ def test_a_lane_is_no_corner_on_the_map() -> None:
         corner = LandmarkEdge(landmark=7, frame=k, x_m=9.0 - k, y_m=1.0, cov=(0.1, 0.0, 0.0, 0.1))
         lanes = tuple(s.edge(k, SE2(float(k))) for s in found(SE2(float(k)), line(0.0, 1.0)))
         cp = (corner, *lanes) if k < 3 else ()
-        graph.update(Measurements(frame_id=k, t_source_ns=k * 10**8, t_capture_ns=0, t_utc_ns=0, cc=cc, cp=cp))
+        graph.optimise(Measurements(frame_id=k, t_source_ns=k * 10**8, t_capture_ns=0, t_utc_ns=0, cc=cc, cp=cp))
     gained = graph.map_update()
     assert gained is not None
     assert len(gained.landmarks_m) == 1

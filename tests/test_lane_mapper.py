@@ -17,7 +17,7 @@ from birdslam.mapping.lane_edges import LaneEdgesConfig
 from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneNews
 from birdslam.mapping.lanes import Grids
 from birdslam.perception import Segmentation
-from birdslam.types import LANE_LANDMARKS, Status
+from birdslam.types import LandmarkKind, Status
 
 CAMERA = Camera(
     width_px=640, height_px=192, fx_px=370.0, fy_px=370.0, cx_px=320.0, cy_px=88.0, height_m=1.6, pitch_rad=0.02
@@ -154,7 +154,7 @@ def test_the_edges_are_of_lanes_that_earlier_frames_knew_and_stay_where_they_are
     seen: dict[int, list[tuple[float, float]]] = {}
     for k, n in enumerate(news):
         for edge in n.edges:
-            assert edge.landmark >= LANE_LANDMARKS
+            assert edge.kind is LandmarkKind.LANE_STATION
             seen.setdefault(edge.landmark, []).append((edge.x_m + STEP_M * k, edge.y_m))
     assert len(seen) > 6
     assert max(len(at) for at in seen.values()) > 5

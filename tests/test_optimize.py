@@ -86,7 +86,7 @@ def estimates(node: OptimizeNode, record: Any) -> list[Estimate]:
 
 def alone(records: list[Measurements], epoch: int = 0) -> list[Estimate]:
     graph = PoseGraph(CALM.graph, CALM.weights, epoch)
-    return [graph.update(record) for record in records]
+    return [graph.optimise(record) for record in records]
 
 
 # --- frames without measurements ---
@@ -204,7 +204,7 @@ def test_frames_never_go_back_and_the_graph_never_notices(lateness: list[int], s
     measured = [made for made in told if Status.PERCEPTION_LATE not in made.status]
     assert all(made == goal[made.frame_id] for made in measured)
     assert all(made.valid == INVALIDATING.isdisjoint(made.status) for made in told)
-    assert node._graph.update(DRIVE[40]) == alone(list(DRIVE[:41]))[40]
+    assert node._graph.optimise(DRIVE[40]) == alone(list(DRIVE[:41]))[40]
 
 
 # --- restarts ---

@@ -63,7 +63,7 @@ def errors(log: list[Measurements]) -> dict[str, tuple[float, float]]:
     graph, past = PoseGraph(GraphConfig(), WeightsConfig()), Retrospect(CONFIG)
     live: dict[int, dict[int, SE2]] = {}
     for m in log:
-        estimate = graph.update(m)
+        estimate = graph.optimise(m)
         past.add(m, estimate)
         for v in estimate.vehicles:
             if v.age_ns == 0:
@@ -174,7 +174,7 @@ def test_worlds_are_kept_apart() -> None:
     log[20] = replace(log[20], cc=None)
     graph, past = PoseGraph(GraphConfig(), WeightsConfig()), Retrospect(CONFIG)
     for m in log:
-        estimate = graph.update(m)
+        estimate = graph.optimise(m)
         past.add(m, estimate)
     assert estimate.epoch == 1
     ways = past.ways()
@@ -187,5 +187,5 @@ def test_frames_without_sights_are_none() -> None:
     past = Retrospect(CONFIG)
     graph = PoseGraph(GraphConfig(), WeightsConfig())
     m = Measurements(frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, status=(Status.FRAME_UNREADABLE,))
-    past.add(m, graph.update(m))
+    past.add(m, graph.optimise(m))
     assert past.ways() == {}

@@ -6,7 +6,16 @@ import msgspec
 import pytest
 
 from birdslam.geometry.se2 import SE2
-from birdslam.types import INVALIDATING, EgoEdge, Estimate, LandmarkEdge, MapUpdate, Status, VehicleEdge
+from birdslam.types import (
+    INVALIDATING,
+    EgoEdge,
+    Estimate,
+    LandmarkEdge,
+    LandmarkKind,
+    MapUpdate,
+    Status,
+    VehicleEdge,
+)
 
 EYE3 = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -51,3 +60,12 @@ def test_a_covariance_of_the_wrong_size_is_refused_on_decoding() -> None:
     stamps = {"epoch": 0, "frame_id": 0, "t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0, "valid": True}
     with pytest.raises(msgspec.ValidationError, match=r"length >= 9.*cov"):
         msgspec.convert({**stamps, "T_world_ego": [0, 0, 0], "cov": [1.0] * 4}, Estimate)
+
+
+def test_a_station_of_an_older_record_keeps_its_meaning() -> None:
+    """Before `kind` its id said what a landmark is, from 2**48 on."""
+    cov = [1.0, 0.0, 0.0, 1.0]
+    station, point = (msgspec.convert([landmark, 5, 2.0, 1.0, cov], LandmarkEdge) for landmark in ((1 << 48) + 41, 41))
+    assert (station.kind, station.landmark) == (LandmarkKind.LANE_STATION, 41)
+    assert (point.kind, point.landmark) == (LandmarkKind.ROAD_POINT, 41)
+    assert msgspec.convert(msgspec.to_builtins(station), LandmarkEdge) == station

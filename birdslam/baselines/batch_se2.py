@@ -21,7 +21,7 @@ from birdslam.geometry.planar import between, compose, log
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import GraphConfig
 from birdslam.graph.weights import WeightsConfig, weighted
-from birdslam.types import LandmarkEdge, Measurements, VehicleEdge
+from birdslam.types import LandmarkEdge, LandmarkKind, Measurements, VehicleEdge
 
 Floats = NDArray[np.float64]
 
@@ -97,6 +97,11 @@ def vehicle_key(vehicle: int, frame: int) -> int:
     return int(gtsam.symbol("v", vehicle * 10_000_000 + frame))
 
 
+def landmark_key(kind: LandmarkKind, landmark: int) -> int:
+    """Of a landmark's place; each kind has ids of its own."""
+    return int(gtsam.symbol("l" if kind is LandmarkKind.ROAD_POINT else "m", landmark))
+
+
 class _Builder:
     def __init__(self, graph: GraphConfig, start: Trajectories) -> None:
         self.graph = graph
@@ -141,13 +146,13 @@ class _Builder:
 
     def add_landmarks(self, edges: Sequence[LandmarkEdge]) -> None:
         """Eq. 3 with the landmark's place unknown; one that is seen once says nothing."""
-        seen: dict[int, list[LandmarkEdge]] = {}
+        seen: dict[tuple[LandmarkKind, int], list[LandmarkEdge]] = {}
         for edge in edges:
-            seen.setdefault(edge.landmark, []).append(edge)
+            seen.setdefault((edge.kind, edge.landmark), []).append(edge)
         for landmark, sights in seen.items():
             if len(sights) < 2:
                 continue
-            node, first = int(gtsam.symbol("l", landmark)), sights[0]
+            node, first = landmark_key(*landmark), sights[0]
             self.values.insert(node, _pose(self._start.ego[first.frame] @ SE2(first.x_m, first.y_m)))
             for edge in sights:
                 cov = np.diag([0.0, 0.0, _SIGMA_FREE_RAD**2])

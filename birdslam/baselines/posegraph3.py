@@ -13,11 +13,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.baselines.batch_se2 import landmark_key
 from birdslam.baselines.trajectories import Trajectories
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.trajectory import ego_pose, inverse, split_pose
-from birdslam.types import Attitude, LandmarkEdge, Measurements
+from birdslam.types import Attitude, LandmarkEdge, LandmarkKind, Measurements
 
 Floats = NDArray[np.float64]
 
@@ -112,13 +113,13 @@ class _Builder:
 
     def add_landmarks(self, edges: Sequence[LandmarkEdge]) -> None:
         """Road points seen at least twice, each a node (Eq. 3 with the landmark's place unknown)."""
-        sightings: dict[int, list[LandmarkEdge]] = {}
+        sightings: dict[tuple[LandmarkKind, int], list[LandmarkEdge]] = {}
         for edge in edges:
-            sightings.setdefault(edge.landmark, []).append(edge)
+            sightings.setdefault((edge.kind, edge.landmark), []).append(edge)
         for landmark, seen in sightings.items():
             if len(seen) < 2:
                 continue
-            node = gtsam.symbol("l", landmark)
+            node = landmark_key(*landmark)
             first = self.poses[seen[0].frame]
             self.values.insert(node, first[:3, :3] @ np.array([seen[0].x_m, seen[0].y_m, 0.0]) + first[:3, 3])
             for edge in seen:

@@ -7,6 +7,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from birdslam.baselines.batch_se2 import landmark_key
 from birdslam.types import LandmarkEdge, Measurements
 
 _PRIOR = gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)
@@ -33,7 +34,7 @@ class Smoother:
         self.frame: int | None = None
         self.ego = gtsam.Pose2()
         self.seen: dict[int, int] = {}
-        self.landmarks: dict[int, int] = {}  # the frame that each was last seen in, of those that are nodes
+        self.landmarks: dict[int, int] = {}  # by key, the frame that each node was last seen in
 
     def step(self, m: Measurements) -> list[tuple[gtsam.Pose2, Any]]:
         """The newest ego pose and every vehicle's, with their covariances."""
@@ -59,18 +60,18 @@ class Smoother:
                 before, key = _vehicle(link.vehicle, link.from_frame), _vehicle(link.vehicle, m.frame_id)
                 factors.add(gtsam.BetweenFactorPose2(before, key, _pose(link.T_from_to), _noise(link.cov)))
         for sight in m.cp:
-            key = gtsam.symbol("l", sight.landmark)
+            key = landmark_key(sight.kind, sight.landmark)
             factors.add(_landmark_factor(ego, key, sight))
-            if sight.landmark not in self.landmarks:
+            if key not in self.landmarks:
                 values.insert(key, self.ego.transformFrom(np.array([sight.x_m, sight.y_m])))
-            self.landmarks[sight.landmark] = m.frame_id
+            self.landmarks[key] = m.frame_id
             stamps.insert((key, float(m.frame_id)))
         if self.kind == "isam2":
             self.solver.update(factors, values)
         else:
             self.solver.update(factors, values, stamps)
             oldest = m.frame_id - self.lag_frames
-            self.landmarks = {landmark: frame for landmark, frame in self.landmarks.items() if frame >= oldest}
+            self.landmarks = {key: frame for key, frame in self.landmarks.items() if frame >= oldest}
         self.frame, self.seen = m.frame_id, {edge.vehicle: m.frame_id for edge in m.cv}
         poses = [self.solver.calculateEstimatePose2(key) for key in keys]
         self.ego = poses[0]

@@ -68,7 +68,7 @@ class Live:
         """One update for each record."""
         graph, live = PoseGraph(self.graph, self.weights), LiveTrajectories()
         for measurements in log:
-            live.add(graph.update(self._reweighed(measurements)))
+            live.add(graph.optimise(self._reweighed(measurements)))
         return live.result
 
     def _reweighed(self, m: Measurements) -> Measurements:
@@ -95,7 +95,7 @@ class Final:
         graph, live = PoseGraph(self.live.graph, self.live.weights), LiveTrajectories()
         past = Retrospect(self.retrospect)
         for measurements in log:
-            estimate = graph.update(measurements)
+            estimate = graph.optimise(measurements)
             live.add(estimate)
             past.add(measurements, estimate)
         out = Trajectories(ego=live.result.ego)

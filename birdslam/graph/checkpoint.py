@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.landmarks import LandmarksState, PendingState
-from birdslam.graph.vehicles import Vehicle
+from birdslam.graph.landmarks import LandmarksState
+from birdslam.graph.pending_map import PendingState
+from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import WindowState
 
-VERSION = 2
+VERSION = 3
 _MAGIC = b"BirdSLAM graph\n"
 _SUM_BYTES = 16
 _KINDS = {"<f8": np.float64, "<c16": np.complex128, "<i8": np.int64}
@@ -31,7 +32,7 @@ class Epoch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """All that a graph knows since its world began."""
 
     window: WindowState
-    vehicles: list[Vehicle]
+    vehicles: list[VehicleNode]
     landmarks: LandmarksState
     t_ns: int
     t_before_ns: int

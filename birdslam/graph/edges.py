@@ -37,6 +37,11 @@ class PoseEdges:
         """Where the VV edges stand in the arrays."""
         return slice(len(self.poses) - len(self.vv), len(self.poses))
 
+    def some(self, at: slice, which: list[int]) -> tuple[Floats, Floats]:
+        """The poses and covariances of some of the edges that stand `at` a slice of the arrays."""
+        poses, covs = self.poses[at], self.covs[at]
+        return (poses, covs) if len(which) == len(poses) else (poses[which], covs[which])
+
 
 def pose_edges(m: Measurements) -> PoseEdges:
     """One CV and one VV edge for each vehicle (the last one counts).

@@ -1,4 +1,4 @@
-"""What the window knows of the vehicles, told in the world: poses, velocities, and the covariances of both."""
+"""Marginal covariances in world: of the vehicles, with their poses and velocities, out of the window's P."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.planar import advance, pairs
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.vehicles import Vehicle
+from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import Window
 from birdslam.types import VehicleEstimate
 
@@ -24,7 +24,7 @@ _TWIST = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1j, 0.0])
 
 
 def vehicle_estimates(
-    window: Window, vehicles: Sequence[Vehicle], t_ns: int, changes: Floats
+    window: Window, vehicles: Sequence[VehicleNode], t_ns: int, changes: Floats
 ) -> tuple[VehicleEstimate, ...]:
     """Every vehicle at source time `t_ns`; one whose newest pose is older is driven on with the twist it had.
 
@@ -35,7 +35,7 @@ def vehicle_estimates(
     ahead_s = None
     if any(v.node_ns < t_ns for v in vehicles):
         ahead_s = np.array([max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles])
-    poses, velocities, covs = in_world(window, ahead_s, changes)
+    poses, velocities, covs = marginals_in_world(window, ahead_s, changes)
     numbers = zip(
         vehicles,
         poses.tolist(),
@@ -64,7 +64,7 @@ def vehicle_estimates(
     )
 
 
-def in_world(window: Window, ahead_s: Floats | None, changes: Floats) -> tuple[Floats, Floats, Floats]:
+def marginals_in_world(window: Window, ahead_s: Floats | None, changes: Floats) -> tuple[Floats, Floats, Floats]:
     """Vehicles in world, driven on by `ahead_s` (M,), if any, past their newest pose: poses (M, 3), velocities
     (M, 2), and the covariances (M, 5, 5) of both. `changes` (3,): twists' variances grow by so much a second.
     """
@@ -78,7 +78,7 @@ def in_world(window: Window, ahead_s: Floats | None, changes: Floats) -> tuple[F
         place, yaw = np.tile(place, (M, 1)), np.tile(yaw, (M, 1))
         place[:, 3:], yaw[:, 8] = partial, ahead_s
     back = heading.conj()
-    place = back[:, None] * place  # told in the vehicle's own axes
+    place = back[:, None] * place  # in the vehicle's own axes
     place[:, 2] = 1j * back * at
     ego = cmath.exp(1j * window.world.yaw_rad)
     at, heading = at * ego + complex(window.world.x_m, window.world.y_m), heading * ego
@@ -87,7 +87,7 @@ def in_world(window: Window, ahead_s: Floats | None, changes: Floats) -> tuple[F
     turns = (1j * velocity)[:, None] * yaw + heading[:, None] * _TWIST
     J = np.empty((M, 5, 9))
     J[:, :2], J[:, 2], J[:, 3:] = pairs(place), yaw, pairs(turns)
-    C = window.P[window.own]
+    C = window.P[window.layout.own]
     if ahead_s is not None:
         C[:, _AXES + 6, _AXES + 6] += ahead_s[:, None] * changes
     covs: Floats = J @ C @ J.transpose(0, 2, 1)

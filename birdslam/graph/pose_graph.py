@@ -1,9 +1,16 @@
-"""The back end: the paper's incremental SE(2) pose graph (Eqs. 2-8), one update for each frame.
+"""The back end: the paper's incremental SE(2) pose graph (Eqs. 2-8), optimised once for each frame.
 
-`PoseGraph` keeps the books: which edges have both ends in the window, epochs and statuses. `window.Window` solves. The
-feedback of each result into the next step is the paper's "incremental approach".
+`PoseGraph.optimise` takes these steps, each in the module of its part of the graph:
 
-What the graph minimises is F of Eq. 8: CC, CV and VV edges (Eq. 6) and CP edges (Eq. 7), each with the covariance that
+1. weights.py weighs the edges by Eq. 4, edges.py makes arrays of them, vehicles.py finds those that tie vehicles of the
+   graph to this frame;
+2. window.py moves the graph on to the frame: the ego by the CC edge, vehicles with constant velocity;
+3. landmarks.py sums the CP edges (Eq. 7), window.py finds the minimum of Eq. 8 over CV, VV and CP edges;
+4. vehicles.py, landmarks.py and pending_map.py begin and end vehicles and landmarks;
+5. marginals.py gives poses, velocities and marginal covariances of the frame.
+
+The equations themselves stand in factors.py. The feedback of each result into the next frame is the paper's
+"incremental approach". F of Eq. 8 has CC, CV and VV edges (Eq. 6) and CP edges (Eq. 7), each with the covariance that
 its record states (`weights.weighted` says whose), and, with `constant_velocity`, one more factor on each three poses of
 a vehicle in a row: the twist (velocity in its own frame) changes little from one interval to the next.
 """
@@ -15,28 +22,25 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.planar import rates
+from birdslam.geometry.planar import Floats, rates
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, plain, unpack
 from birdslam.graph.edges import PoseEdges, pose_edges
-from birdslam.graph.landmarks import Landmarks, PendingMap, Sightings, sightings
+from birdslam.graph.factors import NO_VV
+from birdslam.graph.landmarks import Landmarks, Sightings, sightings
 from birdslam.graph.marginals import vehicle_estimates
-from birdslam.graph.vehicles import Traffic
+from birdslam.graph.pending_map import PendingMap
+from birdslam.graph.vehicles import SHORTEST_S, Ties, VehicleNodes
 from birdslam.graph.weights import WeightsConfig, weighted
-from birdslam.graph.window import KEY_NODE, Edges, Window
+from birdslam.graph.window import Window
 from birdslam.types import INVALIDATING, Estimate, MapUpdate, Measurements, Status, VehicleEstimate
 
-Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 _NO_PIXELS = frozenset({Status.END_OF_SOURCE, Status.FRAME_UNREADABLE, Status.COASTING})
-_SHORTEST_S = 1e-3  # source clocks that stand still or run backwards
-_NO_CP = np.zeros((2, 2))
-_NO_EDGES = np.zeros((0, 3)), np.zeros((0, 3, 3))
 
 
 class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -71,7 +75,7 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PoseGraph:
-    """`update` is one step. Bounded in time and memory; deterministic; raises nothing for what a record may say."""
+    """Bounded in time and memory; deterministic; raises nothing for what a record may say."""
 
     def __init__(self, config: GraphConfig, weights: WeightsConfig, epoch: int = 0) -> None:
         self.config = config
@@ -82,21 +86,30 @@ class PoseGraph:
         self._birth = np.diag(np.square([config.birth_forward_mps, config.birth_sideways_mps, config.birth_turn_radps]))
         self._window: Window | None = None
 
-    def update(self, measurements: Measurements) -> Estimate:
-        """One frame's edges in; the newest frame's poses, velocities and covariances out."""
-        m = weighted(measurements, self.weights)
+    def optimise(self, measurements: Measurements) -> Estimate:
+        """One frame's edges in; the newest frame's poses, velocities and covariances out.
+
+        A frame that no CC edge ties to a pose of the window begins a new epoch.
+        """
+        m = weighted(measurements, self.weights)  # Eq. 4
         if m.cc is None and not _NO_PIXELS.isdisjoint(m.status):
-            return self._repeat(m)
+            return self._coast(m)
         window, edges = self._window, pose_edges(m)
         follows = window is not None and self._follows(m, window, edges)
         reset = window is not None and not follows
         if window is None or not follows:
             window = self._begin(m, reset)
-        self._step(m, window, edges, follows)
-        if not math.isfinite(window.P.trace()):  # numbers that no road has: begin anew rather than publish them
+        ties = self._vehicles.tie(edges, m.frame_id, m.t_source_ns, self.config.constant_velocity)
+        if follows:
+            self._move_on(m, window, edges, ties)  # CC, and the vehicles' constant velocity
+        seen = sightings(m.cp) if window.is_keyframe else None
+        outliers = self._minimise(m, window, ties, seen)  # Eq. 8
+        self._renew_vehicles(m, window, edges, ties, outliers)
+        self._renew_map(m, window, seen)
+        if not window.is_finite:  # numbers that no road has: begin anew rather than publish them
             window, reset = self._begin(m, True), True
         status = (*m.status, Status.GRAPH_RESET) if reset else m.status
-        return self._record(m, status, window.P[:3, :3], self._others(m, window))
+        return self._estimate(m, status, window.ego_cov, self._vehicle_estimates(m, window))
 
     def map_update(self) -> MapUpdate | None:
         """What the map gained since the last call, in world; None where it gained nothing."""
@@ -110,7 +123,7 @@ class PoseGraph:
         if self._window is not None:
             begun = Epoch(
                 window=self._window.state(),
-                vehicles=self._traffic.vehicles,
+                vehicles=self._vehicles.nodes,
                 landmarks=self._landmarks.state(),
                 t_ns=self._t_ns,
                 t_before_ns=self._t_before_ns,
@@ -129,18 +142,18 @@ class PoseGraph:
         checkpoint = unpack(data, plain(graph=config, weights=weights))
         graph = PoseGraph(config, weights, checkpoint.epoch)
         begun = checkpoint.begun
-        graph._map.take_up(checkpoint.pending, checkpoint.epoch)
+        graph._map.resume(checkpoint.pending, checkpoint.epoch)
         if begun is None:
             return graph
         try:
-            graph._window = Window.taken_up(begun.window)
-            graph._landmarks = Landmarks.taken_up(begun.landmarks, config.max_landmarks)
+            graph._window = Window.from_state(begun.window)
+            graph._landmarks = Landmarks.from_state(begun.landmarks, config.max_landmarks)
         except ValueError as error:
             raise CheckpointError(f"does not fit together: {error}") from None
         if len(begun.vehicles) != len(graph._window.velocity):
             raise CheckpointError(f"does not fit together: {len(begun.vehicles)} vehicles are not the window's")
-        graph._traffic = Traffic(config.forget_s, config.max_vehicles, config.detection_contradictions)
-        graph._traffic.take_up(begun.vehicles)
+        graph._vehicles = VehicleNodes(config.forget_s, config.max_vehicles, config.detection_contradictions)
+        graph._vehicles.resume(begun.vehicles)
         graph._t_ns, graph._t_before_ns, graph._motion = begun.t_ns, begun.t_before_ns, begun.motion
         graph._lasting_m = begun.lasting_m
         return graph
@@ -149,7 +162,7 @@ class PoseGraph:
         config = self.config
         self.epoch += int(reset)
         self._window = Window(config.ego_nodes, m.frame_id)
-        self._traffic = Traffic(config.forget_s, config.max_vehicles, config.detection_contradictions)
+        self._vehicles = VehicleNodes(config.forget_s, config.max_vehicles, config.detection_contradictions)
         self._landmarks = Landmarks(config.max_landmarks)
         self._t_ns = self._t_before_ns = m.t_source_ns  # of the newest pose and of the one before
         self._motion = SE2()  # between them
@@ -164,72 +177,26 @@ class PoseGraph:
             cc is not None and cc.to_frame == m.frame_id and m.frame_id > window.frame and window.knows(cc.from_frame)
         )
 
-    # --- one frame's edges ---
+    # --- the steps of a frame ---
 
-    def _step(self, m: Measurements, window: Window, edges: PoseEdges, follows: bool) -> None:
-        """Moves the window on to this frame, if it follows another, and takes the frame's edges in."""
-        config, traffic = self.config, self._traffic
-        vehicles, row_of = traffic.vehicles, traffic.row_of
-        rows_seen = [row_of.get(e.vehicle, -1) for e in edges.cv]
-        known = [k for k, row in enumerate(rows_seen) if row >= 0]
-        linked = [k for k, e in enumerate(edges.vv) if self._links(e.vehicle, e.from_frame)]
-        rows_linked = [row_of[edges.vv[k].vehicle] for k in linked]
-        vv_rows = np.array(rows_linked, dtype=np.int64)
-        vv_poses, vv_covs = edges.poses[edges.vv_at], edges.covs[edges.vv_at]
-        if len(linked) < len(edges.vv):
-            vv_poses, vv_covs = vv_poses[linked], vv_covs[linked]
-        hold = Status.STANDSTILL in m.status
+    def _move_on(self, m: Measurements, window: Window, edges: PoseEdges, ties: Ties) -> None:
+        """The window on to this frame: the ego by the CC edge, vehicles with their twists, for the error of the scale.
 
-        # Every vehicle that an edge of this frame ties to its last pose gets a new one here
-        tied = set(rows_linked)
-        if config.constant_velocity:
-            tied.update([rows_seen[k] for k in known])
-        else:
-            known = [k for k in known if rows_seen[k] in tied]
-        passed_s = [0.0] * len(vehicles)
-        for row in tied:
-            v = vehicles[row]
-            passed_s[row] = max((m.t_source_ns - v.node_ns) * 1e-9, _SHORTEST_S)
-            v.node_frame, v.node_ns = m.frame_id, m.t_source_ns
-        dt_s = np.array(passed_s)
-        vv_dt_s = dt_s[vv_rows]
-        growth = dt_s[:, None] * self._changes if config.constant_velocity else np.zeros((len(vehicles), 3))
-        if linked and not config.constant_velocity:  # the twist of this interval is what VV says, whatever it was
-            window.retwist(vv_rows, *rates(vv_poses, vv_dt_s), vv_covs / np.square(vv_dt_s)[:, None, None])
-            vv_rows, vv_dt_s, (vv_poses, vv_covs) = vv_rows[:0], vv_dt_s[:0], _NO_EDGES
-        if follows and edges.cc is not None:
-            cov = np.zeros((3, 3)) if hold else edges.covs[0]
-            self._motion = window.predict(edges.cc.T_from_to, cov, edges.cc.from_frame, m.frame_id, dt_s, growth)
-            self._t_before_ns, self._t_ns = self._t_ns, m.t_source_ns
-            if not hold:
-                self._drift(window, m.scale_sigma_rel)
-
-        key_frame = window.next_node == KEY_NODE
-        seen = sightings(m.cp) if key_frame else None
-        cp_gap, cp_cov = (None, _NO_CP) if seen is None else self._cp(seen, window)
-        cv_poses, cv_covs = edges.poses[edges.cv_at], edges.covs[edges.cv_at]
-        some = slice(None) if len(known) == len(edges.cv) else known
-        now = Edges(
-            cv_rows=np.array([rows_seen[k] for k in known], dtype=np.int64),
-            cv_poses=cv_poses[some],
-            cv_covs=cv_covs[some],
-            vv_rows=vv_rows,
-            vv_dt_s=vv_dt_s,
-            vv_motions=vv_poses,
-            vv_covs=vv_covs,
-            cp_gap=cp_gap,
-            cp_cov=cp_cov,
-        )
-        wild = window.correct(now, config.detection_gate_sigma**2, hold)
-
-        rows, begun = traffic.see(edges.cv, known, [known[i] for i in wild], m.t_source_ns)
-        if rows is not None:
-            window.select(np.array(rows, dtype=np.int64))
-        if begun:
-            at = [traffic.begin(edges.cv[k].vehicle, m.frame_id, m.t_source_ns) for k in begun]
-            window.place(np.array(at, dtype=np.int64), cv_poses[begun], cv_covs[begun], self._born(cv_covs[begun]))
-        settled = [] if seen is None else self._landmarks.see(seen, window, config.landmark_least_frames)
-        self._map.add(m.frame_id, settled, window.world, m.lanes)
+        Without `constant_velocity` a vehicle's twist in this interval is what its VV edge says, whatever it was before.
+        """
+        cc, vv = edges.cc, ties.vv
+        assert cc is not None  # the frame follows
+        growth = np.zeros((len(ties.dt_s), 3))
+        if self.config.constant_velocity:
+            growth = ties.dt_s[:, None] * self._changes
+        elif len(vv.rows):
+            window.retwist(vv.rows, *rates(vv.motions, vv.dt_s), vv.covs / np.square(vv.dt_s)[:, None, None])
+        stands = Status.STANDSTILL in m.status
+        cov = np.zeros((3, 3)) if stands else edges.covs[0]
+        self._motion = window.propagate(cc.T_from_to, cov, cc.from_frame, m.frame_id, ties.dt_s, growth)
+        self._t_before_ns, self._t_ns = self._t_ns, m.t_source_ns
+        if not stands:
+            self._drift(window, m.scale_sigma_rel)
 
     def _drift(self, window: Window, scale_sigma_rel: float) -> None:
         """The error of the metric scale lasts, so that of a step is the same as that of the way before it.
@@ -242,49 +209,60 @@ class PoseGraph:
             window.drift(step / length_m, 2.0 * scale_sigma_rel**2 * self._lasting_m * length_m)
             self._lasting_m = math.exp(-length_m / self.config.scale_memory_m) * self._lasting_m + length_m
 
-    def _born(self, covs: Floats) -> Floats:
+    def _minimise(self, m: Measurements, window: Window, ties: Ties, seen: Sightings | None) -> list[int]:
+        """Eq. 8 over this frame's edges; which of the CV edges of `ties` are outliers."""
+        config, cp = self.config, None
+        if seen is not None:
+            cp = self._landmarks.sum_of_edges(  # Eq. 7
+                seen, window, config.landmark_gate_sigma**2, config.landmark_common_m**2
+            )
+        vv = ties.vv if config.constant_velocity else NO_VV  # else they have set the twists
+        return window.minimise(ties.cv, vv, cp, config.detection_gate_sigma**2, hold=Status.STANDSTILL in m.status)
+
+    def _renew_vehicles(
+        self, m: Measurements, window: Window, edges: PoseEdges, ties: Ties, outliers: list[int]
+    ) -> None:
+        """Forgets who is long out of sight, and begins who is new or was an outlier too often."""
+        rows, begun = self._vehicles.book(edges.cv, ties.known, [ties.known[i] for i in outliers], m.t_source_ns)
+        if rows is not None:
+            window.select(np.array(rows, dtype=np.int64))
+        if begun:
+            at = [self._vehicles.begin(edges.cv[k].vehicle, m.frame_id, m.t_source_ns) for k in begun]
+            poses, covs = edges.poses[edges.cv_at][begun], edges.covs[edges.cv_at][begun]
+            window.place(np.array(at, dtype=np.int64), poses, covs, self._birth_covs(covs))
+
+    def _birth_covs(self, covs: Floats) -> Floats:
         """(k, 3, 3) of the twists of vehicles first seen with `covs` (k, 3, 3), at rest for all that is known.
 
-        A yaw that is off turns the velocity: of the twist, which is told in axes that are off, both share the doubt.
+        A yaw that is off turns the velocity: the twist is in axes that are off by it, so its variances grow by that.
         """
         out = np.tile(self._birth, (len(covs), 1, 1))
         out[:, 0, 0] += covs[:, 2, 2] * self._birth[1, 1]
         out[:, 1, 1] += covs[:, 2, 2] * self._birth[0, 0]
         return out
 
-    def _links(self, vehicle: int, from_frame: int) -> bool:
-        """Whether a VV edge starts at the vehicle's newest pose."""
-        row = self._traffic.row_of.get(vehicle)
-        return row is not None and self._traffic.vehicles[row].node_frame == from_frame
-
-    def _cp(self, seen: Sightings, window: Window) -> tuple[Floats | None, Floats]:
-        """The sum of the CP edges (2,), (2, 2), with what the sum over a frame's landmarks does not average away."""
-        edge = self._landmarks.edge(seen, window, self.config.landmark_gate_sigma**2)
-        if edge is None:
-            return None, _NO_CP
-        gap, mean, d = edge
-        mean += self.config.landmark_common_m**2
-        return np.array([gap.real, gap.imag]), np.array([[mean + d.real, d.imag], [d.imag, mean - d.real]])
+    def _renew_map(self, m: Measurements, window: Window, seen: Sightings | None) -> None:
+        """Ties a keyframe's landmarks to it; settled landmarks and the frame's lane points go on the map."""
+        settled = [] if seen is None else self._landmarks.tie(seen, window, self.config.landmark_least_frames)
+        self._map.add(m.frame_id, settled, window.world, m.lanes)
 
     # --- the newest frame's estimates ---
 
-    def _repeat(self, m: Measurements) -> Estimate:
+    def _coast(self, m: Measurements) -> Estimate:
         """A frame without a picture: the last pose, as uncertain as the time since then makes it."""
         window, config = self._window, self.config
         if window is None:
-            return self._record(m, (*m.status, Status.NOT_INITIALISED), np.zeros((3, 3)), ())
+            return self._estimate(m, (*m.status, Status.NOT_INITIALISED), np.zeros((3, 3)), ())
         since_s = max((m.t_source_ns - self._t_ns) * 1e-9, 0.0)
-        rate = np.abs(self._motion.log()) / max((self._t_ns - self._t_before_ns) * 1e-9, _SHORTEST_S)
+        rate = np.abs(self._motion.log()) / max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
         rate += np.array([config.blind_mps, config.blind_mps, config.blind_radps])
-        cov = window.P[:3, :3] + np.diag(np.square(rate * since_s))
-        return self._record(
-            m, m.status, cov, vehicle_estimates(window, self._traffic.vehicles, m.t_source_ns, self._changes)
-        )
+        cov = window.ego_cov + np.diag(np.square(rate * since_s))
+        return self._estimate(m, m.status, cov, self._vehicle_estimates(m, window))
 
-    def _others(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
-        return vehicle_estimates(window, self._traffic.vehicles, m.t_source_ns, self._changes)
+    def _vehicle_estimates(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
+        return vehicle_estimates(window, self._vehicles.nodes, m.t_source_ns, self._changes)
 
-    def _record(
+    def _estimate(
         self, m: Measurements, status: tuple[Status, ...], cov: Floats, vehicles: tuple[VehicleEstimate, ...]
     ) -> Estimate:
         numbers = cov.ravel().tolist()

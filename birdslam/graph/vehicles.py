@@ -1,15 +1,22 @@
-"""The vehicles of the pose graph: who is alive, when it was seen, and which of its detections to believe."""
+"""The vehicles of the pose graph: which are in it, which edges tie them to it, and which detections are outliers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from birdslam.geometry.planar import Floats
+from birdslam.graph.edges import PoseEdges
+from birdslam.graph.factors import CvEdges, VvEdges
 from birdslam.types import VehicleEdge
+
+SHORTEST_S = 1e-3  # source clocks that stand still or run backwards
 
 
 @dataclass(slots=True)
-class Vehicle:
-    """One vehicle; its pose and velocity are the window's, in the row at which it stands in `Traffic.vehicles`."""
+class VehicleNode:
+    """One vehicle; its pose and velocity are the window's, in the row at which it stands in `VehicleNodes.nodes`."""
 
     vehicle: int
     node_frame: int = -1  # of its newest pose
@@ -17,47 +24,90 @@ class Vehicle:
     seen_ns: int = 0
     frames: int = 0  # that it was seen in
     agreed: int = 0  # detections that fitted since it was last begun
-    contradicted: int = 0  # detections in a row that did not
+    contradicted: int = 0  # outliers in a row
     label: str = "car"
     length_m: float = 0.0
     width_m: float = 0.0
-    delay_ns: int = 0  # of the sight at seen_ns
+    delay_ns: int = 0  # of the detection at seen_ns
 
 
-class Traffic:
+@dataclass(slots=True)
+class Ties:
+    """The edges of a frame that tie vehicles of the window to it, and for how long each vehicle drives on."""
+
+    known: list[int]  # which of the frame's CV edges `cv` has
+    cv: CvEdges
+    vv: VvEdges
+    dt_s: Floats  # (M,) since each vehicle's newest pose; 0: it gets no pose in this frame
+
+
+class VehicleNodes:
     """The vehicles in the order of the window's rows."""
 
     def __init__(self, forget_s: float, capacity: int, contradictions: int) -> None:
         self._forget_s = forget_s
         self._capacity = capacity
         self._contradictions = contradictions
-        self.vehicles: list[Vehicle] = []
-        self.row_of: dict[int, int] = {}
+        self.nodes: list[VehicleNode] = []
+        self._row: dict[int, int] = {}
 
-    def take_up(self, vehicles: list[Vehicle]) -> None:
+    def resume(self, nodes: list[VehicleNode]) -> None:
         """Goes on with the vehicles of an earlier process, in the order of the window's rows."""
-        self.vehicles = vehicles
-        self.row_of = {v.vehicle: row for row, v in enumerate(vehicles)}
+        self.nodes = nodes
+        self._row = {v.vehicle: row for row, v in enumerate(nodes)}
 
-    def see(
-        self, edges: list[VehicleEdge], tied: list[int], wild: list[int], t_ns: int
+    def tie(self, edges: PoseEdges, frame: int, t_ns: int, constant_velocity: bool) -> Ties:
+        """Which edges of the frame have both ends in the window; each vehicle that they tie to it gets a pose there.
+
+        A VV edge has to start at the vehicle's newest pose. Without `constant_velocity` nothing but a VV edge ties a
+        vehicle's new pose to the one before (Eq. 6).
+        """
+        rows = [self._row.get(e.vehicle, -1) for e in edges.cv]
+        known = [k for k, row in enumerate(rows) if row >= 0]
+        linked = [k for k, e in enumerate(edges.vv) if self._starts_at_newest(e.vehicle, e.from_frame)]
+        linked_rows = [self._row[edges.vv[k].vehicle] for k in linked]
+        tied = set(linked_rows)
+        if constant_velocity:
+            tied.update([rows[k] for k in known])
+        else:
+            known = [k for k in known if rows[k] in tied]
+        passed_s = [0.0] * len(self.nodes)
+        for row in tied:
+            v = self.nodes[row]
+            passed_s[row] = max((t_ns - v.node_ns) * 1e-9, SHORTEST_S)
+            v.node_frame, v.node_ns = frame, t_ns
+        dt_s, vv_rows = np.array(passed_s), np.array(linked_rows, dtype=np.int64)
+        return Ties(
+            known,
+            CvEdges(np.array([rows[k] for k in known], dtype=np.int64), *edges.some(edges.cv_at, known)),
+            VvEdges(vv_rows, dt_s[vv_rows], *edges.some(edges.vv_at, linked)),
+            dt_s,
+        )
+
+    def _starts_at_newest(self, vehicle: int, from_frame: int) -> bool:
+        row = self._row.get(vehicle)
+        return row is not None and self.nodes[row].node_frame == from_frame
+
+    def book(
+        self, edges: list[VehicleEdge], known: list[int], outliers: list[int], t_ns: int
     ) -> tuple[list[int] | None, list[int]]:
         """Books this frame's CV edges and forgets who is long out of sight.
 
-        Of the edges, `tied` are those that corrected a vehicle or, `wild`, contradicted it and were left out. Returns
-        the rows that stay, in their new order, -1 for a vehicle that is new (None: all stay and none is new), and which
-        edges begin a vehicle: one that nothing ties to an earlier pose, or one that was contradicted in a row as often
-        as it had been agreed with before (or often enough), so that a vehicle born of a wild detection soon dies.
+        Of the edges, `known` are those that corrected a vehicle or, being `outliers`, contradicted it and were left
+        out. Returns the rows that stay, in their new order, -1 for a vehicle that is new (None: all stay and none is
+        new), and which edges begin a vehicle: one that nothing ties to an earlier pose, or one that was contradicted in
+        a row as often as it had been agreed with before (or often enough), so that a vehicle that began with an outlier
+        soon ends.
         """
         born = []
-        begun = [k for k in range(len(edges)) if k not in tied] if len(tied) < len(edges) else []
+        begun = [k for k in range(len(edges)) if k not in known] if len(known) < len(edges) else []
         for k, edge in enumerate(edges):
-            row = self.row_of.get(edge.vehicle)
+            row = self._row.get(edge.vehicle)
             if row is None:
-                born.append(v := Vehicle(edge.vehicle))
+                born.append(v := VehicleNode(edge.vehicle))
             else:
-                v = self.vehicles[row]
-            if k not in wild:
+                v = self.nodes[row]
+            if k not in outliers:
                 v.agreed, v.contradicted = v.agreed + 1, 0
             else:
                 v.contradicted += 1
@@ -65,22 +115,22 @@ class Traffic:
                     begun.append(k)
             v.seen_ns, v.frames, v.label = t_ns, v.frames + 1, edge.label
             v.length_m, v.width_m, v.delay_ns = edge.length_m, edge.width_m, edge.delay_ns
-        known = len(self.vehicles)
-        alive = [row for row, v in enumerate(self.vehicles) if (t_ns - v.seen_ns) * 1e-9 <= self._forget_s]
-        if not born and len(alive) == known:
+        before = len(self.nodes)
+        alive = [row for row, v in enumerate(self.nodes) if (t_ns - v.seen_ns) * 1e-9 <= self._forget_s]
+        if not born and len(alive) == before:
             return None, begun
-        everyone = [*self.vehicles, *born]
-        rows = [*alive, *range(known, len(everyone))]
+        everyone = [*self.nodes, *born]
+        rows = [*alive, *range(before, len(everyone))]
         if len(rows) > self._capacity:  # the freshest stay, the first of them first
             rows = sorted(sorted(rows, key=lambda row: (-everyone[row].seen_ns, row))[: self._capacity])
-        self.vehicles = [everyone[row] for row in rows]
-        self.row_of = {v.vehicle: row for row, v in enumerate(self.vehicles)}
-        begun = [k for k in begun if edges[k].vehicle in self.row_of]
-        return [row if row < known else -1 for row in rows], begun
+        self.nodes = [everyone[row] for row in rows]
+        self._row = {v.vehicle: row for row, v in enumerate(self.nodes)}
+        begun = [k for k in begun if edges[k].vehicle in self._row]
+        return [row if row < before else -1 for row in rows], begun
 
     def begin(self, vehicle: int, frame: int, t_ns: int) -> int:
         """The row of a vehicle whose first pose is in this frame."""
-        row = self.row_of[vehicle]
-        v = self.vehicles[row]
+        row = self._row[vehicle]
+        v = self.nodes[row]
         v.node_frame, v.node_ns, v.agreed, v.contradicted = frame, t_ns, 1, 0
         return row

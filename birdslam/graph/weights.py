@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec.structs import replace
 
-from birdslam.types import LANE_LANDMARKS, Cov2, Cov3, Measurements
+from birdslam.graph.factors import effective_cov
+from birdslam.types import LandmarkKind, Measurements
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 EdgeType = Literal["cc", "cp", "cv", "vv", "lanes"]
@@ -56,23 +56,20 @@ def weighted(measurements: Measurements, config: WeightsConfig) -> Measurements:
     threshold_m = config.depth_threshold_m
     cp = () if "cp" in out else measurements.cp
     if "lanes" in out and cp:
-        cp = tuple([edge for edge in cp if edge.landmark < LANE_LANDMARKS])
+        cp = tuple([edge for edge in cp if edge.kind is not LandmarkKind.LANE_STATION])
     if threshold_m is not None and cp:
         cp = tuple([edge for edge in cp if edge.x_m <= threshold_m])
     cv = () if "cv" in out else measurements.cv
     vv = () if "vv" in out else measurements.vv
     cc = measurements.cc
     if config.mode == "paper":
-        cp = tuple(replace(edge, cov=_unit2(1.0 / config.cp)) for edge in cp)
-        cv = tuple(replace(edge, cov=_unit3(1.0 / config.cv_at(edge.T_ego_vehicle.x_m))) for edge in cv)
-        vv = tuple(replace(edge, cov=_unit3(1.0 / config.vv)) for edge in vv)
-        cc = cc and replace(cc, cov=_unit3(1.0 / config.cc))
+        cp_cov, vv_cov = effective_cov(config.cp, 2), effective_cov(config.vv, 3)  # Eq. 4, here and in the next lines
+        cp = tuple(replace(edge, cov=cp_cov) for edge in cp)
+        cv = tuple(replace(edge, cov=effective_cov(config.cv_at(edge.T_ego_vehicle.x_m), 3)) for edge in cv)
+        vv = tuple(replace(edge, cov=vv_cov) for edge in vv)
+        cc = cc and replace(cc, cov=effective_cov(config.cc, 3))
     if cc and "cc" in out:
-        cc = replace(cc, cov=_unit3(1.0))
+        cc = replace(cc, cov=effective_cov(1.0, 3))
     if cc is measurements.cc and cv is measurements.cv and vv is measurements.vv and cp is measurements.cp:
         return measurements
     return replace(measurements, cc=cc, cv=cv, vv=vv, cp=cp)
-
-
-_unit3: Callable[[float], Cov3] = lambda v: (v, 0.0, 0.0, 0.0, v, 0.0, 0.0, 0.0, v)  # noqa: E731
-_unit2: Callable[[float], Cov2] = lambda v: (v, 0.0, 0.0, v)  # noqa: E731

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.types import LANE_LANDMARKS, LandmarkEdge
+from birdslam.types import LandmarkEdge, LandmarkKind
 
 Floats = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -54,7 +54,9 @@ class Station:
         x_m, y_m = (T_world_ego.inverse() @ self.point_m).tolist()
         R = T_world_ego.rotation()
         cov = tuple((R.T @ self.cov @ R).ravel().tolist())
-        return LandmarkEdge(landmark=self.landmark, frame=frame_id, x_m=x_m, y_m=y_m, cov=cov)
+        return LandmarkEdge(
+            landmark=self.landmark, frame=frame_id, x_m=x_m, y_m=y_m, cov=cov, kind=LandmarkKind.LANE_STATION
+        )
 
 
 def stations(points_m: Floats, lanes: Ids, config: LaneEdgesConfig) -> list[tuple[int, Floats, Floats]]:
@@ -77,7 +79,7 @@ def stations(points_m: Floats, lanes: Ids, config: LaneEdgesConfig) -> list[tupl
             if np.std(across - at_m - slope * (along - middle_m)) > config.bend_m:
                 continue
             point, direction = np.array([middle_m, at_m]), np.array([1.0, slope]) / np.hypot(1.0, slope)
-            landmark = LANE_LANDMARKS + (2 * int(lane) + axis) * _CELLS + cell % _CELLS
+            landmark = (2 * int(lane) + axis) * _CELLS + cell % _CELLS
             found.append((landmark, *((point, direction) if axis == 0 else (point[::-1], direction[::-1]))))
     return found
 

@@ -10,7 +10,7 @@ import tokenize
 import types
 import typing
 from collections.abc import Iterable, Iterator
-from enum import Enum
+from enum import IntEnum
 from typing import Any
 
 import msgspec
@@ -216,8 +216,10 @@ def _type(kind: Any) -> str:
         return "pose"
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         return _link(kind)
-    if isinstance(kind, type) and issubclass(kind, Enum):
+    if kind is Status:
         return "[status](#statuses)"
+    if isinstance(kind, type) and issubclass(kind, IntEnum):
+        return "integer"
     return {int: "integer", float: "number", bool: "boolean", str: "text"}[kind]
 
 

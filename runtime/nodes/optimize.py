@@ -121,7 +121,7 @@ class OptimizeNode:
             self.ended = True
             yield from self._end(record)
             return
-        estimate = self._last = self._graph.update(record)
+        estimate = self._last = self._graph.optimise(record)
         if estimate.frame_id <= self._told_before:
             self._graph.map_update()  # told as well
             return
@@ -146,7 +146,7 @@ class OptimizeNode:
 
     def _coast(self, ref: FrameRef) -> Estimate:
         """Of a frame without measurements; the graph stays as it is."""
-        return self._graph.update(unmeasured(ref, self._last, self._coast_max_ns))
+        return self._graph.optimise(unmeasured(ref, self._last, self._coast_max_ns))
 
     def _told(self, estimate: Estimate) -> Estimate:
         """What goes out, with what planners have yet to hear."""

@@ -60,7 +60,7 @@ class _State:
         """One frame's, as OptimizeNode.step."""
         if Status.END_OF_SOURCE in measurements.status:
             return farewell(measurements, self.graph.epoch, self.last)
-        self.last = self.graph.update(measurements)
+        self.last = self.graph.optimise(measurements)
         gained = self.graph.map_update()
         self.maps = [gained] if gained else []
         return self.last
@@ -227,7 +227,7 @@ class Comparison:
             ref = self._frames.get(estimate.frame_id)
             if ref is None:
                 return None
-            replayed = state.graph.update(unmeasured(ref, state.last, self._coast_max_ns))
+            replayed = state.graph.optimise(unmeasured(ref, state.last, self._coast_max_ns))
         if Status.END_OF_SOURCE in replayed.status:
             return replayed
         return state.tell(replayed)
@@ -275,7 +275,7 @@ def estimates(recording: Recording, config: BackEnd) -> Iterator[Estimate | MapU
         measurements = _record(message.data, Measurements)
         if Status.END_OF_SOURCE in measurements.status:
             continue
-        yield graph.update(measurements)
+        yield graph.optimise(measurements)
         gained = graph.map_update()
         if gained is not None:
             yield gained
