@@ -18,14 +18,15 @@ from birdslam.mapping.lanes import LanesConfig
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
 from birdslam.perception import Perception
 from birdslam.types import Attitude, EgoEdge, Frame, Ground, Measurements, Status
+from birdslam.vehicles.camera_height import HeightWatch, HeightWatchConfig
 from birdslam.vehicles.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.ground_size_filter import Horizon, HorizonConfig
-from birdslam.vehicles.height_watch import HeightWatch, HeightWatchConfig
+from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
 from birdslam.vehicles.localisation import LocalisationConfig
-from birdslam.vehicles.out_of_sequence import Hindsight, HindsightConfig, Moment
+from birdslam.vehicles.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
 from birdslam.vehicles.pseudolidar import FrustumNetwork
-from birdslam.vehicles.tracking import Tracker, TrackingConfig
-from birdslam.vehicles.vehicle_edges import Present, vehicle_edges
+from birdslam.vehicles.track import EgoFrame, TrackingConfig
+from birdslam.vehicles.tracking import Tracker
+from birdslam.vehicles.vehicle_edges import vehicle_edges
 
 
 class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -33,10 +34,10 @@ class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     odometry: OdometryConfig = OdometryConfig()
     localisation: LocalisationConfig = LocalisationConfig()
-    horizon: HorizonConfig = HorizonConfig()
+    ground_size: GroundSizeConfig = GroundSizeConfig()
     pseudolidar: PseudoLidarConfig = PseudoLidarConfig()
     tracking: TrackingConfig = TrackingConfig()
-    hindsight: HindsightConfig = HindsightConfig()
+    out_of_sequence: OutOfSequenceConfig = OutOfSequenceConfig()
     static_map: StaticMapConfig = StaticMapConfig()
     lanes: LanesConfig = LanesConfig()
     lane_edges: LaneEdgesConfig = LaneEdgesConfig()
@@ -81,14 +82,10 @@ class FrontEnd:
         self.camera = camera
         self.config = config
         self.odometry: EgoMotion = odometry or Odometry(camera, config.odometry)
-        self.hindsight = Hindsight(
-            camera,
-            Tracker(camera, config.tracking, config.localisation, config.pseudolidar),
-            Horizon(camera, config.horizon),
-            config.localisation,
-            config.hindsight,
-            config.pseudolidar,
-            frustum_network,
+        self.vehicles = OutOfSequenceTracker(
+            Tracker(camera, config.tracking, config.localisation, config.pseudolidar, frustum_network),
+            GroundSizeFilter(camera, config.ground_size),
+            config.out_of_sequence,
         )
         self._reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
         self._lanes = LaneMapper(camera, config.static_map, config.lanes, config.lane_edges, lane_head)
@@ -113,17 +110,17 @@ class FrontEnd:
             self._lanes.clear()
         cc = None if motion is None else self._advance(motion)
         T_world_ego = self._reckoning.T_world_ego
-        self.hindsight.begin(self._moment(frame, motion))
+        opened = self._open_frame(frame, motion)
+        self.vehicles.open_frame(opened)
 
         # Dynamic object localisation: of this very frame, or of the earlier one that late detections are of
         age = perception.ages.get("detector", 0)
         depth = perception.depth if perception.ages.get("depth", 0) == age else None
         road_then = road if perception.ages.get("segmenter", 0) == age else None
-        seen = self.hindsight.see(detections, frame.frame_id - age, depth, road_then)
-        ground, sigma_pitch_rad = self.hindsight.road.ground, self.hindsight.road.sigma_pitch_rad
-        present = Present(frame.frame_id, frame.t_source_ns, T_world_ego, ground)
-        cv, vv = vehicle_edges(seen, present, self.camera, self.config.tracking)
-        status += self.height.step(cv, motion)
+        tracks_seen = self.vehicles.localise_vehicles(detections, frame.frame_id - age, depth, road_then)
+        ground, sigma_pitch_rad = self.vehicles.road.ground, self.vehicles.road.sigma_pitch_rad
+        cv, vv = vehicle_edges(tracks_seen, opened.ego, ground, self.camera, self.config.tracking)
+        status += self.height.judge(cv, motion)
 
         # Lanes, by what is known of this frame's road or an earlier one's (Sec. 3.2)
         segmented = frame.frame_id - perception.ages.get("segmenter", 0)
@@ -162,15 +159,13 @@ class FrontEnd:
         self._last_frame = frame.frame_id
         return (Status.FRAMES_DROPPED,) if gap else ()
 
-    def _moment(self, frame: Frame, motion: Motion | None) -> Moment:
-        """The road as this frame's image and the camera's own pitching since the last frame give it."""
+    def _open_frame(self, frame: Frame, motion: Motion | None) -> OpenFrame:
+        """The ego, and the road as this frame's image and the camera's own pitching since the last frame give it."""
         t_source_ns, pitch_rad = frame.t_source_ns, self._reckoning.attitude.pitch_rad
         (last_ns, last_rad), self._last_pitch = self._last_pitch, (t_source_ns, pitch_rad)
-        return Moment(
-            frame_id=frame.frame_id,
-            t_source_ns=t_source_ns,
-            T_world_ego=self._reckoning.T_world_ego,
-            ego_cov=None if motion is None else np.asarray(motion.cov),
+        step_cov = None if motion is None else np.asarray(motion.cov)
+        return OpenFrame(
+            EgoFrame(frame.frame_id, t_source_ns, self._reckoning.T_world_ego, step_cov),
             dt_s=max(0.0, (t_source_ns - last_ns) * 1e-9),
             turn_rad=None if motion is None else pitch_rad - last_rad,
             image_ground=None if motion is None else motion.ground,

@@ -6,7 +6,7 @@
 - a pitch step of 1.5 degrees, down and up: KITTI 00 with each image from frame 40 on turned by K R K^-1, which is exact
   for a rotation, so that the unedited drive is the truth;
 - a height stated 10 and 15 % too low and too high: KITTI 00 with another `height_m`. The scale follows it, since
-  nothing in the images can tell; the vehicles can (heightwatch.py), where a detector is given.
+  nothing in the images can tell; the vehicles can (camera_height.py), where a detector is given.
 
 Writes ground.json and ground.png.
 """

@@ -28,9 +28,9 @@ from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perception.pointnet import PointNet, load_pointnet
 from birdslam.perf.errors import PerfError
 from birdslam.perf.figures import Ledger
-from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, combined
-from birdslam.vehicles.localisation import LocalisationConfig, Observation, Place, iou, localise, place
-from birdslam.vehicles.placing import Body
+from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
+from birdslam.vehicles.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes, place
+from birdslam.vehicles.placing import Assignment
 from birdslam.vehicles.pseudolidar import localise_by_depth, places_of
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def measured(looks: Iterator[Look], pointnet: PointNet) -> dict[tuple[str, float
         ground = GroundPlane(true.height_m, pitch_rad, true.roll_rad)
         by_box = [by_bottom(o, ground, look.localisation) for o in look.seen]
         headed = [
-            by_bottom(o, ground, look.localisation, Body(0, None, o, body).yaw_rad(SE2()))
+            by_bottom(o, ground, look.localisation, Assignment(0, None, o, body).yaw_rad(SE2()))
             for o, body in zip(look.seen, look.bodies, strict=True)
         ]
         by_net = localise_by_depth(look.seen, look.depth, camera, ground, config, network=pointnet)
@@ -134,10 +134,10 @@ def measured(looks: Iterator[Look], pointnet: PointNet) -> dict[tuple[str, float
             "Eq. 1": by_box,
             "geometric fit": localise_by_depth(look.seen, look.depth, camera, ground, config),
             "Frustum-PointNet": by_net,
-            "Eq. 1 + PointNet": [combined(a, b, config) for a, b in zip(by_box, by_net, strict=True)],
+            "Eq. 1 + PointNet": [fuse(a, b, config) for a, b in zip(by_box, by_net, strict=True)],
             "multi-task body": look.bodies,
             "Eq. 1 + multi-task body": [
-                None if b is None else combined(a, b, config) for a, b in zip(headed, look.bodies, strict=True)
+                None if b is None else fuse(a, b, config) for a, b in zip(headed, look.bodies, strict=True)
             ],
         }
         for method, answers in places.items():
@@ -179,9 +179,11 @@ def _observed(
     truth: Sequence[WorldObject],
     config: LocalisationConfig,
 ) -> tuple[list[Observation], list[WorldObject], list[int]]:
-    """What `localise` makes of boxes, with truth and rows that go with it."""
-    seen = localise(boxes_px, np.full(len(boxes_px), 0.9), tuple(labels), frame.camera, frame.camera.ground, config)
-    rows = [int(np.abs(boxes_px - np.array(o.box_px)).sum(axis=1).argmin()) for o in seen]
+    """What `observe_boxes` makes of boxes, with truth and rows that go with it."""
+    seen = observe_boxes(
+        boxes_px, np.full(len(boxes_px), 0.9), tuple(labels), frame.camera, frame.camera.ground, config
+    )
+    rows = [o.row for o in seen]
     return seen, [truth[row] for row in rows], rows
 
 
@@ -226,7 +228,7 @@ def _seen_by(network: Network, frames: int) -> Iterator[Look]:
         overlap = iou(boxes, np.array([v.box_px for v in vehicles]))
         rows = [row for row in range(len(boxes)) if overlap[row].max() >= SAME_IOU]
         labels = [found.detections.labels[row] for row in rows]
-        localisation = LocalisationConfig().told(found.detections.edge_sigma)
+        localisation = LocalisationConfig().with_edge_sigma(found.detections.edge_sigma)
         matched = [vehicles[overlap[row].argmax()] for row in rows]
         seen, truth, kept = _observed(frame, boxes[rows], labels, matched, localisation)
         bodies = found.detections.boxes3d

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from birdslam.calibration.calibration import CalibrationConfig, CalibrationError, calibrate
+from birdslam.calibration.height_check import VehicleHeightConfig, solve_mounting
 from birdslam.calibration.intrinsics import from_chessboard, read_intrinsics
 from birdslam.datasets.camera_file import load_camera
 from birdslam.datasets.recording import DatasetError
@@ -21,7 +22,7 @@ from birdslam.frontend import FrontEndConfig
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.main import main
 from birdslam.types import Frame
-from birdslam.vehicles.camera_height import Sight, VehicleHeightConfig, stand_of
+from birdslam.vehicles.camera_height import BoxHeight
 from tests.test_odometry import CAMERA, PITCH_RAD, render, street
 
 ROS = """image_width: 640
@@ -180,27 +181,27 @@ def test_a_bad_chessboard_is_named(boards: Path, tmp_path: Path) -> None:
         from_chessboard(flat, COLUMNS, ROWS, SQUARE_M)
 
 
-# --- the stand by the vehicles ---
+# --- the mounting by the vehicles ---
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_stand_by_vehicles_is_within_its_sigma(seed: int) -> None:
     rng, truth = np.random.default_rng(seed), np.array([1.4, 0.02, -0.01])
-    sights = []
+    boxes = []
     for vehicle in range(40):
         tall_m, far_m, b = rng.normal(1.53, 0.12), rng.uniform(8, 40), rng.uniform(-0.5, 0.5)
         for k in range(8):
             z = far_m + 0.5 * k
             bottom = truth[0] / z - truth[1] + truth[2] * b + rng.normal(0, 0.002)
-            sights.append(Sight(vehicle, bottom, 0.002, tall_m / z + rng.normal(0, 0.002), 0.002, b, 1.53, 0.08))
+            boxes.append(BoxHeight(vehicle, bottom, 0.002, tall_m / z + rng.normal(0, 0.002), 0.002, b, 1.53, 0.08))
     for _ in range(10):  # a detector's ghosts: vehicles that hang in the air
-        sights.append(Sight(100 + len(sights), -0.05, 0.002, 0.1, 0.002, 0.0, 1.53, 0.08))
+        boxes.append(BoxHeight(100 + len(boxes), -0.05, 0.002, 0.1, 0.002, 0.0, 1.53, 0.08))
     wide = np.diag([1.0, 0.1**2, 0.1**2])
-    stand = stand_of(sights, np.array([1.65, 0.0, 0.0]), wide, VehicleHeightConfig())
-    assert stand is not None
-    assert np.sqrt(np.diag(stand.cov)) == pytest.approx([0.08, 0.004, 0.015], rel=0.4)
-    assert (np.abs(stand.state - truth) < 2.5 * np.sqrt(np.diag(stand.cov))).all()
-    assert stand_of(sights[:16], np.array([1.65, 0.0, 0.0]), wide, VehicleHeightConfig()) is None
+    mounting = solve_mounting(boxes, np.array([1.65, 0.0, 0.0]), wide, VehicleHeightConfig())
+    assert mounting is not None
+    assert np.sqrt(np.diag(mounting.cov)) == pytest.approx([0.08, 0.004, 0.015], rel=0.4)
+    assert (np.abs(mounting.state - truth) < 2.5 * np.sqrt(np.diag(mounting.cov))).all()
+    assert solve_mounting(boxes[:16], np.array([1.65, 0.0, 0.0]), wide, VehicleHeightConfig()) is None
 
 
 # --- a drive ---

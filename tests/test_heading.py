@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from birdslam.evaluation.localisation import INSIDE_2_SIGMA
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera
-from birdslam.vehicles.heading import HeadingConfig, Headings, spread
-from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, localise, place
+from birdslam.vehicles.heading import HeadingConfig, Headings, marginalise_yaw
+from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes, place
 
 Floats = NDArray[np.float64]
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
@@ -30,22 +30,24 @@ def car_at(centre_m: Floats, yaw_rad: float, noise_px: Floats, stretch: float = 
         CAMERA, CAMERA.ground, np.vstack([np.column_stack([corners, np.full(4, z)]) for z in (0, 1.5)])
     )
     box = np.array([*px.min(axis=0), *px.max(axis=0)]) + noise_px
-    (seen,) = localise(box[None], np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION)
+    (seen,) = observe_boxes(box[None], np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION)
     return seen, float(corners[:, 0].min())
 
 
 def placed(
     seen: Observation, depth_m: float, headings: Headings, localisation: LocalisationConfig = LOCALISATION
 ) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-    """(centre, cov) without and with the doubt of the yaw."""
+    """(centre, cov) without and with the uncertainty of the yaw."""
     log_depth = math.log(depth_m)
     sharp = place(seen, log_depth, SIGMA_DEPTH**2, float(headings.yaw_rad[0]), localisation)
-    shift, cov = spread([seen], np.array([log_depth]), np.array([SIGMA_DEPTH**2]), headings, localisation, CONFIG)
+    shift, cov = marginalise_yaw(
+        [seen], np.array([log_depth]), np.array([SIGMA_DEPTH**2]), headings, localisation, CONFIG
+    )
     return (sharp.centre_m, sharp.cov), (sharp.centre_m + shift[0], sharp.cov + cov[0])
 
 
-def thought(yaw_rad: float, sigma_rad: float, astray: float) -> Headings:
-    return Headings(np.array([yaw_rad]), np.array([sigma_rad]), np.array([astray]))
+def thought(yaw_rad: float, sigma_rad: float, outlier: float) -> Headings:
+    return Headings(np.array([yaw_rad]), np.array([sigma_rad]), np.array([outlier]))
 
 
 @pytest.mark.parametrize("yaw_rad", [-1.0, 0.0, 0.5, 2.0])

@@ -18,7 +18,7 @@ from birdslam.vehicles.localisation import (
     extent_m,
     hidden_edges,
     iou,
-    localise,
+    observe_boxes,
     place,
 )
 
@@ -41,7 +41,7 @@ def observe(
     boxes: list[np.ndarray], labels: tuple[str, ...] | None = None, scores: list[float] | None = None
 ) -> list[Observation]:
     names = labels or ("car",) * len(boxes)
-    return localise(np.array(boxes), np.array(scores or [0.9] * len(boxes)), names, CAMERA, GROUND, CONFIG)
+    return observe_boxes(np.array(boxes), np.array(scores or [0.9] * len(boxes)), names, CAMERA, GROUND, CONFIG)
 
 
 def locate(box: np.ndarray, near_m: float, yaw_rad: float = 0.0) -> Place:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.parallax import UNKNOWN, LearnedSize, Parallax, ParallaxConfig, Sights
+from birdslam.vehicles.parallax import UNKNOWN, LearnedSize, Parallax, ParallaxConfig, ParallaxMeasurements
 
 HEIGHT_M = 1.65  # of the camera
 REACH_M = 2.0
@@ -16,12 +16,12 @@ CLASS_M = 1.53
 SIGMAS = (0.08, 0.2)
 
 
-def sights(at: np.ndarray, height_m: float, noise: np.ndarray) -> Sights:
+def measured(at: np.ndarray, height_m: float, noise: np.ndarray) -> ParallaxMeasurements:
     """Of one vehicle whose centre is at (2,) in ego; `noise` (3,) standard normal."""
     depth = float(at[0]) - REACH_M
     sigma = np.array([0.03, 0.04, 0.001])
     values = np.array([math.log(height_m / depth), -math.log(depth), at[1] / at[0]]) + sigma * noise
-    return Sights(
+    return ParallaxMeasurements(
         log_height=values[:1],
         log_width=values[1:2],
         bearing=values[2:],
@@ -56,14 +56,14 @@ class Road:
     def drive(self, seconds: float, mps: tuple[float, float] = (0.0, 0.0), noisy: bool = True) -> LearnedSize:
         for _ in range(round(seconds / self.dt_s)):
             T_world_ego = SE2(self.ego_m, 0.0, 0.0)
-            seen = sights(self.at - [self.ego_m, 0.0], self.height_m, noisy * self.rng.standard_normal(3))
+            seen = measured(self.at - [self.ego_m, 0.0], self.height_m, noisy * self.rng.standard_normal(3))
             self.parallax.predict(self.dt_s, T_world_ego, None)
             if not self.begun:
                 depth = CLASS_M / math.exp(float(seen.log_height[0])) + REACH_M
                 centre = np.array([depth, depth * float(seen.bearing[0])])
                 self.parallax.begin(3, centre, T_world_ego, math.log(CLASS_M), SIGMAS)
                 self.begun = True
-            learned = self.parallax.update([3], seen, T_world_ego, HEIGHT_M, 0.003)
+            learned = self.parallax.learn_sizes([3], seen, T_world_ego, HEIGHT_M, 0.003)
             self.at = self.at + np.array(mps) * self.dt_s
             self.ego_m += self.ego_mps * self.dt_s
         return learned
@@ -158,20 +158,20 @@ def test_the_forgotten_are_gone_and_the_rest_stay() -> None:
         road.parallax.standing(5)
     road.parallax.keep_only([])
     road.parallax.predict(0.1, SE2(), np.eye(3))
-    nothing = road.parallax.update([], sights(np.array([9.0, 0.0]), 1.5, np.zeros(3)), SE2(), HEIGHT_M, 0.01)
+    nothing = road.parallax.learn_sizes([], measured(np.array([9.0, 0.0]), 1.5, np.zeros(3)), SE2(), HEIGHT_M, 0.01)
     assert nothing.weight.shape == (0, 4)
 
 
 @given(st.lists(st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-8, 8)), min_size=3, max_size=25))
 @settings(max_examples=25, deadline=None)
-def test_wild_sights_leave_weights_and_covariances_what_they_are(noise: list[tuple[float, float, float]]) -> None:
+def test_outliers_leave_weights_and_covariances_what_they_are(noise: list[tuple[float, float, float]]) -> None:
     parallax = Parallax(ParallaxConfig())
     parallax.begin(0, np.array([30.0, 2.0]), SE2(), math.log(CLASS_M), SIGMAS)
     for k, draws in enumerate(noise):
         ego = SE2(0.5 * k, 0.0, 0.0)
         parallax.predict(0.1, ego, np.diag([1e-3, 1e-4, 1e-7]))
-        seen = sights(np.array([30.0 - 0.5 * k, 2.0]), CLASS_M, np.array(draws))
-        learned = parallax.update([0], seen, ego, HEIGHT_M, 0.003)
+        seen = measured(np.array([30.0 - 0.5 * k, 2.0]), CLASS_M, np.array(draws))
+        learned = parallax.learn_sizes([0], seen, ego, HEIGHT_M, 0.003)
         assert learned.weight.sum() == pytest.approx(1.0, abs=1e-6)
         assert (learned.variance > 0.0).all()
         assert np.isfinite(learned.log_height).all()

@@ -12,11 +12,11 @@ from scipy.special import ndtr
 from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.ground_size_filter import Depths, Horizon, HorizonConfig
+from birdslam.vehicles.ground_size_filter import Depths, GroundSizeConfig, GroundSizeFilter
 from birdslam.vehicles.heading import HeadingConfig
-from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, localise
+from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes
 from birdslam.vehicles.parallax import ParallaxConfig
-from birdslam.vehicles.placing import Body, Placing, no_farther_than_cut
+from birdslam.vehicles.placing import Assignment, Placing, no_farther_than_cut
 from tests.test_frontend import CAMERA
 
 Floats = NDArray[np.float64]
@@ -34,7 +34,7 @@ def seen_at(x_m: float, y_m: float, height_m: float = CAR.height_m) -> Observati
     px = bev.ego_to_pixel(CAMERA, CAMERA.ground, corners)
     low, high = np.zeros(2), np.array([CAMERA.width_px - 1.0, CAMERA.height_px - 1.0])
     box = np.array([*np.clip(px.min(axis=0), low, high), *np.clip(px.max(axis=0), low, high)])
-    (found,) = localise(box[None], np.ones(1), ("car",), CAMERA, CAMERA.ground, CONFIG)
+    (found,) = observe_boxes(box[None], np.ones(1), ("car",), CAMERA, CAMERA.ground, CONFIG)
     return found
 
 
@@ -47,29 +47,29 @@ def test_only_a_bottom_that_the_image_cuts_is_a_bound() -> None:
     cut = seen_at(5.0, 1.0)
     assert cut.sigma_cut is not None
     assert cut.sigma_cut < 0.1 * cut.sigma_bottom
-    horizon, whole = Horizon(CAMERA, HorizonConfig()), depths(math.log(18.0), 0.1)
-    assert no_farther_than_cut(whole, [seen_at(20.0, 2.0)], horizon, 0.0) is whole
+    ground_size, whole = GroundSizeFilter(CAMERA, GroundSizeConfig()), depths(math.log(18.0), 0.1)
+    assert no_farther_than_cut(whole, [seen_at(20.0, 2.0)], ground_size, 0.0) is whole
 
 
 @pytest.mark.parametrize(("depth_m", "sigma"), [(12.0, 0.5), (6.0, 0.3), (4.0, 0.2), (3.0, 1.5)])
 def test_the_moments_are_those_of_the_depth_given_the_bound(depth_m: float, sigma: float) -> None:
-    horizon, cut = Horizon(CAMERA, HorizonConfig()), seen_at(5.0, 1.0)
-    found = no_farther_than_cut(depths(math.log(depth_m), sigma), [cut], horizon, 0.0)
+    ground_size, cut = GroundSizeFilter(CAMERA, GroundSizeConfig()), seen_at(5.0, 1.0)
+    found = no_farther_than_cut(depths(math.log(depth_m), sigma), [cut], ground_size, 0.0)
     assert cut.sigma_cut is not None
-    doubt = math.hypot(cut.sigma_cut, horizon.sigma_pitch_rad) / cut.slope_bottom
-    doubt = math.hypot(doubt, horizon.config.sigma_kerb_m / CAMERA.height_m)
+    sigma_bound = math.hypot(cut.sigma_cut, ground_size.sigma_pitch_rad) / cut.slope_bottom
+    sigma_bound = math.hypot(sigma_bound, ground_size.config.sigma_kerb_m / CAMERA.height_m)
     log_z = np.linspace(-12.0, 12.0, 400_001)
-    belief = np.exp(-0.5 * ((log_z - math.log(depth_m)) / sigma) ** 2)
-    belief *= ndtr((math.log(CAMERA.height_m / cut.slope_bottom) - log_z) / doubt)
-    mean = float((log_z * belief).sum() / belief.sum())
+    weight = np.exp(-0.5 * ((log_z - math.log(depth_m)) / sigma) ** 2)
+    weight *= ndtr((math.log(CAMERA.height_m / cut.slope_bottom) - log_z) / sigma_bound)
+    mean = float((log_z * weight).sum() / weight.sum())
     assert found.log_depth[0] == pytest.approx(mean, abs=1e-4)
-    assert found.variance[0] == pytest.approx(float(((log_z - mean) ** 2 * belief).sum() / belief.sum()), rel=1e-3)
+    assert found.variance[0] == pytest.approx(float(((log_z - mean) ** 2 * weight).sum() / weight.sum()), rel=1e-3)
     assert found.depth_per_height[0] / 0.9 == pytest.approx(found.variance[0] / sigma**2)
 
 
 def test_a_depth_far_past_the_bound_gives_finite_numbers() -> None:
-    horizon, cut = Horizon(CAMERA, HorizonConfig()), seen_at(5.0, 1.0)
-    found = no_farther_than_cut(depths(8.0, 0.01), [cut], horizon, 0.0)
+    ground_size, cut = GroundSizeFilter(CAMERA, GroundSizeConfig()), seen_at(5.0, 1.0)
+    found = no_farther_than_cut(depths(8.0, 0.01), [cut], ground_size, 0.0)
     assert np.isfinite(found.log_depth).all()
     assert found.log_depth[0] < 8.0
     assert 0.0 < found.variance[0] < 1e-4
@@ -81,9 +81,9 @@ def test_cars_beside_the_ego_are_not_thought_far_ahead() -> None:
         for side in (-3.3, 3.3):
             for height_m in (1.4, 1.53, 1.66):
                 placing = Placing(CONFIG, ParallaxConfig(), PseudoLidarConfig(), HeadingConfig())
-                body = Body(0, None, seen_at(float(x_m), side, height_m))
-                assert body.seen.sigma_cut is not None
-                (where,) = placing.places([body], SE2(), Horizon(CAMERA, HorizonConfig()))
+                assignment = Assignment(0, None, seen_at(float(x_m), side, height_m))
+                assert assignment.observation.sigma_cut is not None
+                (where,) = placing.locate([assignment], SE2(), GroundSizeFilter(CAMERA, GroundSizeConfig()))
                 errors.append(where.centre_m[0] - x_m)
                 assert abs(errors[-1]) < 2.0 * math.sqrt(where.cov[0, 0])
     assert abs(np.mean(errors)) < 1.0

@@ -15,9 +15,9 @@ from birdslam.geometry.bev import ego_to_pixel
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.perception import Boxes3d, DepthMap, Detections
-from birdslam.vehicles.body_fit import fitted, footprints, surface_m
-from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, combined
-from birdslam.vehicles.localisation import LocalisationConfig, Observation, Place, localise, place
+from birdslam.vehicles.body_fit import fit_footprint, footprints, surface_m
+from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
+from birdslam.vehicles.localisation import LocalisationConfig, Observation, Place, observe_boxes, place
 from birdslam.vehicles.pseudolidar import bodies_by_detector, in_metres, localise_by_depth
 
 CAMERA = Camera(
@@ -59,7 +59,7 @@ def scene(poses: list[SE2], cells: tuple[int, int] = (96, 320)) -> tuple[DepthMa
 def observed(boxes: NDArray[np.float64]) -> list[Observation]:
     """In the order of the boxes."""
     scores, labels = np.linspace(0.9, 0.8, len(boxes)), ("car",) * len(boxes)
-    seen = localise(boxes, scores, labels, CAMERA, CAMERA.ground, LOCALISATION)
+    seen = observe_boxes(boxes, scores, labels, CAMERA, CAMERA.ground, LOCALISATION)
     assert len(seen) == len(boxes)
     return seen
 
@@ -73,7 +73,7 @@ def axis_error(a_rad: float, b_rad: float) -> float:
 def test_exact_depth_gives_the_place_and_the_axis(x_m: float, bearing: float, yaw_rad: float) -> None:
     pose = SE2(x_m, bearing * x_m, yaw_rad)
     depth, boxes = scene([pose], (188, 621))
-    found = fitted(observed(boxes)[0], depth, CAMERA, CAMERA.ground, CONFIG)
+    found = fit_footprint(observed(boxes)[0], depth, CAMERA, CAMERA.ground, CONFIG)
     assert found is not None
     off_m = found.centre_m - [pose.x_m, pose.y_m]
     # Seen face on, its far half is known by its class alone: the yaw there is soft
@@ -85,7 +85,7 @@ def test_exact_depth_gives_the_place_and_the_axis(x_m: float, bearing: float, ya
 def test_near_and_oblique_the_axis_is_sharp() -> None:
     for degrees in (20, 45, 70, 110, 150):
         depth, boxes = scene([SE2(10.0, 1.0, math.radians(degrees))])
-        found = fitted(observed(boxes)[0], depth, CAMERA, CAMERA.ground, CONFIG)
+        found = fit_footprint(observed(boxes)[0], depth, CAMERA, CAMERA.ground, CONFIG)
         assert found is not None
         assert axis_error(found.yaw_rad, math.radians(degrees)) < math.radians(6)
         assert found.sigma_yaw_rad < math.radians(15)
@@ -102,7 +102,7 @@ def test_noise_of_the_map_lies_in_the_covariance() -> None:
             *(1242, 375),
             sigma_rel=0.05,
         )
-        found = fitted(observed(boxes)[0], noisy, CAMERA, CAMERA.ground, CONFIG)
+        found = fit_footprint(observed(boxes)[0], noisy, CAMERA, CAMERA.ground, CONFIG)
         assert found is not None
         off_m = found.centre_m - [pose.x_m, pose.y_m]
         d2.append(off_m @ np.linalg.solve(found.cov, off_m))
@@ -114,9 +114,9 @@ def test_no_place_where_the_depth_says_nothing() -> None:
     depth, boxes = scene([SE2(12.0, 0.0, 0.0)])
     (seen,) = observed(boxes)
     tiny = DepthMap(depth.depth_m[:8, :8], 1242, 375)  # too few columns in the box
-    assert fitted(seen, tiny, CAMERA, CAMERA.ground, CONFIG) is None
+    assert fit_footprint(seen, tiny, CAMERA, CAMERA.ground, CONFIG) is None
     far = DepthMap(np.full((96, 320), 90.0, np.float32), 1242, 375)
-    assert fitted(seen, far, CAMERA, CAMERA.ground, CONFIG) is None
+    assert fit_footprint(seen, far, CAMERA, CAMERA.ground, CONFIG) is None
     assert localise_by_depth([seen], depth, CAMERA, CAMERA.ground, PseudoLidarConfig(rule="off")) == [None]
     assert localise_by_depth([], depth, CAMERA, CAMERA.ground, CONFIG) == []
 
@@ -255,27 +255,27 @@ def by_depth(x_m: float = 20.0, var: float = 4.0) -> DepthPlace:
 
 
 def test_two_sources_are_better_than_one() -> None:
-    both = combined(by_box(20.0), by_depth(21.0), CONFIG)
+    both = fuse(by_box(20.0), by_depth(21.0), CONFIG)
     np.testing.assert_allclose(both.centre_m, [20.5, 1.0])  # sideways both rest on the edges of the one box
     np.testing.assert_allclose(both.cov, np.diag([2.0, 0.04]))
     assert both.depth_m == pytest.approx(18.5)
-    sure = combined(by_box(20.0), by_depth(21.0, 1e-6), CONFIG)
+    sure = fuse(by_box(20.0), by_depth(21.0, 1e-6), CONFIG)
     assert sure.centre_m[0] == pytest.approx(21.0, abs=1e-3)
 
 
 def test_sources_that_contradict_each_other_are_both_believed_less() -> None:
-    both = combined(by_box(20.0), by_depth(60.0), CONFIG)
+    both = fuse(by_box(20.0), by_depth(60.0), CONFIG)
     assert both.centre_m[0] == pytest.approx(40.0)
     assert both.cov[0, 0] > by_box().cov[0, 0]
 
 
 def test_the_papers_rule_asks_the_depth() -> None:
     config = PseudoLidarConfig(rule="paper")
-    near, far = combined(by_box(15.0), by_depth(16.0), config), combined(by_box(40.0), by_depth(42.0), config)
+    near, far = fuse(by_box(15.0), by_depth(16.0), config), fuse(by_box(40.0), by_depth(42.0), config)
     assert near.centre_m.tolist() == [16.0, 1.2]
     assert far.centre_m.tolist() == [40.0, 1.0]
-    assert combined(by_box(), None, CONFIG).centre_m.tolist() == [20.0, 1.0]
-    assert combined(by_box(), by_depth(), PseudoLidarConfig(rule="off")).centre_m.tolist() == [20.0, 1.0]
+    assert fuse(by_box(), None, CONFIG).centre_m.tolist() == [20.0, 1.0]
+    assert fuse(by_box(), by_depth(), PseudoLidarConfig(rule="off")).centre_m.tolist() == [20.0, 1.0]
 
 
 @given(
@@ -287,7 +287,7 @@ def test_the_papers_rule_asks_the_depth() -> None:
 )
 def test_the_combined_covariance_is_one(a_m: float, b_m: float, a_var: float, b_var: float, rho: float) -> None:
     cov = np.array([[a_var, rho * math.sqrt(a_var * 0.1)], [rho * math.sqrt(a_var * 0.1), 0.1]])
-    both = combined(Place(a_m, np.array([a_m, 0.0]), cov), by_depth(b_m, b_var), CONFIG)
+    both = fuse(Place(a_m, np.array([a_m, 0.0]), cov), by_depth(b_m, b_var), CONFIG)
     assert np.linalg.eigvalsh(both.cov).min() > 0.0
     assert np.allclose(both.cov, both.cov.T)
     assert both.depth_m > 0.0
@@ -299,7 +299,7 @@ def test_it_agrees_with_the_place_that_the_box_alone_gives_at_the_same_depth_and
     pose = SE2(15.0, -3.0, 0.5)
     depth, boxes = scene([pose], (188, 621))
     (seen,) = observed(boxes)
-    found = fitted(seen, depth, CAMERA, CAMERA.ground, PseudoLidarConfig(yaws=90))
+    found = fit_footprint(seen, depth, CAMERA, CAMERA.ground, PseudoLidarConfig(yaws=90))
     assert found is not None
     alone = place(seen, math.log(15.0 - 1.96), 0.0, pose.yaw_rad, LOCALISATION)
     assert found.centre_m[1] / found.centre_m[0] == pytest.approx(alone.centre_m[1] / alone.centre_m[0], abs=0.01)

@@ -24,7 +24,7 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.motion import Motion
 from birdslam.perception import Perception, Ready, Segmentation
 from birdslam.types import Estimate, Frame, Status, VehicleEdge
-from birdslam.vehicles.height_watch import HeightWatch, HeightWatchConfig
+from birdslam.vehicles.camera_height import HeightWatch, HeightWatchConfig
 from birdslam.vehicles.localisation import LocalisationConfig
 
 Image = np.ndarray
@@ -239,7 +239,9 @@ def _watched(
             noise = rng.normal(0.0, 1.0, 4)
             box = (columns[0] + noise[0], rows[0] + noise[1], columns[1] + noise[2], rows[1] + noise[3])
             frame = 6 * vehicle + k
-            told.append(bool(watch.step([_edge(vehicle, frame, box)], _motion(frame, camera, tilt_error_rad, *status))))
+            told.append(
+                bool(watch.judge([_edge(vehicle, frame, box)], _motion(frame, camera, tilt_error_rad, *status)))
+            )
     return watch, told
 
 

@@ -10,10 +10,10 @@ from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.vehicles.depth_fusion import DepthPlace
-from birdslam.vehicles.ground_size_filter import Horizon, HorizonConfig
-from birdslam.vehicles.localisation import LocalisationConfig, localise
-from birdslam.vehicles.track import Track
-from birdslam.vehicles.tracking import Tracker, TrackingConfig
+from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.localisation import LocalisationConfig, observe_boxes
+from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig
+from birdslam.vehicles.tracking import Tracker
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 GROUND = GroundPlane(1.65)
@@ -35,7 +35,7 @@ class Drive:
     """Runs a tracker over a world; `sees` may take boxes away or add some."""
 
     def __init__(self, config: TrackingConfig | None = None, noise_px: float = 0.0) -> None:
-        self.horizon = Horizon(CAMERA, HorizonConfig())
+        self.ground_size = GroundSizeFilter(CAMERA, GroundSizeConfig())
         self.tracker = Tracker(CAMERA, config or TrackingConfig(), LocalisationConfig())
         self.rng = np.random.default_rng(1)
         self.noise_px = noise_px
@@ -47,9 +47,9 @@ class Drive:
         px = np.array([boxes[i] for i in kept]).reshape(-1, 4)
         px = px + self.noise_px * self.rng.standard_normal(px.shape)
         names = tuple((labels or ["car"] * len(vehicles))[i] for i in kept)
-        seen = localise(px, np.full(len(px), 0.9), names, CAMERA, self.horizon.ground, LocalisationConfig())
-        self.horizon.predict(0.1, 0.0, None, 0.0)
-        out = self.tracker.step(seen, T_world_ego, self.horizon, self.frame, self.frame * PERIOD_NS)
+        seen = observe_boxes(px, np.full(len(px), 0.9), names, CAMERA, self.ground_size.ground, LocalisationConfig())
+        self.ground_size.predict(0.1, 0.0, None, 0.0)
+        out = self.tracker.follow(EgoFrame(self.frame, self.frame * PERIOD_NS, T_world_ego), seen, self.ground_size)
         self.frame += 1
         return out
 
@@ -127,12 +127,14 @@ def test_a_place_by_depth_counts_by_its_covariance() -> None:
         for k in range(6):
             box = box_px(SE2(25.0, 1.0, 0.0))
             assert box is not None
-            seen = localise(box[None], np.full(1, 0.9), ("car",), CAMERA, drive.horizon.ground, LocalisationConfig())
+            seen = observe_boxes(
+                box[None], np.full(1, 0.9), ("car",), CAMERA, drive.ground_size.ground, LocalisationConfig()
+            )
             by_depth = None
             if sigma_m is not None:
                 by_depth = DepthPlace(np.array([26.0, 1.04]), np.eye(2) * sigma_m**2, 0.0, 0.1)
-            drive.horizon.predict(0.1, 0.0, None, 0.0)
-            tracks = drive.tracker.step(seen, SE2(), drive.horizon, k, k * PERIOD_NS, None, [by_depth])
+            drive.ground_size.predict(0.1, 0.0, None, 0.0)
+            tracks = drive.tracker.follow(EgoFrame(k, k * PERIOD_NS, SE2()), seen, drive.ground_size, [by_depth])
         (track,) = tracks
         return float(track.place.centre_m[0]), float(track.place.cov[0, 0])
 
@@ -164,9 +166,11 @@ def test_a_vehicle_of_no_usual_size_keeps_its_id_while_its_size_is_learned() -> 
         box = box_px(ego.between(SE2(70.0, 8.0, 0.0)), height_m=2.5)
         assert box is not None
         box = box + drive.noise_px * drive.rng.standard_normal(4)
-        seen = localise(box[None], np.full(1, 0.9), ("car",), CAMERA, drive.horizon.ground, LocalisationConfig())
-        drive.horizon.predict(0.1, 0.0, None, 0.0)
-        for track in drive.tracker.step(seen, ego, drive.horizon, k, k * PERIOD_NS):
+        seen = observe_boxes(
+            box[None], np.full(1, 0.9), ("car",), CAMERA, drive.ground_size.ground, LocalisationConfig()
+        )
+        drive.ground_size.predict(0.1, 0.0, None, 0.0)
+        for track in drive.tracker.follow(EgoFrame(k, k * PERIOD_NS, ego), seen, drive.ground_size):
             ids.add(track.vehicle)
             errors.append(float((ego @ track.place.centre_m)[0]) - 70.0)
     assert ids == {0}
@@ -184,10 +188,12 @@ class Looks:
     def see(self, at: SE2, said_rad: float, flip: float = 0.05, sigma_rad: float = 0.1) -> Track | None:
         box = box_px(at)
         assert box is not None
-        seen = localise(box[None], np.array([0.9]), ("car",), CAMERA, self.drive.horizon.ground, LocalisationConfig())
+        seen = observe_boxes(
+            box[None], np.array([0.9]), ("car",), CAMERA, self.drive.ground_size.ground, LocalisationConfig()
+        )
         by_depth = DepthPlace(np.array([at.x_m, at.y_m]), np.eye(2), said_rad, sigma_rad, flip)
-        t_ns = self.frame * PERIOD_NS
-        tracks = self.drive.tracker.step(seen, SE2(), self.drive.horizon, self.frame, t_ns, None, [by_depth])
+        frame = EgoFrame(self.frame, self.frame * PERIOD_NS, SE2())
+        tracks = self.drive.tracker.follow(frame, seen, self.drive.ground_size, [by_depth])
         self.frame += 1
         return tracks[0] if tracks else None
 

@@ -3,11 +3,11 @@
 Three witnesses, each with its own covariance, and the least-squares mean of them with the disagreement in its
 covariance (Birge's ratio):
 
-- the road's image: the homography of the road plane between two images gives pitch and roll (roadalign.py);
+- the road's image: the homography of the road plane between two images gives pitch and roll (road_alignment.py);
 - the direction of travel: on a straight way the epipole lies on the road's horizon, above a camera that looks down;
-- the vehicles: bottoms and heights of many boxes put the horizon where they meet (vehicleheight.py).
+- the vehicles: bottoms and heights of many boxes put the horizon where they meet (vehicles/camera_height.py).
 
-What checks its height is in heightcheck.py.
+What checks its height is in height_check.py.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ from birdslam.calibration.height_check import (
     HeightCheckConfig,
     KnownLength,
     Step,
+    VehicleHeightConfig,
     checks_by_length,
     checks_by_vehicles,
+    solve_mounting,
 )
 from birdslam.frontend import FrontEnd, FrontEndConfig, Pending
 from birdslam.geometry.camera import Camera
@@ -34,7 +36,7 @@ from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road_alignment import RoadFit, plane_normal
 from birdslam.types import Frame, Status
-from birdslam.vehicles.camera_height import Sight, VehicleHeightConfig, sights_of, stand_of
+from birdslam.vehicles.camera_height import BoxHeight, measure_heights
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -111,7 +113,7 @@ class _Seen:
     fits: list[tuple[RoadFit, float]] = field(default_factory=list)  # and the way since the one before
     directions: list[tuple[Floats, float]] = field(default_factory=list)  # of straight travel, and its length
     steps: list[Step] = field(default_factory=list)
-    sights: list[Sight] = field(default_factory=list)
+    boxes: list[BoxHeight] = field(default_factory=list)
     times_ns: dict[int, int] = field(default_factory=dict)
     frames: int = 0
 
@@ -160,7 +162,7 @@ def calibrate(
         witnesses=witnesses,
         height_checks=(
             *checks_by_length(lengths or {}, seen.steps, seen.times_ns, camera, config.height),
-            *checks_by_vehicles(seen.sights, camera, cov, config.vehicles),
+            *checks_by_vehicles(seen.boxes, camera, cov, config.vehicles),
         ),
         yaw_rad=_yaw_rad(seen),
         path_m=seen.path_m,
@@ -176,7 +178,7 @@ def _watch(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: Calib
         measurements = front.step(frame, pending)
         seen.frames += 1
         seen.times_ns[frame.frame_id] = frame.t_source_ns
-        seen.sights += sights_of(measurements.cv, camera, frontend.localisation)
+        seen.boxes += measure_heights(measurements.cv, camera, frontend.localisation)
         motion = odometry.take()
         if motion is None or {Status.ODOMETRY_COASTING, Status.SCALE_INVALID, Status.STANDSTILL} & set(motion.status):
             continue
@@ -247,10 +249,12 @@ def _by_travel(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witnes
 
 def _by_vehicles(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness | None:
     prior = np.array([camera.height_m, camera.pitch_rad, camera.roll_rad])
-    stand = stand_of(seen.sights, prior, np.diag([(0.3 * camera.height_m) ** 2, 0.1**2, 0.1**2]), config.vehicles)
-    if stand is None:
+    mounting = solve_mounting(
+        seen.boxes, prior, np.diag([(0.3 * camera.height_m) ** 2, 0.1**2, 0.1**2]), config.vehicles
+    )
+    if mounting is None:
         return None
-    return _witness("vehicles", stand.state[1:], stand.cov[1:, 1:], stand.vehicles)
+    return _witness("vehicles", mounting.state[1:], mounting.cov[1:, 1:], mounting.vehicles)
 
 
 def _witness(cue: str, tilt: Floats, cov: Floats, samples: int, sees_roll: bool = True) -> Witness:

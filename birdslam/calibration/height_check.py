@@ -1,12 +1,14 @@
 """A check of the camera's height by what is known from elsewhere.
 
 The metric scale of one camera is its height: nothing in the images alone can tell whether that is right. What can is a
-speed or poses of the recording, or what vehicles measure; each says what it makes of the height, and how sure it is.
+speed or poses of the recording, or the sizes of vehicles (vehicles/camera_height.py has their measurement); each gives
+a height with its sigma. The vehicles give pitch and roll as well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
 import msgspec
@@ -14,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.vehicles.camera_height import Sight, VehicleHeightConfig, stand_of
+from birdslam.vehicles.camera_height import BoxHeight
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -29,6 +31,19 @@ class HeightCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     sigma_scale_rel: Positive = 0.015  # of the mean ratio of lengths
 
 
+class VehicleHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How much boxes of vehicles say of the camera."""
+
+    sigma_class_rel: Positive = 0.04  # of the mean height of a class on a country's roads, and of a detector's boxes
+    sigma_kerb_m: Positive = 0.06  # how far the road under a vehicle lies off the ego's plane
+    sigma_bounce_rad: Positive = 0.008  # of the camera's pitch in one frame against its mean
+    sigma_pitch_rad: Positive = 0.003  # of the mean: edges of boxes lie alike above the wheels' contact
+    sigma_crown_rad: Positive = 0.015  # of the mean roll: all that park on one side stand on the same crown or kerb
+    frames_alike: Positive = 5.0  # for so many frames in a row a detector errs alike
+    gate_sigma: Positive = 3.0  # a vehicle that misfits by more is left out
+    min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 5
+
+
 class HeightCheck(msgspec.Struct, frozen=True, kw_only=True):
     """The camera's height as something of known size or speed has it."""
 
@@ -36,6 +51,15 @@ class HeightCheck(msgspec.Struct, frozen=True, kw_only=True):
     height_m: float
     sigma_m: float
     samples: int
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How the camera is mounted: (height_m, pitch_rad, roll_rad) with cov (3, 3), by so many vehicles."""
+
+    state: Floats
+    cov: Floats
+    vehicles: int
 
 
 def checks_by_length(
@@ -51,18 +75,66 @@ def checks_by_length(
 
 
 def checks_by_vehicles(
-    sights: Sequence[Sight], camera: Camera, cov: Floats, config: VehicleHeightConfig
+    boxes: Sequence[BoxHeight], camera: Camera, cov: Floats, config: VehicleHeightConfig
 ) -> list[HeightCheck]:
     """One, or none where too few vehicles were seen; `cov` (2, 2) is of the camera's pitch and roll."""
     prior = np.array([camera.height_m, camera.pitch_rad, camera.roll_rad])
     prior_cov = np.zeros((3, 3))
     prior_cov[0, 0] = (0.5 * camera.height_m) ** 2
     prior_cov[1:, 1:] = cov
-    stand = stand_of(sights, prior, prior_cov, config)
-    if stand is None:
+    mounting = solve_mounting(boxes, prior, prior_cov, config)
+    if mounting is None:
         return []
-    sigma_m = float(np.sqrt(stand.cov[0, 0]))
-    return [HeightCheck(cue="vehicles", height_m=float(stand.state[0]), sigma_m=sigma_m, samples=stand.vehicles)]
+    sigma_m = float(np.sqrt(mounting.cov[0, 0]))
+    return [HeightCheck(cue="vehicles", height_m=float(mounting.state[0]), sigma_m=sigma_m, samples=mounting.vehicles)]
+
+
+def solve_mounting(
+    boxes: Sequence[BoxHeight], prior: Floats, prior_cov: Floats, config: VehicleHeightConfig
+) -> Mounting | None:
+    """Generalised least squares over all boxes, joined with a prior of (height, pitch, roll); None where too few fit.
+
+    The height's prior should be vague where its answer is to be a check of it.
+    """
+    if not boxes:
+        return None
+    table = np.array(
+        [[s.vehicle, s.slope_bottom, s.sigma_bottom, s.tan_height, s.sigma_height, s.bearing, s.height_m,
+          s.sigma_height_rel] for s in boxes]
+    )  # fmt: skip
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    _, first = np.unique(table[:, 0], return_index=True)
+    groups = np.split(table, first[1:])
+    kept = np.ones(len(groups), bool)
+    state = np.array(prior, dtype=np.float64)
+    cov = np.array(prior_cov, dtype=np.float64)
+    for _ in range(6):
+        info, right = np.linalg.inv(prior_cov), np.linalg.solve(prior_cov, prior)
+        misfit = np.zeros(len(groups))
+        for k, rows in enumerate(groups):
+            bottom, sigma_bottom, tall, sigma_tall, bearing, height_m, sigma_rel = rows[:, 1:].T
+            looks = tall / height_m  # 1 / z of a vehicle as tall as its class
+            J = np.column_stack([looks, -np.ones(len(rows)), bearing])
+            r = bottom - J @ state
+            own = sigma_bottom**2 + (state[0] / height_m * sigma_tall) ** 2 + config.sigma_bounce_rad**2
+            own = own * min(config.frames_alike, len(rows))
+            # common to all boxes of the vehicle: its height and the road under it, both in proportion to 1 / z
+            common = np.hypot(state[0] * sigma_rel, config.sigma_kerb_m) * looks
+            weighed = J / own[:, None]
+            of_common = common / own
+            share = 1.0 / (1.0 + common @ of_common)  # Sherman-Morrison
+            Jc = J.T @ of_common
+            if kept[k]:
+                info = info + J.T @ weighed - share * np.outer(Jc, Jc)
+                right = right + weighed.T @ bottom - share * Jc * (of_common @ bottom)
+            misfit[k] = np.median(r) / np.sqrt(np.median(own) / min(len(rows), 4) + np.median(common) ** 2)
+        cov = np.linalg.inv(info)
+        state = cov @ right
+        kept = np.abs(misfit) < config.gate_sigma
+        if kept.sum() < config.min_vehicles:
+            return None
+    cov += np.diag(np.square([state[0] * config.sigma_class_rel, config.sigma_pitch_rad, config.sigma_crown_rad]))
+    return Mounting(state, 0.5 * (cov + cov.T), int(kept.sum()))
 
 
 def _by_length(

@@ -25,7 +25,7 @@ from birdslam.geometry.se2 import wrap
 from birdslam.perception import Detections, Perception, Ready
 from birdslam.simulation.odometry import EXACT, SimulatedOdometry
 from birdslam.types import Measurements, VehicleEdge
-from birdslam.vehicles.ground_size_filter import HorizonConfig
+from birdslam.vehicles.ground_size_filter import GroundSizeConfig
 from birdslam.vehicles.localisation import LocalisationConfig
 
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0))
@@ -35,7 +35,7 @@ MEASURED_KIND = "Car"
 # The paper's: Eq. 1 on the bottom of the box alone, on level ground as calibrated, and the point that it gives
 PAPER = FrontEndConfig(
     localisation=LocalisationConfig(reach_rel=0.0),
-    horizon=HorizonConfig(
+    ground_size=GroundSizeConfig(
         sigma_pitch_rad=1e-6,
         pitch_memory_s=1e-3,
         sigma_pitch_step_rad=1e-6,

@@ -37,7 +37,7 @@ from birdslam.simulation.odometry import SimulatedOdometry
 from birdslam.slam import SlamConfig
 from birdslam.trajectory import NS_PER_S
 from birdslam.types import Frame, Measurements
-from birdslam.vehicles.rts_smoother import Retrospect, RetrospectConfig
+from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 
 EGO = "ego"
 LEAST_FRAMES = 5  # a vehicle matched in fewer is left out of the report, unless the paper names it
@@ -88,18 +88,18 @@ class Final:
 
     label: str
     live: Live
-    retrospect: RetrospectConfig
+    smoother: SmootherConfig
 
     def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
         """One update for each record, and a look back."""
         graph, live = PoseGraph(self.live.graph, self.live.weights), LiveTrajectories()
-        past = Retrospect(self.retrospect)
+        smoother = RtsSmoother(self.smoother)
         for measurements in log:
             estimate = graph.optimise(measurements)
             live.add(estimate)
-            past.add(measurements, estimate)
+            smoother.add(measurements, estimate)
         out = Trajectories(ego=live.result.ego)
-        for (epoch, vehicle), way in past.ways().items():
+        for (epoch, vehicle), way in smoother.smooth().items():
             for frame, pose in way.items():
                 out.put_vehicle(vehicle, frame, live.T_first_world[epoch] @ pose)
         return out
@@ -116,7 +116,7 @@ def ours(config: SlamConfig) -> Live:
 def methods(config: SlamConfig) -> dict[str, Method]:
     """Every method by its name; `config` is that of `birdslam`."""
     return {
-        "birdslam": Final("BirdSLAM (this system)", ours(config), RetrospectConfig()),
+        "birdslam": Final("BirdSLAM (this system)", ours(config), SmootherConfig()),
         "birdslam_live": ours(config),
         "paper": PAPER,
         "batch_se3": batch_se3,

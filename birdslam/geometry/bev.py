@@ -6,24 +6,55 @@ frame at the camera's foot.
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane
 
+Numbers = TypeVar("Numbers", float, NDArray[np.float64])
+
 MAX_RANGE_M = 200.0  # past it a pixel row covers tens of metres: such a point says nothing
+
+
+def meet_road(rays: NDArray[np.float64], fall: NDArray[np.float64], height_m: float) -> NDArray[np.float64]:
+    """Eq. 1: where rays from a camera `height_m` above the road meet it, in metres, in the axes of the rays.
+
+    `fall` is by how much a ray of the given length comes down towards the road, -n . ray for the road's unit normal n.
+    Rays are whole, (N, 3) with `fall` (N, 1), or one component of each, (N,) with `fall` (N,).
+    """
+    out: NDArray[np.float64] = height_m * rays / fall  # Eq. 1
+    return out
+
+
+def road_slope(depth_m: Numbers, height_m: Numbers | float) -> Numbers:
+    """Eq. 1 solved for the slope: how steeply one looks down at the road `depth_m` ahead; both broadcast."""
+    return height_m / depth_m
+
+
+def rays_cam(camera: Camera, px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3) rays of z = 1 in camera axes, K^-1 x, of pixels (N, 2)."""
+    return np.column_stack([camera.to_xy(px), np.ones(len(px))])
+
+
+def bearing_and_slope(camera: Camera, ground: GroundPlane, px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 2) of the rays of pixels (N, 2): bearing y/x in ego, and slope -z/x, the fall for each metre ahead.
+
+    Such a ray (1, bearing, -slope) meets the road at x = `meet_road(1, slope, H)`. Above the horizon slopes are
+    negative.
+    """
+    x, y, z = (rays_cam(camera, px) @ ground.R_ego_cam.T).T
+    return np.column_stack([y / x, -z / x])
 
 
 def road_point_cam(camera: Camera, ground: GroundPlane, px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Road points in camera axes, (N, 3) in metres, of pixels (N, 2); NaN where the ray misses the road (Eq. 1)."""
-    px = np.atleast_2d(np.asarray(px, dtype=np.float64))
-    rays = np.column_stack(
-        [(px[:, 0] - camera.cx_px) / camera.fx_px, (px[:, 1] - camera.cy_px) / camera.fy_px, np.ones(len(px))]
-    )
-    descent = rays @ ground.normal_cam
+    rays = rays_cam(camera, np.atleast_2d(np.asarray(px, dtype=np.float64)))
+    fall = -(rays @ ground.normal_cam)
     with np.errstate(divide="ignore", invalid="ignore"):
-        points = -ground.height_m * rays / descent[:, None]  # Eq. 1
-    points[(descent >= 0.0) | (points[:, 2] > MAX_RANGE_M)] = np.nan
+        points = meet_road(rays, fall[:, None], ground.height_m)
+    points[(fall <= 0.0) | (points[:, 2] > MAX_RANGE_M)] = np.nan
     return points
 
 

@@ -1,4 +1,4 @@
-"""Which box may be which vehicle: where tracks are expected in the image, and how far off a box may be on the road."""
+"""Association: where in the image a track's box is expected, and the gate on the road for a box to be of a track."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.localisation import Observation
 from birdslam.vehicles.track import Track
 
-HEIGHT_SHOWS_REL = 0.2  # 1-sigma of a box's height; past it the box says nothing of a size
+HEIGHT_SHOWS_REL = 0.2  # 1-sigma of a box's height, as a fraction; past it the box says nothing of a size
 NEAREST_M, FAR_M = 1.0, 1e4  # a nearer box is out of the image; from there one looks at the horizon
 
 
@@ -49,7 +49,7 @@ def predicted_boxes_px(
 def within_gate(
     tracks: Sequence[Track], observations: Sequence[Observation], T_world_ego: SE2, gate_sigma: float
 ) -> NDArray[np.bool_]:
-    """(tracks, observations): within the gate, by the height of the box and the track's learned size; no road."""
+    """(tracks, observations): within the gate, by the box's height and the track's learned size alone."""
     depth, bearing, sigma_rel, turned_m = np.array([_rough(observation) for observation in observations]).T
     lengths = np.array([observation.dimensions.length_m for observation in observations])
     sigma_sides = np.array([max(observation.sigma_left, observation.sigma_right) for observation in observations])
@@ -71,7 +71,7 @@ def within_gate(
 
 
 def _learned_height_m(track: Track) -> float:
-    """What made it look as tall as it last did from where it was placed; NaN where its height did not show."""
+    """The height of the vehicle by its last box at the depth where it was placed; NaN where its height did not show."""
     seen = track.observation
     return track.place.depth_m * seen.tan_height if _sigma_height_rel(seen) < HEIGHT_SHOWS_REL else math.nan
 

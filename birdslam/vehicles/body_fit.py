@@ -1,8 +1,8 @@
 """A vehicle's footprint fitted to the pseudo-lidar in its box, where no network reads the body from it.
 
-Of every column of the box the depth of its visible surface is known, and a footprint of the class's size, at each of a
-fan of yaws, has a surface of its own to compare it with. What each yaw then deserves to be believed gives centre, yaw
-and their covariance together.
+The pseudo-lidar gives the depth of the visible surface in each column of the box. It is compared with the surface that
+a footprint of the class's size would show, at each of a fan of yaws. The likelihoods of the yaws give centre, yaw and
+their covariance.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import DepthMap
-from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, across_var, along_sight
+from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, across_var, line_of_sight_cov
 from birdslam.vehicles.localisation import CENTRE_STEPS, Observation
 
 Floats = NDArray[np.float64]
 
 
-def fitted(
+def fit_footprint(
     seen: Observation, depth: DepthMap, camera: Camera, ground: GroundPlane, config: PseudoLidarConfig
 ) -> DepthPlace | None:
-    """The class's footprint where the visible surface of the box's columns wants it; `depth` in metres."""
+    """The class's footprint fitted to the visible surface in the box's columns; `depth` in metres; None: too few."""
     profile = visible_surface(seen, depth, camera, ground, config)
     if profile is None:
         return None
@@ -34,15 +34,15 @@ def fitted(
     yaws: Floats = np.arange(config.yaws, dtype=np.float64) * (math.pi / config.yaws) - math.pi / 2.0
     corners = footprints(seen, yaws)
     centres, misfit = _placed(seen, corners, bearings, x_m, middle_m, config)
-    # How much each yaw is to be believed
+    # The probability of each yaw
     sigma_m = math.hypot(config.sigma_shape_rel * middle_m, config.sigma_shape_m)
-    log_belief = -0.5 * misfit / sigma_m**2 * min(config.independent_columns, len(x_m))
-    log_belief -= 0.5 * _width_misfit(seen, corners, centres, depth.sigma_rel)
-    belief = np.exp(log_belief - log_belief.max())
-    belief /= belief.sum()
-    centre = belief @ centres
-    spread = (centres - centre).T * belief @ (centres - centre)
-    axis = complex(belief @ np.exp(2j * yaws))
+    log_weight = -0.5 * misfit / sigma_m**2 * min(config.independent_columns, len(x_m))
+    log_weight -= 0.5 * _width_misfit(seen, corners, centres, depth.sigma_rel)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    centre = weight @ centres
+    spread = (centres - centre).T * weight @ (centres - centre)
+    axis = complex(weight @ np.exp(2j * yaws))
     return DepthPlace(
         centre,
         spread + _own_cov(seen, centre, depth.sigma_rel, sigma_m),
@@ -80,7 +80,7 @@ def footprints(seen: Observation, yaws_rad: Floats) -> Floats:
 
 
 def surface_m(corners: Floats, bearings: Floats) -> Floats:
-    """(Y, C) x_m at which rays of the given bearings (y / x) first meet each footprint (Y, 4, 2); NaN: it is passed."""
+    """(Y, C) x_m at which rays of the bearings (C,), y / x, first meet each footprint (Y, 4, 2); NaN: they pass it."""
     a, b = corners, np.roll(corners, -1, axis=1)
     # On an edge a + t (b - a) the ray has y = bearing * x
     at_a = a[:, :, 1, None] - bearings * a[:, :, 0, None]
@@ -102,7 +102,7 @@ def _placed(
     middle_m: float,
     config: PseudoLidarConfig,
 ) -> tuple[Floats, Floats]:
-    """Centres (Y, 2) of the footprints where box and surface want them, and how the surface misfits there (Y,), m^2."""
+    """Centres (Y, 2) in m that fit box and surface best at each yaw, and the mean squared misfit there (Y,), m^2."""
     along = middle_m + np.abs(corners[:, :, 0]).max(axis=1) / 2.0
     across = _between_edges(seen, corners, along)
     bound = config.outlier_sigma * math.hypot(config.sigma_shape_rel * middle_m, config.sigma_shape_m)
@@ -146,7 +146,7 @@ def _own_cov(seen: Observation, centre_m: Floats, sigma_rel: float, sigma_m: flo
     x_m, y_m = centre_m.tolist()
     length_m = seen.dimensions.sigma_length_rel * seen.dimensions.length_m / 2.0
     along = (sigma_rel * x_m) ** 2 + sigma_m**2 + length_m**2
-    return along_sight(x_m, y_m, along, across_var(seen, x_m))
+    return line_of_sight_cov(x_m, y_m, along, across_var(seen, x_m))
 
 
 def _sigma_of_axis(resultant: float, step_rad: float) -> float:

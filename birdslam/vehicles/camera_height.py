@@ -1,16 +1,26 @@
-"""The camera's height, pitch and roll over the road by the boxes of many vehicles, of which only the class is known.
+"""The camera's height over the road by the boxes of vehicles, and the watch over whether it is still as calibrated.
 
-The bottom edge of a box falls below the horizon by H / z, its height is h / z: each vehicle's depth z drops out, and
+The bottom edge of a box falls below the horizon by H / z (Eq. 1), its height is h / z: the vehicle's depth z drops out,
 
-    slope of the bottom = (H / h) * height of the box - pitch + roll * bearing        (all at a depth of 1)
+    slope of the bottom = (H / h) * height of the box - d_pitch + d_roll * bearing        (all at a depth of 1)
 
-is linear in the camera's height H, its pitch and its roll, with the vehicles' heights h known by class to some per
-cent. A vehicle is as wrong in all its boxes, so that it is one sample of H, however long it is followed. Apart from a
-known speed this is the only cue that one camera has of how high it stands.
+which is linear in the camera's height H and in its tilt, with the vehicles' heights h known by class to some per cent.
+Apart from a known speed this is the only cue that one camera has of how high it stands. The watch lets slopes count
+from the plane of the road as the images show it (road_scale.py), whose tilt does not depend on H; the one by the boxes
+(ground_size_filter.py) would. What is left of its error, d_pitch and d_roll, is common to all vehicles and grows with
+their distance as H does not, so that near and far ones tell them apart. The calibration solves for the tilt as well
+(calibration/height_check.py).
+
+A vehicle is as wrong in all its boxes, so that it is one sample, however long it is followed, and as good as its class
+is alike; the height of all of them together is not known better than `sigma_class_rel`. So a camera that is wrong by
+15 % is found within some twenty vehicles, one that is wrong by 10 % sometimes, by 5 % never: `HeightWatch.estimate`
+says what is known.
 """
 
 from __future__ import annotations
 
+import math
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -20,29 +30,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.types import VehicleEdge
-from birdslam.vehicles.localisation import LocalisationConfig, localise
+from birdslam.odometry.motion import Motion
+from birdslam.types import Status, VehicleEdge
+from birdslam.vehicles.localisation import LocalisationConfig, observe_boxes
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+LOST = {Status.ODOMETRY_COASTING, Status.SCALE_CARRIED, Status.SCALE_INVALID, Status.GROUND_VIOLATED}  # a guessed tilt
+ITERATIONS = 4
+_LEAST_RATIO = 0.1
 
 
-class VehicleHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How much boxes of vehicles say of the camera."""
+class HeightWatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What vehicles say of the camera's height."""
 
+    sigma_height_rel: Positive = 0.5  # of the calibrated height, beforehand: the vehicles are to judge it
+    sigma_pitch_rad: Positive = 0.004  # of the mean tilt by the images
+    sigma_roll_rad: Positive = 0.01
     sigma_class_rel: Positive = 0.04  # of the mean height of a class on a country's roads, and of a detector's boxes
     sigma_kerb_m: Positive = 0.06  # how far the road under a vehicle lies off the ego's plane
-    sigma_bounce_rad: Positive = 0.008  # of the camera's pitch in one frame against its mean
-    sigma_pitch_rad: Positive = 0.003  # of the mean: edges of boxes lie alike above the wheels' contact
-    sigma_crown_rad: Positive = 0.015  # of the mean roll: all that park on one side stand on the same crown or kerb
-    frames_alike: Positive = 5.0  # for so many frames in a row a detector errs alike
-    gate_sigma: Positive = 3.0  # a vehicle that misfits by more is left out
-    min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 5
+    frames_alike: Positive = 5.0  # for so many frames in a row a detector, and the tilt, err alike
+    gate_sigma: Positive = 1.5  # past it a vehicle counts the less the worse it fits
+    max_sigma_box_rel: Positive = 0.2  # a box that says less is left out
+    kept_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 60  # the last so many
+    min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 8
+    drift_sigma: Positive = 2.5
+    drift_rel: Positive = 0.08  # a smaller difference is none, however sure
 
 
 @dataclass(frozen=True)
-class Sight:
-    """One box of one vehicle in the camera's own axes, level with its optical axis; slopes fall from there."""
+class BoxHeight:
+    """One box of one vehicle; slopes and bearing count from the camera's own optical axis, at a depth of 1."""
 
     vehicle: int
     slope_bottom: float
@@ -54,19 +72,9 @@ class Sight:
     sigma_height_rel: float
 
 
-@dataclass(frozen=True)
-class Stand:
-    """(height_m, pitch_rad, roll_rad) and their covariance (3, 3), of so many vehicles."""
-
-    state: Floats
-    cov: Floats
-    vehicles: int
-
-
-def sights_of(edges: Sequence[VehicleEdge], camera: Camera, config: LocalisationConfig) -> list[Sight]:
+def measure_heights(edges: Sequence[VehicleEdge], camera: Camera, config: LocalisationConfig) -> list[BoxHeight]:
     """The boxes of one frame's CV edges against the camera's own axes; cut and hidden edges have wide sigmas."""
-    vehicle_of = {edge.box_px: edge.vehicle for edge in edges}
-    seen = localise(
+    seen = observe_boxes(
         np.array([edge.box_px for edge in edges]).reshape(-1, 4),
         np.array([edge.score for edge in edges]),
         tuple(edge.label for edge in edges),
@@ -75,8 +83,8 @@ def sights_of(edges: Sequence[VehicleEdge], camera: Camera, config: Localisation
         config,
     )
     return [
-        Sight(
-            vehicle=vehicle_of[o.box_px],
+        BoxHeight(
+            vehicle=edges[o.row].vehicle,
             slope_bottom=o.slope_bottom,
             sigma_bottom=o.sigma_bottom,
             tan_height=o.tan_height,
@@ -89,47 +97,82 @@ def sights_of(edges: Sequence[VehicleEdge], camera: Camera, config: Localisation
     ]
 
 
-def stand_of(sights: Sequence[Sight], prior: Floats, prior_cov: Floats, config: VehicleHeightConfig) -> Stand | None:
-    """Generalised least squares over all sights, joined with a prior of (height, pitch, roll); None where too few fit.
+@dataclass
+class _Known:
+    """The boxes of one vehicle as sums of normal equations, by (H, d_pitch, d_roll)."""
 
-    The height's prior should be vague where its answer is to be a check of it.
+    information: Floats  # (3, 3)
+    right: Floats  # (3,)
+    boxes: int
+    class_rel: float
+
+
+class HeightWatch:
+    """judge(): the CV edges of a frame and its motion; gives CALIBRATION_DRIFT when the height is another.
+
+    Least squares over the vehicles seen last. State: H (m), d_pitch, d_roll (rad). Measurements: the slope of the
+    bottom and the height of each box. Read by the front end, as a status; `estimate` is for perf and tests.
     """
-    if not sights:
-        return None
-    table = np.array(
-        [[s.vehicle, s.slope_bottom, s.sigma_bottom, s.tan_height, s.sigma_height, s.bearing, s.height_m,
-          s.sigma_height_rel] for s in sights]
-    )  # fmt: skip
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    _, first = np.unique(table[:, 0], return_index=True)
-    groups = np.split(table, first[1:])
-    kept = np.ones(len(groups), bool)
-    state = np.array(prior, dtype=np.float64)
-    cov = np.array(prior_cov, dtype=np.float64)
-    for _ in range(6):
-        info, right = np.linalg.inv(prior_cov), np.linalg.solve(prior_cov, prior)
-        misfit = np.zeros(len(groups))
-        for k, rows in enumerate(groups):
-            bottom, sigma_bottom, tall, sigma_tall, bearing, height_m, sigma_rel = rows[:, 1:].T
-            looks = tall / height_m  # 1 / z of a vehicle as tall as its class
-            J = np.column_stack([looks, -np.ones(len(rows)), bearing])
-            r = bottom - J @ state
-            own = sigma_bottom**2 + (state[0] / height_m * sigma_tall) ** 2 + config.sigma_bounce_rad**2
-            own = own * min(config.frames_alike, len(rows))
-            # common to all boxes of the vehicle: its height and the road under it, both in proportion to 1 / z
-            common = np.hypot(state[0] * sigma_rel, config.sigma_kerb_m) * looks
-            weighed = J / own[:, None]
-            of_common = common / own
-            share = 1.0 / (1.0 + common @ of_common)  # Sherman-Morrison
-            Jc = J.T @ of_common
-            if kept[k]:
-                info = info + J.T @ weighed - share * np.outer(Jc, Jc)
-                right = right + weighed.T @ bottom - share * Jc * (of_common @ bottom)
-            misfit[k] = np.median(r) / np.sqrt(np.median(own) / min(len(rows), 4) + np.median(common) ** 2)
-        cov = np.linalg.inv(info)
-        state = cov @ right
-        kept = np.abs(misfit) < config.gate_sigma
-        if kept.sum() < config.min_vehicles:
-            return None
-    cov += np.diag(np.square([state[0] * config.sigma_class_rel, config.sigma_pitch_rad, config.sigma_crown_rad]))
-    return Stand(state, 0.5 * (cov + cov.T), int(kept.sum()))
+
+    def __init__(self, camera: Camera, config: HeightWatchConfig, localisation: LocalisationConfig) -> None:
+        self.camera, self.config, self._localisation = camera, config, localisation
+        self._vehicles: OrderedDict[int, _Known] = OrderedDict()
+        self._estimate = (1.0, math.inf, 0)
+
+    @property
+    def estimate(self) -> tuple[float, float, int]:
+        """(height over the calibrated one, its 1-sigma, vehicles)."""
+        return self._estimate
+
+    def judge(self, edges: Sequence[VehicleEdge], motion: Motion | None) -> tuple[Status, ...]:
+        """Edges of other frames than the motion's are passed over."""
+        if motion is not None and not LOST & set(motion.status):
+            here = [edge for edge in edges if edge.frame == motion.to_frame]
+            if sum(self._add(box, motion) for box in measure_heights(here, self.camera, self._localisation)):
+                self._estimate = self._solve()
+        ratio, sigma_rel, vehicles = self.estimate
+        cfg = self.config
+        drifted = abs(math.log(ratio)) > max(cfg.drift_rel, cfg.drift_sigma * sigma_rel)
+        return (Status.CALIBRATION_DRIFT,) if vehicles >= cfg.min_vehicles and drifted else ()
+
+    def _add(self, box: BoxHeight, motion: Motion) -> bool:
+        """Whether the box says enough to be taken."""
+        cfg, ground = self.config, motion.ground
+        slope = box.slope_bottom + ground.pitch_rad - ground.roll_rad * box.bearing
+        if slope <= 0.0 or box.tan_height <= 0.0:
+            return False
+        sigma_slope = math.hypot(box.sigma_bottom, motion.pitch_sigma_rad)
+        if math.hypot(sigma_slope / slope, box.sigma_height / box.tan_height) > cfg.max_sigma_box_rel:
+            return False
+        J = np.array([box.tan_height / box.height_m, -1.0, box.bearing])
+        weight = 1.0 / (sigma_slope**2 + (self.camera.height_m / box.height_m * box.sigma_height) ** 2)
+        known = self._vehicles.pop(box.vehicle, None) or _Known(np.zeros((3, 3)), np.zeros(3), 0, 0.0)
+        known.information += weight * np.outer(J, J)
+        known.right += weight * slope * J
+        known.boxes, known.class_rel = known.boxes + 1, box.sigma_height_rel
+        self._vehicles[box.vehicle] = known
+        while len(self._vehicles) > cfg.kept_vehicles:
+            self._vehicles.popitem(last=False)
+        return True
+
+    def _solve(self) -> tuple[float, float, int]:
+        """Least squares over all vehicles, of which each has an error of its own in proportion to J[0] (Huber)."""
+        cfg, height_m, vehicles = self.config, self.camera.height_m, list(self._vehicles.values())
+        alike = np.array([min(cfg.frames_alike, known.boxes) for known in vehicles])
+        A = np.array([known.information for known in vehicles]) / alike[:, None, None]
+        b = np.array([known.right for known in vehicles]) / alike[:, None]
+        own = np.square(height_m * np.array([known.class_rel for known in vehicles])) + cfg.sigma_kerb_m**2
+        share = own / (1.0 + own * A[:, 0, 0])  # Sherman-Morrison
+        information = A - share[:, None, None] * A[:, :, None, 0] * A[:, None, 0, :]
+        right = b - (share * b[:, 0])[:, None] * A[:, 0]
+        spread = np.sqrt(A[:, 0, 0] * (1.0 + own * A[:, 0, 0]))
+        prior = np.diag(1.0 / np.square([cfg.sigma_height_rel * height_m, cfg.sigma_pitch_rad, cfg.sigma_roll_rad]))
+        expected = np.array([height_m, 0.0, 0.0])
+        weight, x, cov = np.ones(len(vehicles)), expected, prior
+        for _ in range(ITERATIONS):
+            cov = np.asarray(np.linalg.inv(prior + np.tensordot(weight, information, 1)), dtype=np.float64)
+            x = cov @ (prior @ expected + weight @ right)
+            misfit = np.abs(b[:, 0] - A[:, 0] @ x) / spread
+            weight = 1.0 / np.maximum(1.0, misfit / cfg.gate_sigma)
+        ratio = max(float(x[0]) / height_m, _LEAST_RATIO)
+        return ratio, math.hypot(math.sqrt(float(cov[0, 0])) / (ratio * height_m), cfg.sigma_class_rel), len(vehicles)

@@ -1,6 +1,6 @@
-"""A vehicle's place by its depth, and what it makes of the place by Eq. 1: the two sources of Fig. 2 become one.
+"""The two sources of a vehicle's place, its depth and Eq. 1, fused into one (paper, Fig. 2).
 
-By covariance, or by the paper's rule: this one where the vehicle is near, Eq. 1 where it is far.
+They are fused by their covariances, or by the paper's rule: the depth where the vehicle is near, Eq. 1 where it is far.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class PseudoLidarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     least_columns: Annotated[int, msgspec.Meta(ge=2)] = 5
     least_points: Annotated[int, msgspec.Meta(ge=1)] = 40  # of a frustum that the network is asked about
     max_range_m: Positive = 60.0
-    gate_sigma: Positive = 3.0  # places that differ by more are both believed less
+    gate_sigma: Positive = 3.0  # past it the covariance of two places that differ grows
     road_near_m: Positive = 5.0  # of the road that gives an unscaled map its metres
     road_far_m: Positive = 25.0
 
@@ -62,15 +62,15 @@ class DepthPlace:
 
     @property
     def front_logit(self) -> float:
-        """Of the yaw's end being the front."""
+        """Log odds that the yaw points to the front."""
         return math.log(1.0 - self.flip) - math.log(max(self.flip, 1e-6))
 
 
-def combined(by_box: Place, by_depth: DepthPlace | None, config: PseudoLidarConfig) -> Place:
-    """One place of the two sources.
+def fuse(by_box: Place, by_depth: DepthPlace | None, config: PseudoLidarConfig) -> Place:
+    """One place from the two sources.
 
-    By covariance, with both believed less where they contradict each other by more than `gate_sigma`; or by the paper's
-    rule, which asks the depth. The nearest face moves with the centre.
+    By their covariances, which grow where the two differ by more than `gate_sigma`, or by the paper's rule, which asks
+    the depth. The nearest face moves with the centre.
     """
     if by_depth is None or config.rule == "off":
         return by_box
@@ -81,10 +81,10 @@ def combined(by_box: Place, by_depth: DepthPlace | None, config: PseudoLidarConf
     # Across the line of sight both rest on the same edges of the box: the depth is all that is new
     apart_m = float(by_depth.centre_m[0] - by_box.centre_m[0])
     variance = float(by_box.cov[0, 0] + by_depth.cov[0, 0])
-    doubt = max(1.0, apart_m**2 / variance / config.gate_sigma**2)
+    inflation = max(1.0, apart_m**2 / variance / config.gate_sigma**2)
     gain = by_box.cov[:, 0] / variance
     cov = by_box.cov - np.outer(gain, by_box.cov[0])
-    return _moved(by_box, by_box.centre_m + gain * apart_m, doubt * cov)
+    return _moved(by_box, by_box.centre_m + gain * apart_m, inflation * cov)
 
 
 def _moved(place: Place, centre_m: Floats, cov: Floats) -> Place:
@@ -100,7 +100,7 @@ def across_var(seen: Observation, x_m: float) -> float:
     return x_m**2 / (of_left + of_right) + half_m**2
 
 
-def along_sight(x_m: float, y_m: float, along: float, across: float) -> Floats:
+def line_of_sight_cov(x_m: float, y_m: float, along: float, across: float) -> Floats:
     """(2, 2) of variances of x_m along the line of sight and of y_m at that x_m."""
     slope = y_m / x_m
     return np.array([[along, along * slope], [along * slope, along * slope**2 + across]])

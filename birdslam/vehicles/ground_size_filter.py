@@ -6,18 +6,18 @@ two apart. One Kalman filter holds them all, with their correlations:
 
     x = [pitch, roll, and of every vehicle: log h, log w, d]   and, for one frame only, of every box: log z
 
-pitch and roll (rad) of the camera over the road, h (m) the vehicle's height, w its outline's width as a factor of what
-its class has at its yaw, d (m) how far the road under it lies below the ego's plane (kerb, crown), z (m) the depth of
-its nearest face, of which nothing is known before. With H the camera's height, y/x the bearing, and slopes that fall
-from the plane of the road:
+pitch and roll (rad) are the camera's over the road, h (m) is the vehicle's height, w the width of its outline as a
+factor of what its class has at its yaw, d (m) how far the road under it lies below the ego's plane (kerb, crown), z (m)
+the depth of its nearest face, of which nothing is known before. With H the camera's height, y/x the bearing, and slopes
+that count downwards from the plane of the road, each box has three measurements:
 
     bottom = (H + d) / z - pitch + roll y/x               (Eq. 1, solved for the slope)
     top    = (H + d - h) / (z + r) - pitch + roll y/x     r: to the roof's far edge where the camera looks down on it
     log width = log w + log(class's outline) - log z
 
-The pitch follows the camera's own rotation between frames, and forgets it: where it lasts, the road turned too. Between
-frames a vehicle's size and kerb stay. The update is iterated once about its own result, with the noise of what does not
-fit raised (Huber).
+The pitch follows the camera's own rotation between frames, and decays to the calibrated one: where a rotation lasts,
+the road turned too. Between frames a vehicle's size and kerb stay. The update is iterated once about its own result,
+with the noise of outliers raised (robust weights, Huber).
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.vehicles.localisation import Observation
 from birdslam.vehicles.parallax import LearnedSize
-from birdslam.vehicles.robust_weights import information
 
 Floats = NDArray[np.float64]
 
@@ -45,11 +45,11 @@ CUES: tuple[Cue, ...] = ("bottom", "top", "width")  # measurements of each box, 
 ITERATIONS = 2
 DEPTH_UNKNOWN = 2.0  # 1-sigma of log z before a frame is seen
 UNUSED = 1e3  # 1-sigma of a cue that is not to be used
-_LEAST = 1e-12  # variance of what a class leaves no doubt of
+_LEAST = 1e-12  # variance of a height that its class knows exactly
 _SHORTEST_S = 1e-3
 
 
-class HorizonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is known of roads and vehicles before any was measured."""
 
     sigma_pitch_rad: float = 0.010  # of the camera over real roads against its calibration
@@ -65,26 +65,32 @@ class HorizonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     width_turned_rel: float = 0.6  # of a change of the outline that comes of a yaw newly learned
     roof_reach_rel: float = 0.6  # of the vehicle's extent along the line of sight, to the edge of its roof
     cues: tuple[Cue, ...] = ("bottom", "top", "width")
-    gate_sigma: float = 2.0  # past it a cue is trusted the less the worse it fits
+    gate_sigma: float = 2.0  # past it a cue is an outlier: its weight falls with its misfit
     image_pitch_frames: float = 5.0  # for how long the error of a pitch from the images lasts
-    box_memory_s: float = 0.5  # a box errs in the next frame as in this: no more is learned in this time than from one
+    box_memory_s: float = 0.5  # a box errs in the next frame as in this: this time counts as one box
 
 
 @dataclass(frozen=True)
 class Depths:
-    """Of one frame's boxes, (N,) each: log depths of the nearest faces and the heights that they were found with."""
+    """Of one frame's boxes, (N,) each: logs of the nearest faces' depths and of the vehicles' heights, in metres."""
 
     log_depth: Floats
     variance: Floats
     log_height: Floats
     height_variance: Floats
-    depth_per_height: Floats  # by how much log_depth goes with log_height
+    depth_per_height: Floats  # derivative of log_depth by log_height
 
 
-class Horizon:
-    """predict() once a frame, then update() with its boxes. `ground` is the camera over the road as known so far."""
+class GroundSizeFilter:
+    """predict() once a frame, then estimate_depths() of its boxes.
 
-    def __init__(self, camera: Camera, config: HorizonConfig) -> None:
+    State: pitch and roll (rad) of the camera over the road; of each vehicle the log of its height in metres, the log of
+    its outline's width as a factor, and its kerb (m). Measurements: of each box the slopes of bottom and top and the
+    log of its width (see the module); the pitch (rad) by the images. `placing.Placing` reads depths and heights;
+    `ground` is read by `localisation.observe_boxes`, by association, and by the front end's lanes and landmarks.
+    """
+
+    def __init__(self, camera: Camera, config: GroundSizeConfig) -> None:
         self.camera = camera
         self.config = config
         self._vehicles: list[int] = []
@@ -108,12 +114,12 @@ class Horizon:
         at = self._at(vehicle)
         return math.exp(float(self._x[at])), math.exp(float(self._x[at + 1]))
 
-    def road(self) -> Horizon:
-        """The road alone, without vehicles, to be predicted on while this one stays."""
-        road = copy.copy(self)
-        road._vehicles, road._unseen_s = [], np.zeros(0)
-        road._x, road._P = self._x[:COMMON].copy(), self._P[:COMMON, :COMMON].copy()
-        return road
+    def ground_alone(self) -> GroundSizeFilter:
+        """A copy without vehicles, to be predicted on while this one stays."""
+        ground = copy.copy(self)
+        ground._vehicles, ground._unseen_s = [], np.zeros(0)
+        ground._x, ground._P = self._x[:COMMON].copy(), self._P[:COMMON, :COMMON].copy()
+        return ground
 
     def predict(
         self, dt_s: float, turn_rad: float | None, image_ground: GroundPlane | None, image_sigma_rad: float
@@ -140,8 +146,8 @@ class Horizon:
             self._image_ground = image_ground
             self._correct_pitch(image_ground.pitch_rad, image_sigma_rad * math.sqrt(config.image_pitch_frames))
 
-    def turn(self, vehicle: int, log_outline: float) -> None:
-        """Its yaw was mistaken, so that its class's outline grew by exp(log_outline); what was seen of it did not."""
+    def rescale_outline(self, vehicle: int, log_outline: float) -> None:
+        """The vehicle's yaw was corrected, so that its class's outline grows by exp(log_outline); its box does not."""
         at = self._at(vehicle) + 1
         self._x[at] -= log_outline
         self._P[at, at] += (self.config.width_turned_rel * log_outline) ** 2
@@ -159,7 +165,7 @@ class Horizon:
         self._vehicles = [vehicle for vehicle in self._vehicles if vehicle in wanted]
         self._x, self._P = self._x[rows], self._P[np.ix_(rows, rows)]
 
-    def update(
+    def estimate_depths(
         self,
         vehicles: Sequence[int],
         seen: Sequence[Observation],
@@ -168,11 +174,12 @@ class Horizon:
         turned_rad: Floats,
         learned: LearnedSize | None = None,
     ) -> Depths:
-        """The depths of all of this frame's boxes together.
+        """The depths of all of this frame's boxes (N) together; the filter learns tilt and sizes from them.
 
         `outlines_m` and `extents_m` (N,): what each class measures across and along the line of sight at its yaw;
         `turned_rad` (N,): by how much that line turned since last seen. Observations are against the present `ground`.
-        `learned`, of N, counts in the depths that are returned and is not kept: in the next frame it may say otherwise.
+        `learned` (N, K), sizes by parallax, counts in the depths that are returned and is not kept: the parallax filter
+        gives it anew in each frame.
         """
         for vehicle, observation in zip(vehicles, seen, strict=True):
             if vehicle not in self._vehicles:
@@ -216,11 +223,10 @@ class Horizon:
     ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """log z and its variances, log h and its variances, and their covariances, (N,) each.
 
-        They have this frame's boxes with their noise R. What is kept for the next frame has them with so much more that
-        errors which last are not averaged away.
+        They have this frame's boxes with their noise R. The state that is kept for the next frame has them with so much
+        more noise that errors which last are not averaged away.
         """
         n, m = len(at), len(self._x)
-        height_m = self._image_ground.height_m
         # First guess of the depth: by the prior height from the height of the box
         log_z = self._x[at] - np.log(np.maximum(z[:n] - z[n : 2 * n], 1e-3))
         prior = np.concatenate([self._x, log_z])
@@ -228,43 +234,52 @@ class Horizon:
         P[:m, :m] = self._P
         P[range(m, m + n), range(m, m + n)] = DEPTH_UNKNOWN**2
         x = prior.copy()
-        rows = np.arange(n)
         for iteration in range(ITERATIONS):
-            depth = np.exp(x[m:])
-            height = np.exp(x[at])
-            below = height_m + x[at + 2]
-            far = np.where(below > height, depth + reach, depth)
-            level = x[0] - self._x[0]
-            lean = (x[1] - self._x[1]) * bearing
-            expected = np.concatenate(
-                [
-                    below / depth - level + lean,
-                    (below - height) / far - level + lean,
-                    x[at + 1] - x[m:],
-                ]
-            )
-            J = np.zeros((len(CUES) * n, m + n))
-            J[: 2 * n, 0] = -1.0
-            J[:n, 1] = J[n : 2 * n, 1] = bearing
-            J[rows, at + 2] = 1.0 / depth
-            J[rows, m + rows] = -below / depth
-            J[n + rows, at] = -height / far
-            J[n + rows, at + 2] = 1.0 / far
-            J[n + rows, m + rows] = -(below - height) / far**2 * depth
-            J[2 * n + rows, at + 1] = 1.0
-            J[2 * n + rows, m + rows] = -1.0
+            expected, J = self._expected_boxes(x, at, bearing, reach)
             PJt = P @ J.T
             S = J @ PJt
             innovation = z - expected - J @ (prior - x)
             gate_sigma = self.config.gate_sigma if iteration == ITERATIONS - 1 else math.inf
-            gain = PJt @ information(S + np.diag(R), innovation, len(CUES), gate_sigma)
+            gain = PJt @ _robust_information(S + np.diag(R), innovation, len(CUES), gate_sigma)
             x = prior + gain @ innovation
         P = P - gain @ PJt.T
         lasting = S + np.diag(R * np.tile(alike, len(CUES)))
-        kept = PJt[:m] @ information(lasting, innovation, len(CUES), self.config.gate_sigma)
+        kept = PJt[:m] @ _robust_information(lasting, innovation, len(CUES), self.config.gate_sigma)
         kept_P = self._P - kept @ PJt[:m].T
         self._x, self._P = prior[:m] + kept @ innovation, (kept_P + kept_P.T) / 2.0
         return x[m:], np.diag(P)[m:].copy(), x[at], np.maximum(P[at, at], _LEAST), P[range(m, m + n), at]
+
+    def _expected_boxes(self, x: Floats, at: NDArray[np.intp], bearing: Floats, reach: Floats) -> tuple[Floats, Floats]:
+        """The measurements (3 N,) expected of a state (M + N,), cue by cue, and their derivatives (3 N, M + N) by it.
+
+        `at` (N,) is where the state has each box's vehicle; slopes are against the ground before the update.
+        """
+        n, m = len(at), len(self._x)
+        rows = np.arange(n)
+        depth = np.exp(x[m:])
+        height = np.exp(x[at])
+        below = self._image_ground.height_m + x[at + 2]
+        far = np.where(below > height, depth + reach, depth)
+        level = x[0] - self._x[0]
+        lean = (x[1] - self._x[1]) * bearing
+        expected = np.concatenate(
+            [
+                bev.road_slope(depth, below) - level + lean,  # Eq. 1
+                (below - height) / far - level + lean,
+                x[at + 1] - x[m:],
+            ]
+        )
+        J = np.zeros((len(CUES) * n, m + n))
+        J[: 2 * n, 0] = -1.0
+        J[:n, 1] = J[n : 2 * n, 1] = bearing
+        J[rows, at + 2] = 1.0 / depth
+        J[rows, m + rows] = -below / depth
+        J[n + rows, at] = -height / far
+        J[n + rows, at + 2] = 1.0 / far
+        J[n + rows, m + rows] = -(below - height) / far**2 * depth
+        J[2 * n + rows, at + 1] = 1.0
+        J[2 * n + rows, m + rows] = -1.0
+        return expected, J
 
     def _begin(self, vehicle: int, seen: Observation) -> None:
         self._vehicles.append(vehicle)
@@ -286,6 +301,29 @@ class Horizon:
         gain = self._P[:, 0] / (self._P[0, 0] + sigma_rad**2)
         self._x = self._x + gain * (pitch_rad - self._x[0])
         self._P = self._P - np.outer(gain, self._P[0])
+
+
+def _robust_information(S: Floats, innovation: Floats, cues: int, gate_sigma: float) -> Floats:
+    """The inverse of the innovations' covariance S (M, M), with the worst cue of each box at a robust weight (Huber).
+
+    Innovations (M,) stand cue by cue, of all boxes each. What all the others say of one differs from it by
+    (S^-1 v)_i / (S^-1)_ii, with the variance 1 / (S^-1)_ii: past `gate_sigma` its noise is raised.
+    """
+    whole = np.asarray(np.linalg.inv(S), dtype=np.float64)
+    of_each = np.diag(whole)
+    misfit = np.abs(whole @ innovation) / np.sqrt(of_each)
+    by_box = misfit.reshape(cues, -1)
+    n = by_box.shape[1]
+    worst = by_box.argmax(axis=0) * n + np.arange(n)
+    worst = worst[misfit[worst] > gate_sigma]
+    if not len(worst):
+        return whole
+    # Woodbury: noise added to a few measurements
+    more = ((misfit[worst] / gate_sigma) ** 4 - 1.0) / of_each[worst]
+    columns = whole[:, worst]
+    inner = np.diag(1.0 / more) + columns[worst]
+    out: Floats = whole - columns @ np.linalg.solve(inner, columns.T)
+    return out
 
 
 def _mixed(weight: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:

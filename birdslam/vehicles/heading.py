@@ -1,8 +1,11 @@
-"""What a vehicle's yaw, where it is not known well, makes of its place.
+"""A vehicle's place with the uncertainty of its yaw marginalised out.
 
-A box says how wide a vehicle looks beside how far it is, and so how much it is turned, though not to which side. Each
-yaw of a fan puts the footprint's centre elsewhere; how much each is to be believed, by what was thought of the yaw
-before and by the width, gives the centre's mean and covariance.
+The width of a box, at a depth, shows how much a vehicle is turned, though not to which side. Each yaw of a fan puts the
+footprint's centre elsewhere. The posterior over the fan, from what is known of the yaw beforehand and from the width,
+gives the centre's mean and covariance.
+
+No filter: nothing is kept from frame to frame. Input are the yaws (rad) of `yaw_filter.YawFilter` and the log depths of
+`ground_size_filter.GroundSizeFilter`; `placing.Placing` reads the result.
 """
 
 from __future__ import annotations
@@ -23,14 +26,14 @@ Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
 _NEAR = np.array([0.0, math.sqrt(3.0), -math.sqrt(3.0)])  # Gauss-Hermite points of a normal distribution, in sigmas
 _NEAR_WEIGHT = np.array([2.0, 0.5, 0.5]) / 3.0
-_LEAST_BELIEF = 1e-12
+_LEAST_WEIGHT = 1e-12
 
 
 class HeadingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How vehicles stand on roads, and what the width of a box says of it."""
 
-    astray_unknown: Share = 0.25  # of the vehicles whose yaw nothing has shown yet are headed anywhere
-    astray_known: Share = 0.1  # and of those whose motion or body seemed to show it
+    outlier_unknown: Share = 0.25  # of the vehicles whose yaw nothing has shown yet: they are headed anywhere
+    outlier_known: Share = 0.1  # of those whose motion or body seemed to show it
     sigma_along_road_rad: float = 0.05  # of the others of the first kind: they are headed like the ego
     sigma_width_rel: float = 0.09  # of the outline of a footprint, among vehicles of a class
     fan: Annotated[int, msgspec.Meta(ge=4, le=90)] = 12  # yaws over half a turn: a heading and its opposite look alike
@@ -38,14 +41,17 @@ class HeadingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Headings:
-    """What is thought of the yaws (N,) of a frame's vehicles, against the ego: normal but for those gone `astray`."""
+    """Of the yaws (N,) of a frame's vehicles against the ego: a normal distribution mixed with a uniform one.
+
+    `outlier` (N,) is the weight of the uniform one.
+    """
 
     yaw_rad: Floats
     sigma_rad: Floats
-    astray: Floats
+    outlier: Floats
 
 
-def spread(
+def marginalise_yaw(
     seen: Sequence[Observation],
     log_depth: Floats,
     variance: Floats,
@@ -53,7 +59,7 @@ def spread(
     localisation: LocalisationConfig,
     config: HeadingConfig,
 ) -> tuple[Floats, Floats]:
-    """(N, 2) m in ego: how far the mean centre lies from that of the yaw as told, and the cov (N, 2, 2) about it.
+    """(N, 2) m in ego: how far the mean centre lies from the centre at the mean yaw; its covariance (N, 2, 2) by yaw.
 
     `log_depth` (N,) is of the nearest faces, with its `variance`.
     """
@@ -62,8 +68,8 @@ def spread(
     n, fan = len(seen), config.fan
     anywhere = np.broadcast_to(np.arange(fan) * (math.pi / fan), (n, fan))
     yaws = np.hstack([headings.yaw_rad[:, None] + headings.sigma_rad[:, None] * _NEAR, anywhere])  # (N, M)
-    astray = headings.astray[:, None]
-    prior = np.hstack([(1.0 - astray) * _NEAR_WEIGHT, np.broadcast_to(astray / fan, (n, fan))])
+    outlier = headings.outlier[:, None]
+    prior = np.hstack([(1.0 - outlier) * _NEAR_WEIGHT, np.broadcast_to(outlier / fan, (n, fan))])
     left, right, var_left, var_right, half_l, half_w = np.array(
         [
             (
@@ -88,16 +94,16 @@ def spread(
     far_m = np.maximum(x_m + ahead, 0.1)
     y_m = (left + right) / 2.0 * x_m
     of_left, of_right = 1.0 / var_left, 1.0 / var_right
-    for _ in range(CENTRE_STEPS):  # as `place` does
+    for _ in range(CENTRE_STEPS):  # as `localisation.place`
         outline = (y_m + aside) / far_m
         widest, least = outline.max(axis=0), outline.min(axis=0)
         y_m = y_m + ((left - widest) * of_left + (right - least) * of_right) / (of_left + of_right) * x_m
 
     misfit = np.log(np.maximum(left - right, 1e-3) / np.maximum(widest - least, 1e-3))
     noise = variance[:, None] + config.sigma_width_rel**2 + (var_left + var_right) / (left - right) ** 2
-    belief = prior * np.exp(-0.5 * misfit**2 / noise) + prior * _LEAST_BELIEF
-    belief /= belief.sum(axis=1, keepdims=True)
+    weight = prior * np.exp(-0.5 * misfit**2 / noise) + prior * _LEAST_WEIGHT
+    weight /= weight.sum(axis=1, keepdims=True)
     centres = np.stack([x_m, y_m], axis=-1)
-    mean = (belief[..., None] * centres).sum(axis=1)
+    mean = (weight[..., None] * centres).sum(axis=1)
     away = centres - mean[:, None]
-    return mean - centres[:, 0], (belief[..., None] * away).swapaxes(1, 2) @ away
+    return mean - centres[:, 0], (weight[..., None] * away).swapaxes(1, 2) @ away

@@ -1,8 +1,9 @@
 """Vehicles in bird's-eye view from their boxes (paper, dynamic object localization).
 
-A box becomes an `Observation`: slopes and bearings against the road as it is known, with honest sigmas. An edge that
-the image cuts off is no measurement, one that a nearer vehicle hides a poor one. Depths come of all boxes of a frame
-together (horizon.py); `place` then puts the footprint's centre where the box's edges and the vehicle's yaw want it.
+`observe_boxes` makes an `Observation` of a box: slopes and bearings against the road as it is known, with their sigmas.
+An edge that the image cuts off is no measurement, one that a nearer vehicle hides a poor one. The depths come from all
+boxes of a frame together, by Eq. 1 on their bottom edges (ground_size_filter.py). `place` then puts the centre of the
+footprint where the box's edges and the vehicle's yaw want it.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 
 
@@ -56,8 +58,8 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
     max_range_m: float = 100.0  # by the height of its class
 
-    def told(self, edge_sigma: tuple[float, float] | None) -> LocalisationConfig:
-        """With what a detector itself says of its boxes' edges, where it does (see `perception.Detections`)."""
+    def with_edge_sigma(self, edge_sigma: tuple[float, float] | None) -> LocalisationConfig:
+        """With the 1-sigma (relative, px) that a detector states for its boxes' edges (see `perception.Detections`)."""
         if edge_sigma is None:
             return self
         rel, px = edge_sigma
@@ -68,8 +70,9 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 class Observation:
     """One vehicle's box in one frame.
 
-    `left` and `right` are the bearings (y/x in ego) of its edges; slopes fall from the plane of the road, so that Eq. 1
-    is H / slope_bottom. All sigmas are of these numbers.
+    `left` and `right` are the bearings (y/x in ego) of its edges at the bottom. Slopes (-z/x in ego) count downwards
+    from the plane of the road, so that Eq. 1 puts the bottom edge at x = H / slope_bottom. The sigmas are standard
+    deviations of these numbers.
     """
 
     label: str
@@ -86,6 +89,7 @@ class Observation:
     cut_side: bool
     dimensions: Dimensions
     sigma_cut: float | None = None  # of slope_bottom where the image cuts the bottom off: the true one is no less
+    row: int = 0  # of its box among those that it was observed in
 
     @property
     def bearing(self) -> float:
@@ -109,10 +113,11 @@ class Observation:
 
 
 @dataclass(frozen=True)
-class Taken:
-    """What a vehicle was taken for when it was placed: later frames may know better (retrospect.py).
+class AssumedSize:
+    """The size that a vehicle was placed with, for the smoother (rts_smoother.py): later frames know the size better.
 
-    `depth_per_height` says by how much the logarithm of its depth went with `log_height`, that of its height in metres.
+    `log_height` is the logarithm of its height in metres, `depth_per_height` the derivative of the logarithm of its
+    depth by it.
     """
 
     log_height: float
@@ -128,7 +133,7 @@ class Place:
     depth_m: float
     centre_m: NDArray[np.float64]
     cov: NDArray[np.float64]
-    taken: Taken | None = None
+    assumed: AssumedSize | None = None
 
 
 def iou(a_px: NDArray[np.float64], b_px: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -150,7 +155,7 @@ def corners_of(dimensions: Dimensions, yaw_rad: float) -> list[tuple[float, floa
 
 
 def extent_m(dimensions: Dimensions, yaw_rad: float, depth_m: float, bearing: float) -> tuple[float, float]:
-    """What a vehicle measures along ego's x, and how wide its outline is where it is as far as its nearest face."""
+    """(extent along ego's x, width of its outline as seen at the depth of its nearest face) of a vehicle, in metres."""
     corners = corners_of(dimensions, yaw_rad)
     reach_m = -min(x for x, _ in corners)
     x_m = depth_m + reach_m
@@ -190,7 +195,7 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
     return Place(depth_m, np.array([x_m, y_m]), cov)
 
 
-def localise(
+def observe_boxes(
     boxes_px: NDArray[np.float64],
     scores: NDArray[np.float64],
     labels: tuple[str, ...],
@@ -198,7 +203,7 @@ def localise(
     ground: GroundPlane,
     config: LocalisationConfig,
 ) -> list[Observation]:
-    """The vehicles among the boxes (N, 4), best score first.
+    """Observations of the vehicles among the boxes (N, 4) with scores (N,), best score first.
 
     A box that hangs over the road or lies past `max_range_m` is no vehicle on it and is left out.
     """
@@ -216,10 +221,10 @@ def localise(
     hidden = hidden_edges(boxes)
     slopes = _slopes(camera, ground, boxes)
     found = (
-        _observe(box, float(scores[i]), labels[i], camera, slope, edges, config)
-        for i, box, slope, edges in zip(chosen, boxes.tolist(), slopes.tolist(), hidden.tolist(), strict=True)
+        _observe(i, box, float(scores[i]), labels[i], camera, slope, edges, config)
+        for i, box, slope, edges in zip(chosen.tolist(), boxes.tolist(), slopes.tolist(), hidden.tolist(), strict=True)
     )
-    return [seen for seen in found if _is_on_road(seen, camera, ground, config)]
+    return [seen for seen in found if _is_on_road(seen, ground, config)]
 
 
 def hidden_edges(boxes_px: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -237,15 +242,14 @@ def hidden_edges(boxes_px: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _slopes(camera: Camera, ground: GroundPlane, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 4): bearings of the left and right edge at the bottom, slopes of bottom and top (the rays Eq. 1 scales)."""
+    """(N, 4): bearings of the left and right edge at the bottom, slopes of bottom and top (the rays of Eq. 1)."""
     px = np.concatenate([boxes_px[:, [0, 3]], boxes_px[:, [2, 3]], boxes_px[:, [0, 1]]])
-    rays = np.column_stack([(px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px], np.ones(len(px))])
-    x, y, z = (rays @ ground.R_ego_cam.T).T
-    bearing, slope = (y / x).reshape(3, -1), (-z / x).reshape(3, -1)
-    return np.column_stack([bearing[0], bearing[1], slope[0], slope[2]])
+    left, right, top = np.split(bev.bearing_and_slope(camera, ground, px), 3)
+    return np.column_stack([left[:, 0], right[:, 0], left[:, 1], top[:, 1]])
 
 
 def _observe(
+    row: int,
     box: list[float],
     score: float,
     label: str,
@@ -282,10 +286,14 @@ def _observe(
         cut_side=cut_left or cut_right,
         dimensions=config.vehicles[label],
         sigma_cut=sigma_px(height_px, False, False) / camera.fy_px if cut_bottom else None,
+        row=row,
     )
 
 
-def _is_on_road(seen: Observation, camera: Camera, ground: GroundPlane, config: LocalisationConfig) -> bool:
+def _is_on_road(seen: Observation, ground: GroundPlane, config: LocalisationConfig) -> bool:
     depth_m = seen.depth_by_height_m
-    hangs = seen.slope_bottom < ground.height_m / depth_m - config.max_above_road_rad - 3.0 * seen.sigma_bottom
+    hangs = (
+        seen.slope_bottom
+        < bev.road_slope(depth_m, ground.height_m) - config.max_above_road_rad - 3.0 * seen.sigma_bottom
+    )
     return depth_m < config.max_range_m and not hangs

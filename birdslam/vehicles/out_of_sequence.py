@@ -1,8 +1,9 @@
-"""Detections that come late, used at their own frame: vehicles are followed as if every detection had been in time.
+"""Out-of-sequence measurements: detections that come late are used at their own frame, as if they had been in time.
 
-The horizon and the tracks stand at the last *settled* frame, whose detections are in, or will not be waited for. The
-frames after it are open: what was known of each (pose, time, how the camera pitched) is kept, and they are settled in
-their order once the detections of one of them arrive. The road under the camera now is predicted over the open frames.
+The tracks and the ground and size filter stand at the last *settled* frame, whose detections are in or are no longer
+awaited. The frames after it are open: what is known of each (pose, time, how the camera pitched) is kept. Once the
+detections of one of them arrive, the open frames up to it are settled in their order. The road under the camera in the
+newest frame is predicted over the open ones.
 """
 
 from __future__ import annotations
@@ -14,78 +15,56 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.geometry.se2 import SE2
+from birdslam.geometry.camera import GroundPlane
 from birdslam.perception import DepthMap, Detections
-from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig
-from birdslam.vehicles.ground_size_filter import Horizon
-from birdslam.vehicles.localisation import LocalisationConfig, Observation, localise
-from birdslam.vehicles.pseudolidar import FrustumNetwork, bodies_by_detector, localise_by_depth
-from birdslam.vehicles.track import Track
+from birdslam.vehicles.ground_size_filter import GroundSizeFilter
+from birdslam.vehicles.track import EgoFrame, Track
 from birdslam.vehicles.tracking import Tracker
 
-Floats = NDArray[np.float64]
 
-
-class HindsightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class OutOfSequenceConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How long a frame waits for its detections."""
 
     latest_ms: float = 500.0  # source time; what comes later is left out
 
 
 @dataclass(frozen=True)
-class Moment:
-    """What is known of a frame without its detections; the arguments of `Horizon.predict` from the frame before."""
+class OpenFrame:
+    """What is known of a frame without its detections: the ego, and the arguments of `GroundSizeFilter.predict`."""
 
-    frame_id: int
-    t_source_ns: int
-    T_world_ego: SE2  # by dead reckoning
-    ego_cov: Floats | None  # (3, 3) of the step to it, in its tangent
+    ego: EgoFrame
     dt_s: float
     turn_rad: float | None
     image_ground: GroundPlane | None
     image_sigma_rad: float
 
 
-class Hindsight:
-    """step() once a frame; `road` is the road under the camera in the newest one."""
+class OutOfSequenceTracker:
+    """open_frame(), then localise_vehicles(), once a frame; `road` is the road under the camera in the newest one."""
 
-    def __init__(
-        self,
-        camera: Camera,
-        tracker: Tracker,
-        horizon: Horizon,
-        localisation: LocalisationConfig,
-        config: HindsightConfig,
-        pseudolidar: PseudoLidarConfig | None = None,
-        frustum_network: FrustumNetwork | None = None,
-    ) -> None:
-        self.camera = camera
-        self.pseudolidar = pseudolidar or PseudoLidarConfig()
-        self.frustum_network = frustum_network
-        self.config = config
-        self.localisation = localisation
+    def __init__(self, tracker: Tracker, ground_size: GroundSizeFilter, config: OutOfSequenceConfig) -> None:
         self.tracker = tracker
-        self.horizon = horizon
-        self.road = horizon
-        self._open: deque[Moment] = deque()
+        self.ground_size = ground_size  # at the last settled frame
+        self.road = ground_size  # at the newest frame
+        self.config = config
+        self._open: deque[OpenFrame] = deque()
         self._newest_frame = -1
         self._used_frame = -1  # of the newest detections that were used
 
-    def begin(self, moment: Moment) -> None:
+    def open_frame(self, frame: OpenFrame) -> None:
         """A new frame. One whose number does not grow is of a source that began anew: nothing is awaited any more."""
-        if moment.frame_id <= self._newest_frame:
+        if frame.ego.frame_id <= self._newest_frame:
             self._settle_before(self._newest_frame + 1)
             self._used_frame = -1
-        self._newest_frame = moment.frame_id
-        self._open.append(moment)
-        if self.road is self.horizon:
-            self.road = self.horizon.road()
-        _predict(self.road, moment)
-        while (moment.t_source_ns - self._open[0].t_source_ns) * 1e-6 > self.config.latest_ms:
-            self._settle(None)
+        self._newest_frame = frame.ego.frame_id
+        self._open.append(frame)
+        if self.road is self.ground_size:
+            self.road = self.ground_size.ground_alone()
+        _predict(self.road, frame)
+        while (frame.ego.t_source_ns - self._open[0].ego.t_source_ns) * 1e-6 > self.config.latest_ms:
+            self._settle_oldest(None)
 
-    def see(
+    def localise_vehicles(
         self,
         detections: Detections | None,
         detected_frame: int,
@@ -95,69 +74,34 @@ class Hindsight:
         """The confirmed tracks that detections of `detected_frame` show, as they were in it, ordered by id.
 
         Each detections are used once. A detector works on one image at a time, so that none come after later ones.
-        `depth` and `road` are of the same frame, None where they are not.
+        `depth` and `road`, a mask (H, W), are of the same frame, None where they are not.
         """
-        seen: list[Track] = []
-        awaited = any(moment.frame_id == detected_frame for moment in self._open)
+        tracks: list[Track] = []
+        awaited = any(frame.ego.frame_id == detected_frame for frame in self._open)
         if detections is not None and awaited and detected_frame > self._used_frame:
             self._used_frame = detected_frame
             self._settle_before(detected_frame)
-            seen = self._settle(detections, depth, road)
-            self.road = self.horizon if not self._open else self.horizon.road()
-            for moment in self._open:
-                _predict(self.road, moment)
-        return seen
+            tracks = self._settle_oldest(detections, depth, road)
+            self.road = self.ground_size if not self._open else self.ground_size.ground_alone()
+            for frame in self._open:
+                _predict(self.road, frame)
+        return tracks
 
     def _settle_before(self, frame_id: int) -> None:
-        while self._open and self._open[0].frame_id < frame_id:
-            self._settle(None)
+        while self._open and self._open[0].ego.frame_id < frame_id:
+            self._settle_oldest(None)
 
-    def _settle(
+    def _settle_oldest(
         self,
         detections: Detections | None,
         depth: DepthMap | None = None,
         road: NDArray[np.bool_] | None = None,
     ) -> list[Track]:
         """The oldest open frame, with its detections or without any."""
-        moment = self._open.popleft()
-        _predict(self.horizon, moment)
-        observations: list[Observation] | None = None
-        by_depth: list[DepthPlace | None] = []
-        if detections is not None:
-            observations = localise(
-                detections.boxes_px,
-                detections.scores,
-                detections.labels,
-                self.camera,
-                self.horizon.ground,
-                self.localisation.told(detections.edge_sigma),
-            )
-            observations, by_depth = self._by_depth(observations, detections, depth, road)
-        return self.tracker.step(
-            observations,
-            moment.T_world_ego,
-            self.horizon,
-            moment.frame_id,
-            moment.t_source_ns,
-            moment.ego_cov,
-            by_depth,
-        )
-
-    def _by_depth(
-        self,
-        seen: list[Observation],
-        detections: Detections,
-        depth: DepthMap | None,
-        road: NDArray[np.bool_] | None,
-    ) -> tuple[list[Observation], list[DepthPlace | None]]:
-        """The second source of each observation's place; bodies that the detector itself knows of need no depth map."""
-        ground, config = self.horizon.ground, self.pseudolidar
-        if detections.boxes3d is not None and self.frustum_network is None:
-            return bodies_by_detector(seen, detections, self.camera, ground, config)
-        if depth is None:
-            return seen, []
-        return seen, localise_by_depth(seen, depth, self.camera, ground, config, road, self.frustum_network)
+        frame = self._open.popleft()
+        _predict(self.ground_size, frame)
+        return self.tracker.localise_vehicles(frame.ego, detections, self.ground_size, depth, road)
 
 
-def _predict(horizon: Horizon, moment: Moment) -> None:
-    horizon.predict(moment.dt_s, moment.turn_rad, moment.image_ground, moment.image_sigma_rad)
+def _predict(ground_size: GroundSizeFilter, frame: OpenFrame) -> None:
+    ground_size.predict(frame.dt_s, frame.turn_rad, frame.image_ground, frame.image_sigma_rad)

@@ -1,7 +1,8 @@
 """The places of a frame's vehicles, all of them together, from everything that tells depth.
 
-Boxes against the road (horizon.py), sizes learned as the ego drives by (parallax.py), and a depth map where there is
-one (pseudolidar.py). A further source of a place with its covariance belongs into `Placing.places`, beside the last.
+Sizes learned as the ego drives by (parallax.py), Eq. 1 on all boxes against one road (ground_size_filter.py), the
+uncertain yaw (heading.py), and the depth where there is one (pseudolidar.py). A further source of a place with its
+covariance belongs into `Placing.locate`, beside the last.
 """
 
 from __future__ import annotations
@@ -14,25 +15,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfcx
 
+from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.vehicles.association import NEAREST_M, in_ego
-from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, combined
-from birdslam.vehicles.ground_size_filter import Depths, Horizon
-from birdslam.vehicles.heading import HeadingConfig, Headings, spread
-from birdslam.vehicles.localisation import LocalisationConfig, Observation, Place, Taken, extent_m, place
-from birdslam.vehicles.parallax import LearnedSize, Parallax, ParallaxConfig, sights_of
+from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
+from birdslam.vehicles.ground_size_filter import Depths, GroundSizeFilter
+from birdslam.vehicles.heading import HeadingConfig, Headings, marginalise_yaw
+from birdslam.vehicles.localisation import AssumedSize, LocalisationConfig, Observation, Place, extent_m, place
+from birdslam.vehicles.parallax import LearnedSize, Parallax, ParallaxConfig, measure_boxes
 from birdslam.vehicles.track import Track
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Body:
-    """An observation and whose it is: a track's, or that of a vehicle which is new."""
+class Assignment:
+    """An observation and the track that it is of, None for a vehicle that is new, with its place by depth."""
 
     serial: int
     track: Track | None
-    seen: Observation
+    observation: Observation
     by_depth: DepthPlace | None = None
 
     def yaw_rad(self, T_world_ego: SE2) -> float:
@@ -41,19 +43,19 @@ class Body:
             return self.by_depth.yaw_rad if self.by_depth is not None and self.by_depth.front_seen else 0.0
         return wrap(self.track.yaw_rad - T_world_ego.yaw_rad)
 
-    def yaw_doubt(self, config: HeadingConfig) -> tuple[float, float]:
-        """1-sigma of that yaw, and the probability that it is another one altogether."""
+    def yaw_uncertainty(self, config: HeadingConfig) -> tuple[float, float]:
+        """1-sigma of that yaw (rad), and the probability that it is an outlier: another yaw altogether."""
         if self.track is None:
             if self.by_depth is not None and self.by_depth.front_seen:
-                return self.by_depth.sigma_yaw_rad, config.astray_known
+                return self.by_depth.sigma_yaw_rad, config.outlier_known
         elif self.track.yaw_known:
-            return self.track.sigma_yaw_rad, config.astray_known
-        return config.sigma_along_road_rad, config.astray_unknown
+            return self.track.sigma_yaw_rad, config.outlier_known
+        return config.sigma_along_road_rad, config.outlier_unknown
 
     def expected_depth_m(self, T_world_ego: SE2) -> float:
         """Of the nearest face, before it is measured: as the track predicts it, or by the height of its class."""
         if self.track is None:
-            return self.seen.depth_by_height_m
+            return self.observation.depth_by_height_m
         reach_m = self.track.place.centre_m[0] - self.track.place.depth_m
         return max(NEAREST_M, in_ego(T_world_ego, self.track.state[:2])[0] - reach_m)
 
@@ -62,11 +64,25 @@ class Body:
         if self.track is None:
             return 0.0
         before = math.atan(self.track.observation.bearing) + self.track.T_world_ego.yaw_rad
-        return wrap(math.atan(self.seen.bearing) + T_world_ego.yaw_rad - before)
+        return wrap(math.atan(self.observation.bearing) + T_world_ego.yaw_rad - before)
+
+
+@dataclass(frozen=True)
+class _Expected:
+    """What is known of a frame's vehicles (N) in ego before their boxes are used."""
+
+    yaw_rad: list[float]
+    centre_m: Floats  # (N, 2)
+    extent_m: Floats  # (N, 2) as of `localisation.extent_m`
+    turned_rad: Floats  # (N,)
 
 
 class Placing:
-    """predict() once a frame, then places() of its bodies."""
+    """predict() once a frame, then locate() its vehicles.
+
+    It keeps no state but that of `parallax.Parallax`; the `GroundSizeFilter` is handed in. It measures nothing itself:
+    the tracker reads its places (m, with covariances), the smoother the sizes that they were placed with.
+    """
 
     def __init__(
         self,
@@ -80,104 +96,102 @@ class Placing:
         self.pseudolidar = pseudolidar
         self.parallax = Parallax(parallax)
 
-    def predict(self, dt_s: float, T_world_ego: SE2, ego_cov: Floats | None) -> None:
+    def predict(self, dt_s: float, T_world_ego: SE2, step_cov: Floats | None) -> None:
         """To the next frame's ego pose, with the covariance (3, 3) of the step to it."""
-        self.parallax.predict(dt_s, T_world_ego, ego_cov)
+        self.parallax.predict(dt_s, T_world_ego, step_cov)
 
     def keep_only(self, serials: Iterable[int]) -> None:
         """Forget the other vehicles."""
         self.parallax.keep_only(serials)
 
-    def places(self, bodies: Sequence[Body], T_world_ego: SE2, horizon: Horizon) -> list[Place]:
-        """In ego, one for each body; the horizon learns the road's tilt and their sizes from all of them."""
-        seen, serials = [body.seen for body in bodies], [body.serial for body in bodies]
-        yaws = [body.yaw_rad(T_world_ego) for body in bodies]
-        depths = [body.expected_depth_m(T_world_ego) for body in bodies]
-        turned = np.array([body.turned_rad(T_world_ego) for body in bodies])
-        extents = np.array(
-            [extent_m(o.dimensions, yaw, depth, o.bearing) for o, yaw, depth in zip(seen, yaws, depths, strict=True)]
-        ).reshape(-1, 2)
-        centres = np.array(
-            [
-                place(o, math.log(depth), 0.0, yaw, self.localisation).centre_m
-                for o, yaw, depth in zip(seen, yaws, depths, strict=True)
-            ]
-        ).reshape(-1, 2)
-        learned = self._sizes(bodies, centres, extents, turned, T_world_ego, horizon)
-        pitch_rad = horizon.ground.pitch_rad
-        found = horizon.update(serials, seen, extents[:, 1], extents[:, 0], turned, learned)
-        found = no_farther_than_cut(found, seen, horizon, horizon.ground.pitch_rad - pitch_rad)
-        by_boxes = [
-            place(o, log_depth, variance, yaw, self.localisation)
-            for o, log_depth, variance, yaw in zip(
-                seen, found.log_depth.tolist(), found.variance.tolist(), yaws, strict=True
-            )
-        ]
-        by_boxes = self._headed(by_boxes, bodies, found, yaws)
-        where = [
-            combined(by_box, body.by_depth, self.pseudolidar) for by_box, body in zip(by_boxes, bodies, strict=True)
-        ]
+    def locate(self, assignments: Sequence[Assignment], T_world_ego: SE2, ground_size: GroundSizeFilter) -> list[Place]:
+        """In ego, one place for each assignment; `ground_size` learns the road's tilt and their sizes from all."""
+        expected = self._expected(assignments, T_world_ego)
+        sizes = self._sizes_by_parallax(assignments, expected, T_world_ego, ground_size)
+        depths = _depths_by_eq_1(assignments, expected, sizes, ground_size)
+        by_eq_1 = self._places_at(depths, assignments, expected.yaw_rad)
+        fused = [fuse(where, a.by_depth, self.pseudolidar) for where, a in zip(by_eq_1, assignments, strict=True)]
         return [
-            replace(whole, taken=self._taken(found, k, serials[k], float(whole.cov[0, 0] / by_box.cov[0, 0])))
-            for k, (whole, by_box) in enumerate(zip(where, by_boxes, strict=True))
+            replace(both, assumed=self._assumed(depths, k, a.serial, float(both.cov[0, 0] / one.cov[0, 0])))
+            for k, (both, one, a) in enumerate(zip(fused, by_eq_1, assignments, strict=True))
         ]
 
-    def _headed(
-        self, places: Sequence[Place], bodies: Sequence[Body], depths: Depths, yaws_rad: Sequence[float]
-    ) -> list[Place]:
-        """The places with all that the doubt of the yaws makes of them."""
-        sigma_rad, astray = np.array([body.yaw_doubt(self.heading) for body in bodies]).reshape(-1, 2).T
-        shift_m, cov = spread(
-            [body.seen for body in bodies],
+    def _expected(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> _Expected:
+        yaws = [a.yaw_rad(T_world_ego) for a in assignments]
+        depths = [a.expected_depth_m(T_world_ego) for a in assignments]
+        turned = [a.turned_rad(T_world_ego) for a in assignments]
+        each = [(a.observation, yaw, depth) for a, yaw, depth in zip(assignments, yaws, depths, strict=True)]
+        centres = [place(o, math.log(depth), 0.0, yaw, self.localisation).centre_m for o, yaw, depth in each]
+        extents = [extent_m(o.dimensions, yaw, depth, o.bearing) for o, yaw, depth in each]
+        return _Expected(
+            yaws, np.array(centres).reshape(-1, 2), np.array(extents).reshape(-1, 2), np.array(turned, dtype=np.float64)
+        )
+
+    def _sizes_by_parallax(
+        self, assignments: Sequence[Assignment], expected: _Expected, T_world_ego: SE2, ground_size: GroundSizeFilter
+    ) -> LearnedSize:
+        """What the vehicles' growth in the image says of their heights."""
+        for assignment, centre_m in zip(assignments, expected.centre_m, strict=True):
+            if assignment.track is None:
+                d = assignment.observation.dimensions
+                sigmas = d.sigma_height_rel, d.sigma_width_rel
+                self.parallax.begin(assignment.serial, centre_m, T_world_ego, math.log(d.height_m), sigmas)
+        seen, height_m = [a.observation for a in assignments], ground_size.ground.height_m
+        over_roof_m = np.array([max(0.0, height_m - o.dimensions.height_m) for o in seen])
+        roof_m2 = over_roof_m * expected.extent_m[:, 0] * ground_size.config.roof_reach_rel
+        boxes = measure_boxes(seen, expected.centre_m, expected.extent_m, expected.turned_rad, roof_m2)
+        serials = [a.serial for a in assignments]
+        return self.parallax.learn_sizes(serials, boxes, T_world_ego, height_m, ground_size.sigma_pitch_rad)
+
+    def _places_at(self, depths: Depths, assignments: Sequence[Assignment], yaws_rad: Sequence[float]) -> list[Place]:
+        """The places at these depths, with the uncertainty of the depths and of the yaws."""
+        seen = [a.observation for a in assignments]
+        sigma_rad, outlier = np.array([a.yaw_uncertainty(self.heading) for a in assignments]).reshape(-1, 2).T
+        shift_m, cov = marginalise_yaw(
+            seen,
             depths.log_depth,
             depths.variance,
-            Headings(np.array(yaws_rad), sigma_rad, astray),
+            Headings(np.array(yaws_rad), sigma_rad, outlier),
             self.localisation,
             self.heading,
         )
-        return [
-            replace(where, centre_m=where.centre_m + d, cov=where.cov + C)
-            for where, d, C in zip(places, shift_m, cov, strict=True)
-        ]
+        numbers = zip(seen, depths.log_depth.tolist(), depths.variance.tolist(), yaws_rad, shift_m, cov, strict=True)
+        out = []
+        for observation, log_depth, variance, yaw_rad, d, C in numbers:
+            where = place(observation, log_depth, variance, yaw_rad, self.localisation)
+            out.append(replace(where, centre_m=where.centre_m + d, cov=where.cov + C))
+        return out
 
-    def _taken(self, depths: Depths, k: int, serial: int, share: float) -> Taken:
+    def _assumed(self, depths: Depths, k: int, serial: int, share: float) -> AssumedSize:
         """`share` of the box's variance along the line of sight is left: so much of the place is still the box's."""
-        return Taken(
+        return AssumedSize(
             log_height=float(depths.log_height[k]),
             sigma_log_height=math.sqrt(float(depths.height_variance[k])),
             depth_per_height=float(depths.depth_per_height[k]) * min(share, 1.0),
             standing=self.parallax.standing(serial),
         )
 
-    def _sizes(
-        self,
-        bodies: Sequence[Body],
-        centres_m: Floats,
-        extents_m: Floats,
-        turned_rad: Floats,
-        T_world_ego: SE2,
-        horizon: Horizon,
-    ) -> LearnedSize:
-        """What the vehicles' growth in the image says of their heights."""
-        for body, centre_m in zip(bodies, centres_m, strict=True):
-            if body.track is None:
-                d = body.seen.dimensions
-                sigmas = d.sigma_height_rel, d.sigma_width_rel
-                self.parallax.begin(body.serial, centre_m, T_world_ego, math.log(d.height_m), sigmas)
-        seen, height_m = [body.seen for body in bodies], horizon.ground.height_m
-        over_roof_m = np.array([max(0.0, height_m - o.dimensions.height_m) for o in seen])
-        roof_m2 = over_roof_m * extents_m[:, 0] * horizon.config.roof_reach_rel
-        sights = sights_of(seen, centres_m, extents_m, turned_rad, roof_m2)
-        serials = [body.serial for body in bodies]
-        return self.parallax.update(serials, sights, T_world_ego, height_m, horizon.sigma_pitch_rad)
+
+def _depths_by_eq_1(
+    assignments: Sequence[Assignment], expected: _Expected, sizes: LearnedSize, ground_size: GroundSizeFilter
+) -> Depths:
+    """The depths (N,) of the nearest faces, by all boxes against one road."""
+    seen, serials = [a.observation for a in assignments], [a.serial for a in assignments]
+    pitch_rad = ground_size.ground.pitch_rad
+    depths = ground_size.estimate_depths(
+        serials, seen, expected.extent_m[:, 1], expected.extent_m[:, 0], expected.turned_rad, sizes
+    )
+    return no_farther_than_cut(depths, seen, ground_size, ground_size.ground.pitch_rad - pitch_rad)
 
 
-def no_farther_than_cut(found: Depths, seen: Sequence[Observation], horizon: Horizon, tilted_rad: float) -> Depths:
+def no_farther_than_cut(
+    depths: Depths, seen: Sequence[Observation], ground_size: GroundSizeFilter, tilted_rad: float
+) -> Depths:
     """The depths (N,), given that a box that the image's border cuts reaches at least down to where it was drawn.
 
-    A vehicle's true bottom lies below the border, so that the nearest face of it is nearer than Eq. 1 makes of the
-    border: a bound as sure as that, whose product with the Gaussian has the moments of a probit. The road tilted by
-    `tilted_rad` since the slopes were taken.
+    A vehicle's true bottom lies below the border, so that its nearest face is nearer than Eq. 1 makes of the border.
+    That bound has an uncertainty; its product with the Gaussian of the depth has the moments of a probit. The road
+    tilted by `tilted_rad` since the slopes were taken.
     """
     bounds = {
         k: (o.slope_bottom + tilted_rad, o.sigma_cut)
@@ -185,20 +199,21 @@ def no_farther_than_cut(found: Depths, seen: Sequence[Observation], horizon: Hor
         if o.sigma_cut is not None and o.slope_bottom + tilted_rad > 0.0
     }
     if not bounds:
-        return found
+        return depths
     cut, (slope, sigma_cut) = list(bounds), np.array(list(bounds.values())).T
-    sigma_slope = np.hypot(sigma_cut, horizon.sigma_pitch_rad)
-    height_m = horizon.ground.height_m
-    doubt = np.square(sigma_slope / slope) + (horizon.config.sigma_kerb_m / height_m) ** 2
-    before = found.variance[cut]
-    total = before + doubt
-    inside = (np.log(height_m / slope) - found.log_depth[cut]) / np.sqrt(total)  # in sigmas; < 0: it was too far off
+    sigma_slope = np.hypot(sigma_cut, ground_size.sigma_pitch_rad)
+    height_m = ground_size.ground.height_m
+    bound_var = np.square(sigma_slope / slope) + (ground_size.config.sigma_kerb_m / height_m) ** 2
+    before = depths.variance[cut]
+    total = before + bound_var
+    bound_m = bev.meet_road(np.ones_like(slope), slope, height_m)  # Eq. 1
+    inside = (np.log(bound_m) - depths.log_depth[cut]) / np.sqrt(total)  # in sigmas; < 0: it was too far off
     hazard = math.sqrt(2.0 / math.pi) / erfcx(-inside / math.sqrt(2.0))  # of the normal distribution
     log_depth, variance, depth_per_height = (
-        array.copy() for array in (found.log_depth, found.variance, found.depth_per_height)
+        array.copy() for array in (depths.log_depth, depths.variance, depths.depth_per_height)
     )
     left = 1.0 - before / total * hazard * (hazard + inside)
     log_depth[cut] -= before / np.sqrt(total) * hazard
     variance[cut] *= left
     depth_per_height[cut] *= left
-    return replace(found, log_depth=log_depth, variance=variance, depth_per_height=depth_per_height)
+    return replace(depths, log_depth=log_depth, variance=variance, depth_per_height=depth_per_height)

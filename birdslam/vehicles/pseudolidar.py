@@ -1,8 +1,8 @@
 """Vehicles by their depth: the second source of a vehicle's place (paper, dynamic object localization).
 
-A depth map makes a point of every pixel, the pseudo-lidar; those in a vehicle's box are its frustum. Frustum-PointNet
-reads the body from them where the network is given. A detector that knows of bodies itself says where they are; what it
-says is calibrated. Where there is neither, the body is fitted (bodyfit.py).
+A depth map makes a point of every pixel, the pseudo-lidar; those in a vehicle's box are its frustum. Where a
+Frustum-PointNet is given, it reads the body from them. A detector that finds bodies itself gives them with calibrated
+sigmas. Where there is neither, the class's footprint is fitted to the points (body_fit.py).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from birdslam.geometry.bev import road_point_cam
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import wrap
 from birdslam.perception import Boxes3d, DepthMap, Detections
-from birdslam.vehicles.body_fit import fitted
-from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, across_var, along_sight
+from birdslam.vehicles.body_fit import fit_footprint
+from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, across_var, line_of_sight_cov
 from birdslam.vehicles.localisation import Dimensions, Observation, corners_of
 
 Floats = NDArray[np.float64]
@@ -35,33 +35,26 @@ class FrustumNetwork(Protocol):
     def locate(self, frusta_cam_m: Sequence[Floats], labels: Sequence[str], camera: Camera) -> Boxes3d | None: ...
 
 
-def localise_by_depth(
-    seen: Sequence[Observation],
-    depth: DepthMap,
+def locate_by_depth(
+    observations: list[Observation],
+    detections: Detections,
+    depth: DepthMap | None,
     camera: Camera,
     ground: GroundPlane,
     config: PseudoLidarConfig,
     road: NDArray[np.bool_] | None = None,
     network: FrustumNetwork | None = None,
-) -> list[DepthPlace | None]:
-    """A place for each observation of the frame that `depth` is of, None where its depth says nothing.
+) -> tuple[list[Observation], list[DepthPlace | None]]:
+    """The second source of each observation's place, None where there is none, and the observations (N each).
 
-    `road` (H, W) is the road of the image; a map without a scale of its own needs it. Where the network gives no usable
-    numbers the bodies are fitted.
+    Bodies that the detector itself finds need no depth map; they tell the observations' lengths as well. `depth` and
+    `road`, a mask (H, W), are of the same frame.
     """
-    metres = in_metres(depth, camera, ground, road, config)
-    if metres is None or config.rule == "off" or not seen:
-        return [None] * len(seen)
-    if network is not None:
-        frusta = [frustum_points(o, metres, camera) for o in seen]
-        able = [i for i, points in enumerate(frusta) if len(points) >= config.least_points]
-        bodies = network.locate([frusta[i] for i in able], [seen[i].label for i in able], camera)
-        if bodies is not None:
-            # It knows the errors of the maps that it was taught on, which need not be those of this one
-            doubted = replace(bodies, sigma_depth_m=np.hypot(bodies.sigma_depth_m, metres.sigma_rel * bodies.depth_m))
-            found = dict(zip(able, places_of(doubted, [seen[i] for i in able], camera, ground), strict=True))
-            return [found.get(i) for i in range(len(seen))]
-    return [fitted(o, metres, camera, ground, config) for o in seen]
+    if detections.boxes3d is not None and network is None:
+        return bodies_by_detector(observations, detections, camera, ground, config)
+    if depth is None:
+        return observations, [None] * len(observations)
+    return observations, localise_by_depth(observations, depth, camera, ground, config, road, network)
 
 
 def bodies_by_detector(
@@ -74,14 +67,42 @@ def bodies_by_detector(
     """
     if detections.boxes3d is None or config.rule == "off":
         return list(seen), [None] * len(seen)
-    row_of = {tuple(box): row for row, box in enumerate(detections.boxes_px.tolist())}
-    bodies = detections.boxes3d.take([row_of[o.box_px] for o in seen])
+    bodies = detections.boxes3d.take([o.row for o in seen])
     measured = [
         replace(o, dimensions=_with_length(o.dimensions, *lengths))
         for o, *lengths in zip(seen, bodies.size_m[:, 0].tolist(), bodies.sigma_size_m[:, 0].tolist(), strict=True)
     ]
     places = places_of(bodies, measured, camera, ground)
     return measured, [p and _behind_its_face(p, o) for p, o in zip(places, measured, strict=True)]
+
+
+def localise_by_depth(
+    seen: Sequence[Observation],
+    depth: DepthMap,
+    camera: Camera,
+    ground: GroundPlane,
+    config: PseudoLidarConfig,
+    road: NDArray[np.bool_] | None = None,
+    network: FrustumNetwork | None = None,
+) -> list[DepthPlace | None]:
+    """A place for each observation of the frame that `depth` is of, None where its depth says nothing.
+
+    `road` (H, W) is the mask of the image's road; a map without a scale of its own needs it. Where the network gives no
+    usable numbers the bodies are fitted.
+    """
+    metres = in_metres(depth, camera, ground, road, config)
+    if metres is None or config.rule == "off" or not seen:
+        return [None] * len(seen)
+    if network is not None:
+        frusta = [frustum_points(o, metres, camera) for o in seen]
+        able = [i for i, points in enumerate(frusta) if len(points) >= config.least_points]
+        bodies = network.locate([frusta[i] for i in able], [seen[i].label for i in able], camera)
+        if bodies is not None:
+            # Its sigmas are of the maps that it was trained on; the errors of this one come on top
+            widened = replace(bodies, sigma_depth_m=np.hypot(bodies.sigma_depth_m, metres.sigma_rel * bodies.depth_m))
+            found = dict(zip(able, places_of(widened, [seen[i] for i in able], camera, ground), strict=True))
+            return [found.get(i) for i in range(len(seen))]
+    return [fit_footprint(o, metres, camera, ground, config) for o in seen]
 
 
 def _with_length(of_class: Dimensions, length_m: float, sigma_m: float) -> Dimensions:
@@ -103,13 +124,13 @@ def _behind_its_face(place: DepthPlace, seen: Observation) -> DepthPlace:
 def places_of(
     bodies: Boxes3d, seen: Sequence[Observation], camera: Camera, ground: GroundPlane
 ) -> list[DepthPlace | None]:
-    """What a network says of the observed bodies, in its order, as places in ego; None: nothing is known."""
+    """The bodies (N) of the observations (N) as places in ego; None where the network knows nothing of one."""
     bodies = bodies.in_metres(camera)
     poses = bodies.in_ego(camera, ground)
     return [
         DepthPlace(
             np.array([x_m, y_m]),
-            along_sight(x_m, y_m, float(bodies.sigma_depth_m[i]) ** 2, across_var(o, x_m)),
+            line_of_sight_cov(x_m, y_m, float(bodies.sigma_depth_m[i]) ** 2, across_var(o, x_m)),
             wrap(yaw_rad),
             float(bodies.sigma_alpha_rad[i]),
             float(bodies.flip[i]),
@@ -141,7 +162,7 @@ def in_metres(
 def road_factor(
     depth: DepthMap, camera: Camera, ground: GroundPlane, road: NDArray[np.bool_], config: PseudoLidarConfig
 ) -> float | None:
-    """By what the map is too small, by the road near the camera (Eq. 1); None where too little of it is seen."""
+    """The factor that makes the map metric, by Eq. 1 on the road near the camera; None where too little is seen."""
     height, width = depth.depth_m.shape
     sx, sy = depth.scale
     u, v = np.meshgrid((np.arange(width) + 0.5) / sx - 0.5, (np.arange(height) + 0.5) / sy - 0.5)

@@ -1,17 +1,18 @@
-"""Where vehicles were, as known in the end: their ways once their sizes are learned and their later motion is seen.
+"""Vehicles' trajectories after a drive: smoothed with their sizes as learned in the end, and with their later motion.
 
-The live estimate of a frame knows nothing of later ones. Its largest error is common to many frames: a car taken for
-taller than it is stands too far off in all of them. Each CV edge says for what height the vehicle was taken and how its
-depth goes with that; once the height is known better, every earlier sight moves along its line of sight:
+The live estimate of a frame knows nothing of later ones. Its largest error is common to many frames: a car that is
+assumed taller than it is stands too far off in all of them. Each CV edge says what height the vehicle was placed with
+and how its depth goes with that; once the height is known better, every earlier measurement moves along its line of
+sight:
 
     log z = log z_then + (d log z / d log h) (log h_now - log h_then)
 
-which is the smoother of a state that does not change (Rauch, Tung and Striebel 1965). The sights, rid of that error, go
-through a smoother of constant velocity; where a vehicle stands in all likelihood, its velocity is nothing. Whether it
-stood is smoothed too: what drives now hardly stood a moment before. And it has to be borne out by the sights: the way
-with stops is kept where it foretells them as well as the way without.
+which is the smoother of a state that does not change (Rauch, Tung and Striebel 1965). The measurements, rid of that
+error, go through an RTS smoother of constant velocity. Where a vehicle stands in all likelihood, its velocity is nil.
+The probability that it stood is smoothed too: what drives now hardly stood a moment before. The trajectory with stops
+is kept only where it predicts the measurements as well as the one without.
 
-The ego's way is the live one: CC edges alone tell it, and later ones say nothing of it.
+The ego's trajectory is the live one: CC edges alone determine it, and later ones add nothing to it.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ from birdslam.vehicles.localisation import Dimensions, corners_of
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
-STANDS = 0.5  # the probability from which on a vehicle does
-LEAST_OF_COV = 0.1  # of a sight's variance along its line: not all of it is the size's
+STANDS = 0.5  # the probability from which on a vehicle is taken to stand
+LEAST_OF_COV = 0.1  # of a measurement's variance along the line of sight: not all of it is the size's
 LEAST_DEPTH_M = 1.0
-CERTAIN = 1e-3  # of a probability: nothing is surer
+LEAST_PROBABILITY = 1e-3  # and 1 less it is the largest
 
 
-class RetrospectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SmootherConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How vehicles move and stop, and how long a detector errs alike."""
 
     change_mps: Positive = 2.0  # 1-sigma by which a velocity changes within a second
@@ -47,11 +48,11 @@ class RetrospectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stands_for_s: Positive = 60.0  # on average
     moves_for_s: Positive = 15.0
     box_memory_s: Positive = 0.3  # a box errs in the next frame as in this
-    gate_sigma: Positive = 4.0  # past it a sight is trusted the less
+    gate_sigma: Positive = 4.0  # past it a measurement is an outlier: its noise is raised
 
 
 @dataclass(frozen=True)
-class Sight:
+class VehicleMeasurement:
     """A vehicle in one frame: its CV edge, the ego's pose then, and the vehicle's as the live graph had it."""
 
     frame_id: int
@@ -61,33 +62,36 @@ class Sight:
     T_world_vehicle: SE2
 
 
-class Retrospect:
-    """add() each frame with its live estimate; ways() at any time."""
+class RtsSmoother:
+    """add() each frame with its live estimate; smooth() at any time.
 
-    def __init__(self, config: RetrospectConfig) -> None:
+    State, of each vehicle: x, y (m) and vx, vy (m/s) of its centre in the world of its epoch. Measurements: the places
+    (m) of its CV edges, corrected for the size that is known last. Read by evaluation (final trajectories).
+    """
+
+    def __init__(self, config: SmootherConfig) -> None:
         self.config = config
-        self._sights: dict[tuple[int, int], list[Sight]] = {}  # by epoch and vehicle
+        self._measurements: dict[tuple[int, int], list[VehicleMeasurement]] = {}  # by epoch and vehicle
 
     def add(self, measurements: Measurements, estimate: Estimate) -> None:
         """One frame's edges, and where they left everybody."""
         poses = {v.vehicle: v.T_world_vehicle for v in estimate.vehicles}
+        t_s = estimate.t_source_ns * 1e-9
         for edge in measurements.cv:
             if edge.vehicle in poses:
-                sight = Sight(
-                    estimate.frame_id, estimate.t_source_ns * 1e-9, edge, estimate.T_world_ego, poses[edge.vehicle]
-                )
-                self._sights.setdefault((estimate.epoch, edge.vehicle), []).append(sight)
+                one = VehicleMeasurement(estimate.frame_id, t_s, edge, estimate.T_world_ego, poses[edge.vehicle])
+                self._measurements.setdefault((estimate.epoch, edge.vehicle), []).append(one)
 
-    def ways(self) -> dict[tuple[int, int], dict[int, SE2]]:
+    def smooth(self) -> dict[tuple[int, int], dict[int, SE2]]:
         """(epoch, vehicle) -> frame -> T_world_vehicle in that epoch's world, in the frames in which it was seen."""
-        return {key: way(sights, self.config) for key, sights in self._sights.items()}
+        return {key: smooth_vehicle(seen, self.config) for key, seen in self._measurements.items()}
 
 
-def way(sights: Sequence[Sight], config: RetrospectConfig) -> dict[int, SE2]:
+def smooth_vehicle(seen: Sequence[VehicleMeasurement], config: SmootherConfig) -> dict[int, SE2]:
     """frame -> T_world_vehicle of one vehicle; its yaw is the live one."""
-    t_s = np.array([sight.t_s for sight in sights])
-    places, covs = _resized(sights)
-    stood = _stood(np.array([sight.edge.standing for sight in sights]), np.diff(t_s), config)
+    t_s = np.array([one.t_s for one in seen])
+    places, covs = _resized(seen)
+    stood = _stood(np.array([one.edge.standing for one in seen]), np.diff(t_s), config)
     gaps_s = np.maximum(np.diff(t_s, prepend=t_s[0] - config.box_memory_s), 1e-3)
     covs = covs * np.maximum(1.0, config.box_memory_s / gaps_s)[:, None, None]
     found, log_likelihood = _smoothed(t_s, places, covs, np.zeros(len(t_s), np.bool_), config)
@@ -97,17 +101,17 @@ def way(sights: Sequence[Sight], config: RetrospectConfig) -> dict[int, SE2]:
         if stopping_log_likelihood + _logit(float(stood[still].mean())) > log_likelihood:
             found = stopping
     return {
-        sight.frame_id: SE2(x_m, y_m, sight.T_world_vehicle.yaw_rad)
-        for sight, (x_m, y_m) in zip(sights, found.tolist(), strict=True)
+        one.frame_id: SE2(x_m, y_m, one.T_world_vehicle.yaw_rad)
+        for one, (x_m, y_m) in zip(seen, found.tolist(), strict=True)
     }
 
 
-def _resized(sights: Sequence[Sight]) -> tuple[Floats, Floats]:
+def _resized(seen: Sequence[VehicleMeasurement]) -> tuple[Floats, Floats]:
     """Centres (N, 2) in world, had each been placed with the last height, and (N, 2, 2): how they err one by one."""
-    places, covs = np.zeros((len(sights), 2)), np.zeros((len(sights), 2, 2))
-    log_height = sights[-1].edge.log_height
-    for k, sight in enumerate(sights):
-        edge, T = sight.edge, sight.edge.T_ego_vehicle
+    places, covs = np.zeros((len(seen), 2)), np.zeros((len(seen), 2, 2))
+    log_height = seen[-1].edge.log_height
+    for k, one in enumerate(seen):
+        edge, T = one.edge, one.edge.T_ego_vehicle
         centre = np.array([T.x_m, T.y_m])
         reach_m = max(x for x, _ in corners_of(Dimensions(edge.length_m, edge.width_m, 1.0), T.yaw_rad))
         depth_m = max(T.x_m - reach_m, LEAST_DEPTH_M)
@@ -118,14 +122,14 @@ def _resized(sights: Sequence[Sight]) -> tuple[Floats, Floats]:
         of_height = (edge.depth_per_height * edge.sigma_log_height) ** 2
         most = (1.0 - LEAST_OF_COV) * float(cov[0, 0]) / max(sight_line[0] ** 2, 1e-9)
         cov = cov - min(of_height, most) * np.outer(sight_line, sight_line)
-        R_world_ego = sight.T_world_ego.rotation()
-        places[k] = sight.T_world_ego @ (centre + growth * sight_line)
+        R_world_ego = one.T_world_ego.rotation()
+        places[k] = one.T_world_ego @ (centre + growth * sight_line)
         covs[k] = R_world_ego @ cov @ R_world_ego.T
     return places, covs
 
 
-def _stood(standing: Floats, gaps_s: Floats, config: RetrospectConfig) -> Floats:
-    """(N,) the probability that it stood, all sights given, from what was known of it then (N,)."""
+def _stood(standing: Floats, gaps_s: Floats, config: SmootherConfig) -> Floats:
+    """(N,) the probability that it stood, all measurements given, from what was known of it then (N,)."""
     out = standing.copy()
     for k in range(len(out) - 2, -1, -1):
         starts, stops = (1.0 - math.exp(-gaps_s[k] / t_s) for t_s in (config.stands_for_s, config.moves_for_s))
@@ -136,7 +140,7 @@ def _stood(standing: Floats, gaps_s: Floats, config: RetrospectConfig) -> Floats
 
 
 def _smoothed(
-    t_s: Floats, places: Floats, covs: Floats, still: NDArray[np.bool_], config: RetrospectConfig
+    t_s: Floats, places: Floats, covs: Floats, still: NDArray[np.bool_], config: SmootherConfig
 ) -> tuple[Floats, float]:
     """Places (N, 2) by all the others, and the logarithm of how likely they are, each by those before it."""
     n = len(t_s)
@@ -167,5 +171,5 @@ def _smoothed(
 
 
 def _logit(probability: float) -> float:
-    p = min(max(probability, CERTAIN), 1.0 - CERTAIN)
+    p = min(max(probability, LEAST_PROBABILITY), 1.0 - LEAST_PROBABILITY)
     return math.log(p / (1.0 - p))

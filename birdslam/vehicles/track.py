@@ -1,16 +1,56 @@
-"""One followed vehicle, as the tracker keeps it."""
+"""One followed vehicle as the tracker keeps it, the frame that it is seen from, and how vehicles are followed."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
 from birdslam.types import MotionEdge
+from birdslam.vehicles.heading import HeadingConfig
 from birdslam.vehicles.localisation import Observation, Place
+from birdslam.vehicles.parallax import ParallaxConfig
+
+
+class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """When boxes are the same vehicle, and how vehicles move."""
+
+    min_iou: float = 0.15  # of a box with the one predicted from bird's-eye view
+    gate_sigma: float = 3.0  # Mahalanobis distance in bird's-eye view past which boxes are never the same vehicle
+    birth_score: float = 0.5
+    confirm_hits: int = 3  # a track gets its id when it has been seen so often
+    forget_unconfirmed_s: float = 0.25
+    forget_s: float = 1.0
+    sigma_accel_mps2: float = 3.0
+    sigma_birth_mps: float = 8.0
+    moving_mps: float = 2.0  # below it, or within moving_sigma of rest, a vehicle's motion says nothing of its yaw
+    moving_sigma: float = 3.0
+    moving_of_ego: float = 0.3  # nor within this fraction of the ego's speed: an error of the ground plane moves all
+    moved_along_rel: float = 0.15  # nor until it has come so far from where it was first seen, as fractions of its
+    moved_across_rel: float = 0.05  # distance then: along the line of sight, and across it
+    sigma_yaw_rate_radps: float = 0.5
+    direction_inflation: float = 3.0  # of the motion's direction: its errors last for many frames
+    body_yaw_inflation: float = 3.0  # of a yaw that a network sees in the body: so do its errors
+    sigma_yaw_unknown_rad: float = 0.2
+    sigma_yaw_moving_rad: float = 0.1
+    parallax: ParallaxConfig = ParallaxConfig()
+    heading: HeadingConfig = HeadingConfig()
+    stands: float = 0.5  # the probability from which on a vehicle does, by its parallax: its yaw is kept
+    late_sigma_m: float = 3.0  # a late detection that the velocity puts so far off is not shown in the present frame
+
+
+@dataclass(frozen=True)
+class EgoFrame:
+    """One frame and where the ego stands in it, in the odometry's world (dead reckoning since the start)."""
+
+    frame_id: int
+    t_source_ns: int
+    T_world_ego: SE2
+    step_cov: NDArray[np.float64] | None = None  # (3, 3) of the step to it, in its tangent; None without odometry
 
 
 @dataclass(frozen=True)
@@ -31,9 +71,9 @@ class Track:
     yaw_rad: float
     observation: Observation  # the last one
     place: Place  # and where it put the vehicle, in the ego of frame `seen_frame`
-    serial: int  # known to the horizon by it
+    serial: int  # its number in the other filters: ground_size_filter.py, parallax.py
     first_m: NDArray[np.float64]  # (2,) where it was first seen, in the odometry's world
-    first_sight_m: NDArray[np.float64]  # (2,) from the ego to there, along world's axes
+    first_offset_m: NDArray[np.float64]  # (2,) from the ego to there, along the world's axes
     seen_frame: int
     seen_ns: int
     T_world_ego: SE2  # of frame `seen_frame`
@@ -42,9 +82,9 @@ class Track:
     hits: int = 1
     missed: int = 0  # times that the detector looked since and did not see it
     votes: Counter[str] = field(default_factory=Counter)
-    sigma_yaw_rad: float = 0.0  # of a yaw that motion has shown
+    sigma_yaw_rad: float = 0.0  # of a yaw that motion or the body has shown
     yaw_known: bool = False
-    front_logit: float = 0.0  # of the yaw's end being the front, by what a network saw of the body
+    front_logit: float = 0.0  # log odds that the yaw points to the front, not to the rear
     stands: bool = False  # in all likelihood
     motion: MotionEdge | None = None  # VV: from when it was last shown to now, as predicted before it was seen again
 

@@ -7,7 +7,7 @@ certain for it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -17,27 +17,19 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.types import MotionEdge, VehicleEdge
 from birdslam.vehicles.association import predicted_boxes_px
-from birdslam.vehicles.track import Shown, Track
-from birdslam.vehicles.tracking import TrackingConfig
-
-
-@dataclass(frozen=True)
-class Present:
-    """The frame that edges end in."""
-
-    frame_id: int
-    t_source_ns: int
-    T_world_ego: SE2
-    ground: GroundPlane
+from birdslam.vehicles.track import EgoFrame, Shown, Track, TrackingConfig
 
 
 def vehicle_edges(
-    tracks: list[Track], present: Present, camera: Camera, config: TrackingConfig
+    tracks: list[Track], present: EgoFrame, ground: GroundPlane, camera: Camera, config: TrackingConfig
 ) -> tuple[tuple[VehicleEdge, ...], tuple[MotionEdge, ...]]:
-    """The CV and the VV edges of tracks that were seen in the present frame or, all of them, in an earlier one."""
+    """The CV and VV edges of tracks that were all seen in one frame, the present or an earlier one.
+
+    Edges end in `present`, over whose road `ground` the camera stands.
+    """
     cv, vv = [], []
     for seen in tracks:
-        track = seen if seen.seen_frame == present.frame_id else _moved_on(seen, present, camera, config)
+        track = seen if seen.seen_frame == present.frame_id else _moved_on(seen, present, ground, camera, config)
         if track is None:
             continue
         cv.append(_vehicle_edge(track, present.t_source_ns - seen.seen_ns, config))
@@ -66,11 +58,13 @@ def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> Vehicl
         length_m=seen.dimensions.length_m,
         width_m=seen.dimensions.width_m,
         delay_ns=max(delay_ns, 0),
-        **({} if place.taken is None else vars(place.taken)),
+        **({} if place.assumed is None else vars(place.assumed)),
     )
 
 
-def _moved_on(track: Track, present: Present, camera: Camera, config: TrackingConfig) -> Track | None:
+def _moved_on(
+    track: Track, present: EgoFrame, ground: GroundPlane, camera: Camera, config: TrackingConfig
+) -> Track | None:
     """The track as it would be had it been seen now where its velocity puts it.
 
     None where it has left the view, or its velocity is not known well enough to say where it is.
@@ -80,7 +74,7 @@ def _moved_on(track: Track, present: Present, camera: Camera, config: TrackingCo
     if float(np.linalg.eigvalsh(drift)[-1]) > config.late_sigma_m**2:
         return None
     moved = replace(track, state=np.concatenate([track.state[:2] + velocity * dt_s, velocity]))
-    (box,) = predicted_boxes_px([moved], camera, present.T_world_ego, present.ground)
+    (box,) = predicted_boxes_px([moved], camera, present.T_world_ego, ground)
     if not np.isfinite(box).all():
         return None
     R_world_then, R_now_world = track.T_world_ego.rotation(), present.T_world_ego.rotation().T

@@ -1,4 +1,4 @@
-"""Vehicles in retrospect: sizes learned late correct earlier sights, what stood stands still, what moved is left to."""
+"""Smoothed vehicles: sizes learned late correct earlier measurements, what stood stands still, what moved moves."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections, Perception, Ready
 from birdslam.types import Measurements, Status, VehicleEdge
 from birdslam.vehicles.localisation import DIMENSIONS
-from birdslam.vehicles.rts_smoother import Retrospect, RetrospectConfig, Sight, way
+from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig, VehicleMeasurement, smooth_vehicle
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
 
 Floats = NDArray[np.float64]
 CAR = DIMENSIONS["car"]
-CONFIG = RetrospectConfig()
+CONFIG = SmootherConfig()
 FRAMES = 40
 STEP = SE2(1.0, 0.0, 0.0)  # of the ego, a frame of 0.1 s
 PARKED = SE2(75.0, 6.0, 0.0)
@@ -59,17 +59,17 @@ def log_of(seed: int, parked_height_m: float, oncoming_height_m: float) -> list[
 
 
 def errors(log: list[Measurements]) -> dict[str, tuple[float, float]]:
-    """Root mean squares in metres, of the live estimate and in retrospect, for each of the two cars."""
-    graph, past = PoseGraph(GraphConfig(), WeightsConfig()), Retrospect(CONFIG)
+    """Root mean squares in metres, of the live and the smoothed estimate, for each of the two cars."""
+    graph, smoother = PoseGraph(GraphConfig(), WeightsConfig()), RtsSmoother(CONFIG)
     live: dict[int, dict[int, SE2]] = {}
     for m in log:
         estimate = graph.optimise(m)
-        past.add(m, estimate)
+        smoother.add(m, estimate)
         for v in estimate.vehicles:
             if v.age_ns == 0:
                 live.setdefault(v.vehicle, {})[m.frame_id] = v.T_world_vehicle
     found: dict[str, tuple[list[float], list[float]]] = {"parked": ([], []), "oncoming": ([], [])}
-    for (epoch, vehicle), poses in past.ways().items():
+    for (epoch, vehicle), poses in smoother.smooth().items():
         assert epoch == 0
         assert poses.keys() == live[vehicle].keys()
         for k, pose in poses.items():
@@ -81,30 +81,30 @@ def errors(log: list[Measurements]) -> dict[str, tuple[float, float]]:
 
 
 @pytest.mark.parametrize("parked_height_m", [1.38, 1.46, 1.68])
-def test_a_parked_cars_way_is_better_known_once_its_size_is(parked_height_m: float) -> None:
+def test_a_parked_cars_trajectory_is_better_known_once_its_size_is(parked_height_m: float) -> None:
     trials = [errors(log_of(seed, parked_height_m, 1.53)) for seed in range(4)]
-    live, retrospect = np.mean([t["parked"] for t in trials], axis=0)
-    assert retrospect < 0.6 * live
+    live, smoothed = np.mean([t["parked"] for t in trials], axis=0)
+    assert smoothed < 0.6 * live
 
 
-def test_over_many_sizes_no_kind_of_motion_is_worse_in_retrospect() -> None:
+def test_over_many_sizes_no_kind_of_motion_is_worse_when_smoothed() -> None:
     heights = 1.53 * np.exp(CAR.sigma_height_rel * np.random.default_rng(0).standard_normal((10, 2)))
     trials = [errors(log_of(seed, *pair)) for seed, pair in enumerate(heights.tolist())]
     for name in ("parked", "oncoming"):
-        live, retrospect = np.sqrt(np.mean(np.square([t[name] for t in trials]), axis=0))
-        assert retrospect < 0.9 * live, name
+        live, smoothed = np.sqrt(np.mean(np.square([t[name] for t in trials]), axis=0))
+        assert smoothed < 0.9 * live, name
 
 
-# --- one vehicle's sights ---
+# --- one vehicle's measurements ---
 
 
-def sights(
+def measured(
     xs_m: Floats,
     log_heights: Floats | float = 0.4,
     depth_per_height: float = 0.0,
     standing: Floats | float = 0.0,
     sigma_m: float = 1.0,
-) -> list[Sight]:
+) -> list[VehicleMeasurement]:
     """A vehicle straight ahead of an ego that stands, at `xs_m` (N,)."""
     each = np.broadcast_arrays(xs_m, log_heights, standing)
     out = []
@@ -120,72 +120,72 @@ def sights(
             depth_per_height=depth_per_height,
             standing=stands,
         )
-        out.append(Sight(k, 0.1 * k, edge, SE2(), T))
+        out.append(VehicleMeasurement(k, 0.1 * k, edge, SE2(), T))
     return out
 
 
-def along(seen: list[Sight]) -> Floats:
-    return np.array([pose.x_m for pose in way(seen, CONFIG).values()])
+def along(seen: list[VehicleMeasurement]) -> Floats:
+    return np.array([pose.x_m for pose in smooth_vehicle(seen, CONFIG).values()])
 
 
-def test_a_size_known_in_the_end_moves_every_sight_by_what_its_depth_owed_to_it() -> None:
+def test_a_size_known_in_the_end_moves_every_measurement_by_what_its_depth_owed_to_it() -> None:
     face_m, reach_m = 38.0, 2.0
-    taken = np.linspace(0.5, 0.4, 30)  # it was taken for ten percent taller than it is
-    seen_m = face_m * np.exp(taken - 0.4) + reach_m
-    assert np.abs(along(sights(seen_m, taken, depth_per_height=1.0)) - 40.0).max() < 0.05
-    assert np.abs(along(sights(seen_m, taken, depth_per_height=0.0)) - 40.0).max() > 2.0
-    assert way(sights(seen_m[:1], taken[:1], 1.0), CONFIG)[0].x_m == pytest.approx(seen_m[0])
+    assumed = np.linspace(0.5, 0.4, 30)  # it was assumed ten percent taller than it is
+    seen_m = face_m * np.exp(assumed - 0.4) + reach_m
+    assert np.abs(along(measured(seen_m, assumed, depth_per_height=1.0)) - 40.0).max() < 0.05
+    assert np.abs(along(measured(seen_m, assumed, depth_per_height=0.0)) - 40.0).max() > 2.0
+    assert smooth_vehicle(measured(seen_m[:1], assumed[:1], 1.0), CONFIG)[0].x_m == pytest.approx(seen_m[0])
 
 
 def test_what_stood_has_one_place_and_what_drove_has_not() -> None:
     noise = np.random.default_rng(3).standard_normal(60)
-    still = along(sights(40.0 + noise, standing=0.95))
+    still = along(measured(40.0 + noise, standing=0.95))
     assert np.ptp(still) < 0.3
     assert abs(still.mean() - 40.0) < 0.3
     driving_m = 40.0 + 0.8 * np.arange(60)
-    told_wrong = along(sights(driving_m + noise, standing=0.95))  # its sights say otherwise
+    told_wrong = along(measured(driving_m + noise, standing=0.95))  # its measurements say otherwise
     assert np.abs(told_wrong - driving_m).max() < 2.0
-    assert np.abs(along(sights(driving_m + noise)) - told_wrong).max() == 0.0
+    assert np.abs(along(measured(driving_m + noise)) - told_wrong).max() == 0.0
 
 
 def test_what_drives_now_hardly_stood_a_moment_before() -> None:
     noise = 0.3 * np.random.default_rng(4).standard_normal(40)
     x_m = 30.0 + 0.15 * np.arange(40) + noise
     standing = np.where(np.arange(40) < 4, 0.8, 0.0)  # as a filter has it at first
-    assert np.abs(along(sights(x_m, standing=standing)) - along(sights(x_m))).max() == 0.0
+    assert np.abs(along(measured(x_m, standing=standing)) - along(measured(x_m))).max() == 0.0
 
 
 def test_one_that_stops_stops() -> None:
     x_m = np.concatenate([20.0 + 1.0 * np.arange(20), np.full(30, 39.0)])
     standing = np.where(np.arange(50) < 22, 0.0, 0.97)
-    found = along(sights(x_m + 0.3 * np.random.default_rng(5).standard_normal(50), standing=standing))
+    found = along(measured(x_m + 0.3 * np.random.default_rng(5).standard_normal(50), standing=standing))
     assert np.ptp(found[25:]) < 0.3
     assert np.abs(found - x_m).max() < 1.5
 
 
-def test_a_wild_sight_counts_for_little() -> None:
+def test_an_outlier_counts_for_little() -> None:
     x_m = 40.0 + 0.5 * np.arange(40)
-    wild = x_m + 25.0 * (np.arange(40) == 20)
-    assert np.abs(along(sights(wild, sigma_m=0.3)) - x_m).max() < 0.5
+    outlier = x_m + 25.0 * (np.arange(40) == 20)
+    assert np.abs(along(measured(outlier, sigma_m=0.3)) - x_m).max() < 0.5
 
 
 def test_worlds_are_kept_apart() -> None:
     log = log_of(0, 1.5, 1.5)
     log[20] = replace(log[20], cc=None)
-    graph, past = PoseGraph(GraphConfig(), WeightsConfig()), Retrospect(CONFIG)
+    graph, smoother = PoseGraph(GraphConfig(), WeightsConfig()), RtsSmoother(CONFIG)
     for m in log:
         estimate = graph.optimise(m)
-        past.add(m, estimate)
+        smoother.add(m, estimate)
     assert estimate.epoch == 1
-    ways = past.ways()
-    assert {epoch for epoch, _ in ways} == {0, 1}
-    for (epoch, _), poses in ways.items():
+    trajectories = smoother.smooth()
+    assert {epoch for epoch, _ in trajectories} == {0, 1}
+    for (epoch, _), poses in trajectories.items():
         assert all((k >= 20) == (epoch == 1) for k in poses)
 
 
-def test_frames_without_sights_are_none() -> None:
-    past = Retrospect(CONFIG)
+def test_frames_without_measurements_are_none() -> None:
+    smoother = RtsSmoother(CONFIG)
     graph = PoseGraph(GraphConfig(), WeightsConfig())
     m = Measurements(frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, status=(Status.FRAME_UNREADABLE,))
-    past.add(m, graph.optimise(m))
-    assert past.ways() == {}
+    smoother.add(m, graph.optimise(m))
+    assert smoother.smooth() == {}

@@ -16,10 +16,11 @@ from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections, Perception, Ready
 from birdslam.types import Measurements
-from birdslam.vehicles.ground_size_filter import Horizon, HorizonConfig
+from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
 from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, iou
-from birdslam.vehicles.out_of_sequence import Hindsight, HindsightConfig, Moment
-from birdslam.vehicles.tracking import Tracker, TrackingConfig
+from birdslam.vehicles.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
+from birdslam.vehicles.track import EgoFrame, TrackingConfig
+from birdslam.vehicles.tracking import Tracker
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
 
 CAR = DIMENSIONS["car"]
@@ -55,26 +56,26 @@ def detections(k: int, noise_px: float = 0.0, seed: int = 0, heights_m: tuple[fl
     return Detections(np.array(boxes), np.full(3, 0.9), ("car",) * 3)
 
 
-def hindsight(config: HindsightConfig | None = None) -> Hindsight:
-    localisation = LocalisationConfig()
-    tracker, horizon = Tracker(CAMERA, TrackingConfig(), localisation), Horizon(CAMERA, HorizonConfig())
-    return Hindsight(CAMERA, tracker, horizon, localisation, config or HindsightConfig())
+def out_of_sequence(config: OutOfSequenceConfig | None = None) -> OutOfSequenceTracker:
+    tracker = Tracker(CAMERA, TrackingConfig(), LocalisationConfig())
+    return OutOfSequenceTracker(tracker, GroundSizeFilter(CAMERA, GroundSizeConfig()), config or OutOfSequenceConfig())
 
 
-def moment(k: int) -> Moment:
-    return Moment(
-        k, k * PERIOD_NS, EGO[k], None, 0.1, 0.0, GroundPlane(CAMERA.height_m, CAMERA.pitch_rad + 1e-4 * k), 0.003
-    )
+def open_frame(k: int) -> OpenFrame:
+    ground = GroundPlane(CAMERA.height_m, CAMERA.pitch_rad + 1e-4 * k)
+    return OpenFrame(EgoFrame(k, k * PERIOD_NS, EGO[k]), 0.1, 0.0, ground, 0.003)
 
 
 def follow(used: list[int | None], noise_px: float = 0.5) -> tuple[list[tuple[float, ...]], list[GroundPlane]]:
     """What is seen when frame k knows the detections of frame used[k], and the road under the camera in each frame."""
-    sight, seen, roads = hindsight(), [], []
+    vehicles, seen, roads = out_of_sequence(), [], []
     for k, source in enumerate(used):
-        sight.begin(moment(k))
-        tracks = sight.see(None if source is None else detections(source, noise_px), -1 if source is None else source)
+        vehicles.open_frame(open_frame(k))
+        tracks = vehicles.localise_vehicles(
+            None if source is None else detections(source, noise_px), -1 if source is None else source
+        )
         seen += [(t.seen_frame, t.vehicle, *t.state.tolist(), *t.cov.ravel().tolist()) for t in tracks]
-        roads.append(sight.road.ground)
+        roads.append(vehicles.road.ground)
     return seen, roads
 
 
@@ -101,11 +102,11 @@ def test_vehicles_are_as_if_detections_had_come_in_time(delays: list[int]) -> No
 def test_a_result_is_used_once_and_none_after_the_latest() -> None:
     seen, _ = follow([0, 1, 2, 2, 2, 2, 6])
     assert sorted({row[0] for row in seen}) == [2, 6]
-    sight = hindsight(HindsightConfig(latest_ms=250.0))
+    vehicles = out_of_sequence(OutOfSequenceConfig(latest_ms=250.0))
     tracks: list[int] = []
     for k, source in enumerate([0, 1, 2, 2, 2, 2, 2, 2, 2, 2, 3, 8, 8]):  # 3 is 0.7 s old, 8 is 0.3 s old when it comes
-        sight.begin(moment(k))
-        tracks += [t.seen_frame for t in sight.see(detections(source), source)]
+        vehicles.open_frame(open_frame(k))
+        tracks += [t.seen_frame for t in vehicles.localise_vehicles(detections(source), source)]
     assert sorted(set(tracks)) == [2]
 
 
@@ -115,14 +116,14 @@ def test_an_older_result_does_not_follow_a_newer_one() -> None:
 
 
 def test_a_source_that_begins_anew_awaits_nothing_of_the_old() -> None:
-    sight = hindsight()
+    vehicles = out_of_sequence()
     for k in range(6):
-        sight.begin(moment(k))
-        sight.see(detections(min(k, 4)), min(k, 4))
-    sight.begin(moment(0))
-    assert sight.see(detections(5), 5) == []
-    sight.see(detections(0), 0)
-    assert sight.road is sight.horizon
+        vehicles.open_frame(open_frame(k))
+        vehicles.localise_vehicles(detections(min(k, 4)), min(k, 4))
+    vehicles.open_frame(open_frame(0))
+    assert vehicles.localise_vehicles(detections(5), 5) == []
+    vehicles.localise_vehicles(detections(0), 0)
+    assert vehicles.road is vehicles.ground_size
 
 
 def drive(delay: int, seed: int, noise_px: float, heights_m: tuple[float, ...], **config: float) -> list[Measurements]:
@@ -189,7 +190,7 @@ def test_late_edges_end_in_the_frame_at_hand_and_carry_on_from_one_another() -> 
 
 
 @pytest.mark.parametrize("delay", [0, 2])
-def test_an_estimate_says_how_old_the_sights_are_that_tell_of_it(delay: int) -> None:
+def test_an_estimate_says_how_old_the_measurements_are_that_tell_of_it(delay: int) -> None:
     graph = PoseGraph(GraphConfig(), WeightsConfig())
     estimates = [graph.optimise(m) for m in drive(delay, 0, 0.0, (CAR.height_m,) * 3)]
     assert len(estimates[-1].vehicles) == 3
@@ -207,10 +208,10 @@ def test_a_detector_that_is_less_sure_of_its_edges_gives_poorer_places() -> None
     """`Detections.edge_sigma` takes the place of the configuration's own."""
     covs, own = {}, (LocalisationConfig().sigma_box_rel, LocalisationConfig().sigma_box_px)
     for said in (None, own, (0.2, 10.0)):
-        front = hindsight()
+        front = out_of_sequence()
         for k in range(4):
-            front.begin(moment(k))
-            tracks = front.see(replace(detections(k), edge_sigma=said), k)
+            front.open_frame(open_frame(k))
+            tracks = front.localise_vehicles(replace(detections(k), edge_sigma=said), k)
         covs[said] = tracks[0].place.cov
     np.testing.assert_array_equal(covs[None], covs[own])
     assert np.linalg.eigvalsh(covs[0.2, 10.0] - covs[None]).min() > 0.0

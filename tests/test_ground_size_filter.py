@@ -8,22 +8,22 @@ import pytest
 
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.vehicles.ground_size_filter import Horizon, HorizonConfig
-from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, extent_m, localise
+from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, extent_m, observe_boxes
 from birdslam.vehicles.parallax import LearnedSize
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 CAR = DIMENSIONS["car"]
 LOCALISATION = LocalisationConfig()
-CONFIG = HorizonConfig(roof_reach_rel=1.0)  # the world here is made of cuboids
+CONFIG = GroundSizeConfig(roof_reach_rel=1.0)  # the world here is made of cuboids
 
 
 class Road:
-    """Cars on a road that the camera leans over by `pitch_rad` and `roll_rad`, and a horizon that does not know it."""
+    """Cars on a road that the camera leans over by `pitch_rad` and `roll_rad`, and a filter that does not know it."""
 
-    def __init__(self, pitch_rad: float = 0.0, roll_rad: float = 0.0, config: HorizonConfig = CONFIG) -> None:
+    def __init__(self, pitch_rad: float = 0.0, roll_rad: float = 0.0, config: GroundSizeConfig = CONFIG) -> None:
         self.truth = GroundPlane(CAMERA.height_m, pitch_rad, roll_rad)
-        self.horizon = Horizon(CAMERA, config)
+        self.ground_size = GroundSizeFilter(CAMERA, config)
         self.rng = np.random.default_rng(3)
 
     def box(self, x_m: float, y_m: float, height_m: float, lift_m: float = 0.0) -> np.ndarray:
@@ -34,12 +34,12 @@ class Road:
 
     def see(self, boxes: dict[int, np.ndarray], dt_s: float = 0.1) -> tuple[dict[int, float], dict[int, float]]:
         """Nearest depths in metres and the sigmas of their logarithms."""
-        self.horizon.predict(dt_s, 0.0, None, 0.0)
+        self.ground_size.predict(dt_s, 0.0, None, 0.0)
         seen: list[Observation] = []
         for box in boxes.values():
-            seen += localise(box[None], np.ones(1), ("car",), CAMERA, self.horizon.ground, LOCALISATION)
+            seen += observe_boxes(box[None], np.ones(1), ("car",), CAMERA, self.ground_size.ground, LOCALISATION)
         extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
-        depths = self.horizon.update(list(boxes), seen, extents[:, 1], extents[:, 0], np.zeros(len(seen)))
+        depths = self.ground_size.estimate_depths(list(boxes), seen, extents[:, 1], extents[:, 0], np.zeros(len(seen)))
         log_z, var = depths.log_depth, depths.variance
         return dict(zip(boxes, np.exp(log_z), strict=True)), dict(zip(boxes, np.sqrt(var), strict=True))
 
@@ -61,8 +61,8 @@ def traffic(road: Road, frames: int, heights_m: list[float], noise_px: float = 0
 def test_boxes_alone_give_the_pitch_and_the_depths(pitch_rad: float) -> None:
     road = Road(pitch_rad)
     errors = traffic(road, 20, [1.4, 1.6, 1.5, 1.45, 1.62])
-    assert road.horizon.ground.pitch_rad == pytest.approx(pitch_rad, abs=3.0 * road.horizon.sigma_pitch_rad)
-    assert abs(road.horizon.ground.pitch_rad - pitch_rad) < 0.004
+    assert road.ground_size.ground.pitch_rad == pytest.approx(pitch_rad, abs=3.0 * road.ground_size.sigma_pitch_rad)
+    assert abs(road.ground_size.ground.pitch_rad - pitch_rad) < 0.004
     assert np.median(np.abs(list(errors.values()))) < 0.04
     level = [CAMERA.height_m / (1.65 / z - pitch_rad) / z - 1.0 for z in (20.0, 30.0)]  # Eq. 1 on level ground
     if pitch_rad:
@@ -72,7 +72,7 @@ def test_boxes_alone_give_the_pitch_and_the_depths(pitch_rad: float) -> None:
 def test_roll_shows_in_the_cars_left_and_right() -> None:
     road = Road(0.0, 0.02)
     traffic(road, 30, [1.5, 1.55, 1.5, 1.5, 1.55, 1.5])
-    assert road.horizon.ground.roll_rad > 0.003  # a kerb under each of them would do as well
+    assert road.ground_size.ground.roll_rad > 0.003  # a kerb under each of them would do as well
 
 
 def test_the_tilt_and_the_sizes_are_as_sure_as_they_say() -> None:
@@ -83,7 +83,7 @@ def test_the_tilt_and_the_sizes_are_as_sure_as_they_say() -> None:
         road = Road(float(0.01 * rng.standard_normal()))
         road.rng = rng
         traffic(road, 10, [float(1.53 * math.exp(0.08 * e)) for e in rng.standard_normal(4)], noise_px=1.5)
-        ratios.append((road.horizon.ground.pitch_rad - road.truth.pitch_rad) / road.horizon.sigma_pitch_rad)
+        ratios.append((road.ground_size.ground.pitch_rad - road.truth.pitch_rad) / road.ground_size.sigma_pitch_rad)
     assert np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
@@ -111,7 +111,7 @@ def test_a_faster_camera_learns_no_more_of_a_size_in_the_same_time() -> None:
         road = Road()
         for _ in range(round(2.0 * hz)):
             road.see({0: road.box(20.0, 0.0, 1.5), 1: road.box(30.0, 4.0, 1.55)}, 1.0 / hz)
-        sigmas.append(math.sqrt(road.horizon._P[2, 2]))
+        sigmas.append(math.sqrt(road.ground_size._P[2, 2]))
     assert sigmas[0] == pytest.approx(sigmas[1], rel=0.1)
 
 
@@ -134,17 +134,17 @@ def test_one_wild_bottom_moves_neither_the_road_nor_the_size() -> None:
     cars = {0: (14.0, 0.0, 1.5), 1: (22.0, 3.5, 1.45), 2: (30.0, -3.5, 1.55)}
     for _ in range(15):
         road.see({i: road.box(*car) for i, car in cars.items()})
-    pitch_rad, (height_m, _) = road.horizon.ground.pitch_rad, road.horizon.size(0)
+    pitch_rad, (height_m, _) = road.ground_size.ground.pitch_rad, road.ground_size.size(0)
     boxes = {i: road.box(*car) for i, car in cars.items()}
     boxes[0][3] -= 25.0
     depths, _ = road.see(boxes)
-    assert road.horizon.ground.pitch_rad == pytest.approx(pitch_rad, abs=0.002)
-    assert road.horizon.size(0)[0] == pytest.approx(height_m, rel=0.05)
+    assert road.ground_size.ground.pitch_rad == pytest.approx(pitch_rad, abs=0.002)
+    assert road.ground_size.size(0)[0] == pytest.approx(height_m, rel=0.05)
     assert depths[0] == pytest.approx(14.0 - CAR.length_m / 2.0, rel=0.12)  # Eq. 1 says 30 % farther
 
 
 def test_the_camera_s_own_pitching_carries_the_horizon_through_a_bump() -> None:
-    still, told = Horizon(CAMERA, CONFIG), Horizon(CAMERA, CONFIG)
+    still, told = GroundSizeFilter(CAMERA, CONFIG), GroundSizeFilter(CAMERA, CONFIG)
     still.predict(0.1, 0.0, None, 0.0)
     told.predict(0.1, 0.01, None, 0.0)
     assert told.ground.pitch_rad - still.ground.pitch_rad == pytest.approx(0.01, rel=0.05)
@@ -154,31 +154,31 @@ def test_the_camera_s_own_pitching_carries_the_horizon_through_a_bump() -> None:
 
 
 def test_the_images_pitch_is_taken_when_it_is_new() -> None:
-    horizon = Horizon(CAMERA, CONFIG)
-    before = horizon.sigma_pitch_rad
-    horizon.predict(0.1, 0.0, CAMERA.ground, 0.001)  # the calibration says nothing new
-    assert horizon.sigma_pitch_rad >= before * 0.99
-    horizon.predict(0.1, 0.0, GroundPlane(CAMERA.height_m, 0.015), 0.001)
-    assert horizon.ground.pitch_rad == pytest.approx(0.015, abs=0.002)
-    assert horizon.sigma_pitch_rad < 0.5 * before
+    ground_size = GroundSizeFilter(CAMERA, CONFIG)
+    before = ground_size.sigma_pitch_rad
+    ground_size.predict(0.1, 0.0, CAMERA.ground, 0.001)  # the calibration says nothing new
+    assert ground_size.sigma_pitch_rad >= before * 0.99
+    ground_size.predict(0.1, 0.0, GroundPlane(CAMERA.height_m, 0.015), 0.001)
+    assert ground_size.ground.pitch_rad == pytest.approx(0.015, abs=0.002)
+    assert ground_size.sigma_pitch_rad < 0.5 * before
 
 
 def test_forgotten_vehicles_leave_what_they_said_of_the_road() -> None:
     road = Road(0.015)
     traffic(road, 12, [1.5, 1.55, 1.5])
-    pitch_rad, sigma_rad = road.horizon.ground.pitch_rad, road.horizon.sigma_pitch_rad
-    height = road.horizon.size(1)
-    road.horizon.keep_only([1])
-    assert (road.horizon.ground.pitch_rad, road.horizon.sigma_pitch_rad) == (pitch_rad, sigma_rad)
-    assert road.horizon.size(1) == height
+    pitch_rad, sigma_rad = road.ground_size.ground.pitch_rad, road.ground_size.sigma_pitch_rad
+    height = road.ground_size.size(1)
+    road.ground_size.keep_only([1])
+    assert (road.ground_size.ground.pitch_rad, road.ground_size.sigma_pitch_rad) == (pitch_rad, sigma_rad)
+    assert road.ground_size.size(1) == height
 
 
 def test_nothing_seen_is_nothing_learned() -> None:
-    horizon = Horizon(CAMERA, CONFIG)
-    ground = horizon.ground
-    depths = horizon.update([], [], np.zeros(0), np.zeros(0), np.zeros(0))
+    ground_size = GroundSizeFilter(CAMERA, CONFIG)
+    ground = ground_size.ground
+    depths = ground_size.estimate_depths([], [], np.zeros(0), np.zeros(0), np.zeros(0))
     assert len(depths.log_depth) == len(depths.variance) == len(depths.log_height) == 0
-    assert horizon.ground == ground
+    assert ground_size.ground == ground
 
 
 def test_parked_cars_are_seen_from_a_passing_ego_without_drift() -> None:
@@ -188,26 +188,26 @@ def test_parked_cars_are_seen_from_a_passing_ego_without_drift() -> None:
         first = k // 10
         boxes = {i: road.box(*(15.0 + 7.0 * (i - k / 10.0), 3.5), 1.5) for i in range(first, first + 5)}
         road.see(boxes)
-        road.horizon.keep_only(boxes)
-    assert np.linalg.eigvalsh(road.horizon._P).min() > 0.0
-    assert road.horizon.ground.pitch_rad == pytest.approx(0.005, abs=0.004)
+        road.ground_size.keep_only(boxes)
+    assert np.linalg.eigvalsh(road.ground_size._P).min() > 0.0
+    assert road.ground_size.ground.pitch_rad == pytest.approx(0.005, abs=0.004)
 
 
 def test_a_size_that_is_learned_elsewhere_counts_in_the_depth_and_is_not_kept() -> None:
     road = Road()
     box = {0: road.box(40.0, 0.0, 1.7)}
     (prior_m,), (prior_sigma,) = (list(x.values()) for x in road.see(box))
-    seen = localise(box[0][None], np.ones(1), ("car",), CAMERA, road.horizon.ground, LOCALISATION)
+    seen = observe_boxes(box[0][None], np.ones(1), ("car",), CAMERA, road.ground_size.ground, LOCALISATION)
     extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
 
     def again(weights: list[float], heights_m: list[float], sigma: float) -> tuple[float, float]:
         learned = LearnedSize(np.array([weights]), np.log([heights_m]), np.full((1, len(weights)), sigma**2))
-        horizon = copy.deepcopy(road.horizon)
-        found = horizon.update([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), learned)
-        assert horizon.size(0)[0] < 1.62
+        ground_size = copy.deepcopy(road.ground_size)
+        found = ground_size.estimate_depths([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), learned)
+        assert ground_size.size(0)[0] < 1.62
         depth_m, height_m = float(np.exp(found.log_depth[0])), float(np.exp(found.log_height[0]))
         # The height that comes with the depth is the one that the depth was found with
-        as_before = prior_m * (height_m / road.horizon.size(0)[0]) ** found.depth_per_height[0]
+        as_before = prior_m * (height_m / road.ground_size.size(0)[0]) ** found.depth_per_height[0]
         assert depth_m == pytest.approx(as_before, rel=0.02)
         return depth_m, float(np.sqrt(found.variance[0]))
 
