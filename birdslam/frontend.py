@@ -117,7 +117,7 @@ class FrontEnd:
         age = perception.ages.get("detector", 0)
         depth = perception.depth if perception.ages.get("depth", 0) == age else None
         road_then = road if perception.ages.get("segmenter", 0) == age else None
-        tracks_seen = self.vehicles.localise_vehicles(detections, frame.frame_id - age, depth, road_then)
+        tracks_seen = self.vehicles.ingest_detections(detections, frame.frame_id - age, depth, road_then)
         ground, sigma_pitch_rad = self.vehicles.road.ground, self.vehicles.road.sigma_pitch_rad
         cv, vv = vehicle_edges(tracks_seen, opened.ego, ground, self.camera, self.config.tracking)
         status += self.height.judge(cv, motion)

@@ -36,6 +36,16 @@ def test_equation_1_as_the_paper_writes_it() -> None:
     assert y == pytest.approx(1.65)
 
 
+@given(grounds, st.floats(3.0, 60.0), st.floats(-1.0, 1.0))
+def test_slope_and_bearing_of_a_ray_give_the_same_road_point(ground: GroundPlane, x_m: float, side: float) -> None:
+    """The vehicles' path has Eq. 1 along its rays' forward axis, the others in camera axes."""
+    px = bev.ego_to_pixel(camera(), ground, np.array([[x_m, side * x_m]]))
+    ((bearing, slope),) = bev.bearing_and_slope(camera(), ground, px)
+    (found_m,) = bev.meet_road(np.ones(1), np.array([slope]), ground.height_m)
+    np.testing.assert_allclose([found_m, bearing * found_m], [x_m, side * x_m], rtol=1e-6, atol=1e-6)
+    assert bev.road_slope(found_m, ground.height_m) == pytest.approx(slope)
+
+
 def test_axes_are_rep_103() -> None:
     ahead_left = bev.pixel_to_ego(camera(), GroundPlane(1.65), np.array([[400.0, 300.0]]))[0]
     assert ahead_left[0] > 0.0

@@ -71,7 +71,7 @@ def follow(used: list[int | None], noise_px: float = 0.5) -> tuple[list[tuple[fl
     vehicles, seen, roads = out_of_sequence(), [], []
     for k, source in enumerate(used):
         vehicles.open_frame(open_frame(k))
-        tracks = vehicles.localise_vehicles(
+        tracks = vehicles.ingest_detections(
             None if source is None else detections(source, noise_px), -1 if source is None else source
         )
         seen += [(t.seen_frame, t.vehicle, *t.state.tolist(), *t.cov.ravel().tolist()) for t in tracks]
@@ -106,7 +106,7 @@ def test_a_result_is_used_once_and_none_after_the_latest() -> None:
     tracks: list[int] = []
     for k, source in enumerate([0, 1, 2, 2, 2, 2, 2, 2, 2, 2, 3, 8, 8]):  # 3 is 0.7 s old, 8 is 0.3 s old when it comes
         vehicles.open_frame(open_frame(k))
-        tracks += [t.seen_frame for t in vehicles.localise_vehicles(detections(source), source)]
+        tracks += [t.seen_frame for t in vehicles.ingest_detections(detections(source), source)]
     assert sorted(set(tracks)) == [2]
 
 
@@ -119,10 +119,10 @@ def test_a_source_that_begins_anew_awaits_nothing_of_the_old() -> None:
     vehicles = out_of_sequence()
     for k in range(6):
         vehicles.open_frame(open_frame(k))
-        vehicles.localise_vehicles(detections(min(k, 4)), min(k, 4))
+        vehicles.ingest_detections(detections(min(k, 4)), min(k, 4))
     vehicles.open_frame(open_frame(0))
-    assert vehicles.localise_vehicles(detections(5), 5) == []
-    vehicles.localise_vehicles(detections(0), 0)
+    assert vehicles.ingest_detections(detections(5), 5) == []
+    vehicles.ingest_detections(detections(0), 0)
     assert vehicles.road is vehicles.ground_size
 
 
@@ -211,7 +211,7 @@ def test_a_detector_that_is_less_sure_of_its_edges_gives_poorer_places() -> None
         front = out_of_sequence()
         for k in range(4):
             front.open_frame(open_frame(k))
-            tracks = front.localise_vehicles(replace(detections(k), edge_sigma=said), k)
+            tracks = front.ingest_detections(replace(detections(k), edge_sigma=said), k)
         covs[said] = tracks[0].place.cov
     np.testing.assert_array_equal(covs[None], covs[own])
     assert np.linalg.eigvalsh(covs[0.2, 10.0] - covs[None]).min() > 0.0

@@ -212,6 +212,18 @@ def test_bodies_that_the_detector_knows_of_are_the_second_source() -> None:
     assert bodies_by_detector(seen, without, CAMERA, CAMERA.ground, CONFIG) == (seen, [None, None])
 
 
+def test_of_boxes_that_are_equal_each_keeps_its_own_body() -> None:
+    bodies = told([SE2(10.0, 2.0, 0.4), SE2(12.0, 2.4, 0.4)])
+    detections = found_with([SE2(10.0, 2.0, 0.4)], bodies)
+    boxes_px, scores = detections.boxes_px.repeat(2, axis=0), np.array([0.9, 0.8])
+    twice = replace(detections, boxes_px=boxes_px, scores=scores, labels=("car",) * 2)
+    seen = observe_boxes(boxes_px, scores, twice.labels, CAMERA, CAMERA.ground, LOCALISATION)
+    assert [o.row for o in seen] == [0]  # one vehicle, by the better score
+    _, (found,) = bodies_by_detector(seen, twice, CAMERA, CAMERA.ground, CONFIG)
+    assert found is not None
+    np.testing.assert_allclose(found.centre_m, [10.0, 2.0], atol=1e-6)
+
+
 @given(st.floats(3.0, 7.0), st.floats(0.05, 3.0), st.floats(8.0, 40.0), st.floats(-math.pi, math.pi))
 def test_the_length_is_of_class_and_body_together_and_the_face_stays(
     length_m: float, sigma_m: float, x_m: float, yaw_rad: float

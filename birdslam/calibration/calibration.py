@@ -48,7 +48,7 @@ class CalibrationError(ValueError):
 
 
 class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is believed of each witness."""
+    """How far each witness is trusted, and what a drive must show."""
 
     vehicles: VehicleHeightConfig = VehicleHeightConfig()
     height: HeightCheckConfig = HeightCheckConfig()

@@ -25,7 +25,7 @@ KnownLength = Callable[[int, int, int, int], float | None]  # (frames from, to; 
 
 
 class HeightCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is believed of known lengths."""
+    """How far known lengths are trusted."""
 
     section_m: Positive = 8.0  # over which an estimated length is compared with a known one
     sigma_scale_rel: Positive = 0.015  # of the mean ratio of lengths

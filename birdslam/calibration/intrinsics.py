@@ -6,7 +6,7 @@ by `camera.Camera`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +144,39 @@ def from_chessboard(folder: Path, columns: int, rows: int, square_m: float) -> I
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
     if not paths:
         raise DatasetError(f"{folder}: no images in it (.png or .jpg)")
-    corners, size, first = [], (0, 0), paths[0]
+    corners, size = _find_corners(folder, paths, columns, rows)
+    board = np.zeros((columns * rows, 3), np.float32)
+    board[:, :2] = np.mgrid[0:columns, 0:rows].T.reshape(-1, 2) * square_m
+    rms, K, distortion, turns, _, sigma, _, _ = cv2.calibrateCameraExtended(
+        [board] * len(corners), corners, size, np.eye(3), np.zeros(5)
+    )
+    sigma_focal_px = float(np.max(sigma[:2]))
+    if not np.isfinite(rms) or rms > MAX_REPROJECTION_PX:
+        raise DatasetError(
+            f"{folder}: the corners miss the calibrated camera by {rms:.2f} px (root mean square), more than "
+            f"{MAX_REPROJECTION_PX} px: blurred images, a bent board, or not {columns}x{rows} inner corners"
+        )
+    _check_tilts(folder, turns, float(K[0, 0]), sigma_focal_px)
+    return Intrinsics(
+        fx_px=float(K[0, 0]),
+        fy_px=float(K[1, 1]),
+        cx_px=float(K[0, 2]),
+        cy_px=float(K[1, 2]),
+        distortion=tuple(np.ravel(distortion).tolist()),
+        width_px=size[0],
+        height_px=size[1],
+        source=f"{len(corners)} chessboards in {folder}",
+        reprojection_px=float(rms),
+        sigma_focal_px=sigma_focal_px,
+    )
+
+
+def _find_corners(
+    folder: Path, paths: list[Path], columns: int, rows: int
+) -> tuple[list[NDArray[np.float32]], tuple[int, int]]:
+    """Inner corners (columns * rows, 1, 2) in px of each image that shows the board, and the images' size in px."""
+    corners: list[NDArray[np.float32]] = []
+    size, first = (0, 0), paths[0]
     for path in paths:
         try:
             image = read_image(path)
@@ -163,33 +195,15 @@ def from_chessboard(folder: Path, columns: int, rows: int, square_m: float) -> I
             f"{folder}: the board of {columns}x{rows} inner corners was found in {len(corners)} of {len(paths)} "
             f"images, {FEWEST_BOARDS} are needed"
         )
-    board = np.zeros((columns * rows, 3), np.float32)
-    board[:, :2] = np.mgrid[0:columns, 0:rows].T.reshape(-1, 2) * square_m
-    rms, K, distortion, turns, _, sigma, _, _ = cv2.calibrateCameraExtended(
-        [board] * len(corners), corners, size, np.eye(3), np.zeros(5)
-    )
-    sigma_focal_px = float(np.max(sigma[:2]))
-    if not np.isfinite(rms) or rms > MAX_REPROJECTION_PX:
-        raise DatasetError(
-            f"{folder}: the corners miss the calibrated camera by {rms:.2f} px (root mean square), more than "
-            f"{MAX_REPROJECTION_PX} px: blurred images, a bent board, or not {columns}x{rows} inner corners"
-        )
+    return corners, size
+
+
+def _check_tilts(folder: Path, turns: Sequence[Any], focal_px: float, sigma_focal_px: float) -> None:
+    """Raises DatasetError where boards, by their rotation vectors, stand too much alike to give the focal length."""
     normals = np.array([cv2.Rodrigues(np.asarray(turn))[0][:, 2] for turn in turns])
     tilt_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
-    if tilt_deg < MIN_TILT_DEG or sigma_focal_px > MAX_SIGMA_FOCAL_REL * K[0, 0]:
+    if tilt_deg < MIN_TILT_DEG or sigma_focal_px > MAX_SIGMA_FOCAL_REL * focal_px:
         raise DatasetError(
-            f"{folder}: the boards differ by {tilt_deg:.0f} degrees of tilt, and the focal length {K[0, 0]:.0f} px is "
+            f"{folder}: the boards differ by {tilt_deg:.0f} degrees of tilt, and the focal length {focal_px:.0f} px is "
             f"known to {sigma_focal_px:.1f} px: tilt the board more ({MIN_TILT_DEG:g} degrees)"
         )
-    return Intrinsics(
-        fx_px=float(K[0, 0]),
-        fy_px=float(K[1, 1]),
-        cx_px=float(K[0, 2]),
-        cy_px=float(K[1, 2]),
-        distortion=tuple(np.ravel(distortion).tolist()),
-        width_px=size[0],
-        height_px=size[1],
-        source=f"{len(corners)} chessboards in {folder}",
-        reprojection_px=float(rms),
-        sigma_focal_px=sigma_focal_px,
-    )

@@ -1,4 +1,4 @@
-"""What a network says of a vehicle's body: where its centre is, how large it is, which way it faces."""
+"""A vehicle's body as a network finds it: where its centre is, how large it is, which way it faces."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Boxes3d:
         )
 
     def in_metres(self, camera: Camera) -> Boxes3d:
-        """The bodies as this camera sees them; itself where they are not canonical."""
+        """The bodies with the depths of this camera; itself where its depths are not canonical."""
         if self.canonical_focal_rel <= 0.0:
             return self
         factor = camera.fx_px / (self.canonical_focal_rel * camera.width_px)

@@ -46,11 +46,10 @@ class CenterNetDecoder:
         """The peaks of one run above the score threshold, as boxes in the image and cut to it."""
         table = self.table
         heat = tensors[table.heat_map][0, self._wanted]
-        bar = table.score_threshold
         if table.heat == "logits":
             heat = 1.0 / (1.0 + np.exp(-np.clip(heat, -LARGEST_LOGIT, LARGEST_LOGIT)))
         around = np.stack([cv2.dilate(plane, np.ones((3, 3), np.uint8)) for plane in heat])
-        planes, rows, columns = np.nonzero((heat >= bar) & (heat == around))
+        planes, rows, columns = np.nonzero((heat >= table.score_threshold) & (heat == around))
         scores = heat[planes, rows, columns].astype(np.float64)
         best = np.argsort(-scores, kind="stable")[:MOST_CANDIDATES]
         planes, rows, columns, scores = planes[best], rows[best], columns[best], scores[best]

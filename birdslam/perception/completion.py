@@ -42,6 +42,7 @@ class GridCompletion:
         self(np.zeros((2, *shape), dtype=np.float32))  # warm-up
 
     def __call__(self, grids: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Grids (2, rows, columns) completed."""
         (out,) = self._session.run(None, {self._input: grids[None]})
         completed: NDArray[np.float32] = out[0]
         return completed

@@ -72,7 +72,7 @@ class DepthMap:
         return replace(self, depth_m=self.depth_m * np.float32(factor), metric=True, canonical_focal_rel=0.0)
 
     def in_metres(self, camera: Camera) -> DepthMap:
-        """The map as this camera sees it; itself where it is no canonical one."""
+        """The map with the depths of this camera; itself where its depths are not canonical."""
         if self.canonical_focal_rel <= 0.0:
             return self
         factor = camera.fx_px / (self.canonical_focal_rel * self.image_width_px)
@@ -134,9 +134,4 @@ def _check_map(output: str, shape: tuple[int, ...]) -> None:
 
 def _of_image(tensor: NDArray[np.float32], view: View, input: Input) -> NDArray[np.float32]:
     """(h, w): the part of a map over the whole input that lies over the image, a copy."""
-    values = tensor.reshape(tensor.shape[-2], tensor.shape[-1])
-    fy, fx = values.shape[0] / input.height_px, values.shape[1] / input.width_px
-    rows = slice(round(view.top_px * fy), max(round((view.top_px + view.height_px) * fy), 1))
-    columns = slice(round(view.left_px * fx), max(round((view.left_px + view.width_px) * fx), 1))
-    out: NDArray[np.float32] = values[rows, columns].copy()
-    return out
+    return view.crop(tensor.reshape(tensor.shape[-2], tensor.shape[-1]), input).copy()

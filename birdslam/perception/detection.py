@@ -14,7 +14,7 @@ from birdslam.perception.views import View
 
 CUT_MARGIN = 0.015  # of a tile's width: a box that ends so near to a tile's inner edge is taken to go on behind it
 INSIDE = 0.6  # of a cut box's area inside a whole box: the same object
-MOST_CANDIDATES = 400  # of one run: a network gone wild must not cost memory and time without bound
+MOST_CANDIDATES = 400  # of one run: a network that fails must not cost memory and time without bound
 SAME_ROWS = 0.5  # overlap over union of the rows of two halves of one object
 
 
@@ -45,7 +45,10 @@ class Detections:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Boxes before NMS: image pixels, scores, class ids; `cut` (N, 2): goes on behind the view's left / right edge."""
+    """Boxes (N, 4) before NMS in image pixels, with scores (N,) and class ids (N,).
+
+    `cut` (N, 2): whether a box goes on behind the view's left, right edge.
+    """
 
     boxes_px: NDArray[np.float64]
     scores: NDArray[np.float64]
@@ -64,11 +67,11 @@ class YoloxDecoder:
         if len(shape) != 3 or shape[0] != 1:
             raise Misfit("detector.output", f"{table.output} of shape (1, cells, 5 + classes)", shape)
         if shape[1] != len(cells):
-            said = f"{list(table.strides)} over {input.width_px}x{input.height_px}, which are {len(cells)} cells"
-            raise Misfit("detector.strides", said, f"{shape[1]} cells in {table.output} {shape}")
+            stated = f"{list(table.strides)} over {input.width_px}x{input.height_px}, which are {len(cells)} cells"
+            raise Misfit("detector.strides", stated, f"{shape[1]} cells in {table.output} {shape}")
         if shape[2] != 5 + table.classes:
-            said = f"{table.classes}, so {5 + table.classes} channels"
-            raise Misfit("detector.classes", said, f"{shape[2]} channels in {table.output} {shape}")
+            stated = f"{table.classes}, so {5 + table.classes} channels"
+            raise Misfit("detector.classes", stated, f"{shape[2]} channels in {table.output} {shape}")
         self._cells, self._strides = cells, strides
         self._groups = rival_groups(table.classes, table.labels, table.rivals)
         self._wanted = np.isin(np.arange(table.classes), list(table.labels))
@@ -94,13 +97,13 @@ class YoloxDecoder:
         return replace(merged, edge_sigma=edge_sigma(self.table.box_sigma, views[0]))
 
 
-def edge_sigma(said: BoxSigma | None, view: View) -> tuple[float, float] | None:
-    """What a manifest says of its boxes' edges, in pixels of the image."""
-    return None if said is None else (said.rel, said.px / float(view.ratio.min()))
+def edge_sigma(table: BoxSigma | None, view: View) -> tuple[float, float] | None:
+    """1-sigma of a box's edges by its manifest: a fraction of the box's side, and pixels of the image."""
+    return None if table is None else (table.rel, table.px / float(view.ratio.min()))
 
 
 def rival_groups(classes: int, labels: Mapping[int, str], rivals: Sequence[Sequence[str]]) -> NDArray[np.int64]:
-    """(classes,): classes that compete in NMS share a number; those of others stay clear of the groups."""
+    """(classes,): classes that compete in NMS share a number, that of their group; every other has its own."""
     group_of = {label: i for i, group in enumerate(rivals) for label in group}
     groups = np.arange(classes) + len(rivals)
     for index, label in labels.items():

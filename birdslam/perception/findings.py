@@ -11,7 +11,7 @@ from birdslam.perception.segmentation import Segmentation
 
 @dataclass(frozen=True)
 class Findings:
-    """None is what a network doesn't look for."""
+    """Detections, masks and depth of one image; None where the network does not look for them."""
 
     detections: Detections | None = None
     segmentation: Segmentation | None = None

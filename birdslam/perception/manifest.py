@@ -1,4 +1,4 @@
-"""Model manifests: a small TOML file says what a network takes and what each of its outputs means.
+"""Model manifests: a small TOML file states a network's input and what each of its outputs means.
 
 Unknown keys are errors. manifest_file.py says how a network's manifest is found.
 """
@@ -29,8 +29,8 @@ class ModelError(ValueError):
 class Misfit(ValueError):
     """One key of a manifest that its network contradicts; `load_network` makes a ModelError of it."""
 
-    def __init__(self, key: str, said: object, has: object) -> None:
-        super().__init__(f"{key}: the manifest says {said}, the network has {has}")
+    def __init__(self, key: str, stated: object, has: object) -> None:
+        super().__init__(f"{key}: the manifest says {stated}, the network has {has}")
 
 
 class Stretch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="mode", tag="stretch"):
@@ -175,7 +175,7 @@ class ClassMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return (self.channel,) if isinstance(self.channel, int) else self.channel
 
     @property
-    def bar(self) -> float:
+    def level(self) -> float:
         """What a channel must exceed under rule "above", in the output's own numbers."""
         return math.log(self.threshold / (1.0 - self.threshold)) if self.sigmoid else self.threshold
 
@@ -259,10 +259,10 @@ class MultiTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What suits this network; a `ModelSpec` may say otherwise.
+    """When this network runs, where a `ModelSpec` states nothing else.
 
     It runs on every `every`-th frame with `threads` threads. Where `awaited` is false no frame waits for it: its result
-    is taken when it is there (with patience None it is awaited all the same).
+    is used once it is there (with patience None it is awaited all the same).
     """
 
     every: Count = 1

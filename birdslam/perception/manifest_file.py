@@ -18,7 +18,7 @@ SHIPPED_DIRECTORY = Path(__file__).parent / "manifests"
 
 
 class Described(Protocol):
-    """What every manifest says, whatever its network takes."""
+    """The fields of every kind of manifest."""
 
     @property
     def role(self) -> str: ...
@@ -30,7 +30,7 @@ Kind = TypeVar("Kind", bound=Described)
 
 
 class Glance(msgspec.Struct, frozen=True):
-    """What a manifest of any kind says of itself."""
+    """The fields by which a manifest of any kind is recognised."""
 
     role: str
     title: str = ""

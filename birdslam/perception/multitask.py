@@ -1,7 +1,7 @@
 """The multi-task network's outputs to findings: boxes with their bodies, masks, and a depth map, of one run.
 
-Its depths are canonical: those under a camera whose focal length is `CANONICAL_FOCAL` of the image's width, z * (0.58 *
-width / fx). So one network serves many cameras, and the camera's focal length makes the depths metric (`in_metres`).
+Its depths are canonical, z * (0.58 * width / fx): those of a camera whose focal length is `CANONICAL_FOCAL` of the
+image's width. So one network serves many cameras; `in_metres` makes the depths metric by the camera's focal length.
 """
 
 from __future__ import annotations
@@ -83,36 +83,31 @@ class MultiTaskDecoder:
         )
 
     def merge(self, parts: Sequence[Findings], views: Sequence[View]) -> Findings:
-        """One view sees it all."""
+        """The multi-task network has one view."""
         (part,) = parts
         return part
 
     def _segmentation(self, logits: NDArray[np.float32], view: View) -> Segmentation:
         """Logits and not masks are resized: the border is smooth at the image's resolution."""
         size = (view.image_width_px, view.image_height_px)
-        road, lane = (cv2.resize(self._inside(plane, view), size, interpolation=cv2.INTER_LINEAR) for plane in logits)
+        road, lane = (
+            cv2.resize(view.crop(plane, self.input), size, interpolation=cv2.INTER_LINEAR) for plane in logits
+        )
         return Segmentation(road=road > self.table.road_logit, lane=lane > self.table.lane_logit)
 
     def _depth(self, log_depth: NDArray[np.float32], view: View, focal_rel: float) -> DepthMap:
         return DepthMap(
-            np.exp(self._inside(log_depth, view)),
+            np.exp(view.crop(log_depth, self.input)),
             view.image_width_px,
             view.image_height_px,
             sigma_rel=self.table.depth_sigma_rel,
             canonical_focal_rel=focal_rel,
         )
 
-    def _inside(self, plane: NDArray[np.float32], view: View) -> NDArray[np.float32]:
-        """The view's rectangle of a map over the whole input, which may be coarser than the input."""
-        fy, fx = plane.shape[0] / self.input.height_px, plane.shape[1] / self.input.width_px
-        rows = slice(round(view.top_px * fy), max(round((view.top_px + view.height_px) * fy), 1))
-        columns = slice(round(view.left_px * fx), max(round((view.left_px + view.width_px) * fx), 1))
-        return plane[rows, columns]
-
     def _detections(
         self, heat: NDArray[np.float32], body: NDArray[np.float32], view: View, focal_rel: float
     ) -> Detections:
-        """Peaks of the heat with what the body says there; a box once, the better score first."""
+        """The peaks of the heat map with the body's channels there, each box once, the best score first."""
         classes, ys, xs = self._peaks(heat)
         at = body[:, ys, xs].T.astype(np.float64)  # (N, channels)
         scores = 1.0 / (1.0 + np.exp(-heat[classes, ys, xs].astype(np.float64)))
@@ -139,6 +134,7 @@ class MultiTaskDecoder:
         return classes[best], ys[best], xs[best]
 
     def _bodies(self, at: NDArray[np.float64], cells: NDArray[np.float64], view: View, focal_rel: float) -> Boxes3d:
+        """The bodies (N) by their channels `at` (N, channels), at the cells (N, 2)."""
         centres = np.tile((cells + at[:, _BODY["offset"]]) * self._cell, 2)
         depth_m = np.exp(at[:, _BODY["log_depth"]][:, 0])
         size_m = np.exp(at[:, _BODY["log_size"]]) * MEAN_SIZE_M

@@ -1,4 +1,4 @@
-"""One network: its file, its manifest, its session. The image goes in, findings come out."""
+"""One network, its file, manifest and onnxruntime session: `Network.run` makes findings of an image."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _FLOAT32 = "tensor(float)"
 
 
 class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A network as the configuration names it. What is None is the manifest's to say (see `manifest.Schedule`)."""
+    """A network as the configuration names it; None stands for what the manifest states (see `manifest.Schedule`)."""
 
     path: str
     manifest: str = ""
@@ -57,7 +57,7 @@ class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Decoder(Protocol):
-    """Makes the meaning of a network's outputs: `read` each view's, then `merge` those of one image."""
+    """Makes findings of a network's outputs: `read` those of each view, then `merge` those of one image."""
 
     def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Any: ...
 
@@ -140,7 +140,7 @@ class Network:
         return all(np.isfinite(tensor).all() for tensor in self._tensors.values())
 
     def read(self, view: View) -> Any:
-        """The meaning of the outputs as they are now, for `merge`."""
+        """The outputs of the last run decoded, for `merge`."""
         return self.decoder.read(self._tensors, view)
 
     def run(self, image: NDArray[np.uint8]) -> Findings | None:
@@ -191,8 +191,8 @@ def load_network(name: str, spec: ModelSpec) -> Network:
     manifest, origin = find_manifest(path, sha256, spec.manifest)
     if name in get_args(Role) and name != manifest.role:
         raise ModelError(f"{path}: role: the manifest {origin} says {manifest.role}, it was given as the {name}")
-    said = {key: value for key in ("every", "threads", "awaited") if (value := getattr(spec, key)) is not None}
-    schedule = msgspec.structs.replace(manifest.schedule, **said)
+    stated = {key: value for key in ("every", "threads", "awaited") if (value := getattr(spec, key)) is not None}
+    schedule = msgspec.structs.replace(manifest.schedule, **stated)
     refuse_weights_elsewhere(path, content)
     try:
         return Network(name, path, manifest, sha256, content, schedule)

@@ -1,8 +1,8 @@
-"""Frustum-PointNet: the pseudo-lidar points of each box in, the body in it out.
+"""Frustum-PointNet: locates the body in each box from the pseudo-lidar points inside the box.
 
-What a network takes and gives is its manifest's to say, as for the networks of images. The points of a box are turned
-about the camera's down axis until the box's middle lies straight ahead, as Frustum-PointNet has it; a network that
-wants its points about a centre gets them about the point of that ray at the depth of the box's middle.
+A manifest states the network's input and outputs, as for the networks of images. The points of a box are turned about
+the camera's down axis until the box's middle lies straight ahead, as Frustum-PointNet has it. Where the manifest says
+`centred` they are relative to the point of that ray at the depth of the box's middle.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ CORE = 0.5  # of a box's width and height, about its middle: where its vehicle i
 REACH_M = 8.0  # from the depth of the core: points farther off are another body's, or the background's
 LEAST_POINTS = 16
 REFERENCE_M = 20.0  # of the feature log_depth
-NO_RESIDUE = 1e-6
+MIN_HALF_SPAN = 1e-6  # of a box, at a depth of 1
 
 
 @dataclass(frozen=True)
 class Frustum:
-    """What the network is given of one box, and how its answer comes back to the camera."""
+    """The network's input for one box, and how to turn its output back to camera axes."""
 
     features: NDArray[np.float32]  # (C, count)
     azimuth_rad: float  # of the box's middle, to the right of the optical axis
@@ -61,8 +61,8 @@ def frustum_of(points_cam_m: Floats, points: Points) -> Frustum | None:
     if len(points_cam_m) < LEAST_POINTS:
         return None
     u, v = points_cam_m[:, 0] / points_cam_m[:, 2], points_cam_m[:, 1] / points_cam_m[:, 2]
-    place = [(w - (w.min() + w.max()) / 2.0) / max((w.max() - w.min()) / 2.0, NO_RESIDUE) for w in (u, v)]
-    core = (np.abs(place[0]) <= CORE) & (np.abs(place[1]) <= CORE)
+    offsets = [(w - (w.min() + w.max()) / 2.0) / max((w.max() - w.min()) / 2.0, MIN_HALF_SPAN) for w in (u, v)]
+    core = (np.abs(offsets[0]) <= CORE) & (np.abs(offsets[1]) <= CORE)
     depth_m = float(np.median(points_cam_m[core, 2])) if core.any() else float(np.median(points_cam_m[:, 2]))
     near = np.flatnonzero(np.abs(points_cam_m[:, 2] - depth_m) <= REACH_M)
     if len(near) < LEAST_POINTS or depth_m <= 0.0:
@@ -75,7 +75,9 @@ def frustum_of(points_cam_m: Floats, points: Points) -> Frustum | None:
     turned = np.stack([c * x - s * z, y, s * x + c * z])
     middle_m = np.array([0.0, middle_v * depth_m, depth_m / c]) if points.centred else np.zeros(3)
     rows = dict(zip(("x", "y", "z"), (turned - middle_m[:, None]) * points.scale, strict=True))
-    rows.update(u=place[0][picked], v=place[1][picked], log_depth=np.full(len(picked), math.log(depth_m / REFERENCE_M)))
+    rows.update(
+        u=offsets[0][picked], v=offsets[1][picked], log_depth=np.full(len(picked), math.log(depth_m / REFERENCE_M))
+    )
     return Frustum(np.stack([rows[name] for name in points.features]).astype(np.float32), azimuth_rad, middle_m)
 
 
@@ -179,7 +181,7 @@ class PointNet:
 def decode_body(
     table: Body, tensors: dict[str, Floats], frustum: Frustum, camera: Camera, out: Boxes3d, row: int
 ) -> None:
-    """Writes what `Body` says of one box into a row of `out`."""
+    """Decodes the outputs of one box (see `pointnet_manifest.Body`) into a row of `out`."""
     at = tensors[table.output]
     axis, front = at[7:9], at[9:11]
     yaw = 0.5 * math.atan2(axis[1], axis[0])
@@ -197,7 +199,7 @@ def decode_body(
 def decode_bins(
     table: Bins, tensors: dict[str, Floats], frustum: Frustum, camera: Camera, out: Boxes3d, row: int
 ) -> None:
-    """Writes what `Bins` says of one box into a row of `out`."""
+    """Decodes the outputs of one box (see `pointnet_manifest.Bins`) into a row of `out`."""
     scores = tensors[table.heading_scores]
     bin_, size = int(scores.argmax()), int(tensors[table.size_scores].argmax())
     width_rad = 2.0 * math.pi / len(scores)
@@ -223,6 +225,7 @@ def _write(frustum: Frustum, centre_m: Floats, yaw_rad: float, camera: Camera, o
 
 
 def _unknown(count: int) -> Boxes3d:
+    """Bodies of which nothing is known: infinite sigmas."""
     return Boxes3d(
         centre_px=np.zeros((count, 2)),
         depth_m=np.ones(count),
@@ -248,10 +251,10 @@ def load_pointnet(spec: ModelSpec) -> PointNet:
         raise ModelError(f"{path}: the network can't be read: {error.strerror}") from error
     sha256 = hashlib.sha256(content).hexdigest()
     manifest, origin = find_as(path, sha256, spec.manifest, PointNetManifest)
-    said: dict[str, int] = {k: v for k in ("every", "threads") if (v := getattr(spec, k)) is not None}
+    stated: dict[str, int] = {k: v for k in ("every", "threads") if (v := getattr(spec, k)) is not None}
     refuse_weights_elsewhere(path, content)
     try:
-        return PointNet(path, manifest, sha256, content, msgspec.structs.replace(manifest.schedule, **said))
+        return PointNet(path, manifest, sha256, content, msgspec.structs.replace(manifest.schedule, **stated))
     except Misfit as error:
         raise ModelError(f"{path}: {error} (manifest {origin})") from error
     except SESSION_ERRORS as error:

@@ -1,4 +1,4 @@
-"""What a Frustum-PointNet takes and gives, as its manifest says it."""
+"""Manifests of Frustum-PointNets: the network's input and outputs."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Bins(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class PointNetManifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a Frustum-PointNet takes and gives; the file of one begins with role = "pointnet"."""
+    """Input and outputs of a Frustum-PointNet; its file begins with role = "pointnet"."""
 
     role: Literal["pointnet"]
     points: Points

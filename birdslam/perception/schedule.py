@@ -1,4 +1,4 @@
-"""Which network runs on which frame, and what is known when the frame can wait no longer."""
+"""Which network runs on which frame, and which results a frame gets once it can wait no longer."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ ROLES: dict[Role, tuple[Role, ...]] = {"multitask": ("detector", "segmenter", "d
 
 @dataclass(frozen=True)
 class Perception:
-    """What the networks know at one frame.
+    """The latest results of the networks at one frame.
 
     `ages`: head name -> frames since the frame that its result in use was computed on, 0 is this one; a head without
-    any result yet is absent. A head that fills several roles stands there with these roles, not with its name. A head
-    whose result isn't this frame's says so in `status`.
+    any result yet is absent. A head that fills several roles stands there with these roles, not with its name. Each
+    head whose result is of an earlier frame has its status in `status`.
     """
 
     detections: Detections | None = None
@@ -84,7 +84,7 @@ class _Slot:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What its age stands under."""
+        """The keys of its age in `Perception.ages`."""
         return self.fills if self.head.role in ROLES else (self.head.name,)
 
 
@@ -142,6 +142,14 @@ class Networks:
         return _Started(self, frame_id)
 
     def _collect(self, frame_id: int) -> Perception:
+        self._await(frame_id)
+        status = self._take_results(frame_id)
+        found = {FIELDS[role]: getattr(s.findings, FIELDS[role]) for s in self._slots for role in s.fills}
+        ages = {name: frame_id - s.found_frame for s in self._slots if s.found_frame is not None for name in s.names}
+        return Perception(**found, ages=ages, status=tuple(dict.fromkeys(status)))
+
+    def _await(self, frame_id: int) -> None:
+        """Until the heads that the frame waits for are done, or its patience is over."""
         if self._patience_s is None:
             wait([s.running for s in self._slots if s.running is not None])
         else:
@@ -153,6 +161,9 @@ class Networks:
                 ],
                 timeout=self._patience_s,
             )
+
+    def _take_results(self, frame_id: int) -> list[Status]:
+        """The results that are there replace the older ones; returns the status of what failed or is carried."""
         status = []
         for slot in self._slots:
             if slot.running is not None and slot.running.done():
@@ -166,9 +177,7 @@ class Networks:
                     slot.findings, slot.found_frame = findings, slot.started_frame
             if slot.found_frame != frame_id:
                 status.extend(CARRIED[role] for role in slot.fills)
-        found = {FIELDS[role]: getattr(s.findings, FIELDS[role]) for s in self._slots for role in s.fills}
-        ages = {name: frame_id - s.found_frame for s in self._slots if s.found_frame is not None for name in s.names}
-        return Perception(**found, ages=ages, status=tuple(dict.fromkeys(status)))
+        return status
 
 
 @dataclass(frozen=True)

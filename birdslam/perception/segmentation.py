@@ -30,8 +30,8 @@ class ClassMapsDecoder:
         for index, entry in enumerate(table.maps):
             shape = shapes[entry.output]
             if len(shape) != 4 or shape[0] != 1:
-                said = f"{entry.output} of shape (1, channels, h, w)"
-                raise Misfit(f"segmenter.maps[{index}].output", said, shape)
+                stated = f"{entry.output} of shape (1, channels, h, w)"
+                raise Misfit(f"segmenter.maps[{index}].output", stated, shape)
             if shape[1] != entry.channels:
                 has = f"{shape[1]} in {entry.output} {shape}"
                 raise Misfit(f"segmenter.maps[{index}].channels", entry.channels, has)
@@ -49,21 +49,17 @@ class ClassMapsDecoder:
         return part
 
     def _mask(self, scores: NDArray[np.float32], entry: ClassMap, view: View) -> NDArray[np.bool_]:
-        """(H, W): the margin of the channel over its bar, resized to the image, above zero.
+        """(H, W): where the margin of the channel over its threshold, resized to the image, is above zero.
 
         Resizing the margin and not the mask keeps the border smooth at the image's resolution.
         """
         chosen = entry.chosen
         channel = scores[chosen[0]] if len(chosen) == 1 else scores[list(chosen)].max(axis=0)
         if entry.rule == "above":
-            margin = channel - np.float32(entry.bar)
+            margin = channel - np.float32(entry.level)
         elif entry.channels == 2:
             margin = channel - scores[1 - chosen[0]]
         else:
             margin = channel - np.delete(scores, chosen, axis=0).max(axis=0)
-        # The view's rectangle in the map, which may be coarser than the input.
-        fy, fx = margin.shape[0] / self.input.height_px, margin.shape[1] / self.input.width_px
-        rows = slice(round(view.top_px * fy), max(round((view.top_px + view.height_px) * fy), 1))
-        columns = slice(round(view.left_px * fx), max(round((view.left_px + view.width_px) * fx), 1))
         size = (view.image_width_px, view.image_height_px)
-        return cv2.resize(margin[rows, columns], size, interpolation=cv2.INTER_LINEAR) > 0.0
+        return cv2.resize(view.crop(margin, self.input), size, interpolation=cv2.INTER_LINEAR) > 0.0

@@ -33,6 +33,13 @@ class View:
         """(2,): input pixels in an image pixel, along x and y."""
         return np.array([self.width_px / (self.x1_px - self.x0_px), self.height_px / self.image_height_px])
 
+    def crop(self, plane: NDArray[np.float32], input: Input) -> NDArray[np.float32]:
+        """(h, w), not copied: the rectangle of this view in a map (H, W) over the whole input, coarser or not."""
+        fy, fx = plane.shape[0] / input.height_px, plane.shape[1] / input.width_px
+        rows = slice(round(self.top_px * fy), max(round((self.top_px + self.height_px) * fy), 1))
+        columns = slice(round(self.left_px * fx), max(round((self.left_px + self.width_px) * fx), 1))
+        return plane[rows, columns]
+
     def to_image(self, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """Boxes (N, 4) of the input in the image."""
         corners = boxes_px.reshape(-1, 2, 2) - [self.left_px, self.top_px]

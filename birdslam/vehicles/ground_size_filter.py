@@ -153,7 +153,7 @@ class GroundSizeFilter:
         self._P[at, at] += (self.config.width_turned_rel * log_outline) ** 2
 
     def keep_only(self, vehicles: Iterable[int]) -> None:
-        """Forget the other vehicles; what they said of the road stays."""
+        """Forget the other vehicles; what was learned of the road from them stays."""
         wanted = set(vehicles)
         if wanted.issuperset(self._vehicles):
             return

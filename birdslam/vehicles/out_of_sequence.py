@@ -40,7 +40,7 @@ class OpenFrame:
 
 
 class OutOfSequenceTracker:
-    """open_frame(), then localise_vehicles(), once a frame; `road` is the road under the camera in the newest one."""
+    """open_frame(), then ingest_detections(), once a frame; `road` is the road under the camera in the newest one."""
 
     def __init__(self, tracker: Tracker, ground_size: GroundSizeFilter, config: OutOfSequenceConfig) -> None:
         self.tracker = tracker
@@ -64,7 +64,7 @@ class OutOfSequenceTracker:
         while (frame.ego.t_source_ns - self._open[0].ego.t_source_ns) * 1e-6 > self.config.latest_ms:
             self._settle_oldest(None)
 
-    def localise_vehicles(
+    def ingest_detections(
         self,
         detections: Detections | None,
         detected_frame: int,

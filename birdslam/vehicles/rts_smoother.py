@@ -118,7 +118,7 @@ def _resized(seen: Sequence[VehicleMeasurement]) -> tuple[Floats, Floats]:
         sight_line = centre / max(T.x_m, LEAST_DEPTH_M) * depth_m  # how the centre moves with log z
         growth = math.exp(edge.depth_per_height * (log_height - edge.log_height)) - 1.0
         R = SE2(yaw_rad=T.yaw_rad).rotation()
-        cov = R @ np.reshape(edge.cov, (3, 3))[:2, :2] @ R.T  # an edge's is told in the vehicle's axes
+        cov = R @ np.reshape(edge.cov, (3, 3))[:2, :2] @ R.T  # an edge has it in the vehicle's axes
         of_height = (edge.depth_per_height * edge.sigma_log_height) ** 2
         most = (1.0 - LEAST_OF_COV) * float(cov[0, 0]) / max(sight_line[0] ** 2, 1e-9)
         cov = cov - min(of_height, most) * np.outer(sight_line, sight_line)
