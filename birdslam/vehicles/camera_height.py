@@ -111,7 +111,7 @@ class HeightWatch:
     """judge(): the CV edges of a frame and its motion; gives CALIBRATION_DRIFT when the height is another.
 
     Least squares over the vehicles seen last. State: H (m), d_pitch, d_roll (rad). Measurements: the slope of the
-    bottom and the height of each box. Read by the front end, as a status; `estimate` is for perf and tests.
+    bottom and the height of each box. Read by the front end, as a status; `estimate` gives the height itself.
     """
 
     def __init__(self, camera: Camera, config: HeightWatchConfig, localisation: LocalisationConfig) -> None:
@@ -136,7 +136,7 @@ class HeightWatch:
         return (Status.CALIBRATION_DRIFT,) if vehicles >= cfg.min_vehicles and drifted else ()
 
     def _add(self, box: BoxHeight, motion: Motion) -> bool:
-        """Whether the box says enough to be taken."""
+        """Adds the box to the sums; False where it determines too little to be used."""
         cfg, ground = self.config, motion.ground
         slope = box.slope_bottom + ground.pitch_rad - ground.roll_rad * box.bearing
         if slope <= 0.0 or box.tan_height <= 0.0:
