@@ -32,10 +32,10 @@ from birdslam.perception.views import make_views
 from birdslam.rendered_world.truth import CLASSES as SURFACES
 from birdslam.rendered_world.truth import WorldFrame, WorldObject
 from birdslam.training.augmentation import AugmentationConfig
-from birdslam.training.examination import examine
 from birdslam.training.grading import Grades, average_precision, best_score, extents
 from birdslam.training.stream import StreamConfig, examples
 from birdslam.training.targets import COLUMN, Example, TargetsConfig, Window, encode
+from birdslam.training.validation import validate
 from birdslam.types import Status
 
 WIDTH, HEIGHT, CELL = 320, 96, 4
@@ -326,7 +326,7 @@ def test_perfect_findings_get_the_best_grades() -> None:
 
 
 @pytest.mark.parametrize("certain", [-0.45, -0.75, -1.35])
-def test_an_examination_finds_the_threshold_of_markings_that_a_network_doubts(certain: float) -> None:
+def test_validation_finds_the_threshold_of_markings_that_a_network_doubts(certain: float) -> None:
     cam = camera()
     frame = world(cam, vehicle(cam, SE2(14.0, 2.0, 0.2)))
     example = encode(frame, WHOLE, WIDTH, HEIGHT, TargetsConfig())
@@ -338,7 +338,7 @@ def test_an_examination_finds_the_threshold_of_markings_that_a_network_doubts(ce
         return said
 
     rng = np.random.default_rng(3)
-    figures = examine(answer, lambda *_: frame, (WIDTH, HEIGHT), 2, AugmentationConfig(), rng)
+    figures = validate(answer, lambda *_: frame, (WIDTH, HEIGHT), 2, AugmentationConfig(), rng)
     assert certain - 0.3 < figures["lane_logit"] < certain
     assert figures["lane_iou"] > 0.5  # by the threshold that was found
     assert (figures["frames"], figures["vehicle_ap50"]) == (2, 1.0)
@@ -480,7 +480,7 @@ def test_the_perfect_answer_costs_least() -> None:
 
     from birdslam.training.losses import LossConfig, loss
     from birdslam.training.stream import stack
-    from birdslam.training.teacher import as_batch, as_tensors
+    from birdslam.training.trainer import as_batch, as_tensors
 
     cam = camera()
     example = encode(world(cam, vehicle(cam, SE2(12.0, 1.0, 0.4))), WHOLE, WIDTH, HEIGHT, TargetsConfig())
@@ -494,15 +494,15 @@ def test_the_perfect_answer_costs_least() -> None:
 
 
 @needs_torch
-def test_a_lesson_learns() -> None:
+def test_steps_of_training_learn() -> None:
     from birdslam.training.stream import examples as stream
-    from birdslam.training.teacher import Teacher, TeacherConfig, as_tensors
+    from birdslam.training.trainer import Trainer, TrainerConfig, as_tensors
 
     config = StreamConfig(width_px=WIDTH, height_px=HEIGHT, batch=2, looks=100)
     cam = camera()
     batches = stream(2, config, lambda *_: world(cam, vehicle(cam, SE2(12.0, 1.0, 0.4))))
-    teacher = Teacher(TeacherConfig(warm_up_steps=5), half=False)
-    costs = [teacher.lesson(as_tensors(next(batches)), 0.0, step, 2e-3)["total"] for step in range(30)]
+    trainer = Trainer(TrainerConfig(warm_up_steps=5), half=False)
+    costs = [trainer.train_step(as_tensors(next(batches)), 0.0, step, 2e-3)["total"] for step in range(30)]
     assert np.mean(costs[-5:]) < 0.6 * np.mean(costs[:5])
 
 
@@ -511,11 +511,11 @@ def test_a_network_that_sees_further_begins_as_the_one_before_it() -> None:
     import torch
 
     from birdslam.training.network import NetworkConfig
-    from birdslam.training.teacher import Teacher, TeacherConfig
+    from birdslam.training.trainer import Trainer, TrainerConfig
 
     torch.manual_seed(5)
-    before = Teacher(TeacherConfig(network=NetworkConfig(context=0)), half=False)
-    after = Teacher(TeacherConfig(), half=False)
+    before = Trainer(TrainerConfig(network=NetworkConfig(context=0)), half=False)
+    after = Trainer(TrainerConfig(), half=False)
     after.begin(before.state())
     image = torch.rand(1, 3, 64, 128).numpy() * 2.0 - 1.0
     for name, answer in before.answer(image).items():
@@ -531,20 +531,20 @@ def test_a_network_that_sees_further_begins_as_the_one_before_it() -> None:
 def test_borders_are_added_to_what_a_network_said_without_them() -> None:
     import torch
 
-    from birdslam.training.teacher import Teacher, TeacherConfig
+    from birdslam.training.trainer import Trainer, TrainerConfig
 
     torch.manual_seed(6)
-    coarse, teacher = Teacher(TeacherConfig(), half=False), Teacher(TeacherConfig(), half=False)
+    coarse, trainer = Trainer(TrainerConfig(), half=False), Trainer(TrainerConfig(), half=False)
     state = coarse.state()
     for name in ("network", "average"):
         state[name] = {key: value for key, value in state[name].items() if "fine." not in key}
-    teacher.begin(state)
+    trainer.begin(state)
     image = torch.rand(1, 3, 64, 128).numpy() * 2.0 - 1.0
     for name, answer in coarse.answer(image).items():
-        np.testing.assert_allclose(teacher.answer(image)[name], answer, rtol=1.3e-6, atol=1e-5)
-    torch.nn.init.ones_(teacher.average.module.fine.say.weight)
+        np.testing.assert_allclose(trainer.answer(image)[name], answer, rtol=1.3e-6, atol=1e-5)
+    torch.nn.init.ones_(trainer.average.module.fine.say.weight)
     for name, sharpened in {"segmentation": True, "depth": True, "heat": False, "body": False}.items():
-        assert np.array_equal(teacher.answer(image)[name], coarse.answer(image)[name]) != sharpened
+        assert np.array_equal(trainer.answer(image)[name], coarse.answer(image)[name]) != sharpened
 
 
 @needs_torch
@@ -552,18 +552,18 @@ def test_of_several_networks_one_begins_with_the_mean_of_their_weights() -> None
     import torch
 
     from birdslam.training.network import NetworkConfig
-    from birdslam.training.teacher import Teacher, TeacherConfig
+    from birdslam.training.trainer import Trainer, TrainerConfig
 
     torch.manual_seed(7)
-    first, second, teacher = (Teacher(TeacherConfig(), half=False) for _ in range(3))
-    teacher.begin(first.state(), second.state())
+    first, second, trainer = (Trainer(TrainerConfig(), half=False) for _ in range(3))
+    trainer.begin(first.state(), second.state())
     for network in ("network", "average"):
-        for name, mean in teacher.state()[network].items():
+        for name, mean in trainer.state()[network].items():
             one, other = first.state()[network][name], second.state()[network][name]
             torch.testing.assert_close(mean, 0.5 * (one + other) if mean.is_floating_point() else other)
-    narrow = Teacher(TeacherConfig(network=NetworkConfig(context=0)), half=False)
+    narrow = Trainer(TrainerConfig(network=NetworkConfig(context=0)), half=False)
     with pytest.raises(ValueError, match="different networks"):
-        teacher.begin(first.state(), narrow.state())
+        trainer.begin(first.state(), narrow.state())
 
 
 @needs_torch

@@ -1,4 +1,4 @@
-"""What the multi-task network is graded by."""
+"""The loss of the multi-task network: depth, masks, heat of the classes, and the body that each cell states."""
 
 from __future__ import annotations
 
@@ -67,8 +67,9 @@ def _depth(log_depth: Tensor, batch: Batch, config: LossConfig) -> dict[str, Ten
     error = log_depth - batch.log_depth
     total = weight.sum(dim=(1, 2))
     mean = (weight * error).sum(dim=(1, 2), keepdim=True) / total[:, None, None]
-    # Where an outline leaves both depths open, the logarithm says the more likely one; the share of the truth that is
-    # missed says the nearer. Its derivative is bounded: a pole before the sky is no reason to forget the rest.
+    # On an outline, where either depth may be true, an error of the logarithm favours the more likely depth, an error
+    # relative to the truth the nearer one. The latter's derivative is bounded, so that a pole before the sky does not
+    # outweigh the rest.
     over = torch.expm1(error.clamp(0.0, _STEEP)) + math.exp(_STEEP) * (error - _STEEP).clamp(min=0.0)
     missed = over - torch.expm1(error.clamp(max=0.0))
     blame = config.relative * missed + (1.0 - config.relative) * error.abs()
@@ -81,13 +82,13 @@ def _masks(logits: Tensor, truth: Tensor, config: LossConfig) -> dict[str, Tenso
     out = {}
     for index, (name, weight) in enumerate((("road", config.road), ("lane", config.lane))):
         logit, share = logits[:, index], truth[:, index]
-        doubt = functional.binary_cross_entropy_with_logits(logit, share)
+        entropy = functional.binary_cross_entropy_with_logits(logit, share)
         # Markings are few pixels: their cross entropy is lifted to the road's order of size.
-        doubt = doubt * (1.0 if name == "road" else 5.0)
+        entropy = entropy * (1.0 if name == "road" else 5.0)
         guess = torch.sigmoid(logit)
         common = (guess * share).sum(dim=(1, 2))
         dice = 1.0 - (2.0 * common + 1.0) / (guess.square().sum(dim=(1, 2)) + share.square().sum(dim=(1, 2)) + 1.0)
-        out[name] = weight * (doubt + config.overlap * dice.mean())
+        out[name] = weight * (entropy + config.overlap * dice.mean())
     return out
 
 

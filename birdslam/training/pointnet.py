@@ -1,4 +1,4 @@
-"""Frustum-PointNet: what it is taught of the built-in world's bodies, its layers, its losses, and its ONNX file."""
+"""Frustum-PointNet: its targets from bodies of the built-in world, its layers, its losses, and its ONNX file."""
 
 from __future__ import annotations
 
@@ -152,10 +152,10 @@ def points_of(example: FrustumExample, depth_m: NDArray[np.float32], box_px: Flo
     return out
 
 
-def lesson(
+def training_pair(
     example: FrustumExample, config: DepthErrorConfig, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Features (C, P) and targets (TARGETS,) of one look at an example; None where too little is in the box."""
+    """Features (C, P) and targets (TARGETS,) of an example with drawn errors; None where too little is in the box."""
     frustum = frustum_of(points_of(example, erred(example, config, rng), box_of(example, config, rng)), POINTS)
     if frustum is None:
         return None

@@ -1,7 +1,7 @@
-"""An endless stream of examples from a seed: worlds are rendered, kept a while, and looked at more than once.
+"""An endless stream of training examples from a seed: rendered frames, each used more than once.
 
-Rendering costs more than learning from a frame at the small size. So each frame of a pool is shown several times,
-each time through another window and another camera's eyes; the pool is renewed frame by frame.
+At the small size rendering a frame costs more than a step of training on it. So each frame of a pool gives several
+examples, each from a window and with an augmentation of its own; the pool is renewed frame by frame.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from birdslam.rendered_world.truth import WorldFrame
 from birdslam.training.augmentation import AugmentationConfig, draw_window, photometric
 from birdslam.training.targets import Example, TargetsConfig, encode
 
-Render = Callable[[int, int, int], WorldFrame]  # (seed, width_px, height_px), as `simulation.world.sample`
+Render = Callable[[int, int, int], WorldFrame]  # (seed, width_px, height_px), as `rendered_world.world.sample`
 
 HELD_OUT_SEEDS = 1_000_000  # seeds below are for evaluation; training draws from here on
 
@@ -27,7 +27,7 @@ class StreamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     width_px: int = 640
     height_px: int = 192
-    looks: int = 2  # at each rendered frame, on the average
+    looks: int = 2  # examples of each rendered frame, on the average
     pool_frames: int = 500
     batch: int = 16
     targets: TargetsConfig = TargetsConfig()
@@ -63,12 +63,12 @@ def examples(seed: int, config: StreamConfig, render: Render) -> Iterator[Exampl
                     pool[int(rng.integers(len(pool)))] = frame
             else:
                 frame = pool[int(rng.integers(len(pool)))]
-            batch.append(look(frame, config, rng))
+            batch.append(draw_example(frame, config, rng))
         yield stack(batch)
 
 
-def look(frame: WorldFrame, config: StreamConfig, rng: np.random.Generator) -> Example:
-    """A frame through a drawn window and a drawn camera's eyes."""
+def draw_example(frame: WorldFrame, config: StreamConfig, rng: np.random.Generator) -> Example:
+    """A drawn window of a frame, augmented as a drawn camera would show it."""
     height_px, width_px = frame.image.shape[:2]
     window = draw_window(width_px, height_px, config.augmentation, rng)
     example = encode(frame, window, config.width_px, config.height_px, config.targets)

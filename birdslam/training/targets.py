@@ -1,4 +1,4 @@
-"""From a rendered frame with its truth to a lesson for the multi-task network: a window of it at the network's size."""
+"""From a rendered frame with its truth to an example for the multi-task network: a window of it, at its input size."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from birdslam.perception.multitask import OUTPUTS
 from birdslam.perception.views import Preparation, make_views
 from birdslam.runtime.training.train import write_network
 from birdslam.training.augmentation import AugmentationConfig, photometric
-from birdslam.training.examination import STRANGE_SEEDS
+from birdslam.training.validation import VALIDATION_SEEDS
 
 
 class Frames(CalibrationDataReader):
@@ -35,7 +35,7 @@ class Frames(CalibrationDataReader):
 
     def __init__(self, size: Input, count: int) -> None:
         self._size, self._preparation = size, Preparation(size)
-        self._seeds = iter(range(STRANGE_SEEDS, STRANGE_SEEDS + count))
+        self._seeds = iter(range(VALIDATION_SEEDS, VALIDATION_SEEDS + count))
 
     def get_next(self) -> dict[str, NDArray[np.float32]] | None:
         """The next input; None at the end."""

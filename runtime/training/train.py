@@ -1,4 +1,4 @@
-"""`make train`: the shipped network from a seed. Workers render worlds, the teacher learns, its curves stay.
+"""`make train`: the shipped network from a seed, on worlds that workers render; its curves are kept.
 
     python -m birdslam.runtime.training.train --output out/train [--config FILE.toml] [--start CHECKPOINT...]
 
@@ -27,10 +27,10 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from birdslam.perception.manifest import MultiTask
 from birdslam.rendered_world.truth import WorldFrame
-from birdslam.training.examination import examine
 from birdslam.training.export import manifest, to_onnx
 from birdslam.training.stream import StreamConfig, examples
-from birdslam.training.teacher import Teacher, TeacherConfig, as_tensors
+from birdslam.training.trainer import Trainer, TrainerConfig, as_tensors
+from birdslam.training.validation import validate
 
 NAME = "multitask"
 ABSREL_TO_SIGMA = (0.5 * np.pi) ** 0.5  # of a normal distribution: its sigma over its mean absolute error
@@ -56,7 +56,7 @@ class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         Stage(width_px=640, height_px=192, batch=6, steps=12000, rate=1.2e-3, looks=3),
     )
     stream: StreamConfig = StreamConfig()
-    teacher: TeacherConfig = TeacherConfig()
+    trainer: TrainerConfig = TrainerConfig()
     processes: int = 3  # learn side by side, each on batches of its own: better than threads of one
     workers: int = 1  # of a process, which render; 0: it renders for itself
     threads: int = 1
@@ -102,6 +102,9 @@ def _one_thread(_: int) -> None:
     cv2.setNumThreads(1)
 
 
+_WEIGHTS = "teacher"  # the key of the trainer's state in a checkpoint; it stays, so that older ones can be read
+
+
 class Training:
     """One run in one folder."""
 
@@ -111,15 +114,15 @@ class Training:
         torch.set_num_threads(config.threads)
         cv2.setNumThreads(config.threads)
         half = torch.ops.mkldnn._is_mkldnn_bf16_supported() if config.half is None else config.half
-        self.teacher = Teacher(config.teacher, bool(half))
+        self.trainer = Trainer(config.trainer, bool(half))
         self.stage, self.step = 0, 0
         checkpoint = output / "checkpoint.pt"
         if checkpoint.exists():
             state = torch.load(checkpoint, weights_only=True)
-            self.teacher.load(state["teacher"])
+            self.trainer.load(state[_WEIGHTS])
             self.stage, self.step = state["stage"], state["step"]
         elif start:
-            self.teacher.begin(*(torch.load(path, weights_only=True)["teacher"] for path in start))
+            self.trainer.begin(*(torch.load(path, weights_only=True)[_WEIGHTS] for path in start))
 
     def run(self) -> None:
         """The stages that are left, each from the step that is left."""
@@ -127,7 +130,7 @@ class Training:
             self._learn(self.config.stages[self.stage], self.stage)
             if self.stage + 1 < len(self.config.stages):
                 stage, following = self.config.stages[self.stage : self.stage + 2]
-                self.teacher.enlarge(following.width_px / stage.width_px)
+                self.trainer.enlarge(following.width_px / stage.width_px)
             self.stage, self.step = self.stage + 1, 0
             self._save()
         if self.rank == 0:
@@ -156,7 +159,7 @@ class Training:
             batch = next(batches)
             waited_s += time.monotonic() - asked_s
             share = _share if self.config.processes > 1 else None
-            parts = self.teacher.lesson(batch, self.step / stage.steps, self.step, stage.rate, share)
+            parts = self.trainer.train_step(batch, self.step / stage.steps, self.step, stage.rate, share)
             for name, value in parts.items():
                 sums[name] = sums.get(name, 0.0) + value / self.config.row_steps
             self.step += 1
@@ -178,7 +181,7 @@ class Training:
         """A checkpoint, whole or not at all."""
         if self.rank > 0:
             return
-        state = {"teacher": self.teacher.state(), "stage": self.stage, "step": self.step}
+        state = {_WEIGHTS: self.trainer.state(), "stage": self.stage, "step": self.step}
         partial = self.output / "checkpoint.part"
         torch.save(state, partial)
         partial.replace(self.output / "checkpoint.pt")
@@ -187,14 +190,14 @@ class Training:
         """The figures of the average network on held-out worlds, and its thresholds; into grades.csv too."""
         size_px = (stage.width_px, stage.height_px)
         rng = np.random.default_rng([self.config.seed, number])
-        figures = examine(self.teacher.answer, _render, size_px, frames, self.config.stream.augmentation, rng)
+        figures = validate(self.trainer.answer, _render, size_px, frames, self.config.stream.augmentation, rng)
         _append(self.output / "grades.csv", {"stage": number, "step": self.step, **figures})
         print("  ".join(f"{name} {value:.3f}" for name, value in figures.items()), flush=True)
         return figures
 
     def _export(self, figures: Mapping[str, float]) -> None:
         """The average network as ONNX with a manifest that states its figures, whole or not at all."""
-        network = self.teacher.average.module
+        network = self.trainer.average.module
         size_px = (self.config.stages[-1].width_px, self.config.stages[-1].height_px)
         content = to_onnx(network, *size_px)
         score = figures["vehicle_score"] if np.isfinite(figures["vehicle_score"]) else MultiTask().score_threshold

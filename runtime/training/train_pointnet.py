@@ -29,10 +29,10 @@ from birdslam.training.pointnet import (
     FrustumExample,
     PointNet,
     frusta_of,
-    lesson,
     loss,
     manifest,
     to_onnx,
+    training_pair,
 )
 
 NAME = "pointnet"
@@ -65,13 +65,13 @@ def rendered(first_seed: int, frames: int, processes: int) -> list[FrustumExampl
     return out
 
 
-def lessons(
+def batches(
     examples: Sequence[FrustumExample], rng: np.random.Generator, points: int
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Every example once, in an order of chance, each with errors and a choice of its points of its own; in batches."""
     config, features, targets = DepthErrorConfig(), [], []
     for index in rng.permutation(len(examples)):
-        one = lesson(examples[index], config, rng)
+        one = training_pair(examples[index], config, rng)
         if one is not None:
             features.append(one[0] if points == POINTS.count else one[0][:, rng.permutation(POINTS.count)[:points]])
             targets.append(one[1])
@@ -96,7 +96,7 @@ def learn(
         rows = csv.writer(file)
         for epoch in range(epochs):
             network.train()
-            for features, targets in lessons(examples, rng, FEW_POINTS if epoch < epochs - 2 else POINTS.count):
+            for features, targets in batches(examples, rng, FEW_POINTS if epoch < epochs - 2 else POINTS.count):
                 optimiser.zero_grad()
                 with torch.autocast("cpu", torch.bfloat16, enabled=half):
                     out = network(features)
@@ -121,7 +121,7 @@ def graded(network: PointNet, held_out: Sequence[FrustumExample]) -> dict[str, f
     sums: dict[str, float] = {}
     count = 0
     with torch.no_grad():
-        for features, targets in lessons(held_out, np.random.default_rng(0), POINTS.count):
+        for features, targets in batches(held_out, np.random.default_rng(0), POINTS.count):
             for name, value in loss(network(features), targets).items():
                 sums[name] = sums.get(name, 0.0) + float(value)
             count += 1

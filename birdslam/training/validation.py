@@ -1,4 +1,4 @@
-"""An examination at the end of term: a network's figures on held-out worlds, and the thresholds to read it by."""
+"""Validation of the multi-task network: its figures on held-out worlds, and the thresholds to read it by."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Tensors = Mapping[str, NDArray[np.float32]]
 Answer = Callable[[NDArray[np.float32]], Tensors]  # (1, 3, H, W) in [-1, 1] -> the network's outputs by name
 
 LANE_LOGITS = (-1.5, -1.2, -0.9, -0.6, -0.3, 0.0)  # of a marking; the best is shipped
-LOW_SCORE = 0.05  # nearly every box: the figures choose
-STRANGE_SEEDS = HELD_OUT_SEEDS // 2  # of worlds for thresholds and int8's ranges: not learnt from, not in the figures
+LOW_SCORE = 0.05  # keeps nearly every box: the threshold is chosen from the figures
+VALIDATION_SEEDS = HELD_OUT_SEEDS // 2  # worlds that fix thresholds and int8's ranges; in neither training nor figures
 
 
-def examine(
+def validate(
     answer: Answer,
     render: Render,
     size_px: tuple[int, int],
@@ -32,8 +32,8 @@ def examine(
 ) -> dict[str, float]:
     """The figures of a multi-task network at (width, height) on `frames` held-out worlds; see `Grades.figures`.
 
-    `lane_logit` and `vehicle_score` are the thresholds by which markings and vehicles are found best on other worlds
-    through other eyes: a real camera is as strange to the network as those are, and its scores are as low.
+    `lane_logit` and `vehicle_score` are the thresholds that find markings and vehicles best on other worlds, with their
+    images augmented: that lowers the network's scores as a real camera does.
     """
     width_px, height_px = size_px
     size = Input(
@@ -53,20 +53,20 @@ def examine(
         preparation.fill(image, view)
         return answer(preparation.tensor)
 
-    strained = {logit: Grades() for logit in LANE_LOGITS}
-    for seed in range(STRANGE_SEEDS, STRANGE_SEEDS + frames):
+    augmented = {logit: Grades() for logit in LANE_LOGITS}
+    for seed in range(VALIDATION_SEEDS, VALIDATION_SEEDS + frames):
         frame = render(seed, width_px, height_px)
         tensors = ask(photometric(frame.image, augmentation, rng))
-        for logit, grades in strained.items():
+        for logit, grades in augmented.items():
             grades.add(_decoder(size, tensors, logit).read(tensors, view), frame)
-    under_strain = {logit: grades.figures() for logit, grades in strained.items()}
-    lane_logit = max(LANE_LOGITS, key=lambda logit: np.nan_to_num(under_strain[logit]["lane_iou"]))
+    figures = {logit: grades.figures() for logit, grades in augmented.items()}
+    lane_logit = max(LANE_LOGITS, key=lambda logit: np.nan_to_num(figures[logit]["lane_iou"]))
     grades = Grades()
     for seed in range(frames):
         frame = render(seed, width_px, height_px)
         tensors = ask(frame.image)
         grades.add(_decoder(size, tensors, lane_logit).read(tensors, view), frame)
-    score = under_strain[lane_logit]["vehicle_score"]
+    score = figures[lane_logit]["vehicle_score"]
     return {**grades.figures(), "vehicle_score": score, "lane_logit": lane_logit}
 
 

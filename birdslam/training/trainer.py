@@ -1,4 +1,4 @@
-"""One lesson after the other: the network, its optimiser, its moving average, and what they need to go on later."""
+"""Steps of training of the multi-task network, its optimiser and its moving average; their state can be stored."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from birdslam.training.network import MultiTask, NetworkConfig
 from birdslam.training.stream import Examples
 
 
-class TeacherConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the weights move."""
+class TrainerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The optimiser's numbers."""
 
     network: NetworkConfig = NetworkConfig()
     loss: LossConfig = LossConfig()
@@ -32,10 +32,10 @@ class TeacherConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     average: float = 0.998  # of the old weights, at each step
 
 
-class Teacher:
+class Trainer:
     """Holds the network in training and its average, which is what is exported."""
 
-    def __init__(self, config: TeacherConfig, half: bool) -> None:
+    def __init__(self, config: TrainerConfig, half: bool) -> None:
         """`half`: compute in bfloat16 where that is safe."""
         self.config = config
         self.half = half
@@ -47,7 +47,7 @@ class Teacher:
             [{"params": decayed, "weight_decay": config.weight_decay}, {"params": free, "weight_decay": 0.0}], lr=1e-3
         )
 
-    def lesson(
+    def train_step(
         self,
         examples: tuple[Tensor, ...],
         progress: float,
@@ -57,7 +57,7 @@ class Teacher:
     ) -> dict[str, float]:
         """One step on a batch; `progress` through the stage in [0, 1], `rate` its learning rate. Returns the parts.
 
-        `share` makes the gradients those of several teachers that learn side by side.
+        `share` averages the gradients of several trainers that run side by side.
         """
         cosine = 0.5 * (1.0 + math.cos(math.pi * min(progress, 1.0)))
         warm = min(1.0, (step + 1) / self.config.warm_up_steps)
@@ -114,9 +114,9 @@ class Teacher:
             if any(other.keys() != weights[0].keys() for other in weights):
                 raise ValueError("checkpoints of different networks have no mean")
             mean = {key: _mean([other[key] for other in weights]) for key in weights[0]}
-            strange = getattr(self, name).load_state_dict(mean, strict=False).unexpected_keys
-            if strange:
-                raise ValueError(f"weights of another network: {', '.join(strange[:3])}")
+            unexpected = getattr(self, name).load_state_dict(mean, strict=False).unexpected_keys
+            if unexpected:
+                raise ValueError(f"weights of another network: {', '.join(unexpected[:3])}")
 
     @torch.no_grad()
     def answer(self, image: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
