@@ -19,7 +19,7 @@ SETTINGS = {
     "all edges": (GraphConfig(max_vehicles=3), WeightsConfig(leave_out=())),
     "paper": (GraphConfig(ego_nodes=1, constant_velocity=False), WeightsConfig(mode="paper")),
 }
-WORLDS = [drive(DriveConfig(frames=120, vehicles=5, wild=0.05, drop=0.1), seed).measurements for seed in range(3)]
+WORLDS = [drive(DriveConfig(frames=120, vehicles=5, outliers=0.05, drop=0.1), seed).measurements for seed in range(3)]
 
 
 def goes_on(graph: PoseGraph, log: list[Measurements]) -> bytes:

@@ -188,7 +188,7 @@ def assert_graph_is_honest(model: str, world: DriveConfig, seeds: int) -> None:
 @pytest.mark.parametrize("model", ["Eq. 6", "constant velocity"])
 def test_covariances_are_honest(model: str, wild: float) -> None:
     """The mean NEES of 100 seeded drives, also with outliers in."""
-    world = DriveConfig(frames=40, vehicles=2, landmarks=8, lane_points=0, wild=wild)
+    world = DriveConfig(frames=40, vehicles=2, landmarks=8, lane_points=0, outliers=wild)
     assert_graph_is_honest(model, world, seeds=100)
 
 
@@ -200,7 +200,7 @@ def test_covariances_of_the_live_graph_are_honest_over_longer_drives(
     frames: int, sigma_cv_rad: float, wild: float
 ) -> None:
     """300 seeded drives: bounds nearly twice as narrow, and a vehicle's yaw that is vague when it is first seen."""
-    world = DriveConfig(frames=frames, vehicles=2, landmarks=8, lane_points=0, wild=wild, sigma_cv_rad=sigma_cv_rad)
+    world = DriveConfig(frames=frames, vehicles=2, landmarks=8, lane_points=0, outliers=wild, sigma_cv_rad=sigma_cv_rad)
     assert_graph_is_honest("constant velocity", world, seeds=300)
 
 

@@ -376,7 +376,7 @@ def test_landmarks_never_make_the_ego_worse_than_cc_alone(common_error: bool) ->
     rng = np.random.default_rng(0)
     with_cp, without = [], []
     for seed in range(12):
-        world = drive(DriveConfig(frames=200, vehicles=0, sigma_cc_m=0.02, wild=0.05), seed)
+        world = drive(DriveConfig(frames=200, vehicles=0, sigma_cc_m=0.02, outliers=0.05), seed)
         world = with_common_error(world, rng) if common_error else world
         with_cp.append(ego_ate(world, WeightsConfig()))
         without.append(ego_ate(world, WeightsConfig(leave_out=("cp",))))
@@ -428,7 +428,7 @@ def test_lane_points_keep_their_lanes() -> None:
 
 
 def test_three_thousand_frames_grow_nothing() -> None:
-    world = drive(DriveConfig(frames=3000, vehicles=4, landmarks=6, wild=0.02, drop=0.02), seed=10)
+    world = drive(DriveConfig(frames=3000, vehicles=4, landmarks=6, outliers=0.02, drop=0.02), seed=10)
     config = GraphConfig(max_pending_landmarks=200, max_pending_frames=100)
     graph = PoseGraph(config, WeightsConfig())
     rows, landmarks = [], []
@@ -459,13 +459,13 @@ from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.graph.weights import WeightsConfig
 graph = PoseGraph(GraphConfig(), WeightsConfig(leave_out=()))
-world = drive(DriveConfig(frames=150, wild=0.05, drop=0.1), seed=17)
+world = drive(DriveConfig(frames=150, outliers=0.05, drop=0.1), seed=17)
 print(hashlib.sha256(b"".join(msgspec.msgpack.encode(graph.optimise(m)) for m in world.measurements)).hexdigest())
 """
 
 
 def test_the_same_log_gives_the_same_bytes_in_every_process() -> None:
-    world = drive(DriveConfig(frames=150, wild=0.05, drop=0.1), seed=17)
+    world = drive(DriveConfig(frames=150, outliers=0.05, drop=0.1), seed=17)
     log = [msgspec.msgpack.decode(msgspec.msgpack.encode(m), type=Measurements) for m in world.measurements]
     mine = b"".join(map(msgspec.msgpack.encode, run(log, GraphConfig())))
     other = subprocess.run([sys.executable, "-c", REPLAY], capture_output=True, text=True, check=True, timeout=120)
@@ -482,7 +482,7 @@ def test_the_same_log_gives_the_same_bytes_in_every_process() -> None:
         landmarks=st.integers(0, 6),
         speed_mps=st.floats(0.0, 30.0),
         noise=st.floats(0.0, 3.0),
-        wild=st.floats(0.0, 1.0),
+        outliers=st.floats(0.0, 1.0),
         drop=st.floats(0.0, 0.9),
         sigma_cc_m=st.sampled_from([0.0, 1e-6, 0.01, 1.0]),
         sigma_cc_rad=st.sampled_from([0.0, 1e-6, 0.01, 1.0]),

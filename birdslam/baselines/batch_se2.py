@@ -1,7 +1,7 @@
 """The batch that sees the same edges: Eq. 8 in SE(2) over all frames of a log at once, by gtsam.
 
 It is what the incremental graph is held to: the same CC, CV and VV edges with the same covariances, the same
-constant-velocity factor where the graph has one, CP edges with a node for each landmark. It has no gate: a wild edge
+constant-velocity factor where the graph has one, CP edges with a node for each landmark. It has no gate: an outlier
 counts like any other. Nothing is marginalised and every edge is linearised at the optimum, future frames included.
 """
 

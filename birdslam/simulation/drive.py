@@ -43,7 +43,7 @@ class DriveConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_vv_rad: NotNegative = 0.01
     sigma_cp_m: NotNegative = 0.05
     noise: NotNegative = 1.0  # 0: edges are exact, their covariances as stated
-    wild: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0  # share of CV and CP edges that are nonsense
+    outliers: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0  # share of CV and CP edges that are outliers
     drop: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0  # share of frames that never come
     range_m: NotNegative = 60.0
     # "convoy": everyone stays in sight; "drawn": twists are drawn, as the graph's constant-velocity factor has it
@@ -209,7 +209,7 @@ class _Camera:
         T = SE2(float(x), float(y), yaw)
         turn[:2, :2] = SE2(yaw_rad=float(sight) - yaw).rotation()
         cov = turn @ np.diag(sigmas**2) @ turn.T
-        if rng.uniform() < config.wild:
+        if rng.uniform() < config.outliers:
             T = SE2(T.x_m + rng.uniform(8.0, 30.0), T.y_m + rng.uniform(-10.0, 10.0), T.yaw_rad)
         numbers = tuple((0.5 * (cov + cov.T)).ravel().tolist())
         return VehicleEdge(vehicle=vehicle, frame=frame, T_ego_vehicle=T, cov=numbers)
@@ -229,8 +229,8 @@ class _Camera:
             if x < 4.0:
                 del self._landmarks[landmark]
                 continue
-            wild = rng.uniform(2.0, 8.0) if rng.uniform() < config.wild else 0.0
-            x, y = np.array([x, y]) + config.noise * config.sigma_cp_m * rng.standard_normal(2) + wild
+            outlier_m = rng.uniform(2.0, 8.0) if rng.uniform() < config.outliers else 0.0
+            x, y = np.array([x, y]) + config.noise * config.sigma_cp_m * rng.standard_normal(2) + outlier_m
             out.append(
                 LandmarkEdge(
                     landmark=landmark, frame=frame, x_m=float(x), y_m=float(y), cov=(variance, 0.0, 0.0, variance)

@@ -1,8 +1,8 @@
 """Ego-motion without images: true camera poses, erring as our own image odometry errs on real clips.
 
-It takes the place of `odometry.Odometry` in the front end. Errors have a white part, new in every frame, and a slow
-part that lasts (AR(1)): a scale that is 3 % short stays so for a while. The numbers of `OdometryNoise` are fitted to
-KITTI odometry 00 and 06 and to a raw clip by `python -m perf odometry_noise`, which prints them anew.
+It takes the place of `birdslam.odometry.odometry.Odometry` in the front end. Errors have a white part, new in every
+frame, and a slow part that lasts (AR(1)): a scale that is 3 % short stays so for a while. The numbers of
+`OdometryNoise` are fitted to KITTI odometry 00 and 06 and to a raw clip (`python -m perf odometry_noise`).
 
 The ground under the camera is not simulated: no pose says how the camera leans over the road. It is reported as
 calibrated, so that vehicles get no help from it, and landmarks are seen over the ground that the front end came to
@@ -124,11 +124,11 @@ class SimulatedOdometry:
 
     @property
     def road_tracks(self) -> tuple[NDArray[np.int64], Floats]:
-        """None: there is no image to follow corners in. `landmarks` gives what became of them."""
+        """Empty: no corners are followed without images. `landmarks` gives the CP edges instead."""
         return np.zeros(0, np.int64), np.zeros((0, 2))
 
     def track(self, image: NDArray[np.uint8]) -> None:
-        """Nothing: there is no image to look at."""
+        """Does nothing: no image is needed."""
 
     def estimate(
         self,
