@@ -23,10 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.types import Attitude
+from birdslam.types import NS_PER_S, Attitude
 
 Pose = NDArray[np.float64]  # (4, 4) homogeneous, metres
-NS_PER_S = 1_000_000_000
 
 
 def ego_pose(T_world_ego: SE2, attitude: Attitude) -> Pose:

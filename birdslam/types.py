@@ -39,6 +39,7 @@ Cov3 = Annotated[tuple[float, ...], msgspec.Meta(min_length=9, max_length=9)]
 Cov2 = Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)]
 FrameId = Annotated[int, msgspec.Meta(ge=0)]
 BodyId = Annotated[int, msgspec.Meta(ge=0)]
+NS_PER_S = 1_000_000_000
 
 
 def check_finite(record: msgspec.Struct, *fields: str) -> None:

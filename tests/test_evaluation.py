@@ -23,7 +23,7 @@ from birdslam.evaluation.odometry import (
     ate_aligned_m,
     ate_m,
     compare,
-    evaluate_odometry,
+    evaluate_recordings,
     from_first,
     in_camera0,
     path_length_m,
@@ -264,7 +264,7 @@ def test_evaluate_writes_results_and_report(tmp_path: Path) -> None:
         Drive("01", truth, 40),
         Drive("02", None, 40),
     ]
-    report = evaluate_odometry(recordings, lambda recording: perfect(estimates[recording.name]), tmp_path, {"a": 1})
+    report = evaluate_recordings(recordings, lambda recording: perfect(estimates[recording.name]), tmp_path, {"a": 1})
     assert report[0].ate_m == pytest.approx(0.0, abs=1e-6)
     assert report[0].rpe_r_deg == pytest.approx(0.0, abs=1e-5)
     assert report[1].scale_error == pytest.approx(0.02, abs=1e-6)
@@ -288,7 +288,7 @@ def test_evaluate_writes_results_and_report(tmp_path: Path) -> None:
 def test_evaluate_twice_gives_the_same_bytes(tmp_path: Path) -> None:
     truth = drive(5)
     for name in ("a", "b"):
-        evaluate_odometry([Drive("00", truth, 40)], lambda _: perfect(shaken(truth, 2)), tmp_path / name)
+        evaluate_recordings([Drive("00", truth, 40)], lambda _: perfect(shaken(truth, 2)), tmp_path / name)
     files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
     assert len(files) == 6
     for path in files:
@@ -300,16 +300,16 @@ def test_evaluate_refuses_before_it_runs(tmp_path: Path) -> None:
         raise AssertionError(recording.name)
 
     with pytest.raises(ValueError, match="two recordings of the name 00"):
-        evaluate_odometry([Drive("00", None, 1), Drive("00", None, 1)], never, tmp_path)
+        evaluate_recordings([Drive("00", None, 1), Drive("00", None, 1)], never, tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(ResultsError, match="is a file"):
-        evaluate_odometry([Drive("00", None, 1)], never, tmp_path / "file")
+        evaluate_recordings([Drive("00", None, 1)], never, tmp_path / "file")
 
 
 def test_a_run_that_lost_a_frame_is_an_error(tmp_path: Path) -> None:
     truth = drive(3)
     with pytest.raises(ValueError, match="sequence 00: 39 poses estimated for 40 frames"):
-        evaluate_odometry([Drive("00", truth, 40)], lambda _: perfect(truth[:39]), tmp_path)
+        evaluate_recordings([Drive("00", truth, 40)], lambda _: perfect(truth[:39]), tmp_path)
 
 
 def box_and_returns(distance_m: float, rng: np.random.Generator) -> tuple[tuple[float, ...], np.ndarray]:
@@ -386,7 +386,7 @@ def test_car_ahead_on_a_clip(tmp_path: Path) -> None:
             yield estimate(frame.index, SE2(), vehicles=vehicles, attitude=Attitude(), ground=ground)
 
     recording = open_recording(f"kitti:{tmp_path}")
-    (row,) = evaluate_odometry([recording], run, tmp_path / "out")
+    (row,) = evaluate_recordings([recording], run, tmp_path / "out")
     assert row.car_ahead is not None
     assert row.car_ahead.frames == 3
     assert row.car_ahead.error_median_rel == pytest.approx(0.05, abs=0.012)

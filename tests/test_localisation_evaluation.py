@@ -13,9 +13,9 @@ from birdslam.evaluation.localisation import (
     PAPER,
     CarError,
     LocalisationRow,
-    compare,
-    drive,
-    report,
+    match_cars,
+    measure,
+    summarise_ranges,
 )
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
@@ -51,14 +51,16 @@ def world(frames: int) -> tuple[TrackingSequence, list[Detections]]:
 
 def depth_error(errors: list[CarError], span: str) -> float:
     """The median of a range over all sequences."""
-    (row,) = [row for row in report(errors) if row.sequence == "all" and row.range == span]
+    (row,) = [row for row in summarise_ranges(errors) if row.sequence == "all" and row.range == span]
     assert row.depth_error_median_rel is not None
     return row.depth_error_median_rel
 
 
 def test_untruncated_cars_are_compared_and_a_tilted_road_is_found_out() -> None:
     sequence, detections = world(12)
-    errors, paper = (compare(sequence, drive(sequence, detections, config)) for config in (FrontEndConfig(), PAPER))
+    errors, paper = (
+        match_cars(sequence, measure(sequence, detections, config)) for config in (FrontEndConfig(), PAPER)
+    )
     assert {error.label for error in errors} == {1, 2}  # the first is truncated
     assert {error.frame for error in errors} == set(range(2, 12))  # a track is confirmed in its third frame
     assert depth_error(errors, "15-30") < 0.05
@@ -73,7 +75,7 @@ def test_rows_are_medians_by_range_and_shares_inside_the_right_ellipses() -> Non
     z = rng.standard_normal((20000, 2))
     errors = [CarError("a", k, 0, 20.0, e, float(e @ e), 0.0) for k, e in enumerate(z)]
     errors.append(CarError("b", 0, 0, 45.0, np.array([-4.5, 0.2]), 9.0, math.pi))
-    rows = {(row.sequence, row.range): row for row in report(errors)}
+    rows = {(row.sequence, row.range): row for row in summarise_ranges(errors)}
     assert list(rows) == [(s, r) for s in ("a", "b", "all") for r in ("0-15", "15-30", "30-50")]
     assert rows["a", "0-15"] == LocalisationRow(sequence="a", range="0-15", n=0)
     gauss = rows["a", "15-30"]
@@ -94,6 +96,6 @@ def test_real_boxes_of_cars_beat_the_level_ground(data_dir: Path) -> None:
     root = data_dir / "kitti_tracking" / "training"
     sequence = open_tracking(root, "0003")
     detections = read_detections(root / "det_02_rrc", "0003", len(sequence))
-    ours, paper = (compare(sequence, drive(sequence, detections, config)) for config in (FrontEndConfig(), PAPER))
+    ours, paper = (match_cars(sequence, measure(sequence, detections, config)) for config in (FrontEndConfig(), PAPER))
     for span in ("15-30", "30-50"):
         assert depth_error(ours, span) < min(0.08, 0.5 * depth_error(paper, span))

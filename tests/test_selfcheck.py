@@ -14,7 +14,7 @@ import pytest
 
 from birdslam.datasets.kitti_tracking import open_tracking, read_detections
 from birdslam.datasets.opening import open_recording
-from birdslam.evaluation.localisation import drive as drive_boxes
+from birdslam.evaluation.localisation import measure
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import rotation_exp
@@ -280,5 +280,5 @@ def test_real_boxes_before_a_camera_that_stands_as_stated_raise_no_alarm(data_di
     root = data_dir / "kitti_tracking" / "training"
     sequence = open_tracking(root, "0004")
     detections = read_detections(root / "det_02_rrc", "0004", len(sequence))
-    told = [m for m in drive_boxes(sequence, detections, FrontEndConfig()) if Status.CALIBRATION_DRIFT in m.status]
+    told = [m for m in measure(sequence, detections, FrontEndConfig()) if Status.CALIBRATION_DRIFT in m.status]
     assert not told

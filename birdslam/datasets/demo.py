@@ -20,14 +20,13 @@ from birdslam.datasets.camera_file import load_camera
 from birdslam.datasets.recording import DatasetError, RecordedFrame, Recording
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.types import Ground
+from birdslam.types import NS_PER_S, Ground
 
 Floats = NDArray[np.float64]
 
 DIRECTORY = Path(__file__).parent / "shipped_drive"
 NAME = "demo"
 LABELS = ("car", "van", "truck", "bus", "cyclist", "pedestrian")
-NS_PER_S = 1e9
 # Columns of the file's `bodies`, one row for each body in the image of each frame
 COLUMNS = ("frame", "body", "label", "x_m", "y_m", "yaw_rad", "length_m", "width_m", "height_m", "vx_mps", "vy_mps",
            "visible", "truncated", "x1_px", "y1_px", "x2_px", "y2_px")  # fmt: skip

@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 
 from birdslam.datasets.recording import DatasetError, RecordedFrame, Recording
 from birdslam.geometry.camera import Camera
-from birdslam.trajectory import NS_PER_S, read_kitti
+from birdslam.trajectory import read_kitti
+from birdslam.types import NS_PER_S
 
 KITTI_HEIGHT_M = 1.65  # of every KITTI camera over the road (Geiger et al. 2013); no calibration file says it
 KITTI_RATE_HZ = 10.0

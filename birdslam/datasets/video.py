@@ -10,7 +10,7 @@ import cv2
 
 from birdslam.datasets.recording import DatasetError, RecordedFrame, Recording
 from birdslam.geometry.camera import Camera
-from birdslam.trajectory import NS_PER_S
+from birdslam.types import NS_PER_S
 
 
 class VideoRecording(Recording):

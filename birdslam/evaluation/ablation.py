@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from msgspec.structs import replace as restruct
+import msgspec
 
 from birdslam.baselines import batch_se3
 from birdslam.baselines.trajectories import Trajectories
@@ -19,12 +19,12 @@ from birdslam.geometry.camera import Camera
 from birdslam.graph.weights import EdgeType
 from birdslam.types import Measurements
 
-NO_WEIGHT = 1e-3  # an edge whose variance is past any reason would be taken for a broken one
+NO_WEIGHT = 1e-3  # not 0: the graph refuses edges of an absurd variance as malformed
 CP_WEIGHTS = MappingProxyType({"cp_low": 0.01, "cp_medium": 1.0, "cp_high": 100.0})  # against CC's own
 DEPTHS_M = MappingProxyType(
     {"depth_12": 12.0, "depth_15": 15.0, "depth_18": 18.0, "depth_20": 20.0, "depth_none": None}
 )
-FARTHEST_LANDMARK_M = 200.0  # the front end's own limit must not stand in for the threshold
+FARTHEST_LANDMARK_M = 200.0  # beyond any threshold, so that the front end's own limit does not hide it
 
 
 def constraint_variants(base: Live) -> dict[str, Live]:
@@ -32,7 +32,7 @@ def constraint_variants(base: Live) -> dict[str, Live]:
     return {
         "without_cc": _leave_out(base, "cc"),
         "without_cv": _without_cv(base),
-        "without_vv": replace(_leave_out(base, "vv"), graph=restruct(base.graph, constant_velocity=False)),
+        "without_vv": _without_vv(base),
         "without_cp": _leave_out(base, "cp"),
         "all": base,
     }
@@ -43,11 +43,11 @@ def landmark_variants(base: Live) -> dict[str, Live]:
     out = {}
     for name, factor in CP_WEIGHTS.items():
         if base.weights.mode == "paper":
-            out[name] = replace(base, weights=restruct(base.weights, cp=factor * base.weights.cc))
+            out[name] = _reweighted(base, cp=factor * base.weights.cc)
         else:
             out[name] = replace(base, cp_inflation=1.0 / factor)
     for name, depth_m in DEPTHS_M.items():
-        out[name] = replace(base, weights=restruct(base.weights, depth_threshold_m=depth_m))
+        out[name] = _reweighted(base, depth_threshold_m=depth_m)
     return out
 
 
@@ -66,10 +66,20 @@ class _Batch:
 
 
 def _leave_out(base: Live, edge: EdgeType) -> Live:
-    return replace(base, weights=restruct(base.weights, leave_out=tuple({*base.weights.left_out, edge})))
+    return _reweighted(base, leave_out=tuple({*base.weights.left_out, edge}))
+
+
+def _without_vv(base: Live) -> Live:
+    """Neither VV edges nor what stands in for them in our graph."""
+    base = _leave_out(base, "vv")
+    return replace(base, graph=msgspec.structs.replace(base.graph, constant_velocity=False))
 
 
 def _without_cv(base: Live) -> Live:
     if base.weights.mode == "paper":
-        return replace(base, weights=restruct(base.weights, cv_near=NO_WEIGHT, cv_far=NO_WEIGHT))
+        return _reweighted(base, cv_near=NO_WEIGHT, cv_far=NO_WEIGHT)
     return replace(base, cv_inflation=1.0 / NO_WEIGHT)
+
+
+def _reweighted(base: Live, **weights: object) -> Live:
+    return replace(base, weights=msgspec.structs.replace(base.weights, **weights))

@@ -1,4 +1,4 @@
-"""The distance to the car ahead against LiDAR: the one vehicle that a planner must never get wrong.
+"""The distance to the car ahead, which matters most to a planner, against LiDAR.
 
 LiDAR returns stand beside the images as `lidar_cam0/NNNNNN.npy`, (N, 3) metres in the axes of camera 0.
 """
@@ -17,8 +17,8 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.trajectory import inverse
 from birdslam.types import Estimate, Ground, Measurements, VehicleEdge, VehicleEstimate
 
-SIDE_FRACTION, TOP_FRACTION = 0.15, 0.1  # of the box, cut off: beside a car and over its roof one sees past it
-ROAD_CLEARANCE_M, OVERHEAD_M = 0.25, 3.0  # returns outside are of the road or of what hangs over it
+SIDE_FRACTION, TOP_FRACTION = 0.15, 0.1  # of the box, cut off: there it shows what is behind the car
+ROAD_CLEARANCE_M, OVERHEAD_M = 0.25, 3.0  # over the road; lower returns are the road, higher ones hang over it
 NEAR_FACE_PERCENTILE = 10.0  # a few returns in front of the face are of something else
 FEWEST_RETURNS = 20
 

@@ -1,7 +1,7 @@
-"""Whether the ego's covariance is honest: its error over what was stated of it (NEES, Bar-Shalom et al. 2001, 5.4).
+"""Whether the ego's covariance is consistent with its errors (NEES, Bar-Shalom et al. 2001, 5.4).
 
 One drive is one sample, however many frames it has: the errors of neighbouring frames are nearly the same error. So a
-drive's figure may well be 0.2 or 3 by chance; what tells is many drives.
+drive's figure may well be 0.2 or 3 by chance; only the mean of many drives says whether the covariance is right.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from birdslam.trajectory import Pose, ego_pose, inverse, mount_pose, split_pose
 from birdslam.types import Estimate, Status
 
 DIMENSIONS = 3
-INSIDE_95 = 7.815  # chi-square of three degrees of freedom: 95 % of honest errors lie below
-CERTAIN_M = 0.01  # a pose known better than this is not held to a truth that isn't
+INSIDE_95 = 7.815  # chi-square of three degrees of freedom: 95 % of consistent errors lie below
+CERTAIN_M = 0.01  # a pose of a smaller 1-sigma is left out: the truth is not known so well
 
 
 class ConsistencyReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Of the valid estimates that state at least `CERTAIN_M` of doubt."""
+    """Of the valid estimates whose 1-sigma of the position is at least CERTAIN_M."""
 
     frames: int
-    nees: float | None = None  # mean of e' P^-1 e over its degrees of freedom: 1 is honest, more is too sure
+    nees: float | None = None  # mean of e' P^-1 e over its degrees of freedom: 1 is consistent, more is overconfident
     inside_95: float | None = None  # share of the frames whose error lies within the stated 95 %
 
 
 class Consistency:
-    """Collects, frame by frame, what was stated of the ego's pose."""
+    """Collects the ego's estimates, frame by frame."""
 
     def __init__(self, mount: GroundPlane) -> None:
         self._mount = mount_pose(mount)
@@ -66,5 +66,5 @@ class Consistency:
         )
 
     def _true_ego(self, origin: Pose, T_begin_cam: Pose) -> SE2:
-        """The ego's pose on the road where the camera is truly: both begin as one."""
+        """The ego's true pose on the road; at the epoch's first frame it is `origin`, the estimated one."""
         return split_pose(origin @ self._mount @ T_begin_cam @ inverse(self._mount))[0]

@@ -1,4 +1,4 @@
-"""How well the shipped drive was understood: the ego and every vehicle against what was true.
+"""A run over the shipped drive against its truth: the ego, and every vehicle.
 
 A vehicle of an estimate is matched to a body of the truth frame by frame, by where it stands from the ego, so that the
 ego's drift costs no match; its ATE is then taken in the global frame with nothing aligned, as the paper's.
@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 VEHICLES = ("car", "van", "truck", "bus")
 ASKED_VISIBLE, ASKED_TRUNCATED, ASKED_RANGE_M = 0.5, 0.2, (4.0, 40.0)  # bodies that are to be found
 GATE_M, GATE_REL = 2.0, 0.2  # a vehicle further from a body than the greater of the two (of its range) is another's
-LEAST_FRAMES = 10  # a body matched in fewer has no path to speak of
+LEAST_FRAMES = 10  # a body matched in fewer is not counted as a vehicle
 
 
 class DemoGrade(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,7 +45,7 @@ class DemoGrade(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class GlobalFrame:
-    """Puts estimates into the truth's world: its first pose where it truly was, a new epoch where the last one ended"""
+    """Estimates in the truth's world: the first one starts at its true pose, a new epoch where the last one ended."""
 
     def __init__(self) -> None:
         self._epoch: int | None = None

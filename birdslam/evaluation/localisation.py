@@ -75,7 +75,7 @@ class LocalisationRow(msgspec.Struct, frozen=True, kw_only=True):
     yaw_error_median_deg: float | None = None
 
 
-def drive(sequence: TrackingSequence, detections: Sequence[Detections], config: FrontEndConfig) -> list[Measurements]:
+def measure(sequence: TrackingSequence, detections: Sequence[Detections], config: FrontEndConfig) -> list[Measurements]:
     """The front end over a sequence of known ego motion; of the road it knows only the calibrated camera."""
     odometry = SimulatedOdometry(sequence.camera, sequence.camera_poses, EXACT, np.random.default_rng(0))
 
@@ -85,7 +85,7 @@ def drive(sequence: TrackingSequence, detections: Sequence[Detections], config: 
     return make_log(sequence, range(len(sequence)), odometry, perceive, None, config)
 
 
-def compare(sequence: TrackingSequence, measurements: Iterable[Measurements]) -> list[CarError]:
+def match_cars(sequence: TrackingSequence, measurements: Iterable[Measurements]) -> list[CarError]:
     """Every matched, untruncated car of the labels in every frame."""
     errors: list[CarError] = []
     for record in measurements:
@@ -115,7 +115,7 @@ def _error(sequence: TrackingSequence, label: Label, edge: VehicleEdge) -> CarEr
     )
 
 
-def report(errors: Sequence[CarError]) -> list[LocalisationRow]:
+def summarise_ranges(errors: Sequence[CarError]) -> list[LocalisationRow]:
     """A row for each sequence and range, then those of the union, "all"."""
     names = list(dict.fromkeys(error.sequence for error in errors))
     groups = [(name, [e for e in errors if e.sequence == name]) for name in names] + [("all", list(errors))]

@@ -188,7 +188,7 @@ def compare(
     )
 
 
-def evaluate_odometry(
+def evaluate_recordings(
     recordings: Iterable[Recording],
     run: Callable[[Recording], Iterable[Measurements | Estimate | MapUpdate]],
     directory: Path,

@@ -35,14 +35,13 @@ from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.simulation.odometry import SimulatedOdometry
 from birdslam.slam import SlamConfig
-from birdslam.trajectory import NS_PER_S
-from birdslam.types import Frame, Measurements
+from birdslam.types import NS_PER_S, Frame, Measurements
 from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 
 EGO = "ego"
 LEAST_FRAMES = 5  # a vehicle matched in fewer is left out of the report, unless the paper names it
 
-NO_IMAGE = np.zeros((1, 1), dtype=np.uint8)  # for an odometry that looks at none
+NO_IMAGE = np.zeros((1, 1), dtype=np.uint8)  # for an odometry that needs none
 
 
 class Method(Protocol):
@@ -81,9 +80,9 @@ class Live:
 
 @dataclass(frozen=True)
 class Final:
-    """The vehicles' ways as our system knows them at the end of the log, beside the ego's live one.
+    """The vehicles' trajectories smoothed over the whole log, and the ego's live one.
 
-    A batch, and the paper's graph, which keeps every pose, answer for each frame with all of them: so does this.
+    A batch, and the paper's graph, which keeps every pose, estimate each frame from the whole log: so does this.
     """
 
     label: str
@@ -91,7 +90,7 @@ class Final:
     smoother: SmootherConfig
 
     def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
-        """One update for each record, and a look back."""
+        """One update for each record, and a smoother backwards over the log."""
         graph, live = PoseGraph(self.live.graph, self.live.weights), LiveTrajectories()
         smoother = RtsSmoother(self.smoother)
         for measurements in log:
@@ -136,7 +135,7 @@ def make_log(
 ) -> list[Measurements]:
     """The front end's measurements of `frames`; frame ids are KITTI's.
 
-    `images` gives a frame's image, None where it is unreadable; without `images` the odometry looks at none.
+    `images` gives a frame's image, None where it is unreadable; without `images` the odometry needs none.
     """
     frontend, log = FrontEnd(sequence.camera, config, odometry), []
     for index in frames:
@@ -246,7 +245,7 @@ def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odome
             frames = float(np.median([0 if errors is None else errors.frames for errors in found]))
             if frames < LEAST_FRAMES and body not in keep:
                 continue
-            whole = body == EGO
+            is_ego = body == EGO
             rows.append(
                 Row(
                     sequence=sequence,
@@ -260,8 +259,8 @@ def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odome
                     rpe_t_m=_median([errors.rpe_t_m for errors in seen]),
                     rpe_r_deg=_median([errors.rpe_r_deg for errors in seen]),
                     motion_error_m=_median([errors.motion_error_m for errors in seen]),
-                    hota=_median([trial.hota for trial in trials]) if whole else None,
-                    idf1=_median([trial.idf1 for trial in trials]) if whole else None,
+                    hota=_median([trial.hota for trial in trials]) if is_ego else None,
+                    idf1=_median([trial.idf1 for trial in trials]) if is_ego else None,
                     odometry=odometry,
                     detections=detections,
                 )

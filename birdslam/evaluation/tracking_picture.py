@@ -29,12 +29,12 @@ def draw_sequence(title: str, truth: Truth, result: Trajectories, path: Path) ->
         found = truth.found(label, result)
         if len(found) >= LEAST_FRAMES:
             colour = f"C{k % 10}"
-            at = _paper(poses)
+            at = _forward_up(poses)
             axes.plot(*at.T, color=colour, linewidth=5.0, alpha=TRUTH_ALPHA, solid_capstyle="round")
-            axes.plot(*_paper(found).T, color=colour, linewidth=1.2)
+            axes.plot(*_forward_up(found).T, color=colour, linewidth=1.2)
             axes.annotate(str(label), at[-1], color=colour, fontsize=8, xytext=(3, 3), textcoords="offset points")
-    axes.plot(*_paper(truth.ego).T, color=INK, linewidth=6.0, alpha=TRUTH_ALPHA, label="truth (pale)")
-    axes.plot(*_paper(result.ego).T, color=INK, linewidth=1.5, label="estimate (thin), ego in black")
+    axes.plot(*_forward_up(truth.ego).T, color=INK, linewidth=6.0, alpha=TRUTH_ALPHA, label="truth (pale)")
+    axes.plot(*_forward_up(result.ego).T, color=INK, linewidth=1.5, label="estimate (thin), ego in black")
     axes.set(title=title, xlabel="right of the start (m)", ylabel="ahead of the start (m)")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(linewidth=0.4)
@@ -42,7 +42,8 @@ def draw_sequence(title: str, truth: Truth, result: Trajectories, path: Path) ->
     figure.savefig(path)
 
 
-def _paper(poses: Mapping[int, SE2]) -> NDArray[np.float64]:
+def _forward_up(poses: Mapping[int, SE2]) -> NDArray[np.float64]:
+    """(N, 2) in the picture: metres to the right, metres ahead."""
     return np.array([[-pose.y_m, pose.x_m] for _, pose in sorted(poses.items())])
 
 

@@ -37,7 +37,7 @@ class Outcome:
     updates_ms: dict[str, NDArray[np.float64]]
 
 
-def write(setting: Setting, published: Published, outcomes: Sequence[Outcome]) -> str:
+def render_report(setting: Setting, published: Published, outcomes: Sequence[Outcome]) -> str:
     """The whole of report.md."""
     rows = [row for outcome in outcomes for row in outcome.rows]
     variants = [row for outcome in outcomes for row in outcome.ablation]

@@ -16,7 +16,7 @@ import msgspec
 from birdslam.calibration.calibration import CalibrationError
 from birdslam.datasets.opening import open_recording
 from birdslam.datasets.recording import DatasetError, Recording
-from birdslam.evaluation import odometry as evaluation
+from birdslam.evaluation.odometry import OdometryReport, evaluate_recordings
 from birdslam.evaluation.results import ResultsError
 from birdslam.perception import ModelError
 from birdslam.runtime import model_store
@@ -243,7 +243,7 @@ def evaluate_vehicles(options: argparse.Namespace) -> int:
     return evaluate_localisation.evaluate(options, configuration_of(options))
 
 
-def _evaluate(options: argparse.Namespace) -> list[evaluation.OdometryReport]:
+def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
     configuration = configuration_of(options)
     source = configuration.source
     if source.frames is not None or source.loop:
@@ -255,7 +255,7 @@ def _evaluate(options: argparse.Namespace) -> list[evaluation.OdometryReport]:
     if not configuration.models.in_use():
         print(supervisor.WITHOUT_MODELS)
     with _pipeline(configuration) as drive:
-        reports = evaluation.evaluate_odometry(
+        reports = evaluate_recordings(
             recordings, drive, Path(configuration.output), compared=_compared(options.frames, recordings)
         )
     print(f"results in {configuration.output}")
@@ -277,7 +277,7 @@ def _compared(text: str, recordings: list[Recording]) -> slice:
     return frames
 
 
-def _odometry_table(reports: list[evaluation.OdometryReport]) -> str:
+def _odometry_table(reports: list[OdometryReport]) -> str:
     columns = (
         ("frames", "frames", 0),
         ("path m", "path_m", 1),

@@ -10,7 +10,14 @@ import msgspec
 
 from birdslam.datasets.kitti_tracking import open_tracking, read_detections
 from birdslam.datasets.recording import DatasetError
-from birdslam.evaluation.localisation import PAPER, CarError, LocalisationRow, compare, drive, report
+from birdslam.evaluation.localisation import (
+    PAPER,
+    CarError,
+    LocalisationRow,
+    match_cars,
+    measure,
+    summarise_ranges,
+)
 from birdslam.evaluation.results import claim_directory
 from birdslam.frontend import FrontEndConfig
 from birdslam.runtime.configuration import Configuration, ConfigurationError
@@ -24,7 +31,7 @@ def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
     errors: list[CarError] = []
     for name in _sequences(options):
         errors += _errors(options.root, name, options.detections, modes[options.mode])
-    rows = report(errors)
+    rows = summarise_ranges(errors)
     (output / "report.json").write_bytes(msgspec.json.format(msgspec.json.encode(rows), indent=2) + b"\n")
     print(_table(rows))
     print(f"results in {output}")
@@ -47,7 +54,7 @@ def _errors(root: Path, name: str, detections: str, config: FrontEndConfig) -> l
     sequence = open_tracking(root, name)
     folder = root / "det_02_rrc" if detections == "rrc" else Path(detections)
     found = read_detections(folder, name, len(sequence))
-    return compare(sequence, drive(sequence, found, config))
+    return match_cars(sequence, measure(sequence, found, config))
 
 
 def _table(rows: Sequence[LocalisationRow]) -> str:

@@ -20,7 +20,7 @@ from birdslam.evaluation import tables
 from birdslam.evaluation.results import claim_directory
 from birdslam.evaluation.tracking import Row
 from birdslam.evaluation.tracking_picture import draw_runtime
-from birdslam.evaluation.tracking_report import Outcome, Setting, write
+from birdslam.evaluation.tracking_report import Outcome, Setting, render_report
 from birdslam.runtime.cli.tracking_job import Job, run_sequence
 from birdslam.runtime.cli.tracking_options import METHODS
 from birdslam.runtime.configuration import Configuration, ConfigurationError
@@ -43,7 +43,7 @@ def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
     longest = max(outcomes, key=lambda outcome: len(outcome.frames))
     draw_runtime(longest.updates_ms, output / "runtime.png")
     setting = Setting(job.frames, job.methods, job.odometry, job.detections, job.seeds)
-    report = write(setting, job.published, outcomes)
+    report = render_report(setting, job.published, outcomes)
     (output / "report.md").write_text(report, encoding="utf-8")
     print(report)
     print(f"results in {output}")

@@ -17,10 +17,9 @@ from birdslam.runtime.recording.recording import Recording as File
 from birdslam.runtime.recording.recording import RecordingError
 from birdslam.runtime.recording.scene import timestamp
 from birdslam.runtime.wire import WireError, decode
-from birdslam.types import FrameRef, Status
+from birdslam.types import NS_PER_S, FrameRef, Status
 
 READ = ("v1/frame", "/camera/image")
-NS_PER_S = 1e9
 
 
 class RecordedImages(Recording):

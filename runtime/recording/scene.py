@@ -41,8 +41,8 @@ from birdslam.runtime.recording.foxglove import (
     Time,
     Vector3,
 )
-from birdslam.trajectory import NS_PER_S, Pose, ego_pose, mount_pose
-from birdslam.types import Attitude, Estimate, MapUpdate, Measurements, VehicleEstimate
+from birdslam.trajectory import Pose, ego_pose, mount_pose
+from birdslam.types import NS_PER_S, Attitude, Estimate, MapUpdate, Measurements, VehicleEstimate
 
 VEHICLE_HEIGHT_M = 1.5  # drawn; no height is estimated
 ELLIPSE_POINTS = 24
