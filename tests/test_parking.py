@@ -14,6 +14,7 @@ from birdslam.rendered_world.street.street_plan import draw_street
 from birdslam.rendered_world.traffic.flow import Mover, populate
 from birdslam.rendered_world.traffic.parking import Lot, cleared, draw_lots
 from birdslam.rendered_world.traffic.placement import Standing, furnish
+from birdslam.rendered_world.traffic.poses import moving
 
 EGO_S_M, EGO_D_M = 30.0, -1.5
 
@@ -116,9 +117,6 @@ def test_the_same_seed_parks_the_same_cars() -> None:
 
 
 def test_who_stands_behind_a_kerb_stands_on_it(places: list[Place]) -> None:
-    pytest.importorskip("numba", reason="bodies are put into the world beside the renderer (extra `train`)")
-    from birdslam.rendered_world.traffic.poses import moving
-
     raised = 0
     for street, *_, movers in places:
         scene = moving(street, movers)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.rendered_world.rendering import materials as m
-from birdslam.rendered_world.rendering.renderer import Bodies, Rendered
+from birdslam.rendered_world.rendering.scene import Bodies, Rendered
 from birdslam.rendered_world.street.street import CROSSING, LINE_KINDS, Street
 from birdslam.rendered_world.traffic.flow import Mover
 from birdslam.rendered_world.truth import Floats, WorldFrame, WorldLane, WorldObject

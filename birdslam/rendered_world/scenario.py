@@ -13,7 +13,8 @@ import numpy as np
 from birdslam.geometry.camera import Camera
 from birdslam.rendered_world.labels import frame_of
 from birdslam.rendered_world.rendering.photometrics import Lens, develop, draw_lens, draw_sky
-from birdslam.rendered_world.rendering.renderer import Bodies, Renderer
+from birdslam.rendered_world.rendering.renderer import Renderer
+from birdslam.rendered_world.rendering.scene import Bodies
 from birdslam.rendered_world.street.course import SHARPEST, draw_course
 from birdslam.rendered_world.street.street import Street
 from birdslam.rendered_world.street.street_plan import draw_street
@@ -22,8 +23,8 @@ from birdslam.rendered_world.traffic.flow import Mover, advance, populate, settl
 from birdslam.rendered_world.traffic.placement import furnish
 from birdslam.rendered_world.traffic.poses import ego_pose, moving, place
 from birdslam.rendered_world.truth import Floats, WorldFrame
+from birdslam.types import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 STREET_M = 1500.0  # of a drawn drive
 SIGHT_M = 190.0  # what stands farther away is left out
 _STEPS = 4  # of the drivers' model within a frame

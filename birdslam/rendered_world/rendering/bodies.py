@@ -61,9 +61,8 @@ def roof_half_width(P, x, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def loft(B, body, P):  # type: ignore[no-untyped-def]
-    """The painted body of a vehicle from LOFT_X0 to LOFT_X1."""
-    x0, x1 = P[m.LOFT_X0], P[m.LOFT_X1]
+def _stations(P, x0, x1):  # type: ignore[no-untyped-def]
+    """(STATIONS,) x of the cross-sections from tail to nose: where the profile bends, and between."""
     xs = np.empty(STATIONS)
     xs[0], xs[1], xs[2] = x0, x0 + 0.04, x0 + 0.13
     xs[3] = max(P[m.X_BACK_BOTTOM], x0 + 0.18)
@@ -76,6 +75,13 @@ def loft(B, body, P):  # type: ignore[no-untyped-def]
     xs[13], xs[14] = max(x1 - 0.05, 0.4 * xs[10] + 0.6 * x1), x1
     xs[12] = max(x1 - 0.14, 0.6 * xs[10] + 0.4 * xs[13])
     xs[11] = 0.5 * (xs[10] + xs[12])
+    return xs
+
+
+@njit(cache=True, nogil=True)
+def _cross_sections(P, x0, x1):  # type: ignore[no-untyped-def]
+    """(STATIONS, RIBS, 3) points of the left half of the body, from the sill up to the roof's middle."""
+    xs = _stations(P, x0, x1)
     grid = np.empty((STATIONS, RIBS, 3))
     for k in range(STATIONS):
         x = xs[k]
@@ -101,6 +107,12 @@ def loft(B, body, P):  # type: ignore[no-untyped-def]
         )
         for i in range(RIBS):
             grid[k, i, 0], grid[k, i, 1], grid[k, i, 2] = x, rows[i][0], rows[i][1]
+    return grid
+
+
+@njit(cache=True, nogil=True)
+def _smooth_normals(grid):  # type: ignore[no-untyped-def]
+    """The normal at each point of the cross-sections, from its neighbours; at the ends it turns to tail and nose."""
     normal = np.empty((STATIONS, RIBS, 3))
     for k in range(STATIONS):
         for i in range(RIBS):
@@ -116,6 +128,14 @@ def loft(B, body, P):  # type: ignore[no-untyped-def]
                 nx = 1.5 * math.sqrt(ny * ny + nz * nz) + 1e-6
             norm = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-9
             normal[k, i, 0], normal[k, i, 1], normal[k, i, 2] = nx / norm, ny / norm, nz / norm
+    return normal
+
+
+@njit(cache=True, nogil=True)
+def loft(B, body, P):  # type: ignore[no-untyped-def]
+    """The painted body of a vehicle from LOFT_X0 to LOFT_X1."""
+    grid = _cross_sections(P, P[m.LOFT_X0], P[m.LOFT_X1])
+    normal = _smooth_normals(grid)
     t = begin(B, body, m.PAINT, 4 * (STATIONS - 1) * (RIBS - 1) + 4 * (RIBS - 1))
     if t < 0:
         return
@@ -147,7 +167,7 @@ def vehicle(B, body, P):  # type: ignore[no-untyped-def]
     """Car, van or bus: the loft on four wheels with its mirrors."""
     loft(B, body, P)
     y, r = 0.5 * P[m.WIDTH], P[m.WHEEL_RADIUS]
-    # Exhaust, axles and tank: one doesn't look through under a car
+    # Exhaust, axles and tank close the view under a car
     box(
         B, body, m.DARK, P[m.X_REAR_AXLE] - 0.6 * r, P[m.X_FRONT_AXLE], -0.6 * y, 0.6 * y,
         (0.55 + 0.3 * P[m.SEED]) * P[m.CLEARANCE], P[m.CLEARANCE] + 0.12,

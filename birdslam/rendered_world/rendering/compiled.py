@@ -6,7 +6,10 @@ no longer sees which counts cancel out, and counting took four fifths of the tim
 
 from __future__ import annotations
 
+from typing import Any
+
 from numba import njit
 
-per_pixel = njit(cache=True, nogil=True, fastmath=True, error_model="numpy", _nrt=False)
-inlined = njit(cache=True, nogil=True, fastmath=True, error_model="numpy", _nrt=False, forceinline=True)
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy", "_nrt": False}
+per_pixel = njit(**_OPTIONS)
+inlined = njit(**_OPTIONS, forceinline=True)

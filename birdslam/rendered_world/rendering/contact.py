@@ -10,11 +10,12 @@ from birdslam.rendered_world.rendering.compiled import inlined
 
 
 @inlined
-def contact_light(shade_map, frame_m, x, y):  # type: ignore[no-untyped-def]
+def contact_light(contact, x, y):  # type: ignore[no-untyped-def]
     """Share of the sky that the ground at (x, y) sees past the vehicles over it, from a map of the area ahead.
 
-    `frame_m` = (x of its first row, y of its first column, cells a metre).
+    `contact` = (map, (x of its first row, y of its first column, cells a metre)).
     """
+    shade_map, frame_m = contact
     u, v = (x - frame_m[0]) * frame_m[2], (y - frame_m[1]) * frame_m[2]
     i, j = math.floor(u), math.floor(v)
     if i < 0 or j < 0 or i >= shade_map.shape[0] - 1 or j >= shade_map.shape[1] - 1:

@@ -230,8 +230,13 @@ def _surface(kind, tone, bank, s, d, foot, sky):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def shade_ground(bands, lines, crossings, marks, by_metre, edges, bank, pictures, sky, s, d, footprint_d, footprint_s):  # type: ignore[no-untyped-def]
-    """(r, g, b, mirror, class) of the ground at (s, d) for a pixel that spans so many metres across and along."""
+def shade_ground(ground, bank, pictures, sky, s, d, footprint_d, footprint_s):  # type: ignore[no-untyped-def]
+    """(r, g, b, mirror, class) of the ground at (s, d) for a pixel that spans so many metres across and along.
+
+    `ground` = the street's (bands, lines, crossings, marks), `marks_by_metre`, and (right edge, left edge, surface and
+    tone of side roads).
+    """
+    bands, lines, crossings, marks, by_metre, edges = ground
     foot = max(footprint_d, min(0.35 * footprint_s, 6.0 * footprint_d))
     crossing = crossing_at(crossings, s, d, edges[0], edges[1])
     kind, tone = st.GRASS, 1.0

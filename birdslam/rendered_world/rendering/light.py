@@ -1,4 +1,4 @@
-"""Sun, sky, shadows and noise as shading asks for them, in ego axes. Compiled by numba.
+"""What light falls on a surface and what its gloss shows: sun, sky, shadows, noise; in ego axes. Compiled by numba.
 
 `sky` holds: 0-2 towards the sun, 3-5 its light, 6-8 light from the zenith, 9-11 light from the horizon, 12-14 haze,
 15 metres of sight, 16 wetness of the road, 17 clouds, 18 seed, 19 glare about the sun, 20 leaves' translucence,
@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import math
 
+from birdslam.rendered_world.rendering import materials as m
 from birdslam.rendered_world.rendering.compiled import inlined, per_pixel
+from birdslam.rendered_world.rendering.contact import contact_light
 
 SKY_SLOTS = 35
 
@@ -108,14 +110,79 @@ def _lookup(highest, lean, origin, cells_per_m, x, y, z, bias):  # type: ignore[
 
 
 @inlined
-def sunlit(fine, coarse, lean, fine_origin, coarse_origin, per_m, x, y, z, nx, ny, nz, bias):  # type: ignore[no-untyped-def]
+def sunlit(maps, x, y, z, nx, ny, nz, bias):  # type: ignore[no-untyped-def]
     """Share of the sun that reaches a point of a surface with this normal, from the fine map or the coarse one.
 
-    `lean` is the sun's direction per metre of height, `per_m` the cells a metre of the two maps.
+    `maps` = (fine, coarse, lean, origin of the fine, origin of the coarse, cells a metre of both); `lean` is the sun's
+    direction per metre of height.
     """
+    fine, coarse, lean, fine_origin, coarse_origin, per_m = maps
     off = 0.05 + bias
     x, y, z = x + off * nx, y + off * ny, z + off * nz
     s = _lookup(fine, lean, fine_origin, per_m[0], x, y, z, 0.03 + bias)
     if s < 0.0:
         s = _lookup(coarse, lean, coarse_origin, per_m[1], x + 0.1 * nx, y + 0.1 * ny, z, 0.12 + bias)
     return s if s >= 0.0 else 1.0
+
+
+@inlined
+def sunlight(sky, maps, x, y, z, nx, ny, nz, bias, soft):  # type: ignore[no-untyped-def]
+    """How much of the sun's light a surface with this normal gets; with `soft`, part of it from behind too."""
+    toward = nx * sky[0] + ny * sky[1] + nz * sky[2]
+    direct = 0.0
+    if sky[4] > 0.0 and (toward > 0.0 or soft > 0.0):
+        direct = (soft * 0.5 + (1.0 - soft) * max(toward, 0.0)) * sunlit(maps, x, y, z, nx, ny, nz, bias)
+    return direct
+
+
+@inlined
+def skylight(sky, maps, contact, mat, x, y, z, w, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """(red, green, blue) that a surface gets from the sky, the horizon, and the road that the sun lights.
+
+    `w` is the height over the road of a vehicle's paint.
+    """
+    up = 0.5 + 0.5 * nz
+    open_sky = sky[21] * (1.0 if mat != m.GROUND else contact_light(contact, x, y))
+    high = w if mat == m.PAINT else z  # over the road
+    if mat != m.GROUND and high < 0.8 and nz < 0.5:
+        open_sky *= 0.6 + 0.4 * max(high, 0.0) / 0.8
+    bounce, lit_road = 0.18 * (1.0 - up), max(sky[2], 0.0)
+    if mat == m.PAINT and sky[4] > 0.0 and nz < 0.5:  # the road that a panel faces may lie in the body's own shadow
+        share = 0.0
+        for j in range(3):
+            away = 0.5 + 0.7 * j
+            share += sunlit(maps, x + away * nx, y + away * ny, z - w, 0.0, 0.0, 1.0, 0.0)
+        lit_road *= share / 3.0
+    return (
+        (sky[6] * up * 0.6 + sky[9] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[3] * lit_road + sky[6])) * open_sky,
+        (sky[7] * up * 0.6 + sky[10] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[4] * lit_road + sky[7])) * open_sky,
+        (sky[8] * up * 0.6 + sky[11] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[5] * lit_road + sky[8])) * open_sky,
+    )
+
+
+@inlined
+def glossed(sky, bank, wet, mirror, direct, facing, ex, ey, ez, nx, ny, nz, red, green, blue):  # type: ignore[no-untyped-def]
+    """The light of a surface that mirrors so much straight on: sky and skyline in it, and the sun's glint.
+
+    (ex, ey, ez) is the line of sight, `facing` its cosine to the normal. A `wet` road mirrors most at a flat
+    angle.
+    """
+    f = max(0.0, 1.0 - facing)
+    fresnel = mirror + (1.0 - mirror) * 0.9 * f * f * f * f * f
+    if wet:
+        fresnel = mirror * (0.3 + 6.0 * f * f * f * f)
+    qx, qy, qz = ex + 2.0 * facing * nx, ey + 2.0 * facing * ny, ez + 2.0 * facing * nz
+    mr, mg, mb = mirrored(sky, bank, qx, qy, qz)
+    red, green, blue = red + (mr - red) * fresnel, green + (mg - green) * fresnel, blue + (mb - blue) * fresnel
+    glint = qx * sky[0] + qy * sky[1] + qz * sky[2]
+    if glint > 0.9 and direct > 0.0:
+        s = direct * mirror * (35.0 * max(glint, 0.0) ** 220.0 + 1.2 * max(glint, 0.0) ** 24.0)
+        red, green, blue = red + s * sky[3], green + s * sky[4], blue + s * sky[5]
+    return red, green, blue
+
+
+@inlined
+def hazed(sky, far_m, red, green, blue):  # type: ignore[no-untyped-def]
+    """Light from so far away, through the air."""
+    haze = 1.0 - math.exp(-far_m / sky[15]) if far_m > 0.01 * sky[15] else 0.0
+    return red + (sky[12] - red) * haze, green + (sky[13] - green) * haze, blue + (sky[14] - blue) * haze

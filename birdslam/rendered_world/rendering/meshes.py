@@ -70,97 +70,19 @@ def quad(B, body, material, p, q, r, s, n, u0, v0, u1, v1, face):  # type: ignor
 def box(B, body, material, x0, x1, y0, y1, z0, z1):  # type: ignore[no-untyped-def]
     """A box; faces 0 front (+x), 1 left (+y), 2 rear, 3 right, 4 top, each with (u, v) in metres from its corner."""
     lx, ly, lz = x1 - x0, y1 - y0, z1 - z0
-    quad(
-        B,
-        body,
-        material,
-        (x1, y0, z0),
-        (x1, y1, z0),
-        (x1, y1, z1),
-        (x1, y0, z1),
-        (1.0, 0.0, 0.0),
-        0.0,
-        0.0,
-        ly,
-        lz,
-        0.0,
-    )
-    quad(
-        B,
-        body,
-        material,
-        (x1, y1, z0),
-        (x0, y1, z0),
-        (x0, y1, z1),
-        (x1, y1, z1),
-        (0.0, 1.0, 0.0),
-        0.0,
-        0.0,
-        lx,
-        lz,
-        1.0,
-    )
-    quad(
-        B,
-        body,
-        material,
-        (x0, y1, z0),
-        (x0, y0, z0),
-        (x0, y0, z1),
-        (x0, y1, z1),
-        (-1.0, 0.0, 0.0),
-        0.0,
-        0.0,
-        ly,
-        lz,
-        2.0,
-    )
-    quad(
-        B,
-        body,
-        material,
-        (x0, y0, z0),
-        (x1, y0, z0),
-        (x1, y0, z1),
-        (x0, y0, z1),
-        (0.0, -1.0, 0.0),
-        0.0,
-        0.0,
-        lx,
-        lz,
-        3.0,
-    )
-    quad(
-        B,
-        body,
-        material,
-        (x0, y0, z1),
-        (x1, y0, z1),
-        (x1, y1, z1),
-        (x0, y1, z1),
-        (0.0, 0.0, 1.0),
-        0.0,
-        0.0,
-        lx,
-        ly,
-        4.0,
-    )
-    if z0 > 0.5:
-        quad(
-            B,
-            body,
-            material,
-            (x0, y1, z0),
-            (x1, y1, z0),
-            (x1, y0, z0),
-            (x0, y0, z0),
-            (0.0, 0.0, -1.0),
-            0.0,
-            0.0,
-            lx,
-            ly,
-            5.0,
-        )
+    quad(B, body, material, (x1, y0, z0), (x1, y1, z0), (x1, y1, z1), (x1, y0, z1),
+         (1.0, 0.0, 0.0), 0.0, 0.0, ly, lz, 0.0)  # fmt: skip
+    quad(B, body, material, (x1, y1, z0), (x0, y1, z0), (x0, y1, z1), (x1, y1, z1),
+         (0.0, 1.0, 0.0), 0.0, 0.0, lx, lz, 1.0)  # fmt: skip
+    quad(B, body, material, (x0, y1, z0), (x0, y0, z0), (x0, y0, z1), (x0, y1, z1),
+         (-1.0, 0.0, 0.0), 0.0, 0.0, ly, lz, 2.0)  # fmt: skip
+    quad(B, body, material, (x0, y0, z0), (x1, y0, z0), (x1, y0, z1), (x0, y0, z1),
+         (0.0, -1.0, 0.0), 0.0, 0.0, lx, lz, 3.0)  # fmt: skip
+    quad(B, body, material, (x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1),
+         (0.0, 0.0, 1.0), 0.0, 0.0, lx, ly, 4.0)  # fmt: skip
+    if z0 > 0.5:  # high enough that one sees it from below
+        quad(B, body, material, (x0, y1, z0), (x1, y1, z0), (x1, y0, z0), (x0, y0, z0),
+             (0.0, 0.0, -1.0), 0.0, 0.0, lx, ly, 5.0)  # fmt: skip
 
 
 @njit(cache=True, nogil=True)

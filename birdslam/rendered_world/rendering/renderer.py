@@ -16,6 +16,7 @@ from birdslam.rendered_world.rendering.contact import contact_map
 from birdslam.rendered_world.rendering.light import hashed
 from birdslam.rendered_world.rendering.meshes import new_buffer
 from birdslam.rendered_world.rendering.rasteriser import count_inside, project, rasterize, shadow_map
+from birdslam.rendered_world.rendering.scene import Bodies, Rendered
 from birdslam.rendered_world.rendering.shading import plane_bases, shade_frame, wet_road
 from birdslam.rendered_world.rendering.textures import foliage_masks, noise_bank, pictures
 from birdslam.rendered_world.street.street import ASPHALT, CEMENT, COBBLES, Street
@@ -26,41 +27,9 @@ Floats32 = NDArray[np.float32]
 _CAPACITY = 150_000  # triangles of a frame
 _FINE_CELLS, _FINE_PER_M = 448, 16.0
 _COARSE_CELLS, _COARSE_PER_M = 448, 4.0
-
-
-@dataclass(frozen=True)
-class Bodies:
-    """What is in the world, row by row: its kind of mesh, parameters, pose in world, and class (see `shading`).
-
-    `object_id` is -1 for what can't move. `upright` bodies stand against gravity, the others on the road's slope.
-    """
-
-    kind: NDArray[np.int32]
-    parameters: Floats32  # (n, SLOTS)
-    position_m: Floats  # (n, 3) in world
-    yaw_rad: Floats
-    slope: Floats  # of the road under it along its own x, dz/dx
-    object_id: NDArray[np.int32]
-
-    def subset(self, keep: NDArray[np.bool_]) -> Bodies:
-        return Bodies(*(column[keep] for column in self.__dict__.values()))
-
-    def plus(self, other: Bodies) -> Bodies:
-        pairs = zip(self.__dict__.values(), other.__dict__.values(), strict=True)
-        return Bodies(*(np.concatenate(pair) for pair in pairs))
-
-
-@dataclass(frozen=True)
-class Rendered:
-    """`light` (H, W, 3) linear BGR; boxes (n, 4) in pixels, NaN where nothing is in front of the camera."""
-
-    light: Floats32
-    depth_m: Floats32
-    classes: NDArray[np.uint8]
-    instances: NDArray[np.uint16]
-    boxes_px: Floats  # of bodies that move, in the order of `moving`
-    moving: NDArray[np.int64]
-    visible: Floats  # of each of them: the share of its samples inside the image that nothing hides
+_CLASS_OF_KINDS = (
+    ((m.VEHICLE, m.TRUCK), 7), ((m.PEDESTRIAN, m.CYCLIST), 8), ((m.BUILDING,), 4), ((m.POST, m.SIGN, m.LIGHTS), 6),
+)  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
@@ -109,6 +78,63 @@ def _move(corners, owner, count, R, t):  # type: ignore[no-untyped-def]
                 corners[k, c, j] = R[b, j, 0] * x + R[b, j, 1] * y + R[b, j, 2] * z + t[b, j]
 
 
+@dataclass(frozen=True)
+class _Mesh:
+    """All triangles of a scene in ego, as `meshes.new_buffer` has them; of each body (the last is the ground) its range
+    of triangles, parameters and pose in ego."""
+
+    corners: Floats32
+    attributes: Floats32
+    normals: Floats32
+    material: NDArray[np.int32]
+    owner: NDArray[np.int32]
+    count: int
+    ranges: NDArray[np.int64]
+    parameters: Floats32
+    R: Floats
+    t: Floats
+
+
+class _View:
+    """The camera, with `factor` x `factor` samples a pixel: what is in front in it, and where bodies are."""
+
+    def __init__(self, camera: Camera, factor: int) -> None:
+        f = factor
+        self.C = np.array([0.0, 0.0, camera.height_m])
+        self.R_ego_cam = np.ascontiguousarray(camera.ground.R_ego_cam)
+        self._R_cam_ego = np.ascontiguousarray(self.R_ego_cam.T)
+        self.K = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px])
+        half = 0.5 * (f - 1)
+        self._K_samples = np.array([f * self.K[0], f * self.K[1], f * self.K[2] + half, f * self.K[3] + half])
+        self._size = camera.height_px, camera.width_px
+        self._samples = camera.height_px * f, camera.width_px * f
+
+    def nearest(self, mesh: _Mesh) -> tuple[Floats32, NDArray[np.int32]]:
+        """1 / depth at every sample, and the triangle in front there, -1 for the sky."""
+        nearest, front = np.zeros(self._samples, np.float32), np.full(self._samples, -1, np.int32)
+        rasterize(
+            0, mesh.count, mesh.corners, mesh.attributes, mesh.material, self._R_cam_ego, self.C, self._K_samples,
+            foliage_masks(), nearest, front,
+        )  # fmt: skip
+        return nearest, front
+
+    def boxes(self, mesh: _Mesh, moving: NDArray[np.int64], seen: NDArray[np.int64]) -> tuple[Floats, Floats]:
+        """Of each moving body its box (n, 4) in pixels, and the share (n,) of its samples in the image that is seen."""
+        boxes, visible = np.full((len(moving), 4), np.nan), np.zeros(len(moving))
+        stamp = np.full(self._samples, -1, np.int32)
+        height, width = self._size
+        for row, index in enumerate(moving):
+            first, last = mesh.ranges[index]
+            box = project(first, last, mesh.corners, self._R_cam_ego, self.C, self.K)
+            if box[2] <= box[0]:
+                continue
+            boxes[row] = box
+            if box[2] > 0 and box[3] > 0 and box[0] < width and box[1] < height:
+                whole = count_inside(first, last, mesh.corners, self._R_cam_ego, self.C, self._K_samples, stamp, row)
+                visible[row] = seen[index] / whole if whole else 0.0
+        return boxes, visible
+
+
 class Renderer:
     """Renders scenes on one street; `factor` x `factor` samples a pixel."""
 
@@ -122,71 +148,57 @@ class Renderer:
 
     def render(self, scene: Bodies, camera: Camera, T_world_ego: Floats, s_m: float) -> Rendered:
         """The scene from `camera` over the road at `T_world_ego` (4, 4), which is about `s_m` on the street."""
-        R_ego_world = T_world_ego[:3, :3].T
-        sky = self._sky.copy()
-        sky[:3] = R_ego_world @ sky[:3]
-        sky[26:35] = T_world_ego[:3, :3].ravel()
-        R, t = self._poses(scene, T_world_ego)
-        B = new_buffer(_CAPACITY)
-        corners, attributes, normals, material, owner, _ = B
-        ranges = np.zeros((len(scene.kind) + 1, 2), np.int64)
-        parameters = np.concatenate([scene.parameters, np.zeros((1, m.SLOTS), np.float32)])
-        self._face_cards(scene, parameters, R, t)
-        _emit(B, scene.kind, parameters, ranges)
-        body = len(scene.kind)
-        ranges[body, 0] = B[5][0]
-        ground.strips(B, body, self._stations(s_m), self.street.bands, self.street.crossings, self._base(s_m))
-        ranges[body, 1] = count = int(B[5][0])
-        if B[5][1]:
-            raise ValueError(f"{B[5][1]} triangles of the scene do not fit in {_CAPACITY}")
-        _move(corners, owner, count, R, t)
-        C = np.array([0.0, 0.0, camera.height_m])
-        R_ego_cam = np.ascontiguousarray(camera.ground.R_ego_cam)
-        R_cam_ego = np.ascontiguousarray(R_ego_cam.T)
-        f = self.factor
-        height, width = camera.height_px, camera.width_px
-        K = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px])
-        K_samples = np.array([f * K[0], f * K[1], f * K[2] + 0.5 * (f - 1), f * K[3] + 0.5 * (f - 1)])
-        nearest = np.zeros((height * f, width * f), np.float32)
-        front = np.full((height * f, width * f), -1, np.int32)
-        masks = foliage_masks()
-        rasterize(0, count, corners, attributes, material, R_cam_ego, C, K_samples, masks, nearest, front)
-        maps = self._shadows(sky, corners, attributes, material, count, masks)
+        sky, view = self._sky_in_ego(T_world_ego), _View(camera, self.factor)
+        mesh = self._mesh(scene, T_world_ego, s_m)
+        nearest, front = view.nearest(mesh)
+        shadows = self._shadows(sky, mesh)
         moving = np.flatnonzero(scene.object_id >= 0)
-        contact = self._contact(scene, R, t, moving)
-        ids = np.concatenate([scene.object_id + 1, [0]]).astype(np.uint16)
-        labels = np.zeros(body + 1, np.uint8)
-        labels[:body][np.isin(scene.kind, (m.VEHICLE, m.TRUCK))] = 7
-        labels[:body][np.isin(scene.kind, (m.PEDESTRIAN, m.CYCLIST))] = 8
-        labels[:body][scene.kind == m.BUILDING] = 4
-        labels[:body][np.isin(scene.kind, (m.POST, m.SIGN, m.LIGHTS))] = 6
+        contact = self._contact(scene, mesh.R, mesh.t, moving)
+        height, width, f = camera.height_px, camera.width_px, self.factor
         light = np.empty((height, width, 3), np.float32)
         depth_m = np.empty((height, width), np.float32)
         classes = np.empty((height, width), np.uint8)
         instances = np.empty((height, width), np.uint16)
-        seen = np.zeros(body + 1, np.int64)
-        bases = np.empty((count, 12))
-        plane_bases(corners, count, bases)
+        seen = np.zeros(len(scene.kind) + 1, np.int64)
+        bases = np.empty((mesh.count, 12))
+        plane_bases(mesh.corners, mesh.count, bases)
+        ids = np.concatenate([scene.object_id + 1, [0]]).astype(np.uint16)
         shade_frame(
-            nearest, front, f, R_ego_cam, C, K,
-            (bases, attributes, normals, material, owner, parameters, R, labels, ids),
-            (noise_bank(), masks, pictures(), sky, maps, self._ground, contact, 1.0 / camera.fx_px),
+            nearest, front, f, view.R_ego_cam, view.C, view.K,
+            (bases, mesh.attributes, mesh.normals, mesh.material, mesh.owner, mesh.parameters, mesh.R, _classes(scene),
+             ids),
+            (noise_bank(), foliage_masks(), pictures(), sky, shadows, self._ground, contact, 1.0 / camera.fx_px),
             light, depth_m, classes, instances, seen,
             (np.empty(3), np.empty(4), np.empty(f * f, np.int64), np.empty(f * f, np.int64), np.empty(f * f)),
         )  # fmt: skip
         if sky[16] > 0.0:
             wet_road(light, classes, float(sky[16]))
-        boxes, visible = np.full((len(moving), 4), np.nan), np.zeros(len(moving))
-        stamp = np.full((height * f, width * f), -1, np.int32)
-        for row, index in enumerate(moving):
-            first, last = ranges[index]
-            box = project(first, last, corners, R_cam_ego, C, K)
-            if box[2] > box[0]:
-                boxes[row] = box
-                if box[2] > 0 and box[3] > 0 and box[0] < width and box[1] < height:
-                    whole = count_inside(first, last, corners, R_cam_ego, C, K_samples, stamp, row)
-                    visible[row] = seen[index] / whole if whole else 0.0
+        boxes, visible = view.boxes(mesh, moving, seen)
         return Rendered(light, depth_m, classes, instances, boxes, moving, visible)
+
+    def _sky_in_ego(self, T_world_ego: Floats) -> Floats:
+        sky = self._sky.copy()
+        sky[:3] = T_world_ego[:3, :3].T @ sky[:3]
+        sky[26:35] = T_world_ego[:3, :3].ravel()
+        return sky
+
+    def _mesh(self, scene: Bodies, T_world_ego: Floats, s_m: float) -> _Mesh:
+        """The triangles of all bodies, and after them those of the ground. Raises ValueError where they do not fit."""
+        R, t = self._poses(scene, T_world_ego)
+        B = new_buffer(_CAPACITY)
+        corners, attributes, normals, material, owner, counts = B
+        body = len(scene.kind)
+        ranges = np.zeros((body + 1, 2), np.int64)
+        parameters = np.concatenate([scene.parameters, np.zeros((1, m.SLOTS), np.float32)])
+        self._face_cards(scene, parameters, R, t)
+        _emit(B, scene.kind, parameters, ranges)
+        ranges[body, 0] = counts[0]
+        ground.strips(B, body, self._stations(s_m), self.street.bands, self.street.crossings, self._base(s_m))
+        ranges[body, 1] = count = int(counts[0])
+        if counts[1]:
+            raise ValueError(f"{counts[1]} triangles of the scene do not fit in {_CAPACITY}")
+        _move(corners, owner, count, R, t)
+        return _Mesh(corners, attributes, normals, material, owner, count, ranges, parameters, R, t)
 
     def _poses(self, scene: Bodies, T_world_ego: Floats) -> tuple[Floats, Floats]:
         """Rotations (n + 1, 3, 3) and places (n + 1, 3) in ego; the last is the ground's: its corners are in world."""
@@ -227,18 +239,20 @@ class Renderer:
         over = z[here] + gx * (x - x[here]) + gy * (y - y[here]) - z
         return np.array([x[here], y[here], z[here] - max(float(over.max()), 0.0), gx, gy])
 
-    def _shadows(self, sky, corners, attributes, material, count, masks):  # type: ignore[no-untyped-def]
-        """A fine shadow map near the camera and a coarse one of the street ahead."""
+    @staticmethod
+    def _shadows(sky: Floats, mesh: _Mesh) -> tuple[Floats32, Floats32, Floats, Floats, Floats, Floats]:
+        """A fine shadow map near the camera and a coarse one of the street ahead (see `light.sunlit`)."""
         fine = np.full((_FINE_CELLS, _FINE_CELLS), -1e3, np.float32)
         coarse = np.full((_COARSE_CELLS, _COARSE_CELLS), -1e3, np.float32)
         lean = sky[:2] / max(float(sky[2]), 0.08)
         fine_origin, coarse_origin = np.array([1.0, -14.0]), np.array([-6.0, -56.0])
         if sky[4] > 0.0:
             spare = np.empty((max(_FINE_CELLS, _COARSE_CELLS),) * 2, np.int32)
-            shadow_map(0, count, corners, attributes, material, lean, fine_origin, _FINE_PER_M, masks, fine, spare)
-            shadow_map(
-                0, count, corners, attributes, material, lean, coarse_origin, _COARSE_PER_M, masks, coarse, spare
-            )
+            for origin, per_m, highest in ((fine_origin, _FINE_PER_M, fine), (coarse_origin, _COARSE_PER_M, coarse)):
+                shadow_map(
+                    0, mesh.count, mesh.corners, mesh.attributes, mesh.material, lean, origin, per_m, foliage_masks(),
+                    highest, spare,
+                )  # fmt: skip
         return fine, coarse, lean, fine_origin, coarse_origin, np.array([_FINE_PER_M, _COARSE_PER_M])
 
     def _contact(self, scene: Bodies, R: Floats, t: Floats, moving: NDArray[np.int64]) -> tuple[Floats32, Floats]:
@@ -250,6 +264,14 @@ class Renderer:
         at_edge, reach_m = 0.3 + 0.3 * seed, 0.4 + 2.0 * hashed(seed, 5.0) ** 2
         contact_map(shade_map, -2.0, -16.0, 5.0, np.ascontiguousarray(poses), sizes, at_edge, reach_m)
         return shade_map, np.array([-2.0, -16.0, 5.0])
+
+
+def _classes(scene: Bodies) -> NDArray[np.uint8]:
+    """(bodies + 1,): the class of each body, 0 where its materials tell theirs, as the ground's do."""
+    out = np.zeros(len(scene.kind) + 1, np.uint8)
+    for kinds, label in _CLASS_OF_KINDS:
+        out[:-1][np.isin(scene.kind, kinds)] = label
+    return out
 
 
 def _marks_by_metre(street: Street) -> NDArray[np.int16]:

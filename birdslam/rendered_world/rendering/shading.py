@@ -1,4 +1,9 @@
-"""From triangles in front to light: one pass over the pixels of a frame. Compiled by numba."""
+"""From triangles in front to light: one pass over the pixels of a frame. Compiled by numba.
+
+`shade` goes through what happens at one point: where it is on its triangle (`coordinates`), which way that faces
+(`unit_normal`), what it is painted with (`surface`), and what light falls on it (`sunlight`, `skylight`, `glossed`,
+`hazed` in `light`). `scene` and `look` are what `shade_frame` describes.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +15,12 @@ from numba import njit
 from birdslam.rendered_world.rendering import materials as m
 from birdslam.rendered_world.rendering import paint, surfaces
 from birdslam.rendered_world.rendering.compiled import inlined, per_pixel
-from birdslam.rendered_world.rendering.contact import contact_light
 from birdslam.rendered_world.rendering.ground import shade_ground
-from birdslam.rendered_world.rendering.light import mirrored, sky_colour, sunlit
+from birdslam.rendered_world.rendering.light import glossed, hazed, sky_colour, skylight, sunlight
 
 # Class of each material, in the order of `materials`; the ground's and a vehicle's panels tell theirs
 MATERIAL_CLASS = np.array([1, 7, 7, 7, 4, 9, 5, 5, 6, 6, 8, 9, 4, 9, 9, 8], np.uint8)
-VEHICLE_CLASS, PERSON_CLASS, OTHER_CLASS = 7, 8, 9
+OTHER_CLASS = 9
 
 
 @inlined
@@ -55,14 +59,9 @@ def tuck(P, z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def shade(  # type: ignore[no-untyped-def]
-    t, depth, C, ray, bases, attributes, normals, material, owner, P_all, R_all, labels, bank, masks, pictures, sky,
-    fine, coarse, lean, fine_origin, coarse_origin, per_m, bands, lines, crossings, marks, by_metre, edges, shade_map,
-    shade_frame_m,
-    pixel_rad, out,
-):  # fmt: skip
-    """Light of triangle t along the ray at a depth into out[:3], its class into out[3]."""
-    x, y, z = C[0] + depth * ray[0], C[1] + depth * ray[1], C[2] + depth * ray[2]
+def coordinates(t, x, y, z, scene):  # type: ignore[no-untyped-def]
+    """(u, v, w) that the point (x, y, z) of triangle t is painted by, and its normal in its body's frame."""
+    bases, attributes, normals, material, _, _, _, _, _ = scene
     b = bases[t, 4] * x + bases[t, 5] * y + bases[t, 6] * z + bases[t, 7]
     c = bases[t, 8] * x + bases[t, 9] * y + bases[t, 10] * z + bases[t, 11]
     b, c = min(max(b, -0.5), 1.5), min(max(c, -0.5), 1.5)
@@ -75,104 +74,141 @@ def shade(  # type: ignore[no-untyped-def]
     lz = a * normals[t, 0, 2] + b * normals[t, 1, 2] + c * normals[t, 2, 2]
     if material[t] not in (m.GROUND, m.PAINT, m.SKIN):
         w = attributes[t, 0, 2] + 0.0  # which face, exactly
-    k = owner[t]
-    P, R = P_all[k], R_all[k]
+    return u, v, w, lx, ly, lz
+
+
+@inlined
+def unit_normal(P, R, mat, w, lx, ly, lz):  # type: ignore[no-untyped-def]
+    """The normal in ego, of length 1."""
     nx = R[0, 0] * lx + R[0, 1] * ly + R[0, 2] * lz
     ny = R[1, 0] * lx + R[1, 1] * ly + R[1, 2] * lz
     nz = R[2, 0] * lx + R[2, 1] * ly + R[2, 2] * lz
-    mat = material[t]
     if mat == m.PAINT:  # bumpers and sills turn in towards the road
         nz -= tuck(P, w) * math.sqrt(nx * nx + ny * ny)
     norm = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz + 1e-12)
-    nx, ny, nz = nx * norm, ny * norm, nz * norm
+    return nx * norm, ny * norm, nz * norm
+
+
+@inlined
+def surface(P, mat, own_class, mask, look, u, v, w, lx, ly, lz, z, foot, facing):  # type: ignore[no-untyped-def]
+    """(red, green, blue, mirror, light, class): how a material reflects at (u, v, w), and light of its own.
+
+    `own_class` is the body's, 0 where its materials tell theirs; `foot` is the pixel's width on the surface in metres.
+    """
+    bank, masks, pictures, sky, _, ground, _, _ = look
+    label = MATERIAL_CLASS[mat]
+    mirror, light = 0.0, 0.0
+    if mat == m.GROUND:
+        along = foot / max(facing, 0.02)
+        r, g, b, mirror, label = shade_ground(ground, bank, pictures, sky, u, v, foot, along)
+    elif mat == m.PAINT:
+        r, g, b, mirror, light = paint.bodywork(P, bank, u, v, w, lx, ly, lz, foot)
+    elif mat == m.WHEEL:
+        r, g, b, mirror, light = paint.wheel(P, u, v, w)
+        label = own_class
+    elif mat == m.CARGO:
+        r, g, b, mirror, light = paint.cargo(P, bank, pictures, u, v, w, foot)
+    elif mat == m.CLOTH or mat == m.SKIN:
+        r, g, b, mirror, light = paint.clothing(P, mat, z, P[m.HEIGHT])
+    elif mat == m.WALL:
+        r, g, b, mirror = surfaces.facade(P, bank, pictures, u, v, w, foot)
+        if w < 4.0:
+            label = 4
+    elif mat == m.FOLIAGE:
+        r, g, b = surfaces.leaves(P, masks, u, v, mask)
+    elif mat == m.PANEL:
+        if P[9] > 3.5 or (P[8] > 3.0 and P[10] == 0.0):
+            r, g, b, light = surfaces.traffic_light(P, u, v, w)
+        else:
+            r, g, b, light = surfaces.panel(P, pictures, u, v, w)
+            if facing < 0.0:
+                r, g, b = 0.3, 0.3, 0.3
+    else:
+        r, g, b, mirror = surfaces.plain(P, bank, pictures, mat, u, v, w, foot)
+        if own_class > 0:
+            label = own_class
+        if mat == m.PLAIN and own_class == 0:
+            label = OTHER_CLASS
+    return r, g, b, mirror, light, label
+
+
+@inlined
+def shade(t, depth, C, ray, scene, look, out):  # type: ignore[no-untyped-def]
+    """Light of triangle t along the ray at a depth into out[:3], its class into out[3]."""
+    _, attributes, _, material, owner, P_all, R_all, labels, _ = scene
+    bank, _, _, sky, maps, _, contact, pixel_rad = look
+    mat, k = material[t], owner[t]
+    P = P_all[k]
+    x, y, z = C[0] + depth * ray[0], C[1] + depth * ray[1], C[2] + depth * ray[2]
+    u, v, w, lx, ly, lz = coordinates(t, x, y, z, scene)
+    nx, ny, nz = unit_normal(P, R_all[k], mat, w, lx, ly, lz)
     length = math.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
     ex, ey, ez = ray[0] / length, ray[1] / length, ray[2] / length
     facing = -(nx * ex + ny * ey + nz * ez)
-    foot = depth * pixel_rad
-    label = MATERIAL_CLASS[mat]
-    mirror, light, bias, soft = 0.0, 0.0, 0.0, 0.0
-    if mat == m.GROUND:
-        along = foot / max(facing, 0.02)
-        r, g, bl, mirror, label = shade_ground(
-            bands, lines, crossings, marks, by_metre, edges, bank, pictures, sky, u, v, foot, along
-        )
-    elif mat == m.PAINT:
-        r, g, bl, mirror, light = paint.bodywork(P, bank, u, v, w, lx, ly, lz, foot)
-    elif mat == m.WHEEL:
-        r, g, bl, mirror, light = paint.wheel(P, u, v, w)
-        label = labels[k]
-    elif mat == m.CARGO:
-        r, g, bl, mirror, light = paint.cargo(P, bank, pictures, u, v, w, foot)
-    elif mat == m.CLOTH or mat == m.SKIN:
-        r, g, bl, mirror, light = paint.clothing(P, mat, C[2] * 0.0 + z, P[m.HEIGHT])
-    elif mat == m.WALL:
-        r, g, bl, mirror = surfaces.facade(P, bank, pictures, u, v, w, foot)
-        if w == 0.0 or w < 4.0:
-            label = 4
-    elif mat == m.FOLIAGE:
-        r, g, bl = surfaces.leaves(P, masks, u, v, attributes[t, 0, 2])
+    r, g, b, mirror, light, label = surface(
+        P, mat, labels[k], attributes[t, 0, 2], look, u, v, w, lx, ly, lz, z, depth * pixel_rad, facing
+    )
+    bias, soft = 0.0, 0.0
+    if mat == m.FOLIAGE:  # leaves lie every way, and let light through
         nx, ny, nz = 0.35 * (nx - ex), 0.35 * (ny - ey), 0.65
         bias, soft, facing = 0.35, 0.5, 1.0
-    elif mat == m.PANEL:
-        if P[9] > 3.5 or (P[8] > 3.0 and P[10] == 0.0):
-            r, g, bl, light = surfaces.traffic_light(P, u, v, w)
-        else:
-            r, g, bl, light = surfaces.panel(P, pictures, u, v, w)
-            if facing < 0.0:
-                r, g, bl = 0.3, 0.3, 0.3
-    else:
-        r, g, bl, mirror = surfaces.plain(P, bank, pictures, mat, u, v, w, foot)
-        if labels[k] > 0:
-            label = labels[k]
-        if mat == m.PLAIN and labels[k] == 0:
-            label = OTHER_CLASS
-    if facing < 0.0 and mat != m.FOLIAGE:
+    elif facing < 0.0:
         nx, ny, nz, facing = -nx, -ny, -nz, -facing
-    # sun and sky
-    toward = nx * sky[0] + ny * sky[1] + nz * sky[2]
-    direct = 0.0
-    if sky[4] > 0.0 and (toward > 0.0 or soft > 0.0):
-        direct = (soft * 0.5 + (1.0 - soft) * max(toward, 0.0)) * sunlit(
-            fine, coarse, lean, fine_origin, coarse_origin, per_m, x, y, z, nx, ny, nz, bias
-        )
-    up = 0.5 + 0.5 * nz
-    open_sky = sky[21] * (1.0 if mat != m.GROUND else contact_light(shade_map, shade_frame_m, x, y))
-    high = w if mat == m.PAINT else z  # over the road
-    if mat != m.GROUND and high < 0.8 and nz < 0.5:
-        open_sky *= 0.6 + 0.4 * max(high, 0.0) / 0.8
-    bounce, lit_road = 0.18 * (1.0 - up), max(sky[2], 0.0)
-    if mat == m.PAINT and sky[4] > 0.0 and nz < 0.5:  # the road that a panel faces may lie in the body's own shadow
-        share = 0.0
-        for j in range(3):
-            away = 0.5 + 0.7 * j
-            share += sunlit(
-                fine, coarse, lean, fine_origin, coarse_origin, per_m, x + away * nx, y + away * ny, z - w,
-                0.0, 0.0, 1.0, 0.0,
-            )  # fmt: skip
-        lit_road *= share / 3.0
-    ar = (sky[6] * up * 0.6 + sky[9] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[3] * lit_road + sky[6])) * open_sky
-    ag = (sky[7] * up * 0.6 + sky[10] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[4] * lit_road + sky[7])) * open_sky
-    ab = (sky[8] * up * 0.6 + sky[11] * 0.4 * (0.4 + 0.6 * up) + bounce * (sky[5] * lit_road + sky[8])) * open_sky
+    direct = sunlight(sky, maps, x, y, z, nx, ny, nz, bias, soft)
+    ar, ag, ab = skylight(sky, maps, contact, mat, x, y, z, w, nx, ny, nz)
     red = r * (ar + direct * sky[3]) + light * 2.0 * r * (sky[7] + 0.2 * sky[4])
     green = g * (ag + direct * sky[4]) + light * 2.0 * g * (sky[7] + 0.2 * sky[4])
-    blue = bl * (ab + direct * sky[5]) + light * 2.0 * bl * (sky[7] + 0.2 * sky[4])
+    blue = b * (ab + direct * sky[5]) + light * 2.0 * b * (sky[7] + 0.2 * sky[4])
     if mirror > 0.0:
-        f = max(0.0, 1.0 - facing)
-        fresnel = mirror + (1.0 - mirror) * 0.9 * f * f * f * f * f
-        if mat == m.GROUND:
-            fresnel = mirror * (0.3 + 6.0 * f * f * f * f)
-        qx, qy, qz = ex + 2.0 * facing * nx, ey + 2.0 * facing * ny, ez + 2.0 * facing * nz
-        mr, mg, mb = mirrored(sky, bank, qx, qy, qz)
-        red, green, blue = red + (mr - red) * fresnel, green + (mg - green) * fresnel, blue + (mb - blue) * fresnel
-        glint = qx * sky[0] + qy * sky[1] + qz * sky[2]
-        if glint > 0.9 and direct > 0.0:
-            s = direct * mirror * (35.0 * max(glint, 0.0) ** 220.0 + 1.2 * max(glint, 0.0) ** 24.0)
-            red, green, blue = red + s * sky[3], green + s * sky[4], blue + s * sky[5]
-    haze = 1.0 - math.exp(-depth * length / sky[15]) if depth * length > 0.01 * sky[15] else 0.0
-    out[0] = red + (sky[12] - red) * haze
-    out[1] = green + (sky[13] - green) * haze
-    out[2] = blue + (sky[14] - blue) * haze
+        red, green, blue = glossed(
+            sky, bank, mat == m.GROUND, mirror, direct, facing, ex, ey, ez, nx, ny, nz, red, green, blue
+        )
+    out[0], out[1], out[2] = hazed(sky, depth * length, red, green, blue)
     out[3] = label
+
+
+@inlined
+def triangles_of(row, column, factor, owner, nearest, of_body, seen, counts, inverse, visible):  # type: ignore[no-untyped-def]
+    """How many triangles a pixel's samples show: whose into `seen`, in how many samples, and 1 / depth of the first."""
+    kinds = 0
+    for i in range(row * factor, (row + 1) * factor):
+        for k in range(column * factor, (column + 1) * factor):
+            t = owner[i, k]
+            if t >= 0:
+                visible[of_body[t]] += 1
+            known = False
+            for j in range(kinds):
+                if seen[j] == t:
+                    counts[j] += 1
+                    known = True
+                    break
+            if not known:
+                seen[kinds], counts[kinds], inverse[kinds] = t, 1, nearest[i, k]
+                kinds += 1
+    return kinds
+
+
+@inlined
+def merge_smooth(kinds, of_body, material, seen, counts, inverse):  # type: ignore[no-untyped-def]
+    """How many are left when triangles of one material of one body, which are shaded once, become one."""
+    merged = 0
+    for j in range(kinds):
+        same = -1
+        for i in range(merged):
+            if (
+                seen[j] >= 0
+                and seen[i] >= 0
+                and of_body[seen[j]] == of_body[seen[i]]
+                and material[seen[j]] == material[seen[i]]
+            ):
+                same = i
+                break
+        if same >= 0:
+            counts[same] += counts[j]
+        else:
+            seen[merged], counts[merged], inverse[merged] = seen[j], counts[j], inverse[j]
+            merged += 1
+    return merged
 
 
 @per_pixel
@@ -183,57 +219,26 @@ def shade_frame(  # type: ignore[no-untyped-def]
 
     R turns camera to ego; K = (fx, fy, cx, cy) of pixels. `visible` counts the samples of each body. `spare` is room
     for a ray, an answer, and the triangles of one pixel's samples: whose, how many, and 1 / depth of the first.
+
+    `scene` = (plane_bases, attributes, normals, material and body of each triangle; parameters, rotation, class and
+    instance of each body); `look` = (noise_bank, foliage_masks, pictures, sky, shadow maps, ground, contact map, rad a
+    pixel).
     """
     height, width = depth_m.shape
-    bases, attributes, normals, material, of_body, P_all, R_all, labels, ids = scene
-    bank, masks, pictures, sky, maps, ground, contact, pixel_rad = look
-    fine, coarse, lean, fine_origin, coarse_origin, per_m = maps
-    bands, lines, crossings, marks, by_metre, edges = ground
-    shade_map, shade_frame_m = contact
+    bases, material, of_body, ids = scene[0], scene[3], scene[4], scene[8]
+    bank, sky = look[0], look[3]
     ray, out, seen, counts, inverse = spare
     samples = factor * factor
     for row in range(height):
         for column in range(width):
-            kinds = 0
-            for i in range(row * factor, (row + 1) * factor):
-                for k in range(column * factor, (column + 1) * factor):
-                    t = owner[i, k]
-                    if t >= 0:
-                        visible[of_body[t]] += 1
-                    known = False
-                    for j in range(kinds):
-                        if seen[j] == t:
-                            counts[j] += 1
-                            known = True
-                            break
-                    if not known:
-                        seen[kinds], counts[kinds], inverse[kinds] = t, 1, nearest[i, k]
-                        kinds += 1
+            kinds = triangles_of(row, column, factor, owner, nearest, of_body, seen, counts, inverse, visible)
             cu, cv = (column - K[2]) / K[0], (row - K[3]) / K[1]
             for j in range(3):
                 ray[j] = R[j, 0] * cu + R[j, 1] * cv + R[j, 2]
-            # Neighbouring triangles of one smooth surface are shaded once
-            merged = 0
-            for j in range(kinds):
-                same = -1
-                for i in range(merged):
-                    if (
-                        seen[j] >= 0
-                        and seen[i] >= 0
-                        and of_body[seen[j]] == of_body[seen[i]]
-                        and material[seen[j]] == material[seen[i]]
-                    ):
-                        same = i
-                        break
-                if same >= 0:
-                    counts[same] += counts[j]
-                else:
-                    seen[merged], counts[merged], inverse[merged] = seen[j], counts[j], inverse[j]
-                    merged += 1
             most, label, depth = 0, 0, np.inf
             r = g = b = 0.0
             front = -1
-            for j in range(merged):
+            for j in range(merge_smooth(kinds, of_body, material, seen, counts, inverse)):
                 t, n = seen[j], counts[j]
                 if t < 0:
                     norm = math.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
@@ -246,11 +251,7 @@ def shade_frame(  # type: ignore[no-untyped-def]
                 near = 1.0 / inverse[j]
                 if d <= 0.0 or abs(d - near) > 0.15 * near:
                     d = near
-                shade(
-                    t, d, C, ray, bases, attributes, normals, material, of_body, P_all, R_all, labels, bank, masks,
-                    pictures, sky, fine, coarse, lean, fine_origin, coarse_origin, per_m, bands, lines, crossings,
-                    marks, by_metre, edges, shade_map, shade_frame_m, pixel_rad, out,
-                )  # fmt: skip
+                shade(t, d, C, ray, scene, look, out)
                 r, g, b = r + n * out[0], g + n * out[1], b + n * out[2]
                 if n > most:
                     most, label, depth, front = n, int(out[3]), d, t
@@ -261,7 +262,7 @@ def shade_frame(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def wet_road(light, classes, wetness):  # type: ignore[no-untyped-def]
-    """What stands over a wet road shows in it upside down, the more the flatter one looks; in place."""
+    """What stands over a wet road shows in it upside down, the more the flatter it is seen; in place."""
     height, width = classes.shape
     copy = light.copy()
     for column in range(width):

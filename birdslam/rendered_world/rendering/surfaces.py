@@ -10,21 +10,24 @@ from birdslam.rendered_world.rendering.light import hashed, noise
 
 
 @per_pixel
-def facade(P, bank, pictures, u, v, face, foot):  # type: ignore[no-untyped-def]
-    """(r, g, b, mirror) of a house: windows in storeys, doors, shops, garages, plaster or brick, and its roof."""
+def _roof(P, bank, u, v, foot):  # type: ignore[no-untyped-def]
+    """(r, g, b, mirror) of tiles in rows."""
     t = foot * 256.0
-    if face < 4.0:
-        v -= 1.0  # walls begin 1 m below the ground
-    if face >= 4.0 and face != 6.0:  # roof
-        f = min(max(1.6 - foot / 0.1, 0.0), 1.0)
-        row = math.floor(v / 0.3)
-        tile = (
-            1.0
-            + f * 0.2 * (hashed(math.floor(u / 0.25 + 0.5 * (row % 2.0)), row) - 0.5)
-            - f * 0.25 * ((v / 0.3) % 1.0 < 0.15)
-        )
-        k = tile * (1.0 + 0.15 * noise(bank, 0, u * 0.05, v * 0.05 + P[m.SEED], t * 0.05))
-        return P[14] * k, P[15] * k, P[16] * k, 0.0
+    f = min(max(1.6 - foot / 0.1, 0.0), 1.0)
+    row = math.floor(v / 0.3)
+    tile = (
+        1.0
+        + f * 0.2 * (hashed(math.floor(u / 0.25 + 0.5 * (row % 2.0)), row) - 0.5)
+        - f * 0.25 * ((v / 0.3) % 1.0 < 0.15)
+    )
+    k = tile * (1.0 + 0.15 * noise(bank, 0, u * 0.05, v * 0.05 + P[m.SEED], t * 0.05))
+    return P[14] * k, P[15] * k, P[16] * k, 0.0
+
+
+@per_pixel
+def _wall(P, bank, u, v, face, foot):  # type: ignore[no-untyped-def]
+    """(r, g, b) of a wall without windows: plaster, brick or stone, stained, perhaps over a plinth."""
+    t = foot * 256.0
     r, g, b = P[m.RED], P[m.GREEN], P[m.BLUE]
     stain = 1.0 + 0.07 * noise(bank, 0, u * 0.06 + P[m.SEED] * 7.0, v * 0.06 + face, t * 0.06)
     stain *= 1.0 + 0.05 * noise(bank, 1, u * 0.4, v * 0.4, t * 0.4) - 0.1 * max(0.0, 0.6 - v)
@@ -42,39 +45,40 @@ def facade(P, bank, pictures, u, v, face, foot):  # type: ignore[no-untyped-def]
     r, g, b = r * stain, g * stain, b * stain
     if v < 0.5 and P[m.SEED] > 0.5:
         r, g, b = 0.6 * r, 0.6 * g, 0.6 * b  # a plinth
-    if face == 6.0:
-        return r, g, b, 0.0
-    long = P[m.LENGTH] if face in (1.0, 3.0) else P[m.WIDTH]
-    storey = math.floor(v / P[9])
+    return r, g, b
+
+
+@per_pixel
+def _ground_floor(P, bank, pictures, u, v, foot, r, g, b):  # type: ignore[no-untyped-def]
+    """(r, g, b, mirror) of shop windows under a sign, or of garage doors, in the wall (r, g, b)."""
+    t = foot * 256.0
+    f = min(max(1.6 - foot / 0.03, 0.0), 1.0)
+    i = math.floor(u / 3.4)
+    w = u - 3.4 * i
+    if P[18] < 1.5:
+        if 2.5 < v < 3.0:
+            p = pictures[int(16.0 * hashed(P[m.SEED], i * 0.1)) % 16, 32, int(w / 3.4 * 63.0)]
+            return p[0], p[1], p[2], 0.02
+        if 0.4 < v < 2.4 and 0.2 < w < 3.2:
+            inside = 0.03 + 0.12 * max(0.0, noise(bank, 0, u * 0.21, v * 0.3 + P[m.SEED], t * 0.2))
+            return inside, inside, 0.9 * inside, 0.08
+    elif 0.05 < v < 2.2 and 0.35 < w < 3.05 and hashed(i, P[m.SEED] * 3.0) > 0.35:
+        groove = (v / 0.28) % 1.0 < 0.1
+        k = (0.2 + 0.6 * hashed(P[m.SEED] + 2.0, i)) * (1.0 - 0.4 * f * groove)
+        return k, k, 0.97 * k, 0.01
+    return r, g, b, 0.0
+
+
+@per_pixel
+def _windows(P, u, v, face, long, storey, r, g, b):  # type: ignore[no-untyped-def]
+    """(r, g, b, mirror) of doors and of windows with frames, sills and shutters, in the wall (r, g, b)."""
     zv = v - storey * P[9]
-    if P[20] >= 0.0 and face in (1.0, 3.0):  # wall art or a poster
-        i, j = int((u - 0.25 * long) / 4.0 * 64.0), int((1.0 - (v - 1.0) / 3.0) * 64.0)
-        if 0 <= i < 64 and 0 <= j < 64:
-            p = pictures[int(P[20]) % 16, j, i]
-            return p[0], p[1], p[2], 0.0
-    if face in (0.0, 2.0) and P[m.SEED] < 0.4:
-        return r, g, b, 0.0  # a blind gable
-    if storey == 0.0 and P[18] > 0.5:
-        i = math.floor(u / 3.4)
-        w = u - 3.4 * i
-        if P[18] < 1.5:  # shop windows under a sign
-            if 2.5 < v < 3.0:
-                p = pictures[int(16.0 * hashed(P[m.SEED], i * 0.1)) % 16, 32, int(w / 3.4 * 63.0)]
-                return p[0], p[1], p[2], 0.02
-            if 0.4 < v < 2.4 and 0.2 < w < 3.2:
-                inside = 0.03 + 0.12 * max(0.0, noise(bank, 0, u * 0.21, v * 0.3 + P[m.SEED], t * 0.2))
-                return inside, inside, 0.9 * inside, 0.08
-        elif 0.05 < v < 2.2 and 0.35 < w < 3.05 and hashed(i, P[m.SEED] * 3.0) > 0.35:  # garage doors
-            groove = (v / 0.28) % 1.0 < 0.1
-            k = (0.2 + 0.6 * hashed(P[m.SEED] + 2.0, i)) * (1.0 - 0.4 * f * groove)
-            return k, k, 0.97 * k, 0.01
-        return r, g, b, 0.0
     i = math.floor(u / P[10])
     w = u - i * P[10] - 0.5 * P[10]
     sill = 0.32 * P[9]
     if (i + 1.0) * P[10] > long or v > P[m.HEIGHT] - 0.25:
         return r, g, b, 0.0
-    if style == 3:  # glass all over
+    if int(P[13]) == 3:  # glass all over
         if abs(w) > 0.5 * P[10] - 0.06 or zv < 0.25:
             return 0.1, 0.1, 0.11, 0.03
         return 0.02, 0.024, 0.026, 0.12
@@ -98,6 +102,30 @@ def facade(P, bank, pictures, u, v, face, foot):  # type: ignore[no-untyped-def]
     if abs(w) < half + 0.1 and sill - 0.08 < zv < sill:
         return 0.45, 0.45, 0.44, 0.0
     return r, g, b, 0.0
+
+
+@per_pixel
+def facade(P, bank, pictures, u, v, face, foot):  # type: ignore[no-untyped-def]
+    """(r, g, b, mirror) of a house: its roof, or its wall with what is in it."""
+    if face < 4.0:
+        v -= 1.0  # walls begin 1 m below the ground
+    if face >= 4.0 and face != 6.0:
+        return _roof(P, bank, u, v, foot)
+    r, g, b = _wall(P, bank, u, v, face, foot)
+    if face == 6.0:
+        return r, g, b, 0.0
+    long = P[m.LENGTH] if face in (1.0, 3.0) else P[m.WIDTH]
+    storey = math.floor(v / P[9])
+    if P[20] >= 0.0 and face in (1.0, 3.0):  # wall art or a poster
+        i, j = int((u - 0.25 * long) / 4.0 * 64.0), int((1.0 - (v - 1.0) / 3.0) * 64.0)
+        if 0 <= i < 64 and 0 <= j < 64:
+            p = pictures[int(P[20]) % 16, j, i]
+            return p[0], p[1], p[2], 0.0
+    if face in (0.0, 2.0) and P[m.SEED] < 0.4:
+        return r, g, b, 0.0  # a blind gable
+    if storey == 0.0 and P[18] > 0.5:
+        return _ground_floor(P, bank, pictures, u, v, foot, r, g, b)
+    return _windows(P, u, v, face, long, storey, r, g, b)
 
 
 @per_pixel

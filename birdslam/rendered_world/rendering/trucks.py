@@ -43,12 +43,37 @@ def _side(B, body, P, s, x0, x1):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _load(B, body, P):  # type: ignore[no-untyped-def]
+    """What is carried: a tank, a flat bed with its load, a mixer, or a box."""
+    y, x0, x1 = 0.5 * P[m.WIDTH], P[m.CARGO_X0], P[m.CARGO_X1]
+    z0, z1 = P[m.CARGO_Z0], P[m.HEIGHT]
+    kind = int(P[m.CARGO_KIND])
+    if kind == 2:  # a tank
+        mid, radius = 0.5 * (z0 + z1), 0.5 * (z1 - z0)
+        limb(B, body, m.CARGO, (x1, 0.0, mid), (x0 + 0.3, 0.0, mid), min(radius, 0.98 * y), min(radius, 0.98 * y), 14)
+        limb(B, body, m.CARGO, (x0 + 0.3, 0.0, mid), (x0, 0.0, mid), min(radius, 0.98 * y), 0.75 * radius, 14)
+        box(B, body, m.DARK, x0, x1, -0.6 * y, 0.6 * y, z0 - 0.2, mid - 0.6 * radius)
+        for side in range(2):  # a ladder, a hose, a rail along the top
+            s = 1.0 - 2.0 * side
+            limb(B, body, m.METAL, (x0 - 0.04, 0.2 * s, 0.6), (x0 - 0.02, 0.2 * s, z1), 0.03, 0.03, 4)
+            limb(B, body, m.DARK, (x1 - 1.0, 0.9 * s * y, z0), (x0 + 1.0, 0.9 * s * y, z0), 0.1, 0.1, 6)
+            limb(B, body, m.METAL, (x1 - 0.6, 0.3 * s, z1), (x0 + 0.9, 0.3 * s, z1), 0.03, 0.03, 4)
+    elif kind == 4:  # a flat bed and its load
+        box(B, body, m.CARGO, x0, x1, -y, y, z0 - 0.1, z0 + 0.45)
+        box(B, body, m.PLAIN, x0 + 0.6, 0.5 * (x0 + x1), -0.7 * y, 0.7 * y, z0, z0 + 0.6 * (z1 - z0))
+    elif kind == 5:  # a mixer
+        limb(B, body, m.CARGO, (x1 - 0.3, 0.0, z0 + 0.9), (0.5 * (x0 + x1), 0.0, z0 + 1.1), 0.6, 0.97 * y, 12)
+        limb(B, body, m.CARGO, (0.5 * (x0 + x1), 0.0, z0 + 1.1), (x0 + 0.2, 0.0, z1 - 0.5), 0.97 * y, 0.45, 12)
+        box(B, body, m.DARK, x0, x1, -0.5 * y, 0.5 * y, z0 - 0.2, z0 + 0.4)
+    else:
+        box(B, body, m.CARGO, x0, x1, -y, y, z0, z1)
+
+
+@njit(cache=True, nogil=True)
 def truck(B, body, P):  # type: ignore[no-untyped-def]
     """A cab, a chassis with wheels, and what it carries."""
     loft(B, body, P)
-    y, r, x0, x1 = 0.5 * P[m.WIDTH], P[m.WHEEL_RADIUS], P[m.CARGO_X0], P[m.CARGO_X1]
-    z0, z1 = P[m.CARGO_Z0], P[m.HEIGHT]
-    kind = int(P[m.CARGO_KIND])
+    y, r, x0, z0 = 0.5 * P[m.WIDTH], P[m.WHEEL_RADIUS], P[m.CARGO_X0], P[m.CARGO_Z0]
     box(B, body, m.DARK, x0 + 0.15, P[m.LOFT_X0] + 0.4, -0.45, 0.45, 0.55, z0)
     box(B, body, m.CARGO, x0 + 0.02, x0 + 0.08, -0.95 * y, 0.95 * y, 0.5, 0.75)  # bumper with lamps and plate
     axles = 3 if P[m.LENGTH] > 12.0 else (2 if P[m.LENGTH] > 8.5 else 1)
@@ -87,22 +112,4 @@ def truck(B, body, P):  # type: ignore[no-untyped-def]
             0.12,
             5,
         )
-    if kind == 2:  # a tank
-        mid, radius = 0.5 * (z0 + z1), 0.5 * (z1 - z0)
-        limb(B, body, m.CARGO, (x1, 0.0, mid), (x0 + 0.3, 0.0, mid), min(radius, 0.98 * y), min(radius, 0.98 * y), 14)
-        limb(B, body, m.CARGO, (x0 + 0.3, 0.0, mid), (x0, 0.0, mid), min(radius, 0.98 * y), 0.75 * radius, 14)
-        box(B, body, m.DARK, x0, x1, -0.6 * y, 0.6 * y, z0 - 0.2, mid - 0.6 * radius)
-        for side in range(2):  # a ladder, a hose, a rail along the top
-            s = 1.0 - 2.0 * side
-            limb(B, body, m.METAL, (x0 - 0.04, 0.2 * s, 0.6), (x0 - 0.02, 0.2 * s, z1), 0.03, 0.03, 4)
-            limb(B, body, m.DARK, (x1 - 1.0, 0.9 * s * y, z0), (x0 + 1.0, 0.9 * s * y, z0), 0.1, 0.1, 6)
-            limb(B, body, m.METAL, (x1 - 0.6, 0.3 * s, z1), (x0 + 0.9, 0.3 * s, z1), 0.03, 0.03, 4)
-    elif kind == 4:  # a flat bed and its load
-        box(B, body, m.CARGO, x0, x1, -y, y, z0 - 0.1, z0 + 0.45)
-        box(B, body, m.PLAIN, x0 + 0.6, 0.5 * (x0 + x1), -0.7 * y, 0.7 * y, z0, z0 + 0.6 * (z1 - z0))
-    elif kind == 5:  # a mixer
-        limb(B, body, m.CARGO, (x1 - 0.3, 0.0, z0 + 0.9), (0.5 * (x0 + x1), 0.0, z0 + 1.1), 0.6, 0.97 * y, 12)
-        limb(B, body, m.CARGO, (0.5 * (x0 + x1), 0.0, z0 + 1.1), (x0 + 0.2, 0.0, z1 - 0.5), 0.97 * y, 0.45, 12)
-        box(B, body, m.DARK, x0, x1, -0.5 * y, 0.5 * y, z0 - 0.2, z0 + 0.4)
-    else:
-        box(B, body, m.CARGO, x0, x1, -y, y, z0, z1)
+    _load(B, body, P)

@@ -136,7 +136,7 @@ def _pass(rng: np.random.Generator, street: Street, ego_s_m: float, ego_d_m: flo
 
 
 def _park(rng: np.random.Generator, rows: list[Row], street: Street, add) -> None:  # type: ignore[no-untyped-def]
-    """Cars in their rows: most along a kerb look where the traffic goes, those across either way."""
+    """Cars in their rows: along a kerb most are headed as the traffic goes, those across stand either way."""
     for row in rows:
         pitch = row.pitch_m
         s = row.s0_m + rng.uniform(0.0, pitch)

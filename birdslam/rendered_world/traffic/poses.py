@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.rendered_world.rendering import materials as m
-from birdslam.rendered_world.rendering.renderer import Bodies
+from birdslam.rendered_world.rendering.scene import Bodies
 from birdslam.rendered_world.street.street import Street
 from birdslam.rendered_world.traffic.flow import Mover
 from birdslam.rendered_world.traffic.placement import Standing

@@ -1,0 +1,45 @@
+"""What is rendered, and what comes of it: numpy alone, so that who places bodies needs no numba."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """What is in the world, row by row: its kind of mesh and the mesh's parameters (`materials`), its pose in world."""
+
+    kind: NDArray[np.int32]
+    parameters: Floats32  # (n, SLOTS)
+    position_m: Floats  # (n, 3) in world
+    yaw_rad: Floats
+    slope: Floats  # of the road under it along its own x, dz/dx; 0 for what stands upright on a slope
+    object_id: NDArray[np.int32]  # -1 for what can't move
+
+    def subset(self, keep: NDArray[np.bool_]) -> Bodies:
+        """The rows to keep."""
+        return Bodies(*(column[keep] for column in self.__dict__.values()))
+
+    def plus(self, other: Bodies) -> Bodies:
+        """These rows, then the other ones."""
+        pairs = zip(self.__dict__.values(), other.__dict__.values(), strict=True)
+        return Bodies(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """`light` (H, W, 3) linear BGR; boxes (n, 4) in pixels, NaN where nothing is in front of the camera."""
+
+    light: Floats32
+    depth_m: Floats32
+    classes: NDArray[np.uint8]
+    instances: NDArray[np.uint16]
+    boxes_px: Floats  # of bodies that move, in the order of `moving`
+    moving: NDArray[np.int64]
+    visible: Floats  # of each of them: the share of its samples inside the image that nothing hides
