@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import itertools
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tracking_world
+from msgspec.structs import replace
 
+from birdslam.baselines.trajectories import Trajectories
 from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.datasets.recording import DatasetError
 from birdslam.evaluation import ablation, tables
 from birdslam.evaluation.tables import Published, read_published
-from birdslam.evaluation.tracking import EGO, PAPER, Row, Truth, make_log, methods, ours, run_trial, summarise
+from birdslam.evaluation.tracking import EGO, PAPER, Live, Row, Truth, make_log, methods, ours, run_trial, summarise
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.weights import weighted
+from birdslam.mapping.landmark_edges import StaticMapConfig
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.evaluate_tracking import PUBLISHED, evaluate
 from birdslam.runtime.cli.tracking_job import frames_of
@@ -39,7 +47,9 @@ def published() -> Published:
     return read_published(PUBLISHED)
 
 
-def log_of(sequence: TrackingSequence, root: Path, config: SimulationConfig, seed: int = 0) -> list[Measurements]:
+def log_of(
+    sequence: TrackingSequence, root: Path, config: SimulationConfig, seed: int = 0, landmark_range_m: float = 20.0
+) -> list[Measurements]:
     found = read_detections(root / "det_02_rrc", sequence.name, len(sequence))
     odometry = SimulatedOdometry(sequence.camera, sequence.camera_poses, config, np.random.default_rng(seed))
     return make_log(
@@ -48,7 +58,7 @@ def log_of(sequence: TrackingSequence, root: Path, config: SimulationConfig, see
         odometry,
         lambda frame, image: Ready(Perception(found[frame], None, {"detector": 0}, ())),
         None,
-        FrontEndConfig(),
+        FrontEndConfig(static_map=StaticMapConfig(landmark_range_m=landmark_range_m)),
     )
 
 
@@ -106,16 +116,116 @@ def test_rows_are_medians_over_seeds(sequence: TrackingSequence, tmp_path: Path)
     assert {row.body for row in rows} == {EGO, "3", "7", "9"}
 
 
-def test_ablations_run_on_both_graphs(sequence: TrackingSequence, exact_log: list[Measurements]) -> None:
-    for base in (PAPER, ours(SlamConfig())):
-        variants = ablation.constraint_variants(base) | ablation.landmark_variants(base)
-        assert tuple(variants) == tables.CONSTRAINTS + tables.LANDMARKS
-        trial = run_trial(sequence, exact_log, variants)
-        for name in variants:
-            assert trial.errors[name][EGO] is not None
-            assert trial.errors[name]["3"] is not None, name  # no row of the tables is left open
-    assert tuple(ablation.lane_variants()) == tables.LANES
-    assert ablation.landmark_variants(PAPER)["cp_medium"].weights.cp == PAPER.weights.cc
+# --- the ablations: each is the same method on a log without those edges, and its name is what it leaves out ---
+
+BASES = (PAPER, ours(SlamConfig()))
+of_both_graphs = pytest.mark.parametrize("base", BASES, ids=["paper", "birdslam"])
+
+
+@pytest.fixture(scope="module")
+def noisy_log(sequence: TrackingSequence, tmp_path_factory: pytest.TempPathFactory) -> list[Measurements]:
+    """With landmarks beyond every threshold of Table 4."""
+    root = tracking_world.write(tmp_path_factory.mktemp("noisy"))
+    return log_of(sequence, root, SimulationConfig(), 1, ablation.FARTHEST_LANDMARK_M)
+
+
+def shift_m(one: Trajectories, other: Trajectories) -> tuple[float, float]:
+    """How far the ego, and a vehicle, of one result is at the most from that of the other."""
+    pairs = [(pose, other.vehicles[car][k]) for car, poses in one.vehicles.items() for k, pose in poses.items()]
+    far = [[a.between(b) for a, b in both] for both in ([(one.ego[k], other.ego[k]) for k in one.ego], pairs)]
+    ego, cars = (max(math.hypot(T.x_m, T.y_m) for T in steps) for steps in far)
+    return ego, cars
+
+
+@of_both_graphs
+def test_every_row_of_tables_3_and_4_has_a_variant(
+    sequence: TrackingSequence, noisy_log: list[Measurements], base: Live
+) -> None:
+    variants = ablation.constraint_variants(base) | ablation.landmark_variants(base)
+    assert tuple(variants) == tables.CONSTRAINTS + tables.LANDMARKS
+    assert variants["all"] == base
+    trial = run_trial(sequence, noisy_log, variants)
+    ates = {name: [e and e.ate_m for e in (errors[EGO], errors["3"])] for name, errors in trial.errors.items()}
+    assert all(ate_m is not None and 0.0 < ate_m < 20.0 for row in ates.values() for ate_m in row)
+    same = {name for name, row in ates.items() if row == ates["all"]}
+    assert same == {"all", "cp_medium", "depth_20"}  # whose numbers are the method's own; all others change something
+
+
+@of_both_graphs
+def test_without_cp_and_vv_are_a_log_without_them(
+    sequence: TrackingSequence, noisy_log: list[Measurements], base: Live
+) -> None:
+    variants = ablation.constraint_variants(base)
+    no_cp, no_vv = ([replace(m, **{name: ()}) for m in noisy_log] for name in ("cp", "vv"))
+    assert variants["without_cp"].run(noisy_log, sequence.camera) == base.run(no_cp, sequence.camera)
+    predicted = dataclasses.replace(base, graph=replace(base.graph, constant_velocity=False))
+    assert variants["without_vv"].run(noisy_log, sequence.camera) == predicted.run(no_vv, sequence.camera)
+
+
+@of_both_graphs
+def test_without_cc_the_ego_hardly_follows_its_odometry(
+    sequence: TrackingSequence, noisy_log: list[Measurements], base: Live
+) -> None:
+    aside = SE2(0.0, 0.05, 0.0)
+    drifting = [
+        m if m.cc is None or m.frame_id < 20 else replace(m, cc=replace(m.cc, T_from_to=m.cc.T_from_to @ aside))
+        for m in noisy_log
+    ]
+    drifts_m = {
+        name: shift_m(*(method.run(log, sequence.camera) for log in (noisy_log, drifting)))[0]
+        for name, method in ablation.constraint_variants(base).items()
+        if name in ("all", "without_cc")
+    }
+    assert drifts_m["all"] > 0.9  # of the 1 m of 20 frames
+    assert drifts_m["without_cc"] < 0.5 * drifts_m["all"]
+
+
+@of_both_graphs
+def test_without_cv_a_vehicle_hardly_follows_one_detection(
+    sequence: TrackingSequence, noisy_log: list[Measurements], base: Live
+) -> None:
+    log = list(noisy_log)
+    off = SE2(0.3)
+    log[25] = replace(log[25], cv=tuple(replace(e, T_ego_vehicle=off @ e.T_ego_vehicle) for e in log[25].cv))
+    follows_m = {
+        name: shift_m(*(method.run(one, sequence.camera) for one in (noisy_log, log)))[1]
+        for name, method in ablation.constraint_variants(base).items()
+        if name in ("all", "without_cv")
+    }
+    assert follows_m["all"] > 0.1
+    assert follows_m["without_cv"] < 0.8 * follows_m["all"]
+
+
+@of_both_graphs
+def test_a_depth_threshold_is_a_log_without_landmarks_beyond_it(
+    sequence: TrackingSequence, noisy_log: list[Measurements], base: Live
+) -> None:
+    variants = ablation.landmark_variants(base)
+    results = []
+    for name, depth_m in ablation.DEPTHS_M.items():
+        far_m = math.inf if depth_m is None else depth_m
+        near = [replace(m, cp=tuple(edge for edge in m.cp if edge.x_m <= far_m)) for m in noisy_log]
+        results.append(variants[name].run(noisy_log, sequence.camera))
+        assert results[-1] == variants["depth_none"].run(near, sequence.camera), name
+    assert all(one != other for one, other in itertools.combinations(results, 2))
+
+
+def test_the_weight_of_landmarks_is_against_that_of_the_odometry(noisy_log: list[Measurements]) -> None:
+    paper, own = (ablation.landmark_variants(base) for base in BASES)
+    record = next(m for m in noisy_log if m.cp and m.cc)
+    for name, factor in ablation.CP_WEIGHTS.items():
+        believed = weighted(record, paper[name].weights)
+        assert believed.cc is not None
+        assert believed.cp[0].cov[0] * factor == pytest.approx(believed.cc.cov[0])
+        assert own[name].cp_inflation == pytest.approx(1.0 / factor)
+
+
+def test_before_lanes_is_a_log_without_landmarks(sequence: TrackingSequence, noisy_log: list[Measurements]) -> None:
+    variants = ablation.lane_variants()
+    assert tuple(variants) == tables.LANES
+    before, after = (method.run(noisy_log, sequence.camera) for method in variants.values())
+    assert before == variants["after_lanes"].run([replace(m, cp=()) for m in noisy_log], sequence.camera)
+    assert shift_m(before, after)[0] > 0.1
 
 
 # --- the simulated odometry ---
