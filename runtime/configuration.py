@@ -71,12 +71,11 @@ class ConfigurationError(ValueError):
 class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All that a run can be told."""
 
-    vehicle: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")] = "car"
+    vehicle: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")] = "car"  # its name on the bus
     source: SourceConfig = SourceConfig()
     camera: Camera | None = None  # None: the recording's own; in a file: a table, or the path of a camera file
-    camera_sha256: Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")] = (
-        ""  # of the camera file, where it is pinned
-    )
+    # Of the camera file, where it is pinned
+    camera_sha256: Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")] = ""
     models: ModelsConfig = ModelsConfig()
     perceive: PerceiveConfig = PerceiveConfig()
     slam: SlamConfig = SlamConfig()
@@ -87,7 +86,7 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     realtime: RealtimeConfig = RealtimeConfig()
     atlas: AtlasConfig = AtlasConfig()  # what planners may ask for of the drive so far
     recording: RecordingConfig = RecordingConfig()
-    output: str = "out"
+    output: str = "out"  # the folder of results
 
     @property
     def lossless(self) -> bool:

@@ -15,8 +15,8 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 class Turn(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """When a head of perceive runs: on every so-manieth frame, or so often a second at the source's frame rate."""
 
-    every: PositiveInt | None = None
-    hz: Positive | None = None
+    every: PositiveInt | None = None  # on one frame in so many
+    hz: Positive | None = None  # so often a second; not beside `every`
 
     def __post_init__(self) -> None:
         if self.every is not None and self.hz is not None:

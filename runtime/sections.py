@@ -56,10 +56,11 @@ class ModelsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The perceive process."""
 
-    # A frame waits for networks until its deadline, from its capture on; at rate "max" each is awaited to its end.
-    deadline_ms: Positive | None = None  # None: by the frame rate
-    deadline_periods: Positive = 0.75  # of the source's frames; the rest is for what comes after the networks
-    opencv_threads: PositiveInt = 2
+    # From its capture on a frame waits so long for networks, at rate "max" to their end; None: by the frame rate
+    deadline_ms: Positive | None = None
+    # The same in periods of the source's frames: the rest of a period is for what comes after the networks
+    deadline_periods: Positive = 0.75
+    opencv_threads: PositiveInt = 2  # of OpenCV in perceive
     schedule: ScheduleConfig = ScheduleConfig()
 
 
@@ -68,7 +69,7 @@ class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     runtime_dir: str = ""  # sockets, locks and vitals; "": the user's own (runtime/transport/presence.py)
     models_dir: str = ""  # installed networks; "": the user's own (runtime/model_store.py)
-    ring_slots: Annotated[int, msgspec.Meta(ge=2, le=64)] = 8
+    ring_slots: Annotated[int, msgspec.Meta(ge=2, le=64)] = 8  # frames in shared memory
     in_flight_frames: PositiveInt = 4  # frames between capture and the estimate at rate "max"
     ready_timeout_s: Positive = 60.0  # for a node to load, warm up and find its peers
     drain_timeout_s: Positive = 2.0  # for the last frame's estimate to come back before the end is announced
@@ -80,9 +81,9 @@ class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     # A node that died or stalled is begun anew; None: "always", but "never" at rate "max", which may lose no frame
     restart: Literal["always", "never"] | None = None
     restarts_max: PositiveInt = 5  # of one node within the window: one more ends the run
-    restart_window_s: Positive = 60.0
+    restart_window_s: Positive = 60.0  # in which they count
     restart_backoff_ms: Positive = 100.0  # before the second restart within the window; then twice as long each time
-    restart_backoff_max_ms: Positive = 2000.0
+    restart_backoff_max_ms: Positive = 2000.0  # at most
     checkpoint_ms: Positive = 250.0  # of the optimizer's graph, for the process after it
     catch_up_ms: Positive = 300.0  # it asks perceive for what it has missed since, and waits no longer
     stale_ms: Positive = 500.0  # a node that has received nothing for so long says so in its health
@@ -95,14 +96,15 @@ class BudgetsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     Raises ValueError where the parts exceed the whole.
     """
 
+    # of the frames must keep each limit, in percent
     percentile: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)] = 99.0
-    capture_ms: Positive = 10.0
-    capture_to_perceive_ms: Positive = 10.0
-    perceive_ms: Positive = 100.0
-    perceive_to_optimize_ms: Positive = 10.0
-    optimize_ms: Positive = 10.0
-    optimize_to_planner_ms: Positive = 10.0
-    end_to_end_ms: Positive = 150.0
+    capture_ms: Positive = 10.0  # capture's step
+    capture_to_perceive_ms: Positive = 10.0  # the hop, with its wait in a queue
+    perceive_ms: Positive = 100.0  # perceive's step
+    perceive_to_optimize_ms: Positive = 10.0  # the hop, with its wait in a queue
+    optimize_ms: Positive = 10.0  # optimize's step
+    optimize_to_planner_ms: Positive = 10.0  # the hop, with its wait in a queue
+    end_to_end_ms: Positive = 150.0  # the whole, from the frame's capture to the planner
 
     def __post_init__(self) -> None:
         parts = [name for name in self.__struct_fields__ if name not in ("percentile", "end_to_end_ms")]
@@ -138,7 +140,7 @@ class DegradationConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     window_frames: PositiveInt = 10  # judged together
     late_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5  # so many of them late: one mode less
     calm_frames: PositiveInt = 50  # in a row within `calm_share` of the budget: one mode more
-    calm_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.7
+    calm_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.7  # of the budget; see calm_frames
     rate_divisor: PositiveInt = 3  # in mode "rate" the networks run on every so-manieth frame at the most
     coast_divisor: PositiveInt = 3  # in mode "coasting" every so-manieth frame is looked at
     coast_max_ms: Positive = 500.0  # of source time without a look: what comes then is invalid
@@ -149,7 +151,7 @@ class RecordingConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     file: str = ""  # FILE.mcap, which must not exist yet; a directory: a new file in it, named by the time; "": none
     images: bool = False  # the frames too, as JPEG
-    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 90  # of the frames
     flush_ms: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)] = 500.0  # what a kill may cost
     sync: bool = True  # each time to the disk itself: a power cut then costs no more than a kill
     queue: PositiveInt = 4096  # messages of a topic that wait for the recorder; what is pushed out is counted

@@ -47,17 +47,18 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Raises ValueError (on decoding: msgspec.ValidationError) where the numbers can't be a camera's.
     """
 
-    width_px: Annotated[int, msgspec.Meta(ge=16, le=16384)]
-    height_px: Annotated[int, msgspec.Meta(ge=16, le=16384)]
-    fx_px: Positive
-    fy_px: Positive
-    cx_px: float
-    cy_px: float
-    height_m: Positive
-    pitch_rad: float = 0.0
-    roll_rad: float = 0.0
+    width_px: Annotated[int, msgspec.Meta(ge=16, le=16384)]  # of the image
+    height_px: Annotated[int, msgspec.Meta(ge=16, le=16384)]  # of the image
+    fx_px: Positive  # focal length
+    fy_px: Positive  # focal length
+    cx_px: float  # principal point
+    cy_px: float  # principal point
+    height_m: Positive  # over the road: all metres come from it
+    pitch_rad: float = 0.0  # of the camera against the road; > 0: nose down
+    roll_rad: float = 0.0  # > 0: right side down
+    # OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]; none: undistorted images
     distortion: tuple[float, ...] = ()
-    tilt_sigma_rad: Positive = 0.015
+    tilt_sigma_rad: Positive = 0.015  # 1-sigma of pitch and roll: by default as well as a bracket is screwed on
 
     def __post_init__(self) -> None:
         lens = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)

@@ -51,27 +51,27 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Vehicles
     constant_velocity: bool = True  # False: only VV edges tie the poses of a vehicle, as in Eq. 6
     change_forward_mps: Positive = 2.0  # 1-sigma by which a vehicle's velocity changes within a second
-    change_sideways_mps: Positive = 0.5
-    change_turn_radps: Positive = 0.3
+    change_sideways_mps: Positive = 0.5  # the same across
+    change_turn_radps: Positive = 0.3  # and of its yaw rate
     birth_forward_mps: Positive = 12.0  # 1-sigma of the velocity of a vehicle seen for the first time
-    birth_sideways_mps: Positive = 2.0
-    birth_turn_radps: Positive = 0.5
+    birth_sideways_mps: Positive = 2.0  # the same across
+    birth_turn_radps: Positive = 0.5  # and of its yaw rate
     forget_s: Positive = 1.0  # a vehicle out of sight is predicted on for so long
     max_vehicles: Count = 32  # the longest out of sight go first
     detection_gate_sigma: Positive = 4.0  # Mahalanobis distance past which a detection weighs less; twice it: nothing
     detection_contradictions: Count = 5  # so many left out in a row begin the vehicle anew
     # Static map
-    landmark_gate_sigma: Positive = 3.0
+    landmark_gate_sigma: Positive = 3.0  # Mahalanobis distance past which a landmark weighs less
     landmark_common_m: NotNegative = 0.15  # 1-sigma of what is common to all landmarks of a frame (scale, pitch)
     landmark_least_frames: Count = 2  # key frames that a landmark was seen in, to be put on the map
-    max_landmarks: Count = 512
+    max_landmarks: Count = 512  # of a keyframe
     max_pending_landmarks: Count = 10_000  # waiting for `map_update`
     max_pending_frames: Count = 1_000  # whose lane points wait for `map_update`
     # What is common to many CC edges in a row, and so moves all that is in sight against the world's origin alone
     scale_memory_m: Positive = 20.0  # the way over which the error of the metric scale lasts
     # Frames without a picture
     blind_mps: Positive = 1.0  # 1-sigma by which the ego's velocity may differ from the last one measured
-    blind_radps: Positive = 0.1
+    blind_radps: Positive = 0.1  # the same of its yaw rate
 
 
 class PoseGraph:

@@ -23,15 +23,16 @@ class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     that the CV edges carry, since the graph has a constant-velocity factor of its own.
     """
 
+    # measured: each edge has its own covariance; paper: the weights below
     mode: Literal["measured", "paper"] = "measured"
-    cc: Positive = 10_000.0
-    cp: Positive = 10_000.0
-    cv_near: Positive = 1_000.0
-    cv_far: Positive = 10.0
+    cc: Positive = 10_000.0  # lambda of Eq. 4, as those below
+    cp: Positive = 10_000.0  # of landmarks
+    cv_near: Positive = 1_000.0  # of a vehicle at the camera
+    cv_far: Positive = 10.0  # of a vehicle at cv_far_m and farther
     cv_far_m: Positive = 60.0  # the paper says that CV weighs less with depth, not where it ends
-    vv: Positive = 1.0
+    vv: Positive = 1.0  # of a vehicle's own motion
     depth_threshold_m: Positive | None = 20.0  # T of Table 4: landmarks past it are left out; None keeps all
-    leave_out: tuple[EdgeType, ...] | None = None
+    leave_out: tuple[EdgeType, ...] | None = None  # edge types that don't enter the graph; None: the mode's own choice
 
     @property
     def left_out(self) -> tuple[EdgeType, ...]:

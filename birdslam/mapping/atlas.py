@@ -32,14 +32,14 @@ class AtlasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How finely and how far back the drive is kept. A snapshot of either record stays under a mebibyte."""
 
     key_pose_m: Positive = 0.5  # apart, in the finest octave
-    key_pose_rad: Positive = 0.1
+    key_pose_rad: Positive = 0.1  # or turned, in the finest octave
     key_poses: Count = 1024  # in each octave
-    octaves: Count = 10
+    octaves: Count = 10  # of poses: each is half as fine as the one before
     vehicles: Count = 64  # whose paths are kept; the longest out of sight go first
     vehicle_poses: Count = 64  # the newest of each
-    map_cell_m: Positive = 0.25
+    map_cell_m: Positive = 0.25  # of the map, in the finest octave
     map_cells: Count = 4096  # in each octave, of landmarks and of lanes each
-    map_octaves: Count = 5
+    map_octaves: Count = 5  # of the map: each is half as fine as the one before
     epochs: Count = 3  # the newest; of an older one nothing is kept
 
 

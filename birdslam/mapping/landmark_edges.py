@@ -17,12 +17,12 @@ from birdslam.types import LandmarkEdge
 class StaticMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which points of the road become landmarks and lane points."""
 
-    max_landmarks: int = 40
+    max_landmarks: int = 40  # of a frame
     landmark_range_m: float = 20.0  # the paper's depth threshold T
-    sigma_landmark_px: float = 1.0
-    sigma_height_rel: float = 0.02
-    max_lane_points: int = 64
-    lane_range_m: float = 20.0
+    sigma_landmark_px: float = 1.0  # 1-sigma of a landmark in the image
+    sigma_height_rel: float = 0.02  # of the camera's height over the road there
+    max_lane_points: int = 64  # of a frame
+    lane_range_m: float = 20.0  # nearer lane points are kept
     lane_cell_m: float = 0.5  # one point for each cell
     attitude_memory_m: float = 1000.0  # roads are level on average: tilt is forgotten over this distance
 

@@ -38,24 +38,24 @@ class LanesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     window_frames: int = 45  # segmented frames; the paper has 40 to 50
     step_m: float = 0.4  # between two of them: a car that stands, or a faster camera, has nothing new to say
-    step_rad: float = 0.05
+    step_rad: float = 0.05  # or a turn by this
     depth_m: float = 15.0  # nearer points are kept; the paper's 5 m end before a car's camera sees the road
     lattice_m: float = 0.1  # sideways: finer than a painted line is wide
-    behind_m: float = 8.0
-    ahead_m: float = 24.0
-    half_width_m: float = 16.0
-    cell_m: float = 0.25
+    behind_m: float = 8.0  # of the grid
+    ahead_m: float = 24.0  # of the grid
+    half_width_m: float = 16.0  # of the grid
+    cell_m: float = 0.25  # side of a cell
     full_count: int = 2  # sightings that make a cell certain
-    neighbourhood_cells: int = 3  # m
+    neighbourhood_cells: int = 3  # m of the m x m cells around a cell
     neighbourhood_least: int = 3  # foreground cells among m x m, the cell itself included
     least_occupancy: float = 0.5  # of a completed cell
     # Hough
-    line_votes: int = 10
-    line_least_m: float = 2.0
+    line_votes: int = 10  # of the Hough transform: cells on a line
+    line_least_m: float = 2.0  # shorter pieces are dropped
     line_gap_m: float = 4.0  # a dashed line's
     same_line_rad: float = 0.2  # pieces of one lane differ by less
     bend_rad: float = 0.6  # and where they touch, by less than this
-    same_line_m: float = 0.5
+    same_line_m: float = 0.5  # and lie so near to each other's line
     cell_reach_m: float = 1.0  # a cell belongs to the nearest piece, no farther away than this
     least_cells: int = 8  # of a lane, and of it near what was seen: what no frame saw a piece of is a guess
     # Ids

@@ -31,18 +31,18 @@ _BACK_OFF_PX = 2.0
 class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How corners are found and followed; lengths in pixels; cells are for an image 1242 px wide."""
 
-    max_tracks: Count = 450
+    max_tracks: Count = 450  # corners that are followed at once
     refill_share: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.3  # of them gone, until new ones are looked for
     cell_px: Count = 24  # at most one new corner in a cell of this size
     min_corner_score: Positive = 8.0  # smaller eigenvalue of the structure tensor, (grey / px)^2, half image
     # Of Lucas-Kanade: OpenCV's loop over a row takes eight columns at once, and a ninth costs as much as eight more
     window_columns_px: Annotated[int, msgspec.Meta(ge=5)] = 8
-    window_rows_px: Annotated[int, msgspec.Meta(ge=5)] = 20
-    pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 2
+    window_rows_px: Annotated[int, msgspec.Meta(ge=5)] = 20  # of Lucas-Kanade
+    pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 2  # of Lucas-Kanade, beside the image itself
     max_roundtrip_px: Positive = 0.7  # forward and back again must end where it began
     max_residual_grey: Positive = 14.0  # mean absolute difference of the windows (after LK), grey levels
-    dark_mean_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 8.0
-    dark_std_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 4.0
+    dark_mean_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 8.0  # an image that is darker on average is dark
+    dark_std_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 4.0  # and so is one with less contrast
 
 
 @dataclass(frozen=True)

@@ -20,13 +20,13 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 class KeyWindowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How many images, how far apart, and what is adjusted after each."""
 
-    key_images: Annotated[int, msgspec.Meta(ge=3)] = 8
-    adjusted_landmarks: Count = 400
+    key_images: Annotated[int, msgspec.Meta(ge=3)] = 8  # keyframes that are adjusted together
+    adjusted_landmarks: Count = 400  # at most so many of them
     adjust_iterations: Count = 1  # each image adjusts again what the one before left
     key_parallax_px: Positive = 8.0  # a new key image when the median landmark has moved so far, rotation taken out
-    key_distance_m: Positive = 0.7
-    sigma_track_px: Positive = 0.35
-    reject_px: Positive = 2.2
+    key_distance_m: Positive = 0.7  # a new keyframe also after so long a way
+    sigma_track_px: Positive = 0.35  # 1-sigma of a followed corner
+    reject_px: Positive = 2.2  # a landmark that is off by more is an outlier
 
 
 class KeyWindow(SlidingWindow):

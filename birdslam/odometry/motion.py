@@ -22,16 +22,16 @@ class MotionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a motion is known to: measured, standing, or coasting."""
 
     covariance_inflation: Positive = 1.5  # of variances: tracks of neighbouring corners err together
-    sigma_floor_m: Positive = 0.002
-    sigma_floor_rad: Positive = 0.0004
-    sigma_yaw_rad_per_m: Positive = 0.0004
+    sigma_floor_m: Positive = 0.002  # no motion is known better
+    sigma_floor_rad: Positive = 0.0004  # no turn is known better
+    sigma_yaw_rad_per_m: Positive = 0.0004  # of the turn, for each metre of the way
     sigma_path_rel: Positive = 0.012  # of the direction of travel and of the length, beside the scale
-    standing_sigma_m: Positive = 0.0005
-    standing_sigma_rad: Positive = 0.0001
-    coast_acceleration_mps2: Positive = 3.0
-    coast_yaw_acceleration_radps2: Positive = 0.5
+    standing_sigma_m: Positive = 0.0005  # of a car that stands
+    standing_sigma_rad: Positive = 0.0001  # of a car that stands
+    coast_acceleration_mps2: Positive = 3.0  # 1-sigma, while nothing is measured
+    coast_yaw_acceleration_radps2: Positive = 0.5  # 1-sigma, while nothing is measured
     coast_speed_mps: Positive = 0.3  # uncertainty of the last measured speed
-    coast_yaw_rate_radps: Positive = 0.01
+    coast_yaw_rate_radps: Positive = 0.01  # uncertainty of the last measured yaw rate
     unknown_speed_mps: Positive = 10.0  # where none was ever measured
 
 

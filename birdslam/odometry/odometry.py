@@ -50,15 +50,15 @@ class OdometryConfig(KeyWindowConfig, frozen=True, forbid_unknown_fields=True):
     road: RoadScaleConfig = RoadScaleConfig()
     motion: MotionConfig = MotionConfig()
     # where the window does not show the pose
-    two_view_px: Positive = 0.7
+    two_view_px: Positive = 0.7  # outliers' limit of the pose from two images, where the window does not show it
     min_fitting: Count = 18  # landmarks that must agree before a pose counts as measured
-    min_fitting_fraction: Positive = 0.35
-    max_speed_mps: Positive = 70.0
+    min_fitting_fraction: Positive = 0.35  # and so large a part of those in sight
+    max_speed_mps: Positive = 70.0  # a faster motion is no measurement
     max_coast_s: Positive = 1.0  # after that the window begins anew
     # standstill
     standstill_px: Positive = 0.35  # median displacement against the image that the car stopped in
-    standstill_m: Positive = 0.012
-    standstill_rad: Positive = 0.002
+    standstill_m: Positive = 0.012  # a motion that is shorter is none
+    standstill_rad: Positive = 0.002  # a turn that is smaller is none
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,10 @@ _CLOCK_TOLERANCE = 0.1  # of a span
 class MotionWatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How fast a car's speed may change, and how long the odometry must be steady to be believed again."""
 
-    acceleration_mps2: Positive = 15.0
-    change_mps: Positive = 3.0  # beside it, for the noise of the motions within span_s
+    acceleration_mps2: Positive = 15.0  # no car changes its speed faster
+    change_mps: Positive = 3.0  # beside acceleration_mps2, for the noise of the motions within span_s
     span_s: Positive = 0.1  # over which a speed is taken: that of one motion at 33 Hz is three times as noisy as at 10
-    sigmas: Positive = 3.0  # beside both, of the metric scale
+    sigmas: Positive = 3.0  # beside both: of the metric scale
     blind_s: Positive = 0.5  # of source time without a measured motion: where the car is by then is not known
     steady_s: Positive = 0.5  # of source time, in which every motion is measured and possible
 

@@ -42,21 +42,21 @@ _BEYOND_CREST = 0.01  # where a ray would miss the parabola: that is behind the 
 class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is compared on the road, and how much it is believed."""
 
-    near_m: Positive = 4.0
-    far_m: Positive = 22.0
+    near_m: Positive = 4.0  # where the strip of road begins
+    far_m: Positive = 22.0  # where it ends
     half_width_m: Positive = 3.2  # of the strip in front of the car; past it come crown, kerb and parked cars
     lane_half_width_m: Positive = 2.0  # of the strip where no road mask is given: the car's own lane
-    max_samples: Annotated[int, msgspec.Meta(ge=200)] = 2600
-    min_samples: Annotated[int, msgspec.Meta(ge=50)] = 250
+    max_samples: Annotated[int, msgspec.Meta(ge=200)] = 2600  # pixels of the road that are compared
+    min_samples: Annotated[int, msgspec.Meta(ge=50)] = 250  # fewer say nothing
     contrast_window_px: Annotated[int, msgspec.Meta(ge=3)] = 13  # over which brightness and contrast are evened out
-    contrast_floor_grey: Positive = 2.0
+    contrast_floor_grey: Positive = 2.0  # added to the contrast, so that noise on smooth road is not blown up
     effective_sample_fraction: Positive = 0.013  # neighbouring pixels, and the road's shape, err together
     sigma_rotation_rad: Positive = 0.0005  # of the relative rotation that odometry hands over
     sigma_direction_rad: Positive = 0.007  # of the direction of its translation
-    max_iterations: Annotated[int, msgspec.Meta(ge=3)] = 7
+    max_iterations: Annotated[int, msgspec.Meta(ge=3)] = 7  # of the alignment
     coarse_step: Annotated[int, msgspec.Meta(ge=1)] = 4  # every so-manieth sample comes near to the answer
-    coarse_tolerance: Positive = 2e-3
-    tolerance: Positive = 1e-3
+    coarse_tolerance: Positive = 2e-3  # the coarse steps end with a smaller change
+    tolerance: Positive = 1e-3  # the fine ones end with a smaller change
 
 
 @dataclass(frozen=True)

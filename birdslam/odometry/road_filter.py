@@ -28,20 +28,19 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     align: RoadAlignConfig = RoadAlignConfig()
     min_baseline_m: Positive = 0.35  # travelled between the two images; shorter says too little
-    target_baseline_m: Positive = 1.1
-    kept_images: Annotated[int, msgspec.Meta(ge=2)] = 8
+    target_baseline_m: Positive = 1.1  # of the kept images the one nearest to this is compared
+    kept_images: Annotated[int, msgspec.Meta(ge=2)] = 8  # earlier images of the road, to compare with
+    # of the two images of the road; less is no match
     min_correlation: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.35
     max_innovation_sigma: Positive = 4.0  # a comparison farther from what was expected is refused
-    confirmations: Annotated[int, msgspec.Meta(ge=1)] = (
-        3  # comparisons in a row before an unknown scale counts as known
-    )
+    confirmations: Annotated[int, msgspec.Meta(ge=1)] = 3  # in a row before an unknown scale counts as known
     doubt_sigma_rel: Positive = 0.15  # less sure than this, lengths far from the present one are tried as well
     doubt_after: Annotated[int, msgspec.Meta(ge=1)] = 3  # refused comparisons in a row that begin such a search
     violated_after: Annotated[int, msgspec.Meta(ge=1)] = 5  # refused comparisons in a row until the ground is in doubt
     sigma_scale_floor_rel: Positive = 0.015  # one pair never knows the length better: the road is no perfect plane
-    sigma_tilt_floor_rad: Positive = 0.004
+    sigma_tilt_floor_rad: Positive = 0.004  # nor does it know the tilt better
     sigma_bounce_rad: Positive = 0.012  # pitch and roll of the body against their mean, seen once in bounce_m
-    bounce_m: Positive = 3.0
+    bounce_m: Positive = 3.0  # the way over which the body's bounce lasts
     sigma_travel_rad: Positive = 0.012  # direction of travel against the road, over one metre
     sigma_mount_rad: Positive = 0.02  # of the calibrated pitch and roll
     sigma_unseen_rad: Positive = 0.03  # of the tilt after a gap in which nobody saw how the camera turned
@@ -49,11 +48,11 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tilt_walk_rad_per_sqrt_m: Positive = 0.003  # crown and grade of the road
     sigma_curvature_per_m: Positive = 0.0006  # of roads along the way: town streets have radii of 500 m and more
     curvature_memory_m: Positive = 30.0  # so far a crest or a sag reaches
-    sigma_curvature_floor_per_m: Positive = 0.0001
+    sigma_curvature_floor_per_m: Positive = 0.0001  # nor does one pair know the curvature better
     chord_m: Positive = 15.0  # the ground is reported as the plane that meets the road at the foot and so far ahead
     mount_walk_rad_per_sqrt_m: Positive = 0.0007  # of the mean pitch and roll, as loads and tanks change
     carried_after_m: Positive = 6.0  # without a comparison, until the status says so
-    invalid_sigma_rel: Positive = 0.15
+    invalid_sigma_rel: Positive = 0.15  # less sure of the scale than this, a frame is invalid
     watch: TiltWatchConfig = TiltWatchConfig()
 
 

@@ -33,17 +33,17 @@ MOUNT, WANDER = range(2)
 class TiltWatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How cameras lean in their cars, and cars on real roads."""
 
-    look_m: Positive = 2.0
+    look_m: Positive = 2.0  # the way from one look at the tilt to the next
     sigma_look_rad: Positive = 0.003  # bounces, and errors of one look
-    wander_m: Positive = 40.0  # for so long it lasts
+    wander_m: Positive = 40.0  # the way over which grade and load last
     sigma_wander_pitch_rad: Positive = 0.005  # grade and load
-    sigma_wander_roll_rad: Positive = 0.012  # and the road's crown
-    mount_walk_rad_per_sqrt_m: Positive = 2e-5
-    sigma_knock_rad: Positive = 0.05
+    sigma_wander_roll_rad: Positive = 0.012  # grade, load and the road's crown
+    mount_walk_rad_per_sqrt_m: Positive = 2e-5  # by which the camera's mount gives way
+    sigma_knock_rad: Positive = 0.05  # 1-sigma of what a knock turns the camera by
     knock_odds: Positive = 1e-5  # of a knock at one look, beforehand
     gate_sigma: Positive = 3.5  # a look farther from what was expected is a pothole's: it moves nothing
     kept_looks: Annotated[int, msgspec.Meta(ge=2)] = 24  # a knock that so many looks did not show is none
-    drift_sigma: Positive = 3.0
+    drift_sigma: Positive = 3.0  # a mount that is off by more is told as calibration_drift
 
 
 class TiltWatch:

@@ -49,11 +49,11 @@ _FLOAT32 = "tensor(float)"
 class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A network as the configuration names it; None stands for what the manifest states (see `manifest.Schedule`)."""
 
-    path: str
-    manifest: str = ""
-    every: Count | None = None
-    threads: Annotated[int, msgspec.Meta(ge=1, le=64)] | None = None
-    awaited: bool | None = None
+    path: str  # the ONNX file, or a model's name
+    manifest: str = ""  # its TOML file, or the name of a shipped manifest; "": FILE.toml beside FILE.onnx
+    every: Count | None = None  # it runs on one frame in so many
+    threads: Annotated[int, msgspec.Meta(ge=1, le=64)] | None = None  # of the network
+    awaited: bool | None = None  # whether a frame waits for it, up to its deadline
 
 
 class Decoder(Protocol):

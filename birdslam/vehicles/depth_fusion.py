@@ -22,22 +22,22 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 class PseudoLidarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How depth becomes a place, and what it counts beside Eq. 1."""
 
-    rule: Literal["covariance", "paper", "off"] = "covariance"
+    rule: Literal["covariance", "paper", "off"] = "covariance"  # how the places by depth and by Eq. 1 become one
     near_m: Positive = 20.0  # by the paper's rule: nearer, the depth map alone; farther, Eq. 1 alone
-    top_rel: float = 0.35  # of a box's height: the band of rows in which a vehicle's body shows, and neither
-    bottom_rel: float = 0.8  # its windows nor the road before it
+    top_rel: float = 0.35  # of a box's height: upper end of the rows in which a body shows, below its windows
+    bottom_rel: float = 0.8  # of a box's height: lower end of these rows, above the road before it
     columns: Annotated[int, msgspec.Meta(ge=4, le=64)] = 16  # of the box, each with one depth
     yaws: Annotated[int, msgspec.Meta(ge=4, le=180)] = 36  # of the fan, over half a turn
     sigma_shape_rel: Positive = 0.03  # of a depth: how well the map keeps a vehicle's shape, columns apart
     sigma_shape_m: Positive = 0.25  # vehicles are no cuboids
     independent_columns: Positive = 4.0  # errors of neighbouring columns go together
     outlier_sigma: Positive = 3.0  # past it a column is taken to show something else
-    least_columns: Annotated[int, msgspec.Meta(ge=2)] = 5
+    least_columns: Annotated[int, msgspec.Meta(ge=2)] = 5  # with depth, to fit a body
     least_points: Annotated[int, msgspec.Meta(ge=1)] = 40  # of a frustum that the network is asked about
-    max_range_m: Positive = 60.0
+    max_range_m: Positive = 60.0  # farther vehicles are left to Eq. 1
     gate_sigma: Positive = 3.0  # past it the covariance of two places that differ grows
     road_near_m: Positive = 5.0  # of the road that gives an unscaled map its metres
-    road_far_m: Positive = 25.0
+    road_far_m: Positive = 25.0  # and where that stretch of road ends
 
 
 @dataclass(frozen=True)

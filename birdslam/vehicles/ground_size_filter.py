@@ -53,18 +53,18 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is known of roads and vehicles before any was measured."""
 
     sigma_pitch_rad: float = 0.010  # of the camera over real roads against its calibration
-    pitch_memory_s: float = 5.0
+    pitch_memory_s: float = 5.0  # how long the pitch's deviation from the calibration lasts
     sigma_pitch_step_rad: float = 0.0008  # a frame: the road's own change of grade, and the odometry's error
     sigma_pitch_blind_rad: float = 0.003  # a frame without odometry
-    sigma_roll_rad: float = 0.01
-    roll_memory_s: float = 20.0
+    sigma_roll_rad: float = 0.01  # of the camera over real roads against its calibration
+    roll_memory_s: float = 20.0  # how long the roll's deviation lasts
     sigma_kerb_m: float = 0.04  # how far the road under a vehicle in the ego's lane lies off the ego's plane
     sigma_crown_rad: float = 0.007  # and the more the farther it stands to the side
     width_drift_rel: float = 0.002  # of the outline, a frame
     width_turn_rel: float = 1.0  # of the outline, a radian that the line of sight turned: the yaw is not known as well
     width_turned_rel: float = 0.6  # of a change of the outline that comes of a yaw newly learned
     roof_reach_rel: float = 0.6  # of the vehicle's extent along the line of sight, to the edge of its roof
-    cues: tuple[Cue, ...] = ("bottom", "top", "width")
+    cues: tuple[Cue, ...] = ("bottom", "top", "width")  # what of a box is believed
     gate_sigma: float = 2.0  # past it a cue is an outlier: its weight falls with its misfit
     image_pitch_frames: float = 5.0  # for how long the error of a pitch from the images lasts
     box_memory_s: float = 0.5  # a box errs in the next frame as in this: this time counts as one box

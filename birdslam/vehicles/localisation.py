@@ -22,12 +22,12 @@ from birdslam.geometry.camera import Camera, GroundPlane
 class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a class of vehicle measures, and how much its members differ (1-sigma, as a fraction)."""
 
-    length_m: float
-    width_m: float
-    height_m: float
-    sigma_length_rel: float = 0.12
+    length_m: float  # mean of the class
+    width_m: float  # mean of the class
+    height_m: float  # mean of the class
+    sigma_length_rel: float = 0.12  # of the length
     sigma_width_rel: float = 0.2  # of the outline across the line of sight: the length shows too where it is oblique
-    sigma_height_rel: float = 0.08
+    sigma_height_rel: float = 0.08  # of the height
 
 
 DIMENSIONS = {
@@ -45,14 +45,15 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """How boxes become places; the class table also says which labels are vehicles."""
 
     vehicles: dict[str, Dimensions] = msgspec.field(default_factory=lambda: dict(DIMENSIONS))
-    sigma_box_rel: float = 0.02  # a detector's edges scatter with the size of the box,
-    sigma_box_px: float = 0.7  # and beside it as pixels do
+    sigma_box_rel: float = 0.02  # 1-sigma of a box's edges as a fraction of its size
+    sigma_box_px: float = 0.7  # and beside it
     reach_rel: float = 1.0  # of the way from the nearest face to the centre; the paper stays at the face (0)
     sigma_cut_rel: float = 1.0  # an edge cut by the image says nothing within the whole box
     sigma_hidden_rel: float = 0.05  # an edge behind a nearer vehicle is the detector's guess
-    cut_margin_px: float = 4.0
-    cut_margin_rel: float = 0.1  # of the box's height, at the image's bottom: detectors draw an edge that the image
-    cut_margin_side_rel: float = 0.05  # cuts off a little inside of it; and of its width, at the sides
+    cut_margin_px: float = 4.0  # an edge so near to the image's border counts as cut
+    # of the box's height, at the image's bottom: detectors draw a cut edge a little inside of it
+    cut_margin_rel: float = 0.1
+    cut_margin_side_rel: float = 0.05  # of the box's width, at the image's sides
     shape_floor_m: float = 0.05  # across the line of sight: vehicles are no cuboids
     max_above_road_rad: float = 0.06  # a box whose bottom lies so far above where its height puts it hangs in the air
     same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays

@@ -52,10 +52,10 @@ class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     standing: float = 0.3  # of the vehicles, when first seen; those that drive are the rest
     unusual: float = 0.03  # that stand and are of no usual size
-    creeping: float = 0.3
+    creeping: float = 0.3  # of the vehicles, when first seen
     sigma_unusual_rel: float = 0.3  # of their height
-    sigma_creep_mps: float = 2.0
-    sigma_drive_mps: float = 10.0
+    sigma_creep_mps: float = 2.0  # 1-sigma of a creeping vehicle's velocity
+    sigma_drive_mps: float = 10.0  # 1-sigma of a driving vehicle's velocity
     stands_for_s: float = 60.0  # on average, until it starts to creep
     creeps_for_s: float = 10.0  # until it stops, or drives
     drives_for_s: float = 20.0  # until it creeps

@@ -20,7 +20,15 @@ from birdslam.evaluation.odometry import OdometryReport, evaluate_recordings
 from birdslam.evaluation.results import ResultsError
 from birdslam.perception import ModelError
 from birdslam.runtime import model_store
-from birdslam.runtime.cli import calibrate, demo_drive, doctor, interface, models, recording_commands
+from birdslam.runtime.cli import (
+    calibrate,
+    configuration_page,
+    demo_drive,
+    doctor,
+    interface,
+    models,
+    recording_commands,
+)
 from birdslam.runtime.cli.download import DownloadError
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import (
@@ -66,6 +74,7 @@ def execute(options: argparse.Namespace) -> int:
         "listen": listen,
         "doctor": examine,
         "interface": describe_interface,
+        "configuration": describe_configuration,
         "calibrate": calibrate_camera,
         "models list": models.list_models,
         "models check": models.check,
@@ -129,6 +138,12 @@ def examine(options: argparse.Namespace) -> int:
 def describe_interface(options: argparse.Namespace) -> int:
     """`birdslam interface`: the page of keys, records and statuses."""
     print(interface.page(), end="")
+    return 0
+
+
+def describe_configuration(options: argparse.Namespace) -> int:
+    """`birdslam configuration`: the page of every key."""
+    print(configuration_page.page(), end="")
     return 0
 
 

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import inspect
-import io
 import re
-import textwrap
-import tokenize
 import types
 import typing
 from collections.abc import Iterable, Iterator
@@ -17,24 +14,13 @@ import msgspec
 
 import birdslam.types
 from birdslam.geometry.se2 import SE2
+from birdslam.runtime.cli.pages import comments, table, unit
 from birdslam.runtime.configuration import BudgetsConfig
 from birdslam.runtime.topology import NODES, QUESTIONS, TOPICS, VERSION, Topic, alive_key, key_of
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES, Part, Trace
 from birdslam.types import INVALIDATING, Estimate, Status
 
 _VEHICLE = "VEHICLE"
-_UNITS = {
-    "_mps": "m/s",
-    "_m": "m",
-    "_rad": "rad",
-    "_px": "px",
-    "_ns": "ns",
-    "_ms": "ms",
-    "_hz": "Hz",
-    "_rel": "fraction",
-    "_bytes": "B",
-    "_percent": "%",
-}
 _TRANSFORM = re.compile(r"T_([a-z]+)_([a-z]+)")
 _PAGE = """\
 # What a vehicle says, and how to listen
@@ -108,13 +94,13 @@ def page() -> str:
         bytes=MAX_MESSAGE_BYTES,
         vehicle=_VEHICLE,
         version=VERSION,
-        keys=_table(_keys()),
-        questions=_table(_questions()),
+        keys=table(_keys()),
+        questions=table(_questions()),
         example=f"{key_of(_VEHICLE, 'trajectory')}?last_s=30",
         part=_link(Part),
         budget_ms=budgets.end_to_end_ms,
         percentile=budgets.percentile,
-        statuses=_table(_statuses()),
+        statuses=table(_statuses()),
         trace=_link(Trace),
         conventions=inspect.cleandoc(birdslam.types.__doc__ or ""),
         records="\n\n".join(_records()),
@@ -145,7 +131,7 @@ def _questions() -> Iterator[tuple[str, ...]]:
 
 
 def _statuses() -> Iterator[tuple[str, ...]]:
-    meanings = _comments(Status)
+    meanings = comments(Status)
     yield "status", "meaning", "makes an estimate invalid"
     for status in Status:
         yield f"`{status.value}`", meanings[status.name], "**yes**" if status in INVALIDATING else ""
@@ -157,7 +143,7 @@ def _records() -> Iterator[str]:
         yield f"### {record.__name__}"
         shape = " An array on the wire, in this order." if record.__struct_config__.array_like else ""
         yield inspect.cleandoc(record.__doc__ or "") + shape
-        yield _table([("field", "type", "unit", "default", "meaning"), *_fields(record)])
+        yield table([("field", "type", "unit", "default", "meaning"), *_fields(record)])
 
 
 def _with_parts(records: Iterable[type[msgspec.Struct]]) -> list[type[msgspec.Struct]]:
@@ -180,7 +166,7 @@ def _with_parts(records: Iterable[type[msgspec.Struct]]) -> list[type[msgspec.St
 
 
 def _fields(record: type[msgspec.Struct]) -> Iterator[tuple[str, ...]]:
-    own, common = _comments(record), _comments(Estimate)
+    own, common = comments(record), comments(Estimate)
     everywhere = {f.name: common.get(f.name, "") for f in msgspec.structs.fields(Estimate)}
     kinds = {f.name: f.type for f in msgspec.structs.fields(Estimate)}
     for field in msgspec.structs.fields(record):
@@ -188,9 +174,8 @@ def _fields(record: type[msgspec.Struct]) -> Iterator[tuple[str, ...]]:
         pose = f"the pose of {transform[2]} in {transform[1]}" if transform else ""
         said = own.get(field.name) or (everywhere[field.name] if kinds.get(field.name) == field.type else "")
         meaning = f"{pose}: {said}" if pose and said else pose or said
-        unit = next((unit for end, unit in _UNITS.items() if field.name.endswith(end)), "")
         default = "" if field.required else f"`{_plain(field)}`"
-        yield f"`{field.name}`", _type(field.type), unit, default, meaning
+        yield f"`{field.name}`", _type(field.type), unit(field.name), default, meaning
 
 
 def _plain(field: Any) -> str:
@@ -225,22 +210,3 @@ def _type(kind: Any) -> str:
 
 def _link(record: type) -> str:
     return f"[{record.__name__}](#{record.__name__.lower()})"
-
-
-def _comments(kind: type) -> dict[str, str]:
-    """What stands behind each field of a class, in its source."""
-    source = textwrap.dedent(inspect.getsource(kind))
-    found: dict[str, str] = {}
-    name = ""
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        line = re.match(r"    (\w+)\s*[:=]", token.line)
-        name = line[1] if line else ""
-        if token.type == tokenize.COMMENT and name and token.line.strip() != token.string:
-            found.setdefault(name, token.string.lstrip("# "))
-    return found
-
-
-def _table(rows: Iterable[tuple[str, ...]]) -> str:
-    head, *body = rows
-    lines = [head, ("---",) * len(head), *body]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines)

@@ -74,6 +74,8 @@ def _parser() -> argparse.ArgumentParser:
 
     interface = commands.add_parser("interface", help="print what a vehicle says and how to listen: docs/interface.md")
     interface.set_defaults(command="interface")
+    keys = commands.add_parser("configuration", help="print every key with its default: docs/configuration.md")
+    keys.set_defaults(command="configuration")
 
     calibrate_options.add_command(commands)
     models_options.add_commands(commands)

@@ -1,0 +1,83 @@
+"""What the pages that commands write (`birdslam interface`, `birdslam configuration`) take from the code."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import io
+import textwrap
+import tokenize
+from collections.abc import Iterable
+
+UNITS = {  # by the end of a field's name; the longer ends first
+    "_rad_per_sqrt_m": "rad/m^0.5",
+    "_rel_per_sqrt_m": "fraction/m^0.5",
+    "_rad_per_m": "rad/m",
+    "_per_m": "1/m",
+    "_mps2": "m/s2",
+    "_radps2": "rad/s2",
+    "_radps": "rad/s",
+    "_mps": "m/s",
+    "_m": "m",
+    "_rad": "rad",
+    "_px": "px",
+    "_ns": "ns",
+    "_ms": "ms",
+    "_s": "s",
+    "_hz": "Hz",
+    "_rel": "fraction",
+    "_bytes": "B",
+    "_percent": "%",
+    "_grey": "grey levels",
+    "_sigma": "sigma",
+}
+
+
+def unit(name: str) -> str:
+    """The unit that the end of a field's name tells; "" where it has none."""
+    return next((said for end, said in UNITS.items() if name.endswith(end)), "")
+
+
+def comments(kind: type) -> dict[str, str]:
+    """Field -> what its class's source says of it: the comment on its line, else those on the lines right above it.
+
+    Fields of the base classes are among them. A field without a comment is missing.
+    """
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if base.__module__.partition(".")[0] not in ("builtins", "enum", "msgspec"):
+            found |= _own_comments(base)
+    return found
+
+
+def table(rows: Iterable[tuple[str, ...]]) -> str:
+    """Markdown; the first row is the head."""
+    head, *body = rows
+    lines = [head, ("---",) * len(head), *body]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines)
+
+
+def _own_comments(kind: type) -> dict[str, str]:
+    source = textwrap.dedent(inspect.getsource(kind))
+    said, alone = {}, set()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            said[token.start[0]] = token.string.lstrip("# ")
+            if token.line.lstrip().startswith("#"):
+                alone.add(token.start[0])
+    (tree,) = ast.parse(source).body
+    assert isinstance(tree, ast.ClassDef)
+    found = {}
+    for node in tree.body:
+        target = node.target if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [None])[0]
+        if not isinstance(target, ast.Name):
+            continue
+        lines = [line for line in range(node.lineno, (node.end_lineno or node.lineno) + 1) if line in said]
+        if not lines:
+            above = node.lineno - 1
+            while above in alone:
+                lines.insert(0, above)
+                above -= 1
+        if lines:
+            found[target.id] = " ".join(said[line] for line in lines)
+    return found
