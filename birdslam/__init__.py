@@ -1,6 +1,84 @@
-"""BirdSLAM: monocular multibody SLAM in bird's-eye view.
+"""Monocular multibody SLAM in bird's-eye view: what a program imports (docs/api.md has the page).
 
-The records that everything exchanges stand in `types`, with their frames and units: read that first. Then
-`frontend` (one image to the edges of the pose graph: Fig. 2 of the paper) and `graph.pose_graph` (the back end:
-Eqs. 2-8); `slam` runs both in one process. CONTRIBUTING.md has the table of packages and what each may import.
+    from birdslam import BirdSLAM, load_camera, open_recording
+
+    recording = open_recording("video:drive.mp4", load_camera(Path("camera.toml")))
+    slam = BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz)
+    for frame in recording.undistorted_frames():
+        measurements, estimate = slam.step(frame)
+
+A name is loaded when it is first asked for: `import birdslam` alone loads neither numpy nor any network, since BLAS
+reads the number of its threads from the environment when numpy is loaded (`runtime/environment.py` sets it first).
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # the same names, for editors and mypy; a test holds them to `_MODULES`
+    from birdslam.datasets.camera_file import load_camera as load_camera
+    from birdslam.datasets.opening import open_recording as open_recording
+    from birdslam.datasets.recording import DatasetError as DatasetError
+    from birdslam.datasets.recording import Recording as Recording
+    from birdslam.evaluation.results import Recorder as Recorder
+    from birdslam.frontend import FrontEnd as FrontEnd
+    from birdslam.geometry.camera import Camera as Camera
+    from birdslam.geometry.camera import Undistorter as Undistorter
+    from birdslam.geometry.se2 import SE2 as SE2
+    from birdslam.graph.pose_graph import PoseGraph as PoseGraph
+    from birdslam.graph.weights import WeightsConfig as WeightsConfig
+    from birdslam.perception.manifest import ModelError as ModelError
+    from birdslam.perception.network import ModelSpec as ModelSpec
+    from birdslam.perception.schedule import Networks as Networks
+    from birdslam.perception.shipped import load_networks as load_networks
+    from birdslam.perception.shipped import shipped_networks as shipped_networks
+    from birdslam.slam import BirdSLAM as BirdSLAM
+    from birdslam.slam import SlamConfig as SlamConfig
+    from birdslam.types import Estimate as Estimate
+    from birdslam.types import Frame as Frame
+    from birdslam.types import MapUpdate as MapUpdate
+    from birdslam.types import Measurements as Measurements
+    from birdslam.types import Status as Status
+    from birdslam.types import VehicleEstimate as VehicleEstimate
+
+_MODULES = {
+    "BirdSLAM": "birdslam.slam",
+    "Camera": "birdslam.geometry.camera",
+    "DatasetError": "birdslam.datasets.recording",
+    "Estimate": "birdslam.types",
+    "Frame": "birdslam.types",
+    "FrontEnd": "birdslam.frontend",
+    "MapUpdate": "birdslam.types",
+    "Measurements": "birdslam.types",
+    "ModelError": "birdslam.perception.manifest",
+    "ModelSpec": "birdslam.perception.network",
+    "Networks": "birdslam.perception.schedule",
+    "PoseGraph": "birdslam.graph.pose_graph",
+    "Recorder": "birdslam.evaluation.results",
+    "Recording": "birdslam.datasets.recording",
+    "SE2": "birdslam.geometry.se2",
+    "SlamConfig": "birdslam.slam",
+    "Status": "birdslam.types",
+    "Undistorter": "birdslam.geometry.camera",
+    "VehicleEstimate": "birdslam.types",
+    "WeightsConfig": "birdslam.graph.weights",
+    "load_camera": "birdslam.datasets.camera_file",
+    "load_networks": "birdslam.perception.shipped",
+    "open_recording": "birdslam.datasets.opening",
+    "shipped_networks": "birdslam.perception.shipped",
+}
+__all__ = sorted(_MODULES)
+
+
+def __getattr__(name: str) -> Any:
+    """The public names, loaded when they are first asked for (PEP 562)."""
+    if name not in _MODULES:
+        raise AttributeError(f"module 'birdslam' has no attribute {name!r}")
+    value = getattr(import_module(_MODULES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES})

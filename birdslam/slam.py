@@ -9,13 +9,20 @@ from birdslam.geometry.camera import Camera
 from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.mapping.lane_mapper import LaneHead
-from birdslam.perception import Networks
+from birdslam.perception import Networks, shipped_networks
+from birdslam.perception.completion import shipped_completion
 from birdslam.types import Estimate, Frame, MapUpdate, Measurements
 from birdslam.vehicles.pseudolidar import FrustumNetwork
 
+LANES_HZ = 5.0  # that lanes are made out anew, where nothing else is said (`[perceive.schedule]`)
+
 
 class SlamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Every number of the method that can be tuned; one setting serves all roads."""
+    """Every number of the method that can be tuned; one setting serves all roads.
+
+    docs/configuration.md has every key. `SlamConfig(weights=WeightsConfig(mode="paper"))` is the paper's graph;
+    `msgspec.structs.replace` changes single fields; `msgspec.convert(tree, SlamConfig)` reads a TOML's tables.
+    """
 
     frontend: FrontEndConfig = FrontEndConfig()
     weights: WeightsConfig = WeightsConfig()
@@ -23,13 +30,19 @@ class SlamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class BirdSLAM:
-    """The whole method. The three processes of `runtime` run the same two objects, and get the same bytes."""
+    """The whole method in one object (paper, Fig. 2): undistorted frames in, measurements and estimates out.
+
+    The three processes of `birdslam run` run the same front end and the same graph, and get the same bytes at
+    `--rate max`. `networks` find vehicles, road and lanes (`perception.shipped_networks()`, `load_networks`);
+    `lane_head` says how often lanes are made out, and what completes them where something hid the road;
+    `frustum_network` reads bodies from a depth network's points. Not for several threads at once.
+    """
 
     def __init__(
         self,
         camera: Camera,
         networks: Networks,
-        config: SlamConfig,
+        config: SlamConfig = SlamConfig(),  # noqa: B008
         frustum_network: FrustumNetwork | None = None,
         lane_head: LaneHead = LaneHead(),  # noqa: B008
     ) -> None:
@@ -37,11 +50,34 @@ class BirdSLAM:
         self.frontend = FrontEnd(camera, config.frontend, frustum_network=frustum_network, lane_head=lane_head)
         self.graph = PoseGraph(config.graph, config.weights)
 
+    @staticmethod
+    def with_shipped_networks(
+        camera: Camera,
+        rate_hz: float,
+        config: SlamConfig = SlamConfig(),  # noqa: B008
+    ) -> BirdSLAM:
+        """With the networks that ship with the package, as `birdslam evaluate odometry` runs it.
+
+        `rate_hz` is that of the frames to come: lanes are made out anew LANES_HZ times a second. Raises ModelError.
+        """
+        completion = shipped_completion(config.frontend.lanes.shape)
+        lane_head = LaneHead(completion, every=max(1, round(rate_hz / LANES_HZ)))
+        return BirdSLAM(camera, shipped_networks(), config, lane_head=lane_head)
+
     def step(self, frame: Frame) -> tuple[Measurements, Estimate]:
-        """One undistorted frame (paper, Fig. 2): the networks run beside the feature tracking, then the back end."""
+        """One undistorted frame: the networks run beside the feature tracking, then the back end.
+
+        Frames come in the order of their `frame_id` and `t_source_ns`; motion is computed from the latter. Poses are
+        in metres and rad, in the world of `Estimate.epoch` (`types.py` has every frame and unit). What goes wrong with
+        a frame is a `Status` in both records, and `Estimate.valid` says whether it may be driven by. Raises ValueError
+        for an image of another size than the camera's, and nothing for what may be seen in it.
+        """
         measurements = self.frontend.step(frame, self.networks.start(frame.frame_id, frame.image))
         return measurements, self.graph.optimise(measurements)
 
     def map_update(self) -> MapUpdate | None:
-        """What the map gained since the last call."""
+        """What the map gained since the last call, in world: landmarks that left the window, and points of lanes.
+
+        None where it gained nothing.
+        """
         return self.graph.map_update()

@@ -25,11 +25,10 @@ from birdslam.datasets.opening import open_recording
 from birdslam.datasets.recording import DatasetError
 from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections, Findings, ModelError, ModelSpec, Network, load_network
-from birdslam.perception.manifest import SHIPPED_NETWORKS
+from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS
 from birdslam.perception.multitask import MultiTaskDecoder
 from birdslam.perf.errors import PerfError
 from birdslam.perf.figures import Ledger
-from birdslam.runtime.configuration import SHIPPED_MULTITASK
 from birdslam.training.grading import LONG, Grades, box_ious, extents, overlap
 
 label = "the shipped network: held-out worlds, and real frames beside LiDAR and two other networks"

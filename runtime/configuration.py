@@ -23,7 +23,6 @@ from birdslam.odometry.plausibility import MotionWatchConfig
 from birdslam.perception import ModelError, ModelSpec
 from birdslam.runtime import model_store
 from birdslam.runtime.sections import (
-    SHIPPED_MULTITASK,
     BudgetsConfig,
     DegradationConfig,
     ModelsConfig,
@@ -39,7 +38,6 @@ from birdslam.slam import SlamConfig
 __all__ = [
     "FILE_SCHEMES",
     "NO_MODEL",
-    "SHIPPED_MULTITASK",
     "BudgetsConfig",
     "Configuration",
     "ConfigurationError",

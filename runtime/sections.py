@@ -7,10 +7,8 @@ from typing import Annotated, Literal, get_args
 import msgspec
 
 from birdslam.perception import ModelSpec
-from birdslam.perception.manifest import SHIPPED_NETWORKS, Role
+from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS, Role
 from birdslam.runtime.schedule import ScheduleConfig
-
-SHIPPED_MULTITASK = "multitask_int8.onnx"  # as good as the fp32 one in half the time; `--model multitask` is that
 
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.camera import Camera
+from birdslam.geometry.camera import Camera, Undistorter
+from birdslam.types import Frame, Status
 
 
 class DatasetError(ValueError):
@@ -27,7 +28,10 @@ class RecordedFrame:
 
 
 class Recording(ABC):
-    """A recorded drive of one camera. `rate_hz` is nominal, after the stride; frames are not yet undistorted."""
+    """A recorded drive of one camera: its name, its camera, and its frames a second (nominal, after the stride).
+
+    `undistorted_frames` are what `BirdSLAM` takes; `frames` are as they were recorded.
+    """
 
     name: str
     camera: Camera
@@ -41,6 +45,18 @@ class Recording(ABC):
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
         """Every frame in order, from index `start` on; an unreadable one has no image, and the iteration goes on."""
 
+    def undistorted_frames(self) -> Iterator[Frame]:
+        """Every frame in order, numbered from 0, for a program of one process.
+
+        An unreadable one has no image and says so in its status. Captured, so to say, when the recording says:
+        `t_capture_ns` is `t_source_ns`, and UTC is not known (0).
+        """
+        undistort = Undistorter(self.camera)
+        for frame_id, recorded in enumerate(self.frames()):
+            image, _ = undistorted(undistort, recorded)
+            status = (Status.FRAME_UNREADABLE,) if image is None else ()
+            yield Frame(frame_id, recorded.t_source_ns, recorded.t_source_ns, 0, image, status)
+
     def truth_poses(self) -> NDArray[np.float64] | None:
         """(N, 3, 4) poses of camera 0 as KITTI rows in metres, one a frame; None where there are none."""
         return None
@@ -48,3 +64,13 @@ class Recording(ABC):
     def T_cam0_cam(self) -> NDArray[np.float64]:
         """(4, 4) this camera in the axes of camera 0, whose poses the truth gives: the lever arm between the two."""
         return np.eye(4)
+
+
+def undistorted(undistort: Undistorter, recorded: RecordedFrame) -> tuple[NDArray[np.uint8] | None, str | None]:
+    """The image without its lens' distortion; or None, and why there is none."""
+    if recorded.image is None:
+        return None, recorded.error
+    try:
+        return undistort(recorded.image), None
+    except ValueError as unfit:  # of another size than the camera's
+        return None, str(unfit)

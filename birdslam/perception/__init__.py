@@ -9,6 +9,7 @@ from birdslam.perception.manifest_file import shipped_manifests
 from birdslam.perception.network import ModelSpec, Network, load_network
 from birdslam.perception.schedule import ROLES, Networks, Pending, Perception, Ready
 from birdslam.perception.segmentation import Segmentation
+from birdslam.perception.shipped import load_networks, shipped_networks
 
 __all__ = [
     "ROLES",
@@ -26,5 +27,7 @@ __all__ = [
     "Ready",
     "Segmentation",
     "load_network",
+    "load_networks",
     "shipped_manifests",
+    "shipped_networks",
 ]

@@ -15,10 +15,9 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.datasets.opening import open_recording
-from birdslam.datasets.recording import RecordedFrame, Recording
+from birdslam.datasets.recording import RecordedFrame, Recording, undistorted
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, SourceConfig
 from birdslam.types import Frame, Status
@@ -206,13 +205,7 @@ def to_frame(
     undistort: Undistorter, frame_id: int, recorded: RecordedFrame, t_capture_ns: int, t_utc_ns: int = 0
 ) -> Frame:
     """The one way from a source to the front end, live and in `evaluate`: an undistorted frame, or its status."""
-    image: NDArray[np.uint8] | None = None
-    error = recorded.error
-    if recorded.image is not None:
-        try:
-            image = undistort(recorded.image)
-        except ValueError as unfit:
-            error = str(unfit)
+    image, error = undistorted(undistort, recorded)
     if image is None:
         log.warning("frame %d is unreadable: %s", frame_id, error)
     status = (Status.FRAME_UNREADABLE,) if image is None else ()

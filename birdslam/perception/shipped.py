@@ -1,0 +1,37 @@
+"""The networks of a program of one process: those that ship with the package, or others by their files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Any
+
+from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS, Role
+from birdslam.perception.network import ModelSpec, load_network
+from birdslam.perception.schedule import Networks
+
+
+def shipped_networks() -> Networks:
+    """The package's own network, which finds vehicles, road, lane markings and depth. Raises ModelError.
+
+    It was trained on rendered streets alone; on real roads `load_networks` with YOLOX and TwinLiteNet sees more.
+    """
+    return load_networks({"multitask": ModelSpec(path=str(SHIPPED_NETWORKS / SHIPPED_MULTITASK))})
+
+
+def load_networks(specs: Mapping[Role, ModelSpec]) -> Networks:
+    """A network for each role, run in the caller's thread, one after the other, and awaited to its end.
+
+    So what is found depends on the images alone. Each ONNX file has its manifest, FILE.toml, beside it
+    (docs/networks.md). Raises ModelError, which names the file and what is wrong with it.
+    """
+    return Networks([load_network(role, spec) for role, spec in specs.items()], _at_once)
+
+
+def _at_once(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    done: Future[Any] = Future()
+    try:
+        done.set_result(run(*arguments))
+    except Exception as error:  # a network's bug, which surfaces where the result is asked for
+        done.set_exception(error)
+    return done
