@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -14,6 +19,74 @@ from birdslam.runtime.configuration import Configuration, ConfigurationError, lo
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.glob("*.md"), ROOT / "perf" / "README.md"]
+PAGES += [ROOT / "deploy" / "README.md", ROOT / "CHANGELOG.md"]
+FOLDERS = ("birdslam", "runtime", "perf", "docs", "tests", "configs", "deploy")
+
+
+def named(name: str) -> Any:
+    """The module, class, function or value of a dotted name. Raises where there is none."""
+    parts = name.split(".")
+    for end in range(len(parts), 0, -1):
+        try:
+            found: Any = importlib.import_module(".".join(parts[:end]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[end:]:
+            found = getattr(found, part)
+        return found
+    raise ModuleNotFoundError(name)
+
+
+def rows(page: Path) -> Iterator[dict[str, str]]:
+    """The rows of a page's tables, by the tables' heads."""
+    head: list[str] = []
+    for line in page.read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split(" | ")] if line.startswith("|") else []
+        if not head or not cells:
+            head = [cell.strip() for cell in line.strip("|").split("|")] if cells else []
+        elif not set(line) <= set("|- "):
+            yield dict(zip(head, (cell.strip("| ") for cell in cells), strict=False))
+
+
+def in_the_code(row: dict[str, str]) -> list[str]:
+    return [f"birdslam.{name}" for name in re.findall(r"`([\w.]+)`", row.get("in the code", ""))]
+
+
+def test_every_name_of_the_method_page_is_in_the_code() -> None:
+    found = [name for row in rows(DOCS / "method.md") for name in in_the_code(row)]
+    assert len(found) > 40
+    for name in found:
+        assert named(name) is not None, name
+
+
+def test_each_equation_stands_where_the_page_says() -> None:
+    told = {row["equation"]: in_the_code(row) for row in rows(DOCS / "method.md") if "equation" in row}
+    assert list(told) == [f"Eq. {number}" for number in range(1, 9)]
+    for equation, names in told.items():
+        assert names, equation
+        for name in names:
+            assert re.search(rf"{re.escape(equation)}\b", inspect.getsource(named(name))), f"{equation} in {name}"
+
+
+def test_the_method_page_has_every_table_and_section() -> None:
+    told = list(rows(DOCS / "method.md"))
+    assert [row["table"] for row in told if "table" in row] == [f"Table {number}" for number in range(1, 6)]
+    sections = {row["section"].split(",")[0] for row in told if "section" in row}
+    assert sections >= {"3", "3.1.1", "3.1.2", "3.1.3", "3.2", "3.3.1", "3.3.2", "4", "4.1", "4.2", "4.4", "4.4.5"}
+
+
+def test_every_link_leads_somewhere() -> None:
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):
+            assert target.startswith("https://") or (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_every_path_in_the_pages_is_there() -> None:
+    for page in PAGES:
+        for path in re.findall(r"`([\w./-]+/[\w./-]*)`", page.read_text()):
+            if path.split("/")[0] in FOLDERS and ".." not in path:
+                assert (ROOT / path).exists(), f"{page.name}: {path}"
 
 
 def test_the_page_of_keys_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:

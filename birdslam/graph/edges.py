@@ -18,7 +18,7 @@ _LEAST_COV = 1e-12 * np.eye(3)
 
 @dataclass(slots=True)
 class PoseEdges:
-    """The CC, CV and VV edges that end in a frame, in that order: poses (n, 3) and covariances (n, 3, 3)."""
+    """The CC, CV and VV edges of Eq. 6 that end in a frame, in that order: poses (n, 3), covariances (n, 3, 3)."""
 
     cc: EgoEdge | None
     cv: list[VehicleEdge]
