@@ -1,0 +1,273 @@
+"""docs/results.md, made from the reports of the evaluations; README.md has its first table.
+
+    python -m perf results                          # the page anew, from docs/results/*.json
+    python -m perf results --measure [NAME ...]     # runs the evaluations (all, or these) before that
+
+What the page needs of each report is kept in docs/results/NAME.json, so that a test can hold the page to it;
+its words are in docs/results/page.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from birdslam.evaluation.tables import METHOD_TITLES, read_published
+from birdslam.evaluation.tracking import EGO, Row, mean_ate_m
+from birdslam.perf.errors import PerfError
+from birdslam.runtime.cli.pages import table
+
+label = "docs/results.md and the README's table, from the reports of the evaluations"
+
+ROOT = Path(__file__).resolve().parent.parent
+KEPT = ROOT / "docs" / "results"
+TEXT = KEPT / "page.md"  # the page without its figures
+PAGE = ROOT / "docs" / "results.md"
+REAL = "--model detector={models}/yolox_nano_416.onnx --model segmenter={models}/twinlitenet_640x360.onnx"
+SEQUENCES = "{data}/kitti_odometry/sequences"
+TRACKING = "{data}/kitti_tracking/training"
+LABELLED = "--sequences 0000,0001,0002,0003,0004,0005,0006,0008 --detections rrc"
+ODOMETRY_FIELDS = (
+    *("sequence", "frames", "path_m", "ate_m", "ate_pct", "ate_se3_m", "scale_error", "rpe_t_m", "rpe_r_deg"),
+    *("segment_t_pct", "standing_drift_m"),
+)
+CARS = {"0002": ("1",), "0003": ("0", "1"), "0004": ("2",), "0005": ("31",)}  # of the paper, where labels are at hand
+METHODS = {
+    "paper": "the paper's method, re-implemented, live",
+    "nair": "Nair et al., re-implemented",
+    "birdslam_live": "ours, live",
+    "birdslam": "**ours, final**",
+}
+
+Kept = Any  # plain JSON
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A report: the command that writes it, and what of it is kept."""
+
+    command: str  # of `birdslam evaluate`
+    keep: Callable[[Any], Kept]
+
+
+def _odometry(report: Sequence[Mapping[str, Any]]) -> Kept:
+    kept = []
+    for row in report:
+        ego, ahead = row["ego"], row["car_ahead"]
+        few = {name: row[name] for name in ODOMETRY_FIELDS} | {"nees": ego and ego["nees"]}
+        kept.append(few | {"car_ahead": ahead})
+    return _short(kept)
+
+
+def _localisation(report: Sequence[Mapping[str, Any]]) -> Kept:
+    names = ("range", "n", "depth_error_median_rel", "lateral_error_median_m", "inside_1_sigma", "inside_2_sigma")
+    whole = [row for row in report if row["sequence"] == "all"]
+    worst = {
+        row["range"]: max(
+            other["depth_error_median_rel"] or 0.0
+            for other in report
+            if other["range"] == row["range"] and other["sequence"] != "all"
+        )
+        for row in whole
+    }
+    return _short([{name: row[name] for name in names} | {"worst_sequence_rel": worst[row["range"]]} for row in whole])
+
+
+def _tracking(report: Sequence[Mapping[str, Any]]) -> Kept:
+    rows = msgspec.convert(report, list[Row])
+    egos = dict.fromkeys(CARS, (EGO,))
+    kept: dict[str, Any] = {"seeds": rows[0].seeds}
+    for method in METHODS:
+        of = {(row.sequence, row.body): row.ate_m for row in rows if row.method == method}
+        kept[method] = {_body(sequence, car): of.get((sequence, car)) for sequence in CARS for car in CARS[sequence]}
+        kept[method] |= {"mean, cars": mean_ate_m(rows, method, CARS), "mean, ego": mean_ate_m(rows, method, egos)}
+    return _short(kept)
+
+
+def _body(sequence: str, car: str) -> str:
+    return f"{int(sequence)}/{car}"
+
+
+def _short(value: Any) -> Any:
+    """With as many digits as a page can need."""
+    if isinstance(value, float):
+        return float(f"{value:.5g}")
+    if isinstance(value, Mapping):
+        return {key: _short(inner) for key, inner in value.items()}
+    return [_short(inner) for inner in value] if isinstance(value, list) else value
+
+
+EVALUATIONS = {
+    "odometry": Evaluation(f"odometry {SEQUENCES}/00 {SEQUENCES}/06 {{data}}/kitti_raw_clip {REAL}", _odometry),
+    "odometry_from_14": Evaluation(f"odometry {SEQUENCES}/00 --frames 14: {REAL}", _odometry),
+    "odometry_stride_2": Evaluation(f"odometry {SEQUENCES}/00 {SEQUENCES}/06 --stride 2 {REAL}", _odometry),
+    "odometry_demo": Evaluation("odometry demo", _odometry),
+    "odometry_shipped": Evaluation(f"odometry {SEQUENCES}/00 {SEQUENCES}/06 {{data}}/kitti_raw_clip", _odometry),
+    "localisation": Evaluation(f"localisation {TRACKING} {LABELLED}", _localisation),
+    "localisation_paper": Evaluation(f"localisation {TRACKING} {LABELLED} --mode paper", _localisation),
+    "tracking": Evaluation(f"tracking {TRACKING} --frames paper --seeds 5", _tracking),
+}
+
+COLUMNS = (  # of the odometry's table: field, title, format, what stands behind it
+    ("frames", "frames", "d", ""),
+    ("path_m", "path", ".1f", " m"),
+    ("ate_m", "ATE", ".2f", " m"),
+    ("ate_pct", "ATE", ".1f", " %"),
+    ("ate_se3_m", "rigid", ".2f", " m"),
+    ("scale_error", "scale error", "+.1%", ""),
+    ("rpe_t_m", "RPE", ".3f", " m"),
+    ("rpe_r_deg", "RPE", ".3f", " deg"),
+    ("segment_t_pct", "KITTI segments", ".1f", " %"),
+    ("standing_drift_m", "drift while standing", ".2f", " m"),
+    ("nees", "NEES", ".1f", ""),
+)
+DRIVES = {
+    "odometry": "",
+    "odometry_from_14": ", `--frames 14:`",
+    "odometry_stride_2": ", every second frame",
+    "odometry_demo": " (shipped drive and network)",
+}
+
+
+def run(arguments: list[str]) -> None:
+    """Measures what is asked for, and writes the page. Raises PerfError."""
+    parser = argparse.ArgumentParser(prog="python -m perf results", description=__doc__)
+    parser.add_argument("--measure", nargs="*", metavar="NAME", choices=tuple(EVALUATIONS), help="all, or these")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="where recordings lie")
+    parser.add_argument("--models", type=Path, default=Path("../shared/models"), help="where networks lie")
+    parser.add_argument("--reports", type=Path, default=Path("out/results"), help="where evaluations write; kept there")
+    options = parser.parse_args(arguments)
+    for name in (options.measure or EVALUATIONS) if options.measure is not None else ():
+        measure(name, options.data, options.models, options.reports)
+    PAGE.write_text(page(kept()))
+    print(f"{PAGE.relative_to(ROOT)}; README.md's table is to be:\n\n{summary(kept())}")
+
+
+def measure(name: str, data: Path, models: Path, reports: Path) -> None:
+    """Runs an evaluation and keeps what the page needs of it."""
+    evaluation, output = EVALUATIONS[name], reports / name
+    command = shlex.split(evaluation.command.format(data=data, models=models))
+    print(f"birdslam evaluate {shlex.join(command)}", flush=True)
+    program = [sys.executable, "-m", "birdslam.runtime.cli.main", "evaluate", *command, "--output", str(output)]
+    if subprocess.run(program).returncode:
+        raise PerfError(f"{name}: the evaluation failed")
+    few = evaluation.keep(json.loads((output / "report.json").read_text()))
+    (KEPT / f"{name}.json").write_text(json.dumps(few, indent=1) + "\n")
+
+
+def kept() -> dict[str, Kept]:
+    """What is kept of each report, by its name."""
+    return {name: json.loads((KEPT / f"{name}.json").read_text()) for name in EVALUATIONS}
+
+
+def page(found: Mapping[str, Kept]) -> str:
+    """The whole of docs/results.md."""
+    ahead = _ahead(found["odometry"])
+    return TEXT.read_text().format(
+        summary=summary(found),
+        **{name: _command(name) for name in EVALUATIONS},
+        odometry_table=_odometry_table(found),
+        shipped=", ".join(f"{row['ate_pct']:.1f} %" for row in found["odometry_shipped"]),
+        car_ahead=_command("odometry").replace("odometry ", "car-ahead ", 1),
+        ahead_median=ahead["error_median_rel"],
+        ahead_p90=ahead["error_p90_rel"],
+        ahead_frames=ahead["frames"],
+        ahead_shipped=_ahead(found["odometry_shipped"])["error_median_rel"],
+        localisation_table=_localisation_table(found),
+        seeds=found["tracking"]["seeds"],
+        tracking_table=_tracking_table(found["tracking"]),
+    )
+
+
+def summary(found: Mapping[str, Kept]) -> str:
+    """The one table of the README: what, how good, and the command of each row."""
+    rows = [("what", "how good", "command")]
+    names = {"00": "KITTI 00, its first 12 s", "06": "KITTI 06, 5 s", "kitti_raw_clip": "KITTI raw, stop and go"}
+    for row in (*found["odometry"], *found["odometry_demo"]):
+        what = f"ego motion, {names.get(row['sequence'], 'the shipped drive')}, {row['path_m']:.0f} m"
+        good = f"ATE {row['ate_m']:.2f} m ({row['ate_se3_m']:.2f} after rigid motion), scale {row['scale_error']:+.1%}"
+        rows.append((what, good, "`birdslam evaluate odometry`"))
+    ahead = _ahead(found["odometry"])
+    good = f"median error {ahead['error_median_rel']:.1%}, 90 % within {ahead['error_p90_rel']:.1%}"
+    rows.append(("distance to the car ahead, against LiDAR", good, "`birdslam evaluate car-ahead`"))
+    near, *_, far = found["localisation"]
+    good = f"depth {near['depth_error_median_rel']:.1%} off in the median, {far['depth_error_median_rel']:.1%} far away"
+    span = f"{near['range'].split('-')[0]}-{far['range'].split('-')[1]} m"
+    rows.append((f"places of cars at {span}, KITTI tracking", good, "`birdslam evaluate localisation`"))
+    ours, published = found["tracking"]["birdslam"], _published()
+    for whose, name in (("five cars", "mean, cars"), ("four egos", "mean, ego")):
+        good = f"ATE {ours[name]:.2f} m in the mean; the paper {published[name]:.2f}"
+        rows.append((f"trajectories of {whose}, the paper's sequences", good, "`birdslam evaluate tracking`"))
+    age = re.search(r"^\| system \|(.*)$", (ROOT / "perf" / "results" / "report.md").read_text(), re.MULTILINE)
+    assert age is not None
+    rate, dropped, *_, p50, p99, _, worst, _ = (cell.strip() for cell in age[1].strip("|").split("|"))
+    good = f"p50 {p50}, p99 {p99}, max {worst} ms; {dropped} frames dropped"
+    rows.append((f"age at the planner, {rate} Hz, 4 cores", good, "`python -m perf system`"))
+    return table(rows)
+
+
+def _command(name: str) -> str:
+    return f"birdslam evaluate {EVALUATIONS[name].command.format(data='DATA', models='MODELS')}"
+
+
+def _ahead(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    found: Mapping[str, Any] = next(row["car_ahead"] for row in rows if row["car_ahead"])
+    return found
+
+
+def _odometry_table(found: Mapping[str, Kept]) -> str:
+    head = ("sequence", *(title for _, title, _, _ in COLUMNS))
+    body = [
+        (f"{row['sequence']}{kind}", *(_cell(row[field], form, after) for field, _, form, after in COLUMNS))
+        for name, kind in DRIVES.items()
+        for row in found[name]
+    ]
+    return table([head, *body])
+
+
+def _cell(value: float | None, form: str, after: str) -> str:
+    return "" if value is None else f"{value:{form}}{after}"
+
+
+def _localisation_table(found: Mapping[str, Kept]) -> str:
+    head = ("range", "cars seen", "depth error, median", "worst sequence", "paper mode", "lateral error, median")
+    body = [
+        (
+            f"{row['range']} m",
+            str(row["n"]),
+            f"{row['depth_error_median_rel']:.1%}",
+            f"{row['worst_sequence_rel']:.1%}",
+            f"{paper['depth_error_median_rel']:.1%}",
+            f"{row['lateral_error_median_m']:.2f} m",
+            f"{row['inside_1_sigma']:.0%} / {row['inside_2_sigma']:.0%}",
+        )
+        for row, paper in zip(found["localisation"], found["localisation_paper"], strict=True)
+    ]
+    return table([(*head, "inside 1 / 2 sigma"), *body])
+
+
+def _published() -> dict[str, float]:
+    """Of the paper's own method (its Tables 1 and 2), where labels are at hand."""
+    published = read_published(ROOT / "birdslam" / "evaluation" / "published.toml")
+    cars, egos = published.table1.ate_m["paper"], published.table2.ate_m["paper"]
+    out = {_body(sequence, car): cars[sequence][car] for sequence in CARS for car in CARS[sequence]}
+    out |= {"mean, cars": sum(out.values()) / len(out)}
+    return out | {"mean, ego": sum(egos[sequence][EGO] for sequence in CARS) / len(CARS)}
+
+
+def _tracking_table(kept: Mapping[str, Any]) -> str:
+    lines = {f"published {METHOD_TITLES['paper']}": _published()}
+    lines |= {title: kept[method] for method, title in METHODS.items()}
+    columns = [*kept["birdslam"]]
+    body = [(title, *(f"{errors[column]:.2f}" for column in columns)) for title, errors in lines.items()]
+    return table([("ATE, m", *columns), *body])
