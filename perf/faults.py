@@ -17,11 +17,27 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from birdslam.perf.faulty_vehicle import PATIENCE_S, Vehicle, ends_with_its_vehicle, model_options, record_options
+from birdslam.perf.machine import describe
 from birdslam.perf.street import FRAME_M
 from birdslam.perf.strikes import FAULTS, Fault
 from birdslam.perf.witness import Witness
 from birdslam.types import Estimate
 
+PAGE = """\
+# Faults
+
+Made by `make faults`, which breaks a running vehicle in {faults} ways and looks on as its planner. A test holds the rows
+to the suite (`perf/strikes.py` has the faults, `perf/witness.py` the planner's eyes).
+
+{machine}
+
+*Valid again after* counts from the fault's beginning where it hits a process, and from its end where it hits the world
+(a camera that is gone, frames that come late). *Off by* is the largest distance between a pose that was called valid
+and where the car was. A *wrong pose* was called valid and off by more than 5 % of the way; a *wrongly valid* one came
+while nothing could be known.
+
+{table}
+"""
 BEFORE_S, AFTER_S = 0.3, 1.5  # the witness looks on so long before and after, for a wrong pose that comes late
 
 
@@ -78,11 +94,18 @@ def inflict(vehicle: Vehicle, fault: Fault) -> Row:
     )
 
 
+def page(rows: list[Row]) -> str:
+    """docs/faults.md: the table with its head."""
+    m = describe()
+    machine = f"Measured {m['utc']} on {m['cpu']}, {m['cores']} cores, {m['kernel']}, at commit {m['commit']}."
+    return PAGE.format(faults=len(rows), machine=machine, table=markdown(rows))
+
+
 def markdown(rows: list[Row]) -> str:
-    """The table of the README."""
+    """The table of docs/faults.md."""
     lines = [
         "| fault | hits | valid again after | what the planner saw meanwhile "
-        "| valid pose off by | wrong poses | wrongly valid |",
+        "| valid poses off by | wrong poses | wrongly valid |",
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
@@ -101,7 +124,7 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m perf.faults", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="only faults whose name contains one of these")
     parser.add_argument("--models", type=Path, help="folder of networks, for perceive to carry their weight")
-    parser.add_argument("--markdown", type=Path, help="the table goes there too")
+    parser.add_argument("--markdown", type=Path, help="the page goes there, table and head")
     options = parser.parse_args(arguments)
     ends_with_its_vehicle()
     chosen = [f for f in FAULTS if not options.names or any(name in f"{f.name} {f.node}" for name in options.names)]
@@ -117,7 +140,7 @@ def main(arguments: list[str]) -> int:
             print(markdown(rows[-1:]).splitlines()[-1], flush=True)
     print(f"\n{markdown(rows)}")
     if options.markdown:
-        options.markdown.write_text(markdown(rows) + "\n")
+        options.markdown.write_text(page(rows))
     return int(not all(survived(row) for row in rows))
 
 

@@ -12,6 +12,9 @@ from typing import Any
 import msgspec
 import pytest
 
+from birdslam.evaluation.tracking import Row
+from birdslam.perf import faults, results
+from birdslam.perf.strikes import FAULTS
 from birdslam.runtime.cli import configuration_page
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.cli.pages import comments
@@ -74,6 +77,56 @@ def test_the_method_page_has_every_table_and_section() -> None:
     assert [row["table"] for row in told if "table" in row] == [f"Table {number}" for number in range(1, 6)]
     sections = {row["section"].split(",")[0] for row in told if "section" in row}
     assert sections >= {"3", "3.1.1", "3.1.2", "3.1.3", "3.2", "3.3.1", "3.3.2", "4", "4.1", "4.2", "4.4", "4.4.5"}
+
+
+def test_the_page_of_faults_is_of_the_suite_as_it_is() -> None:
+    text = (DOCS / "faults.md").read_text()
+    told = [row for row in rows(DOCS / "faults.md") if "fault" in row]
+    assert [(row["fault"], row["hits"]) for row in told] == [(fault.name, fault.node) for fault in FAULTS]
+    promised = {(fault.name, fault.node): fault.promise_s for fault in FAULTS if fault.promise_s}
+    for row in told:
+        promise = promised.get((row["fault"], row["hits"]))
+        assert ("promise" in row["valid again after"]) == (promise is not None)
+        assert row["wrong poses"] == row["wrongly valid"] == "0", row
+    head, _, after = faults.PAGE.partition("{faults}")
+    assert text.startswith(f"{head}{len(FAULTS)}{after.partition('{machine}')[0]}")
+    assert after.partition("{machine}")[2].partition("{table}")[0] in text
+    assert faults.markdown([]).splitlines()[0] in text
+
+
+def test_the_page_of_results_is_made_of_the_reports_that_are_kept() -> None:
+    found = results.kept()
+    assert results.page(found) == (DOCS / "results.md").read_text(), "python -m perf results"
+
+
+def test_the_readme_has_the_one_table_of_results_and_150_lines() -> None:
+    lines = (ROOT / "README.md").read_text().splitlines()
+    assert len(lines) <= 150
+    assert max(len(line) for line in lines if not line.startswith("|")) <= 120
+    table = results.summary(results.kept()).splitlines()
+    begin = lines.index(table[0])
+    assert lines[begin : begin + len(table) + 1] == [*table, ""]
+
+
+def test_what_a_report_is_reduced_to() -> None:
+    row = {"ate_m": 2.0962464820956, "ego": {"nees": 14.7083921, "frames": 3}, "car_ahead": None}
+    report = [dict.fromkeys(results.ODOMETRY_FIELDS) | row, dict.fromkeys(results.ODOMETRY_FIELDS) | {"ego": None}]
+    report[1]["car_ahead"] = {"frames": 7}
+    first, second = results.EVALUATIONS["odometry"].keep(report)
+    assert (first["ate_m"], first["nees"], second["nees"]) == (2.0962, 14.708, None)
+    assert second["car_ahead"] == {"frames": 7}
+    rows = [
+        Row(sequence=s, method=method, body=body, frames=1.0, frames_labelled=1, seeds=5, ate_m=float(s))
+        for s, cars in results.CARS.items()
+        for body in ("ego", *cars)
+        for method in results.METHODS
+    ]
+    kept = results.EVALUATIONS["tracking"].keep(msgspec.to_builtins(rows))
+    assert kept["seeds"] == 5
+    assert kept["birdslam"] == {
+        **{"2/1": 2.0, "3/0": 3.0, "3/1": 3.0, "4/2": 4.0, "5/31": 5.0},
+        **{"mean, cars": 3.4, "mean, ego": 3.5},
+    }
 
 
 def test_every_link_leads_somewhere() -> None:
