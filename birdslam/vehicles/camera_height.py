@@ -46,15 +46,15 @@ class HeightWatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
     sigma_height_rel: Positive = 0.5  # of the calibrated height, beforehand: the vehicles are to judge it
     sigma_pitch_rad: Positive = 0.004  # of the mean tilt by the images
-    sigma_roll_rad: Positive = 0.01
+    sigma_roll_rad: Positive = 0.01  # of the mean tilt by the images
     sigma_class_rel: Positive = 0.04  # of the mean height of a class on a country's roads, and of a detector's boxes
     sigma_kerb_m: Positive = 0.06  # how far the road under a vehicle lies off the ego's plane
     frames_alike: Positive = 5.0  # for so many frames in a row a detector, and the tilt, err alike
     gate_sigma: Positive = 1.5  # past it a vehicle counts the less the worse it fits
     max_sigma_box_rel: Positive = 0.2  # a box that says less is left out
     kept_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 60  # the last so many
-    min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 8
-    drift_sigma: Positive = 2.5
+    min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 8  # fewer say nothing
+    drift_sigma: Positive = 2.5  # a height that is off by more is told as calibration_drift
     drift_rel: Positive = 0.08  # a smaller difference is none, however sure
 
 
