@@ -110,6 +110,7 @@ class Placing:
         sizes = self._sizes_by_parallax(assignments, expected, T_world_ego, ground_size)
         depths = _depths_by_eq_1(assignments, expected, sizes, ground_size)
         by_eq_1 = self._places_at(depths, assignments, expected.yaw_rad)
+        # The two sources of Fig. 2 become one
         fused = [fuse(where, a.by_depth, self.pseudolidar) for where, a in zip(by_eq_1, assignments, strict=True)]
         return [
             replace(both, assumed=self._assumed(depths, k, a.serial, float(both.cov[0, 0] / one.cov[0, 0])))
@@ -163,7 +164,7 @@ class Placing:
         return out
 
     def _assumed(self, depths: Depths, k: int, serial: int, share: float) -> AssumedSize:
-        """`share` of the box's variance along the line of sight is left: so much of the place is still the box's."""
+        """The size that the k-th place rests on; `share` is how much of the box's variance in depth fusion has left."""
         return AssumedSize(
             log_height=float(depths.log_height[k]),
             sigma_log_height=math.sqrt(float(depths.height_variance[k])),
