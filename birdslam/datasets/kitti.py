@@ -87,7 +87,11 @@ def find_layout(directory: Path) -> Layout:
 def find_images(folder: Path) -> dict[int, Path]:
     """The images of a folder by number."""
     images: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
+    try:
+        paths = sorted(folder.iterdir())
+    except OSError as error:
+        raise DatasetError(f"{folder}: can't be read: {error.strerror}") from None
+    for path in paths:
         if path.suffix.lower() in IMAGE_SUFFIXES and IMAGE_NUMBER.fullmatch(path.stem):
             number = int(path.stem)
             if number in images:

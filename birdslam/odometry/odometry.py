@@ -1,7 +1,7 @@
 """Ego-motion of one forward camera in metres.
 
-    corners followed (features.py) -> the pose among landmarks, adjusted over a window of key images (bundle.py)
-    -> the length of it from the road under the camera (roadscale.py) -> Motion
+    corners followed (features.py) -> the pose among landmarks, adjusted over a window (bundle_adjustment.py)
+    -> the length of it from the road under the camera (road_scale.py) -> Motion
 
 The paper takes this from an off-the-shelf SLAM and scales it by road points and a moving median (Sec. 3.1,
 scale-unambiguous ego-motion initialisation). A standing car holds its pose exactly: the image that the car stopped in

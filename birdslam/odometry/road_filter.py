@@ -1,8 +1,8 @@
 """The road under the camera as a Kalman filter holds it: tilt, curvature, mount, and the length of what is travelled.
 
-One comparison of two images (roadalign.py) knows some combination of length, pitch, roll and curvature. What joins them
-from frame to frame: the camera's own rotation, the road's curvature, the direction of travel, which lies in the road,
-and the mount, about which the car bounces.
+One comparison of two images (`road_alignment`) knows some combination of length, pitch, roll and curvature. What joins
+them from frame to frame: the camera's own rotation, the road's curvature, the direction of travel, which lies in the
+road, and the mount, about which the car bounces.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The paper scales ego-motion by road points of known metric depth (Eq. 1, camera height H) under a moving median
 (Sec. 3.1, scale-unambiguous ego-motion initialisation). Here a filter over (log lambda, pitch, roll, curvature) takes
-the place of the median: one comparison (roadalign.py) knows only some combination of the four, and the filter knows
-which.
+the place of the median: one comparison (`road_alignment`) knows only some combination of the four, and the filter
+knows which.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The length of a motion of known direction, where nothing is known of it: those tried, compared on the road.
 
-An alignment (roadalign.py) reaches only as far as the road's grain; from here it starts near enough.
+An alignment (road_alignment.py) reaches only as far as the road's grain; from here it starts near enough.
 """
 
 from __future__ import annotations

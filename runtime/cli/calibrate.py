@@ -36,7 +36,7 @@ def run(options: argparse.Namespace, configuration: Configuration) -> int:
     uri = options.source if options.source.partition(":")[0] in FILE_SCHEMES else f"kitti:{options.source}"
     lens, height_m = _lens(options)
     recording = _open(uri, lens, height_m, options)
-    known_height = height_m is not None or lens is None  # KITTI's own cameras stand where datasets.py says
+    known_height = height_m is not None or lens is None  # KITTI's own cameras stand where datasets/kitti.py says
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     rate_max = msgspec.structs.replace(configuration.source, rate="max")
     configuration = msgspec.structs.replace(configuration, source=rate_max)
