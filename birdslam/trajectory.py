@@ -25,10 +25,10 @@ from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.types import NS_PER_S, Attitude
 
-Pose = NDArray[np.float64]  # (4, 4) homogeneous, metres
+Transform = NDArray[np.float64]  # (..., 4, 4) homogeneous, metres; one or many
 
 
-def ego_pose(T_world_ego: SE2, attitude: Attitude) -> Pose:
+def ego_pose(T_world_ego: SE2, attitude: Attitude) -> Transform:
     """`T_world_ego` (4, 4) of a planar pose and what it leaves out."""
     out = np.eye(4)
     angles = [T_world_ego.yaw_rad, attitude.pitch_rad, attitude.roll_rad]
@@ -37,7 +37,7 @@ def ego_pose(T_world_ego: SE2, attitude: Attitude) -> Pose:
     return out
 
 
-def split_pose(T_world_ego: Pose) -> tuple[SE2, Attitude]:
+def split_pose(T_world_ego: Transform) -> tuple[SE2, Attitude]:
     """The inverse of `ego_pose`: pitch within a quarter turn."""
     R, (x_m, y_m, z_m) = T_world_ego[:3, :3], T_world_ego[:3, 3]
     yaw_rad = math.atan2(R[1, 0], R[0, 0])
@@ -46,7 +46,7 @@ def split_pose(T_world_ego: Pose) -> tuple[SE2, Attitude]:
     return SE2(float(x_m), float(y_m), yaw_rad), Attitude(z_m=float(z_m), pitch_rad=pitch_rad, roll_rad=roll_rad)
 
 
-def mount_pose(mount: GroundPlane) -> Pose:
+def mount_pose(mount: GroundPlane) -> Transform:
     """`T_ego_cam` (4, 4) of a camera over the road."""
     out = np.eye(4)
     out[:3, :3] = mount.R_ego_cam
@@ -54,7 +54,7 @@ def mount_pose(mount: GroundPlane) -> Pose:
     return out
 
 
-def inverse(T_a_b: Pose) -> Pose:
+def inverse(T_a_b: Transform) -> Transform:
     """`T_b_a` of poses (..., 4, 4)."""
     out = np.zeros_like(T_a_b)
     Rt = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
@@ -64,19 +64,19 @@ def inverse(T_a_b: Pose) -> Pose:
     return out
 
 
-def as_poses(rows: NDArray[np.float64]) -> Pose:
+def as_poses(rows: NDArray[np.float64]) -> Transform:
     """(N, 4, 4) of KITTI rows (N, 3, 4)."""
     out = np.tile(np.eye(4), (len(rows), 1, 1))
     out[:, :3] = rows
     return out
 
 
-def kitti_row(T_first_i: Pose) -> str:
+def kitti_row(T_first_i: Transform) -> str:
     """One line of a KITTI pose file, without its end."""
     return " ".join(f"{number:.9e}" for number in (T_first_i[:3] + 0.0).ravel())  # + 0.0: no negative zeros
 
 
-def tum_row(t_ns: int, T_world_i: Pose) -> str:
+def tum_row(t_ns: int, T_world_i: Transform) -> str:
     """One line of a TUM trajectory, without its end; the time is exact to the nanosecond, qw >= 0."""
     qx, qy, qz, qw = Rotation.from_matrix(T_world_i[:3, :3]).as_quat(canonical=True)
     numbers = " ".join(f"{number + 0.0:.9f}" for number in (*T_world_i[:3, 3], qx, qy, qz, qw))
@@ -116,7 +116,7 @@ def read_kitti(path: Path) -> NDArray[np.float64]:
     return rows
 
 
-def read_tum(path: Path) -> tuple[NDArray[np.float64], Pose]:
+def read_tum(path: Path) -> tuple[NDArray[np.float64], Transform]:
     """Times (N,) in seconds and poses (N, 4, 4) of a TUM file, comments skipped. Raises ValueError naming the line."""
     rows = _read_numbers(path, 8, "TUM pose")
     wrong = np.flatnonzero(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0) > 1e-3)
@@ -138,11 +138,11 @@ class CameraTrajectory:
 
     def __init__(self, mount: GroundPlane) -> None:
         self._T_ego_cam = mount_pose(mount)
-        self._T_first_world: Pose | None = None
+        self._T_first_world: Transform | None = None
         self._epoch = 0
-        self.last: Pose = np.eye(4)
+        self.last: Transform = np.eye(4)
 
-    def add(self, epoch: int, T_world_ego: Pose) -> Pose:
+    def add(self, epoch: int, T_world_ego: Transform) -> Transform:
         """`T_first_i` (4, 4) of the next frame's `ego_pose`."""
         T_world_cam = T_world_ego @ self._T_ego_cam
         if self._T_first_world is None or epoch != self._epoch:

@@ -24,7 +24,7 @@ from birdslam.geometry import bev
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.simulation.odometry import OdometryNoise, fit_drift
-from birdslam.trajectory import Pose, as_poses, inverse
+from birdslam.trajectory import Transform, as_poses, inverse
 
 Floats = NDArray[np.float64]
 CLIPS = {"kitti_odometry/sequences/00": 13, "kitti_odometry/sequences/06": 11, "kitti_raw_clip": 1}  # frames left out
@@ -105,7 +105,7 @@ def measure(recording: Recording, left_out: int) -> tuple[Floats, list[tuple[NDA
     return np.array(rows), tracks[1:], spread_px
 
 
-def _errors(step: Pose, motion: Motion) -> list[float]:
+def _errors(step: Transform, motion: Motion) -> list[float]:
     turned = Rotation.from_matrix(step[:3, :3].T @ motion.R_prev_curr).as_rotvec()
     true_m, found_m = float(np.linalg.norm(step[:3, 3])), max(float(np.linalg.norm(motion.t_prev_curr_m)), 1e-6)
     swung = np.cross(step[:3, 3] / true_m, motion.t_prev_curr_m / found_m)
@@ -113,7 +113,7 @@ def _errors(step: Pose, motion: Motion) -> list[float]:
     return [true_m, true_turn, *turned, swung[0], swung[1], float(np.log(found_m / true_m))]
 
 
-def _pitch_rad(poses: Pose, recording: Recording) -> float:
+def _pitch_rad(poses: Transform, recording: Recording) -> float:
     """Of the camera against the road that it drives on `ROAD_AHEAD_M` further; NaN at the end of the clip."""
     away = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
     if away.max() < ROAD_AHEAD_M:
@@ -126,7 +126,7 @@ def _pitch_rad(poses: Pose, recording: Recording) -> float:
 
 def _gaps_px(
     recording: Recording,
-    step: Pose,
+    step: Transform,
     motion: Motion,
     before: tuple[NDArray[np.int64], Floats],
     after: tuple[NDArray[np.int64], Floats],

@@ -35,21 +35,21 @@ from birdslam.evaluation.odometry import (
 from birdslam.evaluation.results import ResultsError
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.trajectory import Pose, inverse, mount_pose, split_pose
+from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
 from birdslam.types import Attitude, Estimate, Ground, MapUpdate, Measurements, Status, VehicleEdge, VehicleEstimate
 
 CAMERA = Camera(640, 192, 400.0, 400.0, 320.0, 96.0, 1.65)
 COV3, COV2 = (0.0,) * 9, (0.0,) * 4
 
 
-def rigid(rng: np.random.Generator, angle: float = 1.0, shift_m: float = 50.0) -> Pose:
+def rigid(rng: np.random.Generator, angle: float = 1.0, shift_m: float = 50.0) -> Transform:
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(rng.normal(0.0, angle, 3)).as_matrix()
     T[:3, 3] = rng.normal(0.0, shift_m, 3)
     return T
 
 
-def drive(seed: int, count: int = 40) -> Pose:
+def drive(seed: int, count: int = 40) -> Transform:
     rng = np.random.default_rng(seed)
     poses = [np.eye(4)]
     for _ in range(count - 1):
@@ -59,7 +59,7 @@ def drive(seed: int, count: int = 40) -> Pose:
     return np.array(poses)
 
 
-def shaken(poses: Pose, seed: int) -> Pose:
+def shaken(poses: Transform, seed: int) -> Transform:
     rng = np.random.default_rng(seed)
     return np.array([poses[0], *(T @ rigid(rng, 0.01, 0.1) for T in poses[1:])])
 
@@ -182,7 +182,7 @@ def test_agreement_with_evo(seed: int) -> None:
     truth = drive(seed)
     estimated = rigid(np.random.default_rng(seed)) @ shaken(truth, seed)
 
-    def path(poses: Pose) -> trajectory.PosePath3D:
+    def path(poses: Transform) -> trajectory.PosePath3D:
         return trajectory.PosePath3D(poses_se3=list(poses))
 
     def rmse(metric: metrics.PE, ours: trajectory.PosePath3D) -> float:
@@ -217,7 +217,7 @@ def test_the_lever_arm_of_camera_2_is_taken_out(seed: int) -> None:
 class Drive(Recording):
     """A recording without images."""
 
-    def __init__(self, name: str, truth: Pose | None, frames: int) -> None:
+    def __init__(self, name: str, truth: Transform | None, frames: int) -> None:
         self.name, self.camera, self.rate_hz, self._truth, self._frames = name, CAMERA, 10.0, truth, frames
 
     def __len__(self) -> int:
@@ -244,7 +244,7 @@ def estimate(frame_id: int, T_world_ego: SE2, **fields: object) -> Estimate:
     )
 
 
-def perfect(poses: Pose) -> Iterator[Estimate | MapUpdate]:
+def perfect(poses: Transform) -> Iterator[Estimate | MapUpdate]:
     T_ego_cam = mount_pose(CAMERA.ground)
     for index, pose in enumerate(poses):
         T_world_ego, attitude = split_pose(T_ego_cam @ pose @ inverse(T_ego_cam))

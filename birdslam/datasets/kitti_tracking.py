@@ -21,7 +21,7 @@ from birdslam.datasets.recording import DatasetError
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.perception import Detections
-from birdslam.trajectory import Pose, as_poses, inverse, read_kitti
+from birdslam.trajectory import Transform, as_poses, inverse, read_kitti
 
 Floats = NDArray[np.float64]
 
@@ -55,8 +55,8 @@ class TrackingSequence:
 
     name: str
     camera: Camera
-    T_cam0_cam2: Pose
-    poses: Pose
+    T_cam0_cam2: Transform
+    poses: Transform
     labels: tuple[Label, ...]
     images: Path | None
 
@@ -64,9 +64,9 @@ class TrackingSequence:
         return len(self.poses)
 
     @property
-    def camera_poses(self) -> Pose:
+    def camera_poses(self) -> Transform:
         """(N, 4, 4) `T_first_i` of camera 2."""
-        out: Pose = inverse(self.T_cam0_cam2) @ self.poses @ self.T_cam0_cam2
+        out: Transform = inverse(self.T_cam0_cam2) @ self.poses @ self.T_cam0_cam2
         return out
 
     def labels_of(self, frame: int) -> list[Label]:
@@ -88,7 +88,7 @@ class TrackingSequence:
         return _laid_down(poses @ T_cam0_vehicle)
 
 
-def _laid_down(T_first_i: Pose) -> SE2:
+def _laid_down(T_first_i: Transform) -> SE2:
     """A pose in camera axes, seen from above."""
     forward = T_first_i[:3, 2]
     return SE2(float(T_first_i[2, 3]), float(-T_first_i[0, 3]), math.atan2(-forward[0], forward[2]))
@@ -123,7 +123,7 @@ def open_tracking(root: Path, name: str) -> TrackingSequence:
     return TrackingSequence(name, camera, T_cam0_cam2, poses, tuple(labels), images)
 
 
-def _read_poses(root: Path, name: str, calibration: Path) -> Pose:
+def _read_poses(root: Path, name: str, calibration: Path) -> Transform:
     oxts, rows = root / "oxts" / f"{name}.txt", root / "pose_cam0" / f"{name}.txt"
     if oxts.is_file():
         return read_oxts(oxts, calibration)
@@ -138,7 +138,7 @@ def _read_poses(root: Path, name: str, calibration: Path) -> Pose:
     return poses
 
 
-def read_oxts(path: Path, calibration: Path) -> Pose:
+def read_oxts(path: Path, calibration: Path) -> Transform:
     """(N, 4, 4) `T_first_i` of camera 0 from GPS/IMU rows: latitude, longitude, altitude, roll, pitch, yaw, ...
 
     The devkit's own formula: Mercator about the first latitude, then the chain IMU - Velodyne - camera 0.
@@ -162,7 +162,7 @@ def read_oxts(path: Path, calibration: Path) -> Pose:
     T_velo_imu[:3] = _calibrated(calibration, ("Tr_imu_to_velo", "Tr_imu_velo"), 12).reshape(3, 4)
     T_cam0_imu = rectify @ T_cam0_velo @ T_velo_imu
     T_world_cam0 = T_world_imu @ inverse(T_cam0_imu)
-    out: Pose = inverse(T_world_cam0[0]) @ T_world_cam0
+    out: Transform = inverse(T_world_cam0[0]) @ T_world_cam0
     return out
 
 

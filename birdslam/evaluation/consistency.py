@@ -11,7 +11,7 @@ import numpy as np
 
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.trajectory import Pose, ego_pose, inverse, mount_pose, split_pose
+from birdslam.trajectory import Transform, ego_pose, inverse, mount_pose, split_pose
 from birdslam.types import Estimate, Status
 
 DIMENSIONS = 3
@@ -32,7 +32,7 @@ class Consistency:
 
     def __init__(self, mount: GroundPlane) -> None:
         self._mount = mount_pose(mount)
-        self._begins: dict[int, tuple[int, Pose]] = {}  # of an epoch: its first frame, and T_world_ego there
+        self._begins: dict[int, tuple[int, Transform]] = {}  # of an epoch: its first frame, and T_world_ego there
         self._stated: list[tuple[int, Estimate]] = []  # with its frame of the recording
         self._frames = 0
 
@@ -45,7 +45,7 @@ class Consistency:
             self._stated.append((self._frames, estimate))
         self._frames += 1
 
-    def report(self, truth: Pose) -> ConsistencyReport:
+    def report(self, truth: Transform) -> ConsistencyReport:
         """Against `T_first_i` (N, 4, 4) of the camera, all frames of the recording, in its own axes.
 
         Each epoch's world begins with the truth at its own first frame.
@@ -65,6 +65,6 @@ class Consistency:
             inside_95=float(np.mean(np.less(values, INSIDE_95))),
         )
 
-    def _true_ego(self, origin: Pose, T_begin_cam: Pose) -> SE2:
+    def _true_ego(self, origin: Transform, T_begin_cam: Transform) -> SE2:
         """The ego's true pose on the road; at the epoch's first frame it is `origin`, the estimated one."""
         return split_pose(origin @ self._mount @ T_begin_cam @ inverse(self._mount))[0]

@@ -21,7 +21,7 @@ from birdslam.datasets.recording import Recording
 from birdslam.evaluation.car_ahead import CarAhead, CarAheadReport
 from birdslam.evaluation.consistency import Consistency, ConsistencyReport
 from birdslam.evaluation.results import Recorder, claim_directory
-from birdslam.trajectory import Pose, as_poses, inverse, read_kitti
+from birdslam.trajectory import Transform, as_poses, inverse, read_kitti
 from birdslam.types import Estimate, MapUpdate, Measurements
 
 STANDING_RADIUS_M, STANDING_FRAMES = 0.05, 10  # a car whose truth stays within it for so long stands
@@ -57,29 +57,29 @@ def rms(errors: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(np.square(errors)))) if errors.size else 0.0
 
 
-def path_length_m(poses: Pose) -> float:
+def path_length_m(poses: Transform) -> float:
     """Length of the way through (N, 4, 4) poses."""
     return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
 
 
-def from_first(poses: Pose) -> Pose:
+def from_first(poses: Transform) -> Transform:
     """The poses as seen from the first one: its alignment to the identity."""
     return inverse(poses[0]) @ poses
 
 
-def in_camera0(poses: Pose, T_cam0_cam: Pose) -> Pose:
+def in_camera0(poses: Transform, T_cam0_cam: Transform) -> Transform:
     """`T_first_i` of a camera, as camera 0 of the same car moves: the lever arm between the two is taken out."""
-    out: Pose = T_cam0_cam @ poses @ inverse(T_cam0_cam)
+    out: Transform = T_cam0_cam @ poses @ inverse(T_cam0_cam)
     return out
 
 
-def ate_m(truth: Pose, estimated: Pose, axes: tuple[int, ...] = (0, 1, 2)) -> float:
+def ate_m(truth: Transform, estimated: Transform, axes: tuple[int, ...] = (0, 1, 2)) -> float:
     """Absolute trajectory error: root mean square distance of positions along `axes`, both from their first pose."""
     difference = from_first(estimated)[:, :3, 3] - from_first(truth)[:, :3, 3]
     return rms(np.linalg.norm(difference[:, axes], axis=1))
 
 
-def ate_aligned_m(truth: Pose, estimated: Pose, with_scale: bool) -> float:
+def ate_aligned_m(truth: Transform, estimated: Transform, with_scale: bool) -> float:
     """The same after the motion that fits best (Umeyama 1991, Eqs. 34-42), with its scale or without: what is left is
     shape."""
     goal, points = truth[:, :3, 3], estimated[:, :3, 3]
@@ -93,13 +93,13 @@ def ate_aligned_m(truth: Pose, estimated: Pose, with_scale: bool) -> float:
     return rms(np.linalg.norm(goal0 - scale * points0 @ R.T, axis=1))
 
 
-def scale_error(truth: Pose, estimated: Pose) -> float | None:
+def scale_error(truth: Transform, estimated: Transform) -> float | None:
     """Estimated path length over the true one, less 1; None where the truth stands still."""
     path_m = path_length_m(truth)
     return path_length_m(estimated) / path_m - 1.0 if path_m > 0.0 else None
 
 
-def standing_drift_m(truth: Pose, estimated: Pose) -> float | None:
+def standing_drift_m(truth: Transform, estimated: Transform) -> float | None:
     """The farthest that the estimate strays from where it was when the car came to stand; None: it never does."""
     goal, points = truth[:, :3, 3], estimated[:, :3, 3]
     drift, first = None, 0
@@ -115,7 +115,7 @@ def standing_drift_m(truth: Pose, estimated: Pose) -> float | None:
     return drift
 
 
-def rpe(truth: Pose, estimated: Pose) -> tuple[float, float]:
+def rpe(truth: Transform, estimated: Transform) -> tuple[float, float]:
     """Relative pose error over steps of one frame: root mean squares of translation (m) and rotation angle (deg)."""
     if len(truth) < 2:
         return 0.0, 0.0
@@ -125,7 +125,7 @@ def rpe(truth: Pose, estimated: Pose) -> tuple[float, float]:
     return rms(np.linalg.norm(error[:, :3, 3], axis=1)), float(np.rad2deg(rms(angles)))
 
 
-def segment_errors(truth: Pose, estimated: Pose) -> tuple[float, float] | None:
+def segment_errors(truth: Transform, estimated: Transform) -> tuple[float, float] | None:
     """KITTI's odometry metric (Geiger et al. 2012): over stretches of SEGMENTS_M of the truth's way from every frame.
 
     The mean error of their end in percent of their length, and of their direction in degrees a metre; None where the
@@ -149,7 +149,11 @@ def segment_errors(truth: Pose, estimated: Pose) -> tuple[float, float] | None:
 
 
 def compare(
-    sequence: str, truth: Pose | None, estimated: Pose, statuses: dict[str, int], compared: slice = slice(None)
+    sequence: str,
+    truth: Transform | None,
+    estimated: Transform,
+    statuses: dict[str, int],
+    compared: slice = slice(None),
 ) -> OdometryReport:
     """The report of one sequence; where not all are `compared`, of those, the first of them aligned.
 

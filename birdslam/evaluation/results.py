@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from birdslam.evaluation.picture import Scene, Track, draw
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.trajectory import CameraTrajectory, Pose, ego_pose, kitti_row, tum_row
+from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row, tum_row
 from birdslam.types import Attitude, Estimate, MapUpdate, Status, VehicleEstimate
 
 FILLED_FRAMES = 10_000  # a longer gap in the frame numbers is a new source, not dropped frames
@@ -208,7 +208,7 @@ class Recorder:
         self._epoch = estimate.epoch
         self._epoch_count += 1
 
-    def _write_row(self, estimate: Estimate, T_world_ego: Pose) -> None:
+    def _write_row(self, estimate: Estimate, T_world_ego: Transform) -> None:
         if 0 < estimate.frame_id - self._next_row <= FILLED_FRAMES:
             held = kitti_row(self._trajectory.last)
             self._kitti.writelines(held + "\n" for _ in range(estimate.frame_id - self._next_row))

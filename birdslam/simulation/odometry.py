@@ -22,11 +22,11 @@ from scipy.spatial.transform import Rotation
 
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.geometry.pose import Pose as Step
+from birdslam.geometry.pose import Pose
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
 from birdslam.odometry.motion import Motion, planar
-from birdslam.trajectory import Pose, inverse
+from birdslam.trajectory import Transform, inverse
 from birdslam.types import LandmarkEdge, Status
 
 Floats = NDArray[np.float64]
@@ -103,10 +103,10 @@ class SimulatedOdometry:
     def __init__(
         self,
         camera: Camera,
-        poses: Pose,
+        poses: Transform,
         config: SimulationConfig,
         rng: np.random.Generator,
-        true_poses: Pose | None = None,
+        true_poses: Transform | None = None,
     ) -> None:
         self.camera = camera
         self.config = config
@@ -164,7 +164,7 @@ class SimulatedOdometry:
             to_frame=frame_id,
             R_prev_curr=step[:3, :3],
             t_prev_curr_m=step[:3, 3],
-            T_prev_curr=planar(Step(step[:3, :3], step[:3, 3]), self.camera.ground),
+            T_prev_curr=planar(Pose(step[:3, :3], step[:3, 3]), self.camera.ground),
             cov=np.diag([*np.square(sigma_m), sigma_rad**2]),
             scale_sigma_rel=noise.log_scale.sigma,
             ground=self.camera.ground,
@@ -206,11 +206,11 @@ class SimulatedOdometry:
         return followed
 
 
-def _on_road(camera: Camera, poses: Pose) -> list[SE2]:
+def _on_road(camera: Camera, poses: Transform) -> list[SE2]:
     out = [SE2()]
     for before, after in itertools.pairwise(poses):
         step = inverse(before) @ after
-        out.append(out[-1] @ planar(Step(step[:3, :3], step[:3, 3]), camera.ground))
+        out.append(out[-1] @ planar(Pose(step[:3, :3], step[:3, 3]), camera.ground))
     return out
 
 

@@ -41,7 +41,7 @@ from birdslam.runtime.recording.foxglove import (
     Time,
     Vector3,
 )
-from birdslam.trajectory import Pose, ego_pose, mount_pose
+from birdslam.trajectory import Transform, ego_pose, mount_pose
 from birdslam.types import NS_PER_S, Attitude, Estimate, MapUpdate, Measurements, VehicleEstimate
 
 VEHICLE_HEIGHT_M = 1.5  # drawn; no height is estimated
@@ -172,7 +172,7 @@ def _entity(vehicle: VehicleEstimate, t: Time, z_m: float) -> SceneEntity:
     )
 
 
-def _pose(T_a_b: Pose) -> FoxglovePose:
+def _pose(T_a_b: Transform) -> FoxglovePose:
     x, y, z, w = Rotation.from_matrix(T_a_b[:3, :3]).as_quat().tolist()
     return FoxglovePose(Vector3(*T_a_b[:3, 3].tolist()), Quaternion(x, y, z, w))
 
