@@ -26,8 +26,8 @@ from birdslam.types import Estimate
 PAGE = """\
 # Faults
 
-Made by `make faults`, which breaks a running vehicle in {faults} ways and looks on as its planner. A test holds the rows
-to the suite (`perf/strikes.py` has the faults, `perf/witness.py` the planner's eyes).
+Made by `make faults`, which breaks a running vehicle in {faults} ways and looks on as its planner. A test holds the
+rows to the suite (`perf/strikes.py` has the faults, `perf/witness.py` the planner's eyes).
 
 {machine}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import inspect
 import re
@@ -16,7 +17,7 @@ from birdslam.evaluation.tracking import Row
 from birdslam.perf import faults, results
 from birdslam.perf.strikes import FAULTS
 from birdslam.runtime.cli import configuration_page
-from birdslam.runtime.cli.main import main
+from birdslam.runtime.cli.main import _parser, main
 from birdslam.runtime.cli.pages import comments
 from birdslam.runtime.configuration import Configuration, ConfigurationError, load
 
@@ -140,6 +141,43 @@ def test_every_path_in_the_pages_is_there() -> None:
         for path in re.findall(r"`([\w./-]+/[\w./-]*)`", page.read_text()):
             if path.split("/")[0] in FOLDERS and ".." not in path:
                 assert (ROOT / path).exists(), f"{page.name}: {path}"
+
+
+def test_every_module_that_a_page_names_by_its_file_is_there() -> None:
+    files = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
+    for page in PAGES:
+        for name in re.findall(r"`(\w+\.py)`", page.read_text()):
+            assert name in files, f"{page}: {name}"
+
+
+def test_every_key_that_a_page_names_is_one() -> None:
+    keys = {key.key for table in configuration_page.sections() for key in table.keys}
+    tables = {table.name for table in configuration_page.sections()}
+    tops = {name.partition(".")[0] for name in tables if name}
+    for page in PAGES:
+        for name in re.findall(r"(?:`|--set )((?:\w+\.)+\w+)(?:`| =|=)", page.read_text()):
+            if name.partition(".")[0] in tops and not name.endswith((".py", ".md", ".toml")):
+                assert name in keys | tables or named(f"birdslam.{name}") is not None, f"{page.name}: {name}"
+
+
+def test_every_command_that_a_page_shows_is_one() -> None:
+    """`birdslam WORD` and `python -m perf WORD`, in the words of the parsers."""
+    commands = _words(_parser())
+    benchmarks = {path.stem for path in (ROOT / "perf").glob("*.py")}
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for page in PAGES:
+        text = page.read_text()
+        for word in re.findall(r"(?:^    |`|bin/)birdslam ([a-z]+(?:-[a-z]+)*)", text, re.MULTILINE):
+            assert word in commands, f"{page.name}: birdslam {word}"
+        for word in re.findall(r"python -m perf[. ]([a-z_]+)", text):
+            assert word in benchmarks, f"{page.name}: python -m perf {word}"
+        for word in re.findall(r"`make ([a-z][a-z-]*)`", text):
+            assert word in targets, f"{page.name}: make {word}"
+
+
+def _words(parser: argparse.ArgumentParser) -> set[str]:
+    (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    return set(commands.choices)
 
 
 def test_the_page_of_keys_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
