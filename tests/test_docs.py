@@ -6,12 +6,14 @@ import argparse
 import importlib
 import inspect
 import re
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
+import yaml
 
 from birdslam.evaluation.tracking import Row
 from birdslam.perf import faults, results
@@ -156,8 +158,23 @@ def test_every_key_that_a_page_names_is_one() -> None:
     tops = {name.partition(".")[0] for name in tables if name}
     for page in PAGES:
         for name in re.findall(r"(?:`|--set )((?:\w+\.)+\w+)(?:`| =|=)", page.read_text()):
-            if name.partition(".")[0] in tops and not name.endswith((".py", ".md", ".toml")):
+            if name.partition(".")[0] in tops and name == name.lower() and not name.endswith((".py", ".md", ".toml")):
                 assert name in keys | tables or named(f"birdslam.{name}") is not None, f"{page.name}: {name}"
+
+
+@pytest.mark.parametrize(("subject", "status"), [("x" * 72, 0), ("é" * 72, 0), ("x" * 73, 1)])
+def test_a_commit_with_a_long_subject_is_refused(tmp_path: Path, subject: str, status: int) -> None:
+    message = tmp_path / "message"
+    message.write_text(f"# a comment of git, {'of whatever length, ' * 5}is no subject\n{subject}\n")
+    done = subprocess.run([str(ROOT / ".ci" / "commit-subject"), str(message)], capture_output=True, text=True)
+    assert done.returncode == status
+    assert ("73 characters" in done.stderr) == bool(status)
+
+
+def test_every_hook_is_local() -> None:
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())
+    assert [repository["repo"] for repository in hooks["repos"]] == ["local"]
+    assert {hook["id"] for hook in hooks["repos"][0]["hooks"]} == {"ruff", "ruff-format", "mypy", "commit-subject"}
 
 
 def test_every_command_that_a_page_shows_is_one() -> None:
