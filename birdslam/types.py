@@ -220,7 +220,10 @@ class Ground(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Measurements(msgspec.Struct, frozen=True, kw_only=True):
-    """perceive -> optimize: all that the front end has to say about one frame. Its log replays the back end alone."""
+    """perceive -> optimize: all that the front end has to say about one frame, the edges of Eqs. 6 and 7.
+
+    Its log replays the back end alone.
+    """
 
     frame_id: FrameId
     t_source_ns: int
@@ -265,7 +268,7 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
-    """optimize -> planners, one for each frame: where the ego and every other vehicle are.
+    """optimize -> planners, one for each frame: where the ego and every other vehicle are (paper, Sec. 3).
 
     A raised `epoch` says that the world frame began anew: poses of different epochs must not be compared.
     """

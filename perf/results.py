@@ -166,7 +166,9 @@ def measure(name: str, data: Path, models: Path, reports: Path) -> None:
 
 
 def kept() -> dict[str, Kept]:
-    """What is kept of each report, by its name."""
+    """What is kept of each report, by its name. Raises PerfError where the checkout's docs are not there."""
+    if not TEXT.is_file():
+        raise PerfError(f"{TEXT} is not there: the page is part of the checkout, and no wheel has it")
     return {name: json.loads((KEPT / f"{name}.json").read_text()) for name in EVALUATIONS}
 
 
