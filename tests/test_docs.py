@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import inspect
 import re
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from birdslam.evaluation.tracking import Row
 from birdslam.perf import faults, results
 from birdslam.perf.strikes import FAULTS
 from birdslam.runtime.cli import configuration_page
-from birdslam.runtime.cli.main import _parser, main
+from birdslam.runtime.cli.main import main
 from birdslam.runtime.cli.pages import comments
 from birdslam.runtime.configuration import Configuration, ConfigurationError, load
 
@@ -177,24 +176,38 @@ def test_every_hook_is_local() -> None:
     assert {hook["id"] for hook in hooks["repos"][0]["hooks"]} == {"ruff", "ruff-format", "mypy", "commit-subject"}
 
 
-def test_every_command_that_a_page_shows_is_one() -> None:
-    """`birdslam WORD` and `python -m perf WORD`, in the words of the parsers."""
-    commands = _words(_parser())
+NESTED = ("evaluate", "models", "demo-drive")  # commands that have commands
+WORDS: list[tuple[str, ...]] = [(), *((word,) for word in NESTED)]
+
+
+@pytest.fixture
+def help_of(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What `birdslam WORDS --help` prints, on long lines."""
+    monkeypatch.setenv("COLUMNS", "400")
+
+    def asked(*words: str) -> str:
+        with pytest.raises(SystemExit):
+            main([*words, "--help"])
+        return capsys.readouterr().out
+
+    return asked
+
+
+def test_every_command_that_a_page_shows_is_one(help_of: Callable[..., str]) -> None:
+    """`birdslam WORD`, `python -m perf WORD` and `make WORD`, in the words of the programs."""
+    commands = {words: set(re.findall(r"^    ([a-z][a-z-]+)", help_of(*words), re.MULTILINE)) for words in WORDS}
     benchmarks = {path.stem for path in (ROOT / "perf").glob("*.py")}
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for page in PAGES:
         text = page.read_text()
-        for word in re.findall(r"(?:^    |`|bin/)birdslam ([a-z]+(?:-[a-z]+)*)", text, re.MULTILINE):
-            assert word in commands, f"{page.name}: birdslam {word}"
+        for first, second in re.findall(r"(?:^    |`|bin/)birdslam ([a-z-]+)(?: ([a-z-]+))?", text, re.MULTILINE):
+            assert first in commands[()], f"{page}: birdslam {first}"
+            if first in NESTED and second:
+                assert second in commands[(first,)], f"{page}: birdslam {first} {second}"
         for word in re.findall(r"python -m perf[. ]([a-z_]+)", text):
-            assert word in benchmarks, f"{page.name}: python -m perf {word}"
+            assert word in benchmarks, f"{page}: python -m perf {word}"
         for word in re.findall(r"`make ([a-z][a-z-]*)`", text):
-            assert word in targets, f"{page.name}: make {word}"
-
-
-def _words(parser: argparse.ArgumentParser) -> set[str]:
-    (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
-    return set(commands.choices)
+            assert word in targets, f"{page}: make {word}"
 
 
 def test_the_page_of_keys_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
