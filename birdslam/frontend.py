@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, Protocol
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.geometry.se2 import SE2
+from birdslam.geometry.camera import Camera
 from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
 from birdslam.mapping.lane_edges import LaneEdgesConfig
-from birdslam.mapping.lane_mapper import LaneHead, LaneMapper
+from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneNews
 from birdslam.mapping.lanes import LanesConfig
+from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
+from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
 from birdslam.perception import Perception
-from birdslam.types import Attitude, EgoEdge, Frame, Ground, Measurements, Status
+from birdslam.types import EgoEdge, Frame, Ground, LandmarkEdge, Measurements, MotionEdge, Status, VehicleEdge
 from birdslam.vehicles.camera_height import HeightWatch, HeightWatchConfig
 from birdslam.vehicles.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
@@ -33,6 +33,7 @@ class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The parts of the front end."""
 
     odometry: OdometryConfig = OdometryConfig()
+    plausibility: PlausibilityConfig = PlausibilityConfig()
     localisation: LocalisationConfig = LocalisationConfig()
     ground_size: GroundSizeConfig = GroundSizeConfig()
     pseudolidar: PseudoLidarConfig = PseudoLidarConfig()
@@ -69,7 +70,7 @@ class EgoMotion(Protocol):
 
 
 class FrontEnd:
-    """step(): one frame in, its `Measurements` out. Deterministic; owns no thread."""
+    """One frame in, its `Measurements` out (`measure`). Deterministic; owns no thread."""
 
     def __init__(
         self,
@@ -82,82 +83,81 @@ class FrontEnd:
         self.camera = camera
         self.config = config
         self.odometry: EgoMotion = odometry or Odometry(camera, config.odometry)
+        self._reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
+        self._plausibility = PlausibilityGate(config.plausibility)
         self.vehicles = OutOfSequenceTracker(
             Tracker(camera, config.tracking, config.localisation, config.pseudolidar, frustum_network),
             GroundSizeFilter(camera, config.ground_size),
             config.out_of_sequence,
         )
-        self._reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
-        self._lanes = LaneMapper(camera, config.static_map, config.lanes, config.lane_edges, lane_head)
         self.height = HeightWatch(camera, config.height, config.localisation)
+        self._lanes = LaneMapper(camera, config.static_map, config.lanes, config.lane_edges, lane_head)
         self._last_frame: int | None = None
         self._last_pitch = (0, 0.0)  # when, and the camera's against the level
 
-    def step(self, frame: Frame, pending: Pending) -> Measurements:
-        """`pending` is waited for after the feature tracking, which runs beside the networks."""
+    def measure(self, frame: Frame, pending: Pending) -> Measurements:
+        """The edges that one frame gives: CC, CV, VV and CP (Sec. 3.1 and 3.2).
+
+        `pending` is awaited after the feature tracking, which runs beside the networks. A frame without an image gives
+        its status alone. Raises ValueError for an image of another size than the camera's.
+        """
         status = [*frame.status, *self._dropped(frame)]
         if frame.image is None:
-            return _measurements(frame, status, attitude=self._reckoning.attitude)
-
-        # Ego motion and static map initialisation
+            return self._plausibility.admit(_measurements(frame, status, attitude=self._reckoning.attitude))
         tracks = self.odometry.track(frame.image)
         perception = pending.result()
-        detections, segmentation = perception.detections, perception.segmentation
-        boxes_px = np.zeros((0, 4)) if detections is None else detections.boxes_px
-        road = None if segmentation is None else segmentation.road
-        motion = self.odometry.estimate(tracks, frame.frame_id, frame.t_source_ns, boxes_px, road)
-        if motion is None:
-            self._lanes.clear()
-        cc = None if motion is None else self._advance(motion)
-        T_world_ego = self._reckoning.T_world_ego
-        opened = self._open_frame(frame, motion)
-        self.vehicles.open_frame(opened)
 
-        # Dynamic object localisation: of this very frame, or of the earlier one that late detections are of
-        age = perception.ages.get("detector", 0)
-        depth = perception.depth if perception.ages.get("depth", 0) == age else None
-        road_then = road if perception.ages.get("segmenter", 0) == age else None
-        tracks_seen = self.vehicles.ingest_detections(detections, frame.frame_id - age, depth, road_then)
-        ground, sigma_pitch_rad = self.vehicles.road.ground, self.vehicles.road.sigma_pitch_rad
-        cv, vv = vehicle_edges(tracks_seen, opened.ego, ground, self.camera, self.config.tracking)
+        motion, cc = self._move(frame, tracks, perception)  # scale-unambiguous ego-motion initialisation
+        cv, vv = self._localise_vehicles(frame, motion, perception)  # dynamic object localisation
         status += self.height.judge(cv, motion)
+        cp = self._map_road(frame)  # static map initialisation
+        lanes = self._map_lanes(frame, perception)  # lanes (Sec. 3.2)
 
-        # Lanes, by what is known of this frame's road or an earlier one's (Sec. 3.2)
-        segmented = frame.frame_id - perception.ages.get("segmenter", 0)
-        lanes = self._lanes.step(
-            frame.frame_id, T_world_ego, ground, sigma_pitch_rad, segmentation, segmented, boxes_px
-        )
-        status += lanes.status
-        ages = perception.ages if lanes.age is None else perception.ages | {"lanes": lanes.age}
-
-        return _measurements(
+        ground = self.vehicles.road.ground
+        measurements = _measurements(
             frame,
-            [*status, *perception.status, *(motion.status if motion else (Status.NOT_INITIALISED,))],
+            [
+                *(*status, *lanes.status, *perception.status),
+                *(motion.status if motion else (Status.NOT_INITIALISED,)),
+            ],
             cc=cc,
             cv=cv,
             vv=vv,
-            cp=(
-                *landmark_edges(
-                    *self.odometry.road_tracks,
-                    frame.frame_id,
-                    self.camera,
-                    ground,
-                    sigma_pitch_rad,
-                    self.config.static_map,
-                ),
-                *lanes.edges,
-            ),
+            cp=(*cp, *lanes.edges),
             lanes=lanes.points,
             attitude=self._reckoning.attitude,
             ground=Ground(height_m=ground.height_m, pitch_rad=ground.pitch_rad, roll_rad=ground.roll_rad),
             scale_sigma_rel=0.0 if motion is None else motion.scale_sigma_rel,
-            ages=dict(ages),
+            ages=dict(perception.ages if lanes.age is None else perception.ages | {"lanes": lanes.age}),
         )
+        return self._plausibility.admit(measurements)
 
     def _dropped(self, frame: Frame) -> tuple[Status, ...]:
         gap = self._last_frame is not None and frame.frame_id > self._last_frame + 1
         self._last_frame = frame.frame_id
         return (Status.FRAMES_DROPPED,) if gap else ()
+
+    def _move(self, frame: Frame, tracks: Any, perception: Perception) -> tuple[Motion | None, EgoEdge | None]:
+        """The ego's motion in metres and its CC edge; None where no motion to an earlier frame is known."""
+        road = None if perception.segmentation is None else perception.segmentation.road
+        motion = self.odometry.estimate(tracks, frame.frame_id, frame.t_source_ns, _boxes_px(perception), road)
+        if motion is None:
+            self._lanes.clear()
+            return None, None
+        return motion, self._reckoning.advance(motion)
+
+    def _localise_vehicles(
+        self, frame: Frame, motion: Motion | None, perception: Perception
+    ) -> tuple[tuple[VehicleEdge, ...], tuple[MotionEdge, ...]]:
+        """CV and VV edges of this frame's detections, or of late ones, which are of an earlier frame."""
+        opened = self._open_frame(frame, motion)
+        self.vehicles.open_frame(opened)
+        age = perception.ages.get("detector", 0)
+        depth = perception.depth if perception.ages.get("depth", 0) == age else None
+        segmentation = perception.segmentation if perception.ages.get("segmenter", 0) == age else None
+        road = None if segmentation is None else segmentation.road
+        seen = self.vehicles.ingest_detections(perception.detections, frame.frame_id - age, depth, road)
+        return vehicle_edges(seen, opened.ego, self.vehicles.road.ground, self.camera, self.config.tracking)
 
     def _open_frame(self, frame: Frame, motion: Motion | None) -> OpenFrame:
         """The ego, and the road as this frame's image and the camera's own pitching since the last frame give it."""
@@ -172,71 +172,29 @@ class FrontEnd:
             image_sigma_rad=0.0 if motion is None else motion.pitch_sigma_rad,
         )
 
-    def _advance(self, motion: Motion) -> EgoEdge:
-        """CC, from the frame of the last one: a coasted frame has a pose of its own, which the next edge starts from.
+    def _map_road(self, frame: Frame) -> tuple[LandmarkEdge, ...]:
+        """CP edges of the corners on the road."""
+        road, (ids, px) = self.vehicles.road, self.odometry.road_tracks
+        return landmark_edges(
+            ids, px, frame.frame_id, self.camera, road.ground, road.sigma_pitch_rad, self.config.static_map
+        )
 
-        So a long blindness is a chain of edges, none of which reaches back to a frame that the graph has let go.
-        """
-        last_frame, T_world_last = self._reckoning.frame, self._reckoning.T_world_ego
-        self._reckoning.advance(motion)
-        chained = last_frame not in (-1, motion.from_frame)
-        return EgoEdge(
-            from_frame=last_frame if chained else motion.from_frame,
-            to_frame=motion.to_frame,
-            T_from_to=T_world_last.between(self._reckoning.T_world_ego) if chained else motion.T_prev_curr,
-            cov=tuple(np.ravel(motion.cov).tolist()),
+    def _map_lanes(self, frame: Frame, perception: Perception) -> LaneNews:
+        """Lanes, by what is known of this frame's road or an earlier one's."""
+        road, age = self.vehicles.road, perception.ages.get("segmenter", 0)
+        return self._lanes.step(
+            frame.frame_id,
+            self._reckoning.T_world_ego,
+            road.ground,
+            road.sigma_pitch_rad,
+            perception.segmentation,
+            frame.frame_id - age,
+            _boxes_px(perception),
         )
 
 
-class DeadReckoning:
-    """The odometry's motions chained: the ego on the road plane, for the tracker, and its height and tilt.
-
-    A motion starts at the frame that it names, which need not be the newest: one that coasted is superseded by the next
-    that was measured.
-    """
-
-    def __init__(self, camera: Camera, memory_m: float) -> None:
-        self._T_ego_cam = np.eye(4)
-        self._T_ego_cam[:3, :3] = camera.ground.R_ego_cam
-        self._T_ego_cam[2, 3] = camera.height_m
-        self._T_cam_ego = np.linalg.inv(self._T_ego_cam)
-        self._memory_m = memory_m
-        self.T_world_ego = SE2()
-        self.attitude = Attitude()
-        self._from = (-1, self.T_world_ego, self.attitude)  # the frame that the last motion started from
-        self._to = self._from
-
-    @property
-    def frame(self) -> int:
-        """The frame that `T_world_ego` is of; -1 before the first motion."""
-        return self._to[0]
-
-    def advance(self, motion: Motion) -> None:
-        """To `motion.to_frame`, from the pose of `motion.from_frame` where that was the last motion's start or end."""
-        if motion.from_frame != self._from[0] or self._from[0] < 0:
-            self._from = (motion.from_frame, *self._to[1:])
-        _, T_world_ego, attitude = self._from
-        T_prev_curr = np.eye(4)
-        T_prev_curr[:3, :3] = motion.R_prev_curr
-        T_prev_curr[:3, 3] = motion.t_prev_curr_m
-        T_ego_prev_curr = self._T_ego_cam @ T_prev_curr @ self._T_cam_ego
-        R = _tilt(attitude) @ T_ego_prev_curr[:3, :3]
-        dz_m = float((_tilt(attitude) @ T_ego_prev_curr[:3, 3])[2])
-        keep = math.exp(-float(np.linalg.norm(motion.t_prev_curr_m)) / self._memory_m)
-        self.T_world_ego = T_world_ego @ motion.T_prev_curr
-        self.attitude = Attitude(
-            z_m=attitude.z_m + dz_m,
-            pitch_rad=keep * math.asin(max(-1.0, min(1.0, -R[2, 0]))),
-            roll_rad=keep * math.atan2(R[2, 1], R[2, 2]),
-        )
-        self._to = (motion.to_frame, self.T_world_ego, self.attitude)
-
-
-def _tilt(attitude: Attitude) -> NDArray[np.float64]:
-    """(3, 3) Ry(pitch) Rx(roll): ego to a frame of the same yaw that is level."""
-    level = GroundPlane(1.0, attitude.pitch_rad, attitude.roll_rad).R_ego_cam
-    out: NDArray[np.float64] = level @ GroundPlane(1.0).R_ego_cam.T
-    return out
+def _boxes_px(perception: Perception) -> NDArray[np.float64]:
+    return np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px
 
 
 def _measurements(frame: Frame, status: list[Status], **fields: object) -> Measurements:

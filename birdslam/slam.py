@@ -72,7 +72,7 @@ class BirdSLAM:
         a frame is a `Status` in both records, and `Estimate.valid` says whether it may be driven by. Raises ValueError
         for an image of another size than the camera's, and nothing for what may be seen in it.
         """
-        measurements = self.frontend.step(frame, self.networks.start(frame.frame_id, frame.image))
+        measurements = self.frontend.measure(frame, self.networks.start(frame.frame_id, frame.image))
         return measurements, self.graph.optimise(measurements)
 
     def map_update(self) -> MapUpdate | None:

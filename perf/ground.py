@@ -126,7 +126,7 @@ def _drive(camera: Camera, frames: Iterable[Frame], start: Callable[[Frame], Pen
     front = FrontEnd(camera, config)
     measurements, watched = [], []
     for frame in frames:
-        measurements.append(front.step(frame, start(frame)))
+        measurements.append(front.measure(frame, start(frame)))
         watched.append(front.height.estimate)
     return Drive(measurements, watched)
 

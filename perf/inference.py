@@ -161,7 +161,7 @@ def perceive(configuration: Configuration, frames: list[Frame], options: argpars
             time.sleep(max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
             now_ns = time.monotonic_ns()
             frame = Frame(number, due_ns, now_ns, 0, image, ())
-            frontend.step(frame, inference.start(frame))
+            frontend.measure(frame, inference.start(frame))
             inference.over()
             if number >= WARM_UP_FRAMES:
                 step_ms.append((time.monotonic_ns() - now_ns) / 1e6)

@@ -19,7 +19,6 @@ from birdslam.datasets.camera_file import load_camera
 from birdslam.datasets.recording import DatasetError
 from birdslam.geometry.camera import Camera
 from birdslam.mapping.atlas import AtlasConfig
-from birdslam.odometry.plausibility import MotionWatchConfig
 from birdslam.perception import ModelError, ModelSpec
 from birdslam.runtime import model_store
 from birdslam.runtime.sections import (
@@ -80,7 +79,6 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     runtime: RuntimeConfig = RuntimeConfig()
     budgets: BudgetsConfig = BudgetsConfig()
     degradation: DegradationConfig = DegradationConfig()
-    motion_watch: MotionWatchConfig = MotionWatchConfig()  # live alone: what is evaluated is what was measured
     realtime: RealtimeConfig = RealtimeConfig()
     atlas: AtlasConfig = AtlasConfig()  # what planners may ask for of the drive so far
     recording: RecordingConfig = RecordingConfig()

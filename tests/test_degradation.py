@@ -110,7 +110,7 @@ class Blind(FrontEnd):
     def __init__(self) -> None:
         self.shown: list[int] = []
 
-    def step(self, frame: Frame, pending: Any) -> Measurements:
+    def measure(self, frame: Frame, pending: Any) -> Measurements:
         self.shown.append(frame.frame_id)
         pending.result()
         return Measurements(frame_id=frame.frame_id, t_source_ns=frame.t_source_ns, t_capture_ns=0, t_utc_ns=0)

@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from birdslam.frontend import DeadReckoning, FrontEnd, FrontEndConfig
+from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
+from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.odometry import Motion
 from birdslam.perception import Detections, Perception, Ready, Segmentation
 from birdslam.types import Frame, Measurements, Status
@@ -75,7 +76,7 @@ def seeing(*boxes: list[float], age: int = 0, lane: np.ndarray | None = None) ->
 
 def run(script: dict[int, Motion], views: list[Ready], images: dict[int, None] | None = None) -> list[Measurements]:
     front = FrontEnd(CAMERA, FrontEndConfig(), ScriptedOdometry(script))
-    return [front.step(frame(k, (images or {}).get(k, IMAGE)), view) for k, view in enumerate(views)]
+    return [front.measure(frame(k, (images or {}).get(k, IMAGE)), view) for k, view in enumerate(views)]
 
 
 def test_a_constant_grade_is_the_world_and_a_changed_one_is_climbed() -> None:
@@ -120,8 +121,8 @@ def test_a_blind_camera_makes_a_chain_of_edges_that_ends_where_it_sees_again() -
 
 def test_edges_name_their_frames_over_a_gap() -> None:
     front = FrontEnd(CAMERA, FrontEndConfig(), ScriptedOdometry({4: motion(4, SE2(3.0, 0.0, 0.0), since=4)}))
-    front.step(frame(0), seeing())
-    after = front.step(frame(4), seeing())
+    front.measure(frame(0), seeing())
+    after = front.measure(frame(4), seeing())
     assert after.cc is not None
     assert (after.cc.from_frame, after.cc.to_frame) == (0, 4)
     assert Status.FRAMES_DROPPED in after.status

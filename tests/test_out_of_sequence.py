@@ -136,7 +136,7 @@ def drive(delay: int, seed: int, noise_px: float, heights_m: tuple[float, ...], 
         perception = Perception()
         if k >= delay:
             perception = Perception(detections(k - delay, noise_px, seed, heights_m), None, {"detector": delay}, ())
-        out.append(front.step(frame(k), Ready(perception)))
+        out.append(front.measure(frame(k), Ready(perception)))
     return out
 
 

@@ -54,7 +54,7 @@ def log_of(seed: int, parked_height_m: float, oncoming_height_m: float) -> list[
         ]
         found = np.array(boxes).reshape(-1, 4) + 0.5 * rng.standard_normal((len(boxes), 4))
         detections = Detections(found, np.full(len(boxes), 0.9), ("car",) * len(boxes))
-        out.append(front.step(frame(k), Ready(Perception(detections, None, {"detector": 0}, ()))))
+        out.append(front.measure(frame(k), Ready(Perception(detections, None, {"detector": 0}, ()))))
     return out
 
 

@@ -57,7 +57,7 @@ def drive(
         mask = road(k)
         segmentation = None if mask is None else Segmentation(road=mask, lane=np.zeros_like(mask))
         frame = Frame(k, k * 10**8, k, k, edit(k, image))
-        out.append(graph.optimise(front.step(frame, Ready(Perception(segmentation=segmentation)))))
+        out.append(graph.optimise(front.measure(frame, Ready(Perception(segmentation=segmentation)))))
     return out
 
 

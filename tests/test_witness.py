@@ -39,7 +39,7 @@ def drive(loop: NDArray[np.uint8]) -> list[Estimate]:
     for number in range(FRAMES):
         t_ns = round((number + 0.5) * 1e9 / RATE_HZ)
         frame = Frame(number, t_ns, t_ns, 0, loop[number])
-        estimates.append(graph.optimise(frontend.step(frame, Ready(Perception()))))
+        estimates.append(graph.optimise(frontend.measure(frame, Ready(Perception()))))
     return estimates
 
 

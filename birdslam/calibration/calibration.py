@@ -175,7 +175,7 @@ def _watch(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: Calib
     front = FrontEnd(camera, frontend, odometry)
     since_m = 0.0
     for frame, pending in drive():
-        measurements = front.step(frame, pending)
+        measurements = front.measure(frame, pending)
         seen.frames += 1
         seen.times_ns[frame.frame_id] = frame.t_source_ns
         seen.boxes += measure_heights(measurements.cv, camera, frontend.localisation)

@@ -142,7 +142,7 @@ def make_log(
         image = NO_IMAGE if images is None else images(index)
         t_ns = round(index / KITTI_RATE_HZ * NS_PER_S)
         pending = perceive(index, NO_IMAGE if image is None else image)
-        m = frontend.step(Frame(index, t_ns, t_ns, t_ns, image), pending)
+        m = frontend.measure(Frame(index, t_ns, t_ns, t_ns, image), pending)
         if isinstance(odometry, SimulatedOdometry) and m.ground is not None:
             ground = GroundPlane(m.ground.height_m, m.ground.pitch_rad, m.ground.roll_rad)
             m = replace(m, cp=odometry.landmarks(index, ground, config.static_map))

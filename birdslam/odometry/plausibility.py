@@ -19,7 +19,7 @@ _SHORTEST_S = 1e-3
 _CLOCK_TOLERANCE = 0.1  # of a span
 
 
-class MotionWatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PlausibilityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How fast a car's speed may change, and how long the odometry must be steady to be believed again."""
 
     acceleration_mps2: Positive = 15.0  # no car changes its speed faster
@@ -37,16 +37,16 @@ class _Moved(NamedTuple):
     scale_sigma_rel: float
 
 
-class MotionWatch:
-    """`judge` takes the measurements of each frame in their order."""
+class PlausibilityGate:
+    """`admit` takes the measurements of each frame in their order."""
 
-    def __init__(self, config: MotionWatchConfig) -> None:
+    def __init__(self, config: PlausibilityConfig) -> None:
         self._config = config
         self._times_ns: deque[tuple[int, int]] = deque(maxlen=_KEPT_FRAMES)  # (frame, source time)
         self._moved: deque[_Moved] = deque(maxlen=_KEPT_FRAMES)  # the measured ones
         self._broken_ns: int | None = None  # source time of the last motion that was not measured or not possible
 
-    def judge(self, measurements: Measurements) -> Measurements:
+    def admit(self, measurements: Measurements) -> Measurements:
         """The same; with MOTION_IMPLAUSIBLE; or, where it can be believed again, without its CC edge."""
         m, cc = measurements, measurements.cc
         self._times_ns.append((m.frame_id, m.t_source_ns))

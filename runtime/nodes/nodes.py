@@ -16,7 +16,6 @@ import msgspec
 
 from birdslam.frontend import FrontEnd
 from birdslam.geometry.camera import Camera
-from birdslam.odometry.plausibility import MotionWatch
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.capture import CaptureNode, stamps
 from birdslam.runtime.nodes.degradation import STATUS, Degradation, Mode
@@ -81,7 +80,6 @@ class PerceiveNode:
         self._coast_divisor = configuration.degradation.coast_divisor
         self._coast_max_ns = round(configuration.degradation.coast_max_ms * 1e6)
         self._stale_ns = round(configuration.budgets.received_ms * STALE_BUDGETS * 1e6)
-        self._watch = MotionWatch(configuration.motion_watch)
         self._looked_frame = -1  # the last frame with pixels that was looked at
         self._measured_ns: int | None = None  # the source time of the last one whose motion was measured
         self._looked_invalid: tuple[Status, ...] = ()  # what made it one that nobody may drive by
@@ -106,7 +104,7 @@ class PerceiveNode:
                 return
         frame = Frame(ref.frame_id, ref.t_source_ns, ref.t_capture_ns, ref.t_utc_ns, image, ref.status)
         if self._degradation is None:
-            yield self._frontend.step(frame, self._inference.start(frame))
+            yield self._frontend.measure(frame, self._inference.start(frame))
             return
         mode = self._degradation.mode
         yield self._coast(ref) if self._coasts(ref, mode) else self._look(frame, mode)
@@ -117,7 +115,7 @@ class PerceiveNode:
 
     def _look(self, frame: Frame, mode: Mode) -> Measurements:
         stale = time.monotonic_ns() - frame.t_capture_ns > self._stale_ns
-        measurements = self._watch.judge(self._frontend.step(frame, self._inference.start(frame, mode)))
+        measurements = self._frontend.measure(frame, self._inference.start(frame, mode))
         if frame.image is not None:
             self._looked_frame = frame.frame_id
             if Status.ODOMETRY_COASTING not in measurements.status:
