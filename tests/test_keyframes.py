@@ -1,4 +1,4 @@
-"""The unit of length of the window of key images: no image says anything of it, so nothing may move it."""
+"""The unit of length of the window of keyframes: no image says anything of it, so nothing may move it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.pose import Pose
-from birdslam.odometry.keyframes import KeyWindow, KeyWindowConfig
+from birdslam.odometry.keyframes import KeyframeConfig, KeyframeWindow
+from birdslam.odometry.relative_pose import locate
 from birdslam.odometry.road_filter import RoadScaleConfig
 
 Floats = NDArray[np.float64]
@@ -26,7 +27,7 @@ def unit_of_length(seed: int, way_m: float, sigma_px: float) -> Floats:
     points = np.column_stack(
         [side * rng.uniform(3.0, 8.0, POINTS), rng.uniform(-4.0, 1.5, POINTS), rng.uniform(3.0, way_m + 50.0, POINTS)]
     )
-    window = KeyWindow(FOCAL_PX, KeyWindowConfig())
+    window = KeyframeWindow(FOCAL_PX, KeyframeConfig())
     step = Pose(np.eye(3), np.array([0.0, 0.0, STEP_M]))
     poses = [Pose(np.eye(3), np.zeros(3))]
     for frame in range(int(way_m / STEP_M)):
@@ -40,7 +41,7 @@ def unit_of_length(seed: int, way_m: float, sigma_px: float) -> Floats:
             continue
         pose = poses[-1] @ step
         if frame > 1:
-            pose, _, _ = window.locate(poses[-1] @ poses[-2].between(poses[-1]), ids, xy)
+            pose, _, _ = locate(window, poses[-1] @ poses[-2].between(poses[-1]), ids, xy)
         poses.append(window.extend(frame, pose, ids, xy))
     ways_m = [float(np.linalg.norm(b.p - a.p)) for a, b in zip(poses[9::3], poses[12::3], strict=False)]
     return np.array(ways_m) / (3 * STEP_M)

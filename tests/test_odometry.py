@@ -362,10 +362,10 @@ def test_an_image_of_another_size_is_an_error() -> None:
 
 
 def test_settings_are_typed_and_closed() -> None:
-    config = msgspec.convert({"road": {"align": {"far_m": 30.0}}, "key_images": 5}, OdometryConfig)
+    config = msgspec.convert({"road": {"align": {"far_m": 30.0}}, "keyframes": 5}, OdometryConfig)
     assert config.road.align.far_m == 30.0
     with pytest.raises(msgspec.ValidationError):
-        msgspec.convert({"key_image": 5}, OdometryConfig)
+        msgspec.convert({"keyframe": 5}, OdometryConfig)
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert({"reject_px": -1.0}, OdometryConfig)
 

@@ -1,4 +1,4 @@
-"""Which images stay in the window of the bundle adjustment: one after each piece of way that shows parallax."""
+"""Keyframes: which images stay in the window of the bundle adjustment, by parallax and by distance."""
 
 from __future__ import annotations
 
@@ -9,65 +9,73 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.pose import Pose
-from birdslam.odometry.bundle_adjustment import SlidingWindow
+from birdslam.odometry.bundle_adjustment import adjust
+from birdslam.odometry.sliding_window import SlidingWindow
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
+# Information of each step of a pose, (translation, rotation): loose, but it alone carries the unit of length.
+_STEP_PRIOR = np.array([1.0 / 0.3**2] * 3 + [1e2] * 3)
+_LEAST_SHARED = 10  # landmarks that two images must share for a parallax
 
-class KeyWindowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How many images, how far apart, and what is adjusted after each."""
 
-    key_images: Annotated[int, msgspec.Meta(ge=3)] = 8  # keyframes that are adjusted together
+class KeyframeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How many keyframes, how far apart, and what is adjusted after each image."""
+
+    keyframes: Annotated[int, msgspec.Meta(ge=3)] = 8  # keyframes that are adjusted together
     adjusted_landmarks: Count = 400  # at most so many of them
     adjust_iterations: Count = 1  # each image adjusts again what the one before left
-    key_parallax_px: Positive = 8.0  # a new key image when the median landmark has moved so far, rotation taken out
-    key_distance_m: Positive = 0.7  # a new keyframe also after so long a way
+    keyframe_parallax_px: Positive = 8.0  # a new keyframe when the median landmark moved so far, rotation taken out
+    keyframe_distance_m: Positive = 0.7  # a new keyframe also after so long a way
     sigma_track_px: Positive = 0.35  # 1-sigma of a followed corner
-    reject_px: Positive = 2.2  # a landmark that is off by more is an outlier
+    reject_px: Positive = 2.2  # a landmark's reprojection error past it is an outlier
 
 
-class KeyWindow(SlidingWindow):
-    """Key images, and behind them the newest image, which becomes one where the next is far enough from the last."""
+class KeyframeWindow(SlidingWindow):
+    """Keyframes and, behind them, the newest image, which becomes one when the next is far enough from the last."""
 
-    def __init__(self, focal_px: float, config: KeyWindowConfig) -> None:
+    def __init__(self, focal_px: float, config: KeyframeConfig) -> None:
         super().__init__(focal_px, config.sigma_track_px, config.reject_px)
         self.config = config
-        self._provisional = False  # the newest image is no key image yet
+        self._provisional = False  # the newest image is no keyframe yet
 
     def extend(self, frame_id: int, pose: Pose, ids: Ints, xy: Floats) -> Pose:
-        """Puts the present image into the window in place of a provisional one, and adjusts; its pose after that."""
+        """Puts the present image into the window, triangulates and adjusts it; gives its pose after that.
+
+        `pose` is its relative pose, ids (N,) ascending and xy (N, 2) its corners in normalised coordinates.
+        """
         cfg = self.config
-        if self._provisional:
-            newest = self.poses[-2].between(pose)
-            parallax = self._parallax_px(ids, xy, newest.R)
-            if parallax > cfg.key_parallax_px or float(np.linalg.norm(newest.p)) > cfg.key_distance_m:
-                # The provisional image becomes a key image only if it is itself far enough from the last.
-                held = self.poses[-2].between(self.poses[-1])
-                if float(np.linalg.norm(held.p)) < 0.5 * cfg.key_distance_m and parallax < 2.0 * cfg.key_parallax_px:
-                    self.drop(len(self.poses) - 1)
-            else:
-                self.drop(len(self.poses) - 1)
+        if self._provisional and not self._becomes_keyframe(pose, ids, xy):
+            self.drop(len(self.poses) - 1)
         self.append(frame_id, pose, ids, xy)
         self._provisional = True
-        while len(self.poses) > cfg.key_images + 1:
+        while len(self.poses) > cfg.keyframes + 1:
             self.drop(0)
         self.triangulate()
-        # The prior on steps: loose, but it alone carries the unit of length.
-        loose = 1.0 / 0.3**2
-        prior = np.array([loose, loose, loose, 1e2, 1e2, 1e2])
-        self.adjust(cfg.adjust_iterations, cfg.adjusted_landmarks, prior)
+        adjust(self, cfg.adjust_iterations, cfg.adjusted_landmarks, _STEP_PRIOR)
         if not np.isfinite(self.poses[-1].p).all():
             self.poses[-1] = pose
         return self.poses[-1]
 
+    def _becomes_keyframe(self, pose: Pose, ids: Ints, xy: Floats) -> bool:
+        """Whether the provisional image stays: the present one is far from the last keyframe, and so is itself."""
+        cfg = self.config
+        present = self.poses[-2].between(pose)
+        parallax_px = self._parallax_px(ids, xy, present.R)
+        far = parallax_px > cfg.keyframe_parallax_px or float(np.linalg.norm(present.p)) > cfg.keyframe_distance_m
+        provisional_m = float(np.linalg.norm(self.poses[-2].between(self.poses[-1]).p))
+        near = provisional_m < 0.5 * cfg.keyframe_distance_m and parallax_px < 2.0 * cfg.keyframe_parallax_px
+        return far and not near
+
     def _parallax_px(self, ids: Ints, xy: Floats, R_key_curr: Floats) -> float:
+        """Median displacement of shared landmarks since the last keyframe, rotation taken out."""
         at = np.minimum(np.searchsorted(self.ids, ids), max(len(self.ids) - 1, 0))
         then = self.obs[len(self.poses) - 2, at]
         both = (self.ids[at] == ids) & np.isfinite(then[:, 0])
-        if both.sum() < 10:
+        if both.sum() < _LEAST_SHARED:
             return np.inf
         turned = np.column_stack([xy[both], np.ones(int(both.sum()))]) @ R_key_curr.T
         return float(np.median(np.abs(turned[:, :2] / turned[:, 2:] - then[both]).max(axis=1))) * self.focal_px

@@ -1,7 +1,7 @@
-"""Ego-motion of one forward camera in metres.
+"""Ego-motion of one forward camera in metres, image by image.
 
-    corners followed (features.py) -> the pose among landmarks, adjusted over a window (bundle_adjustment.py)
-    -> the length of it from the road under the camera (road_scale.py) -> Motion
+    track the corners (features.py) -> relative pose among the landmarks (relative_pose.py)
+    -> bundle adjustment over the keyframes (keyframes.py) -> metric scale from the road (metric_scale.py) -> Motion
 
 The paper takes this from an off-the-shelf SLAM and scales it by road points and a moving median (Sec. 3.1,
 scale-unambiguous ego-motion initialisation). A standing car holds its pose exactly: the image that the car stopped in
@@ -20,13 +20,16 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
 from birdslam.geometry.se2 import SE2
-from birdslam.odometry.bundle_adjustment import two_view
 from birdslam.odometry.features import FeatureConfig, FeatureTracker, Tracks
-from birdslam.odometry.keyframes import KeyWindow, KeyWindowConfig
+from birdslam.odometry.keyframes import KeyframeConfig, KeyframeWindow
+from birdslam.odometry.metric_scale import MetricScale, RoadView
 from birdslam.odometry.motion import Motion, MotionConfig, coasting_cov, measured_cov, planar, standing_cov
+from birdslam.odometry.moving_median import MedianScale
+from birdslam.odometry.relative_pose import locate, two_view
 from birdslam.odometry.road_alignment import RoadFit
 from birdslam.odometry.road_filter import RoadScaleConfig
-from birdslam.odometry.road_scale import MetricScale
+from birdslam.odometry.road_points import on_road, outside
+from birdslam.odometry.road_scale import RoadScale
 from birdslam.types import Status
 
 __all__ = ["Motion", "Odometry", "OdometryConfig", "Tracks"]
@@ -41,9 +44,10 @@ _MIN_INTERVAL_S = 0.004
 _STILL = Pose(np.eye(3), np.zeros(3))
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step that two images alone show: 1 cm, 0.25 deg
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
+_STRATEGIES: dict[str, type[RoadScale] | type[MedianScale]] = {"kalman": RoadScale, "paper": MedianScale}
 
 
-class OdometryConfig(KeyWindowConfig, frozen=True, forbid_unknown_fields=True):
+class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
     """One setting for every camera, road and frame rate."""
 
     features: FeatureConfig = FeatureConfig()
@@ -69,6 +73,15 @@ class _Velocity:
     angular_radps: Floats  # (3,)
 
 
+@dataclass(frozen=True)
+class _Corners:
+    """The N corners of one image outside vehicles."""
+
+    ids: Ints  # (N,) ascending
+    xy: Floats  # (N, 2) normalised coordinates
+    displacement_px: Floats  # of those that the base image shows too
+
+
 class Odometry:
     """From images of one undistorted, calibrated camera to metric motion, image by image.
 
@@ -86,7 +99,7 @@ class Odometry:
     def reset(self) -> None:
         """Forgets everything but the camera; track ids go on counting."""
         self._tracker.reset()
-        self._scale = MetricScale(self.camera, self.config.road)
+        self._scale: MetricScale = _STRATEGIES[self.config.road.mode](self.camera, self.config.road)
         self._window = self._new_window()
         self._pose = _STILL  # of the base image, in the window's frame
         self._base_frame: int | None = None  # the last image whose motion was measured
@@ -145,93 +158,90 @@ class Odometry:
 
         `vehicle_boxes_px` (N, 4) is x1, y1, x2, y2; `road_mask` (H, W) may be some images old.
         """
-        boxes = np.asarray(vehicle_boxes_px, dtype=np.float64).reshape(-1, 4)
-        status: list[Status] = []
-        if tracks.dark:
-            status.append(Status.CAMERA_DARK)
-        if tracks.frozen:
-            status.append(Status.CAMERA_FROZEN)
+        boxes_px = np.asarray(vehicle_boxes_px, dtype=np.float64).reshape(-1, 4)
+        blind = [Status.CAMERA_DARK] * tracks.dark + [Status.CAMERA_FROZEN] * tracks.frozen
         if self._base_frame is None:
-            if not status:
-                self._begin(tracks, frame_id, t_source_ns, boxes)
+            if not blind:
+                self._begin(tracks, frame_id, t_source_ns, boxes_px)
             return None
         dt_s = (t_source_ns - self._base_t_ns) * 1e-9
         if dt_s < _MIN_INTERVAL_S:  # a clock that stands or steps back must not make a speed
             dt_s = self._interval_s
-        if status:
-            return self._coasting(frame_id, dt_s, status)
+        if blind:
+            return self._coast(frame_id, dt_s, blind)
 
-        static = self._outside(tracks.px, boxes)
-        ids, xy = tracks.ids[static], self.camera.to_xy(tracks.px[static])
-        displacement = self._displacement(tracks, static)
-        found = self._locate(ids, xy, dt_s, displacement)
-        if found is None:
-            status.append(Status.LOW_TEXTURE)
-            motion = self._coasting(frame_id, dt_s, status)
-            if dt_s > self.config.max_coast_s or len(displacement) < self.config.min_fitting:
+        corners = self._static_corners(tracks, boxes_px)
+        located = self._relative_pose(corners, dt_s)
+        if located is None:
+            motion = self._coast(frame_id, dt_s, [Status.LOW_TEXTURE])
+            if dt_s > self.config.max_coast_s or len(corners.displacement_px) < self.config.min_fitting:
                 # Nothing links this image to the base any more: the window begins anew here, at the coasted pose.
-                self._begin(tracks, frame_id, t_source_ns, boxes)
+                self._begin(tracks, frame_id, t_source_ns, boxes_px)
                 self._scale.turned_unseen()
             return motion
-        pose, info = found
-        if self._stands(self._pose.between(pose), displacement):
+        pose, info = located
+        if self._stands(self._pose.between(pose), corners.displacement_px):
             # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.
-            motion = self._standing(frame_id)
-            self._velocity = _Velocity(np.zeros(3), np.zeros(3))
+            motion = self._stand(frame_id)
         else:
-            pose = self._window.extend(frame_id, pose, ids, xy)
-            step = self._pose.between(pose)
-            self._scale.moved(step)
-            factor = self._scale.compare(tracks.image, pose, boxes, road_mask)
-            self._window.rescale(factor)
-            self._pose = pose
+            pose = self._window.extend(frame_id, pose, corners.ids, corners.xy)  # bundle adjustment
+            step = self._scale_to_metres(pose, tracks, boxes_px, road_mask)
+            motion = self._move(frame_id, step, info, dt_s)
             self._tracker.accept(tracks)
-            step = Pose(step.R, step.p * factor)
-            motion = self._moving(frame_id, step, info)
-            self._velocity, self._interval_s = _Velocity(step.p / dt_s, rotation_log(step.R) / dt_s), dt_s
         self._base_frame, self._base_t_ns = frame_id, t_source_ns
-        self._see_road_tracks(tracks, boxes, road_mask)
+        self._road_tracks = self._tracks_on_road(tracks, boxes_px, road_mask)
         return motion
 
-    def _begin(self, tracks: Tracks, frame_id: int, t_source_ns: int, boxes: Floats) -> None:
+    def _begin(self, tracks: Tracks, frame_id: int, t_source_ns: int, boxes_px: Floats) -> None:
         """A new window that holds this image alone."""
         self._tracker.accept(tracks)
         self._window = self._new_window()
         self._pose = _STILL
-        static = self._outside(tracks.px, boxes)
+        static = outside(tracks.px, boxes_px)
         self._window.append(frame_id, self._pose, tracks.ids[static], self.camera.to_xy(tracks.px[static]))
         self._base_frame, self._base_t_ns = frame_id, t_source_ns
         self._scale.restart(tracks.image, self._pose, 0.3)
 
-    def _locate(self, ids: Ints, xy: Floats, dt_s: float, displacement: Floats) -> tuple[Pose, Floats] | None:
+    def _new_window(self) -> KeyframeWindow:
+        return KeyframeWindow(self._focal_px, self.config)
+
+    def _static_corners(self, tracks: Tracks, boxes_px: Floats) -> _Corners:
+        static, base = outside(tracks.px, boxes_px), self._tracker.base
+        ids, px = tracks.ids[static], tracks.px[static]
+        _, a, b = np.intersect1d(base.ids, ids, return_indices=True)
+        displacement: Floats = np.sqrt(((px[b] - base.px[a]) ** 2).sum(axis=1))
+        return _Corners(ids, self.camera.to_xy(px), displacement)
+
+    # --- relative pose ---
+
+    def _relative_pose(self, corners: _Corners, dt_s: float) -> tuple[Pose, Floats] | None:
         """The present image's pose in the window's frame and its information (6, 6); None where it is not known."""
-        cfg, window = self.config, self._window
+        cfg, window, ids = self.config, self._window, corners.ids
         guesses = [self._pose @ self._predicted_step(dt_s), self._pose]
-        best: tuple[int, Pose, Bools, Floats] | None = None
-        known = np.isfinite(window.rho)
-        shared = int(np.isin(ids, window.ids[known]).sum())
+        best: tuple[int, Pose, Floats] | None = None
+        shared = int(np.isin(ids, window.ids[np.isfinite(window.rho)]).sum())
         if shared >= cfg.min_fitting:
             for guess in guesses:
-                pose, fits, info = window.locate(guess, ids, xy)
-                if best is None or fits.sum() > best[0]:
-                    best = (int(fits.sum()), pose, fits, info)
+                pose, inliers, info = locate(window, guess, ids, corners.xy)
+                if best is None or inliers.sum() > best[0]:
+                    best = (int(inliers.sum()), pose, info)
                 if best[0] > 0.7 * shared:
                     break
         if best is not None and best[0] >= max(cfg.min_fitting, cfg.min_fitting_fraction * shared):
             travelled_m = float(np.linalg.norm(best[1].p - self._pose.p))
             if travelled_m <= cfg.max_speed_mps * dt_s + 0.1:
-                return best[1], best[3]
-        return self._locate_two_view(ids, xy, dt_s, displacement)
+                return best[1], best[2]
+        return self._two_view_pose(corners, dt_s)
 
-    def _locate_two_view(self, ids: Ints, xy: Floats, dt_s: float, displacement: Floats) -> tuple[Pose, Floats] | None:
+    def _two_view_pose(self, corners: _Corners, dt_s: float) -> tuple[Pose, Floats] | None:
         """Starts the window anew from the base image and this one."""
-        cfg = self.config
+        cfg, displacement_px = self.config, corners.displacement_px
         base = self._tracker.base
-        _, a, b = np.intersect1d(base.ids, ids, return_indices=True)
+        _, a, b = np.intersect1d(base.ids, corners.ids, return_indices=True)
         if len(a) < cfg.min_fitting:
             return None
-        xy_a, xy_b = self.camera.to_xy(base.px[a]), xy[b]
-        if float(np.median(displacement)) < cfg.standstill_px and float(np.quantile(displacement, 0.8)) < 1.5:
+        xy_a, xy_b = self.camera.to_xy(base.px[a]), corners.xy[b]
+        if float(np.median(displacement_px)) < cfg.standstill_px and float(np.quantile(displacement_px, 0.8)) < 1.5:
             return self._pose, _TWO_VIEW_INFORMATION
         found = two_view(xy_a, xy_b, self._focal_px, cfg.two_view_px)
         if found is None or found[1].sum() < max(cfg.min_fitting, cfg.min_fitting_fraction * len(a)):
@@ -245,20 +255,24 @@ class Odometry:
         self._scale.restart(base.image, self._pose, 0.2 if speed * dt_s > 0.05 else 1.0)
         return self._pose @ Pose(step.R, step.p * length), _TWO_VIEW_INFORMATION
 
-    # --- standing, coasting ---
+    # --- metric scale ---
 
-    def _displacement(self, tracks: Tracks, static: Bools) -> Floats:
-        """(N,) px: how far the corners outside vehicles have moved since the base image."""
-        base = self._tracker.base
-        _, a, b = np.intersect1d(base.ids, tracks.ids[static], return_indices=True)
-        out: Floats = np.sqrt(((tracks.px[static][b] - base.px[a]) ** 2).sum(axis=1))
-        return out
+    def _scale_to_metres(self, pose: Pose, tracks: Tracks, boxes_px: Floats, road_mask: Bools | None) -> Pose:
+        """T_base_present in metres; the window is rescaled to metres too."""
+        step = self._pose.between(pose)
+        view = RoadView(tracks.image, pose, boxes_px, road_mask, self._window)
+        factor = self._scale.measure_scale(step, view)
+        self._window.rescale(factor)
+        self._pose = pose
+        return Pose(step.R, step.p * factor)
 
-    def _stands(self, step: Pose, displacement: Floats) -> bool:
+    # --- moving, standing, coasting ---
+
+    def _stands(self, step: Pose, displacement_px: Floats) -> bool:
         cfg = self.config
-        if len(displacement) < cfg.min_fitting or float(np.median(displacement)) > cfg.standstill_px:
+        if len(displacement_px) < cfg.min_fitting or float(np.median(displacement_px)) > cfg.standstill_px:
             return False
-        if float(np.quantile(displacement, 0.8)) < cfg.standstill_px:
+        if float(np.quantile(displacement_px, 0.8)) < cfg.standstill_px:
             return True  # four corners of five have not moved: what the others make of the pose does not count
         turn = float(np.linalg.norm(rotation_log(step.R)))
         return float(np.linalg.norm(step.p)) < cfg.standstill_m and turn < cfg.standstill_rad
@@ -268,22 +282,22 @@ class Odometry:
             return _STILL
         return Pose(rotation_exp(self._velocity.angular_radps * dt_s), self._velocity.linear_mps * dt_s)
 
-    def _moving(self, frame_id: int, step: Pose, info: Floats) -> Motion:
+    def _move(self, frame_id: int, step: Pose, info: Floats, dt_s: float) -> Motion:
+        self._velocity, self._interval_s = _Velocity(step.p / dt_s, rotation_log(step.R) / dt_s), dt_s
         T_prev_curr = planar(step, self._scale.ground)
         cov = measured_cov(self.config.motion, info, T_prev_curr, self._scale.ground, self._scale.sigma_rel)
         return self._motion(frame_id, step, T_prev_curr, cov, self._scale.status())
 
-    def _standing(self, frame_id: int) -> Motion:
+    def _stand(self, frame_id: int) -> Motion:
+        self._velocity = _Velocity(np.zeros(3), np.zeros(3))
         return self._motion(frame_id, _STILL, SE2(), standing_cov(self.config.motion), [Status.STANDSTILL])
 
-    def _coasting(self, frame_id: int, dt_s: float, status: list[Status]) -> Motion:
+    def _coast(self, frame_id: int, dt_s: float, status: list[Status]) -> Motion:
         """The last velocity goes on; the base image stays."""
         self._road_tracks = _NO_TRACKS  # those of the last measured image would say that the car has not moved since
-        step = self._predicted_step(dt_s)
+        step, known = self._predicted_step(dt_s), self._velocity is not None
         T_prev_curr = planar(step, self._scale.ground)
-        cov = coasting_cov(
-            self.config.motion, T_prev_curr, dt_s, self._velocity is not None, self._scale.sigma_rel
-        )  # fmt: skip
+        cov = coasting_cov(self.config.motion, T_prev_curr, dt_s, known, self._scale.sigma_rel)
         return self._motion(frame_id, step, T_prev_curr, cov, [*status, Status.ODOMETRY_COASTING])
 
     def _motion(self, frame_id: int, step: Pose, T_prev_curr: SE2, cov: Floats, status: list[Status]) -> Motion:
@@ -303,27 +317,8 @@ class Odometry:
             status=tuple(status),
         )
 
-    def _see_road_tracks(self, tracks: Tracks, boxes: Floats, road_mask: Bools | None) -> None:
-        px = tracks.px
-        rays = np.column_stack([self.camera.to_xy(px), np.ones(len(px))])
-        rho = -(rays @ self._scale.ground.normal_cam) / self.camera.height_m
-        keep = (tracks.age > 0) & (rho > 1.0 / 30.0) & self._outside(px, boxes)
-        if road_mask is not None:
-            at = np.round(px).astype(np.int64)
-            at = np.clip(at, 0, [road_mask.shape[1] - 1, road_mask.shape[0] - 1])
-            keep &= road_mask[at[:, 1], at[:, 0]]
-        else:
-            keep &= np.abs(rays[:, 0]) < self.config.road.align.half_width_m * rho
-        self._road_tracks = (tracks.ids[keep], px[keep])
-
-    # --- small geometry ---
-
-    def _new_window(self) -> KeyWindow:
-        return KeyWindow(self._focal_px, self.config)
-
-    @staticmethod
-    def _outside(px: Floats, boxes: Floats) -> Bools:
-        out = np.ones(len(px), bool)
-        for x1, y1, x2, y2 in boxes:
-            out &= ~((px[:, 0] > x1 - 3) & (px[:, 0] < x2 + 3) & (px[:, 1] > y1 - 3) & (px[:, 1] < y2 + 6))
-        return out
+    def _tracks_on_road(self, tracks: Tracks, boxes_px: Floats, road_mask: Bools | None) -> tuple[Ints, Floats]:
+        """The corners followed into this image that lie on the road: the paper's static map points."""
+        half_width_m = self.config.road.align.half_width_m
+        keep = (tracks.age > 0) & on_road(tracks.px, self.camera, self._scale.ground, boxes_px, road_mask, half_width_m)
+        return tracks.ids[keep], tracks.px[keep]

@@ -7,7 +7,7 @@ road, and the mount, about which the car bounces.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -24,8 +24,13 @@ STATES = ROAD + 2  # log lambda, pitch, roll, curvature; the mount's pitch and r
 
 
 class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How comparisons of the road become a running scale and tilt."""
+    """How what the road shows becomes a running scale and tilt.
 
+    `mode` is the strategy: "kalman" is `road_scale.RoadScale`, "paper" the paper's moving median,
+    `moving_median.MedianScale`.
+    """
+
+    mode: Literal["kalman", "paper"] = "kalman"
     align: RoadAlignConfig = RoadAlignConfig()
     min_baseline_m: Positive = 0.35  # travelled between the two images; shorter says too little
     target_baseline_m: Positive = 1.1  # of the kept images the one nearest to this is compared
@@ -54,6 +59,11 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     carried_after_m: Positive = 6.0  # without a comparison, until the status says so
     invalid_sigma_rel: Positive = 0.15  # less sure of the scale than this, a frame is invalid
     watch: TiltWatchConfig = TiltWatchConfig()
+    # of mode "paper" alone
+    median_frames: Annotated[int, msgspec.Meta(ge=1)] = 21  # over which the median moves; the paper states none
+    median_landmarks: Annotated[int, msgspec.Meta(ge=1)] = 3  # on the road, or the frame gives no scale
+    median_range_m: Positive = 20.0  # of those landmarks: the paper's depth threshold T
+    median_sigma_depth_rel: Positive = 0.1  # of the depth of a landmark that counts, 1-sigma
 
 
 class RoadFilter:

@@ -1,9 +1,8 @@
-"""Metric scale: what the known camera height over the road says about the length of a motion; and the road's tilt.
+"""The metric scale by a Kalman filter over comparisons of the road's image.
 
-The paper scales ego-motion by road points of known metric depth (Eq. 1, camera height H) under a moving median
-(Sec. 3.1, scale-unambiguous ego-motion initialisation). Here a filter over (log lambda, pitch, roll, curvature) takes
-the place of the median: one comparison (`road_alignment`) knows only some combination of the four, and the filter
-knows which.
+The paper scales ego-motion by road points of known metric depth under a moving median (Sec. 3.1; `moving_median.py`).
+Here `road_filter.RoadFilter` takes the place of the median: one comparison of two images (`road_alignment.py`) knows
+only some combination of scale, pitch, roll and curvature, and the filter knows which.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
+from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.road_alignment import ROAD, RoadAligner, RoadFit, RoadImage
 from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
 from birdslam.odometry.road_search import search_length
@@ -22,7 +22,6 @@ from birdslam.odometry.tilt_watch import TiltWatch
 from birdslam.types import Status
 
 Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _LENGTHS_M = np.geomspace(0.03, 6.0, 84)  # tried where the length is not known at all
 
@@ -33,11 +32,11 @@ class _Kept:
     pose: Pose  # in the odometry's frame and unit
 
 
-class MetricScale:
-    """Turns the odometry's unit of length into metres, image by image.
+class RoadScale:
+    """A `metric_scale.MetricScale`: chooses the earlier image, compares, and lets the filter accept or refuse.
 
-    Poses come in the odometry's own frame. By the factor that `compare` returns the caller multiplies all its lengths,
-    about the present camera, and so does this.
+    Poses come in the odometry's own frame. By the factor that `measure_scale` returns the caller multiplies all its
+    lengths, about the present camera, and so does this. A scale that is in doubt is searched for over all lengths.
     """
 
     def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:
@@ -45,13 +44,12 @@ class MetricScale:
         self._aligner = RoadAligner(camera, config.align)
         self._filter = RoadFilter(camera, config)
         self._watch = TiltWatch(camera, config.watch)
-        self._travelled_m = 0.0  # by the last motion
         self._kept: list[_Kept] = []
         self._confirmed = 0
         self._refused = 0.0  # comparisons in a row, each counted by what of it is new: those of one view err together
         self._tries = 0  # and by number
         self._since_m = 0.0  # travelled since the last comparison
-        self.fit: RoadFit | None = None  # what the last image's comparison alone said, where it was taken over
+        self.fit: RoadFit | None = None  # what the newest image's comparison alone said, where it was accepted
 
     @property
     def ground(self) -> GroundPlane:
@@ -61,6 +59,7 @@ class MetricScale:
 
     @property
     def sigma_rel(self) -> float:
+        """1-sigma of the scale as a fraction."""
         return float(np.sqrt(self._filter.cov[0, 0]))
 
     @property
@@ -70,57 +69,59 @@ class MetricScale:
 
     @property
     def pitch_sigma_rad(self) -> float:
+        """1-sigma of the ground's pitch."""
         return self._filter.chord[1]
 
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
         """The odometry begins anew with this image; its unit of length is known to `sigma_rel`."""
         self._kept = [_Kept(self._aligner.image(grey), pose)]
-        self.forget(sigma_rel)
-
-    def turned_unseen(self) -> None:
-        """The odometry lost sight of how the camera turned."""
-        self._filter.turned_unseen()
-
-    def forget(self, sigma_rel: float) -> None:
-        """The unit of length is only known to `sigma_rel` from here on."""
         if not self._confirmed:
             sigma_rel = 1.0
         self._filter.forget_scale(sigma_rel)
         if sigma_rel > self.config.doubt_sigma_rel:
             self._confirmed = 0
 
-    def moved(self, step: Pose) -> None:
-        """The camera moved by T_prev_curr, in the present unit of length."""
-        self._travelled_m = float(np.linalg.norm(step.p))
-        self._filter.predict(step.R, self._travelled_m)
-        self._filter.travel(step.R.T @ step.p, self._travelled_m)
-        self._since_m += self._travelled_m
+    def turned_unseen(self) -> None:
+        """The odometry lost sight of how the camera turned."""
+        self._filter.turned_unseen()
 
-    def compare(self, grey: NDArray[np.uint8], pose: Pose, boxes_px: Floats, road_mask: Bools | None) -> float:
-        """Compares the road with that of an earlier image; returns the factor on all lengths."""
-        cfg = self.config
+    def measure_scale(self, step: Pose, view: RoadView) -> float:
+        """The factor on all lengths, by the road of this image against an earlier one's.
+
+        `step` is T_prev_curr, in the present unit of length.
+        """
         self.fit = None
-        image = self._aligner.image(grey)
+        travelled_m = float(np.linalg.norm(step.p))
+        self._filter.predict(step.R, travelled_m)
+        self._filter.travel(step.R.T @ step.p, travelled_m)
+        self._since_m += travelled_m
+
+        image, pose = self._aligner.image(view.grey), view.pose
         factor = float(np.exp(np.clip(self._filter.owed_log, -0.1, 0.1)))
         self._filter.owed_log = 0.0
         past = self._past(pose)
         if past is not None:
-            ground = self.ground
-            px = self._aligner.samples((ground.pitch_rad, ground.roll_rad), boxes_px, road_mask)
-            if len(px) >= cfg.align.min_samples:
+            px = self._aligner.samples(self._tilt, view.boxes_px, view.road_mask)
+            if len(px) >= self.config.align.min_samples:
                 T = past.pose.between(pose)
                 factor *= self._compare(past, image, Pose(T.R, T.p * factor), px)
         measured = self._filter.carried_m == 0.0 and self._known()  # here, in metres
-        self._watch.see(self._filter.tilt, factor * self._travelled_m, measured)
+        self._watch.see(self._filter.tilt, factor * travelled_m, measured)
+        self._keep(image, pose, factor)
+        return factor
+
+    def _keep(self, image: RoadImage, pose: Pose, factor: float) -> None:
+        """Remembers the image for later comparisons, where it is far enough from the last one kept."""
+        cfg = self.config
         if factor != 1.0:
             centre = pose.p
             self._kept = [_Kept(k.image, Pose(k.pose.R, centre + factor * (k.pose.p - centre))) for k in self._kept]
         newest = self._kept[-1] if self._kept else None
         if newest is None or float(np.linalg.norm(newest.pose.p - pose.p)) > 0.5 * cfg.min_baseline_m:
             self._kept = [*self._kept[1 - cfg.kept_images :], _Kept(image, pose)]
-        return factor
 
     def status(self) -> list[Status]:
+        """What is wrong with the scale, the ground plane or the mount."""
         cfg, out = self.config, []
         if self._filter.carried_m > cfg.carried_after_m or not self._confirmed:
             out.append(Status.SCALE_CARRIED)
@@ -132,7 +133,19 @@ class MetricScale:
             out.append(Status.CALIBRATION_DRIFT)
         return out
 
+    @property
+    def _tilt(self) -> tuple[float, float]:
+        ground = self.ground
+        return ground.pitch_rad, ground.roll_rad
+
+    def _known(self) -> bool:
+        return self._confirmed >= self.config.confirmations
+
+    def _in_doubt(self) -> bool:
+        return self.sigma_rel > self.config.doubt_sigma_rel or self._refused >= self.config.doubt_after
+
     def _past(self, pose: Pose) -> _Kept | None:
+        """The earlier image to compare with: the one whose baseline is nearest to the target."""
         cfg = self.config
         if not self._kept:
             return None
@@ -145,33 +158,17 @@ class MetricScale:
             return None
         return self._kept[int(usable[np.argmin(np.abs(np.log(distance[usable] / cfg.target_baseline_m)))])]
 
-    def _in_doubt(self) -> bool:
-        return self.sigma_rel > self.config.doubt_sigma_rel or self._refused >= self.config.doubt_after
-
     def _compare(self, past: _Kept, image: RoadImage, T: Pose, px: NDArray[np.int64]) -> float:
+        """The factor by which T_past_present is too short, 1 where the comparison is refused."""
         cfg, filter_ = self.config, self._filter
-        prior, prior_cov = filter_.x[:ROAD].copy(), filter_.cov.copy()
-        tilt = (self.ground.pitch_rad, self.ground.roll_rad)
         length = float(np.linalg.norm(T.p))
         if length < 1e-6:
             return 1.0
         new, self._since_m = min(1.0, self._since_m / length), 0.0
-        searched = 1.0
-        fit = self._aligner.align(past.image, image, T, px, prior, prior_cov[:ROAD, :ROAD])
-        if self._in_doubt():
-            found = search_length(self.camera, past.image, image, T, px, tilt, _LENGTHS_M) / length
-            loose = prior_cov.copy()
-            loose[0, :] = loose[:, 0] = 0.0
-            loose[0, 0] = 0.3**2
-            if self._refused >= cfg.doubt_after:
-                loose[1:3, 1:3] += np.eye(2) * cfg.sigma_unseen_rad**2
-            other = self._aligner.align(past.image, image, Pose(T.R, T.p * found), px, prior, loose[:ROAD, :ROAD])
-            # What was confirmed before has to be beaten clearly: the dark below a car ahead agrees with standing still.
-            lead = 0.02 if not self._confirmed else 0.1
-            if other is not None and (fit is None or other.correlation > fit.correlation + lead):
-                fit, searched, prior_cov = other, found, loose
-        if fit is None:
+        found = self._align(past.image, image, T, px)
+        if found is None:
             return 1.0
+        fit, searched, prior_cov = found
         expected = searched != 1.0 or not self._known() or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
         if fit.correlation < cfg.min_correlation or not expected:
             self._refused += new
@@ -186,5 +183,24 @@ class MetricScale:
             filter_.cov[0, 0] = max(filter_.cov[0, 0], (1.1 * cfg.doubt_sigma_rel) ** 2)
         return factor
 
-    def _known(self) -> bool:
-        return self._confirmed >= self.config.confirmations
+    def _align(
+        self, past: RoadImage, image: RoadImage, T: Pose, px: NDArray[np.int64]
+    ) -> tuple[RoadFit, float, Floats] | None:
+        """The fit, the factor on T that it starts from, and the filter's covariance that it is to be joined with."""
+        cfg, filter_ = self.config, self._filter
+        prior, prior_cov = filter_.x[:ROAD].copy(), filter_.cov.copy()
+        fit = self._aligner.align(past, image, T, px, prior, prior_cov[:ROAD, :ROAD])
+        if self._in_doubt():
+            length = float(np.linalg.norm(T.p))
+            searched = search_length(self.camera, past, image, T, px, self._tilt, _LENGTHS_M) / length
+            loose = prior_cov.copy()
+            loose[0, :] = loose[:, 0] = 0.0
+            loose[0, 0] = 0.3**2
+            if self._refused >= cfg.doubt_after:
+                loose[1:3, 1:3] += np.eye(2) * cfg.sigma_unseen_rad**2
+            other = self._aligner.align(past, image, Pose(T.R, T.p * searched), px, prior, loose[:ROAD, :ROAD])
+            # What was confirmed before has to be beaten clearly: the dark below a car ahead agrees with standing still.
+            lead = 0.02 if not self._confirmed else 0.1
+            if other is not None and (fit is None or other.correlation > fit.correlation + lead):
+                return other, searched, loose
+        return None if fit is None else (fit, 1.0, prior_cov)

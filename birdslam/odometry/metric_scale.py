@@ -1,0 +1,64 @@
+"""What the odometry asks of its metric scale (paper, Sec. 3.1, scale-unambiguous ego-motion initialisation).
+
+The scale comes from the known height of the camera over the road. Two strategies stand behind this interface:
+`road_scale.RoadScale`, a Kalman filter, and `moving_median.MedianScale`, the paper's moving median.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.pose import Pose
+from birdslam.odometry.road_alignment import RoadFit
+from birdslam.odometry.sliding_window import SlidingWindow
+from birdslam.types import Status
+
+
+@dataclass(frozen=True)
+class RoadView:
+    """What one image says of the road: its pixels, the camera's pose, and the landmarks, in the odometry's unit."""
+
+    grey: NDArray[np.uint8]  # (H, W)
+    pose: Pose  # in the window's axes
+    boxes_px: NDArray[np.float64]  # (N, 4) vehicles
+    road_mask: NDArray[np.bool_] | None  # (H, W), may be some images old
+    window: SlidingWindow  # its newest keyframe is this image
+
+
+class MetricScale(Protocol):
+    """Turns the odometry's unit of length into metres, image by image."""
+
+    fit: RoadFit | None  # what the newest image's comparison alone said, where it was accepted
+
+    @property
+    def ground(self) -> GroundPlane:
+        """The present camera over the road; the height is the calibrated one, by which all lengths are measured."""
+
+    @property
+    def sigma_rel(self) -> float:
+        """1-sigma of the scale as a fraction."""
+
+    @property
+    def pitch_sigma_rad(self) -> float:
+        """1-sigma of the ground's pitch."""
+
+    @property
+    def unknown(self) -> bool:
+        """Too vague to be driven by."""
+
+    def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
+        """The window begins anew with this image; its unit of length is known to `sigma_rel`."""
+
+    def turned_unseen(self) -> None:
+        """The odometry lost sight of how the camera turned."""
+
+    def measure_scale(self, step: Pose, view: RoadView) -> float:
+        """The factor on all lengths, about the present camera, after a motion T_prev_curr of `step`."""
+
+    def status(self) -> list[Status]:
+        """What is wrong with the scale."""

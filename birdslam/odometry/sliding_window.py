@@ -1,0 +1,130 @@
+"""The sliding window of the odometry: the last keyframes and the landmarks that they share.
+
+A landmark is one number, its inverse depth along the ray of its anchor, the first keyframe of the window that saw it.
+All coordinates are normalised ones of an undistorted camera; the unit of length is the caller's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.pose import Pose
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MIN_DEPTH = 1e-3  # of a ray's own length: nearer or behind counts as not visible
+
+
+class SlidingWindow:
+    """F keyframes, oldest first (the newest may be provisional), and M landmarks.
+
+    `focal_px` scales residuals to pixels, `sigma_px` is the noise of a track, `reject_px` the residual of an outlier.
+    """
+
+    def __init__(self, focal_px: float, sigma_px: float, reject_px: float) -> None:
+        self.focal_px, self.sigma_px, self.reject_px = focal_px, sigma_px, reject_px
+        self.poses: list[Pose] = []
+        self.frames: list[int] = []
+        self.ids: Ints = np.zeros(0, np.int64)  # (M,) ascending
+        self.obs: Floats = np.zeros((0, 0, 2))  # (F, M, 2), NaN where not seen
+        self.rho: Floats = np.zeros(0)  # (M,) inverse depth along the anchor's ray (z = 1), NaN unknown
+        self.rho_sigma: Floats = np.zeros(0)
+
+    def anchors(self) -> Ints:
+        """(M,) index of each landmark's anchor."""
+        out: Ints = np.isfinite(self.obs[..., 0]).argmax(axis=0)
+        return out
+
+    def append(self, frame: int, pose: Pose, ids: Ints, xy: Floats) -> None:
+        """A new keyframe: ids (N,) ascending, xy (N, 2) normalised coordinates."""
+        merged = np.concatenate([self.ids, ids])
+        merged.sort(kind="stable")
+        merged = merged[np.concatenate([[True], merged[1:] != merged[:-1]])] if len(merged) else merged
+        obs = np.full((len(self.poses) + 1, len(merged), 2), np.nan)
+        old = np.searchsorted(merged, self.ids)
+        obs[:-1, old] = self.obs
+        obs[-1, np.searchsorted(merged, ids)] = xy
+        rho, sigma = np.full(len(merged), np.nan), np.full(len(merged), np.inf)
+        rho[old], sigma[old] = self.rho, self.rho_sigma
+        self.ids, self.obs, self.rho, self.rho_sigma = merged, obs, rho, sigma
+        self.poses.append(pose)
+        self.frames.append(frame)
+
+    def drop(self, index: int) -> None:
+        """Forgets one keyframe. Landmarks anchored in it move to the next keyframe that saw them."""
+        anchor, gone, xy = self.anchors(), self.poses[index], self.obs[index]
+        self.obs = self.obs[np.arange(len(self.poses)) != index]
+        del self.poses[index], self.frames[index]
+        seen = np.isfinite(self.obs[..., 0]).any(axis=0)
+        moved = np.flatnonzero(seen & (anchor == index) & np.isfinite(self.rho))
+        if len(moved):
+            new = self.anchors()[moved]
+            R, p = self.stacked()
+            # A point at infinity stays there; one behind its new anchor is forgotten.
+            far = self.rho[moved] <= 1e-6
+            depth = 1.0 / np.where(far, 1.0, self.rho[moved])
+            X = (np.column_stack([xy[moved], np.ones(len(moved))]) * depth[:, None]) @ gone.R.T + gone.p
+            z = (R[new, :, 2] * (X - p[new])).sum(axis=1)
+            self.rho[moved] = np.where(far, 0.0, np.where(z > MIN_DEPTH, 1.0 / np.maximum(z, MIN_DEPTH), np.nan))
+        self.ids, self.obs = self.ids[seen], self.obs[:, seen]
+        self.rho, self.rho_sigma = self.rho[seen], self.rho_sigma[seen]
+
+    def rescale(self, factor: float) -> None:
+        """Multiplies all lengths, about the newest camera."""
+        centre = self.poses[-1].p
+        self.poses = [Pose(T.R, centre + factor * (T.p - centre)) for T in self.poses]
+        self.rho = self.rho / factor
+        self.rho_sigma = self.rho_sigma / factor
+
+    def predict_xy(self, pose: Pose) -> Floats:
+        """(M, 2) where a camera at `pose` sees the landmarks; NaN where unknown or behind it."""
+        q = self._seen_from(pose)
+        xy: Floats = (q[:2] / np.where(q[2] > MIN_DEPTH, q[2], np.nan)).T
+        return xy
+
+    def depths(self, pose: Pose) -> Floats:
+        """(M,) z of the landmarks in a camera at `pose`; NaN where unknown."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z: Floats = self._seen_from(pose)[2] / self.rho
+        return z
+
+    def _seen_from(self, pose: Pose) -> Floats:
+        """(3, M) the landmarks in a camera at `pose`, times their inverse depths."""
+        anchor = self.anchors()
+        R, p = self.stacked()
+        rays = np.column_stack([self.obs[anchor, np.arange(len(self.ids))], np.ones(len(self.ids))])
+        out: Floats = pose.R.T @ ((R[anchor] @ rays[:, :, None])[:, :, 0] + self.rho[:, None] * (p[anchor] - pose.p)).T
+        return out
+
+    def triangulate(self) -> None:
+        """Inverse depths of what the newest keyframe and another see, by linear least squares with the poses held."""
+        newest = np.isfinite(self.obs[-1, :, 0])
+        anchor, xy = self.anchors()[newest], self.obs[:, newest].transpose(0, 2, 1)
+        R, p = self.stacked()
+        rays = np.concatenate([xy[anchor, :, np.arange(len(anchor))].T, np.ones((1, len(anchor)))])
+        R_w = R.transpose(0, 2, 1)
+        q0 = R_w @ (R[anchor] @ rays.T[:, :, None])[:, :, 0].T  # (F, 3, M)
+        dq = R_w @ (p[anchor].T - p[:, :, None])
+        others = np.isfinite(xy[:, 0]) & (np.arange(len(p))[:, None] != anchor[None])
+        # r(rho) = (q0 + rho dq)_xy - xy (q0 + rho dq)_z is linear in rho; weights 1 / q_z make it a reprojection error
+        xy = np.where(others[:, None], xy, 0.0)
+        a = dq[:, :2] - xy * dq[:, 2:]
+        b = q0[:, :2] - xy * q0[:, 2:]
+        aa, ab = (a * a).sum(axis=1), (a * b).sum(axis=1)
+        rho = np.where(np.isfinite(self.rho[newest]), self.rho[newest], 0.0)
+        for _ in range(2):
+            w = others / np.maximum(q0[:, 2] + rho * dq[:, 2], 0.1) ** 2
+            den = (w * aa).sum(axis=0)
+            rho = np.where(den > 1e-12, np.maximum(-(w * ab).sum(axis=0) / np.maximum(den, 1e-12), 0.0), 0.0)
+        z = np.maximum(q0[:, 2] + rho * dq[:, 2], 0.1)
+        r = np.sqrt((others * ((b + a * rho) ** 2).sum(axis=1) / z**2).max(axis=0))
+        good = (den > 1e-12) & others.any(axis=0) & (r * self.focal_px < self.reject_px)
+        sigma = self.sigma_px / self.focal_px / np.sqrt(np.maximum(den, 1e-12))
+        self.rho[newest] = np.where(good, rho, np.nan)
+        self.rho_sigma[newest] = np.where(good, sigma, np.inf)
+
+    def stacked(self) -> tuple[Floats, Floats]:
+        """The poses as arrays: (F, 3, 3) rotations, (F, 3) places."""
+        return np.stack([T.R for T in self.poses]), np.stack([T.p for T in self.poses])
