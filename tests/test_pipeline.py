@@ -10,15 +10,23 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
+from birdslam.datasets.opening import open_recording
+from birdslam.runtime.cli.commands import _pipeline
 from birdslam.runtime.client import Planner
+from birdslam.runtime.configuration import load
+from birdslam.runtime.recording.recording import Recording
+from birdslam.runtime.replay.replay import compare
 from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.transport.presence import ring_path
-from birdslam.types import INVALIDATING, Status
+from birdslam.runtime.wire import decode, encode
+from birdslam.types import INVALIDATING, Estimate, MapUpdate, Measurements, Status
 
 FRAMES, WIDTH, HEIGHT, F_PX, HEIGHT_M = 12, 480, 160, 260.0, 1.65
 LIMIT_S = 60.0
@@ -150,6 +158,60 @@ def run_all(place: Path, sequence: Path, *arguments: str) -> Run:
     return run
 
 
+Records = dict[str, list[bytes]]
+TOPICS = {"v1/measurements": Measurements, "v1/estimate": Estimate, "v1/map": MapUpdate}
+
+
+def untimed(record: Any) -> bytes:
+    """A record's bytes without the times at which the vehicle's computer took it."""
+    if not isinstance(record, MapUpdate):
+        record = msgspec.structs.replace(record, t_capture_ns=0, t_utc_ns=0)
+    return encode(record)
+
+
+def records_of_one_process(sequence: Path, overrides: dict[str, Any]) -> Records:
+    """What `evaluate` computes."""
+    records: Records = {topic: [] for topic in TOPICS}
+    topic_of = {kind: topic for topic, kind in TOPICS.items()}
+    recording = open_recording(f"kitti:{sequence}", stride=overrides.get("source.stride", 1))
+    with _pipeline(load(None, overrides)) as measure:
+        for record in measure(recording):
+            records[topic_of[type(record)]].append(untimed(record))
+    return records
+
+
+def records_of_three(file: Path) -> Records:
+    """What went over the bus, up to the records that end the run."""
+    recording = Recording(file)
+    found = [(m.channel, decode(m.data, TOPICS[m.channel])) for m in recording.messages(tuple(TOPICS))]
+    assert recording.complete
+    end = max(record.frame_id for _, record in found)
+    return {
+        topic: [untimed(record) for name, record in found if name == topic and record.frame_id < end]
+        for topic in TOPICS
+    }
+
+
+def test_evaluation_drive_and_replay_agree_on_motions_that_no_car_makes(drive: Path, place: Path) -> None:
+    """The drive backwards after itself: an implausible motion, and a new world once the odometry is steady again."""
+    sequence = place / "sequences" / "back"
+    (sequence / "image_0").mkdir(parents=True)
+    shown = [*range(FRAMES), *range(FRAMES - 2, -1, -1)]
+    for number, path in enumerate(drive / "image_0" / f"{k:06d}.png" for k in shown):
+        (sequence / "image_0" / f"{number:06d}.png").write_bytes(path.read_bytes())
+    (sequence / "calib.txt").write_text((drive / "calib.txt").read_text())
+    (sequence / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(len(shown))))
+    run_all(place, sequence, "--rate", "max", "--record", str(place / "back.mcap"))
+    live = records_of_three(place / "back.mcap")
+    assert live == records_of_one_process(sequence, {})
+    estimates = [decode(data, Estimate) for data in live["v1/estimate"]]
+    assert any(Status.MOTION_IMPLAUSIBLE in estimate.status for estimate in estimates)
+    assert estimates[-1].epoch > estimates[FRAMES - 1].epoch
+    verdict = compare(Recording(place / "back.mcap"))
+    assert verdict.same, verdict.difference
+    assert verdict.equal == len(shown) + 1  # the end too
+
+
 def test_three_processes_give_the_bytes_of_one(drive: Path, place: Path) -> None:
     offline = evaluate(drive, place / "a")
     run = run_all(place, drive, "--rate", "max")
@@ -172,8 +234,12 @@ def test_real_frames_and_networks_too(data_dir: Path, models_dir: Path, place: P
     options = ["--stride", "6", "--model", "none", *named]
     sequence = data_dir / "kitti_odometry" / "sequences" / "06"
     offline = evaluate(sequence, place / "a", *options)
-    run = run_all(place, sequence, "--rate", "max", *options)
+    run = run_all(place, sequence, "--rate", "max", "--record", str(place / "real.mcap"), *options)
     assert (run.output / "ego.kitti.txt").read_bytes() == offline
+    paths = {f"models.{role}.path": str(models_dir / file) for role, file in networks.items()}
+    overrides = {"source.stride": 6, "models.shipped": False, **paths}
+    assert records_of_three(place / "real.mcap") == records_of_one_process(sequence, overrides)
+    assert compare(Recording(place / "real.mcap")).same
     summary = run.summary()
     assert {role: model["file"] for role, model in summary["models"].items()} == networks
     assert all(len(model["sha256"]) == 64 for model in summary["models"].values())
