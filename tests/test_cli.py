@@ -7,15 +7,16 @@ from pathlib import Path
 import pytest
 
 from birdslam.perception import ModelSpec
-from birdslam.runtime.cli.commands import configuration_of
-from birdslam.runtime.cli.main import _parser, main
+from birdslam.runtime.cli.main import main
+from birdslam.runtime.cli.options import configuration_of
+from birdslam.runtime.cli.parser import build_parser
 from birdslam.runtime.configuration import ConfigurationError
 
 NOWHERE = "kitti:/nowhere/at/all"
 
 
 def configuration(*arguments: str):  # type: ignore[no-untyped-def]
-    return configuration_of(_parser().parse_args(arguments))
+    return configuration_of(build_parser().parse_args(arguments))
 
 
 def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:

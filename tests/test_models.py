@@ -22,9 +22,10 @@ from birdslam.perception.manifest_file import read_manifest
 from birdslam.perception.onnx_file import has_weights_elsewhere
 from birdslam.runtime import model_store
 from birdslam.runtime.cli import models
-from birdslam.runtime.cli.commands import configuration_of
 from birdslam.runtime.cli.download import DownloadError, download
-from birdslam.runtime.cli.main import _parser, main
+from birdslam.runtime.cli.main import main
+from birdslam.runtime.cli.options import configuration_of
+from birdslam.runtime.cli.parser import build_parser
 from birdslam.runtime.configuration import ConfigurationError
 from tests.tiny_networks import DETECTOR, SEGMENTER
 
@@ -91,7 +92,7 @@ def test_files_are_installed_pinned_and_found_by_name(tmp_path: Path, store: Pat
         copy = store / network.stem / network.name
         assert copy.read_bytes() == network.read_bytes()
         assert read_manifest(copy.with_suffix(".toml")).sha256 == sha256(network)
-    options = _parser().parse_args(["run", "--model", "seg", "--model", "detector=det"])
+    options = build_parser().parse_args(["run", "--model", "seg", "--model", "detector=det"])
     given = configuration_of(options).models.given()
     assert given == {
         "detector": ModelSpec(str(store / "det" / "det.onnx")),
@@ -107,10 +108,10 @@ def test_a_configuration_file_may_name_models_and_their_directory(tmp_path: Path
     assert left_in(store) == set()
     path = tmp_path / "car.toml"
     path.write_text('[runtime]\nmodels_dir = "elsewhere"\n[models.segmenter]\npath = "seg"\nevery = 4\n')
-    made = configuration_of(_parser().parse_args(["run", str(path)]))
+    made = configuration_of(build_parser().parse_args(["run", str(path)]))
     assert made.models.segmenter == ModelSpec(str(elsewhere / "seg" / "seg.onnx"), every=4)
     with pytest.raises(ConfigurationError, match=r"no model 'det': at hand are .*seg"):
-        configuration_of(_parser().parse_args(["run", str(path), "--model", "det"]))
+        configuration_of(build_parser().parse_args(["run", str(path), "--model", "det"]))
 
 
 def test_a_changed_file_of_an_installed_model_is_refused_when_it_is_loaded(tmp_path: Path, store: Path) -> None:
@@ -259,7 +260,7 @@ def test_an_address_needs_a_hash_and_brings_its_manifest(
     network.with_suffix(".toml").write_text(f'sha256 = "{sha256(network)}"\n{SEGMENTER}')
     assert main(["models", "add", f"{address}/seg.onnx", "--name", "again"]) == 0
     assert left_in(store) == {"seg", "again"}
-    assert str(network.stem) in configuration_of(_parser().parse_args(["run", "--model", "again"])).models.given()[
+    assert str(network.stem) in configuration_of(build_parser().parse_args(["run", "--model", "again"])).models.given()[
         "segmenter"
     ].path.replace("again", "seg")
 

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from birdslam.perf import replay as perf_replay
-from birdslam.runtime.cli import recording_commands
+from birdslam.runtime.cli import replay as replay_command
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest
 from birdslam.runtime.nodes.recorder import about
@@ -66,7 +66,7 @@ def test_the_last_bit_counts_and_the_first_that_differs_is_named(tmp_path: Path)
     assert verdict.difference.frame_id == frames[17].frame_id
     assert [where for where, _, _ in verdict.difference.fields] == ["T_world_ego[1]"]
     assert f"frame {frames[17].frame_id} DIFFERS" in told(verdict, Recording(tape.path))
-    assert recording_commands.replay(argparse.Namespace(recording=tape.path, set=[], output=None)) == 1
+    assert replay_command.replay(argparse.Namespace(recording=tape.path, set=[], output=None)) == 1
 
 
 def test_frames_that_were_coasted_over_and_measurements_that_came_too_late(tmp_path: Path) -> None:
@@ -252,7 +252,7 @@ def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureF
     tape.end(frames[-1])
     for name, values in (("same", []), ("paper", ["slam.weights.mode=paper"])):
         options = argparse.Namespace(recording=tape.path, set=values, output=tmp_path / name)
-        assert recording_commands.replay(options) == 0
+        assert replay_command.replay(options) == 0
         assert "results in" in capsys.readouterr().out
     same, paper = ((tmp_path / name / "ego.tum.txt").read_text() for name in ("same", "paper"))
     assert same != paper
@@ -262,13 +262,9 @@ def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureF
     again = [out for out in replay.estimates(recording, replay.back_end(recording)) if isinstance(out, Estimate)]
     assert again == recorded
     with pytest.raises(ConfigurationError, match="back end alone"):
-        recording_commands.replay(
-            argparse.Namespace(recording=tape.path, set=["slam.frontend.x=1"], output=tmp_path / "no")
-        )
+        replay(argparse.Namespace(recording=tape.path, set=["slam.frontend.x=1"], output=tmp_path / "no"))
     with pytest.raises(ConfigurationError, match="no_such"):
-        recording_commands.replay(
-            argparse.Namespace(recording=tape.path, set=["slam.graph.no_such=1"], output=tmp_path / "no")
-        )
+        replay(argparse.Namespace(recording=tape.path, set=["slam.graph.no_such=1"], output=tmp_path / "no"))
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from birdslam.runtime.configuration import (
 )
 from birdslam.runtime.nodes import inference
 from birdslam.runtime.nodes.inference import Inference
-from birdslam.runtime.schedule import NetworkTurn, ScheduleConfig, Turn
+from birdslam.runtime.sections import NetworkTurn, ScheduleConfig, Turn
 from birdslam.types import Frame, Status
 
 CAMERA = Camera(640, 192, 370.0, 370.0, 320.0, 88.0, 1.6)

@@ -27,8 +27,8 @@ from birdslam.graph.weights import weighted
 from birdslam.mapping.landmark_edges import StaticMapConfig
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.evaluate_tracking import PUBLISHED, evaluate
+from birdslam.runtime.cli.parser import METHODS, build_parser
 from birdslam.runtime.cli.tracking_job import frames_of
-from birdslam.runtime.cli.tracking_options import METHODS, add_commands
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig, Walk, fit_drift
 from birdslam.slam import SlamConfig
@@ -330,9 +330,7 @@ def test_tables_have_every_cell_of_the_paper(published: Published) -> None:
 
 
 def options(*arguments: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    add_commands(parser.add_subparsers())
-    return parser.parse_args(list(arguments))
+    return build_parser().parse_args(["evaluate", *arguments])
 
 
 def test_the_command_writes_its_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,7 +21,8 @@ from birdslam.datasets.speed_file import read_speeds
 from birdslam.evaluation.results import ResultsError
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
-from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError
+from birdslam.runtime.cli.options import configuration_of
+from birdslam.runtime.configuration import FILE_SCHEMES, ConfigurationError
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
 from birdslam.types import Frame
@@ -31,8 +32,9 @@ MAX_SIGMA_HEIGHT_REL = 0.1
 AGREES_SIGMA = 2.0
 
 
-def run(options: argparse.Namespace, configuration: Configuration) -> int:
+def calibrate_camera(options: argparse.Namespace) -> int:
     """Writes the camera file, prints what it rests on; gives the exit status."""
+    configuration = configuration_of(options)
     uri = options.source if options.source.partition(":")[0] in FILE_SCHEMES else f"kitti:{options.source}"
     lens, height_m = _lens(options)
     recording = _open(uri, lens, height_m, options)

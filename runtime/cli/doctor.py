@@ -7,6 +7,7 @@ It looks with the rights of whoever calls it: as the service's user, `sudo -u bi
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import ctypes
 import os
@@ -20,6 +21,7 @@ from typing import Literal
 
 from birdslam.datasets.recording import DatasetError
 from birdslam.perception import ModelError, load_network
+from birdslam.runtime.cli.options import configuration_of
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.sources import CameraSource, SourceError, open_source
 from birdslam.runtime.process import realtime
@@ -41,6 +43,13 @@ class Finding:
     verdict: Verdict
     found: str
     advice: str = ""
+
+
+def check_machine(options: argparse.Namespace) -> int:
+    """`birdslam doctor`: a row for each check; 1 where one is an error."""
+    findings = list(examine(configuration_of(options)))
+    print(table(findings))
+    return int(any(finding.verdict == "error" for finding in findings))
 
 
 def examine(configuration: Configuration) -> Iterator[Finding]:

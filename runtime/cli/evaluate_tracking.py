@@ -21,8 +21,8 @@ from birdslam.evaluation.results import claim_directory
 from birdslam.evaluation.tracking import Row
 from birdslam.evaluation.tracking_picture import draw_runtime
 from birdslam.evaluation.tracking_report import Outcome, Setting, render_report
+from birdslam.runtime.cli.parser import METHODS
 from birdslam.runtime.cli.tracking_job import Job, run_sequence
-from birdslam.runtime.cli.tracking_options import METHODS
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 
 PUBLISHED = Path(tables.__file__).with_name("published.toml")

@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+import argparse
 import math
 import os
 import time
@@ -220,6 +221,13 @@ def _blueprint() -> Any:
             blueprint.Spatial2DView(origin="bev", name="from above"),
         )
     )
+
+
+def view(options: argparse.Namespace) -> int:
+    """`birdslam view`: a recording or the running system in rerun."""
+    if options.what == "live":
+        return live(options.vehicle, options.runtime_dir, options.save, options.seconds)
+    return recorded(Recording(Path(options.what)), options.save)
 
 
 def _stream(save: Path | None) -> Any:

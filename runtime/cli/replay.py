@@ -1,4 +1,4 @@
-"""What `birdslam replay`, `view` and `top` do (runtime/cli/recording_options.py has their command line)."""
+"""`birdslam replay`: a recording through the back end again, to be compared or with other results."""
 
 from __future__ import annotations
 
@@ -71,19 +71,3 @@ def _changed(config: replaying.BackEnd, settings: Mapping[str, Any]) -> replayin
         except msgspec.ValidationError as error:
             raise ConfigurationError(f"--set {key}: {error}") from None
     return parts["slam.graph"], parts["slam.weights"]  # type: ignore[return-value]
-
-
-def view(options: argparse.Namespace) -> int:
-    """`birdslam view`: a recording or the running system in rerun."""
-    from birdslam.runtime.cli import view as viewing  # only now: rerun is an extra
-
-    if options.what == "live":
-        return viewing.live(options.vehicle, options.runtime_dir, options.save, options.seconds)
-    return viewing.recorded(Recording(Path(options.what)), options.save)
-
-
-def top(options: argparse.Namespace) -> int:
-    """`birdslam top`: a table of the nodes, once a second."""
-    from birdslam.runtime.cli import top as watching
-
-    return watching.top(options.vehicle, options.runtime_dir, options.once)

@@ -1,0 +1,103 @@
+"""Which function each command of `birdslam` is, and what a user can mend: one line and exit status 2."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+
+from birdslam.calibration.calibration import CalibrationError
+from birdslam.datasets.recording import DatasetError
+from birdslam.evaluation.results import ResultsError
+from birdslam.perception import ModelError
+from birdslam.runtime.cli import (
+    calibrate,
+    configuration_page,
+    demo_drive,
+    doctor,
+    evaluate_odometry,
+    interface,
+    listen,
+    models,
+    replay,
+    top,
+)
+from birdslam.runtime.cli.download import DownloadError
+from birdslam.runtime.cli.options import configuration_of
+from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.environment import USER_ERROR_STATUS
+from birdslam.runtime.nodes.sources import SourceError
+from birdslam.runtime.recording.recording import RecordingError
+from birdslam.runtime.supervision import supervisor
+from birdslam.runtime.transport.bus import BusError
+from birdslam.runtime.transport.presence import VehicleBusy
+
+USER_ERRORS = (
+    CalibrationError,
+    ConfigurationError,
+    DatasetError,
+    DownloadError,
+    ModelError,
+    RecordingError,
+    ResultsError,
+    SourceError,
+    BusError,
+    VehicleBusy,
+)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """The command that was parsed; gives the exit status."""
+    try:
+        return COMMANDS[options.command](options)
+    except USER_ERRORS as error:
+        print(f"birdslam: {' '.join(str(error).split())}", file=sys.stderr)
+        return USER_ERROR_STATUS
+
+
+def run(options: argparse.Namespace) -> int:
+    """`birdslam run`: the three processes."""
+    return supervisor.run(configuration_of(options))
+
+
+def view(options: argparse.Namespace) -> int:
+    """`birdslam view`; imported only here: rerun is an extra."""
+    from birdslam.runtime.cli import view as viewing
+
+    return viewing.view(options)
+
+
+def evaluate_tracking(options: argparse.Namespace) -> int:
+    """`birdslam evaluate tracking` and `ablation`; imported only here: gtsam would lie in a drive's memory."""
+    from birdslam.runtime.cli import evaluate_tracking as tracking
+
+    return tracking.evaluate(options, configuration_of(options))
+
+
+def evaluate_localisation(options: argparse.Namespace) -> int:
+    """`birdslam evaluate localisation`; imported only here: scipy.stats would lie in a drive's memory."""
+    from birdslam.runtime.cli import evaluate_localisation as localisation
+
+    return localisation.evaluate(options, configuration_of(options))
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "run": run,
+    "replay": replay.replay,
+    "view": view,
+    "top": lambda options: top.top(options.vehicle, options.runtime_dir, options.once),
+    "listen": listen.listen,
+    "doctor": doctor.check_machine,
+    "interface": interface.print_page,
+    "configuration": configuration_page.print_page,
+    "calibrate": calibrate.calibrate_camera,
+    "models list": models.list_models,
+    "models check": models.check,
+    "models add": models.add,
+    "demo-drive make": demo_drive.make,
+    "evaluate odometry": evaluate_odometry.evaluate_odometry,
+    "evaluate car-ahead": evaluate_odometry.evaluate_car_ahead,
+    "evaluate localisation": evaluate_localisation,
+    "evaluate tracking": evaluate_tracking,
+    "evaluate ablation": evaluate_tracking,
+}

@@ -1,0 +1,149 @@
+"""`birdslam evaluate odometry` and `evaluate car-ahead`: the whole method in one process, held to poses and LiDAR."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import msgspec
+
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import Recording
+from birdslam.evaluation.odometry import OdometryReport, evaluate_recordings
+from birdslam.runtime.cli.options import configuration_of
+from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, complete
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
+from birdslam.runtime.supervision import supervisor
+from birdslam.slam import BirdSLAM
+from birdslam.types import Estimate, MapUpdate, Measurements
+
+Drive = Callable[[Recording], Iterator[Measurements | Estimate | MapUpdate]]
+
+
+def _uri(text: str) -> str:
+    return text if text.partition(":")[0] in FILE_SCHEMES else f"kitti:{text}"
+
+
+@contextlib.contextmanager
+def _pipeline(configuration: Configuration) -> Iterator[Drive]:
+    """The whole method in this process, on frames as capture makes them, awaiting every network.
+
+    Gives each frame's Measurements, its Estimate, and what the map gained.
+    """
+    configuration = msgspec.structs.replace(
+        configuration, source=msgspec.structs.replace(configuration.source, rate="max")
+    )
+    cv2.setNumThreads(configuration.perceive.opencv_threads)
+    with contextlib.ExitStack() as stack:
+
+        def drive(recording: Recording) -> Iterator[Measurements | Estimate | MapUpdate]:
+            source = RecordedSource(recording, configuration.source)
+            inference = stack.enter_context(Inference(complete(configuration, recording.camera, source.rate_hz)))
+            slam = BirdSLAM(
+                recording.camera,
+                inference.networks,
+                configuration.slam,
+                frustum_network=inference.frustum_network,
+                lane_head=inference.lane_head,
+            )
+            for frame in offline_frames(source):
+                yield from slam.step(frame)
+                gained = slam.map_update()
+                if gained is not None:
+                    yield gained
+
+        yield drive
+
+
+def evaluate_odometry(options: argparse.Namespace) -> int:
+    """`birdslam evaluate odometry`: trajectories against the truth; writes report.json and prints a table."""
+    print(_odometry_table(_evaluate(options)))
+    return 0
+
+
+def evaluate_car_ahead(options: argparse.Namespace) -> int:
+    """`birdslam evaluate car-ahead`: the distance to the car ahead against the recording's LiDAR."""
+    for report in _evaluate(options):
+        ahead = report.car_ahead
+        if ahead is None:
+            raise ConfigurationError(f"{report.sequence}: has no LiDAR (lidar_cam0 beside its images) to compare with")
+        if ahead.error_median_rel is None or ahead.error_p90_rel is None or ahead.bias_median_rel is None:
+            print(f"{report.sequence}: no car ahead in {report.frames} frames")
+        else:
+            print(
+                f"{report.sequence}: {ahead.frames} frames with a car ahead, error of its distance: "
+                f"median {ahead.error_median_rel:.1%}, 90 % within {ahead.error_p90_rel:.1%}, "
+                f"bias {ahead.bias_median_rel:+.1%}"
+            )
+    return 0
+
+
+def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
+    configuration = configuration_of(options)
+    source = configuration.source
+    if source.frames is not None or source.loop:
+        raise ConfigurationError("source.frames, source.loop: evaluate takes whole recordings, once")
+    recordings = [open_recording(_uri(text), configuration.camera, source.stride) for text in options.sequences]
+    twice = [name for name, n in Counter(recording.name for recording in recordings).items() if n > 1]
+    if twice:
+        raise ConfigurationError(f"two sequences are named {twice[0]}: their results would overwrite each other")
+    if not configuration.models.in_use():
+        print(supervisor.WITHOUT_MODELS)
+    with _pipeline(configuration) as drive:
+        reports = evaluate_recordings(
+            recordings, drive, Path(configuration.output), compared=_compared(options.frames, recordings)
+        )
+    print(f"results in {configuration.output}")
+    return reports
+
+
+def _compared(text: str, recordings: list[Recording]) -> slice:
+    """The frames FIRST:END (either may be missing) that are held to the truth; at least two of each recording."""
+    first, colon, end = text.partition(":")
+    numbers = [part for part in (first, end) if part]
+    if not colon or not all(part.isdecimal() for part in numbers):
+        raise ConfigurationError(f"--frames {text}: expected FIRST:END, such as 14: or 14:120")
+    frames = slice(int(first) if first else None, int(end) if end else None)
+    for recording in recordings:
+        if len(range(*frames.indices(len(recording)))) < 2:
+            raise ConfigurationError(
+                f"--frames {text}: fewer than two of the {len(recording)} frames of {recording.name}"
+            )
+    return frames
+
+
+def _odometry_table(reports: list[OdometryReport]) -> str:
+    columns = (
+        ("frames", "frames", 0),
+        ("path m", "path_m", 1),
+        ("ATE m", "ate_m", 3),
+        ("ATE %", "ate_pct", 2),
+        ("ATE se3 m", "ate_se3_m", 3),
+        ("ATE sim3 m", "ate_sim3_m", 3),
+        ("scale error", "scale_error", 4),
+        ("RPE m", "rpe_t_m", 4),
+        ("RPE deg", "rpe_r_deg", 4),
+        ("segments %", "segment_t_pct", 2),
+        ("standing m", "standing_drift_m", 3),
+        ("NEES", "ego.nees", 2),
+        ("inside 95 %", "ego.inside_95", 2),
+    )
+    lines = [f"{'sequence':16}" + "".join(f"{title:>12}" for title, _, _ in columns)]
+    for report in reports:
+        values = [(_field(report, name), digits) for _, name, digits in columns]
+        cells = "".join(f"{'-' if value is None else format(value, f'.{digits}f'):>12}" for value, digits in values)
+        lines.append(f"{report.sequence:16}{cells}")
+    return "\n".join(lines)
+
+
+def _field(report: Any, name: str) -> float | None:
+    """A field of a report, or of a report in it: `ego.nees`; None where that is not there."""
+    for part in name.split("."):
+        report = None if report is None else getattr(report, part)
+    return cast("float | None", report)

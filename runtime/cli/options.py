@@ -1,0 +1,39 @@
+"""The configuration that a command line asks for: its file, with its options on top."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from birdslam.runtime import model_store
+from birdslam.runtime.configuration import NO_MODEL, Configuration, ConfigurationError, load, parse_setting
+
+
+def configuration_of(options: argparse.Namespace) -> Configuration:
+    """The configuration file with the options of the command line on top. Raises ConfigurationError."""
+    overrides: dict[str, Any] = dict(parse_setting(text) for text in options.set)
+    named: list[str] = []
+    for text in options.model:
+        role, equals, path = text.partition("=")
+        if text == NO_MODEL:
+            overrides["models.shipped"] = False
+        elif not equals and model_store.is_name(text):
+            named.append(text)
+        elif role and equals and path:
+            overrides[f"models.{role}.path"] = path
+        else:
+            raise ConfigurationError(f"--model {text}: expected ROLE=PATH, or the name of a model")
+    keys = {"source": "source.uri", "rate": "source.rate", "stride": "source.stride"}
+    keys |= {"record": "recording.file", "record_images": "recording.images"}
+    for name in ("source", "rate", "stride", "camera", "vehicle", "record", "record_images", "output"):
+        value = getattr(options, name, None)
+        if value is not None:
+            overrides[keys.get(name, name)] = _number(value) if name == "rate" else value
+    return load(options.config, overrides, named)
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

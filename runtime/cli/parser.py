@@ -1,0 +1,273 @@
+"""The command line of `birdslam`, one function for each command.
+
+Light: main.py imports it before numpy, whose libraries read the environment when they are loaded. What a command does
+stands in dispatch.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from importlib.metadata import version
+from pathlib import Path
+from typing import TypeAlias
+
+USAGE_NOTE = "Sources: demo, kitti:DIR, video:FILE, mcap:FILE, v4l2:/dev/videoN, rtsp://HOST/PATH."
+RECORDING = "FILE.mcap"
+METHODS = ("birdslam", "birdslam_live", "paper", "batch_se3", "nair", "namdev", "cubeslam")
+SEEDS = 5
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All commands; each sets `command`, the name by which dispatch.py knows it."""
+    parser = argparse.ArgumentParser(
+        prog="birdslam", description="Monocular multibody SLAM in bird's-eye view.", epilog=USAGE_NOTE
+    )
+    parser.add_argument("--version", action="version", version=f"birdslam {version('birdslam')}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for add_command in (
+        _run,
+        _replay,
+        _view,
+        _top,
+        _listen,
+        _doctor,
+        _interface,
+        _configuration,
+        _calibrate,
+        _models,
+        _demo_drive,
+    ):
+        add_command(commands)
+    evaluate = commands.add_parser("evaluate", help="compare with ground truth").add_subparsers(
+        required=True, metavar="WHAT"
+    )
+    for add_evaluation in (_odometry, _tracking, _localisation):
+        add_evaluation(evaluate)
+    return parser
+
+
+# --- a drive, live and recorded ---
+
+
+def _run(commands: Commands) -> None:
+    run = commands.add_parser("run", help="capture, perceive and optimize a source, live", epilog=USAGE_NOTE)
+    run.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
+    run.add_argument("--source", metavar="URI", help="where frames come from")
+    run.add_argument("--rate", metavar="HZ|max", help='frames a second, or "max": every frame, as fast as can be')
+    run.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
+    run.add_argument("--record", metavar=RECORDING, help="write the drive down; a directory: a new file in it")
+    run.add_argument("--record-images", action="store_true", default=None, help="with its frames, as JPEG")
+    _add_final_results(run)
+    _add_pipeline(run)
+    run.set_defaults(command="run")
+
+
+def _replay(commands: Commands) -> None:
+    replay = commands.add_parser(
+        "replay", help="the back end alone on a recording: does it give the same, bit for bit?"
+    )
+    replay.add_argument("recording", type=Path, metavar=RECORDING)
+    text = "with another back end (slam.graph.*, slam.weights.*): nothing is compared, results are written"
+    _add_settings(replay, text)
+    replay.add_argument("--output", type=Path, metavar="DIR", help="where results go; with it they are always written")
+    _add_final_results(replay)
+    replay.set_defaults(command="replay")
+
+
+def _add_final_results(parser: argparse.ArgumentParser) -> None:
+    text = "also write the final trajectories, by the RTS smoother: tracks/ID.final.tum.txt, ego.final.*"
+    parser.add_argument("--smooth", action="store_true", default=None, help=text)
+    text = "draw the frames with the estimated boxes beside the bird's-eye view, when the drive is over"
+    parser.add_argument("--video", metavar="FILE.mp4", help=text)
+
+
+def _view(commands: Commands) -> None:
+    view = commands.add_parser(
+        "view", help="show a recording, or what goes on now, in rerun (pip install birdslam[view])"
+    )
+    view.add_argument("what", metavar=f"{RECORDING}|live")
+    view.add_argument("--save", type=Path, metavar="FILE.rrd", help="write it down for rerun instead of showing it")
+    _add_vehicle(view)
+    view.add_argument("--seconds", type=float, metavar="S", help="of live: end after so long")
+    view.set_defaults(command="view")
+
+
+def _top(commands: Commands) -> None:
+    top = commands.add_parser("top", help="a live table of the nodes: rates, ages, budgets, restarts")
+    _add_vehicle(top)
+    top.add_argument("--once", action="store_true", help="one table, and end; 1 where no node is there")
+    top.set_defaults(command="top")
+
+
+def _listen(commands: Commands) -> None:
+    listen = commands.add_parser("listen", help="print live estimates, as a planner gets them, until the source ends")
+    _add_vehicle(listen)
+    listen.add_argument("--json", action="store_true", help="one JSON object a line")
+    listen.add_argument("--count", metavar="N", type=int, help="end after N estimates")
+    listen.add_argument("--timeout", metavar="S", type=float, help="end, with status 1, when none comes for so long")
+    listen.set_defaults(command="listen")
+
+
+# --- the machine, the camera, the networks ---
+
+
+def _doctor(commands: Commands) -> None:
+    doctor = commands.add_parser("doctor", help="check this machine: cores, permissions, memory, camera, models, clock")
+    doctor.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help="of the run to come")
+    doctor.add_argument("--source", metavar="URI", help="where frames will come from")
+    doctor.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
+    _add_pipeline(doctor)
+    doctor.set_defaults(command="doctor")
+
+
+def _interface(commands: Commands) -> None:
+    interface = commands.add_parser("interface", help="print what a vehicle says and how to listen: docs/interface.md")
+    interface.set_defaults(command="interface")
+
+
+def _configuration(commands: Commands) -> None:
+    keys = commands.add_parser("configuration", help="print every key with its default: docs/configuration.md")
+    keys.set_defaults(command="configuration")
+
+
+def _calibrate(commands: Commands) -> None:
+    text = "a camera file from a drive: intrinsics read or measured, pitch and roll estimated, the height checked"
+    parser = commands.add_parser("calibrate", help=text, description=text)
+    parser.add_argument("source", metavar="SOURCE", help="a KITTI directory, or kitti:DIR, video:FILE")
+    parser.add_argument("--output", required=True, metavar="CAMERA.toml", help="the camera file to write")
+    lens = parser.add_mutually_exclusive_group()
+    lens.add_argument("--camera", metavar="FILE", help="an older camera file: its intrinsics and height")
+    lens.add_argument("--intrinsics", type=Path, metavar="FILE", help="KITTI's calib.txt, or ROS or OpenCV YAML")
+    lens.add_argument("--chessboard", type=Path, metavar="DIR", help="images of a chessboard")
+    parser.add_argument("--board", default="9x6", metavar="COLSxROWS", help="its inner corners (default 9x6)")
+    parser.add_argument("--square-mm", type=float, default=25.0, metavar="MM", help="a square's side (default 25)")
+    parser.add_argument("--height", type=float, metavar="M", help="the camera's height over the road, as measured")
+    parser.add_argument("--speed", type=Path, metavar="FILE", help="lines of time in s, speed in m/s")
+    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="networks: vehicles and road")
+    parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame")
+    _add_config(parser)
+    _add_settings(parser)
+    parser.set_defaults(command="calibrate")
+
+
+def _models(commands: Commands) -> None:
+    text = "the networks at hand: list them, check one against its manifest, install"
+    models = commands.add_parser("models", help=text, description=text).add_subparsers(required=True, metavar="WHAT")
+    listing = models.add_parser("list", help="shipped, installed, and in the catalogue")
+    listing.set_defaults(command="models list")
+
+    text = "compare a manifest with its network's real inputs and outputs, with one test run"
+    check = models.add_parser("check", help=text, description=text)
+    check.add_argument("file", metavar="FILE", help="a network (.onnx), its manifest (.toml), or the name of a model")
+    check.add_argument("--manifest", default="", metavar="FILE|NAME", help="of the network, where it isn't beside it")
+    check.set_defaults(command="models check")
+
+    text = "install networks, each with its manifest; `birdslam run --model NAME` finds them"
+    add = models.add_parser("add", help=text, description=text)
+    add.add_argument("sources", nargs="+", metavar="NAME|PATH|URL", help="of the catalogue, or an .onnx file")
+    add.add_argument("--manifest", default="", metavar="FILE|NAME", help="where it isn't beside the network (.toml)")
+    add.add_argument("--sha256", default="", metavar="HEX", help="of the network; needed for a URL unless pinned")
+    add.add_argument("--name", default="", metavar="NAME", help="to install it as; default: the file's")
+    add.add_argument("--limit-mb", type=float, default=500.0, metavar="MB", help="larger files are refused")
+    add.set_defaults(command="models add")
+    for parser in (listing, check, add):
+        parser.add_argument("--directory", type=Path, metavar="DIR", help="where models are installed (models_dir)")
+
+
+def _demo_drive(commands: Commands) -> None:
+    text = "the drive that ships with birdslam (--source demo)"
+    drive = commands.add_parser("demo-drive", help=text, description=text).add_subparsers(required=True, metavar="WHAT")
+    text = "render it anew in the built-in world, with its truth; needs the extra `train`"
+    make = drive.add_parser("make", help=text, description=text)
+    make.add_argument("--output", type=Path, required=True, metavar="DIR", help="for drive.npz and camera.toml")
+    make.add_argument("--frames", type=int, metavar="N", help="end after N frames")
+    make.add_argument("--quality", type=int, default=32, metavar="1-100", help="of its WebP images (32)")
+    make.set_defaults(command="demo-drive make")
+
+
+# --- evaluation ---
+
+
+def _odometry(evaluate: Commands) -> None:
+    odometry = evaluate.add_parser("odometry", help="ego trajectories against KITTI poses, in one process, repeatable")
+    ahead = evaluate.add_parser("car-ahead", help="distance to the car ahead against LiDAR; odometry's report too")
+    for command, parser in (("evaluate odometry", odometry), ("evaluate car-ahead", ahead)):
+        parser.add_argument("sequences", nargs="+", metavar="SEQUENCE_DIR", help="a KITTI directory, or a source's URI")
+        _add_config(parser)
+        parser.add_argument("--frames", default=":", metavar="FIRST:END", help="compare these alone; all are driven")
+        _add_pipeline(parser)
+        parser.set_defaults(command=command)
+
+
+def _tracking(evaluate: Commands) -> None:
+    for command, text in (
+        ("tracking", "vehicles and ego on KITTI tracking: the paper's Tables 1-5"),
+        ("ablation", "the paper's Tables 3-5 alone: constraints, landmark weights and thresholds, lanes"),
+    ):
+        parser = evaluate.add_parser(command, help=text, description=text)
+        _add_tracking_root(parser)
+        parser.add_argument("--frames", default="all", metavar="all|paper|A:B", help="paper: its first so many frames")
+        if command == "tracking":
+            parser.add_argument("--methods", default=",".join(METHODS), metavar="NAME,NAME", help=", ".join(METHODS))
+        parser.add_argument(
+            "--odometry", default="", metavar="images|simulate|truth|FILE", help="FILE: KITTI rows of camera 0"
+        )
+        parser.add_argument("--detections", default="", metavar="rrc|network|DIR", help="DIR: as det_02_rrc")
+        parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help="of the simulated odometry")
+        parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
+        _add_config(parser)
+        parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="for network, images")
+        _add_settings(parser)
+        parser.add_argument("--output", required=True, metavar="DIR", help="where the report goes")
+        parser.set_defaults(command=f"evaluate {command}")
+
+
+def _localisation(evaluate: Commands) -> None:
+    text = "where the front end puts the labelled cars of KITTI tracking, by range, from a detector's boxes"
+    parser = evaluate.add_parser("localisation", help=text, description=text)
+    _add_tracking_root(parser)
+    parser.add_argument("--detections", default="rrc", metavar="rrc|DIR", help="DIR: as det_02_rrc")
+    parser.add_argument("--mode", choices=("default", "paper"), default="default", help="paper: Eq. 1 on level ground")
+    _add_config(parser)
+    _add_settings(parser)
+    parser.add_argument("--output", required=True, metavar="DIR", help="where the report goes")
+    parser.set_defaults(command="evaluate localisation", model=[])
+
+
+def _add_tracking_root(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("root", type=Path, metavar="ROOT", help="KITTI tracking: calib, label_02, oxts, ...")
+    parser.add_argument("--sequences", metavar="N,N", help="e.g. 0002,0003; default: all at hand")
+
+
+# --- options of several commands ---
+
+
+def _add_pipeline(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--model",
+        action="append",
+        default=[],
+        metavar="[ROLE=]PATH|NAME",
+        help="an ONNX network for a role (detector, segmenter, depth, multitask), or a model's name; may be repeated; "
+        "without both a detector and a segmenter the shipped network fills in, unless `none` is named",
+    )
+    parser.add_argument("--camera", metavar="FILE", help="a camera file (TOML) instead of the recording's calibration")
+    parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame of a recording")
+    parser.add_argument("--output", metavar="DIR", help="where results go")
+    _add_settings(parser, "any key, e.g. perceive.deadline_ms=25")
+
+
+def _add_vehicle(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--vehicle", metavar="NAME", default="car")
+    parser.add_argument("--runtime-dir", metavar="DIR", type=Path, help="as runtime.runtime_dir of the run")
+
+
+def _add_config(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--config", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
+
+
+def _add_settings(parser: argparse.ArgumentParser, text: str = "any key") -> None:
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=text)
