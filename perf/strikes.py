@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import psutil
 
 from birdslam.perf.faulty_vehicle import ROOT, Vehicle
-from birdslam.runtime.topology import NODES, QUESTIONS, key_of
+from birdslam.runtime.topology import NODES, QUERIES, key_of
 from birdslam.runtime.transport.presence import ring_path
 
 Strike = Callable[[Vehicle], contextlib.AbstractContextManager[None]]
@@ -165,9 +165,9 @@ with Bus("faults", "asker", runtime_dir=Path(sys.argv[1])) as bus:
 
 
 @contextlib.contextmanager
-def questions(vehicle: Vehicle) -> Iterator[None]:
+def queries(vehicle: Vehicle) -> Iterator[None]:
     """A program that asks for everything, without a pause."""
-    keys = ",".join(key_of(vehicle.vehicle, name) for name in (*QUESTIONS, "estimate", "measurements"))
+    keys = ",".join(key_of(vehicle.vehicle, name) for name in (*QUERIES, "estimate", "measurements"))
     with _beside(_ASKER, str(vehicle.runtime_dir), keys):
         yield
 
@@ -244,7 +244,7 @@ def _faults() -> Iterator[Fault]:
         yield Fault(f"malformed {topic} messages", reader, intruder(topic, 300, 1500), lasts_s=1.5)
     for topic, reader in READERS.items():
         yield Fault(f"{topic} flooded (60 kB each)", reader, intruder(topic, 60_000, 100_000), lasts_s=2.0)
-    yield Fault("flood of questions, 2 s", "supervisor", questions, lasts_s=2.0)
+    yield Fault("flood of queries, 2 s", "supervisor", queries, lasts_s=2.0)
     yield Fault("a planner that stands still", "planner", slow_planner, lasts_s=3.0)
     yield Fault("kill -9 of everything, second start", "all", kill_everything)
     # The last ones: the recording, then the run's results stay incomplete

@@ -1,4 +1,4 @@
-"""The planner's door: live estimates, with alive, on time and valid kept apart.
+"""The planner's client: live estimates, with alive, on time and valid kept apart.
 
     from birdslam.runtime.client import Planner
 
@@ -13,7 +13,7 @@
 
 A planner can start before the system does, and lives through its restarts (`Estimate.epoch` then says that the world
 frame began anew). It can never slow the vehicle down: a planner that is busy gets only the newest estimate. One that
-comes late has the last estimate at once, and asks for the rest: `map`, `trajectory`, `configuration`, `health`.
+comes late has the last estimate at once, and queries the rest: `map`, `trajectory`, `configuration`, `health`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from birdslam.queries import MapSnapshot, Trajectory
-from birdslam.runtime.transport.answer_parts import whole_map, whole_trajectory
 from birdslam.runtime.transport.bus import Bus, BusClosed, Message
+from birdslam.runtime.transport.reply_parts import whole_map, whole_trajectory
 from birdslam.runtime.wire import Health, Trace
 from birdslam.types import INVALIDATING, Estimate
 
@@ -124,17 +124,17 @@ class Planner:
 
         Raises BusError with the reason where it is refused, or where a part of it was lost.
         """
-        parts = self._bus.ask("map", timeout_s)
+        parts = self._bus.query("map", timeout_s)
         return whole_map(parts) if parts else None
 
     def trajectory(self, last_s: float | None = None, timeout_s: float = 2.0) -> Trajectory | None:
         """Where everybody has been in the newest epoch, or in its last `last_s` of the source's time; else as `map`."""
-        parts = self._bus.ask("trajectory", timeout_s, **({} if last_s is None else {"last_s": last_s}))
+        parts = self._bus.query("trajectory", timeout_s, **({} if last_s is None else {"last_s": last_s}))
         return whole_trajectory(parts) if parts else None
 
     def configuration(self, timeout_s: float = 2.0) -> dict[str, Any] | None:
         """The configuration of the run as plain data, as in summary.json; else as `map`."""
-        parts = self._bus.ask("configuration", timeout_s)
+        parts = self._bus.query("configuration", timeout_s)
         return parts[0] if parts else None
 
     def health(self, node: str, timeout_s: float = 2.0) -> Health | None:

@@ -79,8 +79,8 @@ TOPICS = {
 
 
 @dataclass(frozen=True)
-class Question:
-    """What the supervisor is asked for by a query of the key; the answer comes in one or more parts (wire.Part).
+class Query:
+    """A query that the supervisor answers; the reply comes in one or more parts (wire.Part).
 
     `record` is the type of each part; dict: a plain map. `parameters`: name -> meaning.
     """
@@ -91,17 +91,17 @@ class Question:
     parameters: dict[str, str]
 
 
-QUESTIONS = {
-    question.name: question
-    for question in (
-        Question("map", MapSnapshot, "the whole map of the newest epoch", {}),
-        Question(
+QUERIES = {
+    query.name: query
+    for query in (
+        Query("map", MapSnapshot, "the whole map of the newest epoch", {}),
+        Query(
             "trajectory",
             Trajectory,
             "where everybody has been, in the newest epoch",
             {"last_s": "only the last so many seconds of the source's time; left out: all"},
         ),
-        Question("configuration", dict, "the configuration of the run, as in summary.json, without passwords", {}),
+        Query("configuration", dict, "the configuration of the run, as in summary.json, without passwords", {}),
     )
 }
 
@@ -116,8 +116,8 @@ def check_name(what: str, name: str) -> str:
 
 
 def key_of(vehicle: str, topic: str) -> str:
-    """The zenoh key of a topic or a question. Raises ValueError for a bad vehicle name, KeyError for neither."""
-    name = QUESTIONS[topic].name if topic in QUESTIONS else TOPICS[topic].name
+    """The zenoh key of a topic or a query. Raises ValueError for a bad vehicle name, KeyError for neither."""
+    name = QUERIES[topic].name if topic in QUERIES else TOPICS[topic].name
     return f"birdslam/{check_name('vehicle', vehicle)}/{VERSION}/{name}"
 
 

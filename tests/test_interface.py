@@ -16,7 +16,7 @@ import pytest
 from birdslam.perf.faulty_vehicle import Vehicle
 from birdslam.runtime.cli.interface import page
 from birdslam.runtime.cli.main import main
-from birdslam.runtime.topology import QUESTIONS, TOPICS
+from birdslam.runtime.topology import QUERIES, TOPICS
 from birdslam.runtime.transport.presence import socket_path
 from birdslam.types import INVALIDATING, Status
 
@@ -35,7 +35,7 @@ def test_the_page_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
 def test_the_page_has_everything() -> None:
     text = page()
     rows = re.findall(r"^\| `([^`]+)` \|(.*)$", text, re.MULTILINE)
-    for name in (*TOPICS, *QUESTIONS, *(status.value for status in Status)):
+    for name in (*TOPICS, *QUERIES, *(status.value for status in Status)):
         assert name in dict(rows), name
     invalid = {name for name, rest in rows if rest.endswith("**yes** |")}
     assert invalid == {status.value for status in INVALIDATING}

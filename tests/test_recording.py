@@ -35,7 +35,7 @@ from birdslam.runtime.recording.recording import (
     RecordingWriter,
 )
 from birdslam.runtime.replay.replay import compare
-from birdslam.runtime.supervision.recorder_station import choose_file
+from birdslam.runtime.supervision.recording_files import choose_file
 from birdslam.runtime.wire import Health, decode, encode
 from birdslam.types import Estimate, Measurements
 from tests.taped_drive import CAMERA, Tape, measured

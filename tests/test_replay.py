@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from birdslam.perf import replay as perf_replay
 from birdslam.runtime.cli import replay as replay_command
+from birdslam.runtime.cli.parser import build_parser
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest
 from birdslam.runtime.nodes.recorder import about
@@ -24,6 +26,13 @@ from birdslam.runtime.replay.report import told
 from birdslam.runtime.replay.verdict import Verdict
 from birdslam.types import Estimate, Status
 from tests.taped_drive import CAMERA, Tape, measured
+
+
+def options(recording: Path, values: Sequence[str] = (), output: Path | None = None) -> argparse.Namespace:
+    settings = [word for value in values for word in ("--set", value)]
+    return build_parser().parse_args(
+        ["replay", str(recording), *settings, *(("--output", str(output)) if output else ())]
+    )
 
 
 def verdict_of(tape: Tape) -> Verdict:
@@ -66,7 +75,7 @@ def test_the_last_bit_counts_and_the_first_that_differs_is_named(tmp_path: Path)
     assert verdict.difference.frame_id == frames[17].frame_id
     assert [where for where, _, _ in verdict.difference.fields] == ["T_world_ego[1]"]
     assert f"frame {frames[17].frame_id} DIFFERS" in told(verdict, Recording(tape.path))
-    assert replay_command.replay(argparse.Namespace(recording=tape.path, set=[], output=None)) == 1
+    assert replay_command.replay(options(tape.path)) == 1
 
 
 def test_frames_that_were_coasted_over_and_measurements_that_came_too_late(tmp_path: Path) -> None:
@@ -250,9 +259,8 @@ def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureF
     for measurements in frames:
         tape.step(measurements)
     tape.end(frames[-1])
-    for name, values in (("same", []), ("paper", ["slam.weights.mode=paper"])):
-        options = argparse.Namespace(recording=tape.path, set=values, output=tmp_path / name)
-        assert replay_command.replay(options) == 0
+    for name, values in (("same", ()), ("paper", ("slam.weights.mode=paper",))):
+        assert replay_command.replay(options(tape.path, values, tmp_path / name)) == 0
         assert "results in" in capsys.readouterr().out
     same, paper = ((tmp_path / name / "ego.tum.txt").read_text() for name in ("same", "paper"))
     assert same != paper
@@ -262,9 +270,9 @@ def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureF
     again = [out for out in replay.estimates(recording, replay.back_end(recording)) if isinstance(out, Estimate)]
     assert again == recorded
     with pytest.raises(ConfigurationError, match="back end alone"):
-        replay(argparse.Namespace(recording=tape.path, set=["slam.frontend.x=1"], output=tmp_path / "no"))
+        replay_command.replay(options(tape.path, ["slam.frontend.x=1"], tmp_path / "no"))
     with pytest.raises(ConfigurationError, match="no_such"):
-        replay(argparse.Namespace(recording=tape.path, set=["slam.graph.no_such=1"], output=tmp_path / "no"))
+        replay_command.replay(options(tape.path, ["slam.graph.no_such=1"], tmp_path / "no"))
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from birdslam.runtime.configuration import Configuration, RuntimeConfig, SourceC
 from birdslam.runtime.process.notify import Notifier
 from birdslam.runtime.process.restarts import EpochFile, Restarts, Resume
 from birdslam.runtime.process.vitals import Vitals
-from birdslam.runtime.supervision.stations import DEAF_RECORDS, Hearing
+from birdslam.runtime.supervision.stations import MISSED_RECORDS, Intake
 
 CONFIG = RuntimeConfig(restarts_max=3, restart_window_s=10.0, restart_backoff_ms=100.0, restart_backoff_max_ms=150.0)
 
@@ -77,31 +77,31 @@ def test_epochs_grow_through_every_death(tmp_path: Path) -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 1)), max_size=60))
-def test_a_node_that_takes_up_anything_is_not_deaf(steps: list[tuple[int, int]]) -> None:
-    hearing, sent, taken, since = Hearing(), 0, 0, 0
-    hearing.missed(0, 0, 0.0, 0.0, 1.0)
+def test_a_node_that_takes_anything_in_is_left_alone(steps: list[tuple[int, int]]) -> None:
+    intake, sent, taken, since = Intake(), 0, 0, 0
+    intake.missed(0, 0, 0.0, 0.0, 1.0)
     for second, (more, heard) in enumerate(steps, start=1):
         sent += more
         taken += heard
         since = sent if heard else since
-        missed = hearing.missed(sent, taken, 0.1, float(second), 1.5)
+        missed = intake.missed(sent, taken, 0.1, float(second), 1.5)
         assert missed in (0, sent - since)
-        assert bool(missed) <= (sent - since >= DEAF_RECORDS)
+        assert bool(missed) <= (sent - since >= MISSED_RECORDS)
 
 
-def test_silence_is_not_deafness() -> None:
-    hearing = Hearing()
-    assert not any(hearing.missed(5, 5, 0.1, float(second), 1.0) for second in range(100))
-    assert hearing.missed(5 + DEAF_RECORDS, 5, 0.1, 100.0, 1.0) == DEAF_RECORDS
-    assert hearing.missed(2, 5, 0.1, 101.0, 1.0) == 0  # the sender began anew
+def test_silence_is_no_missed_record() -> None:
+    intake = Intake()
+    assert not any(intake.missed(5, 5, 0.1, float(second), 1.0) for second in range(100))
+    assert intake.missed(5 + MISSED_RECORDS, 5, 0.1, 100.0, 1.0) == MISSED_RECORDS
+    assert intake.missed(2, 5, 0.1, 101.0, 1.0) == 0  # the sender began anew
 
 
-def test_a_loop_that_stands_still_is_not_called_deaf() -> None:
-    hearing = Hearing()
-    hearing.missed(0, 7, 0.0, 0.0, 1.5)  # it took its last record, and went on beating for a moment
-    told = [hearing.missed(10 * k, 7, 0.1 * k - 0.2, 0.1 * k, 1.5) for k in range(3, 17)]
+def test_a_loop_that_stands_still_misses_nothing_yet() -> None:
+    intake = Intake()
+    intake.missed(0, 7, 0.0, 0.0, 1.5)  # it took its last record, and went on beating for a moment
+    told = [intake.missed(10 * k, 7, 0.1 * k - 0.2, 0.1 * k, 1.5) for k in range(3, 17)]
     assert not any(told)  # at 1.5 s without a beat it is stalled
-    assert hearing.missed(170, 7, 0.05, 1.7, 1.5) == 170  # it only was slow, and has beaten since
+    assert intake.missed(170, 7, 0.05, 1.7, 1.5) == 170  # it only was slow, and has beaten since
 
 
 @pytest.fixture

@@ -26,8 +26,8 @@ import zenoh
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import load
 from birdslam.runtime.gate import GateError, gate_config
-from birdslam.runtime.supervision.query_server import Door
-from birdslam.runtime.topology import PROCESSES, QUESTIONS, TOPICS, alive_key, key_of
+from birdslam.runtime.supervision.query_server import QueryServer
+from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, key_of
 from birdslam.runtime.transport.bus import Bus, Publisher, Subscriber
 from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
 from birdslam.runtime.wire import MAX_TRACE_BYTES, Health, Trace, WireError, decode, encode
@@ -38,7 +38,7 @@ from tests.test_bus import estimate, measurements, until
 ROOT = Path(__file__).resolve().parent.parent
 DEPLOY = ROOT / "deploy"
 LIMIT_S = 20.0
-ASKABLE = {*QUESTIONS, "estimate", *(f"health/{node}" for node in PROCESSES)}
+ASKABLE = {*QUERIES, "estimate", *(f"health/{node}" for node in PROCESSES)}
 READABLE = {"estimate", "map", *(f"health/{node}" for node in PROCESSES)}
 
 needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
@@ -148,8 +148,8 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Ite
     path = gate_file(base, certificates, port)
     with ExitStack() as stack:
         hub = stack.enter_context(Bus("car", "supervisor", hub=True, runtime_dir=base))
-        door = Door(load(base / "car.toml"), hub)
-        door.add(estimate(1))
+        server = QueryServer(load(base / "car.toml"), hub)
+        server.add(estimate(1))
         nodes = {name: stack.enter_context(Bus("car", name, runtime_dir=base)) for name in PROCESSES}
         for node in nodes.values():
             node.declare_alive()

@@ -24,11 +24,13 @@ LIMIT_S = 10.0
 
 @pytest.fixture
 def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A bus with three nodes on it that have said how they are, and a supervisor that answers questions."""
+    """A bus with three nodes on it that have said how they are, and a supervisor that answers queries."""
     place = tmp_path_factory.mktemp("t")
     with ExitStack() as stack:
         hub = stack.enter_context(Bus("car", "supervisor", hub=True, runtime_dir=place))
-        hub.desk({"configuration": lambda parameters: (Configuration(budgets=BudgetsConfig(perceive_ms=77.0)),)})
+        hub.answer_queries(
+            {"configuration": lambda parameters: (Configuration(budgets=BudgetsConfig(perceive_ms=77.0)),)}
+        )
         for number, name in enumerate(NODES):
             bus = stack.enter_context(Bus("car", name, runtime_dir=place))
             health = Health(

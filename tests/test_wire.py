@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
 from birdslam.queries import MapSnapshot, TimedPose, Trajectory, VehiclePath
-from birdslam.runtime.topology import NODES, PROCESSES, QUESTIONS, TOPICS, alive_key, check_name, key_of
+from birdslam.runtime.topology import NODES, PROCESSES, QUERIES, TOPICS, alive_key, check_name, key_of
 from birdslam.runtime.wire import (
     MAX_MESSAGE_BYTES,
     MAX_TRACE_BYTES,
@@ -195,7 +195,7 @@ def golden(name: str) -> bytes:
 
 
 def test_every_record_of_a_topic_has_a_golden_message() -> None:
-    asked = {question.record.__name__ for question in QUESTIONS.values() if question.record is not dict}
+    asked = {query.record.__name__ for query in QUERIES.values() if query.record is not dict}
     assert {topic.record.__name__ for topic in TOPICS.values()} | asked | {"Trace"} == set(BY_NAME)
     assert {path.name.partition(".")[0] for path in GOLDEN.iterdir()} == set(BY_NAME)
 

@@ -17,7 +17,7 @@ import birdslam.types
 from birdslam.geometry.se2 import SE2
 from birdslam.runtime.cli.pages import comments, table, unit
 from birdslam.runtime.configuration import BudgetsConfig
-from birdslam.runtime.topology import NODES, QUESTIONS, TOPICS, VERSION, Topic, alive_key, key_of
+from birdslam.runtime.topology import NODES, QUERIES, TOPICS, VERSION, Topic, alive_key, key_of
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES, Part, Trace
 from birdslam.types import INVALIDATING, Estimate, Status
 
@@ -37,7 +37,7 @@ changed meaning is another version in the key.
 On the vehicle's computer, as its own user: connect to `unixsock-stream/DIR/{vehicle}/hub.sock` with multicast
 scouting off, where DIR is `runtime.runtime_dir` (of the service: `/run/birdslam`). From elsewhere, or as another
 user: through the gate, by mutual TLS ([deploy/README.md](../deploy/README.md)). Planners may read `estimate`, `map`,
-`health/*` and `alive/*`, and ask all of the questions; `frame` and `measurements` are for the nodes alone.
+`health/*` and `alive/*`, and send every query; `frame` and `measurements` are for the nodes alone.
 
 ## Keys
 
@@ -48,11 +48,11 @@ All are sent with congestion control DROP, express; *urgent* ones with priority 
 (`RingChannel(1)`). Of the others a few may wait: the length of our own readers' queues stands in brackets. Who reads
 too slowly loses messages; nobody slows the vehicle down.
 
-## Questions
+## Queries
 
-{questions}
+{queries}
 
-Ask for the exact key (`{example}`): wildcards get no answer. Ask with consolidation NONE: a long answer comes in
+Ask for the exact key (`{example}`): wildcards get no reply. Query with consolidation NONE: a long reply comes in
 several messages of the same record, whose lists belong together, each with a {part} attached. The payload of an error
 is its reason as text. A reader of `estimate` or `health/*` that comes late asks that same key for the last message.
 
@@ -102,7 +102,7 @@ def page() -> str:
         vehicle=_VEHICLE,
         version=VERSION,
         keys=table(_keys()),
-        questions=table(_questions()),
+        queries=table(_queries()),
         example=f"{key_of(_VEHICLE, 'trajectory')}?last_s=30",
         part=_link(Part),
         budget_ms=budgets.end_to_end_ms,
@@ -118,7 +118,7 @@ def _keys() -> Iterator[tuple[str, ...]]:
     yield "key", "record", "sent by", "when", "kind", "answers a query with"
     for topic in TOPICS.values():
         kept = {0: "", 1: "the last one"}.get(topic.kept, f"the last {topic.kept}")
-        kept = "see Questions" if topic.name in QUESTIONS else kept
+        kept = "see Queries" if topic.name in QUERIES else kept
         yield f"`{topic.name}`", _link(topic.record), topic.producer, topic.pace, _kind(topic), kept
     for node in NODES:
         alive = alive_key(_VEHICLE, node).partition(f"{VERSION}/")[2]
@@ -129,12 +129,12 @@ def _kind(topic: Topic) -> str:
     return f"{'hot ' if topic.hot else ''}{'urgent ' if topic.urgent else ''}({topic.depth})"
 
 
-def _questions() -> Iterator[tuple[str, ...]]:
-    yield "query (zenoh get)", "answer", "what", "parameters"
-    for question in QUESTIONS.values():
-        record = "a plain map" if question.record is dict else _link(question.record)
-        asked = "; ".join(f"`{name}`: {meaning}" for name, meaning in question.parameters.items())
-        yield f"`{question.name}`", record, question.meaning, asked
+def _queries() -> Iterator[tuple[str, ...]]:
+    yield "query (zenoh get)", "reply", "what", "parameters"
+    for query in QUERIES.values():
+        record = "a plain map" if query.record is dict else _link(query.record)
+        asked = "; ".join(f"`{name}`: {meaning}" for name, meaning in query.parameters.items())
+        yield f"`{query.name}`", record, query.meaning, asked
 
 
 def _statuses() -> Iterator[tuple[str, ...]]:
@@ -145,7 +145,7 @@ def _statuses() -> Iterator[tuple[str, ...]]:
 
 
 def _records() -> Iterator[str]:
-    asked = [question.record for question in QUESTIONS.values() if question.record is not dict]
+    asked = [query.record for query in QUERIES.values() if query.record is not dict]
     for record in _with_parts((*(topic.record for topic in TOPICS.values()), *asked, Trace, Part)):
         yield f"### {record.__name__}"
         shape = " An array on the wire, in this order." if record.__struct_config__.array_like else ""

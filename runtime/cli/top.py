@@ -125,7 +125,7 @@ def _line_of(cells: tuple[str, ...]) -> str:
 def _budgets(bus: Bus) -> BudgetsConfig | None:
     """Of the run, where the supervisor answers."""
     try:
-        for configuration in bus.ask("configuration", PERIOD_S):
+        for configuration in bus.query("configuration", PERIOD_S):
             budgets: Any = configuration["budgets"] if isinstance(configuration, dict) else configuration.budgets
             return msgspec.convert(budgets, BudgetsConfig)
     except (BusError, KeyError, msgspec.ValidationError):

@@ -301,7 +301,7 @@ def live(vehicle: str, runtime_dir: Path | None, save: Path | None, seconds: flo
 def _ask_camera(bus: Bus, viewer: Viewer) -> None:
     """The camera of the run, where it answers."""
     try:
-        for configuration in bus.ask("configuration"):
+        for configuration in bus.query("configuration"):
             viewer.camera(msgspec.convert(configuration["camera"], Camera))
     except (BusError, KeyError, msgspec.ValidationError):
         return

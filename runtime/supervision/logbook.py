@@ -1,4 +1,4 @@
-"""The supervisor's ear: records every estimate and map update, and keeps the figures of the run."""
+"""The supervisor's subscriber: every estimate and map update goes to the results, and the figures of the run stay."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Results(Protocol):
 
 
 class Logbook:
-    """Listens in a thread of its own from construction on; stands at a planner's place, so its ages are a planner's.
+    """Subscribes in a thread of its own from construction on; it is a planner like others, so its ages are a planner's.
 
     `event_fd` becomes readable when END_OF_SOURCE came back (`ended`), or recording failed (`error`). A `tolerant` one
     goes on without recording where the disk fails it (`unwritten` says why): the vehicle drives on. `listeners` too

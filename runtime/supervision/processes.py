@@ -1,4 +1,4 @@
-"""A node's process as the supervisor holds it: started, watched by a pidfd, and asked for its last words."""
+"""A node's process as the supervisor holds it: started, watched by a pidfd, its exit status and log in words."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class NodeProcess:
         return bool(self.vitals["ready"])
 
     def silent_s(self) -> float:
-        """How long its loop has shown no life; 0 before it is ready."""
+        """How long its loop has not beaten; 0 before it is ready."""
         return (time.monotonic_ns() - self.vitals["beat_ns"]) / 1e9 if self.ready else 0.0
 
     def send(self, number: signal.Signals) -> None:
@@ -117,14 +117,14 @@ class NodeProcess:
             return f"was killed by {signal.Signals(-status).name}"
         return f"failed with exit status {status}" if status else "ended before its source did"
 
-    def failure(self) -> str:
-        """Why it ended, for a person: exit status or signal, and its last words."""
+    def failure(self, cause: str = "", then: str = "") -> str:
+        """Why it ended, for a person, and what comes of it; with the last line of its log. `cause` goes before `how`"""
         lines = self._log.lines(self._log_start)
-        if self.exit_status == USER_ERROR_STATUS:
+        if self.exit_status == USER_ERROR_STATUS and not then:
             errors = [line for line in lines if " ERROR " in line]
             return _message(errors[-1]) if errors else f"{self.name} can't use its configuration"
         last = f"; its last line: {_message(lines[-1].strip())}" if lines else ""
-        return f"{self.name} {self.how()}{last} (log: {self._log.path})"
+        return f"{self.name} {cause or self.how()}{then}{last} (log: {self._log.path})"
 
     def close(self) -> None:
         """Kills what still runs, and lets go of it."""

@@ -1,6 +1,6 @@
-"""The planner's door at the supervisor: the whole map, everybody's way so far, the configuration, for who asks.
+"""The supervisor answers planners' queries: the whole map, every trajectory so far, the configuration.
 
-It lives through restarts of the nodes. Answers go in parts that each fit a message.
+It lives through restarts of the nodes. Replies go in parts that each fit a message.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ from collections.abc import Mapping, Sequence
 from birdslam.mapping.atlas import Atlas
 from birdslam.queries import MapSnapshot, Trajectory
 from birdslam.runtime.configuration import Configuration, without_passwords
-from birdslam.runtime.transport.answer_parts import map_parts, trajectory_parts
 from birdslam.runtime.transport.bus import Bus
-from birdslam.runtime.transport.queries import Refusal, positive
+from birdslam.runtime.transport.queries import QueryRefused, positive
+from birdslam.runtime.transport.reply_parts import map_parts, trajectory_parts
 from birdslam.types import Estimate, MapUpdate
 
 
-class Door:
-    """Takes what comes out of the optimizer, and answers questions about all of it; until its bus is closed."""
+class QueryServer:
+    """Keeps what comes out of the optimizer, and answers queries about all of it; until its bus is closed."""
 
     def __init__(self, configuration: Configuration, bus: Bus) -> None:
         self._configuration = configuration
         self._atlas = Atlas(configuration.atlas)
         self._newest: Estimate | None = None
-        self._turn = threading.Lock()  # one thread adds, another asks
-        bus.desk({"map": self._map, "trajectory": self._trajectory, "configuration": self._settings})
+        self._turn = threading.Lock()  # one thread adds, another answers
+        bus.answer_queries({"map": self._map, "trajectory": self._trajectory, "configuration": self._settings})
 
     def add(self, estimate: Estimate) -> None:
         """One frame's."""
@@ -43,7 +43,7 @@ class Door:
         with self._turn:
             snapshot = self._atlas.map()
         if snapshot is None:
-            raise Refusal("there is no map yet: nothing has been estimated")
+            raise QueryRefused("there is no map yet: nothing has been estimated")
         return map_parts(snapshot)
 
     def _trajectory(self, parameters: Mapping[str, str]) -> Sequence[Trajectory]:
@@ -51,7 +51,7 @@ class Door:
         with self._turn:
             trajectory = self._atlas.trajectory(last_s)
         if trajectory is None:
-            raise Refusal("there is no trajectory yet: nothing has been estimated")
+            raise QueryRefused("there is no trajectory yet: nothing has been estimated")
         return trajectory_parts(trajectory)
 
     def _settings(self, parameters: Mapping[str, str]) -> Sequence[Configuration]:

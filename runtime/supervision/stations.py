@@ -1,24 +1,47 @@
-"""The place of a node in a run: the process at work, the spare beside it, and the rule by which it is begun anew."""
+"""The place of a process in a run: the process at work, the spare beside it, and the rule by which it is begun anew."""
 
 from __future__ import annotations
 
 import signal
 import time
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
+
 from birdslam.runtime.configuration import Configuration
-from birdslam.runtime.process.restarts import FIRST, Restarts
+from birdslam.runtime.process.restarts import Assignment, Restarts
 from birdslam.runtime.supervision.processes import NodeLog, NodeProcess
 from birdslam.runtime.transport.presence import remove_socket, runtime_dir_of
 
 _SUMMED = ("frames", "dropped", "malformed", "torn", "coasted", "outrun")
 
-DEAF_RECORDS = 10  # sent to a node that has taken up none of them
+MISSED_RECORDS = 10  # in a row that a node was sent and has not taken in: fewer may be on their way
 
 
-class Hearing:
-    """Whether a node takes up what is sent to it: a loop that beats may still have lost its ears.
+def _assignment_alone(assignment: Assignment) -> msgspec.Struct:
+    return assignment
+
+
+@dataclass(frozen=True)
+class Duty:
+    """What the processes of a station do, and what the run is without them."""
+
+    module: str = "birdslam.runtime.nodes.runner"
+    order: Callable[[Assignment], msgspec.Struct] = _assignment_alone  # what a process is told when its work begins
+    final_statuses: tuple[int, ...] = ()  # exit statuses after which none is begun anew; the log says why
+    without: str = ""  # the run goes on without it, and this is said; "": the run fails with it
+
+    @property
+    def essential(self) -> bool:
+        """Whether the run fails with it."""
+        return not self.without
+
+
+class Intake:
+    """Whether a node takes in what is sent to it: a loop that beats may still have lost its input.
 
     Stale input is another thing: nothing was sent then.
     """
@@ -30,32 +53,40 @@ class Hearing:
     def missed(self, sent: int, taken: int, silent_s: float, now_s: float, limit_s: float) -> int:
         """How many records in a row, where that has gone on for too long; else 0. Counters that fall begin anew.
 
-        A loop that has not beaten for half the limit is not deaf, it may be about to count as stalled.
+        A loop that has not beaten for half the limit does not count here: it may be about to count as stalled.
         """
         if taken != self._taken or sent < self._sent:
             self._sent, self._taken, self._since_s = sent, taken, now_s
         missed = sent - self._sent
         late = now_s - self._since_s > limit_s and silent_s <= limit_s / 2.0
-        return missed if missed >= DEAF_RECORDS and late else 0
+        return missed if missed >= MISSED_RECORDS and late else 0
 
 
 class Station:
-    """One node of a run, through all of its processes; it begins at once."""
+    """One node of a run, or its recorder, through all of its processes; it begins at once."""
 
-    def __init__(self, name: str, configuration: Configuration, directory: Path) -> None:
+    def __init__(self, name: str, configuration: Configuration, directory: Path, duty: Duty = Duty()) -> None:
         self.name = name
+        self.duty = duty
         self.log = NodeLog(directory / f"{name}.log")
         self.restarts = Restarts(configuration.runtime)
         self.due_s: float | None = None  # of the next process, where there is none
         self._config = configuration
-        self._hearing = Hearing()
+        self._intake = Intake()
         self._spare: NodeProcess | None = None
         self._spare_due_s = 0.0
         self.stall = ""  # why the process at work was ended by the watchdog
         self._kill_s: float | None = None  # when a stalled process that did not heed SIGTERM is killed
+        self.was_ready = False  # the process at work has been; a recorder that waits for the disk at its end is not
         self._before: Counter[str] = Counter()
-        self.process = NodeProcess(name, configuration, self.log)
-        self.process.begin(FIRST)
+        self.process = self._started()
+        self._begin()
+
+    def _started(self) -> NodeProcess:
+        return NodeProcess(self.name, self._config, self.log, self.duty.module)
+
+    def _begin(self) -> None:
+        self.process.begin(self.duty.order(self.restarts.assignment()))
 
     @property
     def working(self) -> bool:
@@ -68,15 +99,31 @@ class Station:
 
     # --- restarts ---
 
-    def died(self, cause: str) -> bool:
-        """Plans the next process; False where the node has died too often of late."""
-        self.due_s = self.restarts.died(time.monotonic(), cause, self.process.vitals)
+    @property
+    def finished(self) -> bool:
+        """Its process has ended for good: in order, or so that another one would fare no better.
+
+        The end of the source finishes a node even where the watchdog ended it. A recorder that the watchdog ended has
+        closed its file, and nothing more.
+        """
+        status, ended = self.process.exit_status, bool(self.process.vitals["ended"])
+        in_order = status == 0 and ended and (self.duty.essential or not self.stall)
+        return in_order or status in self.duty.final_statuses
+
+    @property
+    def cause(self) -> str:
+        """Why its process ended."""
+        return self.stall or self.process.how()
+
+    def plan_restart(self) -> bool:
+        """Says when the next process is due; False where they have died too often of late."""
+        self.due_s = self.restarts.died(time.monotonic(), self.cause, self.process.vitals)
         return self.due_s is not None
 
     def begin_again(self) -> None:
         """The next process goes to work: the spare, or a new one."""
         self.due_s = self._kill_s = None
-        self.stall = ""
+        self.stall, self.was_ready = "", False
         for counter in _SUMMED:
             self._before[counter] += self.process.vitals[counter]
         self.process.close()
@@ -85,8 +132,8 @@ class Station:
         if spare is not None and spare.exit_status is not None:
             spare.close()
             spare = None
-        self.process = spare or NodeProcess(self.name, self._config, self.log)
-        self.process.begin(self.restarts.assignment())
+        self.process = spare or self._started()
+        self._begin()
 
     def keep_spare(self) -> bool:
         """Starts a spare where there is none; whether one stands by, loaded."""
@@ -96,7 +143,7 @@ class Station:
             self._spare = None
             self._spare_due_s = now_s + self._config.runtime.restart_backoff_max_ms / 1e3
         if self._spare is None and now_s >= self._spare_due_s:
-            self._spare = NodeProcess(self.name, self._config, self.log)
+            self._spare = self._started()
         return self._spare is not None and bool(self._spare.vitals["prepared"])
 
     # --- watchdog ---
@@ -107,17 +154,18 @@ class Station:
         limit_s, now_s = runtime.watchdog_ms / 1e3, time.monotonic()
         if process.exit_status is not None or process.begun_s is None or self._kill_s is not None:
             return ""
+        self.was_ready = self.was_ready or process.ready
         silent_s = process.silent_s()
         if silent_s > limit_s:
             return f"is stalled: its loop has shown no life for {runtime.watchdog_ms:g} ms"
         if before is not None and process.ready:
             sent = before.process.vitals["frames"]
             taken = sum(process.vitals[counter] for counter in ("frames", "torn", "outrun"))
-            missed = self._hearing.missed(sent, taken, silent_s, now_s, limit_s)
+            missed = self._intake.missed(sent, taken, silent_s, now_s, limit_s)
             if missed:
-                return f"is deaf: has taken up none of the last {missed} frames of {before.name}"
+                return f"has taken in none of the last {missed} frames of {before.name}"
         waited_s = now_s - process.begun_s
-        if not process.ready and waited_s > runtime.ready_timeout_s + runtime.stop_timeout_s:
+        if not self.was_ready and waited_s > runtime.ready_timeout_s + runtime.stop_timeout_s:
             return f"was not ready within {waited_s:.0f} s"
         return ""
 

@@ -7,13 +7,14 @@ can't be used; the reason is one line on standard error. Everything here waits b
 
 from __future__ import annotations
 
+import select
 import selectors
 import signal
 import socket
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -32,8 +33,8 @@ from birdslam.runtime.process.notify import Notifier
 from birdslam.runtime.supervision.demo_report import Witness
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.supervision.logbook import Logbook, Results
-from birdslam.runtime.supervision.query_server import Door
-from birdslam.runtime.supervision.recorder_station import RecorderStation, choose_file
+from birdslam.runtime.supervision.query_server import QueryServer
+from birdslam.runtime.supervision.recording_files import RecordingFiles, choose_file
 from birdslam.runtime.supervision.report import summarise, table
 from birdslam.runtime.supervision.stations import Station
 from birdslam.runtime.topology import NODES
@@ -74,23 +75,19 @@ def run(configuration: Configuration) -> int:
             )
         )
         witness = Witness.of(configuration)
-        listeners: list[Results] = [Door(configuration, bus), *([witness] if witness else [])]
+        listeners: list[Results] = [QueryServer(configuration, bus), *([witness] if witness else [])]
         logbook = Logbook(bus, recorder, tolerant=configuration.restarts, listeners=listeners)
         stack.callback(logbook.close)
         bus.declare_alive()
-        recording = None
+        files = None
         if configuration.recording.file:
-            recording = stack.enter_context(closing(RecorderStation(configuration, models, output / "logs")))
-        supervisor = Supervisor(configuration, logbook, live, recording)
+            files = RecordingFiles(Path(configuration.recording.file), models)
+        supervisor = Supervisor(configuration, logbook, live, files)
         supervisor.run(output / "logs")
-        if recording is not None:
-            recording.finish(configuration.runtime.stop_timeout_s)
     live.clear()
-    summary = summarise(configuration, supervisor.stations, logbook, models, supervisor.ended)
-    if recording is not None:
-        summary["recording"] = recording.figures()
-        for line in recording.news():
-            live.say(line)
+    summary = summarise(configuration, supervisor.nodes, logbook, models, supervisor.ended)
+    if files is not None and supervisor.recorder is not None:
+        summary["recording"] = files.figures(supervisor.recorder)
     try:
         if witness is not None:
             summary |= witness.finish(output)
@@ -138,20 +135,21 @@ def check_runtime_dir(vehicle: str, runtime_dir: Path | None) -> None:
 
 
 class Supervisor:
-    """The nodes of one run, from their start to their end."""
+    """The nodes of one run and its recorder, from their start to their end."""
 
     def __init__(
-        self, configuration: Configuration, logbook: Logbook, live: LiveLine, recording: RecorderStation | None = None
+        self, configuration: Configuration, logbook: Logbook, live: LiveLine, files: RecordingFiles | None = None
     ) -> None:
         self.failure = ""
         self.exit_status = 0
         self._config = configuration
         self._logbook = logbook
         self._live = live
-        self._recording = recording
+        self._files = files
+        self.recorder: Station | None = None
         self._notifier = Notifier()
         self._disk_said = False
-        self.stations: dict[str, Station] = {}
+        self.nodes: dict[str, Station] = {}
         self._stopped_by: signal.Signals | None = None
         self._deadline_s: float | None = None  # of a stop that was asked for
         self._selector = selectors.DefaultSelector()
@@ -161,21 +159,42 @@ class Supervisor:
         with _signals() as signals, self._selector, ExitStack() as stack:
             self._selector.register(signals, selectors.EVENT_READ, self._signal)
             self._selector.register(self._logbook.event_fd, selectors.EVENT_READ, self._logbook_event)
+            if self._files is not None:
+                self.recorder = self._files.station(self._config, logs)
+                self._add(self.recorder, stack)
             for name in START_ORDER:
-                station = self.stations[name] = Station(name, self._config, logs)
-                stack.callback(station.close)
-                self._selector.register(station.process.pidfd, selectors.EVENT_READ, self._node_ended)
-            while any(station.working for station in self.stations.values()):
+                self.nodes[name] = Station(name, self._config, logs)
+                self._add(self.nodes[name], stack)
+            while any(station.working for station in self.nodes.values()):
                 for key, _ in self._selector.select(min(self._live.period_s, CHECK_S)):
                     key.data(key.fileobj)
                 self._watch()
                 self._show()
-            if not self.failure and self.stations["capture"].process.ready:
+            if not self.failure and self.nodes["capture"].process.ready:
                 self._logbook.wait_over(self._config.runtime.drain_timeout_s)
+            self._end_recorder(self._config.runtime.stop_timeout_s)
             self._show()
             self._notifier.once("STOPPING=1")
         if not self.failure and not self._logbook.ended and self._stopped_by is None:
             self.fail("all nodes ended, but the end of the source never came back", 1)
+
+    def _add(self, station: Station, stack: ExitStack) -> None:
+        stack.callback(station.close)
+        self._selector.register(station.process.pidfd, selectors.EVENT_READ, self._process_ended)
+
+    @property
+    def _stations(self) -> tuple[Station, ...]:
+        return (*self.nodes.values(), *((self.recorder,) if self.recorder is not None else ()))
+
+    def _end_recorder(self, timeout_s: float) -> None:
+        """Lets it write what it has received, and end its file."""
+        self._stop_by(timeout_s)
+        if self.recorder is None:
+            return
+        process = self.recorder.process
+        process.send(signal.SIGTERM)
+        if process.pidfd in self._selector.get_map() and select.select([process.pidfd], [], [], timeout_s)[0]:
+            self._process_ended(process.pidfd)
 
     def _signal(self, signals: socket.socket) -> None:
         for number in signals.recv(64):
@@ -185,7 +204,7 @@ class Supervisor:
             self._stopped_by = signal.Signals(number)
             self._notifier.once("STOPPING=1")
             self.exit_status = self.exit_status or (INTERRUPTED_STATUS if number == signal.SIGINT else 0)
-            capture = self.stations.get("capture")
+            capture = self.nodes.get("capture")
             if capture is not None and capture.process.ready and capture.process.exit_status is None:
                 capture.process.send(signal.SIGINT)  # END_OF_SOURCE then runs through all
             else:
@@ -194,7 +213,7 @@ class Supervisor:
 
     def _stop_by(self, timeout_s: float) -> None:
         self._deadline_s = time.monotonic() + timeout_s
-        for station in self.stations.values():
+        for station in self._stations:
             station.due_s = None  # none is begun anew
 
     def _logbook_event(self, event_fd: int) -> None:
@@ -204,51 +223,53 @@ class Supervisor:
         elif self._deadline_s is None:
             self._stop_by(self._config.runtime.stop_timeout_s)
 
-    def _node_ended(self, pidfd: int) -> None:
+    def _process_ended(self, pidfd: int) -> None:
+        """One rule for all: what has not finished is begun anew, where that may be; else the run fails with it, or goes
+        on without it."""
         self._selector.unregister(pidfd)
-        station = next(station for station in self.stations.values() if station.process.pidfd == pidfd)
-        process = station.process
+        station = next(station for station in self._stations if station.process.pidfd == pidfd)
+        process, essential = station.process, station.duty.essential
+        stopping = self._deadline_s is not None
         status, at_first = process.exit_status, not process.ready and not station.restarts.count
-        if self._deadline_s is not None or (status == 0 and process.vitals["ended"]):
-            told = status == -signal.SIGTERM  # before it could handle the signal
-            if status not in (0, None) and not told:
-                self.fail(process.failure(), 1)
-        elif at_first or not self._config.restarts:
-            self.fail(process.failure(), USER_ERROR_STATUS if status == USER_ERROR_STATUS else 1)
-        elif station.died(station.stall or process.how()):
-            self._live.say(f"{process.failure()}; it is begun anew")
+        if station.finished or (stopping and essential and status in (0, None, -signal.SIGTERM)):
+            return  # SIGTERM: before it could handle the signal
+        may_begin_again = self._config.restarts and not stopping and not (essential and at_first)
+        if may_begin_again and station.plan_restart():
+            self._live.say(process.failure(station.cause, "; it is begun anew"))
             if station.due_s is not None and station.due_s <= time.monotonic():
                 self._begin_again(station)
-        else:
+        elif not essential:
+            self._live.say(process.failure(station.cause, f"; {station.duty.without}, the run goes on"))
+        elif may_begin_again:
             window_s = self._config.runtime.restart_window_s
             again = f"{self._config.runtime.restarts_max + 1} times in {window_s:g} s: it is not begun anew"
             self.fail(f"{process.failure()}, {again}", 1)
+        else:
+            self.fail(process.failure(), USER_ERROR_STATUS if status == USER_ERROR_STATUS and not stopping else 1)
 
     def _begin_again(self, station: Station) -> None:
         station.begin_again()
-        self._selector.register(station.process.pidfd, selectors.EVENT_READ, self._node_ended)
+        self._selector.register(station.process.pidfd, selectors.EVENT_READ, self._process_ended)
 
     def _watch(self) -> None:
         now_s = time.monotonic()
-        stations = self.stations.values()
-        for station in stations:
-            before = self.stations.get(BEFORE.get(station.name, ""))
+        nodes = self.nodes.values()
+        for station in self._stations:
+            before = self.nodes.get(BEFORE.get(station.name, ""))
             stall = "" if self.failure else station.stalled(before)
-            if stall and not self._config.restarts:
+            if stall and station.duty.essential and not self._config.restarts:
                 self.fail(f"{station.name} {stall}", 1)
             if stall:
                 station.end(stall)
             station.enforce()
             if station.due_s is not None and station.due_s <= now_s:
                 self._begin_again(station)
-        if self._recording is not None:
-            self._recording.watch(may_begin_again=self._config.restarts and self._deadline_s is None)
-        if self._deadline_s is None and all(station.process.ready for station in stations):
+        if self._deadline_s is None and all(node.process.ready for node in nodes):
             self._notifier.once("READY=1")
             if self._config.spares:  # one after the other, so that loading them takes one core at the most
-                all(station.keep_spare() for station in stations)
+                all(node.keep_spare() for node in nodes)
         if self._deadline_s is not None and now_s > self._deadline_s:
-            still = [station.name for station in stations if station.process.exit_status is None]
+            still = [node.name for node in nodes if node.process.exit_status is None]
             if still:
                 limit_s = self._config.runtime.stop_timeout_s
                 self.fail(f"{', '.join(still)} did not end within {limit_s:g} s of being told to", 1)
@@ -264,11 +285,11 @@ class Supervisor:
         self._send_all(signal.SIGTERM)
 
     def _send_all(self, number: signal.Signals) -> None:
-        for station in self.stations.values():
+        for station in self.nodes.values():
             station.process.send(number)
 
     def _show(self) -> None:
-        for station in self.stations.values():
+        for station in self._stations:
             warnings = station.log.new_warnings()
             for line in warnings[:WARNINGS_SHOWN]:
                 self._live.say(f"{station.name}: {line}")
@@ -278,10 +299,8 @@ class Supervisor:
             self._disk_said = True
             self._live.say(f"results are not written any more: {self._logbook.unwritten}")
         status = self._logbook.status_line()
-        if self._recording is not None:
-            for line in self._recording.news():
-                self._live.say(line)
-            status = f"{status}  {self._recording.status()}"
+        if self._files is not None and self.recorder is not None:
+            status = f"{status}  {self._files.status(self.recorder)}"
         self._live.update(status)
         self._notifier.alive(status)
 

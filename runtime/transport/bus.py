@@ -23,7 +23,7 @@ from typing import Any, Self
 
 import zenoh
 
-from birdslam.runtime.topology import PROCESSES, QUESTIONS, TOPICS, alive_key, check_name, key_of
+from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, check_name, key_of
 from birdslam.runtime.transport.endpoints import (
     BusClosed,
     BusError,
@@ -35,12 +35,12 @@ from birdslam.runtime.transport.endpoints import (
     message_of,
 )
 from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
-from birdslam.runtime.transport.queries import Answer, Desk
+from birdslam.runtime.transport.queries import QueryHandler, QueryResponder
 from birdslam.runtime.transport.session import session_config
 from birdslam.runtime.wire import Part, WireError, decode
 
 _LOSSLESS_DEPTH = 4_096
-_ANSWER_S, _ANSWERS = 2.0, 256  # how long a question waits, and how many messages its answer may have
+_REPLY_S, _REPLIES = 2.0, 256  # how long a query waits, and how many messages its reply may have
 
 __all__ = ["Bus", "BusClosed", "BusError", "Message", "MessagesLost", "Publisher", "Subscriber"]
 
@@ -59,7 +59,7 @@ class Bus:
         self.vehicle, self.node, self._lossless = check_name("vehicle", vehicle), check_name("node", node), lossless
         self._publishers: list[Publisher] = []
         self._subscribers: list[Subscriber] = []
-        self._desks: list[Desk] = []
+        self._responders: list[QueryResponder] = []
         self._alive: set[str] = set()
         self._alive_changed = threading.Condition()
         self._alive_callbacks: list[Callable[[str, bool], None]] = []
@@ -100,9 +100,9 @@ class Bus:
         """Gives a subscriber that came late the topic's last message, when it comes; waits for nothing."""
         self._check_open()
         callback = zenoh.handlers.Callback(subscriber._receive_kept, indirect=False)
-        self._session.get(key_of(self.vehicle, topic), callback, timeout=_ANSWER_S)
+        self._session.get(key_of(self.vehicle, topic), callback, timeout=_REPLY_S)
 
-    def kept(self, topic: str, timeout_s: float = _ANSWER_S) -> list[Message]:
+    def kept(self, topic: str, timeout_s: float = _REPLY_S) -> list[Message]:
         """The topic's kept messages (Topic.kept), oldest first; empty where nobody answers in time.
 
         Raises BusError where one is no such record.
@@ -113,30 +113,30 @@ class Bus:
         except WireError as error:
             raise BusError(f"{topic}: a kept message is malformed: {error}") from error
 
-    def ask(self, question: str, timeout_s: float = _ANSWER_S, **parameters: float) -> list[Any]:
-        """The parts of the answer to one of topology.QUESTIONS, in order; empty where nobody answers in time.
+    def query(self, name: str, timeout_s: float = _REPLY_S, **parameters: float) -> list[Any]:
+        """The parts of the reply to one of topology.QUERIES, in order; empty where nobody answers in time.
 
-        Raises BusError with the reason where the question is refused, or where the answer is incomplete or malformed.
+        Raises BusError with the reason where the query is refused, or where the reply is incomplete or malformed.
         """
-        spec, key = QUESTIONS[question], key_of(self.vehicle, question)
-        asked = {name: f"{value:g}" for name, value in parameters.items()}
+        spec, key = QUERIES[name], key_of(self.vehicle, name)
+        given = {parameter: f"{value:g}" for parameter, value in parameters.items()}
         parts: dict[int, Any] = {}
         of = 0
         try:
-            for sample in self._get(zenoh.Selector(key, asked), timeout_s):
+            for sample in self._get(zenoh.Selector(key, given), timeout_s):
                 part = attached(sample, Part) or Part()
                 parts[part.number], of = decode(bytes(sample.payload), spec.record), part.of
         except WireError as error:
-            raise BusError(f"{question}: the answer is malformed: {error}") from error
+            raise BusError(f"{name}: the reply is malformed: {error}") from error
         if sorted(parts) != list(range(of)):
-            raise BusError(f"{question}: {len(parts)} of the answer's {of} parts came")
+            raise BusError(f"{name}: {len(parts)} of the reply's {of} parts came")
         return [parts[number] for number in range(of)]
 
     def _get(self, selector: str | zenoh.Selector, timeout_s: float) -> Iterator[zenoh.Sample]:
         self._check_open()
         replies = self._session.get(
             selector,
-            zenoh.handlers.FifoChannel(_ANSWERS),
+            zenoh.handlers.FifoChannel(_REPLIES),
             timeout=timeout_s,
             consolidation=zenoh.ConsolidationMode.NONE,  # all of them, not the last one alone
         )
@@ -146,12 +146,11 @@ class Bus:
             elif reply.err is not None:
                 raise BusError(f"{selector}: {bytes(reply.err.payload).decode(errors='replace')}")
 
-    def desk(self, answers: Mapping[str, Answer]) -> Desk:
-        """Answers the questions of these names (topology.QUESTIONS) until the bus is closed."""
+    def answer_queries(self, handlers: Mapping[str, QueryHandler]) -> None:
+        """Answers the queries of these names (topology.QUERIES) until the bus is closed."""
         self._check_open()
-        desk = Desk(self._session, {key_of(self.vehicle, name): answer for name, answer in answers.items()})
-        self._desks.append(desk)
-        return desk
+        by_key = {key_of(self.vehicle, name): handler for name, handler in handlers.items()}
+        self._responders.append(QueryResponder(self._session, by_key))
 
     def declare_alive(self) -> None:
         """Says that this node is ready for work; taken back by close, or by the death of the process."""
@@ -207,8 +206,8 @@ class Bus:
             publisher._close()
         for subscriber in self._subscribers:
             subscriber.close()
-        for desk in self._desks:
-            desk.close()
+        for responder in self._responders:
+            responder.close()
         self._session.close()
 
     def __enter__(self) -> Self:

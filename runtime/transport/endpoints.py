@@ -1,4 +1,4 @@
-"""The ends of one topic on the bus: its typed publisher, and its bounded queue of messages; made by bus.Bus."""
+"""Publisher and subscriber of one topic: typed, with a bounded queue of messages; made by bus.Bus."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class BusError(RuntimeError):
 
 
 class BusClosed(BusError):
-    """The bus, or this end of it, was closed."""
+    """The bus, or this publisher or subscriber, was closed."""
 
 
 class MessagesLost(BusError):

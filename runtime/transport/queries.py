@@ -1,8 +1,8 @@
-"""What may be asked of the bus: zenoh queries, each answered with records of one type.
+"""Queries of the bus, by zenoh, each answered with records of one type.
 
 A publisher of a topic that keeps its last messages (`Topic.kept`) answers with them, from the bytes that it sent. What
-costs more to answer (`Desk`) is made in a thread of its own, behind a short queue: who asks too much is not answered,
-and nothing else notices.
+costs more to answer (`QueryResponder`) is made in a thread of its own, behind a short queue: who queries too much gets
+no reply, and nothing else notices.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ import zenoh
 
 from birdslam.runtime.wire import Part, WireError, encode
 
-Answer = Callable[[Mapping[str, str]], Sequence[msgspec.Struct]]
+QueryHandler = Callable[[Mapping[str, str]], Sequence[msgspec.Struct]]
 
-WAITING_QUESTIONS = 16
-_REFUSAL_CHARACTERS = 300
+WAITING_QUERIES = 16
+_REASON_CHARACTERS = 300
 
 log = logging.getLogger(__name__)
 
 
-class Refusal(ValueError):
-    """A question that can't be answered: the reason goes to whoever asked it."""
+class QueryRefused(ValueError):
+    """A query that can't be answered: its sender gets the reason."""
 
 
 class KeptMessages:
@@ -44,32 +44,32 @@ class KeptMessages:
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
-            if str(query.key_expr) != self._key:  # a wildcard: who asks for everything gets nothing
+            if str(query.key_expr) != self._key:  # a wildcard: a query for everything gets nothing
                 return
             for data, attachment in tuple(self._messages):
                 query.reply(self._key, data, attachment=attachment)
 
 
-class Desk:
-    """Answers questions of several keys, one after the other; `close` it before its session.
+class QueryResponder:
+    """Answers queries of several keys, one after the other; `close` it before its session.
 
-    `answers`: key -> what makes the answer's parts from the question's parameters; it may raise Refusal.
+    `handlers`: key -> what makes the parts of the reply from the query's parameters; it may raise QueryRefused.
     """
 
-    def __init__(self, session: zenoh.Session, answers: Mapping[str, Answer]) -> None:
-        self._answers = answers
-        self._waiting: deque[zenoh.Query] = deque(maxlen=WAITING_QUESTIONS)
+    def __init__(self, session: zenoh.Session, handlers: Mapping[str, QueryHandler]) -> None:
+        self._handlers = handlers
+        self._waiting: deque[zenoh.Query] = deque(maxlen=WAITING_QUERIES)
         self._arrived = threading.Condition()
         self._closed = False
-        callback = zenoh.handlers.Callback(self._ask, indirect=False)
-        self._queryables = [session.declare_queryable(key, callback) for key in answers]
-        self._thread = threading.Thread(target=self._run, name="desk", daemon=True)
+        callback = zenoh.handlers.Callback(self._enqueue, indirect=False)
+        self._queryables = [session.declare_queryable(key, callback) for key in handlers]
+        self._thread = threading.Thread(target=self._run, name="queries", daemon=True)
         self._thread.start()
 
-    def _ask(self, query: zenoh.Query) -> None:
+    def _enqueue(self, query: zenoh.Query) -> None:
         with self._arrived:
             if not self._closed:
-                self._waiting.append(query)  # the oldest gives way: whoever asked it may ask again
+                self._waiting.append(query)  # the oldest gives way: its sender may query again
                 self._arrived.notify()
 
     def _run(self) -> None:
@@ -84,17 +84,17 @@ class Desk:
 
     def _answer(self, query: zenoh.Query) -> None:
         key = str(query.key_expr)
-        answer = self._answers.get(key)
-        if answer is None:  # a wildcard
+        handler = self._handlers.get(key)
+        if handler is None:  # a wildcard
             return
         try:
-            parts = answer(_parameters(query))
+            parts = handler(_parameters(query))
             for number, part in enumerate(parts):
                 query.reply(key, encode(part), attachment=encode(Part(number, len(parts))))
-        except (Refusal, WireError) as error:
-            query.reply_err(str(error)[:_REFUSAL_CHARACTERS])
-        except zenoh.ZError as error:  # whoever asked is gone
-            log.info("%s: no answer: %s", key, error)
+        except (QueryRefused, WireError) as error:
+            query.reply_err(str(error)[:_REASON_CHARACTERS])
+        except zenoh.ZError as error:  # its sender is gone
+            log.info("%s: no reply: %s", key, error)
 
     def close(self) -> None:
         """Answers nothing more; a second call does nothing."""
@@ -115,7 +115,7 @@ def _parameters(query: zenoh.Query) -> dict[str, str]:
 
 
 def positive(parameters: Mapping[str, str], name: str) -> float | None:
-    """One parameter of a question as a number; None where it was left out. Raises Refusal, which names it."""
+    """One parameter of a query as a number; None where it was left out. Raises QueryRefused, which names it."""
     text = parameters.get(name)
     if text is None:
         return None
@@ -124,5 +124,5 @@ def positive(parameters: Mapping[str, str], name: str) -> float | None:
     except ValueError:
         value = math.nan
     if not 0.0 < value < math.inf:
-        raise Refusal(f"{name}={text[:40]}: needs a positive number")
+        raise QueryRefused(f"{name}={text[:40]}: needs a positive number")
     return value

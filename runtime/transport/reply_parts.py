@@ -1,4 +1,4 @@
-"""Answers that are too large for one message, in parts and whole again."""
+"""Replies that are too large for one message, in parts and whole again."""
 
 from __future__ import annotations
 

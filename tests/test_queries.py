@@ -1,4 +1,4 @@
-"""What comes late and asks: kept messages, the planner's questions, and that silence is told as such."""
+"""What comes late and asks: kept messages, the planner's queries, and that silence is told as such."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from birdslam.geometry.se2 import SE2
 from birdslam.queries import MapSnapshot, TimedPose, Trajectory, VehiclePath
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import Configuration, SourceConfig
-from birdslam.runtime.supervision.query_server import Door
-from birdslam.runtime.topology import QUESTIONS, TOPICS, key_of
-from birdslam.runtime.transport.answer_parts import map_parts, trajectory_parts, whole_map, whole_trajectory
+from birdslam.runtime.supervision.query_server import QueryServer
+from birdslam.runtime.topology import QUERIES, TOPICS, key_of
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError
-from birdslam.runtime.transport.queries import WAITING_QUESTIONS, Refusal, positive
+from birdslam.runtime.transport.queries import WAITING_QUERIES, QueryRefused, positive
+from birdslam.runtime.transport.reply_parts import map_parts, trajectory_parts, whole_map, whole_trajectory
 from birdslam.runtime.wire import Health, Part, encode
 from birdslam.types import MapUpdate
 from tests.test_bus import LIMIT_S, estimate, measurements, until
@@ -85,15 +85,15 @@ def test_a_planner_that_comes_late_has_the_last_estimate(join: Any, base: Path) 
 
 
 def test_what_planners_ask_for(join: Any, base: Path) -> None:
-    door = Door(CONFIGURATION, hub := join("supervisor", hub=True))
+    server = QueryServer(CONFIGURATION, hub := join("supervisor", hub=True))
     with Planner("car", base) as planner:
         hub.declare_alive()
         until(lambda: "supervisor" in planner._bus.alive, "the supervisor")
         with pytest.raises(BusError, match="there is no map yet"):
             planner.map()
         for number in range(50):
-            door.add(at(number, float(number)))
-            door.add_map(MapUpdate(epoch=3, frame_id=number, lanes_m=((float(number), 2.0),)))
+            server.add(at(number, float(number)))
+            server.add_map(MapUpdate(epoch=3, frame_id=number, lanes_m=((float(number), 2.0),)))
         chart = planner.map()
         assert chart is not None
         assert (chart.epoch, chart.frame_id) == (3, 49)
@@ -115,19 +115,19 @@ def test_what_planners_ask_for(join: Any, base: Path) -> None:
 
 
 def test_a_long_drive_is_answered_in_parts_that_fit(join: Any, base: Path) -> None:
-    door = Door(Configuration(), hub := join("supervisor", hub=True))
+    server = QueryServer(Configuration(), hub := join("supervisor", hub=True))
     with Planner("car", base) as planner:
         hub.declare_alive()
         until(lambda: "supervisor" in planner._bus.alive, "the supervisor")
         for number in range(3000):
-            door.add(at(number, float(number)))
+            server.add(at(number, float(number)))
             points = tuple((number + 0.3 * k, float(k)) for k in range(4))
-            door.add_map(MapUpdate(epoch=3, frame_id=number, lanes_m=points, landmarks_m=points))
+            server.add_map(MapUpdate(epoch=3, frame_id=number, lanes_m=points, landmarks_m=points))
         way, chart = planner.trajectory(timeout_s=LIMIT_S), planner.map(timeout_s=LIMIT_S)
         assert way is not None
         assert chart is not None
-        assert way == door._atlas.trajectory()
-        assert chart == door._atlas.map()
+        assert way == server._atlas.trajectory()
+        assert chart == server._atlas.map()
         assert len(encode_all(map_parts(chart))) > 5
 
 
@@ -170,12 +170,12 @@ def test_a_trajectory_is_whole_again(ego: int, vehicles: list[int]) -> None:
 
 
 def test_who_asks_for_everything_gets_nothing(join: Any) -> None:
-    door = Door(Configuration(), hub := join("supervisor", hub=True))
-    door.add(at(1, 0.0))
+    server = QueryServer(Configuration(), hub := join("supervisor", hub=True))
+    server.add(at(1, 0.0))
     guest = join("guest")
     hub.declare_alive()
     assert not guest.wait_alive({"supervisor"}, LIMIT_S)
-    assert guest.ask("map")
+    assert guest.query("map")
     for selector in ("birdslam/car/v1/*", "birdslam/**", "**"):
         assert [r for r in guest._session.get(selector, timeout=0.3) if r.ok is not None] == []
 
@@ -192,31 +192,31 @@ def test_a_part_that_is_lost_is_told(join: Any) -> None:
     queryable = hub._session.declare_queryable(key, answer)
     hub.declare_alive()
     assert not guest.wait_alive({"supervisor"}, LIMIT_S)
-    with pytest.raises(BusError, match="map: 1 of the answer's 3 parts came"):
-        guest.ask("map")
+    with pytest.raises(BusError, match="map: 1 of the reply's 3 parts came"):
+        guest.query("map")
     for data, attachment in ((b"\xc1", encode(Part())), (answers[0][0], b"\x92\x00\x00")):
         answers[:] = [(data, attachment)]
-        with pytest.raises(BusError, match="map: the answer is malformed"):
-            guest.ask("map")
+        with pytest.raises(BusError, match="map: the reply is malformed"):
+            guest.query("map")
     answers.clear()
-    assert guest.ask("map") == []
+    assert guest.query("map") == []
     queryable.undeclare()
 
 
-def test_a_flood_of_questions_is_answered_in_part_and_harms_nothing(join: Any, base: Path) -> None:
-    door = Door(Configuration(), hub := join("supervisor", hub=True))
-    door.add(at(1, 0.0))
+def test_a_flood_of_queries_is_answered_in_part_and_harms_nothing(join: Any, base: Path) -> None:
+    server = QueryServer(Configuration(), hub := join("supervisor", hub=True))
+    server.add(at(1, 0.0))
     with Planner("car", base) as planner:
         hub.declare_alive()
         until(lambda: "supervisor" in planner._bus.alive, "the supervisor")
-        with door._turn:  # the desk can't answer now
+        with server._turn:  # no query can be answered now
             handlers = [
                 planner._bus._session.get(key_of("car", "trajectory"), zenoh.handlers.FifoChannel(8), timeout=LIMIT_S)
-                for _ in range(10 * WAITING_QUESTIONS)
+                for _ in range(10 * WAITING_QUERIES)
             ]
             time.sleep(0.2)
         answered = sum(any(reply.ok is not None for reply in handler) for handler in handlers)
-        assert 1 <= answered <= 2 * WAITING_QUESTIONS
+        assert 1 <= answered <= 2 * WAITING_QUERIES
         assert planner.trajectory() is not None
 
 
@@ -224,19 +224,19 @@ def test_a_refusal_names_the_parameter() -> None:
     assert positive({}, "last_s") is None
     assert positive({"last_s": "2.5"}, "last_s") == 2.5
     for text in ("", "x", "nan", "inf", "-1", "0", "9" * 500):
-        with pytest.raises(Refusal, match="last_s"):
+        with pytest.raises(QueryRefused, match="last_s"):
             positive({"last_s": text}, "last_s")
 
 
-def test_every_question_has_an_answer(join: Any) -> None:
+def test_every_query_has_a_reply(join: Any) -> None:
     asked: dict[str, Any] = {}
 
     class Hub:
-        def desk(self, answers: dict[str, Any]) -> None:
-            asked.update(answers)
+        def answer_queries(self, handlers: dict[str, Any]) -> None:
+            asked.update(handlers)
 
-    Door(Configuration(), Hub())  # type: ignore[arg-type]
-    assert set(asked) == set(QUESTIONS)
+    QueryServer(Configuration(), Hub())  # type: ignore[arg-type]
+    assert set(asked) == set(QUERIES)
 
 
 def test_silence_is_told_as_such(join: Any, base: Path) -> None:
