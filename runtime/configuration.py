@@ -29,6 +29,7 @@ from birdslam.runtime.sections import (
     PerceiveConfig,
     RealtimeConfig,
     RecordingConfig,
+    ResultsConfig,
     RuntimeConfig,
     SourceConfig,
 )
@@ -46,6 +47,7 @@ __all__ = [
     "PerceiveConfig",
     "RealtimeConfig",
     "RecordingConfig",
+    "ResultsConfig",
     "RuntimeConfig",
     "SourceConfig",
     "complete",
@@ -82,6 +84,7 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     realtime: RealtimeConfig = RealtimeConfig()
     atlas: AtlasConfig = AtlasConfig()  # what planners may ask for of the drive so far
     recording: RecordingConfig = RecordingConfig()
+    results: ResultsConfig = ResultsConfig()  # beside the live ones, when the drive is over
     output: str = "out"  # the folder of results
 
     @property
@@ -206,6 +209,7 @@ def _anchor_paths(tree: dict[str, Any], base: Path) -> None:
 
     anchor(tree, "camera", "output")
     anchor(tree.get("runtime"), "runtime_dir", "models_dir")
+    anchor(tree.get("results"), "video")
     models = tree.get("models")
     for spec in models.values() if isinstance(models, dict) else ():
         if isinstance(spec, dict) and not model_store.is_name(str(spec.get("path", ""))):

@@ -198,6 +198,13 @@ class RecordingConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     ready_timeout_s: Positive = 10.0  # for the recorder to be there before the first frame; then the run goes on
 
 
+class ResultsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is made of a drive when it is over, beside the live results (runtime/supervision/final_results.py)."""
+
+    smooth: bool = False  # final trajectories too, by the RTS smoother: tracks/ID.final.tum.txt, ego.final.*
+    video: str = ""  # FILE.mp4: the frames with the estimated boxes beside the bird's-eye view; "": none
+
+
 class NodeScheduling(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Of one node."""
 

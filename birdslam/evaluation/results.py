@@ -26,6 +26,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.evaluation.final import EGO_FILES
 from birdslam.evaluation.picture import Scene, Track, draw
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
@@ -111,7 +112,8 @@ class Recorder:
         self._files = ExitStack()
         try:
             self._tracks_directory.mkdir(exist_ok=True)
-            for old in (*self._tracks_directory.glob("*.tum.txt"), directory / "summary.json", directory / "bev.png"):
+            later = (directory / name for name in ("summary.json", "bev.png", *EGO_FILES.values()))
+            for old in (*self._tracks_directory.glob("*.tum.txt"), *later):
                 old.unlink(missing_ok=True)  # stale tracks beside new ones would be taken for this run's
             self._kitti, self._tum, self._map = map(self._open, ("ego.kitti.txt", "ego.tum.txt", "map.csv"))
         except OSError as error:

@@ -1,12 +1,15 @@
-"""A frame of the drive's video: the camera's image with the vehicles' boxes beside the ego's bird's-eye view.
+"""The video of a drive: the camera's image with the vehicles' boxes beside the ego's bird's-eye view.
 
 Where the truth is known, thin white outlines show it in the bird's-eye view. All arrays are BGR.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
@@ -25,6 +28,7 @@ from birdslam.evaluation.picture import (
     PAPER,
     colour_of,
 )
+from birdslam.evaluation.results import ResultsError
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
@@ -33,7 +37,7 @@ from birdslam.types import Estimate, MapUpdate, VehicleEstimate
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
-IMAGE_SCALE = 1.5  # of the camera's image
+MOST_SCALE, MOST_WIDTH_PX = 1.5, 1280  # of the camera's image, enlarged or reduced
 STRIP_PX, PANEL_PX = 96, 368  # height of the strip of text below the image, width of the bird's-eye view
 AHEAD_M, BEHIND_M = 50.0, 10.0  # shown of the bird's-eye view
 BOX_HEIGHT_M = 1.5  # estimates have none
@@ -41,6 +45,8 @@ KEPT_POINTS, KEPT_POSES = 12_000, 400
 SHIFT = 4  # OpenCV's fractional bits: outlines don't jump from pixel to pixel
 RING_M = 10.0
 FONT = cv2.FONT_HERSHEY_SIMPLEX
+SUFFIX, CODEC = ".mp4", "mp4v"  # the codec that every build of OpenCV can write
+MOST_PICTURES_HZ = 20.0  # of the video: of faster cameras every second or third frame is drawn
 
 
 def _bgr(colour: str) -> tuple[int, int, int]:
@@ -52,7 +58,8 @@ class SideBySide:
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._image_px = (round(camera.width_px * IMAGE_SCALE), round(camera.height_px * IMAGE_SCALE))
+        self._scale = min(MOST_SCALE, MOST_WIDTH_PX / camera.width_px)
+        self._image_px = (round(camera.width_px * self._scale), round(camera.height_px * self._scale))
         self.size_px = self._image_px[0] + PANEL_PX, self._image_px[1] + STRIP_PX  # width, height; both even
         self.size_px = self.size_px[0] // 2 * 2, self.size_px[1] // 2 * 2
         self._per_m = self.size_px[1] / (AHEAD_M + BEHIND_M)
@@ -68,7 +75,10 @@ class SideBySide:
         self._landmarks.extend(update.landmarks_m)
 
     def draw(self, image: Image, estimate: Estimate, true_outlines: Sequence[Floats], words: Sequence[str]) -> Image:
-        """(H, W, 3) of `size_px`, from the undistorted `image`; `true_outlines` are (4, 2) footprints in ego."""
+        """(H, W, 3) of `size_px`, from the undistorted `image`, (H, W) grey or (H, W, 3) BGR.
+
+        `true_outlines` are (4, 2) footprints in ego.
+        """
         self._enter(estimate.epoch)
         self._way.append((estimate.T_world_ego.x_m, estimate.T_world_ego.y_m))
         canvas = np.full((self.size_px[1], self.size_px[0], 3), _bgr(PAPER), np.uint8)
@@ -89,6 +99,7 @@ class SideBySide:
             self._epoch = epoch
 
     def _camera_view(self, image: Image, estimate: Estimate) -> Image:
+        image = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
         view: Image = cv2.resize(image, self._image_px, interpolation=cv2.INTER_LINEAR)  # type: ignore[assignment]
         ground = self._camera.ground
         if estimate.ground is not None:
@@ -100,7 +111,7 @@ class SideBySide:
             corners = np.vstack([np.column_stack([foot, np.full(4, z_m)]) for z_m in (0.0, BOX_HEIGHT_M)])
             if corners[:, 0].min() < 1.0:  # reaches behind the image plane
                 continue
-            px = (bev.ego_to_pixel(self._camera, ground, corners) + 0.5) * IMAGE_SCALE - 0.5
+            px = (bev.ego_to_pixel(self._camera, ground, corners) + 0.5) * self._scale - 0.5
             low, high = _fixed(px[:4]), _fixed(px[4:])
             colour = _colour_of(vehicle)
             cv2.polylines(view, [low, high], True, colour, 1, cv2.LINE_AA, SHIFT)
@@ -146,6 +157,99 @@ class SideBySide:
             [PANEL_PX / 2.0 - points[:, 1] * self._per_m, (AHEAD_M - points[:, 0]) * self._per_m]
         )
         return out
+
+
+class DriveVideo:
+    """Draws a drive's frames as its estimates come, in order; a context, so that the file is whole where a run ends.
+
+    `frames` are (frame_id, source time in ns, undistorted image or None), in order and without end or not: they are
+    taken up to the last estimate. A frame that was not estimated shows the estimate before it. `truth` gives the true
+    footprints (4, 2) in ego of a frame. Raises ResultsError where the file can't be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera,
+        rate_hz: float,
+        frames: Iterator[tuple[int, int, Image | None]],
+        truth: Callable[[int], Sequence[Floats]] | None = None,
+    ) -> None:
+        self._view = SideBySide(camera)
+        self._every = math.ceil(rate_hz / MOST_PICTURES_HZ)
+        self._frames, self._truth = frames, truth
+        self._next: tuple[int, int, Image | None] | None = None
+        self._estimate: Estimate | None = None
+        self._writer = _open_writer(path, rate_hz / self._every, self._view.size_px)
+        self.drawn_frame = -1
+
+    def add(self, estimate: Estimate) -> None:
+        """One frame's estimate; draws the frames before it."""
+        self._draw_until(estimate.frame_id)
+        self._estimate = estimate
+
+    def add_map(self, update: MapUpdate) -> None:
+        """What the map gained with the frame whose estimate was added last."""
+        self._view.add_map(update)
+
+    def finish(self) -> None:
+        """The frame of the last estimate, and the end of the file."""
+        if self._estimate is not None:
+            self._draw_until(self._estimate.frame_id + 1)
+        self._writer.release()
+
+    def _draw_until(self, end: int) -> None:
+        """All frames before `end`."""
+        while True:
+            self._next = next(self._frames, None) if self._next is None else self._next
+            if self._next is None or self._next[0] >= end:
+                return
+            frame_id, t_ns, image = self._next
+            self._next, self.drawn_frame = None, frame_id
+            if self._estimate is not None and image is not None and frame_id % self._every == 0:
+                self._writer.write(self._picture(t_ns, image, self._estimate))
+
+    def _picture(self, t_ns: int, image: Image, estimate: Estimate) -> Image:
+        seen = sum(vehicle.age_ns == 0 for vehicle in estimate.vehicles)
+        white = "white outlines: truth, " if self._truth else ""
+        words = (
+            f"BirdSLAM  {t_ns * 1e-9:5.1f} s  frame {estimate.frame_id}  {seen} vehicles in sight",
+            f"right: from above, 10 m rings; filled: estimates, {white}cyan: ego",
+            " ".join(status.value for status in estimate.status) or "all well",
+        )
+        truth = self._truth(estimate.frame_id) if self._truth else ()
+        return self._view.draw(image, estimate, truth, words)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._writer.release()
+
+
+def check_video(path: Path, camera: Camera, rate_hz: float) -> None:
+    """Raises ResultsError where a video of this camera can't be written there; what lies there stays as it is."""
+    if path.suffix != SUFFIX:
+        raise ResultsError(f"video {path}: expected FILE{SUFFIX}")
+    if path.is_dir():
+        raise ResultsError(f"video {path}: is a directory")
+    if not path.parent.is_dir():
+        raise ResultsError(f"video {path}: there is no directory {path.parent}")
+    probe = path.with_name(f".{path.stem}.probe{SUFFIX}")
+    try:
+        probe.touch()
+        _open_writer(probe, rate_hz, SideBySide(camera).size_px).release()
+    except OSError as error:
+        raise ResultsError(f"video {path}: {error.strerror}") from None
+    finally:
+        probe.unlink(missing_ok=True)
+
+
+def _open_writer(path: Path, rate_hz: float, size_px: tuple[int, int]) -> cv2.VideoWriter:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate_hz, size_px)
+    if not writer.isOpened():
+        raise ResultsError(f"video {path}: this OpenCV can't write {CODEC} there")
+    return writer
 
 
 def outline(pose: SE2, length_m: float, width_m: float) -> Floats:

@@ -86,6 +86,10 @@ class RtsSmoother:
         """(epoch, vehicle) -> frame -> T_world_vehicle in that epoch's world, in the frames in which it was seen."""
         return {key: smooth_vehicle(seen, self.config) for key, seen in self._measurements.items()}
 
+    def close(self, epoch: int, vehicle: int) -> dict[int, SE2]:
+        """One of `ways`, whose sights are let go: no more of them will come."""
+        return way(self._sights.pop((epoch, vehicle)), self.config)
+
 
 def smooth_vehicle(seen: Sequence[VehicleMeasurement], config: SmootherConfig) -> dict[int, SE2]:
     """frame -> T_world_vehicle of one vehicle; its yaw is the live one."""

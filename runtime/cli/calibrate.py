@@ -25,6 +25,7 @@ from birdslam.runtime.cli.options import configuration_of
 from birdslam.runtime.configuration import FILE_SCHEMES, ConfigurationError
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
+from birdslam.runtime.progress import shown
 from birdslam.types import Frame
 
 UNKNOWN_HEIGHT_M = 1.5  # where none was given: all lengths are in proportion to it, and it is replaced
@@ -45,7 +46,8 @@ def calibrate_camera(options: argparse.Namespace) -> int:
     with Inference(configuration) as inference:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
-            for frame in offline_frames(RecordedSource(recording, configuration.source)):
+            frames = offline_frames(RecordedSource(recording, configuration.source))
+            for frame in shown(frames, "calibrate", len(recording) or None):
                 yield frame, inference.start(frame)
 
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from birdslam.datasets.demo import COLUMNS, LABELS, Floats, write_drive
 from birdslam.datasets.recording import DatasetError
 from birdslam.geometry.camera import Camera
+from birdslam.runtime.progress import shown
 
 if TYPE_CHECKING:
     from birdslam.rendered_world.truth import WorldFrame
@@ -38,13 +38,11 @@ def make(options: argparse.Namespace) -> int:
     poses: list[Floats] = []
     ground: list[tuple[float, float, float]] = []
     bodies: list[tuple[float, ...]] = []
-    for frame in drive(demo_scenario(), CAMERA, count, RATE_HZ, SAMPLES):
+    for frame in shown(drive(demo_scenario(), CAMERA, count, RATE_HZ, SAMPLES), "demo drive", count):
         images.append(_webp(frame.image, options.quality))
         poses.append(frame.T_world_cam)
         ground.append((frame.camera.height_m, frame.camera.pitch_rad, frame.camera.roll_rad))
         bodies.extend(_rows(frame))
-        print(f"\rframe {frame.frame_id + 1} of {count}", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
     from_first = (np.linalg.inv(poses[0]) @ np.array(poses)).astype(np.float64)
     write_drive(
         options.output, images, RATE_HZ, from_first[:, :3], np.array(ground), np.array(bodies).reshape(-1, len(COLUMNS))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import sys
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -67,15 +66,3 @@ class _Redirects(urllib.request.HTTPRedirectHandler):
         if urlsplit(address).scheme not in SCHEMES:
             raise DownloadError(f"{request.full_url}: leads to {address}, which is no {' or '.join(SCHEMES)} address")
         return super().redirect_request(request, file, code, message, headers, address)
-
-
-def on_terminal(name: str) -> Progress:
-    """Progress as one line on standard error that is written over; nothing where that is no terminal."""
-
-    def show(got_bytes: int, total_bytes: int | None) -> None:
-        if sys.stderr.isatty():
-            share = f" of {total_bytes / 1e6:.1f}" if total_bytes else ""
-            end = "\n" if got_bytes == total_bytes else ""
-            print(f"\r{name}: {got_bytes / 1e6:.1f}{share} MB", end=end, file=sys.stderr, flush=True)
-
-    return show

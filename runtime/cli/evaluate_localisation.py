@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from birdslam.datasets.kitti_tracking import open_tracking, read_detections
+from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.datasets.recording import DatasetError
 from birdslam.evaluation.localisation import (
     PAPER,
@@ -21,6 +21,7 @@ from birdslam.evaluation.localisation import (
 from birdslam.evaluation.results import claim_directory
 from birdslam.frontend import FrontEndConfig
 from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.progress import Progress
 
 
 def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
@@ -29,8 +30,12 @@ def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
     output = Path(options.output)
     claim_directory(output)
     errors: list[CarError] = []
-    for name in _sequences(options):
-        errors += _errors(options.root, name, options.detections, modes[options.mode])
+    sequences = [open_tracking(options.root, name) for name in _sequences(options)]
+    with Progress("localisation", sum(map(len, sequences))) as progress:
+        progress.reach(0)
+        for sequence in sequences:
+            errors += _errors(options.root, sequence, options.detections, modes[options.mode])
+            progress.advance(len(sequence))
     rows = summarise_ranges(errors)
     (output / "report.json").write_bytes(msgspec.json.format(msgspec.json.encode(rows), indent=2) + b"\n")
     print(_table(rows))
@@ -50,10 +55,9 @@ def _sequences(options: argparse.Namespace) -> list[str]:
     return chosen
 
 
-def _errors(root: Path, name: str, detections: str, config: FrontEndConfig) -> list[CarError]:
-    sequence = open_tracking(root, name)
+def _errors(root: Path, sequence: TrackingSequence, detections: str, config: FrontEndConfig) -> list[CarError]:
     folder = root / "det_02_rrc" if detections == "rrc" else Path(detections)
-    found = read_detections(folder, name, len(sequence))
+    found = read_detections(folder, sequence.name, len(sequence))
     return match_cars(sequence, measure(sequence, found, config))
 
 

@@ -19,6 +19,7 @@ from birdslam.runtime.cli.options import configuration_of
 from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, complete
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
+from birdslam.runtime.progress import Progress
 from birdslam.runtime.supervision import supervisor
 from birdslam.slam import BirdSLAM
 from birdslam.types import Estimate, MapUpdate, Measurements
@@ -97,10 +98,23 @@ def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
         print(supervisor.WITHOUT_MODELS)
     with _pipeline(configuration) as drive:
         reports = evaluate_recordings(
-            recordings, drive, Path(configuration.output), compared=_compared(options.frames, recordings)
+            recordings,
+            _with_progress(drive),
+            Path(configuration.output),
+            compared=_compared(options.frames, recordings),
         )
     print(f"results in {configuration.output}")
     return reports
+
+
+def _with_progress(drive: Drive) -> Drive:
+    def shown_drive(recording: Recording) -> Iterator[Measurements | Estimate | MapUpdate]:
+        with Progress(recording.name, len(recording) or None) as progress:
+            for record in drive(recording):
+                yield record
+                progress.advance(isinstance(record, Estimate))
+
+    return shown_drive
 
 
 def _compared(text: str, recordings: list[Recording]) -> slice:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import sys
+import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -22,8 +23,9 @@ from birdslam.evaluation.tracking import Row
 from birdslam.evaluation.tracking_picture import draw_runtime
 from birdslam.evaluation.tracking_report import Outcome, Setting, render_report
 from birdslam.runtime.cli.parser import METHODS
-from birdslam.runtime.cli.tracking_job import Job, run_sequence
+from birdslam.runtime.cli.tracking_job import Job, frames_to_make, run_sequence
 from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.progress import Progress, time_to_go
 
 PUBLISHED = Path(tables.__file__).with_name("published.toml")
 
@@ -99,22 +101,31 @@ def _jobs(options: argparse.Namespace, configuration: Configuration) -> list[Job
 
 def _run_all(jobs: Sequence[Job], processes: int) -> list[Outcome]:
     """Every job in a process of its own, and a line for each that is done."""
+    begun_s = time.monotonic()
     if processes == 1 or len(jobs) == 1:
-        return [_shown(run_sequence(job), k, jobs) for k, job in enumerate(jobs, start=1)]
+        with Progress("front end", sum(map(frames_to_make, jobs))) as progress:
+            outcomes = []
+            for k, job in enumerate(jobs, start=1):
+                outcome = run_sequence(job, progress.advance)
+                progress.clear()
+                outcomes.append(_shown(outcome, k, jobs, begun_s))
+            return outcomes
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
         running = [pool.submit(run_sequence, job) for job in jobs]
         try:
-            return [_shown(done.result(), k, jobs) for k, done in enumerate(as_completed(running), start=1)]
+            return [_shown(done.result(), k, jobs, begun_s) for k, done in enumerate(as_completed(running), start=1)]
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
-def _shown(outcome: Outcome, number: int, jobs: Sequence[Job]) -> Outcome:
+def _shown(outcome: Outcome, number: int, jobs: Sequence[Job], begun_s: float) -> Outcome:
+    left = len(jobs) - number
+    to_go = f", {time_to_go((time.monotonic() - begun_s) * left / number)} to go" if left else ""
     print(
         f"sequence {outcome.sequence}: {len(outcome.frames)} frames, {jobs[0].seeds} seeds done "
-        f"({number} of {len(jobs)})",
+        f"({number} of {len(jobs)}{to_go})",
         file=sys.stderr,
         flush=True,
     )

@@ -30,7 +30,8 @@ from birdslam.perception import ModelError, ModelSpec, Network, load_network, sh
 from birdslam.perception.manifest_file import Glance, find_as
 from birdslam.perception.pointnet import PointNet, load_pointnet
 from birdslam.runtime import model_store
-from birdslam.runtime.cli.download import SCHEMES, download, on_terminal
+from birdslam.runtime.cli.download import SCHEMES, download
+from birdslam.runtime.progress import Progress
 
 CATALOGUE = Path(__file__).parent / "catalogue.toml"
 TIMEOUT_S = 30.0  # without a byte
@@ -270,7 +271,13 @@ def _manifest_text(order: Order, network: Path, sha256: str, scratch: Path) -> t
 
 def _fetch(source: str, target: Path, limit_bytes: int) -> None:
     if _is_address(source):
-        download(source, target, limit_bytes, TIMEOUT_S, on_terminal(target.stem))
+        with Progress(target.stem, None, "MB", 1e6) as progress:
+
+            def got(got_bytes: int, total_bytes: int | None) -> None:
+                progress.total = total_bytes
+                progress.reach(got_bytes)
+
+            download(source, target, limit_bytes, TIMEOUT_S, got)
         return
     path = Path(source).expanduser()
     try:

@@ -25,7 +25,8 @@ def configuration_of(options: argparse.Namespace) -> Configuration:
             raise ConfigurationError(f"--model {text}: expected ROLE=PATH, or the name of a model")
     keys = {"source": "source.uri", "rate": "source.rate", "stride": "source.stride"}
     keys |= {"record": "recording.file", "record_images": "recording.images"}
-    for name in ("source", "rate", "stride", "camera", "vehicle", "record", "record_images", "output"):
+    keys |= {"smooth": "results.smooth", "video": "results.video"}
+    for name in ("camera", "vehicle", "output", *keys):
         value = getattr(options, name, None)
         if value is not None:
             overrides[keys.get(name, name)] = _number(value) if name == "rate" else value

@@ -5,34 +5,51 @@ from __future__ import annotations
 import argparse
 import importlib.metadata
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from birdslam.evaluation.final import FinalTracks, last_seen, write_final_ego
 from birdslam.evaluation.results import Recorder
+from birdslam.evaluation.video import DriveVideo, check_video
 from birdslam.runtime.configuration import ConfigurationError, parse_setting
+from birdslam.runtime.progress import Progress
+from birdslam.runtime.recording.recorded_drive import measurements_of
 from birdslam.runtime.recording.recording import Recording, RecordingError
 from birdslam.runtime.replay import replay as replaying
 from birdslam.runtime.replay.report import told
-from birdslam.types import Estimate
+from birdslam.runtime.supervision.final_results import recorded_frames
+from birdslam.types import Estimate, MapUpdate
 
 
 def replay(options: argparse.Namespace) -> int:
     """`birdslam replay`: 0 where the back end gives the recorded estimates, 1 where not; or new results."""
-    recording = Recording(options.recording)
-    if options.set or options.output:
-        settings = dict(parse_setting(text) for text in options.set)
-        print(_results(recording, settings, options.output or Path("out") / options.recording.stem))
-        return 0
+    with Progress("replay", _size(options.recording), "MB", 1e6) as progress:
+        recording = Recording(options.recording, progress.reach)
+        if options.set or options.output or options.smooth or options.video:
+            said, status = _results(recording, options), 0
+        else:
+            said, status = _compared(recording)
+    print(said)
+    return status
+
+
+def _compared(recording: Recording) -> tuple[str, int]:
+    """What is said of the comparison, and the exit status."""
     verdict = replaying.compare(recording)
-    print(told(verdict, recording))
+    lines = [told(verdict, recording)]
     if verdict.difference is not None:
         for name, version in recording.about.versions.items():
             now = _version(name)
             if now is not None and now != version:
-                print(f"  recorded with {name} {version}, here it is {now}")
-    return int(not verdict.same)
+                lines.append(f"  recorded with {name} {version}, here it is {now}")
+    return "\n".join(lines), int(not verdict.same)
+
+
+def _size(path: Path) -> int | None:
+    return path.stat().st_size if path.is_file() else None
 
 
 def _version(library: str) -> str | None:
@@ -42,20 +59,38 @@ def _version(library: str) -> str | None:
         return None
 
 
-def _results(recording: Recording, settings: Mapping[str, Any], output: Path) -> str:
+def _results(recording: Recording, options: argparse.Namespace) -> str:
     """Writes what the back end makes of the recorded measurements; says so."""
     if recording.camera is None:
         raise RecordingError(f"{recording.path}: its configuration has no camera")
-    config = _changed(replaying.back_end(recording), settings)
-    with Recorder(output, recording.camera) as recorder:
+    config = _changed(replaying.back_end(recording), dict(parse_setting(text) for text in options.set))
+    output: Path = options.output or Path("out") / recording.path.stem
+    with ExitStack() as stack:
+        video = None
+        if options.video:
+            camera, rate_hz, frames = recorded_frames([recording.path])
+            check_video(Path(options.video), camera, rate_hz)
+            video = stack.enter_context(DriveVideo(Path(options.video), camera, rate_hz, frames))
+        recorder = stack.enter_context(Recorder(output, recording.camera))
+        final = None
+        if options.smooth:
+            final = FinalTracks(output / "tracks", last_seen(measurements_of([recording])))
         for record in replaying.estimates(recording, config):
-            if isinstance(record, Estimate):
-                recorder.add(record)
-            else:
-                recorder.add_map(record)
+            if final is not None:
+                final.take(record)
+            for results in (recorder, *([video] if video else [])):
+                if isinstance(record, Estimate):
+                    results.add(record)
+                elif isinstance(record, MapUpdate):
+                    results.add_map(record)
         graph, weights = map(msgspec.to_builtins, config)
         recorder.finish({"source": str(recording.path), "slam": {"graph": graph, "weights": weights}})
-    return f"results in {output}"
+        if final is not None:
+            final.finish()
+            write_final_ego(output)
+        if video is not None:
+            video.finish()
+    return f"results in {output}" + (f", video {options.video}" if options.video else "")
 
 
 def _changed(config: replaying.BackEnd, settings: Mapping[str, Any]) -> replaying.BackEnd:

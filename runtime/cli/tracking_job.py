@@ -80,8 +80,14 @@ def frames_of(text: str, sequence: TrackingSequence, published: Published) -> ra
     return frames
 
 
-def run_sequence(job: Job) -> Outcome:
-    """All methods and ablations on one sequence."""
+def frames_to_make(job: Job) -> int:
+    """How many frames the front end goes through for a job, seeds and logs together."""
+    frames = frames_of(job.frames, open_tracking(job.root, job.sequence), job.published)
+    return len(frames) * job.seeds * (bool(job.methods) + bool(_variants(job)))
+
+
+def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> Outcome:
+    """All methods and ablations on one sequence; `frame_made` is told of each frame of the front end."""
     cv2.setNumThreads(1)
     sequence = open_tracking(job.root, job.sequence)
     frames = frames_of(job.frames, sequence, job.published)
@@ -90,7 +96,7 @@ def run_sequence(job: Job) -> Outcome:
     variants = _variants(job)
     trials, ablations, log = [], [], []
     with ExitStack() as stack:
-        make = _log_maker(job, sequence, frames, stack)
+        make = _log_maker(job, sequence, frames, stack, frame_made)
         for seed in range(job.seeds):
             log = make(seed, slam.frontend)
             if chosen:
@@ -137,7 +143,7 @@ def _variants(job: Job) -> dict[str, Method]:
 
 
 def _log_maker(
-    job: Job, sequence: TrackingSequence, frames: range, stack: ExitStack
+    job: Job, sequence: TrackingSequence, frames: range, stack: ExitStack, frame_made: Callable[[], object]
 ) -> Callable[[int, FrontEndConfig], list[Measurements]]:
     """Gives the log of a seed."""
     paths = {} if sequence.images is None else find_images(sequence.images)
@@ -163,7 +169,12 @@ def _log_maker(
             configuration = msgspec.structs.replace(job.configuration, source=lossless)
             perceive = stack.enter_context(Inference(configuration)).networks.start
         odometry = _odometry(job, sequence, frames, np.random.default_rng([seed, *sequence.name.encode()]))
-        return make_log(sequence, frames, odometry, perceive, image_of if looks else None, config)
+
+        def counted(frame: int, image: NDArray[np.uint8]) -> Pending:
+            frame_made()
+            return perceive(frame, image)
+
+        return make_log(sequence, frames, odometry, counted, image_of if looks else None, config)
 
     return make
 

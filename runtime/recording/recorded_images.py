@@ -43,6 +43,7 @@ class RecordedImages(Recording):
         if not refs:
             raise DatasetError(f"{path}: holds no frame")
         self._first, self._last = refs[0], refs[-1]
+        self.first_frame = self._first.frame_id  # of the run; frames count from it
         span_ns = self._last.t_source_ns - self._first.t_source_ns
         frames = self._last.frame_id - self._first.frame_id
         if frames > 0 and span_ns > 0:

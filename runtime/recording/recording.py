@@ -23,7 +23,7 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -231,8 +231,10 @@ class Recording:
     left out; `end` is what its writer said at last.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, on_read: Callable[[int], object] | None = None) -> None:
+        """`on_read` is told how many bytes of the file have been read, again and again, for who shows progress."""
         self.path = path
+        self._on_read = on_read
         self.complete = False
         self.damaged = 0
         self.end: dict[str, str] = {}
@@ -274,9 +276,12 @@ class Recording:
             records = StreamReader(file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records
             while True:
                 try:
-                    yield next(records)
+                    record = next(records)
                 except (StopIteration, *_TORN):
                     return
+                if self._on_read is not None:
+                    self._on_read(file.tell())
+                yield record
 
     def messages(self, channels: Collection[str] | None = None) -> Iterator[Recorded]:
         """Those of some channels (None: of all) in the order in which they were written."""

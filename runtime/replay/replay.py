@@ -268,13 +268,14 @@ def back_end(recording: Recording) -> BackEnd:
     return recording.part("slam.graph", GraphConfig), recording.part("slam.weights", WeightsConfig)
 
 
-def estimates(recording: Recording, config: BackEnd) -> Iterator[Estimate | MapUpdate]:
-    """What the back end makes of the recorded measurements with another configuration."""
+def estimates(recording: Recording, config: BackEnd) -> Iterator[Measurements | Estimate | MapUpdate]:
+    """What the back end makes of the recorded measurements with another configuration: each after its measurements."""
     graph = PoseGraph(*config)
     for message in recording.messages(("v1/measurements",)):
         measurements = _record(message.data, Measurements)
         if Status.END_OF_SOURCE in measurements.status:
             continue
+        yield measurements
         yield graph.optimise(measurements)
         gained = graph.map_update()
         if gained is not None:

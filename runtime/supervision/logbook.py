@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
 
 from birdslam.runtime.latency import Distribution, stages
+from birdslam.runtime.progress import time_to_go
 from birdslam.runtime.transport.bus import Bus, BusClosed, Message
 from birdslam.types import Estimate, MapUpdate, Status
 
@@ -122,8 +123,8 @@ class Logbook:
         span_ns = self._last_ns - self._first_ns
         return (self.recorded - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
 
-    def status_line(self) -> str:
-        """What goes on now: rate, age, tracks and warnings of the newest frames."""
+    def status_line(self, frames: int | None = None) -> str:
+        """What goes on now: rate, age, tracks and warnings of the newest frames. `frames`: how many there will be."""
         recent, latest = tuple(self._recent), self._latest
         if latest is None or not recent:
             return "waiting for the first frame"
@@ -131,9 +132,13 @@ class Logbook:
         rate_hz = (len(recent) - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
         ages = sorted(age for _, age in recent)
         trouble = " ".join(status.value for status in latest.status)
+        to_go = ""
+        if frames is not None and self.rate_hz > 0.0:
+            to_go = f" of {frames}, {time_to_go((frames - 1 - latest.frame_id) / self.rate_hz)} to go"
         return (
-            f"frame {latest.frame_id}  {rate_hz:.1f} Hz  age {ages[len(ages) // 2]:.0f} ms (max {ages[-1]:.0f})  "
-            f"tracks {len(latest.vehicles)}  {'valid' if latest.valid else 'NOT VALID'}  {trouble}"
+            f"frame {latest.frame_id}{to_go}  {rate_hz:.1f} Hz  "
+            f"age {ages[len(ages) // 2]:.0f} ms (max {ages[-1]:.0f})  tracks {len(latest.vehicles)}  "
+            f"{'valid' if latest.valid else 'NOT VALID'}  {trouble}"
         ).rstrip()
 
     def figures(self) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Any
 from birdslam.runtime.configuration import Configuration, dump
 from birdslam.runtime.environment import LIBRARIES
 from birdslam.runtime.supervision.demo_report import rows as truth_rows
+from birdslam.runtime.supervision.final_results import rows as final_rows
 from birdslam.runtime.supervision.logbook import Logbook
 from birdslam.runtime.supervision.stations import Station
 from birdslam.runtime.topology import NODES
@@ -87,6 +88,7 @@ def table(summary: dict[str, Any], output: Path) -> str:
         *((f"  {name} begun anew", f"{n} times") for name, n in summary["restarts"].items() if n),
         *((f"  {status}", f"{n} frames") for status, n in summary["statuses"].items()),
         *truth_rows(summary),
+        *final_rows(summary),
         *(("recorded", _recorded(recording)) for recording in [summary.get("recording")] if recording),
         ("results in", str(output)),
     ]

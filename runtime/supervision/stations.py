@@ -107,7 +107,7 @@ class Station:
         closed its file, and nothing more.
         """
         status, ended = self.process.exit_status, bool(self.process.vitals["ended"])
-        in_order = status == 0 and ended and (self.duty.essential or not self.stall)
+        in_order = ended and (status == 0 if self.duty.essential else not self.stall)
         return in_order or status in self.duty.final_statuses
 
     @property

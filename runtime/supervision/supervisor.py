@@ -21,16 +21,19 @@ from typing import Any
 
 import msgspec
 
-from birdslam.evaluation.results import Recorder, claim_directory
+from birdslam.datasets.recording import DatasetError
+from birdslam.evaluation.results import Recorder, ResultsError, claim_directory
 from birdslam.perception import load_network
 from birdslam.perception.pointnet import load_pointnet
 from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
 from birdslam.runtime.environment import INTERRUPTED_STATUS, USER_ERROR_STATUS
-from birdslam.runtime.nodes.sources import CameraSource, open_source
+from birdslam.runtime.nodes.sources import CameraSource, RecordedSource, open_source
 from birdslam.runtime.process import realtime
 from birdslam.runtime.process.child import give_back_memory
 from birdslam.runtime.process.notify import Notifier
-from birdslam.runtime.supervision.demo_report import Witness
+from birdslam.runtime.recording.recording import RecordingError
+from birdslam.runtime.supervision.demo_report import DemoReport
+from birdslam.runtime.supervision.final_results import FinalResults, check_results
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.supervision.logbook import Logbook, Results
 from birdslam.runtime.supervision.query_server import QueryServer
@@ -53,44 +56,40 @@ DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come t
 def run(configuration: Configuration) -> int:
     """A whole run; gives the exit status. Raises what a user has to mend before anything is started."""
     realtime.one_heap()  # before networks are looked at, which begins threads
-    configuration, models = check(configuration)
+    configuration, models, frames = check(configuration)
     give_back_memory()  # the networks that were looked at
     output = Path(configuration.output)
     realtime.reserve(*DRIVE_MIB)
     live = LiveLine(sys.stdout)
-    with ExitStack() as stack:
-        stack.enter_context(VehicleLock(configuration.vehicle, configuration.runtime_dir))
-        claim_directory(output / "logs")
-        if not models:
-            live.say(WITHOUT_MODELS)
-        assert configuration.camera is not None
-        recorder = Recorder(output, configuration.camera)
-        bus = stack.enter_context(
-            Bus(
-                configuration.vehicle,
-                "supervisor",
-                hub=True,
-                runtime_dir=configuration.runtime_dir,
-                lossless=configuration.lossless,
-            )
-        )
-        witness = Witness.of(configuration)
-        listeners: list[Results] = [QueryServer(configuration, bus), *([witness] if witness else [])]
-        logbook = Logbook(bus, recorder, tolerant=configuration.restarts, listeners=listeners)
-        stack.callback(logbook.close)
-        bus.declare_alive()
-        files = None
-        if configuration.recording.file:
-            files = RecordingFiles(Path(configuration.recording.file), models)
-        supervisor = Supervisor(configuration, logbook, live, files)
-        supervisor.run(output / "logs")
-    live.clear()
-    summary = summarise(configuration, supervisor.nodes, logbook, models, supervisor.ended)
-    if files is not None and supervisor.recorder is not None:
-        summary["recording"] = files.figures(supervisor.recorder)
+    demo = DemoReport.of(configuration)
+    final = FinalResults(configuration, demo)
+    with ExitStack() as until_written:
+        with ExitStack() as stack:
+            stack.enter_context(VehicleLock(configuration.vehicle, configuration.runtime_dir))
+            claim_directory(output / "logs")
+            if not models:
+                live.say(WITHOUT_MODELS)
+            assert configuration.camera is not None
+            recorder = Recorder(output, configuration.camera)
+            recorded = final.recorded(until_written)
+            files = RecordingFiles(Path(recorded.recording.file), models) if recorded.recording.file else None
+            logbook = _logbook(configuration, recorder, demo, stack)
+            supervisor = Supervisor(recorded, logbook, live, files, frames)
+            supervisor.run(output / "logs")
+        live.clear()
+        summary = summarise(configuration, supervisor.nodes, logbook, models, supervisor.ended)
+        if configuration.recording.file and files is not None and supervisor.recorder is not None:
+            summary["recording"] = files.figures(supervisor.recorder)
+        try:
+            if demo is not None and (found := demo.grade()) is not None:
+                summary["truth"] = msgspec.to_builtins(found)
+            if logbook.recorded:
+                summary |= final.write(files.paths if files is not None else ())
+        except (ResultsError, DatasetError, RecordingError, OSError) as error:
+            supervisor.fail(f"final results can't be written: {error}", 1)
+        except KeyboardInterrupt:
+            supervisor.fail("the final results were cut short", INTERRUPTED_STATUS)
     try:
-        if witness is not None:
-            summary |= witness.finish(output)
         recorder.finish(summary)
     except OSError as error:
         supervisor.fail(f"results can't be written: {error}", 1)
@@ -102,17 +101,39 @@ def run(configuration: Configuration) -> int:
     return supervisor.exit_status
 
 
-def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any]]:
+def _logbook(configuration: Configuration, recorder: Recorder, demo: DemoReport | None, stack: ExitStack) -> Logbook:
+    """The supervisor on the bus: it takes the results, and answers queries about them."""
+    bus = stack.enter_context(
+        Bus(
+            configuration.vehicle,
+            "supervisor",
+            hub=True,
+            runtime_dir=configuration.runtime_dir,
+            lossless=configuration.lossless,
+        )
+    )
+    listeners: list[Results] = [QueryServer(configuration, bus), *([demo] if demo else [])]
+    logbook = Logbook(bus, recorder, tolerant=configuration.restarts, listeners=listeners)
+    stack.callback(logbook.close)
+    bus.declare_alive()
+    return logbook
+
+
+def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any], int | None]:
     """Everything that can be wrong before a process is started; fills in the source's own camera.
 
-    Gives the networks' descriptions too. Raises ConfigurationError, SourceError, datasets.DatasetError or
-    perception.ModelError.
+    Gives the networks' descriptions too, and how many frames the source has, where it has an end that is known. Raises
+    ConfigurationError, SourceError, datasets.DatasetError, perception.ModelError or results.ResultsError.
     """
     check_runtime_dir(configuration.vehicle, configuration.runtime_dir)
     source = open_source(configuration)
     configuration = complete(configuration, source.camera, source.rate_hz)
+    frames: int | None = None
     if isinstance(source, CameraSource):
         source.close()  # capture opens it for itself
+    elif isinstance(source, RecordedSource) and not configuration.source.loop:
+        frames = min(len(source.recording), configuration.source.frames or len(source.recording)) or None
+    check_results(configuration, source)
     recording = configuration.recording
     if recording.file:
         file = choose_file(recording, configuration.vehicle)
@@ -122,7 +143,7 @@ def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any]]:
     }
     if configuration.models.pointnet is not None:
         models["pointnet"] = load_pointnet(configuration.models.pointnet).describe()
-    return configuration, models
+    return configuration, models, frames
 
 
 def check_runtime_dir(vehicle: str, runtime_dir: Path | None) -> None:
@@ -138,14 +159,21 @@ class Supervisor:
     """The nodes of one run and its recorder, from their start to their end."""
 
     def __init__(
-        self, configuration: Configuration, logbook: Logbook, live: LiveLine, files: RecordingFiles | None = None
+        self,
+        configuration: Configuration,
+        logbook: Logbook,
+        live: LiveLine,
+        files: RecordingFiles | None = None,
+        frames: int | None = None,
     ) -> None:
+        """`frames` is how many the source has, for the time to go; None where nobody knows."""
         self.failure = ""
         self.exit_status = 0
         self._config = configuration
         self._logbook = logbook
         self._live = live
         self._files = files
+        self._frames = frames
         self.recorder: Station | None = None
         self._notifier = Notifier()
         self._disk_said = False
@@ -298,7 +326,7 @@ class Supervisor:
         if self._logbook.unwritten is not None and not self._disk_said:
             self._disk_said = True
             self._live.say(f"results are not written any more: {self._logbook.unwritten}")
-        status = self._logbook.status_line()
+        status = self._logbook.status_line(self._frames)
         if self._files is not None and self.recorder is not None:
             status = f"{status}  {self._files.status(self.recorder)}"
         self._live.update(status)

@@ -1,0 +1,189 @@
+"""What is made of a run when it is over: the final trajectories, and the video. Nobody waits for it.
+
+Both are made of what the recorder wrote, so that they cost the vehicle no time and no memory: of the file of --record,
+else of a temporary one in the output directory, which goes when the results are there (a kill -9 leaves it behind). A
+video shows a recording's own frames; those of a live camera are read from the recording again. The shipped drive is
+short: what was estimated of it is kept in memory, and its truth is drawn too.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from birdslam.datasets.recording import DatasetError
+from birdslam.evaluation.final import FinalTracks, last_seen, write_final_ego
+from birdslam.evaluation.results import ResultsError
+from birdslam.evaluation.video import CODEC, DriveVideo, Floats, Image, check_video
+from birdslam.geometry.camera import Camera, Undistorter
+from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.nodes.sources import Source, open_source
+from birdslam.runtime.progress import Progress
+from birdslam.runtime.recording.recorded_drive import measurements_of, recorded_drive
+from birdslam.runtime.recording.recorded_images import RecordedImages
+from birdslam.runtime.recording.recording import Recording
+from birdslam.runtime.supervision.demo_report import DemoReport
+from birdslam.types import Estimate, MapUpdate, Measurements
+
+DEMO_VIDEO = "drive.mp4"  # of the shipped drive, asked for or not
+TEMPORARY = "drive.mcap"
+
+Frames = Iterator[tuple[int, int, Image | None]]  # frame_id, source time in ns, undistorted image
+Records = Iterable[Measurements | Estimate | MapUpdate]
+
+
+def check_results(configuration: Configuration, source: Source) -> None:
+    """Raises ConfigurationError or ResultsError where what is asked for can't be made."""
+    results, recording = configuration.results, configuration.recording
+    if not results.video:
+        return
+    check_video(Path(results.video), source.camera, source.rate_hz)
+    if configuration.live and recording.file and not recording.images:
+        raise ConfigurationError(
+            "results.video: the frames of a live camera are gone when the drive is over: record them (--record-images)"
+        )
+
+
+class FinalResults:
+    """Of one run."""
+
+    def __init__(self, configuration: Configuration, demo: DemoReport | None) -> None:
+        self._config, self._demo = configuration, demo
+        self._asked_video = bool(configuration.results.video)
+        self._video: Path | None = None
+        if self._asked_video:
+            self._video = Path(configuration.results.video)
+        elif demo is not None:
+            self._video = Path(configuration.output) / DEMO_VIDEO
+
+    def recorded(self, stack: ExitStack) -> Configuration:
+        """The configuration of the run, with a temporary recording where one is needed and none was asked for."""
+        config = self._config
+        needed = config.results.smooth or (self._video is not None and self._demo is None)
+        if not needed or config.recording.file:
+            return config
+        directory = stack.enter_context(tempfile.TemporaryDirectory(prefix=".recording-", dir=config.output))
+        images = config.live and self._video is not None
+        recording = msgspec.structs.replace(config.recording, file=str(Path(directory) / TEMPORARY), images=images)
+        return msgspec.structs.replace(config, recording=recording)
+
+    def write(self, files: Sequence[Path]) -> dict[str, Any]:
+        """Writes what was asked for, from the recording in `files`; what summary.json says of it.
+
+        Raises ResultsError, DatasetError, RecordingError or OSError.
+        """
+        summary: dict[str, Any] = {}
+        if self._config.results.smooth:
+            summary["final_tracks"] = smooth(files, Path(self._config.output))
+        if self._video is not None and (self._demo is None or self._demo.records):
+            try:
+                self._draw(self._video, files)
+                summary["video"] = str(self._video)
+            except ResultsError:
+                if self._asked_video:
+                    raise
+                summary["video"] = None
+        return summary
+
+    def _draw(self, path: Path, files: Sequence[Path]) -> None:
+        truth = None if self._demo is None else self._demo.true_outlines
+        records: Records = recorded_drive(map(Recording, files)) if self._demo is None else self._demo.records
+        if self._config.live:
+            camera, rate_hz, frames = recorded_frames(files)
+        else:
+            source = open_source(self._config)
+            camera, rate_hz, frames = source.camera, source.rate_hz, source_frames(source)
+        draw_video(path, camera, rate_hz, frames, records, _last_frame(files, self._demo), truth)
+
+
+def smooth(files: Sequence[Path], output: Path) -> int:
+    """Writes the final trajectories beside the live ones in `output`; gives the number of vehicles.
+
+    Read twice, so that no more than the vehicles that are in sight at once is kept in memory, however long the drive.
+    """
+    size = sum(path.stat().st_size for path in files)
+    with Progress("smoothing", 2 * size, "MB", 1e6) as progress:
+        tracks = FinalTracks(output / "tracks", last_seen(measurements_of(_recordings(files, progress, 0))))
+        for record in recorded_drive(_recordings(files, progress, size)):
+            tracks.take(record)
+        tracks.finish()
+    write_final_ego(output)
+    return tracks.vehicles
+
+
+def _recordings(files: Sequence[Path], progress: Progress, start: int) -> Iterator[Recording]:
+    for path in files:
+        yield Recording(path, lambda read, start=start: progress.reach(start + read))  # type: ignore[misc]
+        start += path.stat().st_size
+
+
+def draw_video(
+    path: Path,
+    camera: Camera,
+    rate_hz: float,
+    frames: Frames,
+    records: Records,
+    last_frame: int | None,
+    truth: Callable[[int], Sequence[Floats]] | None = None,
+) -> None:
+    """Draws a whole drive. Raises ResultsError where the file can't be written."""
+    with Progress("video", last_frame) as progress, DriveVideo(path, camera, rate_hz, frames, truth) as video:
+        for record in records:
+            if isinstance(record, Estimate):
+                video.add(record)
+                progress.reach(video.drawn_frame)
+            elif isinstance(record, MapUpdate):
+                video.add_map(record)
+        video.finish()
+
+
+def source_frames(source: Source) -> Frames:
+    """The frames of a recording, numbered as capture does."""
+    undistort = Undistorter(source.camera)
+    for frame_id, recorded in enumerate(source.frames()):
+        image = recorded.image
+        fits = image is not None and image.shape[1::-1] == (source.camera.width_px, source.camera.height_px)
+        yield frame_id, recorded.t_source_ns, undistort(image) if image is not None and fits else None
+
+
+def recorded_frames(files: Sequence[Path]) -> tuple[Camera, float, Frames]:
+    """The camera, its rate and the frames of a recording with images, by their numbers in the run.
+
+    Raises DatasetError where the first file has none.
+    """
+    first = RecordedImages(files[0])
+
+    def frames() -> Frames:
+        for path in files:
+            try:
+                images = RecordedImages(path)
+            except DatasetError:  # of a recorder that was begun anew and ended before its second frame
+                continue
+            for frame in images.frames():
+                yield images.first_frame + frame.index, frame.t_source_ns, frame.image
+
+    return first.camera, first.rate_hz, frames()
+
+
+def _last_frame(files: Sequence[Path], demo: DemoReport | None) -> int | None:
+    """The frame of the last estimate, for the time to go."""
+    if demo is not None:
+        return max((r.frame_id for r in demo.records if isinstance(r, Estimate)), default=None)
+    return max((m.frame_id for m in measurements_of(map(Recording, files))), default=None)
+
+
+def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """The lines of the table of a run that speak of the final results."""
+    out = []
+    if "final_tracks" in summary:
+        out.append(
+            ("final trajectories", f"of {summary['final_tracks']} vehicles: tracks/ID.final.tum.txt, ego.final.*")
+        )
+    if "video" in summary:
+        out.append(("video", summary["video"] or f"none: this OpenCV can't write {CODEC}"))
+    return out
