@@ -16,6 +16,8 @@ import pytest
 from tests.systemd_machine import ROOT, Machine, why_not
 from tests.test_pipeline import drive
 
+pytestmark = pytest.mark.processes
+
 __all__ = ["drive"]  # a fixture
 
 DEPLOY = ROOT / "deploy"
@@ -133,7 +135,7 @@ def estimates(machine: Machine, count: int = 1) -> list[dict]:
 
 def node(machine: Machine, name: str) -> int:
     """The process of a node; 0 where there is none."""
-    found = [pid for line, pid in machine.pids("birdslam").items() if f" runtime.runner {name} " in line]
+    found = [pid for line, pid in machine.pids("birdslam").items() if f" birdslam.runtime.nodes.runner {name} " in line]
     return found[0] if found else 0
 
 
@@ -183,6 +185,8 @@ def test_the_sandbox_from_inside(machine: Machine) -> None:
     assert {what for what, refused in json.loads(said).items() if not refused} == set()
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_install_start_break_and_remove(machine: Machine) -> None:
     """One long story, since each step needs the one before it."""
     # Installed: a user, a virtual environment, a configuration; a second run changes nothing.
@@ -225,6 +229,7 @@ def test_install_start_break_and_remove(machine: Machine) -> None:
     # A node is killed, then another stalls: the supervisor's to mend. systemd sees no restart.
     for name, number in (("optimize", signal.SIGKILL), ("perceive", signal.SIGSTOP)):
         killed = node(machine, name)
+        assert killed > 1
         machine("kill", f"-{number}", str(killed))
         machine.until(lambda: node(machine, name) not in (0, killed), f"{name} is back")  # noqa: B023
         assert estimates(machine)
@@ -233,6 +238,7 @@ def test_install_start_break_and_remove(machine: Machine) -> None:
     # The supervisor stalls: systemd's watchdog ends it and starts it anew. Then it is killed outright.
     for restarts, number in enumerate((signal.SIGSTOP, signal.SIGKILL), 1):
         nodes = [node(machine, name) for name in NODES]
+        assert 0 not in nodes
         machine("kill", f"-{number}", machine.show("birdslam", "MainPID"))
         machine.until(lambda: machine.show("birdslam", "NRestarts") == str(restarts), "a restart")  # noqa: B023
         machine.until(lambda: machine("systemctl", "is-active", "birdslam", check=False) == "active", "active again")
