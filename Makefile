@@ -6,7 +6,10 @@ TRAIN_VENV := .venv-train
 DATA := $(or $(BIRDSLAM_DATA),../shared/data)
 MODELS := $(or $(BIRDSLAM_MODELS),../shared/models)
 
-.PHONY: setup test test-slow fuzz faults onroad perf lint train demo demo-kitti clean
+CORES := $(or $(shell nproc 2>/dev/null),2)
+ON_EACH_CHANGE := not slow and not faults and not onroad
+
+.PHONY: setup test test-slow wheel-test fuzz faults onroad perf lint train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -18,11 +21,19 @@ $(VENV)/.ready: pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	@touch $@
 
+# First the tests that compute, one on each core; then those that start processes and wait for them, two at a time
 test: setup
-	$(BIN)/python -m pytest -m 'not slow and not faults and not onroad'
+	$(BIN)/python -m pytest -n $(CORES) --dist worksteal -m 'not processes and $(ON_EACH_CHANGE)'
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'processes and $(ON_EACH_CHANGE)'
 
+# Then property tests with examples that are new each time
 test-slow: setup
 	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -n $(CORES) --dist worksteal -m 'hypothesis and $(ON_EACH_CHANGE)' --hypothesis-profile=explore
+
+# What a user installs: the wheel in an empty environment, without the checkout
+wheel-test: setup
+	$(BIN)/python -m tests.installed_wheel
 
 # A million mutated messages, references and files; FUZZ_SEED=N gives others.
 fuzz: setup

@@ -1,13 +1,35 @@
-"""Where real recordings and networks lie: `BIRDSLAM_DATA`, `BIRDSLAM_MODELS`, else ../shared beside the project."""
+"""Where real recordings and networks lie, how property tests are run, and which tests may start processes.
+
+`BIRDSLAM_DATA` and `BIRDSLAM_MODELS` name the folders of real recordings and networks; without them they lie in
+../shared beside the project.
+"""
 
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+from birdslam.runtime.environment import ENVIRONMENT
 
 ROOT = Path(__file__).resolve().parent.parent
+
+# As the nodes, and before any library is loaded: one thread for each, since tests run side by side
+os.environ.update(ENVIRONMENT, OPENCV_FOR_THREADS_NUM="1")
+
+# No time limits, since machines are shared. `make test` draws the same examples each time; `make test-slow` draws new
+# ones by the profile "explore", and prints how to repeat one that fails.
+settings.register_profile(
+    "repeat", deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.register_profile(
+    "explore", settings.get_profile("repeat"), derandomize=False, max_examples=1000, print_blob=True
+)
+settings.load_profile("repeat")
 
 
 def _folder(variable: str, default: str) -> Path:
@@ -27,3 +49,20 @@ def data_dir() -> Path:
 def models_dir() -> Path:
     """The folder of real networks; the test skips with its reason where there is none."""
     return _folder("BIRDSLAM_MODELS", "models")
+
+
+_may_start_processes = True
+
+
+def _watch_processes(event: str, arguments: tuple[Any, ...]) -> None:
+    if event == "subprocess.Popen" and arguments[0] == sys.executable and not _may_start_processes:
+        raise RuntimeError("a test that starts Python processes needs the marker `processes`")
+
+
+sys.addaudithook(_watch_processes)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Only tests with the marker `processes` start any: the others compute, and fill a core each."""
+    global _may_start_processes
+    _may_start_processes = item.get_closest_marker("processes") is not None

@@ -28,8 +28,10 @@ from birdslam.runtime.transport.presence import VehicleBusy, VehicleLock, ring_p
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES, Stage, Trace, encode
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
 
+pytestmark = pytest.mark.processes
+
 ROOT = Path(__file__).parent.parent
-LIMIT_S = 20.0
+LIMIT_S = 60.0
 
 
 @pytest.fixture

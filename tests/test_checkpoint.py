@@ -42,7 +42,7 @@ def worn(log: list[Measurements], break_at: int, blind_at: int) -> list[Measurem
     return log
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     world=st.sampled_from(WORLDS),
     cut=st.integers(0, 200),

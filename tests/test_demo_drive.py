@@ -94,13 +94,14 @@ def test_a_body_keeps_its_number_and_its_size(demo: DemoRecording) -> None:
     assert len(sizes) > 15
 
 
+@pytest.mark.processes
 def test_it_is_read_without_the_renderer() -> None:
     code = (
         "import sys; sys.modules['numba'] = sys.modules['torch'] = None\n"
         "from birdslam.datasets import open_recording\n"
         "assert next(open_recording('demo').frames()).image is not None"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=600)
 
 
 def test_it_is_a_source_like_others() -> None:

@@ -177,7 +177,7 @@ def test_one_pose_and_none() -> None:
 
 
 @given(seeds)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_agreement_with_evo(seed: int) -> None:
     truth = drive(seed)
     estimated = rigid(np.random.default_rng(seed)) @ shaken(truth, seed)
@@ -325,7 +325,6 @@ def box_and_returns(distance_m: float, rng: np.random.Generator) -> tuple[tuple[
 
 
 @given(st.floats(5.0, 30.0), seeds)
-@settings(deadline=None)
 def test_lidar_distance_is_that_of_the_near_face(distance_m: float, seed: int) -> None:
     box_px, points = box_and_returns(distance_m, np.random.default_rng(seed))
     found = lidar_distance_m(CAMERA, CAMERA.ground, points, box_px)

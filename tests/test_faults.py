@@ -17,6 +17,8 @@ from birdslam.perf.strikes import FAULTS
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.presence import ring_path
 
+pytestmark = pytest.mark.processes
+
 SHORT = (
     *("kill -9 perceive", "kill -9 optimize", "camera gone 1.5 s capture", "malformed measurements messages optimize"),
     "kill -9 of everything, second start all",
@@ -99,7 +101,7 @@ def nothing_leaks(place: Path, times: int) -> None:
             continue
         before = held(vehicle)
         epochs = [vehicle.planner.latest().estimate.epoch for _ in restarted(vehicle, times)]  # type: ignore[union-attr]
-        until_s = time.monotonic() + 10.0
+        until_s = time.monotonic() + 60.0
         while any(after > before[what] for what, after in held(vehicle).items()) and time.monotonic() < until_s:
             vehicle.planner.wait(0.1)  # a dead peer's link is given up after its lease
         after = held(vehicle)
@@ -124,7 +126,7 @@ def test_a_node_that_keeps_dying_ends_the_run_with_its_name(place: Path) -> None
         vehicle.node("optimize").send_signal(signal.SIGKILL)
         vehicle.settle(0.3)
         vehicle.node("optimize").send_signal(signal.SIGKILL)
-        assert vehicle.process.wait(30.0) == 1
+        assert vehicle.process.wait(120.0) == 1
         last = (place / "run.log").read_text().splitlines()[-1]
         assert last.startswith("birdslam: optimize was killed by SIGKILL")
         assert "2 times in 60 s: it is not begun anew" in last

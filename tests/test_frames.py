@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.runtime.transport.ring import FrameError, FrameReader, FrameRing
@@ -60,7 +60,6 @@ def test_every_frame_that_fits_comes_back(tmp_path_factory: pytest.TempPathFacto
     path = tmp_path_factory.mktemp("frames") / "ring"
     with FrameRing(path, HEIGHT_PX, WIDTH_PX, slots=2) as ring, FrameReader(path) as reader:
 
-        @settings(deadline=None)
         @given(
             st.integers(1, HEIGHT_PX), st.integers(1, WIDTH_PX), st.sampled_from((1, 3)), st.integers(0), st.booleans()
         )
@@ -239,10 +238,11 @@ def numbered(n: int, epoch: int) -> FrameRef:
     return ref_of(np.empty((96, 128, 3), np.uint8), (n % 2, 2 * (n // 2 + 1)), epoch)
 
 
+@pytest.mark.processes
 def test_a_writer_killed_in_the_middle_of_a_frame_leaves_no_half_frame(tmp_path: Path, reader: FrameReader) -> None:
     process, epoch, _ = start_writer(reader.path, die_at=5)
     with process:
-        assert process.wait(timeout=30) == -signal.SIGKILL
+        assert process.wait(timeout=120) == -signal.SIGKILL
         got = [reader.read(numbered(n, epoch)) for n in range(7)]
     # 3 lay in the slot that was being overwritten by 5
     assert [image is not None for image in got] == [False, False, False, False, True, False, False]
@@ -253,6 +253,7 @@ def test_a_writer_killed_in_the_middle_of_a_frame_leaves_no_half_frame(tmp_path:
     assert [path.name for path in tmp_path.iterdir()] == ["count"]
 
 
+@pytest.mark.processes
 def test_two_processes_under_stress_never_show_a_wrong_frame(reader: FrameReader) -> None:
     whole = missed = 0
     buffer = np.empty((96, 128, 3), np.uint8)
@@ -270,7 +271,7 @@ def test_two_processes_under_stress_never_show_a_wrong_frame(reader: FrameReader
                         whole += 1
         finally:
             process.kill()
-            process.communicate(timeout=30)
+            process.communicate(timeout=120)
         for n in range(max(int(count[0]) - 4, 0), int(count[0]) + 2):
             image = reader.read(numbered(n, epoch))
             assert image is None or (image == n % 251).all()

@@ -264,8 +264,8 @@ def test_a_logbook_goes_on_without_its_disk(tmp_path: Path) -> None:
         logbook = Logbook(hub, Full(), tolerant=True)
         with Bus("disk", "optimize", runtime_dir=tmp_path) as bus:
             out, gained = bus.publisher("estimate"), bus.publisher("map")
-            assert out.wait_matched(10.0)
-            assert gained.wait_matched(10.0)
+            assert out.wait_matched(60.0)
+            assert gained.wait_matched(60.0)
             gained.put(MapUpdate(epoch=0, frame_id=0), Trace((Stage("optimize", 1, 2),)))
             for number in range(3):
                 status = (Status.END_OF_SOURCE,) if number == 2 else ()
@@ -279,7 +279,7 @@ def test_a_logbook_goes_on_without_its_disk(tmp_path: Path) -> None:
                     **stamps,
                 )
                 out.put(estimate, Trace((Stage("optimize", 1, 2),)))
-            logbook.wait_over(10.0)
+            logbook.wait_over(60.0)
         assert logbook.ended
         assert (logbook.recorded, logbook.error) == (2, None)
         assert isinstance(logbook.unwritten, OSError)
@@ -297,6 +297,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / 80)
 """
 
 
+@pytest.mark.processes
 def test_a_frame_s_images_cost_no_page_of_the_kernel() -> None:
     """The allocator's settings of the nodes: what a frame's images leave is for those of the next."""
     if platform.libc_ver()[0] != "glibc":
@@ -327,6 +328,7 @@ print(faults)
 """
 
 
+@pytest.mark.processes
 def test_what_a_drive_fills_can_be_reserved() -> None:
     """Some 8 MiB of objects and a table of 2, made by a thread after the start."""
     plain, reserved = (
@@ -350,6 +352,7 @@ print(sys.getallocatedblocks() - before)
 """
 
 
+@pytest.mark.processes
 def test_what_python_keeps_of_freed_tuples_is_there_from_the_start() -> None:
     """Its store fills in the first half hour else, and looks like a leak."""
     if platform.python_implementation() != "CPython":

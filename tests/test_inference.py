@@ -111,7 +111,7 @@ def test_what_runs_aside_begins_when_its_frame_is_over(made: Made) -> None:
         future = aside(begun.set)
         assert not begun.wait(0.05)
         networks.over()
-        future.result(timeout=5.0)
+        future.result(timeout=60.0)
         assert begun.is_set()
         networks.start(frame(1))
         last = aside(lambda: 7)  # a run that is closed ends without waiting for a frame that does not end

@@ -21,7 +21,7 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[socket.so
     address = str(tmp_path_factory.mktemp("j") / "socket")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
         end.bind(address)
-        end.settimeout(5.0)
+        end.settimeout(60.0)
         yield end, address
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import onnxruntime as ort
 import pytest
 import tiny_networks as tiny
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto
 
@@ -187,7 +187,6 @@ def test_shipped_manifests_are_sound() -> None:
         read_manifest(path)
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1e-45, 1e-39, 9e-21, -1e-30]))
 def test_tiny_weights_are_taken_out_and_nothing_else(
     tmp_path_factory: pytest.TempPathFactory, seed: int, tiny_: float

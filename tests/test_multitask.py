@@ -172,7 +172,7 @@ poses = st.builds(
 sizes_m = st.tuples(st.floats(3.0, 12.0), st.floats(1.5, 2.6), st.floats(1.3, 3.5))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(poses, sizes_m, st.sampled_from(["car", "truck", "bus"]), st.floats(0.45, 1.3))
 def test_what_is_taught_of_a_body_is_read_back(
     pose: SE2, size_m: tuple[float, float, float], label: str, focal: float
@@ -197,7 +197,7 @@ def test_what_is_taught_of_a_body_is_read_back(
     assert bodies.flip[0] < 0.05
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(poses)
 def test_a_mirrored_world_is_read_as_its_mirror(pose: SE2) -> None:
     cam = camera()

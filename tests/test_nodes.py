@@ -66,7 +66,7 @@ class Source:
             pixels = None if index == 1 else np.full((32, 64, 3), index, dtype=np.uint8)
             yield RecordedFrame(index, 1000 + index, pixels, "torn" if pixels is None else None)
         if self.live:
-            self.over.wait(30.0)
+            self.over.wait(600.0)
 
 
 def make_capture(
@@ -75,13 +75,14 @@ def make_capture(
     source: Source,
     rate: Any = "max",
     assignment: Assignment = FIRST,
+    camera_timeout_s: float = 60.0,
     **limits: Any,
 ) -> tuple[CaptureNode, Inbox, FrameReader]:
     monkeypatch.setattr(capture, "open_source", lambda configuration, must_open: source)
     configuration = Configuration(
         vehicle="test",
         camera=CAMERA,
-        source=SourceConfig(uri="kitti:none", rate=rate, camera_timeout_s=0.2),
+        source=SourceConfig(uri="kitti:none", rate=rate, camera_timeout_s=camera_timeout_s),
         runtime=RuntimeConfig(runtime_dir=str(place), **limits),
     )
     bus = FakeBus()
@@ -90,7 +91,7 @@ def make_capture(
 
 
 def receive(node: CaptureNode) -> Message:
-    until_s = time.monotonic() + 10.0
+    until_s = time.monotonic() + 60.0
     while time.monotonic() < until_s:
         message = node.receive(0.1)
         if message is not None:
@@ -167,7 +168,7 @@ def test_draining_ends_a_source_that_goes_on(monkeypatch: pytest.MonkeyPatch, tm
 
 def test_a_camera_that_falls_silent_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     source = Source(1, live=True)
-    node, _, reader = make_capture(monkeypatch, tmp_path, source, rate=None)
+    node, _, reader = make_capture(monkeypatch, tmp_path, source, rate=None, camera_timeout_s=0.2)
     next(node.step(receive(node).record))
     with pytest.raises(SourceError, match=r"source: has delivered no frame for 0\.2 s"):
         receive(node)

@@ -16,6 +16,8 @@ from birdslam.perf.live import Ask, drive
 from birdslam.perf.machine import Steal
 from birdslam.perf.system import WARM_UP_S, figures, table
 
+pytestmark = pytest.mark.processes
+
 SECONDS = 25.0
 BUDGET_FACTOR = 1.5  # over the configuration's
 DROPPED_SHARE = 0.02

@@ -80,7 +80,7 @@ def follow(used: list[int | None], noise_px: float = 0.5) -> tuple[list[tuple[fl
 
 
 @given(st.lists(st.integers(0, 4), min_size=FRAMES, max_size=FRAMES))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_vehicles_are_as_if_detections_had_come_in_time(delays: list[int]) -> None:
     """A detector that takes `delays` frames, one image at a time."""
     used: list[int | None] = []

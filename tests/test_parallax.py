@@ -163,7 +163,7 @@ def test_the_forgotten_are_gone_and_the_rest_stay() -> None:
 
 
 @given(st.lists(st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-8, 8)), min_size=3, max_size=25))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_outliers_leave_weights_and_covariances_what_they_are(noise: list[tuple[float, float, float]]) -> None:
     parallax = Parallax(ParallaxConfig())
     parallax.begin(0, np.array([30.0, 2.0]), SE2(), math.log(CLASS_M), SIGMAS)

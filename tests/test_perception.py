@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 import tiny_networks as tiny
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -32,8 +32,6 @@ from birdslam.perception.detection import MOST_CANDIDATES, YoloxDecoder, interse
 from birdslam.perception.manifest import FitPad, Input, Schedule, Stretch, Tiles, Yolox
 from birdslam.perception.views import Preparation, View, make_views
 from birdslam.types import Status
-
-law = settings(deadline=None)  # a slow machine breaks no law
 
 SIZE_PX = 128
 STRIDES = (8, 16, 32)
@@ -91,7 +89,6 @@ tilings = st.none() | st.builds(Tiles, columns=st.integers(1, 6), overlap=st.flo
 # --- views
 
 
-@law
 @given(image_sizes, resizes, tilings, st.data())
 def test_a_box_comes_back_from_the_networks_pixels(
     size: tuple[int, int], resize: Stretch | FitPad, tiles: Tiles | None, data: st.DataObject
@@ -102,7 +99,6 @@ def test_a_box_comes_back_from_the_networks_pixels(
         np.testing.assert_allclose(view.to_image(view.to_network(box)), box, atol=1e-8)
 
 
-@law
 @given(image_sizes, resizes, tilings)
 def test_views_cover_the_image_and_lie_in_the_input(
     size: tuple[int, int], resize: Stretch | FitPad, tiles: Tiles | None
@@ -130,7 +126,6 @@ def test_no_more_tiles_than_enlarge_anything() -> None:
     assert count == {300: 1, 376: 1, 640: 2, 1241: 3}
 
 
-@law
 @given(st.sampled_from(["RGB", "BGR"]), st.sampled_from(["NCHW", "NHWC"]), st.booleans(), st.integers(0, 2**32 - 1))
 def test_the_input_is_the_manifests_arithmetic(colour: str, layout: str, grey: bool, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -151,7 +146,6 @@ def test_the_input_is_the_manifests_arithmetic(colour: str, layout: str, grey: b
 # --- detection
 
 
-@law
 @given(image_sizes, st.integers(0, 2), st.floats(0.35, 1.0), st.data())
 def test_an_encoded_box_is_decoded(size: tuple[int, int], label: int, score: float, data: st.DataObject) -> None:
     reader = decoder()
@@ -192,7 +186,6 @@ def iou(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-@law
 @given(st.lists(boxes_in(200.0, 100.0), min_size=1, max_size=12), st.integers(0, 2**32 - 1))
 def test_nms_keeps_the_best_of_each_heap_whatever_the_order(boxes_list: list[NDArray[np.float64]], seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -234,7 +227,6 @@ def seen_on_tiles(objects: NDArray[np.float64], tiles: Tiles, scores: Any) -> De
     return reader.merge(parts, views)
 
 
-@law
 @given(boxes_in(*WIDE, 12.0), st.integers(2, 4), st.sampled_from([0.1, 0.2, 0.45]))
 def test_an_object_on_tiles_is_one_whole_box(box: NDArray[np.float64], columns: int, overlap: float) -> None:
     found = seen_on_tiles(box[None], Tiles(columns=columns, overlap=overlap), [0.9])
@@ -242,7 +234,6 @@ def test_an_object_on_tiles_is_one_whole_box(box: NDArray[np.float64], columns: 
     np.testing.assert_allclose(found.boxes_px[0], box, atol=0.1)
 
 
-@law
 @given(st.lists(boxes_in(WIDE[0], 70.0, 12.0), min_size=2, max_size=5), st.integers(0, 2**32 - 1))
 def test_objects_above_each_other_on_tiles_stay_apart(objects: list[NDArray[np.float64]], seed: int) -> None:
     boxes = np.array([np.add(box, [0, 75 * i, 0, 75 * i]) for i, box in enumerate(objects)])
@@ -252,7 +243,6 @@ def test_objects_above_each_other_on_tiles_stay_apart(objects: list[NDArray[np.f
     np.testing.assert_allclose(found.boxes_px[np.argsort(found.boxes_px[:, 1])], boxes, atol=0.1)
 
 
-@law
 @given(st.lists(st.integers(20, 300), min_size=2, max_size=8), st.floats(1.0, 30.0), st.integers(0, 2**32 - 1))
 def test_objects_beside_each_other_on_tiles_stay_apart(widths: list[int], gap_px: float, seed: int) -> None:
     left = np.cumsum([0.0, *[w + gap_px for w in widths]])
@@ -433,7 +423,6 @@ def step(networks: Networks, executor: Executor, frame_id: int, finish: bool = T
 IMAGE = np.zeros((2, 2), np.uint8)
 
 
-@law
 @given(st.integers(1, 5), st.lists(st.integers(1, 4), min_size=1, max_size=30))
 def test_dropped_frames_do_not_starve_a_head(every: int, gaps: list[int]) -> None:
     executor = Executor()

@@ -211,6 +211,7 @@ def test_lateness_is_against_the_frame_that_kept_the_pace_best() -> None:
     assert system.lateness(messages, 1e3 / 30.0) == pytest.approx([0.0, 0.0, 0.0, 4.0, 0.0], abs=1e-3)
 
 
+@pytest.mark.processes
 def test_the_shipped_drive_is_the_source_of_everything(tmp_path: Path) -> None:
     """One short run of the real processes: its keys are those that a report and a CI read."""
     path = tmp_path / "system.json"
@@ -223,6 +224,7 @@ def test_the_shipped_drive_is_the_source_of_everything(tmp_path: Path) -> None:
     assert "multitask" in found["networks"]
 
 
+@pytest.mark.processes
 def test_the_optimize_process_is_driven_with_vehicles_at_the_rate() -> None:
     row = convoy.measure(4, 33.0, 0.6, 0.5, ())
     assert row["vehicles"] == 4
@@ -282,6 +284,7 @@ def test_a_report_shows_what_is_there_and_names_what_is_not(tmp_path: Path) -> N
         assert (tmp_path / name).stat().st_size > 1000
 
 
+@pytest.mark.processes
 def test_carriers_deliver_every_message_of_a_slow_stream() -> None:
     rows = [transport.measure(transport.Case(carrier, 4_000, 20, 0), 0.5) for carrier in ("ring", "zenoh-shm")]
     for row in rows:
@@ -290,6 +293,7 @@ def test_carriers_deliver_every_message_of_a_slow_stream() -> None:
         assert row["latency_ms"]["n"] > 0
 
 
+@pytest.mark.processes
 def test_the_optimizer_is_measured_with_its_noise(tmp_path: Path) -> None:
     log = tmp_path / "log"
     optimizer.write_log(log, DriveConfig(frames=60, vehicles=1), seed=1)
@@ -305,6 +309,7 @@ def test_a_bound_is_passed_only_where_every_round_is_worse() -> None:
     assert ratios.worse({"a": [5.0, 2.1]}, bounds) == ["a"]
 
 
+@pytest.mark.processes
 def test_ours_over_its_peers_has_not_got_worse() -> None:
     """Ratios of one machine at one time; noise gets a second and a third chance, a change that made us slower none."""
     bounds, found = ratios.reference(), ratios.measure(1)

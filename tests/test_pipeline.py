@@ -28,8 +28,10 @@ from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.wire import decode, encode
 from birdslam.types import INVALIDATING, Estimate, MapUpdate, Measurements, Status
 
+pytestmark = pytest.mark.processes
+
 FRAMES, WIDTH, HEIGHT, F_PX, HEIGHT_M = 12, 480, 160, 260.0, 1.65
-LIMIT_S = 60.0
+LIMIT_S = 240.0
 
 
 def road_image(x_m: float) -> np.ndarray:
@@ -140,7 +142,7 @@ def wait_gone(pids: list[int]) -> None:
         except ProcessLookupError:
             continue
         try:
-            assert select.select([fd], [], [], 10.0)[0], f"process {pid} is still there"
+            assert select.select([fd], [], [], LIMIT_S)[0], f"process {pid} is still there"
         finally:
             os.close(fd)
 
@@ -295,7 +297,7 @@ def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None
 
             heard = call(
                 *("listen", "--vehicle", run.vehicle, "--runtime-dir", str(run.runtime_dir)),
-                *("--json", "--count", "2", "--timeout", "20"),
+                *("--json", "--count", "2", "--timeout", f"{LIMIT_S:g}"),
             )
             assert heard.returncode == 0, heard.stderr
             assert [json.loads(line)["epoch"] for line in heard.stdout.splitlines()] == [first.epoch] * 2
@@ -303,7 +305,7 @@ def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None
             nodes = [run.node_pid(name) for name in ("capture", "perceive", "optimize")]
             run.process.send_signal(signal.SIGINT)
             status, out, err = run.end()
-            for estimate in iter(lambda: planner.wait(5.0), None):
+            for estimate in iter(lambda: planner.wait(LIMIT_S), None):
                 assert estimate is not None
                 if Status.END_OF_SOURCE in estimate.status:
                     break

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,11 +22,13 @@ from birdslam.runtime.configuration import Configuration, SourceConfig
 from birdslam.runtime.supervision.query_server import QueryServer
 from birdslam.runtime.topology import QUERIES, TOPICS, key_of
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError
-from birdslam.runtime.transport.queries import WAITING_QUERIES, QueryRefused, positive
+from birdslam.runtime.transport.queries import WAITING_QUERIES, QueryRefused, QueryResponder, positive
 from birdslam.runtime.transport.reply_parts import map_parts, trajectory_parts, whole_map, whole_trajectory
 from birdslam.runtime.wire import Health, Part, encode
 from birdslam.types import MapUpdate
 from tests.test_bus import LIMIT_S, estimate, measurements, until
+
+pytestmark = pytest.mark.processes
 
 CONFIGURATION = Configuration(source=SourceConfig(uri="rtsp://driver:secret@10.0.0.7/front"))
 
@@ -203,7 +204,16 @@ def test_a_part_that_is_lost_is_told(join: Any) -> None:
     queryable.undeclare()
 
 
-def test_a_flood_of_queries_is_answered_in_part_and_harms_nothing(join: Any, base: Path) -> None:
+def test_a_flood_of_queries_is_answered_in_part_and_harms_nothing(
+    join: Any, base: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    came, receive = [0], QueryResponder._enqueue
+
+    def count(responder: QueryResponder, query: zenoh.Query) -> None:
+        receive(responder, query)
+        came[0] += 1
+
+    monkeypatch.setattr(QueryResponder, "_enqueue", count)
     server = QueryServer(Configuration(), hub := join("supervisor", hub=True))
     server.add(at(1, 0.0))
     with Planner("car", base) as planner:
@@ -214,7 +224,7 @@ def test_a_flood_of_queries_is_answered_in_part_and_harms_nothing(join: Any, bas
                 planner._bus._session.get(key_of("car", "trajectory"), zenoh.handlers.FifoChannel(8), timeout=LIMIT_S)
                 for _ in range(10 * WAITING_QUERIES)
             ]
-            time.sleep(0.2)
+            until(lambda: came[0] == len(handlers), "all queries have come")
         answered = sum(any(reply.ok is not None for reply in handler) for handler in handlers)
         assert 1 <= answered <= 2 * WAITING_QUERIES
         assert planner.trajectory() is not None

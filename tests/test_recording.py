@@ -292,6 +292,7 @@ def drive_on(planner: Planner, frames: int) -> dict[int, float]:
     return heard
 
 
+@pytest.mark.processes
 def test_kills_and_restarts_cost_no_bit_and_a_kill_of_everything_leaves_a_file_that_opens(
     tmp_path_factory: pytest.TempPathFactory, road: Path
 ) -> None:
@@ -324,6 +325,7 @@ def test_kills_and_restarts_cost_no_bit_and_a_kill_of_everything_leaves_a_file_t
     assert cv2.imdecode(np.frombuffer(images[-1].data, np.uint8), cv2.IMREAD_UNCHANGED).shape == (HEIGHT, WIDTH)
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("number", "cause"),
     [(signal.SIGKILL, "was killed by SIGKILL"), (signal.SIGSTOP, "is stalled: its loop has shown no life for 500 ms")],
@@ -368,6 +370,7 @@ def test_a_recorder_that_dies_or_stalls_is_begun_anew_in_a_file_of_its_own(
     assert {(health.restarts, health.cause) for health in said} == {(1, cause)}
 
 
+@pytest.mark.processes
 def test_a_recorder_that_keeps_dying_is_given_up_and_the_drive_goes_on(
     tmp_path_factory: pytest.TempPathFactory, road: Path
 ) -> None:
@@ -391,6 +394,7 @@ def test_a_recorder_that_keeps_dying_is_given_up_and_the_drive_goes_on(
     assert run.summary()["recording"]["restarts"] == 1
 
 
+@pytest.mark.processes
 def test_a_full_disk_ends_the_recording_and_the_drive_goes_on(
     tmp_path_factory: pytest.TempPathFactory, road: Path
 ) -> None:

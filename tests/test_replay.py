@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.perf import replay as perf_replay
@@ -153,7 +153,7 @@ def test_measurements_that_the_recorder_never_had_end_the_comparison_until_a_new
 EVENTS = ("well", "well", "well", "dropped", "estimate lost", "late", "restored", "new world")
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=25)
 @given(events=st.lists(st.sampled_from(EVENTS), min_size=5, max_size=18), seed=st.integers(0, 3))
 def test_whatever_happens_nothing_differs(events: list[str], seed: int) -> None:
     frames = iter(measured(4 * len(events) + 2, seed))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
-import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -108,19 +108,21 @@ def test_a_loop_that_stands_still_misses_nothing_yet() -> None:
 def systemd(tmp_path: Path) -> socket.socket:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     listener.bind(str(tmp_path / "notify"))
-    listener.settimeout(5.0)
+    listener.settimeout(60.0)
     yield listener  # type: ignore[misc]
     listener.close()
 
 
-def test_systemd_is_told(systemd: socket.socket) -> None:
+def test_systemd_is_told(systemd: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock_s = [100.0]
+    monkeypatch.setattr("birdslam.runtime.process.notify.time", SimpleNamespace(monotonic=lambda: clock_s[0]))
     notifier = Notifier({"NOTIFY_SOCKET": systemd.getsockname(), "WATCHDOG_USEC": "300000"})
     assert notifier.period_s == pytest.approx(0.1)
     notifier.once("READY=1")
     notifier.once("READY=1")
     notifier.alive("frame 7")
     notifier.alive("not due yet")
-    time.sleep(0.11)
+    clock_s[0] += 0.11
     notifier.alive("frame 9")
     notifier.once("STOPPING=1")
     said = [systemd.recv(4096).decode() for _ in range(4)]

@@ -106,12 +106,12 @@ def test_a_recording_is_read_whole_whatever_the_reader_does() -> None:
     reader = ReadAhead(RecordedSource(Drive(9), SourceConfig()), capacity=2)
     seen = []
     for _ in range(9):
-        item = reader.next(timeout_s=5.0)
+        item = reader.next(timeout_s=60.0)
         assert item is not None
         seen.append(item)
         assert reader.read <= len(seen) + 3  # two wait, one is in hand
     with pytest.raises(EndOfSource):
-        reader.next(timeout_s=5.0)
+        reader.next(timeout_s=60.0)
     assert [frame_id for frame_id, _ in seen] == list(range(9))
     assert [frame.error for _, frame in seen] == [None, None, "torn", *[None] * 6]
     assert reader.dropped == 0
@@ -125,12 +125,12 @@ def test_a_slow_reader_of_a_camera_gets_the_newest_frame_and_the_count() -> None
     for _ in range(5):
         camera.tick.release()
     wait_for(lambda: reader.read == 5)
-    item = reader.next(timeout_s=5.0)
+    item = reader.next(timeout_s=60.0)
     assert item is not None
     assert (item[0], item[1].t_source_ns) == (4, 5)
     assert reader.dropped == 4
     camera.tick.release()
-    item = reader.next(timeout_s=5.0)
+    item = reader.next(timeout_s=60.0)
     assert item is not None
     assert item[0] == 5
     reader.close(timeout_s=0.01)
@@ -142,13 +142,13 @@ def test_what_a_source_raises_reaches_the_reader() -> None:
     reader = ReadAhead(camera, capacity=1)
     camera.tick.release()
     with pytest.raises(SourceError, match="gone"):
-        reader.next(timeout_s=5.0)
+        reader.next(timeout_s=60.0)
 
 
 def test_closing_ends_a_reader_that_waits() -> None:
     reader = ReadAhead(RecordedSource(Drive(100), SourceConfig()), capacity=1)
     wait_for(lambda: reader.read == 2)
-    reader.close(timeout_s=5.0)
+    reader.close(timeout_s=60.0)
     assert not any(thread.name == "read-ahead" and thread.is_alive() for thread in threading.enumerate())
 
 

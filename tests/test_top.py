@@ -19,7 +19,9 @@ from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.wire import Health, Spread, Stage, Trace
 from birdslam.types import Estimate, Status
 
-LIMIT_S = 10.0
+pytestmark = pytest.mark.processes
+
+LIMIT_S = 60.0
 
 
 @pytest.fixture

@@ -378,7 +378,6 @@ def estimates(draw: st.DrawFn) -> Estimate:
     )
 
 
-@settings(deadline=None)
 @given(estimates())
 def test_an_estimate_comes_back_as_it_was(estimate: Estimate) -> None:
     data = encode(estimate)
@@ -396,7 +395,6 @@ def accepted_or_refused(data: bytes, record: type[msgspec.Struct]) -> None:
     decode(encode(found), record)
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=400), st.sampled_from(EXAMPLES))
 def test_random_bytes_are_refused(data: bytes, example: msgspec.Struct) -> None:
     accepted_or_refused(data, type(example))
@@ -414,7 +412,6 @@ plain_data = st.recursive(
 )
 
 
-@settings(deadline=None)
 @given(st.data(), st.sampled_from(EXAMPLES))
 def test_fields_of_any_content_are_refused_or_valid(data: st.DataObject, example: msgspec.Struct) -> None:
     plain = msgpack.unpackb(encode(example))
@@ -423,7 +420,7 @@ def test_fields_of_any_content_are_refused_or_valid(data: st.DataObject, example
     accepted_or_refused(msgpack.packb(plain), type(example))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.randoms(use_true_random=False), st.sampled_from(EXAMPLES), st.sampled_from(EXAMPLES))
 def test_mutated_messages_never_do_harm(chance: random.Random, example: msgspec.Struct, other: msgspec.Struct) -> None:
     """Flipped, lost, doubled and foreign bytes; 50 mutants of each draw."""
