@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -34,6 +35,7 @@ MODULES = modules()
 HOUSE = [name for name in MODULES if name.count(".") > 1 or MODULES[name].name != "__init__.py"]
 
 
+@cache
 def imports(path: Path) -> set[str]:
     """Full names of the modules that a file imports, wherever in it the import stands."""
     found: set[str] = set()

@@ -5,7 +5,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry import bev
@@ -57,16 +57,17 @@ def test_no_road_above_the_horizon() -> None:
     assert np.isnan(bev.pixel_to_ego(camera(), GroundPlane(1.65), np.array([[600.0, 172.0], [600.0, 173.0]]))).all()
 
 
+@settings(max_examples=20)
 @given(st.floats(5.0, 25.0), st.floats(-6.0, 6.0), st.floats(-0.02, 0.02))
 def test_covariance_is_that_of_sampled_errors(x_m: float, y_m: float, pitch_rad: float) -> None:
-    ground, sigma_px, sigma_pitch, sigma_height = GroundPlane(1.65, pitch_rad), 0.3, 0.0005, 0.01
-    px = bev.ego_to_pixel(camera(), ground, np.array([[x_m, y_m]]))
-    cov = bev.road_point_cov(camera(), ground, px, sigma_px, sigma_pitch, sigma_height)[0]
+    lens, ground, sigma_px, sigma_pitch, sigma_height = camera(), GroundPlane(1.65, pitch_rad), 0.3, 0.0005, 0.01
+    px = bev.ego_to_pixel(lens, ground, np.array([[x_m, y_m]]))
+    cov = bev.road_point_cov(lens, ground, px, sigma_px, sigma_pitch, sigma_height)[0]
     rng = np.random.default_rng(0)
     samples = np.array(
         [
             bev.pixel_to_ego(
-                camera(),
+                lens,
                 GroundPlane(1.65 * (1 + sigma_height * h), pitch_rad + sigma_pitch * p),
                 px + sigma_px * np.array([[u, v]]),
             )[0]

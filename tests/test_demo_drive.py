@@ -98,7 +98,7 @@ def test_a_body_keeps_its_number_and_its_size(demo: DemoRecording) -> None:
 def test_it_is_read_without_the_renderer() -> None:
     code = (
         "import sys; sys.modules['numba'] = sys.modules['torch'] = None\n"
-        "from birdslam.datasets import open_recording\n"
+        "from birdslam.datasets.opening import open_recording\n"
         "assert next(open_recording('demo').frames()).image is not None"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=600)

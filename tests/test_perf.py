@@ -309,6 +309,7 @@ def test_a_bound_is_passed_only_where_every_round_is_worse() -> None:
     assert ratios.worse({"a": [5.0, 2.1]}, bounds) == ["a"]
 
 
+@pytest.mark.slow  # a ratio of times, which neighbours disturb
 @pytest.mark.processes
 def test_ours_over_its_peers_has_not_got_worse() -> None:
     """Ratios of one machine at one time; noise gets a second and a third chance, a change that made us slower none."""
