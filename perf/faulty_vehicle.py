@@ -130,7 +130,7 @@ class Vehicle:
 
     def settle(self, settle_s: float = SETTLE_S) -> None:
         """Until estimates are valid and have been for a while, and spares stand by."""
-        until_s, calm_s = time.monotonic() + 3 * PATIENCE_S, 0.0
+        until_s, calm_s = time.monotonic() + 12 * PATIENCE_S, 0.0
         while calm_s < settle_s or self.spares() < len(NODES):
             if time.monotonic() > until_s or self.process.poll() is not None:
                 raise TimeoutError(f"no valid estimates: {(self.place / 'run.log').read_text()[-2000:]}")
@@ -149,7 +149,7 @@ class Vehicle:
     def stop(self) -> int:
         """An ordered end; gives the exit status."""
         self.process.terminate()
-        return self.process.wait(30.0)
+        return self.process.wait(6 * PATIENCE_S)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

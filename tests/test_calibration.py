@@ -250,6 +250,7 @@ def _said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str
     return status, told.out + told.err
 
 
+@pytest.mark.slow
 def test_the_command_on_kitti(data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sequence = data_dir / "kitti_odometry" / "sequences" / "06"
     status, told = _said(capsys, str(sequence), "--output", str(tmp_path / "camera.toml"))

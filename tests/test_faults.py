@@ -25,6 +25,7 @@ SHORT = (
 )
 BUSY_MACHINE = 10.0  # so many times its promise may a restart take here; `make faults` holds it to 3
 SEVERE = 3.0
+PATIENT = ("--set", "runtime.watchdog_ms=20000")  # no fault of the short form is a node that stalls
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def models_dir_if_any() -> Path | None:
 
 
 def test_faults_in_short(place: Path) -> None:
-    with Vehicle(place) as vehicle:
+    with Vehicle(place, *PATIENT) as vehicle:
         for fault in FAULTS:
             if f"{fault.name} {fault.node}" not in SHORT:
                 continue
@@ -96,7 +97,7 @@ def restarted(vehicle: Vehicle, times: int) -> Iterator[str]:
 
 
 def nothing_leaks(place: Path, times: int) -> None:
-    with Vehicle(place) as vehicle:
+    with Vehicle(place, *PATIENT) as vehicle:
         for _ in restarted(vehicle, len(NODES)):  # once round, so that all is there that ever will be
             continue
         before = held(vehicle)
@@ -122,7 +123,7 @@ def test_nothing_leaks_over_a_hundred_restarts(place: Path) -> None:
 
 
 def test_a_node_that_keeps_dying_ends_the_run_with_its_name(place: Path) -> None:
-    with Vehicle(place, "--set", "runtime.restarts_max=1") as vehicle:
+    with Vehicle(place, *PATIENT, "--set", "runtime.restarts_max=1") as vehicle:
         vehicle.node("optimize").send_signal(signal.SIGKILL)
         vehicle.settle(0.3)
         vehicle.node("optimize").send_signal(signal.SIGKILL)

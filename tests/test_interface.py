@@ -79,7 +79,7 @@ def until_said(process: subprocess.Popen[str], *wanted: str) -> None:
 def test_the_examples_against_a_drive(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Alive, then without a vehicle: neither falls silent."""
     place = tmp_path_factory.mktemp("i")
-    with Vehicle(place) as vehicle:
+    with Vehicle(place, "--set", "runtime.watchdog_ms=20000") as vehicle:
         hub = socket_path(vehicle.runtime_dir / vehicle.vehicle, "hub")
         name, folder = vehicle.vehicle, str(vehicle.runtime_dir)
         with (

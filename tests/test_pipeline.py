@@ -32,6 +32,8 @@ pytestmark = pytest.mark.processes
 
 FRAMES, WIDTH, HEIGHT, F_PX, HEIGHT_M = 12, 480, 160, 260.0, 1.65
 LIMIT_S = 240.0
+# Nothing is left out or coasted over for want of time
+UNHURRIED = ("--set", "budgets.end_to_end_ms=60000", "--set", "degradation.enabled=false")
 
 
 def road_image(x_m: float) -> np.ndarray:
@@ -85,7 +87,9 @@ class Run:
         self.process = subprocess.Popen(
             command(
                 *("run", "--vehicle", vehicle, "--output", str(self.output)),
-                *("--set", f"runtime.runtime_dir={self.runtime_dir}", *arguments),
+                *("--set", f"runtime.runtime_dir={self.runtime_dir}"),
+                *("--set", f"runtime.watchdog_ms={1e3 * LIMIT_S}"),  # a busy machine is no stalled node
+                *("--set", "runtime.spares=false", *arguments),
             ),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -250,7 +254,7 @@ def test_real_frames_and_networks_too(data_dir: Path, models_dir: Path, place: P
 
 def test_a_torn_image_costs_one_frame_and_a_status(drive: Path, place: Path) -> None:
     sequence = torn(drive, place, number=5)
-    run = Run(place, "--source", f"kitti:{sequence}", "--rate", "40")
+    run = Run(place, "--source", f"kitti:{sequence}", "--rate", "max")
     status, out, err = run.end()
     assert (status, err) == (0, "")
     assert "000005.png" in out
@@ -281,7 +285,7 @@ def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None
             assert first is not None
             assert second is not None
             assert second.frame_id > first.frame_id
-            reading = planner.latest(max_age_ms=10_000.0)
+            reading = planner.latest(max_age_ms=1e3 * LIMIT_S)
             assert reading.alive
             assert reading.on_time
             assert reading.estimate is not None
@@ -355,7 +359,7 @@ def test_a_service_is_stopped_in_order(drive: Path, place: Path) -> None:
 def test_a_stalled_node_and_then_a_killed_supervisor(drive: Path, place: Path) -> None:
     arguments = (
         *("--source", f"kitti:{drive}", "--set", "source.loop=true"),
-        *("--set", "runtime.watchdog_ms=1500", "--set", "runtime.restart=never"),
+        *("--set", "runtime.watchdog_ms=4000", "--set", "runtime.restart=never"),
     )
     run = Run(place, *arguments)
     try:
@@ -364,7 +368,7 @@ def test_a_stalled_node_and_then_a_killed_supervisor(drive: Path, place: Path) -
         os.kill(run.node_pid("optimize"), signal.SIGSTOP)
         status, _, err = run.end()
         assert status == 1
-        assert err.startswith("birdslam: optimize is stalled: its loop has shown no life for 1500 ms")
+        assert err.startswith("birdslam: optimize is stalled: its loop has shown no life for 4000 ms")
     finally:
         run.kill()
 
@@ -423,7 +427,7 @@ def test_a_manifest_that_does_not_fit_its_network(drive: Path, models_dir: Path,
 def test_a_recording_keeps_its_own_time(drive: Path, place: Path) -> None:
     """Its last frame leaves when its time stamp says, and each stage of the way is measured."""
     begun_s = time.monotonic()
-    run = run_all(place, drive)
+    run = run_all(place, drive, *UNHURRIED)
     assert time.monotonic() - begun_s >= 0.1 * (FRAMES - 1)
     summary = run.summary()
     assert summary["frames_processed"] + summary["frames_dropped"] == summary["frames_in"] == FRAMES
@@ -434,7 +438,9 @@ def test_a_recording_keeps_its_own_time(drive: Path, place: Path) -> None:
 
 
 def test_a_killed_capture_goes_on_in_its_recording(drive: Path, place: Path) -> None:
-    run = Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true")
+    run = Run(
+        place, "--source", f"kitti:{drive}", "--set", "source.loop=true", *UNHURRIED, "--set", "runtime.spares=true"
+    )
     try:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             before = planner.wait(LIMIT_S)
