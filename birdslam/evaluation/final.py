@@ -19,7 +19,7 @@ from typing import TextIO
 
 from birdslam.trajectory import ego_pose, tum_row
 from birdslam.types import Attitude, Estimate, MapUpdate, Measurements, VehicleEdge
-from birdslam.vehicles.rts_smoother import Retrospect, RetrospectConfig
+from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 
 EGO_FILES = {"ego.tum.txt": "ego.final.tum.txt", "ego.kitti.txt": "ego.final.kitti.txt"}
 TRACK_SUFFIX = ".final.tum.txt"
@@ -41,12 +41,12 @@ class FinalTracks:
         self,
         directory: Path,
         last_frames: Mapping[int, int],
-        config: RetrospectConfig = RetrospectConfig(),  # noqa: B008
+        config: SmootherConfig = SmootherConfig(),  # noqa: B008
     ) -> None:
         """`directory` is that of the live tracks; it is there. Raises OSError where a file can't be written."""
         self._directory = directory
         self._last_frames = last_frames
-        self._smoother = Retrospect(config)
+        self._smoother = RtsSmoother(config)
         self._epoch: int | None = None
         self._open: dict[int, _OpenTrack] = {}
         self._written: set[int] = set()

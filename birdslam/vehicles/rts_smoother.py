@@ -87,8 +87,8 @@ class RtsSmoother:
         return {key: smooth_vehicle(seen, self.config) for key, seen in self._measurements.items()}
 
     def close(self, epoch: int, vehicle: int) -> dict[int, SE2]:
-        """One of `ways`, whose sights are let go: no more of them will come."""
-        return way(self._sights.pop((epoch, vehicle)), self.config)
+        """One vehicle's part of `smooth`; its measurements are let go, since no more of them will come."""
+        return smooth_vehicle(self._measurements.pop((epoch, vehicle)), self.config)
 
 
 def smooth_vehicle(seen: Sequence[VehicleMeasurement], config: SmootherConfig) -> dict[int, SE2]:
