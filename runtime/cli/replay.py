@@ -75,10 +75,11 @@ def _results(recording: Recording, options: argparse.Namespace) -> str:
         final = None
         if options.smooth:
             final = FinalTracks(output / "tracks", last_seen(measurements_of([recording])))
+        sinks: list[Recorder | DriveVideo] = [recorder, *([video] if video else [])]
         for record in replaying.estimates(recording, config):
             if final is not None:
                 final.take(record)
-            for results in (recorder, *([video] if video else [])):
+            for results in sinks:
                 if isinstance(record, Estimate):
                     results.add(record)
                 elif isinstance(record, MapUpdate):
