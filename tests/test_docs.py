@@ -210,6 +210,17 @@ def test_every_command_that_a_page_shows_is_one(help_of: Callable[..., str]) -> 
             assert word in targets, f"{page}: make {word}"
 
 
+def test_every_option_that_a_page_shows_is_one(help_of: Callable[..., str]) -> None:
+    for page in PAGES:
+        text = page.read_text().replace("\\\n", " ")
+        shown = re.findall(r"^    (?:\.venv/bin/)?birdslam ([^#\n]+)", text, re.MULTILINE)
+        for line in (*shown, *re.findall(r"`birdslam ([^`]+)`", text)):
+            first, *others = line.split()
+            words = (first, *others[:1]) if first in NESTED else (first,)
+            for option in re.findall(r"(?<=\s)--[a-z-]+", line):
+                assert option in help_of(*words), f"{page}: birdslam {' '.join(words)} {option}"
+
+
 def test_the_page_of_keys_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["configuration"]) == 0
     assert capsys.readouterr().out == (DOCS / "configuration.md").read_text(), (
