@@ -122,12 +122,12 @@ COLUMNS = (  # of the odometry's table: field, title, format, what stands behind
     ("frames", "frames", "d", ""),
     ("path_m", "path", ".1f", " m"),
     ("ate_m", "ATE", ".2f", " m"),
-    ("ate_pct", "ATE", ".1f", " %"),
+    ("ate_pct", "ATE", ".1f", "%"),
     ("ate_se3_m", "rigid", ".2f", " m"),
     ("scale_error", "scale error", "+.1%", ""),
     ("rpe_t_m", "RPE", ".3f", " m"),
     ("rpe_r_deg", "RPE", ".3f", " deg"),
-    ("segment_t_pct", "KITTI segments", ".1f", " %"),
+    ("segment_t_pct", "KITTI segments", ".1f", "%"),
     ("standing_drift_m", "drift while standing", ".2f", " m"),
     ("nees", "NEES", ".1f", ""),
 )
@@ -181,10 +181,10 @@ def page(found: Mapping[str, Kept]) -> str:
         odometry_table=_odometry_table(found),
         shipped=", ".join(f"{row['ate_pct']:.1f} %" for row in found["odometry_shipped"]),
         car_ahead=_command("odometry").replace("odometry ", "car-ahead ", 1),
-        ahead_median=ahead["error_median_rel"],
-        ahead_p90=ahead["error_p90_rel"],
+        ahead_median=_percent(ahead["error_median_rel"]),
+        ahead_p90=_percent(ahead["error_p90_rel"]),
         ahead_frames=ahead["frames"],
-        ahead_shipped=_ahead(found["odometry_shipped"])["error_median_rel"],
+        ahead_shipped=_percent(_ahead(found["odometry_shipped"])["error_median_rel"], ".0"),
         localisation_table=_localisation_table(found),
         seeds=found["tracking"]["seeds"],
         tracking_table=_tracking_table(found["tracking"]),
@@ -197,15 +197,15 @@ def summary(found: Mapping[str, Kept]) -> str:
     names = {"00": "KITTI 00, its first 12 s", "06": "KITTI 06, 5 s", "kitti_raw_clip": "KITTI raw, stop and go"}
     for row in (*found["odometry"], *found["odometry_demo"]):
         what = f"ego motion, {names.get(row['sequence'], 'the shipped drive')}, {row['path_m']:.0f} m"
-        good = f"ATE {row['ate_m']:.2f} m ({row['ate_se3_m']:.2f} after rigid motion), scale {row['scale_error']:+.1%}"
+        scale = _percent(row["scale_error"], "+.1")
+        good = f"ATE {row['ate_m']:.2f} m ({row['ate_se3_m']:.2f} after rigid motion), scale {scale}"
         rows.append((what, good, "`birdslam evaluate odometry`"))
     ahead = _ahead(found["odometry"])
-    good = f"median error {ahead['error_median_rel']:.1%}, 90 % within {ahead['error_p90_rel']:.1%}"
+    good = f"median error {_percent(ahead['error_median_rel'])}, 90 % within {_percent(ahead['error_p90_rel'])}"
     rows.append(("distance to the car ahead, against LiDAR", good, "`birdslam evaluate car-ahead`"))
-    near, *_, far = found["localisation"]
-    good = f"depth {near['depth_error_median_rel']:.1%} off in the median, {far['depth_error_median_rel']:.1%} far away"
-    span = f"{near['range'].split('-')[0]}-{far['range'].split('-')[1]} m"
-    rows.append((f"places of cars at {span}, KITTI tracking", good, "`birdslam evaluate localisation`"))
+    ranges = [(row["range"], _percent(row["depth_error_median_rel"])) for row in found["localisation"]]
+    good = "depth off in the median by " + ", ".join(f"{error} at {span} m" for span, error in ranges)
+    rows.append(("places of cars, KITTI tracking", good, "`birdslam evaluate localisation`"))
     ours, published = found["tracking"]["birdslam"], _published()
     for whose, name in (("five cars", "mean, cars"), ("four egos", "mean, ego")):
         good = f"ATE {ours[name]:.2f} m in the mean; the paper {published[name]:.2f}"
@@ -238,7 +238,11 @@ def _odometry_table(found: Mapping[str, Kept]) -> str:
 
 
 def _cell(value: float | None, form: str, after: str) -> str:
-    return "" if value is None else f"{value:{form}}{after}"
+    return "" if value is None else f"{value:{form}}{after}".replace("%", " %")
+
+
+def _percent(share: float, form: str = ".1") -> str:
+    return f"{share:{form}%}".replace("%", " %")
 
 
 def _localisation_table(found: Mapping[str, Kept]) -> str:
@@ -247,11 +251,11 @@ def _localisation_table(found: Mapping[str, Kept]) -> str:
         (
             f"{row['range']} m",
             str(row["n"]),
-            f"{row['depth_error_median_rel']:.1%}",
-            f"{row['worst_sequence_rel']:.1%}",
-            f"{paper['depth_error_median_rel']:.1%}",
+            _percent(row["depth_error_median_rel"]),
+            _percent(row["worst_sequence_rel"]),
+            _percent(paper["depth_error_median_rel"]),
             f"{row['lateral_error_median_m']:.2f} m",
-            f"{row['inside_1_sigma']:.0%} / {row['inside_2_sigma']:.0%}",
+            f"{_percent(row['inside_1_sigma'], '.0')} / {_percent(row['inside_2_sigma'], '.0')}",
         )
         for row, paper in zip(found["localisation"], found["localisation_paper"], strict=True)
     ]
