@@ -270,7 +270,8 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True):
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     """optimize -> planners, one for each frame: where the ego and every other vehicle are (paper, Sec. 3).
 
-    A raised `epoch` says that the world frame began anew: poses of different epochs must not be compared.
+    Poses are in m and rad in the world of `epoch`, covariances (3, 3) row-major of the tangent (x_m, y_m, yaw_rad). A
+    raised `epoch` says that the world frame began anew: poses of different epochs must not be compared.
     """
 
     epoch: int  # which world: raised where the world frame began anew
