@@ -18,7 +18,7 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     uri: str = ""  # kitti:DIR, video:FILE, v4l2:/dev/videoN, rtsp://...
     rate: Positive | Literal["max"] | None = None  # Hz; None: by the source's own time stamps; "max": lossless
-    stride: PositiveInt = 1  # every so-manieth frame of a recording
+    stride: PositiveInt = 1  # one frame of a recording in so many
     frames: PositiveInt | None = None  # end after so many; None: all
     loop: bool = False  # a recording begins anew at its end
     prefetch_frames: PositiveInt = 4  # decoded ahead of their time, so that a slow file is not a late frame
@@ -181,8 +181,8 @@ class DegradationConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     late_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5  # so many of them late: one mode less
     calm_frames: PositiveInt = 50  # in a row within `calm_share` of the budget: one mode more
     calm_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.7  # of the budget; see calm_frames
-    rate_divisor: PositiveInt = 3  # in mode "rate" the networks run on every so-manieth frame at the most
-    coast_divisor: PositiveInt = 3  # in mode "coasting" every so-manieth frame is looked at
+    rate_divisor: PositiveInt = 3  # in mode "rate" the networks run on one frame in so many at the most
+    coast_divisor: PositiveInt = 3  # in mode "coasting" one frame in so many is looked at
     coast_max_ms: Positive = 500.0  # of source time without a look: what comes then is invalid
 
 

@@ -54,7 +54,7 @@ class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_rotation_rad: Positive = 0.0005  # of the relative rotation that odometry hands over
     sigma_direction_rad: Positive = 0.007  # of the direction of its translation
     max_iterations: Annotated[int, msgspec.Meta(ge=3)] = 7  # of the alignment
-    coarse_step: Annotated[int, msgspec.Meta(ge=1)] = 4  # every so-manieth sample comes near to the answer
+    coarse_step: Annotated[int, msgspec.Meta(ge=1)] = 4  # one sample in so many comes near to the answer
     coarse_tolerance: Positive = 2e-3  # the coarse steps end with a smaller change
     tolerance: Positive = 1e-3  # the fine ones end with a smaller change
 
