@@ -182,7 +182,7 @@ class FrontEnd:
     def _map_lanes(self, frame: Frame, perception: Perception) -> LaneNews:
         """Lanes, by what is known of this frame's road or an earlier one's."""
         road, age = self.vehicles.road, perception.ages.get("segmenter", 0)
-        return self._lanes.step(
+        return self._lanes.map_lanes(
             frame.frame_id,
             self._reckoning.T_world_ego,
             road.ground,

@@ -1,4 +1,4 @@
-"""The head of lanes: on its schedule, never awaited, said to be late, and its edges in the measurements."""
+"""Lanes in the front end: on their schedule, never awaited, said to be late, and their edges in the measurements."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.landmark_edges import StaticMapConfig
 from birdslam.mapping.lane_edges import LaneEdgesConfig
-from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneNews
+from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneOutput
 from birdslam.mapping.lanes import Grids
 from birdslam.perception import Segmentation
 from birdslam.types import LandmarkKind, Status
@@ -73,14 +73,14 @@ class Driver:
         self.mapper = LaneMapper(CAMERA, StaticMapConfig(), head=head)
         self.frame = -1
 
-    def step(self, segmentation: Segmentation | None = MASKS) -> LaneNews:
+    def step(self, segmentation: Segmentation | None = MASKS) -> LaneOutput:
         self.frame += 1
         T_world_ego = SE2(STEP_M * self.frame)
-        return self.mapper.step(self.frame, T_world_ego, CAMERA.ground, 0.003, segmentation, self.frame, NOBODY)
+        return self.mapper.map_lanes(self.frame, T_world_ego, CAMERA.ground, 0.003, segmentation, self.frame, NOBODY)
 
 
 @pytest.mark.parametrize("every", [1, 4, 7])
-def test_lanes_are_made_out_on_their_schedule_and_say_their_age(every: int) -> None:
+def test_lanes_are_found_on_their_schedule_and_say_their_age(every: int) -> None:
     complete = Counted()
     drive = Driver(LaneHead(complete, None, every))
     news = [drive.step() for _ in range(21)]
@@ -124,7 +124,7 @@ def test_a_run_that_is_not_done_is_not_awaited_and_where_lanes_are_due_that_is_s
 def test_what_comes_late_lies_where_it_was_seen() -> None:
     elsewhere = Elsewhere()
     late, punctual = Driver(LaneHead(None, elsewhere)), Driver(LaneHead())
-    before: LaneNews | None = None
+    before: LaneOutput | None = None
     for _ in range(10):
         now, then = punctual.step(), late.step()
         if before is not None:

@@ -1,8 +1,8 @@
-"""The batch that sees the same edges: Eq. 8 in SE(2) over all frames of a log at once, by gtsam.
+"""The reference of the paper's incremental SE(2) graph: Eq. 8 over all frames of a log at once, by gtsam.
 
-It is what the incremental graph is held to: the same CC, CV and VV edges with the same covariances, the same
-constant-velocity factor where the graph has one, CP edges with a node for each landmark. It has no gate: an outlier
-counts like any other. Nothing is marginalised and every edge is linearised at the optimum, future frames included.
+It has the same CC, CV and VV edges with the same covariances as the incremental graph, the same constant-velocity
+factor where that has one, and CP edges with a node for each landmark. It has no gate: an outlier counts like any other
+edge. Nothing is marginalised and every edge is linearised at the optimum, future frames included.
 """
 
 from __future__ import annotations

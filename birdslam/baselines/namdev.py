@@ -1,4 +1,4 @@
-"""Namdev et al., "Motion segmentation and multibody VSLAM on monocular sequences" (their ego and objects in one scale).
+"""Namdev et al., "Multibody VSLAM with relative scale solution for curvilinear motion reconstruction" (ICRA 2013).
 
 Kept: ego and objects are reconstructed apart, each up to a scale of its own; an object's scale against the ego's is the
 one for which its motion in the world is locally linear. Where both move uniformly every scale does (Fig. 1 of the

@@ -1,4 +1,8 @@
-"""gtsam's own incremental solvers on the edges of `Measurements`: what the pose graph is measured against."""
+"""gtsam's incremental solvers on the edges of `Measurements`: what the pose graph's time is measured against.
+
+ISAM2 is Kaess et al., "iSAM2: Incremental smoothing and mapping using the Bayes tree" (IJRR 2012); the fixed-lag
+smoothers are gtsam's.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The whole drive, kept beside the graph's window: everybody's way and the map, in memory that is bounded.
+"""The atlas: the trajectories and the map of a whole drive, beside the graph's window, in bounded memory.
 
-What is recent is kept finely and what is long past coarsely. Both are kept in octaves: each is twice as coarse as the
-one before, what no longer fits into one falls into the next, and out of the last one it is forgotten. So every call of
-`add` costs the same, however long the drive is, and the defaults reach back over 500 km of way.
+What is recent is kept finely and what is long past coarsely, in octaves: each is twice as coarse as the one before,
+what no longer fits into one falls into the next, and what falls out of the last is forgotten. So every call of `add`
+costs the same, however long the drive is, and the defaults reach back over 500 km.
 """
 
 from __future__ import annotations
@@ -48,69 +48,69 @@ class Atlas:
 
     def __init__(self, config: AtlasConfig) -> None:
         self._config = config
-        self._chapters: dict[int, _Chapter] = {}  # by epoch
-        self._newest: _Chapter | None = None
+        self._by_epoch: dict[int, _Epoch] = {}  # the newest last
+        self._newest: _Epoch | None = None
 
     @property
     def epochs(self) -> tuple[int, ...]:
         """Those that can be asked for, oldest first."""
-        return tuple(self._chapters)
+        return tuple(self._by_epoch)
 
     def add(self, estimate: Estimate, map_update: MapUpdate | None = None) -> None:
         """One frame. An estimate that is not valid leaves no pose behind."""
-        chapter = self._newest = self._chapter(estimate.epoch)
+        held = self._newest = self._epoch_of(estimate.epoch)
         if estimate.valid:
-            chapter.walk(estimate)
+            held.add_poses(estimate)
         if map_update is not None:
-            self._chapter(map_update.epoch).draw(map_update)
+            self._epoch_of(map_update.epoch).add_points(map_update)
 
     def trajectory(self, last_s: float | None = None, epoch: int | None = None) -> Trajectory | None:
         """The key poses of the last `last_s` of source time, or all; of the newest epoch if none is named.
 
         None where nothing is known of the epoch.
         """
-        chapter = self._newest if epoch is None else self._chapters.get(epoch)
-        return None if chapter is None else chapter.trajectory(last_s)
+        held = self._newest if epoch is None else self._by_epoch.get(epoch)
+        return None if held is None else held.trajectory(last_s)
 
     def map(self, epoch: int | None = None) -> MapSnapshot | None:
         """All of the map; of the newest epoch if none is named. None where nothing is known of the epoch."""
-        chapter = self._newest if epoch is None else self._chapters.get(epoch)
-        return None if chapter is None else chapter.map()
+        held = self._newest if epoch is None else self._by_epoch.get(epoch)
+        return None if held is None else held.map()
 
-    def _chapter(self, epoch: int) -> _Chapter:
-        chapter = self._chapters.get(epoch)
-        if chapter is None:
-            chapter = self._chapters[epoch] = _Chapter(self._config, epoch)
-            while len(self._chapters) > self._config.epochs:
-                del self._chapters[next(iter(self._chapters))]
-        return chapter
+    def _epoch_of(self, epoch: int) -> _Epoch:
+        held = self._by_epoch.get(epoch)
+        if held is None:
+            held = self._by_epoch[epoch] = _Epoch(self._config, epoch)
+            while len(self._by_epoch) > self._config.epochs:
+                del self._by_epoch[next(iter(self._by_epoch))]
+        return held
 
 
-class _Chapter:
-    """One epoch."""
+class _Epoch:
+    """The trajectories and the map in the world of one epoch."""
 
     def __init__(self, config: AtlasConfig, epoch: int) -> None:
         self._config = config
         self._epoch = epoch
         self._frame_id = self._map_frame_id = 0
         self._t_ns = 0
-        self._ego = _Way(config)
-        self._paths: dict[int, _Path] = {}  # by vehicle, the longest out of sight first
+        self._ego = _EgoPath(config)
+        self._paths: dict[int, _VehiclePath] = {}  # by vehicle, the longest out of sight first
         self._landmarks, self._lanes = _Cells(config), _Cells(config)
 
-    def walk(self, estimate: Estimate) -> None:
+    def add_poses(self, estimate: Estimate) -> None:
         """Everybody's poses of one frame."""
         frame_id, t_ns = self._frame_id, self._t_ns = estimate.frame_id, estimate.t_source_ns
         self._ego.add(TimedPose(frame_id, t_ns, estimate.T_world_ego))
         for v in estimate.vehicles:
             if v.age_ns == 0:
-                path = self._paths.pop(v.vehicle, None) or _Path(v, deque(maxlen=self._config.vehicle_poses))
+                path = self._paths.pop(v.vehicle, None) or _VehiclePath(v, deque(maxlen=self._config.vehicle_poses))
                 path.add(v, TimedPose(frame_id, t_ns, v.T_world_vehicle), self._config)
                 self._paths[v.vehicle] = path
         while len(self._paths) > self._config.vehicles:
             del self._paths[next(iter(self._paths))]
 
-    def draw(self, update: MapUpdate) -> None:
+    def add_points(self, update: MapUpdate) -> None:
         """What the map gained."""
         self._map_frame_id = update.frame_id
         self._landmarks.add(update.landmarks_m)
@@ -120,7 +120,7 @@ class _Chapter:
         since_ns = -math.inf if last_s is None else self._t_ns - last_s * 1e9
         paths = []
         for vehicle, path in sorted(self._paths.items()):
-            poses = tuple(pose for pose in path.taken() if pose.t_source_ns >= since_ns)
+            poses = tuple(pose for pose in path.newest_last() if pose.t_source_ns >= since_ns)
             if poses:
                 v = path.newest
                 sizes = {"label": v.label, "length_m": v.length_m, "width_m": v.width_m}
@@ -129,16 +129,16 @@ class _Chapter:
             epoch=self._epoch,
             frame_id=self._frame_id,
             t_source_ns=self._t_ns,
-            ego=tuple(pose for pose in self._ego.taken() if pose.t_source_ns >= since_ns),
+            ego=tuple(pose for pose in self._ego.newest_last() if pose.t_source_ns >= since_ns),
             vehicles=tuple(paths),
         )
 
     def map(self) -> MapSnapshot:
-        lanes_m, lane_ids = self._lanes.taken()
+        lanes_m, lane_ids = self._lanes.newest_last()
         return MapSnapshot(
             epoch=self._epoch,
             frame_id=self._map_frame_id,
-            landmarks_m=self._landmarks.taken()[0],
+            landmarks_m=self._landmarks.newest_last()[0],
             lanes_m=lanes_m,
             cell_m=self._config.map_cell_m,
             lane_ids=lane_ids if any(lane >= 0 for lane in lane_ids) else (),
@@ -149,7 +149,7 @@ def _apart(a: SE2, b: SE2, least_m: float, least_rad: float) -> bool:
     return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) >= least_m or abs(wrap(a.yaw_rad - b.yaw_rad)) >= least_rad
 
 
-class _Way:
+class _EgoPath:
     """The ego's key poses, in octaves."""
 
     def __init__(self, config: AtlasConfig) -> None:
@@ -169,7 +169,7 @@ class _Way:
                 return
             pose, coarser = octave.popleft(), 2.0 * coarser
 
-    def taken(self) -> list[TimedPose]:
+    def newest_last(self) -> list[TimedPose]:
         poses = list(chain.from_iterable(reversed(self._octaves)))
         if self._newest is not None and (not poses or poses[-1] != self._newest):
             poses.append(self._newest)
@@ -177,7 +177,7 @@ class _Way:
 
 
 @dataclass(slots=True)
-class _Path:
+class _VehiclePath:
     """One vehicle's newest key poses."""
 
     newest: VehicleEstimate
@@ -194,7 +194,7 @@ class _Path:
         ):
             self.poses.append(pose)
 
-    def taken(self) -> list[TimedPose]:
+    def newest_last(self) -> list[TimedPose]:
         poses = list(self.poses)
         return poses if self.last is None or self.last == poses[-1] else [*poses, self.last]
 
@@ -230,7 +230,7 @@ class _Cells:
                     break
                 moment, side_m = cells.pop(next(iter(cells))), 2.0 * side_m
 
-    def taken(self) -> tuple[tuple[tuple[float, float], ...], tuple[int, ...]]:
+    def newest_last(self) -> tuple[tuple[tuple[float, float], ...], tuple[int, ...]]:
         """The points, oldest first, and their ids."""
         cells = [moment for octave in reversed(self.octaves) for moment in octave.values()]
         return tuple((x / n, y / n) for x, y, n, _ in cells), tuple(lane for *_, lane in cells)

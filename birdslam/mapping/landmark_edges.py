@@ -1,6 +1,7 @@
-"""Landmarks of the road plane: feature tracks on the road, back-projected by Eq. 1 (paper, static map initialization).
+"""Static map initialisation (paper, Sec. 3.1): CP edges of feature tracks on the road, back-projected by Eq. 1.
 
-Lanes, the other static features, are lane_mapper.py's.
+The other landmarks are stations of lanes (lane_edges.py). What the back end does with the edges of both is in
+graph/landmarks.py.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from birdslam.types import LandmarkEdge
 
 
 class StaticMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Which points of the road become landmarks and lane points."""
+    """Which points of the road become landmarks (here) and lane points (lane_mapper.py)."""
 
     max_landmarks: int = 40  # of a frame
     landmark_range_m: float = 20.0  # the paper's depth threshold T
@@ -36,7 +37,7 @@ def landmark_edges(
     sigma_pitch_rad: float,
     config: StaticMapConfig,
 ) -> tuple[LandmarkEdge, ...]:
-    """CP edges of feature tracks (N,) at pixels (N, 2) that lie on the road: the nearest ones."""
+    """CP edges of the nearest feature tracks that lie on the road: `ids` (N,) at pixels `px` (N, 2)."""
     points = bev.pixel_to_ego(camera, ground, px)  # Eq. 1
     with np.errstate(invalid="ignore"):
         near = np.flatnonzero(points[:, 0] < config.landmark_range_m)

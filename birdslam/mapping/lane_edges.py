@@ -1,9 +1,10 @@
-"""CP edges of lanes: where this frame's own markings lie across the lanes that earlier frames left on the map (Eq. 3).
+"""CP edges of lanes (Eq. 3): where one frame's markings lie across the lanes that earlier frames put on the map.
 
-A point of a line has no place along it, so a landmark is a *station*: where a lane crosses a line of world's grid, the
-same place whenever that lane is seen. What the edge tells is where the lane lies across its direction; along it the
-point is the odometry's own, so that its covariance says nothing along the lane. Only what this very frame saw goes in:
-the completed lanes are of many frames, laid together by the odometry itself.
+A point of a line can't be found again along the line, so a landmark is a *station*: the point where a lane crosses a
+line of a grid in world, the same whenever that lane is seen. An edge measures where the lane lies across its direction.
+Along the lane the point comes from the odometry's pose, not from the image, and so the covariance is large there. Only
+what one frame saw makes edges: the completed lanes are of many frames, put together with the odometry that the edges
+are to correct.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from birdslam.types import LandmarkEdge, LandmarkKind
 Floats = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-_CELLS = 1 << 20  # stations of one lane along one axis, before their numbers come round
-_FULL = 0.7  # of a station's stretch that its points must span: the line through fewer is led by their noise
+_CELLS = 1 << 20  # stations of one lane along one axis, before their ids repeat: 4000 km
+_FULL = 0.7  # share of a station's stretch that its points must span: a line through fewer follows their noise
 
 
 class LaneEdgesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,14 +44,14 @@ class LaneEdgesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Station:
-    """A point of a lane in world with its covariance (2, 2), and the id of its landmark."""
+    """A station as one frame saw it: its landmark's id, its place (2,) in world and the covariance (2, 2) of that."""
 
     landmark: int
     point_m: Floats
     cov: Floats
 
     def edge(self, frame_id: int, T_world_ego: SE2) -> LandmarkEdge:
-        """As the ego at `T_world_ego` has it."""
+        """The CP edge of a frame in which the ego is at `T_world_ego`."""
         x_m, y_m = (T_world_ego.inverse() @ self.point_m).tolist()
         R = T_world_ego.rotation()
         cov = tuple((R.T @ self.cov @ R).ravel().tolist())

@@ -1,4 +1,4 @@
-"""Lanes keep their ids from frame to frame, by where in the world they were."""
+"""Ids of lanes, which last from frame to frame: a lane is known by where in world it was."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from birdslam.geometry.se2 import SE2
 Floats = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-NO_LANE = -1  # of a point: of none that is known
+NO_LANE = -1  # of a point that lies on no known lane
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class LaneIds:
         self.forget()
 
     def forget(self) -> None:
-        """Where the lanes were."""
+        """Forgets where the lanes were."""
         self._points = np.zeros((0, 2))  # remembered, in world
         self._lanes = np.zeros(0, dtype=np.int64)
 

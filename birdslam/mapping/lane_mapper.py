@@ -1,4 +1,7 @@
-"""Lanes of the front end: what each segmentation adds to them, on the schedule of their head (Sec. 3.2)."""
+"""Lanes in the front end: each segmentation's lane points and CP edges (paper, Sec. 3.2).
+
+Finding lanes takes longer than a frame, so it runs beside the frames where it can, and at a rate of its own.
+"""
 
 from __future__ import annotations
 
@@ -27,15 +30,16 @@ Floats = NDArray[np.float64]
 Ids = NDArray[np.int64]
 Aside = Callable[..., Future[Any]]  # (function, *arguments)
 
-REMEMBERED_FRAMES = 64  # a segmentation that is older than that is no news
+REMEMBERED_FRAMES = 64  # the pose of a segmentation that is older is not known any more
 
 
 @dataclass(frozen=True)
 class LaneHead:
-    """How lanes are made out: a head of perceive's schedule, though what it looks at is no image.
+    """How lanes are found, and how often: perceive's schedule has them beside the networks' heads.
 
-    `complete` fills the grids where something hid the road; None leaves them as they were seen. `aside` runs a function
-    elsewhere, so that no frame waits for it; None: at once. Lanes are made out anew after so many frames as `every`.
+    `complete` is the network that fills the grids where something hid the road; None leaves them as they were seen.
+    `aside` runs a function beside the frames, so that none waits for it; None: the frame does. Lanes are found anew
+    after `every` frames.
     """
 
     complete: Completion | None = None
@@ -44,8 +48,8 @@ class LaneHead:
 
 
 @dataclass(frozen=True)
-class LaneNews:
-    """What a frame gains, in its ego. `age`: frames since the one that lanes were last made out in; None: never yet."""
+class LaneOutput:
+    """What a frame gains, in its ego. `age`: frames since the one that lanes were last found in; None: never yet."""
 
     points: tuple[LanePoint, ...] = ()
     edges: tuple[LandmarkEdge, ...] = ()
@@ -54,19 +58,19 @@ class LaneNews:
 
 
 @dataclass(frozen=True)
-class _Gathered:
+class _Found:
     """What a run found, in world: points (N, 2), their lanes (N,), and stations."""
 
     points_m: Floats
     lanes: Ids
     stations: list[Station]
-    made_out: bool  # the lanes too, and not only what this one frame saw
+    with_lanes: bool  # the lanes of many frames too, and not only what this one frame saw
     failed: bool  # their completion gave no usable numbers
 
 
 @dataclass(frozen=True)
-class _Then:
-    """A frame as it was."""
+class _PastFrame:
+    """What the back-projection of an earlier frame's segmentation needs to know of that frame."""
 
     frame_id: int
     T_world_ego: SE2
@@ -74,7 +78,7 @@ class _Then:
     sigma_pitch_rad: float
 
 
-def _at_once(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
+def _run_at_once(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
     done: Future[Any] = Future()
     done.set_result(run(*arguments))
     return done
@@ -84,11 +88,11 @@ class LaneMapper:
     """Lane points and lane edges of each segmentation, once, in the ego of the frame at hand.
 
     A segmentation may come frames after its image. It is back-projected with the pose and the ground plane of its own
-    frame, which are kept until then. Where it is due, the lanes that many of them show together are made out
-    (`lanes.AmodalLanes`); what this one saw where none is known stands for itself.
+    frame, which are kept until then. Every `LaneHead.every` frames the lanes that many segmentations show together are
+    found (`lanes.AmodalLanes`); points of this one that lie on no known lane are lane points without an id.
 
-    With an `aside` what is found comes with a later frame, and a segmentation that comes meanwhile adds nothing. Where
-    it was due, that is said (LANES_CARRIED): it is skipped, not awaited.
+    With `LaneHead.aside` what is found comes with a later frame, and a segmentation that comes meanwhile is skipped.
+    Where lanes were due with it, the status LANES_CARRIED says so.
     """
 
     def __init__(
@@ -103,27 +107,27 @@ class LaneMapper:
         self.config = config
         self.edges = edges
         self.head = head
-        self._aside = head.aside or _at_once
+        self._aside = head.aside or _run_at_once
         self._amodal = AmodalLanes(lanes, head.complete)
-        self._frames: deque[_Then] = deque(maxlen=REMEMBERED_FRAMES)
+        self._frames: deque[_PastFrame] = deque(maxlen=REMEMBERED_FRAMES)
         self._used_frame = -1
-        self._running: Future[_Gathered] | None = None
+        self._running: Future[_Found] | None = None
         self._running_frame = -1
-        self._outdated = False  # the run under way belongs to a world of before
-        self._due_frame: int | None = None  # that lanes were last made out for, or are being
-        self._made_out_frame: int | None = None
+        self._outdated = False  # the run under way belongs to a world that has ended
+        self._due_frame: int | None = None  # whose run finds lanes, or found them last
+        self._found_frame: int | None = None  # whose run found them last
         self._stations: tuple[int, list[Station]] = (-1, [])  # the frame that saw them last
 
     def clear(self) -> None:
         """The world frame began anew."""
         self._frames.clear()
-        self._due_frame = self._made_out_frame = None
+        self._due_frame = self._found_frame = None
         self._stations = (-1, [])
         self._outdated = self._running is not None
         if not self._outdated:
             self._amodal.clear()
 
-    def step(
+    def map_lanes(
         self,
         frame_id: int,
         T_world_ego: SE2,
@@ -132,12 +136,12 @@ class LaneMapper:
         segmentation: Segmentation | None,
         segmented_frame: int,
         boxes_px: Floats,
-    ) -> LaneNews:
+    ) -> LaneOutput:
         """What the segmentation of `segmented_frame` adds, nothing where it was used before or the ego stands.
 
         `boxes_px` (N, 4) are the vehicles' latest boxes, under which no line is believed.
         """
-        self._frames.append(_Then(frame_id, T_world_ego, ground, sigma_pitch_rad))
+        self._frames.append(_PastFrame(frame_id, T_world_ego, ground, sigma_pitch_rad))
         earlier = self._finished()
         status: tuple[Status, ...] = ()
         if segmentation is not None and segmented_frame != self._used_frame:
@@ -151,9 +155,9 @@ class LaneMapper:
                     self._due_frame = frame_id if due else self._due_frame
                     self._running_frame = frame_id
                     self._running = self._aside(self._gather, T_world_ego, then, segmentation, boxes_px, due)
-        return self._news(earlier or self._finished(), frame_id, T_world_ego, status)
+        return self._output(earlier or self._finished(), frame_id, T_world_ego, status)
 
-    def _finished(self) -> _Gathered | None:
+    def _finished(self) -> _Found | None:
         """What a run found that has ended."""
         if self._running is None or not self._running.done():
             return None
@@ -163,19 +167,19 @@ class LaneMapper:
             self._amodal.clear()
             return None
         self._stations = self._running_frame, found.stations
-        if found.made_out:
-            self._made_out_frame = self._running_frame
+        if found.with_lanes:
+            self._found_frame = self._running_frame
         return found
 
-    def _news(self, found: _Gathered | None, frame_id: int, T_world_ego: SE2, status: tuple[Status, ...]) -> LaneNews:
-        age = None if self._made_out_frame is None else frame_id - self._made_out_frame
+    def _output(self, found: _Found | None, frame_id: int, T_world_ego: SE2, status: tuple[Status, ...]) -> LaneOutput:
+        age = None if self._found_frame is None else frame_id - self._found_frame
         seen_frame, seen = self._stations
         carried = 0 <= frame_id - seen_frame <= self.edges.carried_frames
         edges = tuple(station.edge(frame_id, T_world_ego) for station in seen) if carried else ()
         if found is None:
-            return LaneNews(edges=edges, age=age, status=status)
+            return LaneOutput(edges=edges, age=age, status=status)
         points = (T_world_ego.inverse() @ found.points_m).tolist()
-        return LaneNews(
+        return LaneOutput(
             tuple(LanePoint(x, y, lane) for (x, y), lane in zip(points, found.lanes.tolist(), strict=True)),
             edges,
             age,
@@ -183,8 +187,8 @@ class LaneMapper:
         )
 
     def _gather(
-        self, T_world_ego: SE2, then: _Then, segmentation: Segmentation, boxes_px: Floats, due: bool
-    ) -> _Gathered:
+        self, T_world_ego: SE2, then: _PastFrame, segmentation: Segmentation, boxes_px: Floats, due: bool
+    ) -> _Found:
         road_m, boundary_m = points_of(segmentation, self.camera, then.ground, boxes_px, self._amodal.config)
         on_world_m = then.T_world_ego @ boundary_m
         found = lane_stations(
@@ -206,7 +210,7 @@ class LaneMapper:
         seen_m = seen_m[: self.config.max_lane_points - len(points_m)]
         all_lanes = np.concatenate([lanes, np.full(len(seen_m), NO_LANE)])
         failed = due and self._amodal.completion_failed
-        return _Gathered(np.concatenate([points_m, seen_m]), all_lanes, found, due, failed)
+        return _Found(np.concatenate([points_m, seen_m]), all_lanes, found, due, failed)
 
     def _lanes_m(self, T_world_ego: SE2) -> tuple[Floats, Ids]:
         """(N, 2) points, in world, of the lanes ahead, and their lanes (N,): the middle of what lies in each cell.

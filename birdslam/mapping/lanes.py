@@ -3,6 +3,7 @@
 Near points of road and lane boundaries, gathered over a window of frames with the odometry, fill two occupancy grids in
 the ego of the newest frame. Lone cells are dropped, a network (ENet) completes the grids, opening and closing clean
 them, and the Hough transform segregates the boundary's cells into lanes, which keep their ids (lane_ids.py).
+`AmodalLanes.lanes` takes these steps.
 
 A grid is (rows, columns) over x (row 0 is `behind_m` behind the ego) and y (column 0 is `half_width_m` to the right).
 """
@@ -80,7 +81,7 @@ class AmodalLanes:
     def __init__(self, config: LanesConfig, complete: Completion | None = None) -> None:
         self.config = config
         self.complete = complete
-        self.completion_failed = False  # the last time: it gave numbers that are none, and the grids stayed as seen
+        self.completion_failed = False  # the last time: its output was not finite, and the grids stayed as seen
         self._frames: deque[tuple[SE2, Floats, Floats]] = deque(maxlen=config.window_frames)
         self.ids = LaneIds(config.same_lane_m, config.cell_m, config.remembered_m)
 
@@ -97,7 +98,7 @@ class AmodalLanes:
         self._frames.append((T_world_ego, road_m[road_m[:, 0] < reach_m], boundary_m[boundary_m[:, 0] < reach_m]))
 
     def clear(self) -> None:
-        """The world frame began anew: what was gathered has no place in it, and no lane is called as one before."""
+        """The world frame began anew: what was gathered has no place in it, and no lane keeps its id."""
         self._frames.clear()
         self.ids.forget()
 
@@ -132,8 +133,8 @@ def points_of(
 ) -> tuple[Floats, Floats]:
     """Points of road (N, 2) and of lane boundaries (M, 2) in the ego of the segmentation's frame, up to `depth_m`.
 
-    Each point of a lattice on the road is looked up in the masks (Eq. 1 the other way round), so near and far weigh the
-    same. Nothing is believed inside `boxes_px` (B, 4): what stands there hides the road.
+    Each point of a lattice on the road is looked up in the masks (the inverse of Eq. 1), so that near and far road has
+    as many points. What `boxes_px` (B, 4) cover is left out: a vehicle hides the road there.
     """
     x_m = np.arange(0.5 * config.cell_m, config.depth_m, config.cell_m)
     y_m = np.arange(-config.half_width_m, config.half_width_m, config.lattice_m)
