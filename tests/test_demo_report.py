@@ -16,7 +16,9 @@ from birdslam.evaluation.demo import VEHICLES, grade, match, mount_pose_of, true
 from birdslam.evaluation.video import SideBySide
 from birdslam.geometry.se2 import SE2
 from birdslam.runtime.configuration import load
-from birdslam.runtime.supervision.demo_report import Witness, rows
+from birdslam.runtime.supervision.demo_report import DemoReport, rows
+from birdslam.runtime.supervision.final_results import FinalResults
+from birdslam.runtime.supervision.final_results import rows as final_rows
 from birdslam.trajectory import as_poses, inverse, split_pose
 from birdslam.types import Estimate, VehicleEstimate
 
@@ -118,9 +120,9 @@ def test_a_vehicle_out_of_reach_or_out_of_sight_matches_nobody(demo: DemoRecordi
 def test_nothing_is_known_of_the_vehicles_of_a_drive_without_any(demo: DemoRecording, truthful: list[Estimate]) -> None:
     found = grade(demo, [msgspec.structs.replace(estimate, vehicles=()) for estimate in truthful])
     assert (found.vehicles, found.vehicle_ate_m, found.vehicle_centre_m, found.found) == (0, None, None, 0.0)
-    text = dict(rows({"truth": msgspec.to_builtins(found), "video": None}))
+    text = dict(rows({"truth": msgspec.to_builtins(found)}))
     assert text["ATE of vehicles"].startswith("- m")
-    assert "can't write" in text["video"]
+    assert "can't write" in dict(final_rows({"video": None}))["video"]
 
 
 def test_true_egos_begin_at_the_origin_and_go_forward(demo: DemoRecording) -> None:
@@ -131,13 +133,16 @@ def test_true_egos_begin_at_the_origin_and_go_forward(demo: DemoRecording) -> No
 
 
 def test_a_run_leaves_a_video_and_its_figures(demo: DemoRecording, truthful: list[Estimate], tmp_path: Path) -> None:
-    witness = Witness.of(load(None, {"source.uri": "demo"}))
-    assert witness is not None
-    assert witness.finish(tmp_path) == {}
+    configuration = load(None, {"source.uri": "demo", "output": str(tmp_path)})
+    report = DemoReport.of(configuration)
+    assert report is not None
+    assert report.grade() is None
+    assert FinalResults(configuration, report).write(()) == {}
     for estimate in truthful:
-        witness.add(estimate)
-    summary = witness.finish(tmp_path)
-    assert [name for name, _ in rows(summary)] == ["ATE of the ego", "ATE of vehicles", "  from the ego", "video"]
+        report.add(estimate)
+    summary = {"truth": msgspec.to_builtins(report.grade()), **FinalResults(configuration, report).write(())}
+    told = [name for name, _ in (*rows(summary), *final_rows(summary))]
+    assert told == ["ATE of the ego", "ATE of vehicles", "  from the ego", "video"]
     video = cv2.VideoCapture(summary["video"])
     shown, picture = video.read()
     video.release()
@@ -157,6 +162,6 @@ def test_the_picture_shows_vehicles_in_both_views(demo: DemoRecording, truthful:
 
 
 @pytest.mark.parametrize("settings", [{"source.uri": "kitti:nowhere"}, {"source.uri": "demo", "source.loop": True}])
-def test_a_run_without_truth_or_without_end_has_no_witness(settings: dict[str, object]) -> None:
-    assert Witness.of(load(None, settings)) is None
+def test_a_run_without_truth_or_without_end_has_no_report(settings: dict[str, object]) -> None:
+    assert DemoReport.of(load(None, settings)) is None
     assert rows({}) == []

@@ -9,6 +9,8 @@
 | summary.json      | counts of this recording, and what the caller adds                                    |
 | bev.png           | all of it from above (`picture.py`)                                                   |
 
+Final trajectories, where they are asked for, lie beside the live ones (`final.py`).
+
 Where the optimizer began a new epoch, TUM files carry a comment line and begin in the new world frame. KITTI rows can't
 say that, and go on from the last pose, as the picture does; nothing is known of the motion in between. A frame without
 an estimate (dropped, unreadable) keeps the pose before it, so that row k is always frame k.

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from birdslam.evaluation.final import FinalTracks, last_seen, write_final_ego
-from birdslam.evaluation.results import Recorder
+from birdslam.evaluation.results import Recorder, claim_directory
 from birdslam.evaluation.video import DriveVideo, check_video
 from birdslam.runtime.configuration import ConfigurationError, parse_setting
 from birdslam.runtime.progress import Progress
@@ -21,6 +21,7 @@ from birdslam.runtime.recording.recording import Recording, RecordingError
 from birdslam.runtime.replay import replay as replaying
 from birdslam.runtime.replay.report import told
 from birdslam.runtime.supervision.final_results import recorded_frames
+from birdslam.runtime.supervision.logbook import Results
 from birdslam.types import Estimate, MapUpdate
 
 
@@ -69,17 +70,18 @@ def _results(recording: Recording, options: argparse.Namespace) -> str:
         video = None
         if options.video:
             camera, rate_hz, frames = recorded_frames([recording.path])
+            claim_directory(output)
             check_video(Path(options.video), camera, rate_hz)
             video = stack.enter_context(DriveVideo(Path(options.video), camera, rate_hz, frames))
         recorder = stack.enter_context(Recorder(output, recording.camera))
+        everything: list[Results] = [recorder, *([video] if video is not None else [])]
         final = None
         if options.smooth:
             final = FinalTracks(output / "tracks", last_seen(measurements_of([recording])))
-        sinks: list[Recorder | DriveVideo] = [recorder, *([video] if video else [])]
         for record in replaying.estimates(recording, config):
             if final is not None:
                 final.take(record)
-            for results in sinks:
+            for results in everything:
                 if isinstance(record, Estimate):
                     results.add(record)
                 elif isinstance(record, MapUpdate):

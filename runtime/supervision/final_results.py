@@ -18,7 +18,7 @@ import msgspec
 
 from birdslam.datasets.recording import DatasetError
 from birdslam.evaluation.final import FinalTracks, last_seen, write_final_ego
-from birdslam.evaluation.results import ResultsError
+from birdslam.evaluation.results import ResultsError, claim_directory
 from birdslam.evaluation.video import CODEC, DriveVideo, Floats, Image, check_video
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.runtime.configuration import Configuration, ConfigurationError
@@ -42,6 +42,9 @@ def check_results(configuration: Configuration, source: Source) -> None:
     results, recording = configuration.results, configuration.recording
     if not results.video:
         return
+    output = Path(configuration.output)
+    if Path(results.video).parent.resolve() == output.resolve():
+        claim_directory(output)  # as the run will
     check_video(Path(results.video), source.camera, source.rate_hz)
     if configuration.live and recording.file and not recording.images:
         raise ConfigurationError(

@@ -80,6 +80,9 @@ def run(configuration: Configuration) -> int:
         summary = summarise(configuration, supervisor.nodes, logbook, models, supervisor.ended)
         if configuration.recording.file and files is not None and supervisor.recorder is not None:
             summary["recording"] = files.figures(supervisor.recorder)
+        lost = 0 if supervisor.recorder is None else supervisor.recorder.total("dropped")
+        if lost and not configuration.recording.file:
+            live.say(f"{lost} messages did not come to the recorder: the final results lack them")
         try:
             if demo is not None and (found := demo.grade()) is not None:
                 summary["truth"] = msgspec.to_builtins(found)
