@@ -1,9 +1,9 @@
-"""Mutated bytes at every door: `make fuzz`, or `python -m tests.fuzz --cases 1000000 --seed 6`.
+"""Mutated bytes at every target: `make fuzz`, or `python -m tests.fuzz --cases 1000000 --seed 6`.
 
-Doors are the messages of the bus, what a subscriber, a planner and the optimizer make of them, references to frames in
-shared memory, and the files that a user gives: configuration, camera, manifest. Whatever comes in is either accepted,
-and then is a whole valid record that can be sent on, or refused with the one exception that the door is there to raise.
-Anything else ends the run with status 1 and the case that did it. The same seed gives the same cases.
+Targets are the messages of the bus, what a subscriber, a planner and the optimizer make of them, references to frames
+in shared memory, and the files that a user gives: configuration, camera, manifest. Whatever comes in is either
+accepted, and then is a whole valid record that can be sent on, or refused with the one exception that the target is
+there to raise. Anything else ends the run with status 1 and the case that did it. The same seed gives the same cases.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from tests.mutations import Chance, mutated, mutated_text, with_other_fields
 from tests.test_wire import BY_NAME, EXAMPLES
 
 ROOT = Path(__file__).resolve().parent.parent
-Door = Callable[[Chance], bool]  # makes a case and tries it; whether it was let in
+Target = Callable[[Chance], bool]  # makes a case and tries it; whether it was let in
 
 
 def sendable(data: bytes, record: type[msgspec.Struct], max_bytes: int) -> bool:
@@ -58,27 +58,27 @@ def sendable(data: bytes, record: type[msgspec.Struct], max_bytes: int) -> bool:
     return True
 
 
-def bytes_of_messages() -> Door:
+def bytes_of_messages() -> Target:
     """wire.decode on mutated bytes of each record."""
     goods = [(type(example), encode(example)) for example in EXAMPLES]
 
-    def door(chance: Chance) -> bool:
+    def target(chance: Chance) -> bool:
         (record, good), (_, donor) = chance.choice(goods), chance.choice(goods)
         return sendable(mutated(chance, good, donor), record, 64_000)
 
-    return door
+    return target
 
 
-def fields_of_messages() -> Door:
+def fields_of_messages() -> Target:
     """wire.decode on whole MessagePack with other contents."""
     goods = [(type(example), msgpack.unpackb(encode(example))) for example in EXAMPLES]
 
-    def door(chance: Chance) -> bool:
+    def target(chance: Chance) -> bool:
         record, plain = chance.choice(goods)
         limit = MAX_TRACE_BYTES if record is Trace else 64_000
         return sendable(msgpack.packb(with_other_fields(chance, plain)), record, limit)
 
-    return door
+    return target
 
 
 @dataclass
@@ -102,7 +102,7 @@ class Undeclared:
 
 
 @contextmanager
-def subscribers() -> Iterator[Door]:
+def subscribers() -> Iterator[Target]:
     """bus.Subscriber of every topic on mutated payloads, attachments, keys and kinds; a planner reads the estimates."""
     session, ends, readings = Undeclared(), {}, {}
     goods = {type(example): encode(example) for example in EXAMPLES}
@@ -113,7 +113,7 @@ def subscribers() -> Iterator[Door]:
     planner._bus = type("Bus", (), {"alive": frozenset({"optimize"}), "close": lambda self: None})()
     readings["planner"] = planner
 
-    def door(chance: Chance) -> bool:
+    def target(chance: Chance) -> bool:
         name = chance.choice(sorted(TOPICS))
         subscriber, key, good = ends[name], key_of("car", name), goods[TOPICS[name].record]
         donor = goods[chance.choice(sorted(goods, key=lambda record: record.__name__))]
@@ -136,13 +136,13 @@ def subscribers() -> Iterator[Door]:
             assert not reading.valid or (record.valid and INVALIDATING.isdisjoint(record.status))
         return True
 
-    yield door
+    yield target
     for end in ends.values():
         end.close()
 
 
 @contextmanager
-def references() -> Iterator[Door]:
+def references() -> Iterator[Target]:
     """frames.FrameReader on references that lead anywhere, and on rings whose head was overwritten."""
     with tempfile.TemporaryDirectory() as folder:
         path, broken = Path(folder, "ring"), Path(folder, "broken")
@@ -155,7 +155,7 @@ def references() -> Iterator[Door]:
                 **{"sequence": sequence, "ring_epoch": ring.epoch, "width_px": 32, "height_px": 24, "channels": 1},
             }
 
-            def door(chance: Chance) -> bool:
+            def target(chance: Chance) -> bool:
                 plain, where = dict(good), path
                 if chance.random() < 0.9:
                     for _ in range(chance.randint(1, 2)):
@@ -179,15 +179,15 @@ def references() -> Iterator[Door]:
                 assert pixels is None or np.array_equal(pixels, image), "pixels that were never written"
                 return pixels is not None
 
-            yield door
+            yield target
 
 
-def optimizer() -> Door:
+def optimizer() -> Target:
     """graph.PoseGraph on Measurements that passed the wire and say anything; what it makes of them can be sent."""
     config, good = SlamConfig(), msgpack.unpackb(encode(BY_NAME["Measurements"]))
     graph, frame = PoseGraph(config.graph, config.weights), 0
 
-    def door(chance: Chance) -> bool:
+    def target(chance: Chance) -> bool:
         nonlocal graph, frame
         if chance.random() < 0.1:
             graph = PoseGraph(config.graph, config.weights)
@@ -209,16 +209,16 @@ def optimizer() -> Door:
         encode(graph.optimise(measurements))
         return True
 
-    return door
+    return target
 
 
-def files(goods: list[str], read: Callable[[Path], object], refusal: type[Exception]) -> Callable[[Path], Door]:
+def files(goods: list[str], read: Callable[[Path], object], refusal: type[Exception]) -> Callable[[Path], Target]:
     """Files that a user gives; `read` raises `refusal` or gives something whole."""
 
-    def make(folder: Path) -> Door:
+    def make(folder: Path) -> Target:
         path = folder / "file.toml"
 
-        def door(chance: Chance) -> bool:
+        def target(chance: Chance) -> bool:
             path.write_bytes(mutated_text(chance, chance.choice(goods)))
             try:
                 read(path)
@@ -226,7 +226,7 @@ def files(goods: list[str], read: Callable[[Path], object], refusal: type[Except
                 return False
             return True
 
-        return door
+        return target
 
     return make
 
@@ -253,7 +253,7 @@ def _read_recording(path: Path) -> None:
 
 
 @contextmanager
-def images(folder: Path) -> Iterator[Door]:
+def images(folder: Path) -> Iterator[Target]:
     """kitti.read_image on mutated PNGs and JPEGs: an image of a known kind, or ValueError."""
     grey = np.random.default_rng(6).integers(0, 256, (12, 16), dtype=np.uint8)
     goods = [
@@ -262,7 +262,7 @@ def images(folder: Path) -> Iterator[Door]:
         for image in (grey, np.dstack([grey, grey, grey]))
     ]
 
-    def door(chance: Chance) -> bool:
+    def target(chance: Chance) -> bool:
         suffix, good = chance.choice(goods)
         path = folder / f"image{suffix}"
         path.write_bytes(mutated(chance, good, chance.choice(goods)[1]))
@@ -277,7 +277,7 @@ def images(folder: Path) -> Iterator[Door]:
     spoken, quiet = os.dup(2), os.open(os.devnull, os.O_WRONLY)  # the decoders complain there of each
     try:
         os.dup2(quiet, 2)
-        yield door
+        yield target
     finally:
         os.dup2(spoken, 2)
         os.close(spoken)
@@ -294,8 +294,8 @@ def _cameras() -> list[str]:
     return ["".join(f"{key} = {value}\n" for key, value in camera.items())]
 
 
-def doors(folder: Path) -> Iterator[tuple[str, float, Callable[[], object]]]:
-    """Name, share of all cases, and what makes the door."""
+def targets(folder: Path) -> Iterator[tuple[str, float, Callable[[], object]]]:
+    """Name, share of all cases, and what makes the target."""
     yield "bytes of messages", 0.585, bytes_of_messages
     yield "fields of messages", 0.17, fields_of_messages
     yield "optimizer", 0.02, optimizer
@@ -317,7 +317,7 @@ def doors(folder: Path) -> Iterator[tuple[str, float, Callable[[], object]]]:
 
 @dataclass(frozen=True)
 class Count:
-    """What one door did."""
+    """What one target did."""
 
     name: str
     cases: int
@@ -326,16 +326,16 @@ class Count:
 
 
 def run(cases: int, seed: int) -> Iterator[Count]:
-    """All doors; raises what a door should not have raised, with the case's number in a note."""
+    """All targets; raises what a target should not have raised, with the case's number in a note."""
     with tempfile.TemporaryDirectory() as folder:
-        for name, share, make in doors(Path(folder)):
+        for name, share, make in targets(Path(folder)):
             chance, begun_s, let_in = Chance(f"{seed} {name}"), time.monotonic(), 0
             number = round(cases * share)
             made = make()
-            with made if hasattr(made, "__enter__") else _open(made) as door:  # type: ignore[attr-defined]
+            with made if hasattr(made, "__enter__") else _open(made) as target:  # type: ignore[attr-defined]
                 for case in range(number):
                     try:
-                        let_in += door(chance)
+                        let_in += target(chance)
                     except Exception as error:
                         error.add_note(f"case {case} of {name!r}, seed {seed}")
                         raise
@@ -343,13 +343,13 @@ def run(cases: int, seed: int) -> Iterator[Count]:
 
 
 @contextmanager
-def _open(door: object) -> Iterator[object]:
-    yield door
+def _open(target: object) -> Iterator[object]:
+    yield target
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point."""
-    parser = argparse.ArgumentParser(prog="tests.fuzz", description="Mutated bytes at every door.")
+    parser = argparse.ArgumentParser(prog="tests.fuzz", description="Mutated bytes at every target.")
     parser.add_argument("--cases", type=int, default=1_000_000, metavar="N")
     parser.add_argument("--seed", type=int, default=6, metavar="N")
     options = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""The bus and the planner's door, over real zenoh sessions on unix sockets in a directory of their own.
+"""The bus and the planner's client, over real zenoh sessions on unix sockets in a directory of their own.
 
 Waiting is by events with generous limits; no test asserts how fast something is.
 """

@@ -19,10 +19,10 @@ RUNS_CODE = {"eval", "exec", "compile", "__import__"}
 READS_CODE = {"pickle", "marshal", "shelve", "dill", "joblib", "runpy", "imp", "code"}
 
 
-def test_every_door_holds() -> None:
+def test_every_target_holds() -> None:
     counts = {count.name: count for count in fuzz.run(CASES, SEED)}
     assert abs(sum(count.cases for count in counts.values()) - CASES) < len(counts)
-    for count in counts.values():  # a door that lets all or nothing in was not tried
+    for count in counts.values():  # a target that lets all or nothing in was not tried
         assert 0 < count.let_in < count.cases, count
 
 

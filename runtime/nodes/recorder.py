@@ -63,7 +63,7 @@ class Order(msgspec.Struct, frozen=True):
 
 
 class Recorder:
-    """From the bus into the file, turn by turn."""
+    """From the bus into the file."""
 
     def __init__(
         self,
@@ -102,18 +102,18 @@ class Recorder:
         if configuration.camera is not None:
             self._draw(scene.from_camera(configuration.camera, time.time_ns()), time.monotonic_ns())
 
-    def turn(self, timeout_s: float) -> bool:
+    def record_received(self, timeout_s: float) -> bool:
         """Writes what has come; whether anything has."""
         first = self._estimates.recv(timeout_s)
-        heard = [("estimate", first)] if first else []
+        received = [("estimate", first)] if first else []
         for topic, subscriber in (("estimate", self._estimates), *self._others.items()):
             while (message := subscriber.recv(0.0)) is not None:
-                heard.append((topic, message))
+                received.append((topic, message))
         while self._events:
             t_ns, event = self._events.popleft()
             self._writer.draw("/alive", event, t_ns)
-        heard.sort(key=lambda pair: pair[1].t_received_ns)
-        for topic, message in heard:
+        received.sort(key=lambda pair: pair[1].t_received_ns)
+        for topic, message in received:
             self._take(topic, message)
         now_ns = time.monotonic_ns()
         if now_ns - self._said_ns >= HEALTH_NS:
@@ -126,7 +126,7 @@ class Recorder:
             self._handed.append((self._writer.handed_bytes, self._estimate_frame + 1))
         while self._handed and self._handed[0][0] <= self._writer.written_bytes:
             self._vitals.count(next_frame=self._handed.popleft()[1])
-        return bool(heard)
+        return bool(received)
 
     def _begin_from_checkpoint(self, path: Path, first_frame: int, now_ns: int) -> None:
         """As soon as there is one from which on all measurements are in this file."""
@@ -265,10 +265,10 @@ def record(configuration: Configuration, order: Order, vitals: Vitals, stop: lis
         bus.declare_alive()
         end_s = None
         while writer.error is None and not stop and not recorder.over and (end_s is None or time.monotonic() < end_s):
-            recorder.turn(TURN_S)
+            recorder.record_received(TURN_S)
             if recorder.ending and end_s is None:
                 end_s = time.monotonic() + END_S
-        while writer.error is None and not recorder.over and recorder.turn(QUIET_S):
+        while writer.error is None and not recorder.over and recorder.record_received(QUIET_S):
             pass
         vitals.count(ready=0)  # no beat any more: it waits for the disk
         writer.close(recorder.end())
