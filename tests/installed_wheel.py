@@ -73,6 +73,7 @@ def drive(programs: Path, folder: Path) -> None:
     said = call(
         *(programs / "birdslam", "run", "--source", "demo", "--rate", "max", "--set", f"source.frames={FRAMES}"),
         *("--set", f"runtime.runtime_dir={folder / 'run'}", "--output", folder / "out"),
+        *("--set", f"runtime.watchdog_ms={1e3 * LIMIT_S}"),  # a busy machine is no stalled node
         cwd=folder,
         env=environment,
     )

@@ -544,6 +544,7 @@ def test_numbers_that_are_no_measurement_raise_nothing(cov: tuple[float, ...], T
 # --- the benchmark ---
 
 
+@pytest.mark.processes
 def test_the_benchmark_measures_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (
         perf_main(["optimizer", *f"--vehicles 0,2 --frames 150 --contenders ours --output {tmp_path}/F.json".split()])

@@ -42,14 +42,20 @@ def _texture(seed: int) -> list[np.ndarray]:
 
 
 def _sample(seed: int, a_m: np.ndarray, b_m: np.ndarray, footprint_m: np.ndarray) -> np.ndarray:
-    """The texture at (a, b), mirrored at its edges, from the level that suits the pixel's footprint."""
+    """The texture at points (a, b), mirrored at its edges, from the levels that suit each one's footprint; (N,)."""
     level = np.clip(np.log2(np.maximum(footprint_m / 0.02, 1.0)), 0.0, 4.99)
     out = np.zeros(a_m.shape, np.float32)
     for k, image in enumerate(_texture(seed)):
         share = np.maximum(1.0 - np.abs(level - k), 0.0).astype(np.float32)
+        (seen,) = np.nonzero(share)
         side, texel = image.shape[0] - 1, 0.02 * 2**k
-        u, v = ((side - np.abs(x / texel % (2 * side) - side)).astype(np.float32) for x in (a_m, b_m))
-        out += share * cv2.remap(image, u, v, cv2.INTER_LINEAR)
+        rows = -(-len(seen) // WIDTH_PX)  # remap takes an image of points
+        u, v = np.zeros((2, rows * WIDTH_PX), np.float32)
+        for to, x in ((u, a_m), (v, b_m)):
+            to[: len(seen)] = side - np.abs(x[seen] / texel % (2 * side) - side)
+        if rows:
+            texels = cv2.remap(image, u.reshape(rows, -1), v.reshape(rows, -1), cv2.INTER_LINEAR)
+            out[seen] += share[seen] * texels.ravel()[: len(seen)]
     return out
 
 
@@ -70,9 +76,10 @@ def render(pose: Pose, noise_seed: int = 0) -> np.ndarray:
     footprint = np.minimum(depth, 100.0) / CAMERA.fx_px
     on_road, on_wall = depth == road, (depth == wall) & (hit[..., 1] > -5.0)
     on_front = (depth == front) & (hit[..., 1] > -6.0)
-    image[on_front] = _sample(3, hit[..., 0], hit[..., 1], footprint)[on_front]
-    image[on_wall] = _sample(2, hit[..., 2], hit[..., 1], footprint * 2)[on_wall]
-    image[on_road] = 0.6 * _sample(1, hit[..., 0], hit[..., 2], footprint * 4)[on_road] + 30.0
+    x_m, y_m, z_m = np.moveaxis(hit, -1, 0)
+    image[on_front] = _sample(3, x_m[on_front], y_m[on_front], footprint[on_front])
+    image[on_wall] = _sample(2, z_m[on_wall], y_m[on_wall], footprint[on_wall] * 2)
+    image[on_road] = 0.6 * _sample(1, x_m[on_road], z_m[on_road], footprint[on_road] * 4) + 30.0
     image += np.random.default_rng(noise_seed).normal(0.0, 1.5, image.shape)
     return np.clip(image, 0, 255).astype(np.uint8)
 

@@ -40,7 +40,7 @@ from birdslam.runtime.wire import Health, decode, encode
 from birdslam.types import Estimate, Measurements
 from tests.taped_drive import CAMERA, Tape, measured
 from tests.test_bus import until
-from tests.test_pipeline import F_PX, HEIGHT, LIMIT_S, WIDTH, Run, call, road_image
+from tests.test_pipeline import F_PX, HEIGHT, LIMIT_S, UNHURRIED, WIDTH, Run, call, road_image
 
 
 @pytest.fixture
@@ -409,7 +409,7 @@ def test_a_full_disk_ends_the_recording_and_the_drive_goes_on(
     file = place / "f.mcap"
     run = Run(
         *(place, "--source", f"kitti:{road}", "--rate", "25", "--set", "source.loop=true"),
-        *("--record", str(file)),
+        *("--record", str(file), *UNHURRIED),
     )
     try:
         with Planner(run.vehicle, run.runtime_dir) as planner:
