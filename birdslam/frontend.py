@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
 from birdslam.mapping.lane_edges import LaneEdgesConfig
-from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneNews
+from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneOutput
 from birdslam.mapping.lanes import LanesConfig
 from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
@@ -179,7 +179,7 @@ class FrontEnd:
             ids, px, frame.frame_id, self.camera, road.ground, road.sigma_pitch_rad, self.config.static_map
         )
 
-    def _map_lanes(self, frame: Frame, perception: Perception) -> LaneNews:
+    def _map_lanes(self, frame: Frame, perception: Perception) -> LaneOutput:
         """Lanes, by what is known of this frame's road or an earlier one's."""
         road, age = self.vehicles.road, perception.ages.get("segmenter", 0)
         return self._lanes.map_lanes(
