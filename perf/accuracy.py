@@ -1,4 +1,4 @@
-"""How right the system is, offline where nothing is lost, and live at a rate and under load, with what it dropped.
+"""How accurate the system is: offline, where no frame is dropped, and live at a rate and under load.
 
     python -m perf accuracy [--source demo] [--source kitti:DIR] [--labels DIR] [--load 1] [--output F.json]
 
@@ -72,7 +72,7 @@ def _source(ledger: Ledger, options: argparse.Namespace, source: str) -> None:
         return
     row = _offline(options, source, recording)
     ledger.add(
-        f"{name} offline", told(row), **row, exact={key: row[key] for key in COLUMNS if row.get(key) is not None}
+        f"{name} offline", summary(row), **row, exact={key: row[key] for key in COLUMNS if row.get(key) is not None}
     )
     rates = sorted({round(recording.rate_hz), *options.rates})
     for rate, load in [(rate, 0) for rate in rates] + ([(rates[-1], options.load)] if options.load else []):
@@ -81,7 +81,7 @@ def _source(ledger: Ledger, options: argparse.Namespace, source: str) -> None:
             ages_ms = [age_of(message) for message in result.messages]
             row |= {"epochs": len({m.record.epoch for m in result.messages}), "age_ms": spread(ages_ms)}
             beside = f", {load} busy" if load else ""
-            ledger.add(f"{name} live {rate} Hz{beside}", told(row), rate_hz=rate, load=load, **row)
+            ledger.add(f"{name} live {rate} Hz{beside}", summary(row), rate_hz=rate, load=load, **row)
             if not result.complete:
                 raise KeyboardInterrupt
 
@@ -147,7 +147,7 @@ def _labels(ledger: Ledger, labels: Path, name: str, measure: Callable[[Path, Pa
             return
     for row_name, row in rows.items():
         exact = {key: value for key, value in row.items() if isinstance(value, float)}
-        ledger.add(f"{name} {row_name}", told(row), **row, exact=exact)
+        ledger.add(f"{name} {row_name}", summary(row), **row, exact=exact)
 
 
 def _localisation(labels: Path, folder: Path) -> dict[str, Row]:
@@ -180,7 +180,7 @@ def _tracking(labels: Path, folder: Path) -> dict[str, Row]:
     return out
 
 
-def told(row: Row) -> str:
+def summary(row: Row) -> str:
     """For a person."""
     errors = "  ".join(f"{name} {row[name]:.4g}" for name in COLUMNS if row.get(name) is not None)
     return errors + (f"  dropped {row['dropped']} frames" if "dropped" in row else "")

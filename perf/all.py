@@ -35,7 +35,7 @@ NETWORKS = {"detector": "yolox_nano_416.onnx", "segmenter": "twinlitenet_640x360
 
 @dataclass(frozen=True)
 class Step:
-    """One benchmark with its options: for a quick run, and for figures to be shown. `on`: what it looks at."""
+    """One benchmark with its options: for a quick run, and for figures to be shown. `on`: its recording."""
 
     file: str
     benchmark: str

@@ -138,7 +138,7 @@ def _answer(estimates: Subscriber, frame_id: int, until_ns: int) -> Message | No
     return None
 
 
-def told(row: dict[str, Any]) -> str:
+def summary(row: dict[str, Any]) -> str:
     """For a person."""
     step = row["step_ms"]
     times = "  ".join(f"{name} {step[name]:.2f}" for name in ("p50", "p99", "max"))

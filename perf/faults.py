@@ -3,7 +3,7 @@
     python -m perf.faults [--models DIR] [--markdown FILE] [NAME ...]
 
 Each row: how long until the planner has a valid estimate again (from the fault's beginning where a process is hit, from
-its end where the world is), what it was told meanwhile, how far the poses that were marked valid were off, and whether
+its end where the world is), the statuses meanwhile, how far the poses that were marked valid were off, and whether
 anything was marked valid that was not: by its own status, or by where the car really was (perf/witness.py).
 """
 
@@ -27,7 +27,7 @@ PAGE = """\
 # Faults
 
 Made by `make faults`, which breaks a running vehicle in {faults} ways and looks on as its planner. A test holds the
-rows to the suite (`perf/strikes.py` has the faults, `perf/witness.py` the planner's eyes).
+rows to the suite (`perf/strikes.py` has the faults, `perf/witness.py` the planner that judges).
 
 {machine}
 
@@ -38,7 +38,7 @@ while nothing could be known.
 
 {table}
 """
-BEFORE_S, AFTER_S = 0.3, 1.5  # the witness looks on so long before and after, for a wrong pose that comes late
+BEFORE_S, AFTER_S = 0.3, 1.5  # so long before and after, estimates are collected: a wrong pose may come late
 
 
 @dataclass

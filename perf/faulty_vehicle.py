@@ -34,7 +34,7 @@ VITALS = "memfd:birdslam-vitals"
 
 
 def ends_with_its_vehicle() -> None:
-    """A suite that is told to end (SIGTERM) takes its vehicle along, as on Ctrl-C."""
+    """A suite that gets SIGTERM ends its vehicle too, as on Ctrl-C."""
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
 
 

@@ -56,7 +56,7 @@ class GradedRoad:
         return out
 
     def stand(self, rear_m: float) -> Stand:
-        """Of a car whose rear axle stands at `rear_m`; the camera looks along the body, as high as calibrated."""
+        """Of a car whose rear axle stands at `rear_m`; the camera is aligned with the body, as high as calibrated."""
         rear, front = (float(self.up_m(rear_m + a)) for a in (0.0, WHEELBASE_M))
         rise = math.atan2(front - rear, WHEELBASE_M)
         height_m = self.camera.height_m

@@ -55,7 +55,7 @@ label = "the ground on a grade, after a pitch step, with a wrong height: plotted
 
 GRADE, SPEED_MPS, RATE_HZ = 0.06, 10.0, 10.0
 LOOK_AHEAD_M = 15.0  # where the depth by Eq. 1 is compared
-LEVEL_REL = 1e-3  # less off, and the road is straight as far as one looks
+LEVEL_REL = 1e-3  # the road bends or climbs where Eq. 1 on level ground errs by more
 STEP_DEG, STEP_FRAME = 1.5, 40
 HEIGHTS = (0.85, 0.9, 1.0, 1.1, 1.15)
 STREET = Camera(931, 282, 540.0, 540.0, 456.3, 139.2, height_m=1.65)
@@ -66,7 +66,7 @@ class Drive:
     """What the front end said over a drive, frame by frame."""
 
     measurements: list[Measurements]
-    watched: list[tuple[float, float, int]]  # height over the stated one, 1-sigma, vehicles
+    heights: list[tuple[float, float, int]]  # height over the stated one, 1-sigma, vehicles
 
     @property
     def pitch_rad(self) -> Floats:
@@ -124,11 +124,11 @@ def _keep(output: Path, rows: dict[str, Any]) -> None:
 def _drive(camera: Camera, frames: Iterable[Frame], start: Callable[[Frame], Pending]) -> Drive:
     config = FrontEndConfig()
     front = FrontEnd(camera, config)
-    measurements, watched = [], []
+    measurements, heights = [], []
     for frame in frames:
         measurements.append(front.measure(frame, start(frame)))
-        watched.append(front.height.estimate)
-    return Drive(measurements, watched)
+        heights.append(front.height.estimate)
+    return Drive(measurements, heights)
 
 
 def _alone(frame: Frame) -> Pending:
@@ -148,7 +148,7 @@ def _grade(axes: Any) -> dict[str, Any]:
     way = np.array([stand.way_m for stand in stands])
     up = np.array([stand.up_m for stand in stands])
     true_way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(way), np.diff(up)))])
-    # The ground is told as the plane through the road under the camera and that `chord_m` ahead
+    # The estimated ground is given as the plane through the road under the camera and that `chord_m` ahead
     chord_m = RoadScaleConfig().chord_m
     true_pitch = np.array(
         [s.pitch_rad + math.atan((road.up_m(s.way_m + chord_m) - road.up_m(s.way_m)) / chord_m) for s in stands]
@@ -242,17 +242,19 @@ def _pitch_step(recording: Recording, configuration: Configuration, axes: Any) -
             drive = _drive(calibrated, _frames(recording, knocked), inference.start)
         found = np.degrees(drive.pitch_rad - plain.pitch_rad)
         name = f"{sign * STEP_DEG:+g} deg"
-        told = drive.first("calibration_drift", STEP_FRAME)
+        warned = drive.first("calibration_drift", STEP_FRAME)
         left.plot(found, label=f"{name}: pitch, less the unedited drive's")
         left.axhline(sign * STEP_DEG, color="k", linestyle=":", linewidth=1)
-        if told is not None:
-            left.axvline(told, color="C3", linewidth=1)
+        if warned is not None:
+            left.axvline(warned, color="C3", linewidth=1)
         right.plot(100.0 * (drive.way_m / np.maximum(plain.way_m, 1e-3) - 1.0), label=name)
         out[name] = {
             "found_after_1_frame_deg": float(found[STEP_FRAME + 1]),
             "found_median_deg": float(np.nanmedian(found[STEP_FRAME:])),
-            "calibration_drift_after_frames": None if told is None else told - STEP_FRAME,
-            "calibration_drift_after_m": None if told is None else float(plain.way_m[told] - plain.way_m[STEP_FRAME]),
+            "calibration_drift_after_frames": None if warned is None else warned - STEP_FRAME,
+            "calibration_drift_after_m": (
+                None if warned is None else float(plain.way_m[warned] - plain.way_m[STEP_FRAME])
+            ),
             "way_against_unedited": float(drive.way_m[-1] / plain.way_m[-1] - 1.0),
             "statuses": _statuses(drive, STEP_FRAME),
         }
@@ -276,7 +278,7 @@ def _height(recording: Recording, configuration: Configuration, axes: Any) -> di
             drive = _drive(camera, _frames(recording), inference.start)
         name = f"stated {factor - 1:+.0%}"
         left.plot(drive.way_m, label=name)
-        ratio, sigma, vehicles = (np.array(column) for column in zip(*drive.watched, strict=True))
+        ratio, sigma, vehicles = (np.array(column) for column in zip(*drive.heights, strict=True))
         if vehicles[-1]:
             k = np.flatnonzero(vehicles)
             right.errorbar(k[::6], ratio[k][::6] * factor, yerr=(sigma * factor)[k][::6], label=name, linewidth=1)

@@ -142,13 +142,13 @@ def _errors(world: Drive, lag: int) -> list[tuple[str, str, float]]:
     whole = batch_se2.solve(log, *EQ_6)
     for k in np.linspace(0, len(log) - 1 - lag, SAMPLES + 1).astype(int)[1:].tolist():
         so_far, later = (batch_se2.solve(log[: n + 1], *EQ_6) for n in (k, k + lag))
-        told: list[tuple[str, SE2, list[tuple[int, SE2]]]] = []
+        answers: list[tuple[str, SE2, list[tuple[int, SE2]]]] = []
         seen = [(v.vehicle, v.T_world_vehicle) for v in live[k].vehicles if v.age_ns == 0]
-        told.append((WHO[0], live[k].T_world_ego, seen))
+        answers.append((WHO[0], live[k].T_world_ego, seen))
         batches: tuple[Solution, ...] = (so_far, later, whole)
         for who, batch in zip(WHO[1:], batches, strict=True):
-            told.append((who, batch.ego(k), [(vehicle, batch.vehicle(vehicle, k)) for vehicle, _ in seen]))
-        for who, ego, vehicles in told:
+            answers.append((who, batch.ego(k), [(vehicle, batch.vehicle(vehicle, k)) for vehicle, _ in seen]))
+        for who, ego, vehicles in answers:
             out.append((who, "ego", _away_m(ego, world.ego[k])))
             out += [(who, "vehicle", _away_m(pose, world.vehicles[vehicle][k])) for vehicle, pose in vehicles]
     return out

@@ -60,17 +60,17 @@ def run(arguments: list[str]) -> None:
                 row = _row(alone(network, frames, options.seconds))
                 ledger.add(
                     f"{role} {network.path.name} {threads} threads",
-                    _told(row),
+                    _summary(row),
                     network=network.describe(),
                     size_bytes=network.path.stat().st_size,
                     **row,
                 )
             if configuration.models.completion:
                 row = _row(_completion(configuration, options.seconds))
-                ledger.add("completion lanes.onnx 1 threads", _told(row), **row)
+                ledger.add("completion lanes.onnx 1 threads", _summary(row), **row)
             for threads in options.threads:
                 row = _row(perceive(_with_threads(configuration, threads), frames, options))
-                ledger.add(f"perceive step {threads} threads", _told(row), threads=threads, **row)
+                ledger.add(f"perceive step {threads} threads", _summary(row), threads=threads, **row)
     except (ModelError, ConfigurationError, SourceError) as error:
         raise PerfError(str(error)) from error
 
@@ -185,6 +185,6 @@ def _row(parts: Parts) -> dict[str, Any]:
     }
 
 
-def _told(row: dict[str, Any]) -> str:
+def _summary(row: dict[str, Any]) -> str:
     parts = "  ".join(f"{name} {part['p50']:.2f}" for name, part in row["parts_ms"].items() if part["n"])
     return f"{shown(row['total_ms'], 'ms')}  ({parts})"

@@ -1,7 +1,8 @@
-"""What the lane completion is worth: bird's-eye road and lane IoU with ENet and without, on worlds held out.
+"""Bird's-eye road and lane IoU with the lane completion (ENet) and without it, on held-out worlds.
 
 Both grids are compared at a tolerance of a cell (0.25 m): the boundary's cells are widened by one on each side before
-the intersection is counted, since a line one cell wide misses another by a hair. The worlds need the extra [train].
+the intersection is counted, since two lines one cell wide that lie side by side would share nothing. The worlds need
+the extra [train].
 """
 
 from __future__ import annotations

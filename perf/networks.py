@@ -3,8 +3,8 @@
     python -m perf networks [--network F.onnx] [--frames 300] [--data DIR] [--models DIR] [--output F.json]
 
 Held-out worlds need the extra [train]; without it their rows are left out and said to be. Real frames are those of
-BIRDSLAM_DATA: depth against the LiDAR of the raw clip; masks and boxes against two networks of other makers, whose
-word is no truth but a second opinion.
+BIRDSLAM_DATA: depth against the LiDAR of the raw clip; masks and boxes against two networks of other makers, which
+are no truth but a comparison.
 """
 
 from __future__ import annotations
@@ -65,11 +65,11 @@ def run(arguments: list[str]) -> None:
             else:
                 for width_px, height_px in SIZES:
                     figures = simulated(network, options.frames, width_px, height_px)
-                    ledger.add(f"worlds {width_px}x{height_px}", _told(figures), **figures)
+                    ledger.add(f"worlds {width_px}x{height_px}", _summary(figures), **figures)
             if options.data.is_dir():
                 for name, folder in RECORDINGS.items():
                     figures = real(network, options.data / folder, options.models)
-                    ledger.add(f"real {name}", _told(figures), **figures)
+                    ledger.add(f"real {name}", _summary(figures), **figures)
             else:
                 print(f"real frames: left out, {options.data} is not there (set BIRDSLAM_DATA)")
     except (ModelError, DatasetError) as error:
@@ -220,7 +220,7 @@ def _sizes(ours: Detections, theirs: Detections, width_px: int) -> list[NDArray[
     return out
 
 
-def _told(figures: dict[str, float]) -> str:
+def _summary(figures: dict[str, float]) -> str:
     return "  ".join(
         f"{name} {value:.3f}" if isinstance(value, float) else f"{name} {value}"
         for name, value in figures.items()

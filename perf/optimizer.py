@@ -3,7 +3,7 @@
 Every contender takes the same log of `Measurements` in a fresh process with one BLAS thread, as the optimize node runs,
 and the same edges of it: CC, CV, VV and CP (Eqs. 6 and 7). "ours" is Eq. 8 on just these; "ours_live" is the graph as
 it is configured by default, with its constant-velocity factor in VV's place. The log has CP edges in one frame of
-four, on ours' key frames, so that ours uses them all: as one edge between key frames, where gtsam has a node for each
+four, on our keyframes, so that ours uses them all: as one edge between keyframes, where gtsam has a node for each
 landmark.
 
 What is timed is one frame from decoded record to the poses and covariances of the newest ego and of every vehicle in
@@ -75,7 +75,7 @@ def run(arguments: list[str]) -> None:
             for contender in options.contenders.split(","):
                 row = measure(contender, vehicles, log, options.limit_s)
                 rows.append({"name": f"{contender} {vehicles} vehicles", **row})
-                print(f"{rows[-1]['name']:44} {told(row)}", flush=True)
+                print(f"{rows[-1]['name']:44} {summary(row)}", flush=True)
                 if options.output is not None:
                     write_json(options.output, rows)  # after each: Ctrl-C keeps what was measured
 
@@ -87,7 +87,7 @@ def write_log(log: Path, config: DriveConfig, seed: int) -> None:
     log.write_bytes(msgspec.msgpack.encode([msgspec.msgpack.encode(m) for m in with_key_frames]))
 
 
-def told(row: dict[str, Any]) -> str:
+def summary(row: dict[str, Any]) -> str:
     """For a person."""
     times = "  ".join(f"{name} {row[f'{name}_us'] / 1e3:.2f}" for name in ("p50", "p99", "undisturbed_p99", "max"))
     grown = f"frames {row['frames']}  memory {row['rss_growth_mb']:+.0f} MB  exceptions {row['exceptions']}"

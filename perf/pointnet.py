@@ -4,8 +4,8 @@
 
 `noisy`: the worlds' exact depth with the errors that depth networks make, in the bodies' own boxes, drawn a little
 wrong. `network`: depth and boxes as the shipped multi-task network finds them in the image. Eq. 1 stands on the true
-road, its pitch off by PITCH_ERROR_RAD; it takes the vehicle to be headed as the ego, as a track begins without a look
-at its front, and with a multi-task body as that one says. Needs the extra [train].
+road, its pitch off by PITCH_ERROR_RAD; without a multi-task body, which says it, the vehicle's yaw is taken to be
+the ego's, as that of a new track is. Needs the extra [train].
 """
 
 from __future__ import annotations
@@ -74,14 +74,14 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Look:
+class Sample:
     """A frame's depth and its observed vehicles, each with its truth."""
 
     frame: WorldFrame
     depth: DepthMap
     seen: list[Observation]
     truth: list[WorldObject]
-    bodies: list[DepthPlace | None]  # as the multi-task network says
+    bodies: list[DepthPlace | None]  # of the multi-task network
     localisation: LocalisationConfig  # with what the network says of its boxes' edges
 
 
@@ -98,20 +98,20 @@ def run(arguments: list[str]) -> None:
     try:
         pointnet = load_pointnet(ModelSpec(str(options.network), threads=1))
         if options.depth == "network":
-            looks = _seen_by(load_network("multitask", ModelSpec(str(options.multitask))), options.frames)
+            samples = _seen_by(load_network("multitask", ModelSpec(str(options.multitask))), options.frames)
         else:
-            looks = _noisy(options.frames)
+            samples = _noisy(options.frames)
     except ModelError as error:
         raise PerfError(str(error)) from error
     with Ledger(options.output, label, network=pointnet.describe(), depth=options.depth) as ledger:
-        for (method, near_m, far_m), errors in measured(looks, pointnet).items():
+        for (method, near_m, far_m), errors in measured(samples, pointnet).items():
             if errors.centre_m:
                 figures = errors.figures()
-                told = "  ".join(f"{name} {value:.3f}" for name, value in figures.items())
-                ledger.add(f"{method} {near_m:g}-{far_m:g} m", told, **figures)
+                line = "  ".join(f"{name} {value:.3f}" for name, value in figures.items())
+                ledger.add(f"{method} {near_m:g}-{far_m:g} m", line, **figures)
 
 
-def measured(looks: Iterator[Look], pointnet: PointNet) -> dict[tuple[str, float, float], Errors]:
+def measured(samples: Iterator[Sample], pointnet: PointNet) -> dict[tuple[str, float, float], Errors]:
     """Errors by method and range."""
     config = PseudoLidarConfig()
     methods = (
@@ -120,28 +120,28 @@ def measured(looks: Iterator[Look], pointnet: PointNet) -> dict[tuple[str, float
     )
     found = {(method, *range_m): Errors() for method in methods for range_m in RANGES_M}
     rng = np.random.default_rng(1)
-    for look in looks:
-        camera, true = look.frame.camera, look.frame.camera.ground
+    for sample in samples:
+        camera, true = sample.frame.camera, sample.frame.camera.ground
         pitch_rad = true.pitch_rad + float(rng.normal(0.0, PITCH_ERROR_RAD))
         ground = GroundPlane(true.height_m, pitch_rad, true.roll_rad)
-        by_box = [by_bottom(o, ground, look.localisation) for o in look.seen]
+        by_box = [by_bottom(o, ground, sample.localisation) for o in sample.seen]
         headed = [
-            by_bottom(o, ground, look.localisation, Assignment(0, None, o, body).yaw_rad(SE2()))
-            for o, body in zip(look.seen, look.bodies, strict=True)
+            by_bottom(o, ground, sample.localisation, Assignment(0, None, o, body).yaw_rad(SE2()))
+            for o, body in zip(sample.seen, sample.bodies, strict=True)
         ]
-        by_net = localise_by_depth(look.seen, look.depth, camera, ground, config, network=pointnet)
+        by_net = locate_by_depth(sample.seen, sample.depth, camera, ground, config, network=pointnet)
         places: dict[str, Sequence[DepthPlace | Place | None]] = {
             "Eq. 1": by_box,
-            "geometric fit": localise_by_depth(look.seen, look.depth, camera, ground, config),
+            "geometric fit": locate_by_depth(sample.seen, sample.depth, camera, ground, config),
             "Frustum-PointNet": by_net,
             "Eq. 1 + PointNet": [fuse(a, b, config) for a, b in zip(by_box, by_net, strict=True)],
-            "multi-task body": look.bodies,
+            "multi-task body": sample.bodies,
             "Eq. 1 + multi-task body": [
-                None if b is None else fuse(a, b, config) for a, b in zip(headed, look.bodies, strict=True)
+                None if b is None else fuse(a, b, config) for a, b in zip(headed, sample.bodies, strict=True)
             ],
         }
         for method, answers in places.items():
-            for answer, truth in zip(answers, look.truth, strict=True):
+            for answer, truth in zip(answers, sample.truth, strict=True):
                 _count(found, method, answer, truth.T_ego_object)
     return found
 
@@ -187,7 +187,7 @@ def _observed(
     return seen, [truth[row] for row in rows], rows
 
 
-def _noisy(frames: int) -> Iterator[Look]:
+def _noisy(frames: int) -> Iterator[Sample]:
     """Exact depth with a network's errors, each body's own."""
     from birdslam.rendered_world.world import sample
     from birdslam.training.pointnet import (
@@ -211,10 +211,10 @@ def _noisy(frames: int) -> Iterator[Look]:
             box_px = box_of(example, errors, rng)[None]
             seen, truth, _ = _observed(frame, box_px, [body.label], [body], localisation)
             if seen:
-                yield Look(frame, DepthMap(depth_m, *MAP_PX), seen, truth, [None] * len(seen), localisation)
+                yield Sample(frame, DepthMap(depth_m, *MAP_PX), seen, truth, [None] * len(seen), localisation)
 
 
-def _seen_by(network: Network, frames: int) -> Iterator[Look]:
+def _seen_by(network: Network, frames: int) -> Iterator[Sample]:
     """Depth, boxes and bodies of the multi-task network; a box belongs to the vehicle that it overlaps most."""
     from birdslam.rendered_world.world import sample
     from birdslam.training.pointnet import FrustumConfig, chosen
@@ -235,4 +235,4 @@ def _seen_by(network: Network, frames: int) -> Iterator[Look]:
         said: list[DepthPlace | None] = [None] * len(seen)
         if bodies is not None and seen:
             said = places_of(bodies.take([rows[i] for i in kept]), seen, frame.camera, frame.camera.ground)
-        yield Look(frame, found.depth, seen, truth, said, localisation)
+        yield Sample(frame, found.depth, seen, truth, said, localisation)

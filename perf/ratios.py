@@ -53,10 +53,10 @@ def run(arguments: list[str]) -> int:
         for name, values in found.items():
             bound = bounds[name]
             verdict = "held" if min(values) <= bound.bound else "WORSE than its bound"
-            told = f"{np.median(values):.3f} (reference {bound.measured:g}, bound {bound.bound:g}): {verdict}"
+            line = f"{np.median(values):.3f} (reference {bound.measured:g}, bound {bound.bound:g}): {verdict}"
             ledger.add(
                 name,
-                told,
+                line,
                 rounds=values,
                 median=float(np.median(values)),
                 noise={"ratio": values},

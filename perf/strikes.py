@@ -1,4 +1,4 @@
-"""The faults that a vehicle is struck with, each a context that it goes on in."""
+"""The faults of the fault suite, each a context manager: the fault lasts as long as the context."""
 
 from __future__ import annotations
 

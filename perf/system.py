@@ -74,7 +74,7 @@ def _with_vehicles(options: argparse.Namespace) -> None:
     with Ledger(options.output, label, vehicles=options.vehicles, **settings) as ledger, loaded(options.load):
         for vehicles in options.vehicles:
             row = convoy.measure(vehicles, options.rate, options.seconds, WARM_UP_S, tuple(options.set))
-            ledger.add(f"{vehicles} vehicles", convoy.told(row), **row)
+            ledger.add(f"{vehicles} vehicles", convoy.summary(row), **row)
 
 
 def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
@@ -220,6 +220,6 @@ def table(content: dict[str, Any]) -> str:
         lines.append(f"  {name:30}{shown(stage, 'ms')}  mean {stage['mean']:.2f}")
     for row in content["budgets"]:
         verdict = "met" if row["met"] else "NOT MET"
-        told = f"p{row['percentile']:g} {row['measured_ms']:.2f} of {row['limit_ms']:g} ms: {verdict}"
-        lines.append(f"{row['budget']:32}{told}")
+        line = f"p{row['percentile']:g} {row['measured_ms']:.2f} of {row['limit_ms']:g} ms: {verdict}"
+        lines.append(f"{row['budget']:32}{line}")
     return "\n".join(lines)

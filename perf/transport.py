@@ -63,8 +63,8 @@ def run(arguments: list[str]) -> None:
                 for case in cases(carriers, options.bytes, options.rates, load):
                     row = measure(case, options.seconds)
                     cpu = f"cpu {row['cpu_percent']['sender']:.1f} + {row['cpu_percent']['receiver']:.1f} %"
-                    told = f"{shown(row['latency_ms'], 'ms')}  {cpu}  dropped {row['dropped']} of {row['sent']}"
-                    ledger.add(case.name, told, **row)
+                    line = f"{shown(row['latency_ms'], 'ms')}  {cpu}  dropped {row['dropped']} of {row['sent']}"
+                    ledger.add(case.name, line, **row)
 
 
 def cases(carriers: list[str], sizes: tuple[int, ...], rates: tuple[int, ...], load: int) -> Iterator[Case]:

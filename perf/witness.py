@@ -1,4 +1,4 @@
-"""What a planner sees of a vehicle under faults, held against where the car really was."""
+"""What a planner receives of a vehicle under faults, compared with where the car really was."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Witness:
         statuses = Counter(status.value for _, estimate in self.estimates for status in estimate.status)
         epochs = {estimate.epoch for _, estimate in self.estimates}
         carried = (Status.DETECTIONS_CARRIED, Status.SEGMENTATION_CARRIED)
-        told = [f"{name} {n}" for name, n in statuses.most_common(SEEN_STATUSES) if name not in carried]
+        seen = [f"{name} {n}" for name, n in statuses.most_common(SEEN_STATUSES) if name not in carried]
         new = f", {len(epochs) - 1} new epochs" if len(epochs) > 1 else ""
         silence = f"silent for {self.silent_ms:.0f} ms at the most"
-        return f"{len(self.estimates)} estimates, {invalid} invalid, {silence}{new}; {', '.join(told) or 'no status'}"
+        return f"{len(self.estimates)} estimates, {invalid} invalid, {silence}{new}; {', '.join(seen) or 'no status'}"

@@ -47,7 +47,7 @@ if FOLDER:
             now_s = time.monotonic()
             self._due_s = max(self._due_s + 1.0 / self._rate_hz, now_s - 1.0 / self._rate_hz)
             time.sleep(max(0.0, self._due_s - now_s) + (0.4 if fault == "late" else 0.0))
-            # the world goes on while nobody looks: the image follows from the time
+            # frames that nobody reads are skipped: the image follows from the time
             before, self._number = self._number, int(time.monotonic() * self._rate_hz)
             self._shown = before if fault == "frozen" else self._number
             if fault == "frozen":
