@@ -129,10 +129,10 @@ def measured(samples: Iterator[Sample], pointnet: PointNet) -> dict[tuple[str, f
             by_bottom(o, ground, sample.localisation, Assignment(0, None, o, body).yaw_rad(SE2()))
             for o, body in zip(sample.seen, sample.bodies, strict=True)
         ]
-        by_net = locate_by_depth(sample.seen, sample.depth, camera, ground, config, network=pointnet)
+        by_net = localise_by_depth(sample.seen, sample.depth, camera, ground, config, network=pointnet)
         places: dict[str, Sequence[DepthPlace | Place | None]] = {
             "Eq. 1": by_box,
-            "geometric fit": locate_by_depth(sample.seen, sample.depth, camera, ground, config),
+            "geometric fit": localise_by_depth(sample.seen, sample.depth, camera, ground, config),
             "Frustum-PointNet": by_net,
             "Eq. 1 + PointNet": [fuse(a, b, config) for a, b in zip(by_box, by_net, strict=True)],
             "multi-task body": sample.bodies,

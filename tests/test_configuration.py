@@ -175,6 +175,6 @@ def test_the_deadline_follows_the_frame_rate() -> None:
     assert complete(load(None, {"source.rate": "max"}), camera, 10.0).deadline_ns is None
 
 
-@pytest.mark.parametrize("name", ["kitti", "vehicle"])
+@pytest.mark.parametrize("name", ["kitti", "vehicle", "paper"])
 def test_the_examples_load(name: str) -> None:
     assert load(ROOT / "configs" / f"{name}.toml") != Configuration()

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from birdslam.evaluation.tracking import PAPER
 from birdslam.geometry.camera import AXES_EGO_CAM, Camera
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.metric_scale import RoadView
@@ -139,3 +140,9 @@ def test_the_key_chooses_the_strategy_and_is_validated(tmp_path: Path) -> None:
     path.write_text("[slam.frontend.odometry.road]\nmoed = 'paper'\n")
     with pytest.raises(ConfigurationError, match=r"slam\.frontend\.odometry\.road\.moed"):
         load(path)
+
+
+def test_the_papers_settings_are_those_that_are_evaluated_as_published() -> None:
+    slam = load(Path(__file__).parent.parent / "configs" / "paper.toml").slam
+    assert (slam.weights, slam.graph) == (PAPER.weights, PAPER.graph)
+    assert slam.frontend.odometry.road.mode == "paper"

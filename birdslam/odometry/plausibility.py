@@ -1,7 +1,8 @@
-"""Whether the ego's measured motions are those of a car: images that came out of order or were replayed give others.
+"""The plausibility gate: whether the ego's measured motions are those of a car.
 
-A motion that no car makes is not believed, nor what comes after it, or after a long blindness, until the odometry has
-been steady again; then the world begins anew, since how far the car has come meanwhile is not known.
+Images that came out of order, or were replayed, give motions that no car makes. From such a motion on, or after a long
+blindness, no motion is trusted until the odometry has been steady for a while. Then the CC edge is left out, so that
+the graph begins a new epoch: how far the car has come meanwhile is not known.
 """
 
 from __future__ import annotations
@@ -38,7 +39,12 @@ class _Moved(NamedTuple):
 
 
 class PlausibilityGate:
-    """`admit` takes the measurements of each frame in their order."""
+    """State, measurements and readers:
+
+    - State: the last measured motions (m forwards, s), and the source time of the last one that was not plausible.
+    - Measurements: each frame's CC edge, through `admit`, in the order of the frames.
+    - Readers: `FrontEnd.measure`, whose records pass through it last; by MOTION_IMPLAUSIBLE the planner.
+    """
 
     def __init__(self, config: PlausibilityConfig) -> None:
         self._config = config
@@ -47,7 +53,7 @@ class PlausibilityGate:
         self._broken_ns: int | None = None  # source time of the last motion that was not measured or not possible
 
     def admit(self, measurements: Measurements) -> Measurements:
-        """The same; with MOTION_IMPLAUSIBLE; or, where it can be believed again, without its CC edge."""
+        """The measurements as they are, or with MOTION_IMPLAUSIBLE, or, to begin a new epoch, without the CC edge."""
         m, cc = measurements, measurements.cc
         self._times_ns.append((m.frame_id, m.t_source_ns))
         moved = None if cc is None or Status.ODOMETRY_COASTING in m.status else self._measured(m, cc)
@@ -67,7 +73,7 @@ class PlausibilityGate:
         return msgspec.structs.replace(m, status=(*m.status, Status.MOTION_IMPLAUSIBLE))
 
     def _measured(self, m: Measurements, cc: EgoEdge) -> _Moved | None:
-        """The edge forwards; None where its beginning is too long ago."""
+        """The motion of the edge; None where the frame that it starts from is too long ago."""
         times_ns = dict(self._times_ns)
         if cc.from_frame not in times_ns or cc.to_frame not in times_ns:
             return None
@@ -75,7 +81,7 @@ class PlausibilityGate:
         return _Moved(m.t_source_ns, dt_s, cc.T_from_to.x_m, m.scale_sigma_rel) if dt_s > _SHORTEST_S else None
 
     def _possible(self) -> bool:
-        """The speed over the newest span_s against that over the span before it."""
+        """Whether the speeds over the newest span_s and over the span before it are those of one car."""
         config, moved = self._config, list(self._moved)
         now, before = _newest(moved, config.span_s)
         then, _ = _newest(before, config.span_s)

@@ -1,6 +1,6 @@
-"""The road of two images compared as a whole: what their difference says about length, pitch and roll.
+"""Direct alignment of the road in two images: scale, pitch, roll and curvature from the road's grey values.
 
-Points followed on the road by optical flow give a length that is always short: the tracker's window sees a strong
+Corners that optical flow follows on the road give a length that is always short: the tracker's window sees a strong
 change of perspective there. So the earlier image is warped by the homography of the road plane,
 K (R + lambda t n(pitch, roll)^T / H) K^-1, against the present one, over the length's factor lambda, the pitch and the
 roll together: in one pair of images the three are correlated, and a wrong pitch biases the length by several per cent.
@@ -30,11 +30,11 @@ Bools = NDArray[np.bool_]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 _MARGIN_PX = 4  # from the image's edge, for the warp and the smoothing
-ROAD = 4  # log lambda, pitch, roll, curvature; behind them what odometry handed over wrongly and the brightness
+ROAD = 4  # log lambda, pitch, roll, curvature; then the errors of the odometry's motion, and the brightness
 MOTION = 5  # the rotation's error (3), that of the direction of travel to the right and down (2)
 _LEAST_INFORMATION = (1.0, 10.0, 10.0, 1e4)
 _LARGEST_STEP = np.array([0.1, 0.1, 0.1, 0.005] + [0.1] * MOTION)  # of one iteration
-# Changes that count like one by 1 rad; what odometry handed over need not be settled as well
+# The change of each that counts as much as 1 rad; the motion's errors need not converge as far
 _STEP_UNITS = np.array([1.0, 1.0, 1.0, 0.05] + [3.0] * MOTION)
 _BEYOND_CREST = 0.01  # where a ray would miss the parabola: that is behind the crest
 
@@ -54,7 +54,7 @@ class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_rotation_rad: Positive = 0.0005  # of the relative rotation that odometry hands over
     sigma_direction_rad: Positive = 0.007  # of the direction of its translation
     max_iterations: Annotated[int, msgspec.Meta(ge=3)] = 7  # of the alignment
-    coarse_step: Annotated[int, msgspec.Meta(ge=1)] = 4  # one sample in so many comes near to the answer
+    coarse_step: Annotated[int, msgspec.Meta(ge=1)] = 4  # every so-manieth sample is used at first
     coarse_tolerance: Positive = 2e-3  # the coarse steps end with a smaller change
     tolerance: Positive = 1e-3  # the fine ones end with a smaller change
 
@@ -183,7 +183,7 @@ class RoadAligner:
     def align(
         self, past: RoadImage, present: RoadImage, T_past_present: Pose, px: Ints, prior: Floats, prior_cov: Floats
     ) -> RoadFit | None:  # fmt: skip
-        """Fits (log lambda, pitch, roll, curvature) of the present camera, joined with the prior; None: no help.
+        """Fits (log lambda, pitch, roll, curvature) of the present camera, with the prior; None: too few samples.
 
         `T_past_present` is the motion with its length in the odometry's own unit, lambda times it are metres.
         """
@@ -199,7 +199,7 @@ class RoadAligner:
             np.repeat([cfg.sigma_rotation_rad**-2, cfg.sigma_direction_rad**-2], [3, 2])
         )
         light = None  # bias and gain of the brightness
-        # Few samples come near to the answer, all of them settle it.
+        # Few samples first, for speed; then all of them.
         for view, share, tolerance, iterations in (
             (coarse, cfg.coarse_step, cfg.coarse_tolerance, cfg.max_iterations - 2),
             (fine, 1, cfg.tolerance, 3),

@@ -1,8 +1,8 @@
-"""The road under the camera as a Kalman filter holds it: tilt, curvature, mount, and the length of what is travelled.
+"""The Kalman filter of the road under the camera: scale, tilt, curvature and mount.
 
-One comparison of two images (`road_alignment`) knows some combination of length, pitch, roll and curvature. What joins
-them from frame to frame: the camera's own rotation, the road's curvature, the direction of travel, which lies in the
-road, and the mount, about which the car bounces.
+One comparison of two images (`road_alignment.py`) knows only some combination of scale, pitch, roll and curvature. Four
+things join the comparisons from frame to frame: the camera's own rotation, the road's curvature, the direction of
+travel, which lies in the road, and the mount, about which the car bounces.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # of the two images of the road; less is no match
     min_correlation: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.35
     max_innovation_sigma: Positive = 4.0  # a comparison farther from what was expected is refused
-    confirmations: Annotated[int, msgspec.Meta(ge=1)] = 3  # in a row before an unknown scale counts as known
+    confirmations: Annotated[int, msgspec.Meta(ge=1)] = 3  # comparisons in a row before a scale counts as known
     doubt_sigma_rel: Positive = 0.15  # less sure than this, lengths far from the present one are tried as well
     doubt_after: Annotated[int, msgspec.Meta(ge=1)] = 3  # refused comparisons in a row that begin such a search
     violated_after: Annotated[int, msgspec.Meta(ge=1)] = 5  # refused comparisons in a row until the ground is in doubt
@@ -67,13 +67,19 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RoadFilter:
-    """The running estimate of (log lambda, pitch, roll, curvature, pitch and roll in the mean), and its covariance.
+    """State, measurements and readers:
 
-    Pitch and roll are against the plane that touches the road under the camera: as the way goes on over a crest or
-    through a sag, that plane turns by curvature times the way, and so, in the mean, does the car. What they are in the
-    mean, about which the car bounces, is the mount: a state like the others, or what it learned of a tilt would be
-    believed twice. The visual scale is rescaled after each update, so log lambda is 0 between updates; only its
-    variance runs.
+    - `x` (6,): log lambda (lambda: metres per unit of the odometry's length); pitch and roll (rad) of the camera
+      against the plane that touches the road under it; the road's curvature (1/m, > 0 in a sag); pitch and roll (rad)
+      of the mount, which is the tilt in the mean. `cov` (6, 6).
+    - Predicted by the camera's rotation and the distance travelled (`predict`). Over a crest or through a sag the
+      touching plane turns by curvature times distance, and so, in the mean, does the car.
+    - Measured: the tilt is the mount's in the mean (in `predict`), the direction of travel lies in the road (`travel`),
+      comparisons of the road's image (`accept`).
+    - Readers: `RoadScale`, for the factor on all lengths, the ground plane and its sigma; through it `TiltWatch`.
+
+    The mount is a state, since otherwise what it learned of a tilt would be believed twice. The odometry is rescaled
+    after each update, so log lambda is 0 between updates and only its variance runs.
     """
 
     def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:

@@ -1,6 +1,7 @@
-"""The length of a motion of known direction, where nothing is known of it: those tried, compared on the road.
+"""A search for the length of a motion of known direction: candidate lengths are compared on the road's image.
 
-An alignment (road_alignment.py) reaches only as far as the road's grain; from here it starts near enough.
+An alignment (`road_alignment.py`) converges only from within the size of the road's texture. Where nothing is known of
+the length, this search gives it a start that is near enough.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ def search_length(
     tilt: tuple[float, float],
     lengths: Floats,
 ) -> float:
-    """The one of `lengths` at which the road, a plane here, fits best, over a few pitches about `tilt`."""
+    """The one of `lengths` (L,) in metres with the best correlation, on a flat road, over a few pitches about `tilt`.
+
+    `px` (N, 2) are pixels of the present image that show road, `tilt` its (pitch, roll) in rad; only the direction of
+    `T_past_present`'s translation counts."""
     f32 = np.float32
     px = px[:: max(1, len(px) // 900)]
     rays = np.stack(
@@ -38,7 +42,7 @@ def search_length(
     best = (float(lengths[0]), -1.0)
     for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01):
         rho = (plane_normal(pitch_rad, tilt[1])[0].astype(f32) @ rays) * f32(-1.0 / camera.height_m)
-        way = lengths.astype(f32)[:, None] * rho  # (lengths, samples); what a sample moves, over its depth
+        way = lengths.astype(f32)[:, None] * rho  # (L, N) displacement over depth
         by_z = f32(1.0) / np.maximum(turned[2] + way * direction[2], f32(1e-3))
         u = (turned[0] + way * direction[0]) * by_z * f32(camera.fx_px) + f32(camera.cx_px)
         v = (turned[1] + way * direction[1]) * by_z * f32(camera.fy_px) + f32(camera.cy_px - past.top_px)

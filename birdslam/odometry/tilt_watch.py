@@ -1,15 +1,16 @@
-"""Does the camera still lean as it was calibrated? Looks at its tilt over the road, and knocks between them.
+"""Whether the camera's mount still has the tilt of its calibration: a bank of Kalman filters with change points.
 
-What is measured of the tilt over a few metres is the mount, by which the camera file can be wrong, and a wander about
-it: the road's crown and changes of grade, loads, braking. The wander lasts for tens of metres, so that looks are not
-independent, and the mean of a long way is worth less than their number. A Kalman filter holds both, of pitch and roll:
+The tilt that is measured over a few metres (a look) is that of the mount, plus a wander about it: the road's crown and
+changes of grade, loads, braking. The wander lasts for tens of metres, so that looks are not independent, and the mean
+over a long distance is worth less than their number says. One Kalman filter for each of pitch and roll holds both:
 
-    look = mount + wander + noise        wander: Ornstein-Uhlenbeck along the way
+    look = mount + wander + noise        wander: an Ornstein-Uhlenbeck process over distance
 
-A knock turns the mount at once. At each look another filter begins as if it had just happened; the one that foretells
-the looks since so much better than the filter without a knock that this outweighs how rare knocks are is believed
-(Bayesian change points, Adams and MacKay 2007). A step shows against the metres before it more clearly than against
-the file: the wander is nearly the same there. What was never right shows in the mount itself.
+A knock turns the mount at once: a change point (Bayesian online change points, Adams and MacKay 2007). With each look a
+further filter starts, for the case that a knock has just happened. It is believed once it predicts the looks since then
+better than the filter without a knock, by more than knocks are rare. Such a step shows more clearly against the metres
+before it, whose wander is nearly the same, than against the camera file. A mount that was never as in the file shows in
+the mount's estimate itself.
 """
 
 from __future__ import annotations
@@ -34,22 +35,25 @@ class TiltWatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How cameras lean in their cars, and cars on real roads."""
 
     look_m: Positive = 2.0  # the way from one look at the tilt to the next
-    sigma_look_rad: Positive = 0.003  # bounces, and errors of one look
-    wander_m: Positive = 40.0  # the way over which grade and load last
+    sigma_look_rad: Positive = 0.003  # of one look: bounces, and errors of the filter
+    wander_m: Positive = 40.0  # the wander's correlation length
     sigma_wander_pitch_rad: Positive = 0.005  # grade and load
     sigma_wander_roll_rad: Positive = 0.012  # grade, load and the road's crown
     mount_walk_rad_per_sqrt_m: Positive = 2e-5  # by which the camera's mount gives way
     sigma_knock_rad: Positive = 0.05  # 1-sigma of what a knock turns the camera by
     knock_odds: Positive = 1e-5  # of a knock at one look, beforehand
-    gate_sigma: Positive = 3.5  # a look farther from what was expected is a pothole's: it moves nothing
-    kept_looks: Annotated[int, msgspec.Meta(ge=2)] = 24  # a knock that so many looks did not show is none
+    gate_sigma: Positive = 3.5  # a look farther from the prediction is an outlier (a pothole) and is not used
+    kept_looks: Annotated[int, msgspec.Meta(ge=2)] = 24  # within so many a change point is confirmed or dropped
     drift_sigma: Positive = 3.0  # a mount that is off by more is told as calibration_drift
 
 
 class TiltWatch:
-    """see() the tilt along the way; `drifted` says whether the mount is another than the camera file's.
+    """State, measurements and readers:
 
-    Rows of the filters (K, AXES, 2): the first knows of no further knock, each next one of a later one.
+    - Each of K filters: mount and wander (rad, off the camera file's tilt), for pitch and roll: (K, AXES, 2). The first
+      filter assumes no further knock, each next one a later knock.
+    - Measurements: the tilt of `RoadFilter`, averaged over `look_m` metres (`see`).
+    - Readers: `RoadScale`, which reports CALIBRATION_DRIFT where `drifted`.
     """
 
     def __init__(self, camera: Camera, config: TiltWatchConfig) -> None:
@@ -72,14 +76,14 @@ class TiltWatch:
 
     @property
     def drifted(self) -> bool:
-        """Whether that is more than chance: by the file's sigma and the looks', or, after a knock, by the latter."""
+        """Whether the mount is off by more than chance: by the sigma of file and looks, after a knock by the looks'."""
         off, sigma = self.mount
-        # The variance of an estimate that begins at the file's, were the file right
+        # The variance that an estimate which starts at the file's tilt has where the file is right
         var = np.square(sigma) if self._knocked else np.maximum(self._calibrated_var - np.square(sigma), 0.0)
         return bool((np.abs(off) > self.config.drift_sigma * np.sqrt(var)).any())
 
     def see(self, tilt_rad: Floats, travelled_m: float, measured: bool) -> None:
-        """(pitch, roll) after a further `travelled_m`; where it was not `measured` it says nothing."""
+        """Takes the tilt (pitch, roll) after a further `travelled_m`; one that was not `measured` is left out."""
         if not measured:
             self._unseen_m += travelled_m
             return
