@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -26,7 +27,7 @@ from birdslam.runtime.configuration import ConfigurationError, RecordingConfig, 
 from birdslam.runtime.recording import scene
 from birdslam.runtime.recording.recorded_drive import recorded_drive
 from birdslam.runtime.recording.recording import Recording
-from birdslam.runtime.supervision.final_results import check_results, recorded_frames, smooth
+from birdslam.runtime.supervision.final_results import FinalResults, check_results, recorded_frames, smooth
 from birdslam.slam import SlamConfig
 from birdslam.trajectory import ego_pose, tum_row
 from birdslam.types import Attitude, Estimate, Measurements
@@ -313,6 +314,25 @@ def test_a_live_camera_that_is_recorded_without_images_has_no_video(tmp_path: Pa
     with pytest.raises(ConfigurationError, match="--record-images"):
         check_results(load(None, settings), Source())  # type: ignore[arg-type]
     check_results(load(None, {**settings, "recording.images": True}), Source())  # type: ignore[arg-type]
+
+
+def test_a_temporary_recording_is_made_where_one_is_needed_with_images_of_a_live_camera(tmp_path: Path) -> None:
+    camera, drive = {"source.uri": "v4l2:/dev/video9"}, {"source.uri": "kitti:x"}
+    video, smooth_too = {"results.video": str(tmp_path / "v.mp4")}, {"results.smooth": True}
+    for settings, needed, images in (
+        (camera, False, False),
+        (camera | smooth_too, True, False),
+        (camera | video, True, True),
+        (drive | video, True, False),  # the drive's own images are there when it is over
+        (drive | smooth_too | {"recording.file": "mine.mcap"}, False, False),
+    ):
+        configuration = load(None, {"output": str(tmp_path), **settings})
+        with ExitStack() as stack:
+            recorded = FinalResults(configuration, None).recorded(stack)
+            assert (recorded != configuration) == needed
+            assert recorded.recording.images == images
+            assert not needed or Path(recorded.recording.file).parent.is_dir()
+        assert not list(tmp_path.iterdir())
 
 
 def test_paths_of_a_file_are_relative_to_it(tmp_path: Path) -> None:

@@ -1,9 +1,9 @@
 """What is made of a run when it is over: the final trajectories, and the video. Nobody waits for it.
 
 Both are made of what the recorder wrote, so that they cost the vehicle no time and no memory: of the file of --record,
-else of a temporary one in the output directory, which goes when the results are there (a kill -9 leaves it behind). A
-video shows a recording's own frames; those of a live camera are read from the recording again. The shipped drive is
-short: what was estimated of it is kept in memory, and its truth is drawn too.
+else of a temporary one in the output directory, which is removed when the results are there (a supervisor that is
+killed before leaves its folder .recording-* behind). A video shows the source's own frames; those of a live camera are
+recorded as JPEG. The shipped drive is short: its estimates are kept in memory, and its truth is drawn too.
 """
 
 from __future__ import annotations
