@@ -6,6 +6,8 @@ would be judged by motions that are in no street. The mean of a rectangle of tex
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +60,11 @@ class Texture:
         return mean
 
 
+@functools.cache
 def street_loop() -> NDArray[np.uint8]:
-    """(LOOP_FRAMES, HEIGHT_PX, WIDTH_PX): FRAME_M further from each to the next, and from the last to the first."""
+    """(LOOP_FRAMES, HEIGHT_PX, WIDTH_PX), read-only: FRAME_M further from each to the next, and from the last to the
+    first.
+    """
     u, v = np.meshgrid(np.arange(WIDTH_PX) - WIDTH_PX / 2, np.arange(HEIGHT_PX) - HEIGHT_PX / 2)
     out = np.full((LOOP_FRAMES, HEIGHT_PX, WIDTH_PX), SKY, dtype=np.uint8)
 
@@ -86,4 +91,5 @@ def street_loop() -> NDArray[np.uint8]:
             driven_m = number * FRAME_M
             shade = texture.mean(TEXELS_PER_M * (near_m + driven_m), TEXELS_PER_M * (far_m + driven_m), left, right)
             out[number][seen] = np.clip(shade + 0.5, 0.0, 255.0).astype(np.uint8)
+    out.setflags(write=False)  # it is rendered once for all who ask
     return out

@@ -113,7 +113,7 @@ def nothing_leaks(place: Path, times: int) -> None:
 
 
 def test_nothing_leaks_over_a_few_restarts(place: Path) -> None:
-    nothing_leaks(place, 5)
+    nothing_leaks(place, 3)
 
 
 @pytest.mark.slow
