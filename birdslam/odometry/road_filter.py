@@ -30,7 +30,7 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `moving_median.MedianScale`.
     """
 
-    mode: Literal["kalman", "paper"] = "kalman"
+    mode: Literal["kalman", "paper"] = "kalman"  # of the metric scale: a Kalman filter, or the paper's moving median
     align: RoadAlignConfig = RoadAlignConfig()
     min_baseline_m: Positive = 0.35  # travelled between the two images; shorter says too little
     target_baseline_m: Positive = 1.1  # of the kept images the one nearest to this is compared
