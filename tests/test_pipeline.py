@@ -35,6 +35,7 @@ pytestmark = pytest.mark.processes
 
 FRAMES, WIDTH, HEIGHT, F_PX, HEIGHT_M = 12, 480, 160, 260.0, 1.65
 LIMIT_S = 240.0
+WITH_NETWORKS = ("--set", "models.shipped=true")  # of most runs it is not their figures that are looked at
 # Nothing is left out or coasted over for want of time
 UNHURRIED = ("--set", "budgets.end_to_end_ms=60000", "--set", "degradation.enabled=false")
 
@@ -92,7 +93,7 @@ class Run:
                 *("run", "--vehicle", vehicle, "--output", str(self.output)),
                 *("--set", f"runtime.runtime_dir={self.runtime_dir}"),
                 *("--set", f"runtime.watchdog_ms={1e3 * LIMIT_S}"),  # a busy machine is no stalled node
-                *("--set", "runtime.spares=false", *arguments),
+                *("--set", "runtime.spares=false", "--set", "models.shipped=false", *arguments),
             ),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -231,7 +232,7 @@ def test_evaluation_drive_and_replay_agree_on_motions_that_no_car_makes(drive: P
 
 def test_three_processes_give_the_bytes_of_one(drive: Path, place: Path) -> None:
     offline = evaluate(drive, place / "a")
-    run = run_all(place, drive, "--rate", "max")
+    run = run_all(place, drive, "--rate", "max", *WITH_NETWORKS)
     assert (run.output / "ego.kitti.txt").read_bytes() == offline
     assert len(offline.splitlines()) == FRAMES
     summary = run.summary()
@@ -483,7 +484,7 @@ def test_short_of_time_the_planner_is_told_and_never_deceived(drive: Path, place
     """With a budget that nothing can keep, perceive goes down to coasting, and that grows old."""
     budgets = ("capture_ms", "capture_to_perceive_ms", "perceive_ms")
     run = Run(
-        *(place, "--source", f"kitti:{drive}", "--set", "source.loop=true"),
+        *(place, "--source", f"kitti:{drive}", "--set", "source.loop=true", *WITH_NETWORKS),
         *(part for name in budgets for part in ("--set", f"budgets.{name}=0.001")),
         *("--set", "degradation.window_frames=2", "--set", "degradation.coast_divisor=6"),
         *("--set", "degradation.coast_max_ms=250", "--set", "budgets.end_to_end_ms=60000"),  # optimize has time
