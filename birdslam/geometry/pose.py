@@ -1,4 +1,4 @@
-"""Rigid motions in space, as the image odometry needs them: rotations as matrices and as vectors, `Pose`; a median."""
+"""Rigid motions in space, as the image odometry needs them: rotations as matrices and as vectors, `Pose`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-
-
-def middle(values: Floats) -> float:
-    """The median (of an even number the upper one), without the overhead of numpy.median."""
-    half = len(values) // 2
-    return float(np.partition(values, half)[half])
 
 
 def rotation_exp(w: Floats) -> Floats:

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.pose import Pose, middle
+from birdslam.geometry.pose import Pose
+from birdslam.odometry.median import upper_median
 from birdslam.odometry.sliding_window import MIN_DEPTH, SlidingWindow
 
 Floats = NDArray[np.float64]
@@ -50,7 +51,7 @@ def locate(window: SlidingWindow, guess: Pose, ids: Ints, xy: Floats) -> tuple[P
     for k in range(_ITERATIONS):
         r, variance, ahead = _linearise(window, landmarks, pose, J)
         norm = np.sqrt((r**2).sum(axis=0) / variance)
-        gate = max(limit, 3.0 * 1.2 * middle(norm)) if k < _SOFT_ITERATIONS else limit
+        gate = max(limit, 3.0 * 1.2 * upper_median(norm)) if k < _SOFT_ITERATIONS else limit
         w = np.where(ahead & (norm < gate), 1.0 / (np.maximum(1.0, norm / _HUBER_SIGMA) * variance), 0.0)
         flat = J.reshape(6, -1)
         Jw = (J * w).reshape(6, -1)

@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.geometry.pose import Pose, middle, rotation_exp
+from birdslam.geometry.pose import Pose, rotation_exp
+from birdslam.odometry.median import upper_median
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -212,7 +213,7 @@ class RoadAligner:
                     light = _brightness(there[0][seen], view.grey[seen])
                 r = there[0] - light[1] * view.grey - light[0]
                 J = self._derivative(view, there, T_past_present, x)
-                sigma = 1.4826 * middle(np.abs(r[seen])) + 0.5
+                sigma = 1.4826 * upper_median(np.abs(r[seen])) + 0.5
                 w = np.where(seen, 1.0 / np.maximum(1.0, np.abs(r) * (1.0 / (1.5 * sigma))), 0.0)
                 w *= share * cfg.effective_sample_fraction / sigma**2
                 Jw = J * w
