@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from birdslam.baselines.posegraph3 import BatchConfig, optimise
+from birdslam.baselines.posegraph3 import BatchConfig, optimise_batch
 from birdslam.baselines.trajectories import Trajectories
 from birdslam.geometry.camera import Camera
 from birdslam.types import Measurements
@@ -21,4 +21,4 @@ label = "Batch SE(3), unscaled odometry"
 
 def run(log: Sequence[Measurements], camera: Camera, lanes: bool = True) -> Trajectories:
     """Trajectories of the whole log at once; `lanes=False` is "before lane constraints" of Table 5."""
-    return optimise(log, BatchConfig(metric=False, landmarks=lanes))
+    return optimise_batch(log, BatchConfig(metric=False, landmarks=lanes))

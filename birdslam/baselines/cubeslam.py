@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.baselines.posegraph3 import BatchConfig, optimise
+from birdslam.baselines.posegraph3 import BatchConfig, optimise_batch
 from birdslam.baselines.trajectories import Trajectories
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
@@ -49,7 +49,7 @@ def run(log: Sequence[Measurements], camera: Camera, config: CuboidConfig | None
     config = config or CuboidConfig()
     cuboids = [msgspec.structs.replace(m, cv=tuple(cuboid(edge, camera, config) for edge in m.cv)) for m in log]
     batch = BatchConfig(metric=True, steady_motion=config.steady_motion, weights=WeightsConfig(mode="measured"))
-    return optimise(cuboids, batch)
+    return optimise_batch(cuboids, batch)
 
 
 def cuboid(edge: VehicleEdge, camera: Camera, config: CuboidConfig) -> VehicleEdge:

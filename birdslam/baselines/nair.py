@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from birdslam.baselines.posegraph3 import BatchConfig, optimise
+from birdslam.baselines.posegraph3 import BatchConfig, optimise_batch
 from birdslam.baselines.trajectories import Trajectories
 from birdslam.geometry.camera import Camera
 from birdslam.types import Measurements
@@ -20,4 +20,4 @@ label = "Nair et al. (IV 2020)"
 
 def run(log: Sequence[Measurements], camera: Camera) -> Trajectories:
     """Trajectories of the whole log at once."""
-    return optimise(log, BatchConfig(metric=True, landmarks=False))
+    return optimise_batch(log, BatchConfig(metric=True, landmarks=False))

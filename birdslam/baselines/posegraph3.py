@@ -40,7 +40,7 @@ class BatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 _SCALE = gtsam.symbol("s", 0)
 
 
-def optimise(log: Sequence[Measurements], config: BatchConfig) -> Trajectories:
+def optimise_batch(log: Sequence[Measurements], config: BatchConfig) -> Trajectories:
     """The trajectories that minimise the graph, laid on the road. An empty log gives none."""
     log = [weighted(m, config.weights) for m in log]
     builder = _Builder(config)

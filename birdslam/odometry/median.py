@@ -8,6 +8,6 @@ from birdslam.geometry.pose import Floats
 
 
 def upper_median(values: Floats) -> float:
-    """The median of `values` (N,), N >= 1, of an even number the upper one: numpy.median's overhead is many times it."""
+    """The median of `values` (N,), N >= 1, of an even number the upper one; numpy.median takes many times as long."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])
