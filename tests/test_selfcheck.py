@@ -22,6 +22,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.motion import Motion
+from birdslam.odometry.plausibility import PlausibilityConfig
 from birdslam.perception import Perception, Ready, Segmentation
 from birdslam.types import Estimate, Frame, Status, VehicleEdge
 from birdslam.vehicles.camera_height import HeightWatch, HeightWatchConfig
@@ -49,9 +50,10 @@ def drive(
     images: list[Image],
     edit: Edit = lambda k, image: image,
     road: Callable[[int], Image | None] = lambda k: None,
+    config: FrontEndConfig = FrontEndConfig(),  # noqa: B008
 ) -> list[Estimate]:
     """What planners get, at 10 Hz, of the front end and the graph without networks."""
-    front, graph = FrontEnd(camera, FrontEndConfig()), PoseGraph(GraphConfig(), WeightsConfig())
+    front, graph = FrontEnd(camera, config), PoseGraph(GraphConfig(), WeightsConfig())
     out = []
     for k, image in enumerate(images):
         mask = road(k)
@@ -191,7 +193,9 @@ def test_a_stop_keeps_the_metres_that_were_known(recorded: tuple[Camera, list[Im
     def stop(k: int, image: Image) -> Image:
         return image if k < 20 else np.clip(images[20] + rng.normal(0.0, 1.5, image.shape), 0, 255).astype(np.uint8)
 
-    estimates = drive(camera, images[:32], stop)
+    assert carrying(Status.MOTION_IMPLAUSIBLE, drive(camera, images[:32], stop))  # no car stops within a frame
+    any_stop = FrontEndConfig(plausibility=PlausibilityConfig(change_mps=50.0))
+    estimates = drive(camera, images[:32], stop, config=any_stop)
     assert set(range(23, 32)) <= set(carrying(Status.STANDSTILL, estimates))
     assert all(e.valid for e in estimates[20:])
 
