@@ -78,6 +78,7 @@ def test_everything_of_a_drive_is_sent(tape: Tape) -> None:
     assert logged["status"] >= 2
 
 
+@pytest.mark.processes
 @pytest.mark.skipif(importlib.util.find_spec("rerun") is not None, reason="rerun-sdk is installed")
 def test_without_rerun_it_says_what_to_install(tape: Tape) -> None:
     answer = call("view", str(tape.path), "--save", str(tape.path.with_suffix(".rrd")))
