@@ -31,7 +31,7 @@ from birdslam.runtime.supervision.final_results import FinalResults, check_resul
 from birdslam.slam import SlamConfig
 from birdslam.trajectory import ego_pose, tum_row
 from birdslam.types import Attitude, Estimate, Measurements
-from birdslam.vehicles.rts_smoother import Retrospect, RetrospectConfig
+from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 from tests.taped_drive import CAMERA, Tape, measured
 
 
@@ -45,12 +45,12 @@ def tracks(directory: Path) -> dict[int, list[str]]:
 
 def smoothed(pairs: Iterable[tuple[Measurements, Estimate]]) -> dict[int, list[str]]:
     """The rows of every vehicle by the smoother that the evaluation uses, which keeps the whole drive."""
-    past, times = Retrospect(RetrospectConfig()), {}
+    smoother, times = RtsSmoother(SmootherConfig()), {}
     for measurements, estimate in pairs:
-        past.add(measurements, estimate)
+        smoother.add(measurements, estimate)
         times[estimate.epoch, estimate.frame_id] = estimate.t_source_ns, estimate.attitude.z_m
     out: dict[int, list[str]] = {}
-    for (epoch, vehicle), way in sorted(past.ways().items()):
+    for (epoch, vehicle), way in sorted(smoother.smooth().items()):
         for frame, pose in way.items():
             t_ns, z_m = times[epoch, frame]
             out.setdefault(vehicle, []).append(tum_row(t_ns, ego_pose(pose, Attitude(z_m=z_m))))
@@ -84,7 +84,7 @@ def test_a_recording_gives_the_trajectories_that_are_evaluated_bit_for_bit(tmp_p
     final = tracks(tmp_path / "out" / "tracks")
     assert final == smoothed(zip(frames, tape.estimates, strict=False))
     assert found == len(final) > 1
-    evaluated = Final("", ours(SlamConfig()), RetrospectConfig()).run(frames, CAMERA)
+    evaluated = Final("", ours(SlamConfig()), SmootherConfig()).run(frames, CAMERA)
     assert {vehicle: len(poses) for vehicle, poses in final.items()} == {
         vehicle: len(poses) for vehicle, poses in evaluated.vehicles.items()
     }

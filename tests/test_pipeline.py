@@ -18,9 +18,9 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from birdslam.runtime.cli.commands import _pipeline
 
 from birdslam.datasets.opening import open_recording
+from birdslam.runtime.cli.evaluate_odometry import _pipeline
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import load
 from birdslam.runtime.environment import ENVIRONMENT

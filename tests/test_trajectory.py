@@ -15,7 +15,7 @@ from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import (
     CameraTrajectory,
-    Pose,
+    Transform,
     as_poses,
     ego_pose,
     inverse,
@@ -36,7 +36,7 @@ attitudes = st.builds(Attitude, z_m=metres, pitch_rad=tilts, roll_rad=tilts)
 mounts = st.builds(GroundPlane, st.floats(0.5, 3.0), tilts, tilts)
 
 
-def random_poses(count: int, seed: int, step_m: float = 1.0) -> Pose:
+def random_poses(count: int, seed: int, step_m: float = 1.0) -> Transform:
     rng = np.random.default_rng(seed)
     poses = np.tile(np.eye(4), (count, 1, 1))
     for i in range(1, count):
