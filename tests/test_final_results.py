@@ -121,7 +121,7 @@ def test_what_was_seen_for_the_last_time_is_let_go(tmp_path: Path) -> None:
     frames, graph = measured(60), PoseGraph(GraphConfig(), WeightsConfig())
     final = FinalTracks(tmp_path, last_seen(frames))
     for measurements in frames:
-        final.add(measurements, graph.update(measurements))
+        final.add(measurements, graph.optimise(measurements))
         known = {vehicle for vehicle, frame in last_seen(frames).items() if frame > measurements.frame_id}
         assert set(final._open) <= known
         assert {vehicle for _, vehicle in final._smoother._sights} <= known
@@ -228,7 +228,7 @@ def pictures(path: Path) -> list[np.ndarray]:
 
 def test_every_frame_up_to_the_last_estimate_is_drawn(tmp_path: Path) -> None:
     graph, frames = PoseGraph(GraphConfig(), WeightsConfig()), measured(12)
-    estimates = [graph.update(measurements) for measurements in frames]
+    estimates = [graph.optimise(measurements) for measurements in frames]
     grey = np.full((CAMERA.height_px, CAMERA.width_px), 90, np.uint8)
 
     def images() -> Iterable[tuple[int, int, np.ndarray | None]]:
