@@ -25,6 +25,7 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "docs" / "examples"
 FRAMES = 12
 
 
+@pytest.mark.processes
 def test_importing_birdslam_loads_nothing_until_a_name_is_asked_for() -> None:
     code = (
         "import sys, birdslam; assert not {'numpy', 'cv2', 'onnxruntime', 'msgspec'} & set(sys.modules); "
@@ -95,6 +96,7 @@ def test_an_unreadable_frame_says_so() -> None:
     assert [frame.frame_id for frame in frames] == [0, 1, 2]
 
 
+@pytest.mark.processes
 def test_the_offline_example(tmp_path: Path) -> None:
     recording = Beginning(open_recording("demo"))
     camera = recording.camera

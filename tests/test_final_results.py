@@ -124,7 +124,7 @@ def test_what_was_seen_for_the_last_time_is_let_go(tmp_path: Path) -> None:
         final.add(measurements, graph.optimise(measurements))
         known = {vehicle for vehicle, frame in last_seen(frames).items() if frame > measurements.frame_id}
         assert set(final._open) <= known
-        assert {vehicle for _, vehicle in final._smoother._sights} <= known
+        assert {vehicle for _, vehicle in final._smoother._measurements} <= known
     assert final.vehicles == len(list(tmp_path.glob("*.final.tum.txt")))
 
 
@@ -182,6 +182,7 @@ def test_replay_writes_them_too(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert (tmp_path / "out" / "ego.final.tum.txt").read_bytes() == (tmp_path / "out" / "ego.tum.txt").read_bytes()
 
 
+@pytest.mark.processes
 def test_a_run_writes_what_is_evaluated_and_takes_its_temporary_recording_away(tmp_path: Path) -> None:
     """The shipped drive through the three processes; --record only so that the test can evaluate the same records."""
     arguments = [
@@ -260,7 +261,7 @@ def test_a_large_camera_is_drawn_smaller_and_a_fast_one_by_every_second_frame(tm
 
 
 def estimate() -> Estimate:
-    return PoseGraph(GraphConfig(), WeightsConfig()).update(measured(1)[0])
+    return PoseGraph(GraphConfig(), WeightsConfig()).optimise(measured(1)[0])
 
 
 def test_the_images_of_a_recording_are_drawn_by_their_numbers_in_the_run(tmp_path: Path) -> None:
