@@ -6,6 +6,7 @@ by `camera.Camera`.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,28 @@ class Intrinsics(msgspec.Struct, frozen=True, kw_only=True):
     source: str = ""
     reprojection_px: float | None = None  # root mean square of a chessboard's corners
     sigma_focal_px: float | None = None
+    left_out: tuple[str, ...] = ()  # images that could not be used, and why
+
+    def for_size(self, width_px: int, height_px: int) -> Intrinsics:
+        """Of the same camera's images at another size of the same aspect; unchanged where the aspect is another.
+
+        A pixel's middle has whole coordinates, so that the image's edge lies at -0.5.
+        """
+        if self.width_px is None or self.height_px is None:
+            return self
+        scale = width_px / self.width_px
+        if width_px == self.width_px or abs(self.height_px * scale - height_px) >= 1.0:
+            return self
+        return msgspec.structs.replace(
+            self,
+            fx_px=self.fx_px * scale,
+            fy_px=self.fy_px * scale,
+            cx_px=(self.cx_px + 0.5) * scale - 0.5,
+            cy_px=(self.cy_px + 0.5) * scale - 0.5,
+            width_px=width_px,
+            height_px=height_px,
+            source=f"{self.source}, scaled from {self.width_px}x{self.height_px}",
+        )
 
 
 def read_intrinsics(path: Path, key: str | None = None) -> Intrinsics:
@@ -144,7 +167,7 @@ def from_chessboard(folder: Path, columns: int, rows: int, square_m: float) -> I
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
     if not paths:
         raise DatasetError(f"{folder}: no images in it (.png or .jpg)")
-    corners, size = _find_corners(folder, paths, columns, rows)
+    corners, size, left_out = _find_corners(folder, paths, columns, rows)
     board = np.zeros((columns * rows, 3), np.float32)
     board[:, :2] = np.mgrid[0:columns, 0:rows].T.reshape(-1, 2) * square_m
     rms, K, distortion, turns, _, sigma, _, _ = cv2.calibrateCameraExtended(
@@ -154,9 +177,10 @@ def from_chessboard(folder: Path, columns: int, rows: int, square_m: float) -> I
     if not np.isfinite(rms) or rms > MAX_REPROJECTION_PX:
         raise DatasetError(
             f"{folder}: the corners miss the calibrated camera by {rms:.2f} px (root mean square), more than "
-            f"{MAX_REPROJECTION_PX} px: blurred images, a bent board, or not {columns}x{rows} inner corners"
+            f"{MAX_REPROJECTION_PX} px: blurred images, a bent board, or not {columns}x{rows} inner "
+            f"corners{_without(left_out)}"
         )
-    _check_tilts(folder, turns, float(K[0, 0]), sigma_focal_px)
+    _check_tilts(folder, turns, float(K[0, 0]), sigma_focal_px, left_out)
     return Intrinsics(
         fx_px=float(K[0, 0]),
         fy_px=float(K[1, 1]),
@@ -168,42 +192,66 @@ def from_chessboard(folder: Path, columns: int, rows: int, square_m: float) -> I
         source=f"{len(corners)} chessboards in {folder}",
         reprojection_px=float(rms),
         sigma_focal_px=sigma_focal_px,
+        left_out=tuple(left_out),
     )
 
 
 def _find_corners(
     folder: Path, paths: list[Path], columns: int, rows: int
-) -> tuple[list[NDArray[np.float32]], tuple[int, int]]:
-    """Inner corners (columns * rows, 1, 2) in px of each image that shows the board, and the images' size in px."""
+) -> tuple[list[NDArray[np.float32]], tuple[int, int], list[str]]:
+    """Inner corners (columns * rows, 1, 2) in px of each image that shows the board, and the size in px of most images.
+
+    Images of another size, torn ones and those without the board are left out: their names, with the reason.
+    """
+    images, left_out = _grey_images(paths)
+    sizes = Counter(image.shape for image in images.values())
+    if not sizes:
+        raise DatasetError(f"{folder}: none of its images can be read ({'; '.join(left_out)})")
+    height_px, width_px = sizes.most_common(1)[0][0]
     corners: list[NDArray[np.float32]] = []
-    size, first = (0, 0), paths[0]
+    for name, grey in images.items():
+        if grey.shape != (height_px, width_px):
+            left_out.append(f"{name}: is {grey.shape[1]}x{grey.shape[0]}, but most are {width_px}x{height_px}")
+            continue
+        found, at = cv2.findChessboardCornersSB(grey, (columns, rows), flags=cv2.CALIB_CB_ACCURACY)
+        if found:
+            corners.append(np.asarray(at, np.float32).reshape(-1, 1, 2))
+        else:
+            left_out.append(f"{name}: shows no board of {columns}x{rows} inner corners")
+    if len(corners) < FEWEST_BOARDS:
+        raise DatasetError(
+            f"{folder}: the board of {columns}x{rows} inner corners was found in {len(corners)} of {len(paths)} "
+            f"images, {FEWEST_BOARDS} are needed{_without(left_out)}"
+        )
+    return corners, (width_px, height_px), left_out
+
+
+def _grey_images(paths: list[Path]) -> tuple[dict[str, NDArray[np.uint8]], list[str]]:
+    """By name; and what can't be read, with the reason."""
+    images: dict[str, NDArray[np.uint8]] = {}
+    unread = []
     for path in paths:
         try:
             image = read_image(path)
         except ValueError as error:
-            raise DatasetError(f"{path}: {error}") from None
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        if size == (0, 0):
-            size, first = (grey.shape[1], grey.shape[0]), path
-        if (grey.shape[1], grey.shape[0]) != size:
-            raise DatasetError(f"{path}: is {grey.shape[1]}x{grey.shape[0]}, but {first.name} is {size[0]}x{size[1]}")
-        found, at = cv2.findChessboardCornersSB(grey, (columns, rows), flags=cv2.CALIB_CB_ACCURACY)
-        if found:
-            corners.append(np.asarray(at, np.float32).reshape(-1, 1, 2))
-    if len(corners) < FEWEST_BOARDS:
-        raise DatasetError(
-            f"{folder}: the board of {columns}x{rows} inner corners was found in {len(corners)} of {len(paths)} "
-            f"images, {FEWEST_BOARDS} are needed"
-        )
-    return corners, size
+            unread.append(f"{path.name}: {error}")
+            continue
+        images[path.name] = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    return images, unread
 
 
-def _check_tilts(folder: Path, turns: Sequence[Any], focal_px: float, sigma_focal_px: float) -> None:
+def _without(left_out: Sequence[str]) -> str:
+    return f"; left out: {'; '.join(left_out)}" if left_out else ""
+
+
+def _check_tilts(
+    folder: Path, turns: Sequence[Any], focal_px: float, sigma_focal_px: float, left_out: Sequence[str]
+) -> None:
     """Raises DatasetError where boards, by their rotation vectors, stand too much alike to give the focal length."""
     normals = np.array([cv2.Rodrigues(np.asarray(turn))[0][:, 2] for turn in turns])
     tilt_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
     if tilt_deg < MIN_TILT_DEG or sigma_focal_px > MAX_SIGMA_FOCAL_REL * focal_px:
         raise DatasetError(
             f"{folder}: the boards differ by {tilt_deg:.0f} degrees of tilt, and the focal length {focal_px:.0f} px is "
-            f"known to {sigma_focal_px:.1f} px: tilt the board more ({MIN_TILT_DEG:g} degrees)"
+            f"known to {sigma_focal_px:.1f} px: tilt the board more ({MIN_TILT_DEG:g} degrees){_without(left_out)}"
         )

@@ -122,6 +122,18 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     return image  # type: ignore[return-value]
 
 
+def image_size(directory: Path) -> tuple[int, int]:
+    """(width, height) in pixels of a recording's images. Raises DatasetError where none can be read."""
+    folder = find_layout(directory).images
+    for path in find_images(folder).values():
+        try:
+            height_px, width_px = read_image(path).shape[:2]
+        except ValueError:
+            continue
+        return width_px, height_px
+    raise DatasetError(f"{folder}: none of its images can be read")
+
+
 def _read_lines(path: Path) -> list[str]:
     try:
         return path.read_text(encoding="ascii", errors="replace").split("\n")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from birdslam.datasets.demo import DemoRecording
-from birdslam.datasets.kitti import KittiRecording
+from birdslam.datasets.kitti import KittiRecording, image_size
 from birdslam.datasets.recording import DatasetError, Recording
-from birdslam.datasets.video import VideoRecording
+from birdslam.datasets.video import VideoRecording, video_size
 from birdslam.geometry.camera import Camera
 
 
@@ -27,3 +27,13 @@ def open_recording(uri: str, camera: Camera | None = None, stride: int = 1) -> R
         raise DatasetError(f"{uri}: no recording; expected kitti:DIR, video:FILE or demo")
     path = Path(rest).expanduser()
     return KittiRecording(path, camera, stride) if scheme == "kitti" else VideoRecording(path, camera, stride)
+
+
+def frame_size(uri: str) -> tuple[int, int] | None:
+    """(width, height) in pixels of the frames of `kitti:DIR` or `video:FILE`; None where they say nothing of it."""
+    scheme, _, rest = uri.partition(":")
+    path = Path(rest).expanduser()
+    try:
+        return image_size(path) if scheme == "kitti" else video_size(path) if scheme == "video" else None
+    except DatasetError:  # opening it says what is wrong
+        return None

@@ -13,6 +13,19 @@ from birdslam.geometry.camera import Camera
 from birdslam.types import NS_PER_S
 
 
+def video_size(path: Path) -> tuple[int, int]:
+    """(width, height) in pixels, as the container declares. Raises DatasetError where OpenCV can't open it."""
+    if not path.is_file():
+        raise DatasetError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
+    capture = cv2.VideoCapture(str(path))
+    try:
+        if not capture.isOpened():
+            raise DatasetError(f"{path}: is no video that OpenCV can open")
+        return round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    finally:
+        capture.release()
+
+
 class VideoRecording(Recording):
     """A video file, through OpenCV; `len` is what its container declares (0 where it declares nothing)."""
 

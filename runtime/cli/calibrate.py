@@ -15,7 +15,7 @@ from birdslam.calibration.calibration import Calibration, CalibrationConfig, Cal
 from birdslam.calibration.height_check import HeightCheck, KnownLength
 from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
 from birdslam.datasets.camera_file import load_camera
-from birdslam.datasets.opening import open_recording
+from birdslam.datasets.opening import frame_size, open_recording
 from birdslam.datasets.recording import DatasetError, Recording
 from birdslam.datasets.speed_file import read_speeds
 from birdslam.evaluation.results import ResultsError
@@ -38,6 +38,9 @@ def calibrate_camera(options: argparse.Namespace) -> int:
     configuration = configuration_of(options)
     uri = options.source if options.source.partition(":")[0] in FILE_SCHEMES else f"kitti:{options.source}"
     lens, height_m = _lens(options)
+    size = frame_size(uri)
+    if lens is not None and size is not None:
+        lens = lens.for_size(*size)
     recording = _open(uri, lens, height_m, options)
     known_height = height_m is not None or lens is None  # KITTI's own cameras stand where datasets/kitti.py says
     cv2.setNumThreads(configuration.perceive.opencv_threads)
@@ -178,6 +181,8 @@ def _report(
     source = "the recording" if lens is None else lens.source
     error = "" if lens is None or lens.reprojection_px is None else f", reprojection {lens.reprojection_px:.2f} px"
     yield f"intrinsics: {source}{error}"
+    for reason in () if lens is None else lens.left_out:
+        yield f"  left out: {reason}"
     sigma = np.degrees(np.sqrt(np.diag(np.reshape(found.cov, (2, 2)))))
     pitch_deg, roll_deg = np.degrees([camera.pitch_rad, camera.roll_rad])
     yield f"pitch {pitch_deg:+.2f} +- {sigma[0]:.2f} deg, roll {roll_deg:+.2f} +- {sigma[1]:.2f} deg"
