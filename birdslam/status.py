@@ -20,6 +20,7 @@ class Status(enum.StrEnum):
     MOTION_IMPLAUSIBLE = "motion_implausible"  # a motion of no car, or a long blindness; until all is steady again
     STANDSTILL = "standstill"  # the car stands: the pose is held
     GROUND_VIOLATED = "ground_violated"  # the road does not fit the ground plane
+    VIEW_OBSTRUCTED = "view_obstructed"  # something stands still in the image while the car drives; it is left out
     CALIBRATION_DRIFT = "calibration_drift"  # the estimated pitch or height left the calibrated one
     DETECTIONS_CARRIED = "detections_carried"  # the detector did not run on this frame
     SEGMENTATION_CARRIED = "segmentation_carried"  # the segmenter did not run on this frame

@@ -317,10 +317,12 @@ def test_a_view_that_contradicts_counts_once_however_often_it_is_looked_at() -> 
         return image
 
     chained, motions = drive(truth, rate_hz=33.0, edit=shade)
-    told = {m.to_frame for m in motions if {Status.SCALE_INVALID, Status.GROUND_VIOLATED} & set(m.status)}
+    trouble = {Status.SCALE_INVALID, Status.GROUND_VIOLATED, Status.VIEW_OBSTRUCTED}
+    told = {m.to_frame for m in motions if trouble & set(m.status)}
     assert not told & set(range(37, 51))
     assert path_m(chained[k] for k in range(36, 51)) == pytest.approx(0.42, rel=0.08)
     assert told & set(range(51, 87))
+    assert path_m(chained[k] for k in range(50, 87)) == pytest.approx(36 * 0.35, rel=0.05)
 
 
 def test_which_masks_come_late_moves_the_length_by_no_more_than_is_told() -> None:

@@ -40,6 +40,9 @@ class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     window_rows_px: Annotated[int, msgspec.Meta(ge=5)] = 20  # of Lucas-Kanade
     pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 2  # of Lucas-Kanade, beside the image itself
     max_roundtrip_px: Positive = 0.7  # forward and back again must end where it began
+    start_pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 4  # from a guess that was searched for
+    least_followed: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.35  # of the corners; fewer: a wrong guess
+    search_pause: Count = 5  # images after a search that found no better
     max_residual_grey: Positive = 14.0  # mean absolute difference of the windows (after LK), grey levels
     dark_mean_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 8.0  # an image that is darker on average is dark
     dark_std_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 4.0  # and so is one with less contrast
@@ -61,6 +64,10 @@ class Tracks:
     frozen: bool = False
 
 
+Predict = Callable[[Tracks], Floats]
+Search = Callable[[NDArray[np.uint8], NDArray[np.uint8], Tracks], list[Floats]]  # by both images and the tracks
+
+
 class FeatureTracker:
     """Keeps tracks over a stream of images of one size.
 
@@ -74,6 +81,7 @@ class FeatureTracker:
         self._base_image: NDArray[np.uint8] | None = None
         self._candidate: NDArray[np.uint8] | None = None
         self._last_image: NDArray[np.uint8] | None = None
+        self._search_in = 0  # images
         self._base = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros((0, 0), np.uint8))
 
     @property
@@ -81,10 +89,13 @@ class FeatureTracker:
         """The tracks in the image that the next one is followed from."""
         return self._base
 
-    def track(self, image: NDArray[np.uint8], predict: Callable[[Tracks], Floats] | None = None) -> Tracks:
+    def track(
+        self, image: NDArray[np.uint8], predict: Predict | None = None, search: Search | None = None
+    ) -> Tracks:  # fmt: skip
         """Follows the base's corners into `image` ((H, W) grey or (H, W, 3) BGR, uint8) and finds new ones.
 
-        `predict` gives the pixels (N, 2) where the base's tracks are expected. Raises ValueError for another size.
+        `predict` gives the pixels (N, 2) where the base's tracks are expected; where there is none, or the image does
+        not bear it out, `search` gives several such guesses. Raises ValueError for another size.
         """
         grey = self._grey(image)
         frozen = self._last_image is not None and bool(np.array_equal(grey, self._last_image))
@@ -98,8 +109,7 @@ class FeatureTracker:
         self._candidate = grey
         ids, px, age = base.ids, base.px, base.age
         if self._base_image is not None and len(ids):
-            start = predict(base) if predict is not None else base.px
-            followed, good = self._follow(self._base_image, grey, base.px, start)
+            followed, good = self._follow_base(self._base_image, grey, predict, search)
             ids, px, age = ids[good], followed[good], age[good] + 1
         fresh = self._new_corners(grey, px)
         ids = np.concatenate([ids, np.arange(self._next_id, self._next_id + len(fresh))])
@@ -129,15 +139,44 @@ class FeatureTracker:
             return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)  # type: ignore[return-value]
         return np.array(image)  # a copy: the caller may reuse the buffer
 
-    def _follow(
-        self, then: NDArray[np.uint8], now: NDArray[np.uint8], px: Floats, start: Floats
+    def _follow_base(
+        self, then: NDArray[np.uint8], now: NDArray[np.uint8], predict: Predict | None, search: Search | None
     ) -> tuple[Floats, Bools]:
+        """The base's tracks in the present image, and which of them were found there.
+
+        Where too few were, the guess was wrong. Of several that are searched for each corner takes the one from
+        which it comes to what looks most alike.
+        """
+        cfg, px = self.config, self._base.px
+        start = predict(self._base) if predict is not None else px
+        at, good, error = self._follow(then, now, px, start, cfg.pyramid_levels)
+        wrong = predict is None or float(good.mean()) < cfg.least_followed
+        self._search_in = max(self._search_in - 1, 0)
+        if search is None or not wrong or (predict is not None and self._search_in):
+            return at, good
+        guesses = [
+            self._follow(then, now, px, guess, cfg.start_pyramid_levels) for guess in search(then, now, self._base)
+        ]
+        best = max(guesses, key=lambda guess: int(guess[1].sum()))
+        if int(best[1].sum()) < 1.2 * int(good.sum()) and predict is not None:
+            self._search_in = cfg.search_pause
+            return at, good
+        at, good, error = best
+        for other, found, its_error in guesses:
+            better = found & (~good | (its_error < error))
+            at, error, good = np.where(better[:, None], other, at), np.where(better, its_error, error), good | found
+        return at, good
+
+    def _follow(
+        self, then: NDArray[np.uint8], now: NDArray[np.uint8], px: Floats, start: Floats, levels: int
+    ) -> tuple[Floats, Bools, Floats]:
+        """Where corners came to (N, 2), whether that can be believed (N,), and the residual there (N,), grey levels."""
         cfg = self.config
         window = (cfg.window_columns_px, cfg.window_rows_px)
         here = px.astype(np.float32).reshape(-1, 1, 2)
         guess = np.where(np.isfinite(start), start, px).astype(np.float32).reshape(-1, 1, 2)
         there, ok, error = cv2.calcOpticalFlowPyrLK(
-            then, now, here, guess.copy(), winSize=window, maxLevel=cfg.pyramid_levels,
+            then, now, here, guess.copy(), winSize=window, maxLevel=levels,
             criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
         )  # fmt: skip  # type: ignore[call-overload]
         # The way back starts off by the guess's own error, as far as it reaches without a pyramid, and not at the
@@ -154,7 +193,8 @@ class FeatureTracker:
             (end >= margin).all(axis=1) & (end[:, 0] < self.width_px - margin) & (end[:, 1] < self.height_px - margin)
         )
         good = (ok.ravel() == 1) & (ok_back.ravel() == 1) & (roundtrip < cfg.max_roundtrip_px) & inside
-        return end, good & (error.ravel() < cfg.max_residual_grey) & np.isfinite(end).all(axis=1)
+        good &= (error.ravel() < cfg.max_residual_grey) & np.isfinite(end).all(axis=1)
+        return end, good, np.where(good, error.ravel(), np.inf)
 
     def _new_corners(self, grey: NDArray[np.uint8], px: Floats) -> Floats:
         """The best corner of each cell that holds no track, best first, until `max_tracks` are reached."""

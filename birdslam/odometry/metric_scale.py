@@ -28,6 +28,7 @@ class RoadView:
     boxes_px: NDArray[np.float64]  # (N, 4) vehicles
     road_mask: NDArray[np.bool_] | None  # (H, W), may be some images old
     window: SlidingWindow  # its newest keyframe is this image
+    near_px: float = 0.0  # how far corners on the near road have moved since the last image: in no unit of length
 
 
 class MetricScale(Protocol):

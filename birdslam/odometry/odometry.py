@@ -10,6 +10,7 @@ stays the one that all later ones are compared with until they differ.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -21,15 +22,17 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
 from birdslam.geometry.se2 import SE2
 from birdslam.odometry.features import FeatureConfig, FeatureTracker, Tracks
+from birdslam.odometry.guided_two_view import guided_two_view
 from birdslam.odometry.keyframes import KeyframeConfig, KeyframeWindow
 from birdslam.odometry.metric_scale import MetricScale, RoadView
 from birdslam.odometry.motion import Motion, MotionConfig, coasting_cov, measured_cov, planar, standing_cov
 from birdslam.odometry.moving_median import MedianScale
 from birdslam.odometry.relative_pose import locate, two_view
-from birdslam.odometry.road_alignment import RoadFit
+from birdslam.odometry.road_alignment import RoadAligner, RoadFit
 from birdslam.odometry.road_filter import RoadScaleConfig
 from birdslam.odometry.road_points import on_road, outside
 from birdslam.odometry.road_scale import RoadScale
+from birdslam.odometry.start_search import StartSearch, StartSearchConfig
 from birdslam.types import Status
 
 __all__ = ["Motion", "Odometry", "OdometryConfig", "Tracks"]
@@ -41,6 +44,9 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 _MIN_INTERVAL_S = 0.004
+_NEAR_M = 20.0  # road nearer than this moves in the image when the car does
+# Of its corners: so few say nothing, and a standing car keeps so many. By judgement; no data chose them
+_FEWEST_NEAR, _LEAST_NEAR_SHARE = 8, 0.4
 _STILL = Pose(np.eye(3), np.zeros(3))
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step that two images alone show: 1 cm, 0.25 deg
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
@@ -53,6 +59,7 @@ class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
     features: FeatureConfig = FeatureConfig()
     road: RoadScaleConfig = RoadScaleConfig()
     motion: MotionConfig = MotionConfig()
+    start: StartSearchConfig = StartSearchConfig()
     # where the window does not show the pose
     two_view_px: Positive = 0.7  # outliers' limit of the pose from two images, where the window does not show it
     min_fitting: Count = 18  # landmarks that must agree before a pose counts as measured
@@ -61,6 +68,9 @@ class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
     max_coast_s: Positive = 1.0  # after that the window begins anew
     # standstill
     standstill_px: Positive = 0.35  # median displacement against the image that the car stopped in
+    standstill_near_px: Positive = 1.5  # the near road moves more than this when the car does
+    braking_mps2: Positive = 12.0  # tyres on dry asphalt give 10
+    standstill_mps: Positive = 1.0  # a measured speed from which a car may be found to stand the next image
     standstill_m: Positive = 0.012  # a motion that is shorter is none
     standstill_rad: Positive = 0.002  # a turn that is smaller is none
 
@@ -94,6 +104,7 @@ class Odometry:
         self.config = config if config is not None else OdometryConfig()
         self._focal_px = 0.5 * (camera.fx_px + camera.fy_px)
         self._tracker = FeatureTracker(camera.width_px, camera.height_px, self.config.features)
+        self._search = StartSearch(camera, RoadAligner(camera, self.config.road.align), self.config.start)
         self.reset()
 
     def reset(self) -> None:
@@ -105,6 +116,7 @@ class Odometry:
         self._base_frame: int | None = None  # the last image whose motion was measured
         self._base_t_ns = 0
         self._velocity: _Velocity | None = None
+        self._guess: Pose | None = None  # of the step to the present image, where it had to be searched for
         self._interval_s = 0.1
         self._road_tracks: tuple[Ints, Floats] = _NO_TRACKS
 
@@ -122,11 +134,15 @@ class Odometry:
 
     def track(self, image: NDArray[np.uint8]) -> Tracks:
         """Follows the corners into an image, (H, W) grey or (H, W, 3) BGR uint8, undistorted."""
-        return self._tracker.track(image, self._predict_px)
+        self._guess = None
+        return self._tracker.track(image, self._predict_px if self._velocity is not None else None, self._search_px)
+
+    def _search_px(self, past: NDArray[np.uint8], present: NDArray[np.uint8], base: Tracks) -> list[Floats]:
+        """Where the base's corners are by the motions that are searched for."""
+        turned, self._guess = self._search.guesses(past, present)
+        return [self._default_prediction(base.px, step) for step in (turned, self._guess)]
 
     def _predict_px(self, base: Tracks) -> Floats:
-        if self._velocity is None:
-            return base.px
         step = self._predicted_step(self._interval_s)
         pose = self._pose @ step
         out = self._default_prediction(base.px, step)
@@ -180,12 +196,13 @@ class Odometry:
                 self._scale.turned_unseen()
             return motion
         pose, info = located
-        if self._stands(self._pose.between(pose), corners.displacement_px):
+        near_px = self._near_displacement_px(tracks, boxes_px)
+        if self._stands(self._pose.between(pose), corners.displacement_px, near_px, dt_s):
             # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.
             motion = self._stand(frame_id)
         else:
             pose = self._window.extend(frame_id, pose, corners.ids, corners.xy)  # bundle adjustment
-            step = self._scale_to_metres(pose, tracks, boxes_px, road_mask)
+            step = self._scale_to_metres(pose, tracks, boxes_px, road_mask, near_px)
             motion = self._move(frame_id, step, info, dt_s)
             self._tracker.accept(tracks)
         self._base_frame, self._base_t_ns = frame_id, t_source_ns
@@ -217,7 +234,8 @@ class Odometry:
     def _relative_pose(self, corners: _Corners, dt_s: float) -> tuple[Pose, Floats] | None:
         """The present image's pose in the window's frame and its information (6, 6); None where it is not known."""
         cfg, window, ids = self.config, self._window, corners.ids
-        guesses = [self._pose @ self._predicted_step(dt_s), self._pose]
+        searched = [] if self._guess is None else [self._pose @ self._guess]
+        guesses = [*searched, self._pose @ self._predicted_step(dt_s), self._pose]
         best: tuple[int, Pose, Floats] | None = None
         shared = int(np.isin(ids, window.ids[np.isfinite(window.rho)]).sum())
         if shared >= cfg.min_fitting:
@@ -243,24 +261,38 @@ class Odometry:
         xy_a, xy_b = self.camera.to_xy(base.px[a]), corners.xy[b]
         if float(np.median(displacement_px)) < cfg.standstill_px and float(np.quantile(displacement_px, 0.8)) < 1.5:
             return self._pose, _TWO_VIEW_INFORMATION
-        found = two_view(xy_a, xy_b, self._focal_px, cfg.two_view_px)
+        found = self._two_view(xy_a, xy_b, dt_s)
         if found is None or found[1].sum() < max(cfg.min_fitting, cfg.min_fitting_fraction * len(a)):
             return None
         step, _ = found
-        speed = float(np.linalg.norm(self._velocity.linear_mps)) if self._velocity is not None else 0.0
+        speed = self._speed_mps()
         length = speed * dt_s if speed * dt_s > 0.05 else 0.5
+        if self._guess is not None:
+            length = float(np.linalg.norm(self._guess.p))
         frame = self._base_frame if self._base_frame is not None else 0
         self._window = self._new_window()
         self._window.append(frame, self._pose, base.ids[a], xy_a)
         self._scale.restart(base.image, self._pose, 0.2 if speed * dt_s > 0.05 else 1.0)
         return self._pose @ Pose(step.R, step.p * length), _TWO_VIEW_INFORMATION
 
+    def _two_view(self, xy_a: Floats, xy_b: Floats, dt_s: float) -> tuple[Pose, Bools] | None:
+        """T_base_present with a translation of unit length, from a guess where there is one, else from five points."""
+        cfg = self.config
+        guess = self._guess if self._guess is not None else self._predicted_step(dt_s)
+        guided = guided_two_view(xy_a, xy_b, guess, self._focal_px, cfg.two_view_px)
+        free = two_view(xy_a, xy_b, self._focal_px, cfg.two_view_px)
+        if guided is None or free is None:
+            return free if guided is None else guided
+        return guided if guided[1].sum() > 0.9 * free[1].sum() else free
+
     # --- metric scale ---
 
-    def _scale_to_metres(self, pose: Pose, tracks: Tracks, boxes_px: Floats, road_mask: Bools | None) -> Pose:
+    def _scale_to_metres(
+        self, pose: Pose, tracks: Tracks, boxes_px: Floats, road_mask: Bools | None, near_px: float | None
+    ) -> Pose:
         """T_base_present in metres; the window is rescaled to metres too."""
         step = self._pose.between(pose)
-        view = RoadView(tracks.image, pose, boxes_px, road_mask, self._window)
+        view = RoadView(tracks.image, pose, boxes_px, road_mask, self._window, near_px or 0.0)
         factor = self._scale.measure_scale(step, view)
         self._window.rescale(factor)
         self._pose = pose
@@ -268,14 +300,37 @@ class Odometry:
 
     # --- moving, standing, coasting ---
 
-    def _stands(self, step: Pose, displacement_px: Floats) -> bool:
+    def _near_displacement_px(self, tracks: Tracks, boxes_px: Floats) -> float | None:
+        """How far corners well below the horizon have moved, their third quartile; None where there are none to see.
+
+        Infinite where most of them were lost: of a car that stands they would have been found.
+        """
+        base = self._tracker.base
+        rays = np.column_stack([self.camera.to_xy(base.px), np.ones(len(base.px))])
+        near = (rays @ self._scale.ground.normal_cam < -self.camera.height_m / _NEAR_M) & outside(base.px, boxes_px)
+        if near.sum() < _FEWEST_NEAR:
+            return None
+        _, a, b = np.intersect1d(base.ids[near], tracks.ids, return_indices=True)
+        if len(a) < _LEAST_NEAR_SHARE * near.sum():
+            return math.inf
+        return float(np.quantile(np.sqrt(((tracks.px[b] - base.px[near][a]) ** 2).sum(axis=1)), 0.75))
+
+    def _stands(self, step: Pose, displacement_px: Floats, near_px: float | None, dt_s: float) -> bool:
         cfg = self.config
         if len(displacement_px) < cfg.min_fitting or float(np.median(displacement_px)) > cfg.standstill_px:
+            return False
+        if near_px is None and self._speed_mps() > cfg.braking_mps2 * dt_s + cfg.standstill_mps:
+            return False  # no car stops so soon, and no near road says that it did: the glass stands, or the horizon
+        if near_px is not None and near_px > cfg.standstill_near_px:
             return False
         if float(np.quantile(displacement_px, 0.8)) < cfg.standstill_px:
             return True  # four corners of five have not moved: what the others make of the pose does not count
         turn = float(np.linalg.norm(rotation_log(step.R)))
         return float(np.linalg.norm(step.p)) < cfg.standstill_m and turn < cfg.standstill_rad
+
+    def _speed_mps(self) -> float:
+        """Of the last measured motion."""
+        return 0.0 if self._velocity is None else float(np.linalg.norm(self._velocity.linear_mps))
 
     def _predicted_step(self, dt_s: float) -> Pose:
         if self._velocity is None:

@@ -133,6 +133,13 @@ class RoadImage:
         self.grey: Grey = cv2.divide(difference, contrast, dst=mean, scale=10.0)  # type: ignore[assignment]
         self._slopes: tuple[Grey, Grey] | None = None
 
+    @classmethod
+    def of(cls, grey: Grey, top_px: int) -> RoadImage:
+        """Of rows from `top_px` on that are to be compared as they are."""
+        image = cls.__new__(cls)
+        image.top_px, image.grey, image._slopes = top_px, grey, None
+        return image
+
     @property
     def slopes(self) -> tuple[Grey, Grey]:
         """d grey / du and d grey / dv, grey levels per pixel."""
@@ -161,14 +168,27 @@ class RoadAligner:
     def image(self, grey: NDArray[np.uint8]) -> RoadImage:
         return RoadImage(grey, self.top_px, self.config)
 
-    def samples(self, tilt: tuple[float, float], boxes_px: Floats, road_mask: Bools | None) -> Ints:
-        """Pixels (N, 2) of the present image that show road: of the mask, else of a strip in front, less vehicles."""
+    def samples(
+        self,
+        tilt: tuple[float, float],
+        boxes_px: Floats,
+        road_mask: Bools | None,
+        bend_per_m: float = 0.0,
+        wide: bool = False,
+    ) -> Ints:
+        """Pixels (N, 2) of the present image that show road: of the mask, else of a strip in front, less vehicles.
+
+        `bend_per_m` is the curvature of the car's way to the right: where no mask is given, the strip bends with it. A
+        `wide` one takes in the lines of the lane.
+        """
         cam, cfg = self.camera, self.config
         normal, _, _ = plane_normal(*tilt)
         u, v, x, y = self._grid
         rho = -(normal[0] * x + (normal[1] * y + normal[2])) / cam.height_m  # Eq. 1 is X = ray / rho
-        half_width_m = cfg.half_width_m if road_mask is not None else cfg.lane_half_width_m
-        keep = (np.abs(x) < half_width_m * rho) & (rho > 1.0 / cfg.far_m) & (rho < 1.0 / cfg.near_m)
+        half_width_m = cfg.half_width_m if wide or road_mask is not None else cfg.lane_half_width_m
+        inside = (rho > 1.0 / cfg.far_m) & (rho < 1.0 / cfg.near_m)
+        middle_m = 0.0 if road_mask is not None else 0.5 * bend_per_m / np.where(inside, rho, 1.0)
+        keep = (np.abs(x - middle_m) < half_width_m * rho) & inside
         if road_mask is not None:
             keep &= road_mask[v, u]
         for x1, y1, x2, y2 in boxes_px:

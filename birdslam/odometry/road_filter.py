@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.odometry.road_alignment import ROAD, RoadAlignConfig, RoadFit, plane_normal, plane_tilt
+from birdslam.odometry.standing_pattern import StandingPatternConfig
 from birdslam.odometry.tilt_watch import TiltWatchConfig
 
 Floats = NDArray[np.float64]
@@ -32,6 +33,7 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     mode: Literal["kalman", "paper"] = "kalman"  # of the metric scale: a Kalman filter, or the paper's moving median
     align: RoadAlignConfig = RoadAlignConfig()
+    standing: StandingPatternConfig = StandingPatternConfig()
     min_baseline_m: Positive = 0.35  # travelled between the two images; shorter says too little
     target_baseline_m: Positive = 1.1  # of the kept images the one nearest to this is compared
     kept_images: Annotated[int, msgspec.Meta(ge=2)] = 8  # earlier images of the road, to compare with
@@ -47,9 +49,15 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_bounce_rad: Positive = 0.012  # pitch and roll of the body against their mean, seen once in bounce_m
     bounce_m: Positive = 3.0  # the way over which the body's bounce lasts
     sigma_travel_rad: Positive = 0.012  # direction of travel against the road, over one metre
+    # A file's pitch so far from the first direction of travel is wrong: bumps and loads make a degree of it
+    wrong_pitch_rad: Positive = 0.025
+    max_wrong_pitch_rad: Positive = 0.08  # a direction that is off by more is no car's: nothing is concluded from it
     sigma_mount_rad: Positive = 0.02  # of the calibrated pitch and roll
     sigma_unseen_rad: Positive = 0.03  # of the tilt after a gap in which nobody saw how the camera turned
     scale_walk_rel_per_sqrt_m: Positive = 0.004  # drift of the visual scale
+    # ... and in a bend of so much: on KITTI 01's ramp of 21 m radius it drifts by 12 % over as many metres
+    scale_walk_bend_sqrt_m: Positive = 0.4
+    max_bend_per_m: Positive = 0.15  # a tighter curvature of the way than this counts as this
     tilt_walk_rad_per_sqrt_m: Positive = 0.003  # crown and grade of the road
     sigma_curvature_per_m: Positive = 0.0006  # of roads along the way: town streets have radii of 500 m and more
     curvature_memory_m: Positive = 30.0  # so far a crest or a sag reaches
@@ -131,7 +139,11 @@ class RoadFilter:
         mount = cfg.mount_walk_rad_per_sqrt_m**2 * travelled_m
         bend = (1.0 - keep**2) * cfg.sigma_curvature_per_m**2
         self.cov = F @ self.cov @ F.T + np.diag([0.0, walk, walk, bend, mount, mount])
-        self.cov[0, 0] = min(self.cov[0, 0] + cfg.scale_walk_rel_per_sqrt_m**2 * travelled_m, 1.0)
+        # Of landmarks that a turn takes out of sight at the side none hands the length on
+        turned_rad = float(np.arctan2(R_prev_curr[0, 2], R_prev_curr[2, 2]))
+        bend_per_m = min(abs(turned_rad) / max(travelled_m, 0.1), cfg.max_bend_per_m)
+        drift = cfg.scale_walk_rel_per_sqrt_m**2 + (cfg.scale_walk_bend_sqrt_m * bend_per_m) ** 2
+        self.cov[0, 0] = min(self.cov[0, 0] + drift * travelled_m, 1.0)
         self.carried_m += travelled_m
         # The road under the car is, in the mean, where the mount says: holds the tilt where no comparison does.
         share = travelled_m / cfg.bounce_m
@@ -159,6 +171,19 @@ class RoadFilter:
         share = travelled_m / 1.0
         noise = np.array([[self.config.sigma_travel_rad**2 / share]])
         self._update(np.array([-(normal @ d)]), H, noise)
+
+    def begin_travelling(self, t_prev_curr: Floats) -> None:
+        """The first direction of travel: where it says that the camera file's pitch is far off, it goes before it."""
+        length = float(np.linalg.norm(t_prev_curr))
+        if length <= 0.0 or t_prev_curr[2] < 0.9 * length:
+            return  # not forwards: a direction that no start may rest on
+        off_rad = float(np.arctan2(-t_prev_curr[1], t_prev_curr[2])) - float(self.x[1])
+        if abs(off_rad) < self.config.wrong_pitch_rad or abs(off_rad) > self.config.max_wrong_pitch_rad:
+            return
+        self.cov[np.ix_([1, 4], [1, 4])] += off_rad**2
+        H = np.zeros((1, STATES))
+        H[0, 1] = 1.0
+        self._update(np.array([off_rad]), H, np.array([[self.config.sigma_travel_rad**2]]))
 
     def innovation(self, fit: RoadFit) -> tuple[Floats, Floats, float]:
         """What a comparison says beyond what was expected, its noise (4, 4), and how many sigma that is away."""

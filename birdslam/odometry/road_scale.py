@@ -17,18 +17,32 @@ from birdslam.geometry.pose import Pose
 from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.road_alignment import ROAD, RoadAligner, RoadFit, RoadImage
 from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
+from birdslam.odometry.road_landmarks import length_unit
 from birdslam.odometry.road_search import search_length
+from birdslam.odometry.sliding_window import SlidingWindow
+from birdslam.odometry.standing_pattern import StandingPattern
 from birdslam.odometry.tilt_watch import TiltWatch
 from birdslam.types import Status
 
 Floats = NDArray[np.float64]
 
+_SHORTEST_M = 0.1  # of a motion whose rotation says how the way bends
+_LANDMARKS_LOG = 0.4  # they are short by up to a tenth, and a wrong pitch of a degree makes another fifth
+_DRIVEN_PX = 3.0  # of what is below the horizon from one image to the next
+_BEND_PER_M = 0.2  # no car turns more tightly
 _LENGTHS_M = np.geomspace(0.03, 6.0, 84)  # tried where the length is not known at all
 
 
 @dataclass(frozen=True)
-class _Kept:
-    image: RoadImage
+class _Seen:
+    """The road in one image."""
+
+    plain: RoadImage
+    image: RoadImage  # the same, or without what stands still in it
+
+
+@dataclass(frozen=True)
+class _Kept(_Seen):
     pose: Pose  # in the odometry's frame and unit
 
 
@@ -44,6 +58,7 @@ class RoadScale:
         self._aligner = RoadAligner(camera, config.align)
         self._filter = RoadFilter(camera, config)
         self._watch = TiltWatch(camera, config.watch)
+        self._standing = StandingPattern(config.standing)
         self._kept: list[_Kept] = []
         self._confirmed = 0
         self._refused = 0.0  # comparisons in a row, each counted by what of it is new: those of one view err together
@@ -74,7 +89,8 @@ class RoadScale:
 
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
         """The odometry begins anew with this image; its unit of length is known to `sigma_rel`."""
-        self._kept = [_Kept(self._aligner.image(grey), pose)]
+        image = self._aligner.image(grey)
+        self._kept = [_Kept(image, image, pose)] if not self._standing.present else []
         if not self._confirmed:
             sigma_rel = 1.0
         self._filter.forget_scale(sigma_rel)
@@ -96,29 +112,53 @@ class RoadScale:
         self._filter.travel(step.R.T @ step.p, travelled_m)
         self._since_m += travelled_m
 
-        image, pose = self._aligner.image(view.grey), view.pose
+        image, pose = self._image(view.grey), view.pose
         factor = float(np.exp(np.clip(self._filter.owed_log, -0.1, 0.1)))
         self._filter.owed_log = 0.0
         past = self._past(pose)
         if past is not None:
-            px = self._aligner.samples(self._tilt, view.boxes_px, view.road_mask)
+            T = past.pose.between(pose)
+            if not self._confirmed and self.unknown:
+                self._filter.begin_travelling(T.R.T @ T.p)
+            bend_per_m = _bend_per_m(step.R, travelled_m)
+            px = self._aligner.samples(self._tilt, view.boxes_px, view.road_mask, bend_per_m, self._standing.present)
             if len(px) >= self.config.align.min_samples:
-                T = past.pose.between(pose)
-                factor *= self._compare(past, image, Pose(T.R, T.p * factor), px)
+                unit = self._unit_of_landmarks(view.window)
+                baseline_m = float(np.linalg.norm(T.p)) * (unit or factor)
+                driven_m = baseline_m if view.near_px < _DRIVEN_PX else np.inf
+                if self._standing.judge(past.plain, image.plain, px, driven_m):
+                    self._kept = []  # they are of the other kind
+                    return factor
+                borne_out = None if unit is None else unit / factor
+                factor *= self._compare(past.image, image.image, Pose(T.R, T.p * factor), px, borne_out)
         measured = self._filter.carried_m == 0.0 and self._known()  # here, in metres
         self._watch.see(self._filter.tilt, factor * travelled_m, measured)
         self._keep(image, pose, factor)
         return factor
 
-    def _keep(self, image: RoadImage, pose: Pose, factor: float) -> None:
+    def _image(self, grey: NDArray[np.uint8]) -> _Seen:
+        plain, standing, top_px = self._aligner.image(grey), self._standing, self._aligner.top_px
+        standing.learn(grey, top_px)
+        if not standing.present:
+            return _Seen(plain, plain)
+        return _Seen(plain, RoadImage.of(standing.without(grey, top_px), top_px))
+
+    def _unit_of_landmarks(self, window: SlidingWindow) -> float | None:
+        """Metres in the window's unit of length by its landmarks on the road, where the length is in doubt."""
+        if not (self._in_doubt() or self._refused):
+            return None
+        return length_unit(self.camera, self._tilt, window)
+
+    def _keep(self, seen: _Seen, pose: Pose, factor: float) -> None:
         """Remembers the image for later comparisons, where it is far enough from the last one kept."""
         cfg = self.config
         if factor != 1.0:
             centre = pose.p
-            self._kept = [_Kept(k.image, Pose(k.pose.R, centre + factor * (k.pose.p - centre))) for k in self._kept]
+            moved = [Pose(k.pose.R, centre + factor * (k.pose.p - centre)) for k in self._kept]
+            self._kept = [_Kept(k.plain, k.image, T) for k, T in zip(self._kept, moved, strict=True)]
         newest = self._kept[-1] if self._kept else None
         if newest is None or float(np.linalg.norm(newest.pose.p - pose.p)) > 0.5 * cfg.min_baseline_m:
-            self._kept = [*self._kept[1 - cfg.kept_images :], _Kept(image, pose)]
+            self._kept = [*self._kept[1 - cfg.kept_images :], _Kept(seen.plain, seen.image, pose)]
 
     def status(self) -> list[Status]:
         """What is wrong with the scale, the ground plane or the mount."""
@@ -129,6 +169,8 @@ class RoadScale:
             out.append(Status.SCALE_INVALID)
         if self._refused >= cfg.violated_after:
             out.append(Status.GROUND_VIOLATED)
+        if self._standing.present:
+            out.append(Status.VIEW_OBSTRUCTED)
         if self._watch.drifted:
             out.append(Status.CALIBRATION_DRIFT)
         return out
@@ -158,14 +200,19 @@ class RoadScale:
             return None
         return self._kept[int(usable[np.argmin(np.abs(np.log(distance[usable] / cfg.target_baseline_m)))])]
 
-    def _compare(self, past: _Kept, image: RoadImage, T: Pose, px: NDArray[np.int64]) -> float:
-        """The factor by which T_past_present is too short, 1 where the comparison is refused."""
+    def _compare(
+        self, past: RoadImage, image: RoadImage, T: Pose, px: NDArray[np.int64], borne_out: float | None
+    ) -> float:
+        """The factor by which T_past_present is too short, 1 where the comparison is refused.
+
+        `borne_out` is that factor by the landmarks on the road; None where they say nothing or are not asked.
+        """
         cfg, filter_ = self.config, self._filter
         length = float(np.linalg.norm(T.p))
         if length < 1e-6:
             return 1.0
         new, self._since_m = min(1.0, self._since_m / length), 0.0
-        found = self._align(past.image, image, T, px)
+        found = self._align(past, image, T, px, borne_out)
         if found is None:
             return 1.0
         fit, searched, prior_cov = found
@@ -184,12 +231,14 @@ class RoadScale:
         return factor
 
     def _align(
-        self, past: RoadImage, image: RoadImage, T: Pose, px: NDArray[np.int64]
+        self, past: RoadImage, image: RoadImage, T: Pose, px: NDArray[np.int64], borne_out: float | None
     ) -> tuple[RoadFit, float, Floats] | None:
         """The fit, the factor on T that it starts from, and the filter's covariance that it is to be joined with."""
         cfg, filter_ = self.config, self._filter
         prior, prior_cov = filter_.x[:ROAD].copy(), filter_.cov.copy()
-        fit = self._aligner.align(past, image, T, px, prior, prior_cov[:ROAD, :ROAD])
+        fit, factor, cov = self._aligner.align(past, image, T, px, prior, prior_cov[:ROAD, :ROAD]), 1.0, prior_cov
+        if fit is not None and _contradicts(fit.state[0], borne_out):
+            fit = None
         if self._in_doubt():
             length = float(np.linalg.norm(T.p))
             searched = search_length(self.camera, past, image, T, px, self._tilt, _LENGTHS_M) / length
@@ -198,9 +247,23 @@ class RoadScale:
             loose[0, 0] = 0.3**2
             if self._refused >= cfg.doubt_after:
                 loose[1:3, 1:3] += np.eye(2) * cfg.sigma_unseen_rad**2
-            other = self._aligner.align(past, image, Pose(T.R, T.p * searched), px, prior, loose[:ROAD, :ROAD])
             # What was confirmed before has to be beaten clearly: the dark below a car ahead agrees with standing still.
             lead = 0.02 if not self._confirmed else 0.1
-            if other is not None and (fit is None or other.correlation > fit.correlation + lead):
-                return other, searched, loose
-        return None if fit is None else (fit, 1.0, prior_cov)
+            for begin in (searched,) if borne_out is None else (searched, borne_out):
+                other = self._aligner.align(past, image, Pose(T.R, T.p * begin), px, prior, loose[:ROAD, :ROAD])
+                if other is None or _contradicts(float(np.log(begin)) + other.state[0], borne_out):
+                    continue
+                if fit is None or other.correlation > fit.correlation + lead:
+                    fit, factor, cov = other, begin, loose
+        return None if fit is None else (fit, factor, cov)
+
+
+def _contradicts(log_length: float, borne_out: float | None) -> bool:
+    """Whether a factor on the lengths is none that the landmarks on the road could bear out."""
+    return borne_out is not None and abs(log_length - float(np.log(borne_out))) > _LANDMARKS_LOG
+
+
+def _bend_per_m(R_prev_curr: Floats, travelled_m: float) -> float:
+    """The curvature of the way, to the right."""
+    turned_rad = float(np.arctan2(R_prev_curr[0, 2], R_prev_curr[2, 2]))
+    return float(np.clip(turned_rad / max(travelled_m, _SHORTEST_M), -_BEND_PER_M, _BEND_PER_M))

@@ -90,6 +90,12 @@ class SlidingWindow:
             z: Floats = self._seen_from(pose)[2] / self.rho
         return z
 
+    def inverse_depths(self, pose: Pose) -> Floats:
+        """(M,) 1 / z of the landmarks in a camera at `pose`; NaN where unknown or behind it."""
+        z = self._seen_from(pose)[2]
+        out: Floats = self.rho / np.where(z > MIN_DEPTH, z, np.nan)
+        return out
+
     def _seen_from(self, pose: Pose) -> Floats:
         """(3, M) the landmarks in a camera at `pose`, times their inverse depths."""
         anchor = self.anchors()

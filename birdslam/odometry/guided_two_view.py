@@ -1,0 +1,76 @@
+"""The relative pose of two images from a guess of it: epipolar geometry with a car's motion for its prior.
+
+Five points determine the pose of two images, but where most corners are far away a turn looks like a move to the side,
+and among wrong matches or along a moving car RANSAC finds many corners that agree on one that no car makes. From a
+guess near the truth the same residuals, weighted robustly, have one minimum.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.pose import Pose, rotation_exp
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+# 1-sigma of a guess: a degree of rotation, as far as a search's cell and a car's roll go; of the direction of travel
+# the mount's yaw and pitch and the slip of a camera in front of the rear axle
+_SIGMA_ROTATION_RAD = 0.02
+_SIGMA_DIRECTION_RAD = 0.07
+# Of the robust weights, one a step: from wide to narrow
+_WIDTHS_PX = (4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.7, 0.7, 0.7)
+_STEP_RAD = 1e-5  # of the numerical derivative
+
+
+def guided_two_view(
+    xy_a: Floats, xy_b: Floats, guess: Pose, focal_px: float, threshold_px: float
+) -> tuple[Pose, Bools] | None:
+    """T_a_b (translation of unit length) near `guess`, and which of the N pairs fit it.
+
+    xy_a, xy_b (N, 2) are normalised coordinates. None where the guess has no direction, or nothing fits.
+    """
+    length = float(np.linalg.norm(guess.p))
+    if len(xy_a) < 12 or length < 1e-6:
+        return None
+    rays_a, rays_b = (np.column_stack([xy, np.ones(len(xy))]) for xy in (xy_a, xy_b))
+    axes = _across(guess.p / length)
+    prior = np.array([_SIGMA_ROTATION_RAD**-2] * 3 + [_SIGMA_DIRECTION_RAD**-2] * 2)
+    x = np.zeros(5)
+    for width_px in _WIDTHS_PX:
+        r = _residuals(x, guess, axes, rays_a, rays_b, focal_px)
+        J = np.empty((5, len(r)))
+        for k in range(5):
+            moved = x.copy()
+            moved[k] += _STEP_RAD
+            J[k] = (_residuals(moved, guess, axes, rays_a, rays_b, focal_px) - r) / _STEP_RAD
+        w = 1.0 / np.square(1.0 + np.square(r / width_px)) / threshold_px**2  # Geman-McClure
+        x = x - np.linalg.solve((J * w) @ J.T + np.diag(prior), (J * w) @ r + prior * x)
+    fits = np.abs(_residuals(x, guess, axes, rays_a, rays_b, focal_px)) < threshold_px
+    if not fits.any() or not np.isfinite(x).all():
+        return None
+    return _pose(x, guess, axes), fits
+
+
+def _across(direction: Floats) -> Floats:
+    """(2, 3): two unit vectors across a direction and each other."""
+    first = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(direction, first)])
+
+
+def _pose(x: Floats, guess: Pose, axes: Floats) -> Pose:
+    direction = guess.p / np.linalg.norm(guess.p) + x[3:] @ axes
+    return Pose(rotation_exp(x[:3]) @ guess.R, direction / np.linalg.norm(direction))
+
+
+def _residuals(x: Floats, guess: Pose, axes: Floats, rays_a: Floats, rays_b: Floats, focal_px: float) -> Floats:
+    """(N,) px: Sampson's distance of each pair from the epipolar geometry."""
+    T = _pose(x, guess, axes)
+    tx, ty, tz = T.p
+    E = np.array([[0.0, -tz, ty], [tz, 0.0, -tx], [-ty, tx, 0.0]]) @ T.R
+    along_a, along_b = rays_b @ E.T, rays_a @ E
+    norm2 = (along_a[:, :2] ** 2).sum(axis=1) + (along_b[:, :2] ** 2).sum(axis=1)
+    out: Floats = focal_px * (rays_a * along_a).sum(axis=1) / np.sqrt(np.maximum(norm2, 1e-12))
+    return out
