@@ -1,0 +1,144 @@
+"""Rain drops, dirt and a windscreen's reflection that come in the middle of a drive: does the ego-motion go on?
+
+    python -m perf overlays [SEQUENCE ...] [--output FILE.json] [--data DIR] [--networks] [--model ROLE=PATH ...]
+
+Each is drawn over the second half of each sequence, seeded, and stands still in the image: dirt is opaque, a drop shows
+the image upside down and blurred within a bright rim, a reflection is added to what lies behind it. Counts the frames
+of the second half that were called valid with a speed off by more than a tenth, and those called standstill while the
+car drove.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.datasets.recording import DatasetError
+from birdslam.odometry.odometry import Odometry
+from birdslam.perception import ModelError
+from birdslam.perf.errors import PerfError
+from birdslam.perf.figures import Ledger
+from birdslam.perf.starts import Drive, Task, is_valid, is_wrong, networks_of, read, uri_of
+from birdslam.types import Status
+
+Image = NDArray[np.uint8]
+
+label = "drops, dirt and a reflection from the middle of recorded drives on"
+
+SEQUENCES = (
+    "kitti_odometry/sequences/00",
+    "kitti_odometry/sequences/06",
+    "kitti_tracking/training/image_03/0005",
+)
+KINDS = ("nothing", "drops", "dirt", "reflection")
+DRIVES_M = 0.1  # in one image, by the truth: such a car does not stand
+
+
+class Overlay:
+    """`draw` puts one kind over an image, the same each time."""
+
+    def __init__(self, kind: str, width_px: int, height_px: int, seed: int) -> None:
+        self.kind = kind
+        rng = np.random.default_rng(seed)
+        count = {"drops": 60, "dirt": 45, "reflection": 40}.get(kind, 0)
+        cover = np.zeros((height_px, width_px), np.float32)  # share of the overlay in each pixel
+        brightness = np.zeros((height_px, width_px), np.float32)  # its own brightness
+        for _ in range(count):
+            centre = (int(rng.integers(0, width_px)), int(rng.integers(0, height_px)))
+            radius = int(rng.integers(5, 26) * width_px / 1242)
+            light = float(rng.uniform(15.0, 70.0))
+            if kind == "reflection":  # of what lies on the dashboard: edges over the lower half
+                centre = (centre[0], height_px // 2 + centre[1] // 2)
+                end = (centre[0] + int(rng.integers(-150, 150)), centre[1] + int(rng.integers(-20, 20)))
+                cv2.line(brightness, centre, end, light, int(rng.integers(1, 4)), cv2.LINE_AA)
+            else:
+                cv2.circle(cover, centre, radius, 1.0, -1, cv2.LINE_AA)
+                cv2.circle(brightness, centre, radius, light if kind == "dirt" else 0.0, -1, cv2.LINE_AA)
+                if kind == "drops":
+                    cv2.ellipse(brightness, centre, (radius, radius), 0.0, 200.0, 340.0, light, 2, cv2.LINE_AA)
+        self._cover = cv2.GaussianBlur(cover, (0, 0), 1.5)[..., None]
+        self._light = cv2.GaussianBlur(brightness, (0, 0), 1.0)[..., None]
+
+    def draw(self, image: Image) -> Image:
+        """(H, W) grey or (H, W, 3)."""
+        if self.kind == "nothing":
+            return image
+        seen = image.reshape(*image.shape[:2], -1).astype(np.float32)
+        if self.kind == "dirt":
+            drawn = (1.0 - self._cover) * seen + self._cover * self._light
+        else:
+            inside = cv2.GaussianBlur(image[::-1], (0, 0), 6.0).reshape(seen.shape)
+            drawn = (1.0 - self._cover) * seen + self._cover * inside + self._light
+        return np.clip(drawn, 0.0, 255.0).astype(np.uint8).reshape(image.shape)
+
+
+def run(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m perf overlays", description=label)
+    parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="kitti:DIR, or a folder of --data")
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BIRDSLAM_DATA", "../shared/data")))
+    parser.add_argument("--networks", action="store_true", help="with the configured networks")
+    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="with this network")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--output", type=Path, help="JSON")
+    options = parser.parse_args(arguments)
+    configuration = networks_of(options)
+    cv2.setNumThreads(1)
+    try:
+        with Ledger(options.output, label, seed=options.seed, networks=configuration is not None) as ledger:
+            for sequence in options.sequences or SEQUENCES:
+                task = Task(uri_of(sequence, options.data), "", False, 1, 1, 0, None)
+                for kind in KINDS:
+                    # The networks see the overlay as well
+                    name, drive = read(replace(task, configuration=configuration), from_middle(kind, options.seed))
+                    row = measure(drive)
+                    ledger.add(f"{name} {kind}", told(row), **row)
+    except (DatasetError, ModelError) as error:
+        raise PerfError(str(error)) from error
+
+
+def from_middle(kind: str, seed: int) -> Any:
+    """(index, count, image) -> image."""
+    overlays: dict[tuple[int, ...], Overlay] = {}
+
+    def edit(index: int, count: int, image: Image) -> Image:
+        size = (image.shape[1], image.shape[0])
+        overlay = overlays.setdefault(size, Overlay(kind, *size, seed))
+        return overlay.draw(image) if 2 * index >= count else image
+
+    return edit
+
+
+def measure(drive: Drive) -> dict[str, Any]:
+    """What the odometry says of the second half."""
+    odometry, half = Odometry(drive.camera), len(drive.images) // 2
+    row = dict.fromkeys(("frames", "valid", "wrong_valid", "standstill", "obstructed"), 0)
+    way_m = true_m = 0.0
+    for k, image in enumerate(drive.images):
+        motion = odometry.estimate(odometry.track(image), k, drive.t_ns[k], *drive.seen[k])
+        if motion is None or k < half:
+            continue
+        step_m = float(np.linalg.norm(drive.poses[k, :3, 3] - drive.poses[motion.from_frame, :3, 3]))
+        row["frames"] += 1
+        row["valid"] += is_valid(motion)
+        row["wrong_valid"] += is_valid(motion) and is_wrong(motion, drive.poses)
+        row["standstill"] += motion.standstill and step_m > DRIVES_M * (k - motion.from_frame)
+        row["obstructed"] += Status.VIEW_OBSTRUCTED in motion.status
+        if motion.from_frame == k - 1:
+            way_m, true_m = way_m + float(np.linalg.norm(motion.t_prev_curr_m)), true_m + step_m
+    return {**row, "scale_error": way_m / true_m - 1.0 if true_m else None}
+
+
+def told(row: dict[str, Any]) -> str:
+    """A row for a person."""
+    scale = "unknown" if row["scale_error"] is None else f"{row['scale_error']:+.1%}"
+    return (
+        f"{row['frames']:4} frames  valid {row['valid']}, of them wrong {row['wrong_valid']}  standstill "
+        f"{row['standstill']}  view_obstructed {row['obstructed']}  scale {scale}"
+    )
