@@ -108,7 +108,11 @@ def _short(value: Any) -> Any:
 
 
 EVALUATIONS = {
-    "odometry": Evaluation(f"odometry {SEQUENCES}/00 {SEQUENCES}/06 {{data}}/kitti_raw_clip {REAL}", _odometry),
+    "odometry": Evaluation(
+        f"odometry {SEQUENCES}/00 {SEQUENCES}/01 {SEQUENCES}/06 {{data}}/kitti_raw_clip "
+        f"{{data}}/kitti_tracking/training/image_03/0005 {REAL}",
+        _odometry,
+    ),
     "odometry_from_14": Evaluation(f"odometry {SEQUENCES}/00 --frames 14: {REAL}", _odometry),
     "odometry_stride_2": Evaluation(f"odometry {SEQUENCES}/00 {SEQUENCES}/06 --stride 2 {REAL}", _odometry),
     "odometry_demo": Evaluation("odometry demo", _odometry),
@@ -194,7 +198,13 @@ def page(found: Mapping[str, Kept]) -> str:
 def summary(found: Mapping[str, Kept]) -> str:
     """The one table of the README: what, how good, and the command of each row."""
     rows = [("what", "how good", "command")]
-    names = {"00": "KITTI 00, its first 12 s", "06": "KITTI 06, 5 s", "kitti_raw_clip": "KITTI raw, stop and go"}
+    names = {
+        "00": "KITTI 00, its first 12 s",
+        "01": "KITTI 01, a ramp, 5 s",
+        "06": "KITTI 06, 5 s",
+        "kitti_raw_clip": "KITTI raw, stop and go",
+        "0005": "KITTI tracking 0005, 30 s",
+    }
     for row in (*found["odometry"], *found["odometry_demo"]):
         what = f"ego motion, {names.get(row['sequence'], 'the shipped drive')}, {row['path_m']:.0f} m"
         scale = _percent(row["scale_error"], "+.1")

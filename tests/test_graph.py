@@ -32,7 +32,9 @@ from birdslam.types import EgoEdge, Estimate, LanePoint, Measurements, Status
 Floats = NDArray[np.float64]
 
 ALL_EDGES = WeightsConfig(leave_out=())
-EQ_6 = GraphConfig(constant_velocity=False, detection_gate_sigma=1e3)  # the paper's graph, and nothing counts as wild
+EQ_6 = GraphConfig(
+    constant_velocity=False, detection_gate_sigma=1e3
+)  # the paper's graph, and nothing counts as an outlier
 NO_CP = DriveConfig(landmarks=0, lane_points=0)
 
 
@@ -371,7 +373,7 @@ def with_common_error(world: Drive, rng: np.random.Generator) -> Drive:
     return Drive(measurements, world.ego, world.vehicles)
 
 
-@pytest.mark.parametrize("common_error", [False, True])
+@pytest.mark.parametrize("common_error", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_landmarks_never_make_the_ego_worse_than_cc_alone(common_error: bool) -> None:
     rng = np.random.default_rng(0)
     with_cp, without = [], []
@@ -427,6 +429,7 @@ def test_lane_points_keep_their_lanes() -> None:
 # --- bounded, deterministic, never raises ---
 
 
+@pytest.mark.slow
 def test_three_thousand_frames_grow_nothing() -> None:
     world = drive(DriveConfig(frames=3000, vehicles=4, landmarks=6, outliers=0.02, drop=0.02), seed=10)
     config = GraphConfig(max_pending_landmarks=200, max_pending_frames=100)

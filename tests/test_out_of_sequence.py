@@ -161,7 +161,7 @@ def sizes(seed: int) -> tuple[float, ...]:
     return tuple(CAR.height_m * np.exp(CAR.sigma_height_rel * np.random.default_rng(seed).standard_normal(3)))
 
 
-@pytest.mark.parametrize("delay", [1, 3])
+@pytest.mark.parametrize("delay", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_late_vehicles_are_where_their_covariance_says(delay: int) -> None:
     late = [deviations(drive(delay, seed, 1.0, sizes(seed))) for seed in range(12)]
     punctual = [deviations(drive(0, seed, 1.0, sizes(seed))) for seed in range(12)]

@@ -204,6 +204,7 @@ def test_thinned_rows_are_bounded_and_evenly_spread(count: int, keep: int) -> No
     assert count > keep or step == 1.0
 
 
+@pytest.mark.slow
 def test_memory_of_a_long_drive_is_bounded(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, CAMERA)
     for k in range(4500):

@@ -39,6 +39,7 @@ def told(tilts: Floats, camera: Camera = CAMERA, off: Floats | None = None) -> t
     return watch, np.array(out)
 
 
+@pytest.mark.slow
 def test_roads_as_they_are_raise_no_alarm() -> None:
     """40 drives of 1.5 km; the file is off by what its sigma says."""
     alarms = 0
