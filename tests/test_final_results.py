@@ -288,7 +288,8 @@ def test_a_video_that_cannot_be_is_named_before_anything_starts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "is.mp4").mkdir()
-    for name, reason in (("no/v.mp4", "no directory"), ("v.gif", "expected FILE.mp4"), ("is.mp4", "is a directory")):
+    (tmp_path / "file").touch()
+    for name, reason in (("file/v.mp4", "can't be made"), ("v.gif", "expected FILE.mp4"), ("is.mp4", "is a directory")):
         output = str(tmp_path / "out")
         assert main(["run", "--source", "demo", "--video", str(tmp_path / name), "--output", output]) == 2
         error = capsys.readouterr().err
@@ -299,7 +300,12 @@ def test_a_video_that_cannot_be_is_named_before_anything_starts(
     monkeypatch.setattr("birdslam.evaluation.video.CODEC", "none")
     with pytest.raises(ResultsError, match="can't write none"):
         check_video(tmp_path / "v.mp4", CAMERA, 10.0)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["is.mp4"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "is.mp4"]
+
+
+def test_folders_on_the_way_to_a_video_are_made(tmp_path: Path) -> None:
+    check_video(tmp_path / "new" / "folder" / "v.mp4", CAMERA, 10.0)
+    assert list((tmp_path / "new" / "folder").iterdir()) == []
 
 
 def test_a_live_camera_that_is_recorded_without_images_has_no_video(tmp_path: Path) -> None:

@@ -228,13 +228,18 @@ class DriveVideo:
 
 
 def check_video(path: Path, camera: Camera, rate_hz: float) -> None:
-    """Raises ResultsError where a video of this camera can't be written there; what lies there stays as it is."""
+    """Raises ResultsError where a video of this camera can't be written there; what lies there stays as it is.
+
+    Folders on the way to it are made, as those of the results are.
+    """
     if path.suffix != SUFFIX:
         raise ResultsError(f"video {path}: expected FILE{SUFFIX}")
     if path.is_dir():
         raise ResultsError(f"video {path}: is a directory")
-    if not path.parent.is_dir():
-        raise ResultsError(f"video {path}: there is no directory {path.parent}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ResultsError(f"video {path}: {path.parent} can't be made: {error.strerror}") from None
     probe = path.with_name(f".{path.stem}.probe{SUFFIX}")
     try:
         probe.touch()
