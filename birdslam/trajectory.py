@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
@@ -30,6 +29,8 @@ Transform = NDArray[np.float64]  # (..., 4, 4) homogeneous, metres; one or many
 
 def ego_pose(T_world_ego: SE2, attitude: Attitude) -> Transform:
     """`T_world_ego` (4, 4) of a planar pose and what it leaves out."""
+    from scipy.spatial.transform import Rotation  # here: few processes that import this module turn poses
+
     out = np.eye(4)
     angles = [T_world_ego.yaw_rad, attitude.pitch_rad, attitude.roll_rad]
     out[:3, :3] = Rotation.from_euler("ZYX", angles).as_matrix()
@@ -78,6 +79,8 @@ def kitti_row(T_first_i: Transform) -> str:
 
 def tum_row(t_ns: int, T_world_i: Transform) -> str:
     """One line of a TUM trajectory, without its end; the time is exact to the nanosecond, qw >= 0."""
+    from scipy.spatial.transform import Rotation  # here: few processes that import this module turn poses
+
     qx, qy, qz, qw = Rotation.from_matrix(T_world_i[:3, :3]).as_quat(canonical=True)
     numbers = " ".join(f"{number + 0.0:.9f}" for number in (*T_world_i[:3, 3], qx, qy, qz, qw))
     sign, t_ns = ("-", -t_ns) if t_ns < 0 else ("", t_ns)
@@ -118,6 +121,8 @@ def read_kitti(path: Path) -> NDArray[np.float64]:
 
 def read_tum(path: Path) -> tuple[NDArray[np.float64], Transform]:
     """Times (N,) in seconds and poses (N, 4, 4) of a TUM file, comments skipped. Raises ValueError naming the line."""
+    from scipy.spatial.transform import Rotation  # here: few processes that import this module turn poses
+
     rows = _read_numbers(path, 8, "TUM pose")
     wrong = np.flatnonzero(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0) > 1e-3)
     if wrong.size:

@@ -182,6 +182,7 @@ def test_replay_writes_them_too(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert (tmp_path / "out" / "ego.final.tum.txt").read_bytes() == (tmp_path / "out" / "ego.tum.txt").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.processes
 def test_a_run_writes_what_is_evaluated_and_takes_its_temporary_recording_away(tmp_path: Path) -> None:
     """The shipped drive through the three processes; --record only so that the test can evaluate the same records."""

@@ -26,6 +26,7 @@ from typing import Any, Self, TextIO
 
 import msgspec
 import numpy as np
+import scipy.spatial.transform  # noqa: F401  # at the start of a drive, not with its first frame (trajectory.py)
 from numpy.typing import NDArray
 
 from birdslam.evaluation.final import EGO_FILES

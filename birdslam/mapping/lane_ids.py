@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from birdslam.geometry.se2 import SE2
 
@@ -35,6 +34,9 @@ class LaneIds:
 
     def __init__(self, same_lane_m: float, cell_m: float, remembered_m: float) -> None:
         """A lane seen again lies within `same_lane_m` of where it was; past `remembered_m` it is forgotten."""
+        from scipy.spatial import cKDTree  # half a second, which only who maps lanes pays: the other processes don't
+
+        self._tree = cKDTree
         self._same_lane_m, self._cell_m, self._remembered_m = same_lane_m, cell_m, remembered_m
         self._next = 0
         self.forget()
@@ -48,7 +50,7 @@ class LaneIds:
         """(N,) the lanes that points (N, 2) in world lie on, NO_LANE where none is known to be."""
         out: Ids = np.full(len(points_m), NO_LANE)
         if len(self._points) and len(points_m):
-            distance, at = cKDTree(self._points).query(points_m, distance_upper_bound=self._same_lane_m)
+            distance, at = self._tree(self._points).query(points_m, distance_upper_bound=self._same_lane_m)
             near = np.isfinite(distance)
             out[near] = self._lanes[at[near]]
         return out
@@ -58,7 +60,7 @@ class LaneIds:
         in_world = [T_world_ego @ cloud for cloud in clouds]
         votes: list[tuple[int, int, int]] = []  # (how many points, the cloud, the lane)
         if len(self._points):
-            tree = cKDTree(self._points)
+            tree = self._tree(self._points)
             for k, points in enumerate(in_world):
                 distance, at = tree.query(points, distance_upper_bound=self._same_lane_m)
                 seen, counts = np.unique(self._lanes[at[np.isfinite(distance)]], return_counts=True)

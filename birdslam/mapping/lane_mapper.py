@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
@@ -206,6 +205,8 @@ class LaneMapper:
         seen_m = then.T_world_ego @ self._points_m(segmentation, then.ground, boxes_px)
         seen_m = seen_m[self._amodal.ids.of(seen_m) == NO_LANE]
         if len(points_m):
+            from scipy.spatial import cKDTree  # loaded by lane_ids.py
+
             seen_m = seen_m[cKDTree(points_m).query(seen_m)[0] > self._amodal.config.same_lane_m]
         seen_m = seen_m[: self.config.max_lane_points - len(points_m)]
         all_lanes = np.concatenate([lanes, np.full(len(seen_m), NO_LANE)])

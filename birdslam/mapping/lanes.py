@@ -18,8 +18,6 @@ import cv2
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
@@ -269,6 +267,9 @@ def _join(pieces: Floats, touching: Bools, config: LanesConfig) -> NDArray[np.in
     meets = (np.abs(aside) < config.same_line_m) & (past < config.line_gap_m)
     joined = meets.reshape(count, 2, count).any(axis=1) & (turn < config.same_line_rad)
     joined |= touching & (turn < config.bend_rad)
+    from scipy.sparse import coo_array  # loaded by lane_ids.py's import of scipy.spatial
+    from scipy.sparse.csgraph import connected_components
+
     first, second = np.nonzero(joined)
     _, lane = connected_components(coo_array((np.ones(len(first)), (first, second)), (count, count)), directed=False)
     return np.asarray(lane, dtype=np.int64)
