@@ -28,7 +28,7 @@ from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.environment import USER_ERROR_STATUS
 from birdslam.runtime.nodes.sources import SourceError
 from birdslam.runtime.recording.recording import RecordingError
-from birdslam.runtime.supervision import supervisor
+from birdslam.runtime.supervision import run as running
 from birdslam.runtime.transport.bus import BusError
 from birdslam.runtime.transport.presence import VehicleBusy
 
@@ -57,7 +57,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """`birdslam run`: the three processes."""
-    return supervisor.run(configuration_of(options))
+    return running.run(configuration_of(options))
 
 
 def view(options: argparse.Namespace) -> int:

@@ -20,7 +20,7 @@ from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, Configur
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
 from birdslam.runtime.progress import Progress
-from birdslam.runtime.supervision import supervisor
+from birdslam.runtime.supervision.run import WITHOUT_MODELS
 from birdslam.slam import BirdSLAM
 from birdslam.types import Estimate, MapUpdate, Measurements
 
@@ -95,7 +95,7 @@ def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
     if twice:
         raise ConfigurationError(f"two sequences are named {twice[0]}: their results would overwrite each other")
     if not configuration.models.in_use():
-        print(supervisor.WITHOUT_MODELS)
+        print(WITHOUT_MODELS)
     with _pipeline(configuration) as drive:
         reports = evaluate_recordings(
             recordings,

@@ -8,7 +8,7 @@ import sys
 import msgspec
 
 from birdslam.runtime.client import Planner
-from birdslam.runtime.supervision.supervisor import check_runtime_dir
+from birdslam.runtime.supervision.run import check_runtime_dir
 from birdslam.types import Estimate, Status
 
 

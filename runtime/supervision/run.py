@@ -1,0 +1,146 @@
+"""A whole run: what is checked before it, the processes, and what is written when it is over.
+
+Exit status: 0 at the end of the source, and after SIGTERM (a service's ordered stop); 130 after Ctrl-C; in each case
+the frames in flight are processed and the results written. 1 where a node failed for good, 2 where what the user gave
+can't be used; the reason is one line on standard error.
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from birdslam.datasets.recording import DatasetError
+from birdslam.evaluation.results import Recorder, ResultsError, claim_directory
+from birdslam.perception import load_network
+from birdslam.perception.pointnet import load_pointnet
+from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
+from birdslam.runtime.environment import INTERRUPTED_STATUS
+from birdslam.runtime.nodes.sources import CameraSource, RecordedSource, open_source
+from birdslam.runtime.process import realtime
+from birdslam.runtime.process.child import give_back_memory
+from birdslam.runtime.recording.recording import RecordingError
+from birdslam.runtime.supervision.demo_report import DemoReport
+from birdslam.runtime.supervision.final_results import FinalResults, check_results
+from birdslam.runtime.supervision.live import LiveLine
+from birdslam.runtime.supervision.logbook import Logbook, Results
+from birdslam.runtime.supervision.query_server import QueryServer
+from birdslam.runtime.supervision.recording_files import RecordingFiles, choose_file
+from birdslam.runtime.supervision.report import summarise, table
+from birdslam.runtime.supervision.supervisor import Supervisor
+from birdslam.runtime.topology import NODES
+from birdslam.runtime.transport.bus import Bus
+from birdslam.runtime.transport.presence import VehicleLock, runtime_dir_of, socket_path
+
+WITHOUT_MODELS = "no networks: odometry only, without vehicles and lanes"
+DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come to in a long drive among lane lines
+
+
+def run(configuration: Configuration) -> int:
+    """A whole run; gives the exit status. Raises what a user has to mend before anything is started."""
+    realtime.one_heap()  # before networks are looked at, which begins threads
+    configuration, models, frames = check(configuration)
+    give_back_memory()  # the networks that were looked at
+    output = Path(configuration.output)
+    realtime.reserve(*DRIVE_MIB)
+    live = LiveLine(sys.stdout)
+    demo = DemoReport.of(configuration)
+    final = FinalResults(configuration, demo)
+    with ExitStack() as until_written:
+        with ExitStack() as stack:
+            stack.enter_context(VehicleLock(configuration.vehicle, configuration.runtime_dir))
+            claim_directory(output / "logs")
+            if not models:
+                live.say(WITHOUT_MODELS)
+            assert configuration.camera is not None
+            recorder = Recorder(output, configuration.camera)
+            recorded = final.recorded(until_written)
+            files = RecordingFiles(Path(recorded.recording.file), models) if recorded.recording.file else None
+            logbook = _logbook(configuration, recorder, demo, stack)
+            supervisor = Supervisor(recorded, logbook, live, files, frames)
+            supervisor.run(output / "logs")
+        live.clear()
+        summary = summarise(configuration, supervisor.nodes, logbook, models, supervisor.ended)
+        if files is not None and supervisor.recorder is not None:
+            figures = files.figures(supervisor.recorder)
+            if configuration.recording.file:
+                summary["recording"] = figures
+            elif figures["dropped"]:
+                live.say(f"{figures['dropped']} messages did not come to the recorder: the final results lack them")
+        if demo is not None and (found := demo.grade()) is not None:
+            summary["truth"] = msgspec.to_builtins(found)
+        try:
+            if logbook.recorded:
+                summary |= final.write(files.paths if files is not None else ())
+        except (ResultsError, DatasetError, RecordingError, OSError) as error:
+            supervisor.fail(f"final results can't be written: {error}", 1)
+        except KeyboardInterrupt:
+            supervisor.fail("the final results were cut short", INTERRUPTED_STATUS)
+    try:
+        recorder.finish(summary)
+    except OSError as error:
+        supervisor.fail(f"results can't be written: {error}", 1)
+    if logbook.unwritten is not None:
+        supervisor.fail(f"results are incomplete: {logbook.unwritten}", 1)
+    live.say(table(summary, output))
+    if supervisor.failure:
+        print(f"birdslam: {supervisor.failure}", file=sys.stderr)
+    return supervisor.exit_status
+
+
+def _logbook(configuration: Configuration, recorder: Recorder, demo: DemoReport | None, stack: ExitStack) -> Logbook:
+    """The supervisor on the bus: it takes the results, and answers queries about them."""
+    bus = stack.enter_context(
+        Bus(
+            configuration.vehicle,
+            "supervisor",
+            hub=True,
+            runtime_dir=configuration.runtime_dir,
+            lossless=configuration.lossless,
+        )
+    )
+    listeners: list[Results] = [QueryServer(configuration, bus), *([demo] if demo else [])]
+    logbook = Logbook(bus, recorder, tolerant=configuration.restarts, listeners=listeners)
+    stack.callback(logbook.close)
+    bus.declare_alive()
+    return logbook
+
+
+def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any], int | None]:
+    """Everything that can be wrong before a process is started; fills in the source's own camera.
+
+    Gives the networks' descriptions too, and how many frames the source has, where it has an end that is known. Raises
+    ConfigurationError, SourceError, datasets.DatasetError, perception.ModelError or results.ResultsError.
+    """
+    check_runtime_dir(configuration.vehicle, configuration.runtime_dir)
+    source = open_source(configuration)
+    configuration = complete(configuration, source.camera, source.rate_hz)
+    frames: int | None = None
+    if isinstance(source, CameraSource):
+        source.close()  # capture opens it for itself
+    elif isinstance(source, RecordedSource) and not configuration.source.loop:
+        frames = min(len(source.recording), configuration.source.frames or len(source.recording)) or None
+    check_results(configuration, source)
+    recording = configuration.recording
+    if recording.file:
+        file = choose_file(recording, configuration.vehicle)
+        configuration = msgspec.structs.replace(configuration, recording=msgspec.structs.replace(recording, file=file))
+    models: dict[str, Any] = {
+        role: load_network(role, spec).describe() for role, spec in configuration.models.in_use().items()
+    }
+    if configuration.models.pointnet is not None:
+        models["pointnet"] = load_pointnet(configuration.models.pointnet).describe()
+    return configuration, models, frames
+
+
+def check_runtime_dir(vehicle: str, runtime_dir: Path | None) -> None:
+    """Raises ConfigurationError where sockets can't lie there."""
+    try:
+        for name in NODES:
+            socket_path(runtime_dir_of(vehicle, runtime_dir), name)
+    except (ValueError, OSError) as error:
+        raise ConfigurationError(f"vehicle {vehicle!r}, runtime directory: {error}") from error
