@@ -10,7 +10,6 @@ stays the one that all later ones are compared with until they differ.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -32,6 +31,7 @@ from birdslam.odometry.road_alignment import RoadAligner, RoadFit
 from birdslam.odometry.road_filter import RoadScaleConfig
 from birdslam.odometry.road_points import on_road, outside
 from birdslam.odometry.road_scale import RoadScale
+from birdslam.odometry.standstill import StandstillConfig, near_displacement_px, stands
 from birdslam.odometry.start_search import StartSearch, StartSearchConfig
 from birdslam.types import Status
 
@@ -44,9 +44,6 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 _MIN_INTERVAL_S = 0.004
-_NEAR_M = 20.0  # road nearer than this moves in the image when the car does
-# Of its corners: so few say nothing, and a standing car keeps so many. By judgement; no data chose them
-_FEWEST_NEAR, _LEAST_NEAR_SHARE = 8, 0.4
 _STILL = Pose(np.eye(3), np.zeros(3))
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step that two images alone show: 1 cm, 0.25 deg
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
@@ -66,13 +63,7 @@ class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
     min_fitting_fraction: Positive = 0.35  # and so large a part of those in sight
     max_speed_mps: Positive = 70.0  # a faster motion is no measurement
     max_coast_s: Positive = 1.0  # after that the window begins anew
-    # standstill
-    standstill_px: Positive = 0.35  # median displacement against the image that the car stopped in
-    standstill_near_px: Positive = 1.5  # the near road moves more than this when the car does
-    braking_mps2: Positive = 12.0  # tyres on dry asphalt give 10
-    standstill_mps: Positive = 1.0  # a measured speed from which a car may be found to stand the next image
-    standstill_m: Positive = 0.012  # a motion that is shorter is none
-    standstill_rad: Positive = 0.002  # a turn that is smaller is none
+    standstill: StandstillConfig = StandstillConfig()
 
 
 @dataclass(frozen=True)
@@ -196,8 +187,8 @@ class Odometry:
                 self._scale.turned_unseen()
             return motion
         pose, info = located
-        near_px = self._near_displacement_px(tracks, boxes_px)
-        if self._stands(self._pose.between(pose), corners.displacement_px, near_px, dt_s):
+        near_px = near_displacement_px(self.camera, self._scale.ground, self._tracker.base, tracks, boxes_px)
+        if self._stands(self._pose.between(pose), corners, near_px, dt_s):
             # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.
             motion = self._stand(frame_id)
         else:
@@ -259,7 +250,8 @@ class Odometry:
         if len(a) < cfg.min_fitting:
             return None
         xy_a, xy_b = self.camera.to_xy(base.px[a]), corners.xy[b]
-        if float(np.median(displacement_px)) < cfg.standstill_px and float(np.quantile(displacement_px, 0.8)) < 1.5:
+        still = float(np.median(displacement_px)) < cfg.standstill.still_px
+        if still and float(np.quantile(displacement_px, 0.8)) < 1.5:
             return self._pose, _TWO_VIEW_INFORMATION
         found = self._two_view(xy_a, xy_b, dt_s)
         if found is None or found[1].sum() < max(cfg.min_fitting, cfg.min_fitting_fraction * len(a)):
@@ -300,33 +292,10 @@ class Odometry:
 
     # --- moving, standing, coasting ---
 
-    def _near_displacement_px(self, tracks: Tracks, boxes_px: Floats) -> float | None:
-        """How far corners well below the horizon have moved, their third quartile; None where there are none to see.
-
-        Infinite where most of them were lost: of a car that stands they would have been found.
-        """
-        base = self._tracker.base
-        rays = np.column_stack([self.camera.to_xy(base.px), np.ones(len(base.px))])
-        near = (rays @ self._scale.ground.normal_cam < -self.camera.height_m / _NEAR_M) & outside(base.px, boxes_px)
-        if near.sum() < _FEWEST_NEAR:
-            return None
-        _, a, b = np.intersect1d(base.ids[near], tracks.ids, return_indices=True)
-        if len(a) < _LEAST_NEAR_SHARE * near.sum():
-            return math.inf
-        return float(np.quantile(np.sqrt(((tracks.px[b] - base.px[near][a]) ** 2).sum(axis=1)), 0.75))
-
-    def _stands(self, step: Pose, displacement_px: Floats, near_px: float | None, dt_s: float) -> bool:
-        cfg = self.config
-        if len(displacement_px) < cfg.min_fitting or float(np.median(displacement_px)) > cfg.standstill_px:
+    def _stands(self, step: Pose, corners: _Corners, near_px: float | None, dt_s: float) -> bool:
+        if len(corners.displacement_px) < self.config.min_fitting:
             return False
-        if near_px is None and self._speed_mps() > cfg.braking_mps2 * dt_s + cfg.standstill_mps:
-            return False  # no car stops so soon, and no near road says that it did: the glass stands, or the horizon
-        if near_px is not None and near_px > cfg.standstill_near_px:
-            return False
-        if float(np.quantile(displacement_px, 0.8)) < cfg.standstill_px:
-            return True  # four corners of five have not moved: what the others make of the pose does not count
-        turn = float(np.linalg.norm(rotation_log(step.R)))
-        return float(np.linalg.norm(step.p)) < cfg.standstill_m and turn < cfg.standstill_rad
+        return stands(self.config.standstill, step, corners.displacement_px, near_px, self._speed_mps(), dt_s)
 
     def _speed_mps(self) -> float:
         """Of the last measured motion."""
