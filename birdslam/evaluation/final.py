@@ -5,9 +5,10 @@
 | tracks/ID.final.tum.txt       | one vehicle by the RTS smoother (vehicles/rts_smoother.py), as tracks/ID.tum.txt |
 | ego.final.tum.txt, .kitti.txt | the ego: the poses of ego.tum.txt and ego.kitti.txt again                        |
 
-The ego's final trajectory equals its live one: CC edges alone tell its motion, each between two neighbouring frames,
-and nothing that is seen later speaks of a motion before (no loop is closed). The vehicles' are other ones: their sizes
-are learned by and by, and where a vehicle stops or turns is known best from both sides.
+The ego's final trajectory equals its live one, as in the evaluation: no loop is closed, so that hardly anything that
+is seen later speaks of a pose that has left the graph's window, and no smoother of the ego is built on the little.
+The vehicles' are other ones: their sizes are learned by and by, and where a vehicle stops or turns is known best from
+both sides.
 """
 
 from __future__ import annotations
