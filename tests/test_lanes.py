@@ -153,7 +153,7 @@ def test_every_point_of_the_grid_is_counted_once(points: list[tuple[float, float
     cloud = np.array(points).reshape(-1, 2)
     inside = (cloud[:, 0] >= -CONFIG.behind_m) & (cloud[:, 0] < CONFIG.ahead_m)
     inside &= (cloud[:, 1] >= -CONFIG.half_width_m) & (cloud[:, 1] < CONFIG.half_width_m)
-    counts = count_cells(cloud, CONFIG)
+    counts = count_cells(cloud[:, 0] + 1j * cloud[:, 1], CONFIG)
     assert counts.shape == CONFIG.shape == (128, 128)
     assert counts.sum() == inside.sum()
     centres = cell_centres_m(counts > 0, CONFIG)

@@ -10,6 +10,8 @@ A grid is (rows, columns) over x (row 0 is `behind_m` behind the ego) and y (col
 
 from __future__ import annotations
 
+import cmath
+import functools
 import math
 from collections import deque
 from typing import Protocol
@@ -26,6 +28,7 @@ from birdslam.mapping.lane_ids import LaneCloud, LaneIds
 from birdslam.perception import Segmentation
 
 Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]  # points x + iy
 Grids = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
@@ -80,7 +83,7 @@ class AmodalLanes:
         self.config = config
         self.complete = complete
         self.completion_failed = False  # the last time: its output was not finite, and the grids stayed as seen
-        self._frames: deque[tuple[SE2, Floats, Floats]] = deque(maxlen=config.window_frames)
+        self._frames: deque[tuple[SE2, tuple[Complexes, Complexes]]] = deque(maxlen=config.window_frames)
         self.ids = LaneIds(config.same_lane_m, config.cell_m, config.remembered_m)
 
     def is_news(self, T_world_ego: SE2) -> bool:
@@ -92,8 +95,9 @@ class AmodalLanes:
 
     def add(self, T_world_ego: SE2, road_m: Floats, boundary_m: Floats) -> None:
         """What one frame saw: points of the road (N, 2) and of lane boundaries (M, 2) in its ego."""
-        reach_m = self.config.depth_m
-        self._frames.append((T_world_ego, road_m[road_m[:, 0] < reach_m], boundary_m[boundary_m[:, 0] < reach_m]))
+        near = [points[points[:, 0] < self.config.depth_m] for points in (road_m, boundary_m)]
+        road, boundary = (points[:, 0] + 1j * points[:, 1] for points in near)
+        self._frames.append((T_world_ego, (road, boundary)))
 
     def clear(self) -> None:
         """The world frame began anew: what was gathered has no place in it, and no lane keeps its id."""
@@ -115,15 +119,23 @@ class AmodalLanes:
     def grids(self, T_world_ego: SE2) -> Grids:
         """(2, rows, columns) occupancy of 0..1 of road and lane boundary, gathered and filtered."""
         config = self.config
-        counts = np.zeros((2, *config.shape), dtype=np.float32)
-        for T_world_then, *seen in self._frames:
-            T_ego_then = T_world_ego.between(T_world_then)
-            for channel in (ROAD, BOUNDARY):
-                counts[channel] += count_cells(T_ego_then @ seen[channel], config)
+        counts = np.stack([count_cells(self._gathered(T_world_ego, channel), config) for channel in (ROAD, BOUNDARY)])
         occupancy = np.minimum(counts / config.full_count, 1.0).astype(np.float32)
         for channel in (ROAD, BOUNDARY):
             occupancy[channel] *= dense(counts[channel] > 0, config)
         return occupancy
+
+    def _gathered(self, T_world_ego: SE2, channel: int) -> Complexes:
+        """(N,) the points x + iy of a channel that the frames saw, in the ego at `T_world_ego`."""
+        out = np.empty(sum(len(seen[channel]) for _, seen in self._frames), dtype=np.complex128)
+        end = 0
+        for T_world_then, seen in self._frames:
+            T_ego_then, points = T_world_ego.between(T_world_then), seen[channel]
+            here = out[end : end + len(points)]
+            np.multiply(points, cmath.exp(1j * T_ego_then.yaw_rad), out=here)
+            here += complex(T_ego_then.x_m, T_ego_then.y_m)
+            end += len(points)
+        return out
 
 
 def points_of(
@@ -134,26 +146,43 @@ def points_of(
     Each point of a lattice on the road is looked up in the masks (the inverse of Eq. 1), so that near and far road has
     as many points. What `boxes_px` (B, 4) cover is left out: a vehicle hides the road there.
     """
+    lattice = _lattice(config)
+    with np.errstate(invalid="ignore"):
+        u, v = np.floor(bev.ego_to_pixel(camera, ground, lattice)).T
+        seen = np.flatnonzero((u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px))
+    at = v[seen].astype(np.int64), u[seen].astype(np.int64)
+    road, lane = (lattice[seen[without_boxes(mask, boxes_px)[at]]] for mask in (segmentation.road, segmentation.lane))
+    return road, lane
+
+
+def without_boxes(mask: Bools, boxes_px: Floats) -> Bools:
+    """A copy of a mask (H, W) that is False in every pixel (u, v) that a box x1, y1, x2, y2 of (B, 4) covers."""
+    out = mask.copy()
+    first = np.maximum(np.ceil(boxes_px[:, :2]), 0.0).astype(np.int64)
+    past = np.maximum(np.floor(boxes_px[:, 2:]) + 1.0, 0.0).astype(np.int64)
+    for (u1, v1), (u2, v2) in zip(first.tolist(), past.tolist(), strict=True):
+        out[v1:v2, u1:u2] = False
+    return out
+
+
+@functools.lru_cache(maxsize=4)
+def _lattice(config: LanesConfig) -> Floats:
+    """(N, 2) the points of the road that are looked up."""
     x_m = np.arange(0.5 * config.cell_m, config.depth_m, config.cell_m)
     y_m = np.arange(-config.half_width_m, config.half_width_m, config.lattice_m)
-    lattice = np.stack(np.meshgrid(x_m, y_m, indexing="ij"), axis=-1).reshape(-1, 2)
-    with np.errstate(invalid="ignore"):
-        px = np.floor(bev.ego_to_pixel(camera, ground, lattice))
-        seen = ((px >= 0) & (px < [camera.width_px, camera.height_px])).all(axis=1)
-    lattice, (u, v) = lattice[seen], px[seen].astype(np.int64).T
-    for x1, y1, x2, y2 in boxes_px:
-        free = (u < x1) | (u > x2) | (v < y1) | (v > y2)
-        lattice, u, v = lattice[free], u[free], v[free]
-    return lattice[segmentation.road[v, u]], lattice[segmentation.lane[v, u]]
+    return np.stack(np.meshgrid(x_m, y_m, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def count_cells(points_m: Floats, config: LanesConfig) -> NDArray[np.float32]:
-    """How many of the points (N, 2) in ego fall into each cell."""
+def count_cells(points_m: Complexes, config: LanesConfig) -> NDArray[np.float32]:
+    """How many of the points x + iy (N,) in ego fall into each cell."""
     rows, columns = config.shape
-    x, y = points_m.T
-    row = ((x + config.behind_m) / config.cell_m + 1.0).clip(0.0, rows + 1.0).astype(np.int32)  # a rim for the rest
-    column = ((y + config.half_width_m) / config.cell_m + 1.0).clip(0.0, columns + 1.0).astype(np.int32)
-    counts = np.bincount(row * np.int32(columns + 2) + column, minlength=(rows + 2) * (columns + 2))
+    origin = complex(config.behind_m + config.cell_m, config.half_width_m + config.cell_m)  # a rim for the rest
+    cells = (points_m + origin) / config.cell_m
+    row = cells.real.clip(0.0, rows + 1.0).astype(np.int32)
+    column = cells.imag.clip(0.0, columns + 1.0).astype(np.int32)
+    row *= np.int32(columns + 2)
+    row += column
+    counts = np.bincount(row, minlength=(rows + 2) * (columns + 2))
     return counts.reshape(rows + 2, columns + 2)[1:-1, 1:-1].astype(np.float32)
 
 
