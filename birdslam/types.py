@@ -40,6 +40,7 @@ Cov2 = Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)]
 FrameId = Annotated[int, msgspec.Meta(ge=0)]
 BodyId = Annotated[int, msgspec.Meta(ge=0)]
 NS_PER_S = 1_000_000_000
+IN_SIGHT_NS = 350_000_000  # three looks a second, the fewest of perceive, are a third of a second apart
 
 
 def check_finite(record: msgspec.Struct, *fields: str) -> None:
@@ -258,6 +259,11 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True):
     length_m: float = 4.0  # of its footprint
     width_m: float = 1.7  # of its footprint
     delay_ns: int = 0  # by so much older was the image that it was seen in: it was last seen age_ns + delay_ns ago
+
+    @property
+    def in_sight(self) -> bool:
+        """Seen so shortly ago that it counts as seen: networks need not look at every frame."""
+        return self.age_ns <= IN_SIGHT_NS
 
     def __post_init__(self) -> None:
         cov, u = self.cov, self.velocity_cov

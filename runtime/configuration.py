@@ -24,6 +24,7 @@ from birdslam.runtime import model_store
 from birdslam.runtime.sections import (
     BudgetsConfig,
     DegradationConfig,
+    LooksConfig,
     ModelsConfig,
     NodeScheduling,
     PerceiveConfig,
@@ -42,6 +43,7 @@ __all__ = [
     "Configuration",
     "ConfigurationError",
     "DegradationConfig",
+    "LooksConfig",
     "ModelsConfig",
     "NodeScheduling",
     "PerceiveConfig",
@@ -160,7 +162,7 @@ def complete(configuration: Configuration, camera: Camera, rate_hz: float) -> Co
     """
     rate, perceive = configuration.source.rate, configuration.perceive
     hz = rate if isinstance(rate, float) else rate_hz
-    perceive = msgspec.structs.replace(perceive, schedule=perceive.schedule.at(hz))
+    perceive = msgspec.structs.replace(perceive, schedule=perceive.schedule.at(hz), period_ms=1e3 / hz)
     if perceive.deadline_ms is None:
         deadline_ms = min(perceive.deadline_periods * 1e3 / hz, configuration.budgets.perceived_ms)
         perceive = msgspec.structs.replace(perceive, deadline_ms=deadline_ms)

@@ -11,6 +11,7 @@ from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS, Ro
 
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Share = Annotated[float, msgspec.Meta(gt=0.0, le=1.0)]
 
 
 class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -93,6 +94,21 @@ class ScheduleConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         return ScheduleConfig(**{head: getattr(self, head).at(rate_hz) for head in self.__struct_fields__})
 
 
+class LooksConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How often networks look where the user does not say it; never at rate "max" (runtime/nodes/look_rate.py)."""
+
+    adaptive: bool = True  # False: as each network's manifest says, whatever the computer
+    measured_s: Positive = 1.0  # all networks together are measured for so long before the first frame
+    least_hz: Positive = 3.0  # not fewer looks a second than this
+    awaited_share: Share = 0.45  # of a frame's period: a network that takes longer is not awaited
+    room_share: Share = 0.6  # of the cores that the front end leaves, the networks begin with so much
+    busy_share: Share = 0.92  # of the period: perceive's mean step takes longer, and the networks look less often
+    calm_share: Share = 0.72  # ... and they look more often where it takes less
+    window_frames: PositiveInt = 10  # over which the step's mean is taken
+    calm_frames: PositiveInt = 60  # in a row, before they look more often; twice as many after a try that failed
+    most_calm_frames: PositiveInt = 2000  # but no more than this
+
+
 class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The perceive process."""
 
@@ -100,8 +116,10 @@ class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     deadline_ms: Positive | None = None
     # The same in periods of the source's frames: the rest of a period is for what comes after the networks
     deadline_periods: Positive = 0.75
+    period_ms: Positive | None = None  # from one frame of the source to the next; None: by the frame rate
     opencv_threads: PositiveInt = 2  # of OpenCV in perceive
     schedule: ScheduleConfig = ScheduleConfig()
+    looks: LooksConfig = LooksConfig()
 
 
 class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -178,9 +196,9 @@ class DegradationConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
 
     enabled: bool = True  # never at rate "max"
     window_frames: PositiveInt = 10  # judged together
-    late_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5  # so many of them late: one mode less
+    late_share: Share = 0.5  # so many of them late: one mode less
     calm_frames: PositiveInt = 50  # in a row within `calm_share` of the budget: one mode more
-    calm_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.7  # of the budget; see calm_frames
+    calm_share: Share = 0.7  # of the budget; see calm_frames
     rate_divisor: PositiveInt = 3  # in mode "rate" the networks run on one frame in so many at the most
     coast_divisor: PositiveInt = 3  # in mode "coasting" one frame in so many is looked at
     coast_max_ms: Positive = 500.0  # of source time without a look: what comes then is invalid

@@ -12,7 +12,7 @@ import pytest
 
 from birdslam.datasets.demo import DemoRecording
 from birdslam.datasets.opening import open_recording
-from birdslam.evaluation.demo import VEHICLES, grade, match, mount_pose_of, true_egos
+from birdslam.evaluation.demo import VEHICLES, DemoGrade, grade, match, mount_pose_of, true_egos
 from birdslam.evaluation.video import SideBySide
 from birdslam.geometry.se2 import SE2
 from birdslam.runtime.configuration import load
@@ -20,7 +20,7 @@ from birdslam.runtime.supervision.demo_report import DemoReport, rows
 from birdslam.runtime.supervision.final_results import FinalResults
 from birdslam.runtime.supervision.final_results import rows as final_rows
 from birdslam.trajectory import as_poses, inverse, split_pose
-from birdslam.types import Estimate, VehicleEstimate
+from birdslam.types import IN_SIGHT_NS, Estimate, VehicleEstimate
 
 FRAMES = range(0, 90, 3)
 COV = (0.0,) * 9
@@ -109,12 +109,22 @@ def test_a_new_epoch_goes_on_where_the_last_one_ended(demo: DemoRecording, truth
 def test_a_vehicle_out_of_reach_or_out_of_sight_matches_nobody(demo: DemoRecording, truthful: list[Estimate]) -> None:
     estimate, body = truthful[0], next(b for b in demo.truth_bodies(0) if b.label in VEHICLES)
     (vehicle,) = (v for v in estimate.vehicles if v.vehicle == body.body)
-    assert [v.vehicle for _, v in match(estimate, [body])] == [body.body]
+    assert [v.vehicle for _, v in match(estimate, [body], [vehicle])] == [body.body]
     range_m = math.hypot(body.T_ego_body.x_m, body.T_ego_body.y_m)
     away = SE2(max(2.0, 0.2 * range_m) + 0.1, 0.0, 0.0) @ vehicle.T_world_vehicle
-    for changes in ({"T_world_vehicle": away}, {"age_ns": 1}):
-        other = msgspec.structs.replace(vehicle, **changes)
-        assert match(msgspec.structs.replace(estimate, vehicles=(other,)), [body]) == []
+    assert match(estimate, [body], [msgspec.structs.replace(vehicle, T_world_vehicle=away)]) == []
+
+
+def test_who_is_predicted_between_two_looks_is_told_of_and_not_found(
+    demo: DemoRecording, truthful: list[Estimate]
+) -> None:
+    def aged(age_ns: int) -> DemoGrade:
+        vehicles = tuple(msgspec.structs.replace(v, age_ns=age_ns) for v in truthful[0].vehicles)
+        return grade(demo, [msgspec.structs.replace(truthful[0], vehicles=vehicles)])
+
+    assert (aged(0).found, aged(0).told) == (1.0, 1.0)
+    assert (aged(1).found, aged(1).told) == (0.0, 1.0)
+    assert (aged(IN_SIGHT_NS + 1).found, aged(IN_SIGHT_NS + 1).told) == (0.0, 0.0)
 
 
 def test_nothing_is_known_of_the_vehicles_of_a_drive_without_any(demo: DemoRecording, truthful: list[Estimate]) -> None:

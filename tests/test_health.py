@@ -35,6 +35,7 @@ from birdslam.runtime.environment import ENVIRONMENT
 from birdslam.runtime.latency import Recent
 from birdslam.runtime.nodes.meter import PERIOD_NS, Meter
 from birdslam.runtime.process import realtime
+from birdslam.runtime.process.cores import quota
 from birdslam.runtime.process.restarts import Assignment
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.supervision.logbook import Logbook
@@ -235,11 +236,11 @@ def test_the_doctor_finds_what_is_wrong(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_the_doctor_counts_the_cores_of_its_control_group(tmp_path: Path) -> None:
-    assert doctor._quota(tmp_path) == float("inf")
+    assert quota(tmp_path) == float("inf")
     (tmp_path / "cpu.max").write_text("150000 100000\n")
-    assert doctor._quota(tmp_path) == 1.5
+    assert quota(tmp_path) == 1.5
     (tmp_path / "cpu.max").write_text("max 100000\n")
-    assert doctor._quota(tmp_path) == float("inf")
+    assert quota(tmp_path) == float("inf")
 
 
 def test_a_full_disk_costs_lines_not_the_drive() -> None:

@@ -42,6 +42,7 @@ class DemoGrade(msgspec.Struct, frozen=True, kw_only=True):
     vehicle_centre_m: float | None  # median distance from the true centre, both as seen from the ego
     vehicle_centre_rel: float | None  # the same over the body's range
     found: float | None  # share of the bodies in clear sight (ASKED_...), frame by frame, that were matched
+    told: float | None = None  # the same with vehicles that the last looks showed, predicted to the frame
 
 
 class GlobalFrame:
@@ -85,13 +86,13 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
     true_paths: dict[int, dict[int, SE2]] = {}
     paths: dict[int, dict[int, SE2]] = {}
     errors: list[tuple[float, float]] = []  # distance, range
-    asked = found = 0
+    asked = found = told = 0
     for estimate in estimates:
         k = estimate.frame_id
         cameras.append(trajectory.add(estimate.epoch, ego_pose(estimate.T_world_ego, estimate.attitude)))
         T_true_world = frame.place(estimate, egos[k])
         bodies = [body for body in recording.truth_bodies(k) if body.label in VEHICLES]
-        matched = match(estimate, bodies)
+        matched = match(estimate, bodies, [v for v in estimate.vehicles if v.age_ns == 0])
         for body, vehicle in matched:
             seen, true = estimate.T_world_ego.between(vehicle.T_world_vehicle), body.T_ego_body
             errors.append((math.hypot(seen.x_m - true.x_m, seen.y_m - true.y_m), math.hypot(true.x_m, true.y_m)))
@@ -100,6 +101,8 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
         clear = {body.body for body in bodies if in_clear_sight(body)}
         asked += len(clear)
         found += len(clear & {body.body for body, _ in matched})
+        in_sight = match(estimate, bodies, [v for v in estimate.vehicles if v.in_sight])
+        told += len(clear & {body.body for body, _ in in_sight})
     ego = compare(recording.name, truth[[e.frame_id for e in estimates]], np.array(cameras), {})
     ates = [
         errors_of.ate_m
@@ -118,6 +121,7 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
         vehicle_centre_m=float(np.median(distance)) if errors else None,
         vehicle_centre_rel=float(np.median(distance / reach)) if errors else None,
         found=found / asked if asked else None,
+        told=told / asked if asked else None,
     )
 
 
@@ -129,9 +133,10 @@ def in_clear_sight(body: TrueBody) -> bool:
     )
 
 
-def match(estimate: Estimate, bodies: Sequence[TrueBody]) -> list[tuple[TrueBody, VehicleEstimate]]:
-    """Pairs of least total distance, measured in gates, of bodies and the vehicles that were seen in this frame."""
-    seen = [vehicle for vehicle in estimate.vehicles if vehicle.age_ns == 0]
+def match(
+    estimate: Estimate, bodies: Sequence[TrueBody], seen: Sequence[VehicleEstimate]
+) -> list[tuple[TrueBody, VehicleEstimate]]:
+    """Pairs of least total distance, measured in gates, of bodies and of vehicles `seen` in this frame's estimate."""
     if not seen or not bodies:
         return []
     from_ego = [estimate.T_world_ego.between(vehicle.T_world_vehicle) for vehicle in seen]

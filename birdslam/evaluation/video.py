@@ -105,7 +105,7 @@ class SideBySide:
         if estimate.ground is not None:
             ground = GroundPlane(estimate.ground.height_m, estimate.ground.pitch_rad, estimate.ground.roll_rad)
         for vehicle in estimate.vehicles:
-            if vehicle.age_ns:
+            if not vehicle.in_sight:
                 continue
             foot = outline(estimate.T_world_ego.between(vehicle.T_world_vehicle), vehicle.length_m, vehicle.width_m)
             corners = np.vstack([np.column_stack([foot, np.full(4, z_m)]) for z_m in (0.0, BOX_HEIGHT_M)])
@@ -139,7 +139,7 @@ class SideBySide:
         for vehicle in estimate.vehicles:
             pose = estimate.T_world_ego.between(vehicle.T_world_vehicle)
             px = self._panel_px(outline(pose, vehicle.length_m, vehicle.width_m))
-            if vehicle.age_ns == 0:
+            if vehicle.in_sight:
                 cv2.fillPoly(panel, [_fixed(px)], _colour_of(vehicle), cv2.LINE_AA, SHIFT)
             cv2.polylines(panel, [_fixed(px)], True, _colour_of(vehicle), 1, cv2.LINE_AA, SHIFT)
             u, v = px.max(axis=0)
@@ -210,7 +210,7 @@ class DriveVideo:
                 self._writer.write(self._picture(t_ns, image, self._estimate))
 
     def _picture(self, t_ns: int, image: Image, estimate: Estimate) -> Image:
-        seen = sum(vehicle.age_ns == 0 for vehicle in estimate.vehicles)
+        seen = sum(vehicle.in_sight for vehicle in estimate.vehicles)
         white = "white outlines: truth, " if self._truth else ""
         words = (
             f"BirdSLAM  {t_ns * 1e-9:5.1f} s  frame {estimate.frame_id}  {seen} vehicles in sight",

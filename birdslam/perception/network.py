@@ -176,9 +176,10 @@ class Network:
         }
 
 
-def load_network(name: str, spec: ModelSpec) -> Network:
+def load_network(name: str, spec: ModelSpec, most_threads: int | None = None) -> Network:
     """Opens a network, checks its manifest against its real inputs and outputs, and warms it up.
 
+    Where the `spec` does not say how many threads it has, these are its manifest's, but no more than `most_threads`.
     A `name` that is a role's must be the manifest's. Raises ModelError naming the file, the key, what the manifest says
     and what the network has.
     """
@@ -193,6 +194,8 @@ def load_network(name: str, spec: ModelSpec) -> Network:
         raise ModelError(f"{path}: role: the manifest {origin} says {manifest.role}, it was given as the {name}")
     stated = {key: value for key in ("every", "threads", "awaited") if (value := getattr(spec, key)) is not None}
     schedule = msgspec.structs.replace(manifest.schedule, **stated)
+    if most_threads is not None and spec.threads is None:
+        schedule = msgspec.structs.replace(schedule, threads=min(schedule.threads, most_threads))
     refuse_weights_elsewhere(path, content)
     try:
         return Network(name, path, manifest, sha256, content, schedule)

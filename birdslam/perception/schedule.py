@@ -92,7 +92,8 @@ class Networks:
     """Starts each head on the frames that it is due on and carries its last result in between.
 
     A head is due when `every` frames have passed since the one it last started on, so that a dropped frame doesn't
-    starve it; while its last run is under way it isn't started again. A head that fills several roles leaves those to
+    starve it; while its last run is under way it isn't started again. `sparing` may be set between two frames: then
+    each head is due after so many times as many. A head that fills several roles leaves those to
     others that have a head of their own. `submit(run, image) -> Future` is the executor's
     (birdslam has no threads of its own; it needs one for each head). `patience_s` None awaits every head that runs, so
     that the results depend on the frames alone. Else `result()` waits that long in all, for the heads that started on
@@ -122,6 +123,7 @@ class Networks:
             for head in heads
         ]
         self._last_frame = -1
+        self.sparing = 1
 
     def start(self, frame_id: int, image: NDArray[np.uint8] | None, only: Collection[Role] | None = None) -> Pending:
         """Starts the heads that are due, of the roles in `only` (None: all).
@@ -134,7 +136,8 @@ class Networks:
             self._slots = [_Slot(s.head, s.fills, s.running, outdated=s.running is not None) for s in self._slots]
         self._last_frame = frame_id
         for slot in self._slots:
-            due = slot.started_frame is None or frame_id - slot.started_frame >= slot.head.schedule.every
+            every = slot.head.schedule.every * self.sparing
+            due = slot.started_frame is None or frame_id - slot.started_frame >= every
             wanted = bool(slot.fills) and (only is None or not set(only).isdisjoint(slot.fills))
             if image is not None and due and wanted and slot.running is None:
                 slot.running = self._submit(slot.head.run, image)

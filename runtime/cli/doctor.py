@@ -23,8 +23,10 @@ from birdslam.datasets.recording import DatasetError
 from birdslam.perception import ModelError, load_network
 from birdslam.runtime.cli.options import configuration_of
 from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.nodes.look_rate import threads_of_a_network
 from birdslam.runtime.nodes.sources import CameraSource, SourceError, open_source
 from birdslam.runtime.process import realtime
+from birdslam.runtime.process.cores import usable_cores
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.presence import ring_path, runtime_dir_of
 
@@ -70,7 +72,7 @@ def table(findings: list[Finding]) -> str:
 
 def _cores(configuration: Configuration) -> Iterator[Finding]:
     usable = os.sched_getaffinity(0)
-    cores, load = min(len(usable), _quota(Path("/sys/fs/cgroup"))), os.getloadavg()[0]
+    cores, load = usable_cores(), os.getloadavg()[0]
     found = f"{cores:g} usable, load {load:.1f}"
     wanted = {node: set(configuration.realtime.of(node).cpus) - usable for node in NODES}
     beyond = {node: cpus for node, cpus in wanted.items() if cpus}
@@ -88,26 +90,13 @@ def _cores(configuration: Configuration) -> Iterator[Finding]:
         yield Finding("cores", "ok", found)
 
 
-def _quota(root: Path) -> float:
-    """Cores that the control groups of this process leave it."""
-    group = Path("/proc/self/cgroup").read_text().strip().rpartition("::")[2].lstrip("/")
-    limits = [float("inf")]
-    for place in (root / group, *(root / group).parents):
-        if not place.is_relative_to(root):
-            break
-        with contextlib.suppress(OSError, ValueError):
-            quota, period = (place / "cpu.max").read_text().split()
-            limits.append(float(quota) / float(period))  # "max" is no number, and no limit
-    return min(limits)
-
-
 def _threads(configuration: Configuration) -> Iterator[Finding]:
     """What runs side by side on a frame. BLAS and its like have one thread in every node (runtime/cli/main.py)."""
     cores = len(os.sched_getaffinity(0))
     networks: dict[str, int] = {}
     for role, spec in configuration.models.in_use().items():
         with contextlib.suppress(ModelError):  # said with the models
-            networks[role] = load_network(role, spec).schedule.threads
+            networks[role] = load_network(role, spec, threads_of_a_network(usable_cores())).schedule.threads
     opencv = configuration.perceive.opencv_threads
     parts = [*(f"{role} {count}" for role, count in networks.items()), f"OpenCV {opencv}", "BLAS 1"]
     if sum(networks.values()) >= cores or opencv > cores:

@@ -146,7 +146,7 @@ class Viewer:
     def _vehicles(self, vehicles: tuple[VehicleEstimate, ...]) -> None:
         middle_m = self._height_m + VEHICLE_HEIGHT_M / 2.0
         centers = np.array([(v.T_world_vehicle.x_m, v.T_world_vehicle.y_m, middle_m) for v in vehicles]).reshape(-1, 3)
-        colors = [SEEN if v.age_ns == 0 else UNSEEN for v in vehicles]
+        colors = [SEEN if v.in_sight else UNSEEN for v in vehicles]
         speeds_mps = [math.hypot(*v.velocity_mps) for v in vehicles]
         boxes = rr.Boxes3D(
             centers=centers,
@@ -174,7 +174,7 @@ class Viewer:
             T_ego_vehicle = T_ego_world @ vehicle.T_world_vehicle
             footprints.append(_footprint(T_ego_vehicle, vehicle.length_m, vehicle.width_m))
             ellipses.append(ellipse(T_ego_vehicle, vehicle.cov))
-        colors = [EGO, *(SEEN if v.age_ns == 0 else UNSEEN for v in estimate.vehicles)]
+        colors = [EGO, *(SEEN if v.in_sight else UNSEEN for v in estimate.vehicles)]
         labels = ["ego", *(f"{v.label} {v.vehicle}" for v in estimate.vehicles)]
         shown = [_above(np.vstack([outline, outline[:1]])) for outline in footprints]
         self._stream.log("bev/bodies", rr.LineStrips2D(shown, colors=colors, labels=labels))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -11,17 +12,23 @@ from types import TracebackType
 from typing import Any, Self
 
 from birdslam.frontend import Pending
+from birdslam.geometry.camera import Camera
 from birdslam.mapping.lane_mapper import LaneHead
 from birdslam.perception import Networks, Perception, Ready, load_network
 from birdslam.perception.completion import GridCompletion, shipped_completion
 from birdslam.perception.manifest import Role
 from birdslam.perception.pointnet import PointNet, load_pointnet
 from birdslam.perception.schedule import ROLES
-from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.configuration import Configuration, PerceiveConfig
 from birdslam.runtime.nodes.degradation import Mode
+from birdslam.runtime.nodes.look_rate import Cost, LookRate, measure, threads_of_a_network
+from birdslam.runtime.process import realtime
+from birdslam.runtime.process.cores import usable_cores
 from birdslam.types import Frame
 
 Run = Callable[..., Any]
+
+log = logging.getLogger(__name__)
 
 
 class Inference:
@@ -34,8 +41,12 @@ class Inference:
     """
 
     def __init__(self, configuration: Configuration) -> None:
-        schedule = configuration.perceive.schedule
-        heads = [load_network(role, schedule.of(role, spec)) for role, spec in configuration.models.in_use().items()]
+        schedule, looks = configuration.perceive.schedule, configuration.perceive.looks
+        specs = {role: schedule.of(role, spec) for role, spec in configuration.models.in_use().items()}
+        self._adapts = looks.adaptive and not configuration.lossless
+        most_threads = threads_of_a_network(usable_cores()) if self._adapts else None
+        heads = [load_network(role, spec, most_threads) for role, spec in specs.items()]
+        self._specs = specs
         self._lanes_every = schedule.lanes.every or 1
         pointnet = configuration.models.pointnet
         self.frustum_network: PointNet | None = None if pointnet is None else load_pointnet(pointnet)
@@ -43,20 +54,42 @@ class Inference:
         if configuration.models.completion and any("segmenter" in ROLES.get(h.role, (h.role,)) for h in heads):
             self.completion = shipped_completion(configuration.slam.frontend.lanes.shape)
         self._deadline_ns = configuration.deadline_ns
-        self._awaited: frozenset[Run] = frozenset(head.run for head in heads if head.schedule.awaited)
+        self._awaited: set[Run] = {head.run for head in heads if head.schedule.awaited}
         self._rate_divisor = configuration.degradation.rate_divisor
         self._ran_frame = -self._rate_divisor  # the last frame that networks were offered
         self._started: list[Future[Any]] = []  # for the frame at hand, and awaited
         self._threads = ThreadPoolExecutor(max(1, len(heads)), thread_name_prefix="network")
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="beside")
+        self._behind = ThreadPoolExecutor(max(1, len(heads)), "network-behind", initializer=realtime.give_way)
+        self._beside = ThreadPoolExecutor(1, "beside", initializer=realtime.give_way)
         self._frame_over = threading.Event()
         self.networks = Networks(heads, self._submit, None if self._deadline_ns is None else 0.0)
 
     def _submit(self, run: Run, *arguments: Any) -> Future[Any]:
+        if run not in self._awaited and self._deadline_ns is not None:
+            return self._behind.submit(run, *arguments)  # no frame waits for it: frames go first
         future = self._threads.submit(run, *arguments)
-        if run in self._awaited:
-            self._started.append(future)
+        self._started.append(future)
         return future
+
+    def fit(self, camera: Camera | None, perceive: PerceiveConfig, measured_s: float) -> LookRate | None:
+        """Measures the networks for `measured_s` and chooses for this computer how often they look, and who is awaited.
+
+        None where nothing is to be chosen: at rate "max", or where the user has said on which frames a network runs.
+        """
+        heads, period_ms = self.networks.heads, perceive.period_ms
+        if not (self._adapts and heads) or any(self._specs[head.role].every is not None for head in heads):
+            return None
+        if camera is None or period_ms is None:  # nobody knows the frames yet
+            return None
+        took_ms = measure({head.role: head.run for head in heads}, camera, measured_s)
+        costs: dict[str, Cost] = {h.role: Cost(took_ms[h.role], h.schedule.threads, h.schedule.every) for h in heads}
+        for head in heads:
+            if self._specs[head.role].awaited is None and took_ms[head.role] > perceive.looks.awaited_share * period_ms:
+                self._awaited.discard(head.run)
+        rate = LookRate(perceive.looks, costs, usable_cores(), period_ms)
+        self.networks.sparing = rate.sparing
+        log.info("%s", rate.describe(costs, {head.role for head in heads if head.run in self._awaited}))
+        return rate
 
     @property
     def aside(self) -> Run | None:
@@ -112,6 +145,7 @@ class Inference:
         """Ends the threads, after the runs at hand."""
         self._frame_over.set()
         self._beside.shutdown(wait=True, cancel_futures=True)
+        self._behind.shutdown(wait=True, cancel_futures=True)
         self._threads.shutdown(wait=True, cancel_futures=True)
 
     def __enter__(self) -> Self:

@@ -77,6 +77,11 @@ class PerceiveNode:
         if configuration.degradation.enabled and not configuration.lossless:
             budget_ms = configuration.budgets.perceived_ms
             self._degradation = Degradation(configuration.degradation, inference.roles, budget_ms)
+        perceive = configuration.perceive
+        # A node begun anew is awaited: it looks at its networks for as short a time as it can
+        measured_s = 0.0 if assignment.restarts else perceive.looks.measured_s
+        self._look_rate = inference.fit(configuration.camera, perceive, measured_s)
+        self._last_frame: int | None = None  # that came
         self._coast_divisor = configuration.degradation.coast_divisor
         self._coast_max_ns = round(configuration.degradation.coast_max_ms * 1e6)
         self._stale_ns = round(configuration.budgets.received_ms * STALE_BUDGETS * 1e6)
@@ -92,6 +97,7 @@ class PerceiveNode:
         return self._frames.recv(timeout_s)
 
     def step(self, ref: FrameRef) -> Iterator[Measurements]:
+        begun_ns = time.monotonic_ns()
         if Status.END_OF_SOURCE in ref.status:
             self.ended = True
             yield Measurements(**stamps(ref), status=ref.status)
@@ -109,9 +115,18 @@ class PerceiveNode:
         mode = self._degradation.mode
         yield self._coast(ref) if self._coasts(ref, mode) else self._look(frame, mode)
         self._inference.over()
-        age_ms = (time.monotonic_ns() - ref.t_capture_ns) / 1e6
-        if self._degradation.judge(age_ms):
+        now_ns = time.monotonic_ns()
+        self._keep_pace(ref.frame_id, (now_ns - begun_ns) / 1e6)
+        if self._degradation.judge((now_ns - ref.t_capture_ns) / 1e6):
             log.warning("frame %d: mode %s after %s", ref.frame_id, self._degradation.mode, mode)
+
+    def _keep_pace(self, frame_id: int, step_ms: float) -> None:
+        """Networks that look less often before frames are dropped, and more often once there is time."""
+        dropped = self._last_frame is not None and frame_id > self._last_frame + 1
+        self._last_frame = frame_id
+        if self._look_rate is not None and self._look_rate.judge(step_ms, dropped):
+            self._inference.networks.sparing = self._look_rate.sparing
+            log.info("frame %d: networks look %d times less often than they would", frame_id, self._look_rate.sparing)
 
     def _look(self, frame: Frame, mode: Mode) -> Measurements:
         stale = time.monotonic_ns() - frame.t_capture_ns > self._stale_ns

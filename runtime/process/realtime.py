@@ -10,6 +10,7 @@ import ctypes
 import gc
 import os
 import resource
+import threading
 from collections.abc import Iterator
 
 from birdslam.runtime.configuration import Configuration
@@ -19,6 +20,8 @@ _CAP_IPC_LOCK = 14
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of mallopt(3)
 _OBJECT_BYTES, _ANCHORED = 400, 256  # of Python's small objects, and how many in a row have one that stays
 _MIB = 1 << 20
+
+_GIVES_WAY = 5  # nice: a third of the time that one gets that wants the same core and has none
 
 NODE_IMAGES = {"capture": 8, "perceive": 40}  # of the camera's size, in colour, that a node has at once at its worst
 NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, 4.0
@@ -50,6 +53,15 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
             yield "realtime.lock_memory: locking memory is not permitted (LimitMEMLOCK=infinity): it may be paged out"
         elif ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
             yield f"realtime.lock_memory: {os.strerror(ctypes.get_errno())}: memory may be paged out"
+
+
+def give_way() -> None:
+    """The calling thread runs where the others of its process, and the other nodes, leave a core."""
+    if os.sched_getscheduler(0) == os.SCHED_FIFO:
+        priority = os.sched_getparam(0).sched_priority
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(max(priority - 1, 1)))
+    else:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _GIVES_WAY)
 
 
 def reserve_for(node: str, configuration: Configuration) -> None:

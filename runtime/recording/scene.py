@@ -157,7 +157,7 @@ def _ellipse(body: SE2, cov: tuple[float, ...], z_m: float, color: Color) -> Lin
 def _entity(vehicle: VehicleEstimate, t: Time, z_m: float) -> SceneEntity:
     pose = _pose(ego_pose(vehicle.T_world_vehicle, Attitude(z_m=z_m + VEHICLE_HEIGHT_M / 2.0)))
     at, (vx, vy) = pose.position, vehicle.velocity_mps
-    color = VEHICLE if vehicle.age_ns == 0 else UNSEEN
+    color = VEHICLE if vehicle.in_sight else UNSEEN
     above = FoxglovePose(Vector3(at.x, at.y, z_m + VEHICLE_HEIGHT_M + 0.8))
     in_a_second = LinePrimitive(type=LINE_STRIP, points=(at, Vector3(at.x + vx, at.y + vy, at.z)), color=color)
     return SceneEntity(

@@ -79,6 +79,7 @@ def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         (
             "  from the ego",
             f"{number(found.vehicle_centre_m, '.2f')} m, {number(found.vehicle_centre_rel, '.1%')} of the range, "
-            f"median; {number(found.found, '.0%')} of those in clear sight found",
+            f"median; {number(found.told, '.0%')} of those in clear sight told of, "
+            f"{number(found.found, '.0%')} seen in that very frame",
         ),
     ]
