@@ -72,6 +72,7 @@ class LookRate:
         fits = (n for n in range(1, self.most + 1) if load(costs, period_ms, n) <= room)
         self.sparing = next(fits, self.most)
         self._steps_ms: deque[float] = deque(maxlen=config.window_frames)
+        self._dropped = 0  # frames since the last change before which some were
         self._calm = 0  # frames in a row
         self._calm_frames = config.calm_frames
         self._tried: int | None = None  # frames since they looked more often
@@ -89,16 +90,18 @@ class LookRate:
         """One frame more, which took perceive `step_ms`; `dropped`: some before it were. Whether `sparing` changed."""
         config = self._config
         self._steps_ms.append(step_ms)
-        mean_ms, full = statistics.fmean(self._steps_ms), len(self._steps_ms) == config.window_frames
+        self._dropped += dropped
         self._tried = None if self._tried is None else self._tried + 1
-        if dropped or (full and mean_ms > config.busy_share * self._period_ms):
+        if len(self._steps_ms) < config.window_frames:  # a change shows first in the frames after it
+            return False
+        mean_ms = statistics.fmean(self._steps_ms)
+        if self._dropped or mean_ms > config.busy_share * self._period_ms:
             return self._look_less()
-        calm = full and mean_ms < config.calm_share * self._period_ms
-        self._calm = self._calm + 1 if calm else 0
+        self._calm = self._calm + 1 if mean_ms < config.calm_share * self._period_ms else 0
         return self._calm >= self._calm_frames and self._look_more()
 
     def _look_less(self) -> bool:
-        self._calm = 0
+        self._calm = self._dropped = 0
         if self.sparing == self.most:
             return False
         failed = self._tried is not None and self._tried <= self._calm_frames
@@ -110,6 +113,6 @@ class LookRate:
         return self.sparing > 1 and self._change(self.sparing - 1, 0)
 
     def _change(self, sparing: int, tried: int | None) -> bool:
-        self.sparing, self._tried, self._calm = sparing, tried, 0
+        self.sparing, self._tried, self._calm, self._dropped = sparing, tried, 0, 0
         self._steps_ms.clear()
         return True
