@@ -64,6 +64,32 @@ def check_points(record: msgspec.Struct, *points_m: tuple[float, float]) -> None
             raise ValueError(f"{type(record).__name__} needs finite points, got ({x_m}, {y_m})")
 
 
+class SpeedSource(enum.StrEnum):
+    """What the metres of a frame's motion rest on."""
+
+    ROAD = "road"  # the road's image, under a camera of known height
+    CAR = "car"  # the car's own speed
+    CARRIED = "carried"  # an earlier frame's: nothing showed it anew
+    UNKNOWN = "unknown"  # a source that a newer sender knows and this reader does not
+
+    @classmethod
+    def _missing_(cls, value: object) -> SpeedSource | None:
+        return cls.UNKNOWN if isinstance(value, str) else None
+
+
+class SpeedReading(msgspec.Struct, frozen=True, kw_only=True):
+    """What the car itself says of its motion, from wheels or another source.
+
+    Plausibility is judged where readings are used: a wrong one is told of by a status, it is no malformed record.
+    """
+
+    t_ns: int  # when it held, by the frames' t_source_ns
+    speed_mps: float  # along the car's x axis, < 0 backwards
+    sigma_mps: float  # 1-sigma of its noise, without the scale factor that the tyres make
+    yaw_rate_radps: float | None = None  # counter-clockwise; None: the car does not say
+    yaw_rate_sigma_radps: float = 0.0
+
+
 @dataclass(frozen=True)
 class Frame:
     """One undistorted image inside a process; on the bus a `FrameRef` stands for it.
@@ -77,6 +103,7 @@ class Frame:
     t_utc_ns: int
     image: NDArray[np.uint8] | None
     status: tuple[Status, ...] = ()
+    speeds: tuple[SpeedReading, ...] = ()  # the car's own that had come by now, of the last second; in order of coming
 
 
 class FrameRef(msgspec.Struct, frozen=True, kw_only=True):
@@ -97,6 +124,7 @@ class FrameRef(msgspec.Struct, frozen=True, kw_only=True):
     channels: int = 0  # 1 grey, 3 BGR
     dropped: int = 0  # frames that capture itself had to drop since the start
     status: tuple[Status, ...] = ()
+    speeds: tuple[SpeedReading, ...] = ()  # as in `Frame`; a frame that is dropped loses none, the next has them too
 
 
 class EgoEdge(msgspec.Struct, frozen=True, kw_only=True):
@@ -240,6 +268,7 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     scale_sigma_rel: float = 0.0  # 1-sigma of the metric scale as a fraction
     ages: dict[str, int] = {}  # frames since each network's result in use was computed; 0 is this frame
     status: tuple[Status, ...] = ()
+    speed_sources: tuple[SpeedSource, ...] = ()  # what the metres of this frame's motion rest on
 
     def __post_init__(self) -> None:
         check_finite(self, "scale_sigma_rel")
@@ -293,6 +322,7 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     ground: Ground | None = None  # the camera over the road
     scale_sigma_rel: float = 0.0  # 1-sigma of the metric scale as a fraction
     status: tuple[Status, ...] = ()  # expected trouble
+    speed_sources: tuple[SpeedSource, ...] = ()  # what the metres of this frame's motion rest on
 
     def __post_init__(self) -> None:
         check_finite(self, "scale_sigma_rel")

@@ -8,7 +8,7 @@ import re
 import types
 import typing
 from collections.abc import Iterable, Iterator
-from enum import IntEnum
+from enum import IntEnum, StrEnum
 from typing import Any
 
 import msgspec
@@ -212,6 +212,8 @@ def _type(kind: Any) -> str:
         return "[status](#statuses)"
     if isinstance(kind, type) and issubclass(kind, IntEnum):
         return "integer"
+    if isinstance(kind, type) and issubclass(kind, StrEnum):
+        return " or ".join(f"`{item}`" for item in kind)
     return {int: "integer", float: "number", bool: "boolean", str: "text"}[kind]
 
 
