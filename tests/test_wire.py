@@ -45,6 +45,8 @@ from birdslam.types import (
     MapUpdate,
     Measurements,
     MotionEdge,
+    SpeedReading,
+    SpeedSource,
     Status,
     VehicleEdge,
     VehicleEstimate,
@@ -62,6 +64,13 @@ _TIMES = {
 }
 _ATTITUDE = Attitude(z_m=-0.12, pitch_rad=0.011, roll_rad=-0.004)
 _GROUND = Ground(height_m=1.65, pitch_rad=0.009, roll_rad=0.002)
+_READING = SpeedReading(
+    t_ns=33_290_000_000,
+    speed_mps=11.25,
+    sigma_mps=0.0625,
+    yaw_rate_radps=-0.125,
+    yaw_rate_sigma_radps=0.015625,
+)
 # Every field holds something else than its default.
 EXAMPLES: tuple[msgspec.Struct, ...] = (
     FrameRef(
@@ -74,6 +83,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         channels=3,
         dropped=2,
         status=(Status.FRAME_UNREADABLE, Status.END_OF_SOURCE),
+        speeds=(_READING,),
     ),
     Measurements(
         **_TIMES,
@@ -104,6 +114,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         scale_sigma_rel=0.015,
         ages={"detector": 1, "segmenter": 3},
         status=(Status.DETECTIONS_CARRIED, Status.SCALE_CARRIED),
+        speed_sources=(SpeedSource.ROAD, SpeedSource.CAR),
     ),
     Estimate(
         **_TIMES,
@@ -130,6 +141,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         ground=_GROUND,
         scale_sigma_rel=0.015,
         status=(Status.STANDSTILL,),
+        speed_sources=(SpeedSource.CARRIED,),
     ),
     MapUpdate(
         epoch=2, frame_id=4711, landmarks_m=((80.5, -9.0),), lanes_m=((81.0, -7.25), (82.0, -7.5)), lane_ids=(12, -1)
