@@ -1,7 +1,8 @@
 """Records to bytes and back: plain MessagePack, so that a planner in any language can read it.
 
 What comes in is never trusted: sizes are limited before anything is built, then types, ranges and finite numbers are
-checked. Whatever is wrong with the bytes, the only exception is WireError.
+checked. Whatever is wrong with the bytes, the only exception is WireError. Of a SpeedReading alone numbers may be other
+than finite: a sensor that fails says such things, and what reads it answers with a status.
 Versions: fields that a newer sender appended are ignored; a changed meaning is a new version in the topic's key.
 """
 
@@ -14,13 +15,18 @@ import msgpack
 import msgspec
 import numpy as np
 
-from birdslam.types import Status
+from birdslam.types import FrameRef, SpeedReading, Status
 
 # A message is a few kB. With its attachment it must pass zenoh's filter (bus.py, 65,000 B), which drops silently.
 MAX_MESSAGE_BYTES = 64_000
 MAX_TRACE_BYTES = 900
 _MAX_TEXT_BYTES = 1_000
 _MAX_ITEMS = 10_000
+
+_MAY_BE_NAN: dict[type, frozenset[str]] = {  # record -> its fields of any numbers
+    SpeedReading: frozenset(SpeedReading.__struct_fields__),
+    FrameRef: frozenset({"speeds"}),
+}
 
 _Record = TypeVar("_Record", bound=msgspec.Struct)
 _Count = Annotated[int, msgspec.Meta(ge=0)]
@@ -104,9 +110,11 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} has no place in a message")
 
 
-def _check_finite(plain: Any) -> None:
+def _check_finite(plain: Any, record: type) -> None:
     """Whatever a record itself checks, no NaN and no infinity passes the wire, in either direction."""
     waiting = [plain]
+    if record in _MAY_BE_NAN and isinstance(plain, dict):
+        waiting = [value for field, value in plain.items() if field not in _MAY_BE_NAN[record]]
     while waiting:
         item = waiting.pop()
         if isinstance(item, float):
@@ -122,7 +130,7 @@ def encode(record: msgspec.Struct) -> bytes:
     """The record as one MessagePack map; the same record gives the same bytes. Raises WireError where it can't."""
     try:
         plain = msgspec.to_builtins(record, enc_hook=_plain)
-        _check_finite(plain)
+        _check_finite(plain, type(record))
         data: bytes = msgpack.packb(plain)
     except (ValueError, TypeError, OverflowError) as error:
         raise WireError(f"{type(record).__name__} can't be encoded: {error}") from error
@@ -144,7 +152,7 @@ def decode(data: bytes, record: type[_Record], max_bytes: int = MAX_MESSAGE_BYTE
             max_array_len=_MAX_ITEMS,
             max_map_len=_MAX_ITEMS,
         )
-        _check_finite(plain)
+        _check_finite(plain, record)
         return msgspec.convert(plain, record)
     except (ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise WireError(f"{record.__name__}: {str(error) or type(error).__name__}") from error

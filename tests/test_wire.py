@@ -293,9 +293,22 @@ def with_each_float(plain: Any, value: float) -> Iterator[Any]:
 @by_name
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_no_number_may_be_other_than_finite(name: str, value: float) -> None:
-    for plain in with_each_float(msgpack.unpackb(golden(name)), value):
+    for plain in with_each_float(msgpack.unpackb(golden(name)) | {"speeds": []}, value):
         with pytest.raises(WireError):
             decode(msgpack.packb(plain), type(BY_NAME[name]))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_but_what_the_car_says_of_its_speed(value: float) -> None:
+    """A sensor that fails is no malformed message: the method judges it, and a frame bears it bit for bit."""
+    for field in ("speed_mps", "sigma_mps", "yaw_rate_radps", "yaw_rate_sigma_radps"):
+        reading = msgspec.structs.replace(_READING, **{field: value})
+        frame = msgspec.structs.replace(BY_NAME["FrameRef"], speeds=(_READING, reading))
+        assert getattr(decode(encode(reading), SpeedReading), field) == pytest.approx(value, nan_ok=True)
+        assert getattr(decode(encode(frame), FrameRef).speeds[1], field) == pytest.approx(value, nan_ok=True)
+        assert encode(decode(encode(frame), FrameRef)) == encode(frame)
+    with pytest.raises(WireError, match="int"):  # a time is a whole number
+        decode(msgpack.packb(msgspec.to_builtins(_READING) | {"t_ns": value}), SpeedReading)
 
 
 @pytest.mark.parametrize(
