@@ -20,6 +20,7 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     uri: str = ""  # kitti:DIR, video:FILE, v4l2:/dev/videoN, rtsp://...
     rate: Positive | Literal["max"] | None = None  # Hz; None: by the source's own time stamps; "max": lossless
     stride: PositiveInt = 1  # one frame of a recording in so many
+    speed: str = ""  # FILE of the car's own speed over a recording: lines of time in s, speed in m/s; "": none
     frames: PositiveInt | None = None  # end after so many; None: all
     loop: bool = False  # a recording begins anew at its end
     prefetch_frames: PositiveInt = 4  # decoded ahead of their time, so that a slow file is not a late frame

@@ -17,7 +17,7 @@ from birdslam.calibration.height_check import VehicleHeightConfig, solve_mountin
 from birdslam.calibration.intrinsics import from_chessboard, read_intrinsics
 from birdslam.datasets.camera_file import load_camera
 from birdslam.datasets.recording import DatasetError
-from birdslam.datasets.speed_file import read_speeds
+from birdslam.datasets.speed_file import read_speed_curve
 from birdslam.frontend import FrontEndConfig
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.main import main
@@ -304,4 +304,4 @@ def test_bad_input_is_one_line(data_dir: Path, tmp_path: Path, capsys: pytest.Ca
 def test_a_bad_speed_file_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "speed.txt").write_text(text)
     with pytest.raises(DatasetError, match=r"speed\.txt"):
-        read_speeds(tmp_path / "speed.txt")
+        read_speed_curve(tmp_path / "speed.txt")

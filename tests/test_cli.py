@@ -26,7 +26,7 @@ def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.startswith("birdslam ")
 
 
-@pytest.mark.parametrize("arguments", [[], ["fly"], ["run", "--speed", "3"], ["evaluate", "odometry"]])
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["run", "--pace", "3"], ["evaluate", "odometry"]])
 def test_a_wrong_command_shows_the_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         main(arguments)

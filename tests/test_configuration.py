@@ -38,7 +38,7 @@ def test_differences_only(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "key", "reason"),
     [
-        ("[source]\nspeed = 3\n", "source.speed", "there is no such key"),
+        ("[source]\npace = 3\n", "source.pace", "there is no such key"),
         ("[slam.graph]\nlagg = 3\n", "slam.graph.lagg", "there is no such key"),
         ("colour = 1\n", "colour", "there is no such key"),
         ('[source]\nstride = "two"\n', "source.stride", "Expected `int`, got `str`"),

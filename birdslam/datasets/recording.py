@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.datasets.speed_log import SpeedLog
 from birdslam.geometry.camera import Camera, Undistorter
-from birdslam.types import Frame, Status
+from birdslam.types import Frame, SpeedReading, Status
 
 
 class DatasetError(ValueError):
@@ -25,6 +26,7 @@ class RecordedFrame:
     t_source_ns: int  # the recording's own clock
     image: NDArray[np.uint8] | None
     error: str | None = None
+    speeds: tuple[SpeedReading, ...] = ()  # as in `Frame`
 
 
 class Recording(ABC):
@@ -36,6 +38,7 @@ class Recording(ABC):
     name: str
     camera: Camera
     rate_hz: float
+    speeds: SpeedLog | None = None  # the car's own, of a file beside it: they go before those that it has itself
 
     @abstractmethod
     def __len__(self) -> int:
@@ -45,6 +48,11 @@ class Recording(ABC):
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
         """Every frame in order, from index `start` on; an unreadable one has no image, and the iteration goes on."""
 
+    def frames_with_speeds(self, start: int = 0) -> Iterator[RecordedFrame]:
+        """`frames`, each with what the car had said of its speed by then."""
+        for frame in self.frames(start) if start else self.frames():
+            yield frame if self.speeds is None else replace(frame, speeds=self.speeds.until(frame.t_source_ns))
+
     def undistorted_frames(self) -> Iterator[Frame]:
         """Every frame in order, numbered from 0, for a program of one process.
 
@@ -52,10 +60,10 @@ class Recording(ABC):
         `t_capture_ns` is `t_source_ns`, and UTC is not known (0).
         """
         undistort = Undistorter(self.camera)
-        for frame_id, recorded in enumerate(self.frames()):
+        for frame_id, recorded in enumerate(self.frames_with_speeds()):
             image, _ = undistorted(undistort, recorded)
             status = (Status.FRAME_UNREADABLE,) if image is None else ()
-            yield Frame(frame_id, recorded.t_source_ns, recorded.t_source_ns, 0, image, status)
+            yield Frame(frame_id, recorded.t_source_ns, recorded.t_source_ns, 0, image, status, recorded.speeds)
 
     def truth_poses(self) -> NDArray[np.float64] | None:
         """(N, 3, 4) poses of camera 0 as KITTI rows in metres, one a frame; None where there are none."""

@@ -17,7 +17,7 @@ from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_in
 from birdslam.datasets.camera_file import load_camera
 from birdslam.datasets.opening import frame_size, open_recording
 from birdslam.datasets.recording import DatasetError, Recording
-from birdslam.datasets.speed_file import read_speeds
+from birdslam.datasets.speed_file import read_speed_curve
 from birdslam.evaluation.results import ResultsError
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
@@ -130,8 +130,8 @@ def _lengths(recording: Recording, options: argparse.Namespace) -> dict[str, Kno
             return float(np.linalg.norm(np.diff(at[start : end + 1], axis=0), axis=1).sum())
 
         out["poses"] = by_poses
-    if options.speed is not None:
-        t_s, speed_mps = read_speeds(options.speed).T
+    if options.known_speed is not None:
+        t_s, speed_mps = read_speed_curve(options.known_speed).T
         way_m = np.concatenate([[0.0], np.cumsum(np.diff(t_s) * 0.5 * (speed_mps[1:] + speed_mps[:-1]))])
 
         def by_speed(start: int, end: int, start_ns: int, end_ns: int) -> float | None:
@@ -142,7 +142,7 @@ def _lengths(recording: Recording, options: argparse.Namespace) -> dict[str, Kno
         first, last = recording_span_s(recording)
         if t_s[-1] < first or t_s[0] > last:
             raise DatasetError(
-                f"{options.speed}: its times {t_s[0]:g} to {t_s[-1]:g} s lie outside the recording's, "
+                f"{options.known_speed}: its times {t_s[0]:g} to {t_s[-1]:g} s lie outside the recording's, "
                 f"{first:g} to {last:g} s"
             )
         out["speed"] = by_speed

@@ -23,7 +23,7 @@ def configuration_of(options: argparse.Namespace) -> Configuration:
             overrides[f"models.{role}.path"] = path
         else:
             raise ConfigurationError(f"--model {text}: expected ROLE=PATH, or the name of a model")
-    keys = {"source": "source.uri", "rate": "source.rate", "stride": "source.stride"}
+    keys = {"source": "source.uri", "rate": "source.rate", "stride": "source.stride", "speed": "source.speed"}
     keys |= {"record": "recording.file", "record_images": "recording.images"}
     keys |= {"smooth": "results.smooth", "video": "results.video"}
     for name in ("camera", "vehicle", "output", *keys):

@@ -61,6 +61,7 @@ def _run(commands: Commands) -> None:
     run.add_argument("--record", metavar=RECORDING, help="write the drive down; a directory: a new file in it")
     run.add_argument("--record-images", action="store_true", default=None, help="with its frames, as JPEG")
     _add_final_results(run)
+    run.add_argument("--speed", metavar="FILE", help="the car's own speed over a recording: time in s, speed in m/s")
     _add_pipeline(run)
     run.set_defaults(command="run")
 
@@ -145,7 +146,8 @@ def _calibrate(commands: Commands) -> None:
     parser.add_argument("--board", default="9x6", metavar="COLSxROWS", help="its inner corners (default 9x6)")
     parser.add_argument("--square-mm", type=float, default=25.0, metavar="MM", help="a square's side (default 25)")
     parser.add_argument("--height", type=float, metavar="M", help="the camera's height over the road, as measured")
-    parser.add_argument("--speed", type=Path, metavar="FILE", help="lines of time in s, speed in m/s")
+    text = "lines of time in s, speed in m/s"
+    parser.add_argument("--speed", dest="known_speed", type=Path, metavar="FILE", help=text)
     parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="networks: vehicles and road")
     parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame")
     _add_config(parser)
@@ -198,6 +200,7 @@ def _odometry(evaluate: Commands) -> None:
         parser.add_argument("sequences", nargs="+", metavar="SEQUENCE_DIR", help="a KITTI directory, or a source's URI")
         _add_config(parser)
         parser.add_argument("--frames", default=":", metavar="FIRST:END", help="compare these alone; all are driven")
+        parser.add_argument("--speed", metavar="FILE|DIR", help="the car's own speed; DIR: NAME.txt of each sequence")
         _add_pipeline(parser)
         parser.set_defaults(command=command)
 

@@ -14,15 +14,18 @@ from pathlib import Path
 from typing import Protocol
 
 import cv2
+import msgspec
 import numpy as np
 
 from birdslam.datasets.opening import open_recording
 from birdslam.datasets.recording import RecordedFrame, Recording, undistorted
+from birdslam.datasets.speed_file import with_speeds
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, SourceConfig
-from birdslam.types import Frame, Status
+from birdslam.types import Frame, SpeedReading, Status
 
 SOURCES = "kitti:DIR, video:FILE, mcap:FILE, demo, v4l2:/dev/videoN or rtsp://HOST/PATH"
+_LAST_NS = (1 << 63) - 1  # as a car's computer may say that is out of its mind
 LIVE_RATE_HZ = 30.0  # of a camera that does not say
 
 log = logging.getLogger(__name__)
@@ -53,18 +56,21 @@ def open_source(configuration: Configuration, must_open: bool = True) -> Source:
     """
     source = configuration.source
     scheme, colon, address = source.uri.partition(":")
+    speeds = Path(source.speed).expanduser() if source.speed else None
     if colon and scheme == "mcap" and address:
         from birdslam.runtime.recording.recorded_images import (
             RecordedImages,  # only where it is needed: Foxglove's types and mcap
         )
 
         images = RecordedImages(Path(address).expanduser(), configuration.camera, source.stride)
-        return RecordedSource(images, source)
+        return RecordedSource(with_speeds(images, speeds) if speeds else images, source)
     if scheme in FILE_SCHEMES and (colon or scheme == "demo"):
-        return RecordedSource(open_recording(source.uri, configuration.camera, source.stride), source)
+        return RecordedSource(open_recording(source.uri, configuration.camera, source.stride, speeds), source)
     if colon and scheme in ("v4l2", "rtsp") and address:
         if configuration.camera is None:
             raise ConfigurationError(f"{source.uri}: a live camera needs a camera file (--camera FILE)")
+        if speeds is not None:
+            raise ConfigurationError(f"{source.uri}: a speed file is for recordings; live the car says it on the bus")
         if source.rate == "max":
             raise ConfigurationError(f'{source.uri}: rate "max" is for recordings; a live camera has its own')
         return CameraSource(source, configuration.camera, must_open)
@@ -104,17 +110,24 @@ class RecordedSource:
         shift_ns: int | None = None if loops else 0
         while True:
             first_ns = last_ns = None
-            for frame in self.recording.frames(start) if start else self.recording.frames():
+            for frame in self.recording.frames_with_speeds(start):
                 if shift_ns is None:
                     shift_ns = self._resume_ns - frame.t_source_ns
                 first_ns = frame.t_source_ns if first_ns is None else first_ns
                 last_ns = frame.t_source_ns
-                yield replace(frame, t_source_ns=frame.t_source_ns + shift_ns)
+                yield replace(frame, t_source_ns=frame.t_source_ns + shift_ns, speeds=_later(frame.speeds, shift_ns))
             if not self._config.loop or first_ns is None or last_ns is None or shift_ns is None:
                 return
             if start:  # the next pass begins at frame 0, whose time lies before this pass's first
                 first_ns, start = next(iter(self.recording.frames())).t_source_ns, 0
             shift_ns += last_ns - first_ns + round(1e9 / self.rate_hz)
+
+
+def _later(speeds: tuple[SpeedReading, ...], shift_ns: int) -> tuple[SpeedReading, ...]:
+    """In a loop the car's readings stay beside their frames."""
+    if not shift_ns:
+        return speeds
+    return tuple(msgspec.structs.replace(one, t_ns=min(one.t_ns + shift_ns, _LAST_NS)) for one in speeds)
 
 
 class CameraSource:
@@ -209,7 +222,7 @@ def to_frame(
     if image is None:
         log.warning("frame %d is unreadable: %s", frame_id, error)
     status = (Status.FRAME_UNREADABLE,) if image is None else ()
-    return Frame(frame_id, recorded.t_source_ns, t_capture_ns, t_utc_ns, image, status)
+    return Frame(frame_id, recorded.t_source_ns, t_capture_ns, t_utc_ns, image, status, recorded.speeds)
 
 
 def offline_frames(source: Source) -> Iterator[Frame]:

@@ -1,0 +1,154 @@
+"""The car's own speed beside a recording: what a file may say, and which frame bears which of its readings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import DatasetError, RecordedFrame, Recording
+from birdslam.datasets.speed_file import SIGMA_MPS, YAW_RATE_SIGMA_RADPS, read_speed_curve, read_speeds, with_speeds
+from birdslam.datasets.speed_log import KEPT_NS, KEPT_READINGS, SpeedLog
+from birdslam.geometry.camera import Camera
+from birdslam.runtime.cli.main import main
+from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
+from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_source
+from birdslam.types import SpeedReading
+
+CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
+PERIOD_NS = 100_000_000
+
+
+class Drive(Recording):
+    """Frames at 10 Hz, without a disk."""
+
+    name, camera, rate_hz = "drive", CAMERA, 10.0
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
+        for index in range(start, self._count):
+            yield RecordedFrame(index, index * PERIOD_NS, np.zeros((32, 64), dtype=np.uint8))
+
+
+def reading(t_ns: int, speed_mps: float = 5.0) -> SpeedReading:
+    return SpeedReading(t_ns=t_ns, speed_mps=speed_mps, sigma_mps=0.1)
+
+
+def file(folder: Path, text: str) -> Path:
+    path = folder / "speed.csv"
+    path.write_text(text)
+    return path
+
+
+def test_a_line_says_as_much_as_it_knows(tmp_path: Path) -> None:
+    text = "# t v\n\n0.5 10\n1, 10.5\n1.5 11 0.25 # wheels\n2,-1,,0.125\n2.5,12,0.5,-0.25,0.0625\n3,13,,,\n"
+    gyro = {"yaw_rate_radps": 0.125, "yaw_rate_sigma_radps": YAW_RATE_SIGMA_RADPS}
+    exact = {"yaw_rate_radps": -0.25, "yaw_rate_sigma_radps": 0.0625}
+    assert read_speeds(file(tmp_path, text)).readings == (
+        SpeedReading(t_ns=500_000_000, speed_mps=10.0, sigma_mps=SIGMA_MPS),
+        SpeedReading(t_ns=1_000_000_000, speed_mps=10.5, sigma_mps=SIGMA_MPS),
+        SpeedReading(t_ns=1_500_000_000, speed_mps=11.0, sigma_mps=0.25),
+        SpeedReading(t_ns=2_000_000_000, speed_mps=-1.0, sigma_mps=SIGMA_MPS, **gyro),
+        SpeedReading(t_ns=2_500_000_000, speed_mps=12.0, sigma_mps=0.5, **exact),
+        SpeedReading(t_ns=3_000_000_000, speed_mps=13.0, sigma_mps=SIGMA_MPS),
+    )
+
+
+@pytest.mark.parametrize(
+    "line", ["3", "3,", "fast 3", "3 fast", "nan 3", "inf 3", "1e30 3", ",3", "1 2 3 4 5 6", "1;2", "2026-01-01 3"]
+)
+def test_a_torn_line_is_named(tmp_path: Path, line: str) -> None:
+    with pytest.raises(DatasetError, match=r"speed\.csv: line 3 is no time in s and speed"):
+        read_speeds(file(tmp_path, f"0 1\n# so far\n{line}\n4 5\n"))
+
+
+def test_a_file_without_speeds_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"speed\.csv: holds no speeds"):
+        read_speeds(file(tmp_path, "# t v\n"))
+    (tmp_path / "bytes").write_bytes(b"\xff\xfe\x00")
+    for path in (tmp_path / "nowhere", tmp_path / "bytes", tmp_path):
+        with pytest.raises(DatasetError, match="can't be read"):
+            read_speeds(path)
+
+
+def test_what_a_failing_sensor_says_is_passed_on_but_calibrates_nothing(tmp_path: Path) -> None:
+    path = file(tmp_path, "0 1\n1 nan\n2 900\n1.5 3\n3 4 nan\n")
+    log = read_speeds(path)
+    assert [one.t_ns // 10**8 for one in log.readings] == [0, 10, 20, 15, 30]
+    assert math.isnan(log.readings[1].speed_mps)
+    assert math.isnan(log.readings[4].sigma_mps)
+    with pytest.raises(DatasetError, match="line 2: nan m/s at 1 s is no speed of a car"):
+        read_speed_curve(path)
+    with pytest.raises(DatasetError, match="line 3 is not later"):
+        read_speed_curve(file(tmp_path, "0 1\n2 1\n1 1\n"))
+    assert read_speed_curve(file(tmp_path, "0 1\n2 1.5 0.1 0.2\n")).tolist() == [[0.0, 1.0], [2.0, 1.5]]
+
+
+@given(st.lists(st.integers(-(10**10), 10**10), max_size=30), st.integers(-(10**10), 10**10))
+def test_a_frame_bears_what_had_come_in_the_second_before_it(times_ns: list[int], t_ns: int) -> None:
+    readings = [reading(one, float(number)) for number, one in enumerate(times_ns)]
+    come_ns = [max(times_ns[: number + 1]) for number in range(len(times_ns))]
+    expected = [one for one, come in zip(readings, come_ns, strict=True) if t_ns - KEPT_NS < come <= t_ns]
+    assert list(SpeedLog(readings).until(t_ns)) == expected
+
+
+def test_a_frame_bears_so_many_and_the_newest() -> None:
+    log = SpeedLog(reading(number * 1_000_000) for number in range(3_000))
+    borne = log.until(2_000_500_000)
+    assert len(borne) == KEPT_READINGS
+    assert borne[-1].t_ns == 2_000_000_000
+
+
+def test_the_same_frames_bear_the_same_readings_offline_and_in_a_loop(tmp_path: Path) -> None:
+    path = file(tmp_path, "".join(f"{0.02 * number} {number}\n" for number in range(40)))
+    recording = with_speeds(Drive(5), path)
+    borne = [frame.speeds for frame in recording.undistorted_frames()]
+    assert [one[-1].t_ns for one in borne] == [number * PERIOD_NS for number in range(5)]
+    assert [frame.speeds for frame in offline_frames(RecordedSource(recording, SourceConfig()))] == borne
+    looped = list(offline_frames(RecordedSource(recording, SourceConfig(loop=True, frames=9))))
+    assert [frame.speeds for frame in looped[:5]] == borne
+    again = [msgspec.structs.replace(one, t_ns=one.t_ns - 5 * PERIOD_NS) for one in looped[8].speeds]
+    assert tuple(again) == borne[3]
+    assert [frame.speeds for frame in Drive(2).undistorted_frames()] == [(), ()]
+
+
+def test_a_file_of_another_clock_is_named(tmp_path: Path) -> None:
+    for text in ("1700000000 3\n1700000001 3\n", "-9 3\n-8 3\n"):
+        with pytest.raises(DatasetError, match=r"speed\.csv: its times .* lie outside the recording's, 0 to 0\.5 s"):
+            with_speeds(Drive(5), file(tmp_path, text))
+
+
+def test_a_speed_file_is_asked_for_by_the_configuration(tmp_path: Path) -> None:
+    (tmp_path / "car.toml").write_text('[source]\nuri = "demo"\nspeed = "speed.csv"\n')
+    path = file(tmp_path, "0 12\n0.02 12.5\n")
+    configuration = load(tmp_path / "car.toml")
+    assert configuration.source.speed == str(path)
+    source = open_source(configuration)
+    assert [len(frame.speeds) for frame, _ in zip(source.frames(), range(2), strict=False)] == [1, 2]
+    assert open_recording("demo", speeds=path).speeds is not None
+    live = Configuration(camera=CAMERA, source=SourceConfig(uri="v4l2:/dev/video0", speed=str(path)))
+    with pytest.raises(ConfigurationError, match="on the bus"):
+        open_source(live)
+
+
+def test_bad_speed_files_of_an_evaluation_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--output", str(tmp_path / "out")]
+    for speed, wanted in (
+        (file(tmp_path, "0 1\n1 fast\n"), "speed.csv: line 2 is no time"),
+        (tmp_path, "demo.txt: can't be read"),
+        (tmp_path / "none.csv", "none.csv: can't be read"),
+    ):
+        assert main(["evaluate", "odometry", "demo", "--speed", str(speed), *out]) == 2
+        assert wanted in capsys.readouterr().err
