@@ -46,6 +46,7 @@ class OdometryReport(msgspec.Struct, frozen=True, kw_only=True):
     path_estimated_m: float = 0.0
     standing_drift_m: float | None = None  # how far the estimate strays while the truth stands; None: it never does
     statuses: dict[str, int] = {}  # how many frames carried each status
+    speed_sources: dict[str, int] = {}  # on how many frames the metres rested on each source
     car_ahead: CarAheadReport | None = None  # where the recording has LiDAR
     ego: ConsistencyReport | None = None  # what the ego's covariance is worth; None where only some frames are compared
     segment_t_pct: float | None = None  # mean error of stretches of SEGMENTS_M, each aligned at its own first pose:
@@ -233,6 +234,7 @@ def evaluate_recordings(
         estimated = in_camera0(rows, recording.T_cam0_cam())
         goal = None if truth is None else from_first(as_poses(truth))
         row = compare(recording.name, goal, estimated, dict(sorted(recorder.statuses.items())), compared)
+        row = msgspec.structs.replace(row, speed_sources=dict(sorted(recorder.speed_sources.items())))
         if goal is not None and compared == slice(None):
             T_cam0_cam = recording.T_cam0_cam()
             row = msgspec.structs.replace(row, ego=ego.report(inverse(T_cam0_cam) @ goal @ T_cam0_cam))

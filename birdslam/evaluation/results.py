@@ -125,6 +125,7 @@ class Recorder:
         self._tum.write("# t_s x_m y_m z_m qx qy qz qw: the ego (the camera's foot on the road) in world\n")
         self._map.write("epoch,kind,x_m,y_m,lane\n")
         self.statuses: Counter[str] = Counter()
+        self.speed_sources: Counter[str] = Counter()
         self._trajectory = CameraTrajectory(camera.ground)
         self._next_row = 0
         self._frames = self._invalid = 0
@@ -163,6 +164,7 @@ class Recorder:
         self._frames += 1
         self._invalid += not estimate.valid
         self.statuses.update(status.value for status in estimate.status)
+        self.speed_sources.update(source.value for source in estimate.speed_sources)
         pose = ego_pose(estimate.T_world_ego, estimate.attitude)
         self._tum.write(tum_row(estimate.t_source_ns, pose) + "\n")
         self._write_row(estimate, pose)
@@ -198,6 +200,7 @@ class Recorder:
             "tracks": self._track_count,
             "epochs": self._epoch_count,
             "statuses": dict(sorted(self.statuses.items())),
+            "speed_sources": dict(sorted(self.speed_sources.items())),
         }
         encoded = msgspec.json.encode({**counts, **summary}, enc_hook=_plain)
         (self._directory / "summary.json").write_bytes(msgspec.json.format(encoded, indent=2) + b"\n")

@@ -34,7 +34,7 @@ from birdslam.graph.pending_map import PendingMap
 from birdslam.graph.vehicles import SHORTEST_S, Ties, VehicleNodes
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
-from birdslam.types import INVALIDATING, Estimate, MapUpdate, Measurements, Status, VehicleEstimate
+from birdslam.types import INVALIDATING, Estimate, MapUpdate, Measurements, SpeedSource, Status, VehicleEstimate
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
@@ -253,6 +253,7 @@ class PoseGraph:
         window, config = self._window, self.config
         if window is None:
             return self._estimate(m, (*m.status, Status.NOT_INITIALISED), np.zeros((3, 3)), ())
+        m = msgspec.structs.replace(m, speed_sources=m.speed_sources or (SpeedSource.CARRIED,))
         since_s = max((m.t_source_ns - self._t_ns) * 1e-9, 0.0)
         rate = np.abs(self._motion.log()) / max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
         rate += np.array([config.blind_mps, config.blind_mps, config.blind_radps])
@@ -281,4 +282,5 @@ class PoseGraph:
             ground=m.ground,
             scale_sigma_rel=m.scale_sigma_rel,
             status=tuple(dict.fromkeys(status)),
+            speed_sources=m.speed_sources,
         )

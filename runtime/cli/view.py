@@ -188,6 +188,9 @@ class Viewer:
             self._stream.log("ego/speed_mps", rr.Scalars(speed_mps))
         for name, variance in zip(("x_m", "y_m", "yaw_rad"), estimate.cov[::4], strict=True):
             self._stream.log(f"ego/sigma_{name}", rr.Scalars(math.sqrt(max(variance, 0.0))))
+        if self._last is None or estimate.speed_sources != self._last.speed_sources:
+            sources = " and ".join(estimate.speed_sources) or "nothing yet"
+            self._stream.log("status", rr.TextLog(f"metres from {sources}", level="INFO"))
         if estimate.status or not estimate.valid:
             text = f"{'' if estimate.valid else 'NOT VALID '}{' '.join(estimate.status)}"
             self._stream.log("status", rr.TextLog(text, level="INFO" if estimate.valid else "WARN"))

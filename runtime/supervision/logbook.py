@@ -47,6 +47,7 @@ class Logbook:
         self.age = Distribution()
         self.stages: dict[str, Distribution] = {}
         self.statuses: Counter[str] = Counter()
+        self.speed_sources: Counter[str] = Counter()
         self._results = results
         self._listeners = tuple(listeners)
         self._bus = bus
@@ -79,6 +80,7 @@ class Logbook:
             self.ended = True
             return
         self.statuses.update(status.value for status in estimate.status)
+        self.speed_sources.update(source.value for source in estimate.speed_sources)
         self._latest = estimate
         if Status.PERCEPTION_LATE in estimate.status:  # nothing was measured: no row, and no frame that was processed
             return
@@ -148,6 +150,7 @@ class Logbook:
             "age_ms": self.age.summary(),
             "stages_ms": {name: distribution.summary() for name, distribution in self.stages.items()},
             "statuses": dict(sorted(self.statuses.items())),
+            "speed_sources": dict(sorted(self.speed_sources.items())),
         }
 
     def wait_over(self, timeout_s: float) -> None:
