@@ -6,6 +6,8 @@ from bisect import bisect_right
 from collections.abc import Iterable
 from itertools import accumulate
 
+import msgspec
+
 from birdslam.types import NS_PER_S, SpeedReading
 
 KEPT_NS = NS_PER_S  # a frame bears the readings of so long before it
@@ -27,3 +29,10 @@ class SpeedLog:
         """Those of the last second that had come by `t_ns` (as t_source_ns of a frame), in order of coming."""
         begin, end = bisect_right(self._come_ns, t_ns - KEPT_NS), bisect_right(self._come_ns, t_ns)
         return self.readings[max(begin, end - KEPT_READINGS) : end]
+
+
+def added(before: tuple[SpeedReading, ...], after: tuple[SpeedReading, ...]) -> tuple[SpeedReading, ...]:
+    """What a frame bears beyond the frame before it: of two such spans, those that came between the ends of the two."""
+    was, now = ([msgspec.msgpack.encode(one) for one in span] for span in (before, after))  # a NaN equals itself there
+    both = next(n for n in range(min(len(was), len(now)), -1, -1) if was[len(was) - n :] == now[:n])
+    return after[both:]

@@ -25,6 +25,7 @@ import cv2
 import msgspec
 import psutil
 
+from birdslam.datasets.speed_log import added
 from birdslam.runtime.configuration import Configuration, dump, without_passwords
 from birdslam.runtime.environment import LIBRARIES, USER_ERROR_STATUS
 from birdslam.runtime.latency import stages
@@ -40,7 +41,7 @@ from birdslam.runtime.transport.bus import Bus, Message
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameError, FrameReader
 from birdslam.runtime.wire import Health
-from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
+from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedReading, Status
 
 TURN_S = 0.05  # what has come is written at least so often
 QUIET_S = 0.2  # at the end: nothing more has come for so long
@@ -92,6 +93,7 @@ class Recorder:
         self._end_frame: int | None = None  # of END_OF_SOURCE
         self._end_measured = False  # the measurements of it have come: another link, which may be the slower one
         self._map_frame = -1
+        self._speeds: tuple[SpeedReading, ...] = ()  # that the last frame bore
         self._estimate_frame = -1
         self._handed: deque[tuple[int, int]] = deque()  # the file's length with them, and the frame that is next
         self._missed = 0  # frames between the last on the disk of the recorder before this one, and this one's first
@@ -162,6 +164,9 @@ class Recorder:
         if isinstance(record, Health):
             self._writer.draw(f"/{topic}", record, t_ns)
         elif isinstance(record, FrameRef):
+            for reading in added(self._speeds, record.speeds):
+                self._writer.draw("/speed", reading, t_ns)
+            self._speeds = record.speeds
             self._take_image(record, t_ns)
         elif isinstance(record, Measurements):
             if self._first_measured is None:

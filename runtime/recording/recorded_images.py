@@ -25,7 +25,8 @@ READ = ("v1/frame", "/camera/image")
 class RecordedImages(Recording):
     """One frame for each that was captured; those that were not recorded (the ring went on) are unreadable ones.
 
-    The images are as perceive had them, without distortion, but for what JPEG takes. Raises DatasetError.
+    Each bears the readings of the car's speed that it bore in the drive. The images are as perceive had them, without
+    distortion, but for what JPEG takes. Raises DatasetError.
     """
 
     def __init__(self, path: Path, camera: Camera | None = None, stride: int = 1) -> None:
@@ -62,7 +63,7 @@ class RecordedImages(Recording):
                 continue
             pixels = None if image is None else _pixels(image)
             error = None if pixels is not None else f"frame {ref.frame_id} was not recorded"
-            yield RecordedFrame(number // self._stride, ref.t_source_ns, pixels, error)
+            yield RecordedFrame(number // self._stride, ref.t_source_ns, pixels, error, ref.speeds)
 
     def _pairs(self) -> Iterator[tuple[FrameRef, CompressedImage | None]]:
         """Every frame with its image; a frame that is missing altogether stands at its time between the two."""
@@ -98,7 +99,7 @@ def _between(before: FrameRef, after: FrameRef) -> Iterator[FrameRef]:
     gap = after.frame_id - before.frame_id
     for step in range(1, gap):
         t_source_ns = before.t_source_ns + (after.t_source_ns - before.t_source_ns) * step // gap
-        yield msgspec.structs.replace(before, frame_id=before.frame_id + step, t_source_ns=t_source_ns)
+        yield msgspec.structs.replace(before, frame_id=before.frame_id + step, t_source_ns=t_source_ns, speeds=())
 
 
 def _pixels(image: CompressedImage) -> np.ndarray | None:

@@ -8,7 +8,7 @@
 | v1/estimate/trace           |              | learns from it is which message an estimate answers                    |
 | v1/checkpoint               | MessagePack  | once in a file that begins in the middle of a drive: the graph there   |
 | /estimate, /health/NODE,    | JSON, schema | for plots: the estimate again, the nodes' health, where the time went, |
-| /latency, /alive            |              | nodes that came and went                                               |
+| /latency, /alive, /speed    |              | nodes that came and went, each reading of the car's speed once         |
 | /tf, /scene, ... (scene.py) | JSON, schema | what Foxglove draws; /camera/image where images were asked for         |
 
 Attachments: `about.json` (the whole configuration, the networks with their hashes, versions) and `camera.toml`. A
@@ -40,7 +40,7 @@ from birdslam.runtime.recording.foxglove import schema
 from birdslam.runtime.recording.scene import CHANNELS
 from birdslam.runtime.topology import PROCESSES
 from birdslam.runtime.wire import Health, Trace, encode
-from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements
+from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedReading
 
 EXACT: dict[str, type[msgspec.Struct]] = {
     "frame": FrameRef,
@@ -99,6 +99,7 @@ JSON_CHANNELS: dict[str, type[msgspec.Struct]] = {
     "/estimate": Estimate,
     "/latency": Latency,
     "/alive": Alive,
+    "/speed": SpeedReading,
     **{f"/health/{name}": Health for name in PROCESSES},
     **CHANNELS,
 }
