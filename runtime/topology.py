@@ -1,5 +1,7 @@
 """The whole system on one screen: which nodes there are, and which records pass between them.
 
+    the car's own speed, if it says it
+              v
     camera -> [capture] -- frame --> [perceive] -- measurements --> [optimize] -- estimate, map --> planners
 
 A topic's key is `birdslam/<vehicle>/v1/<topic>`, its payload one record as plain MessagePack (runtime/wire.py). Each
@@ -16,7 +18,7 @@ import msgspec
 
 from birdslam.queries import MapSnapshot, Trajectory
 from birdslam.runtime.wire import Health
-from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements
+from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedReading
 
 VERSION = "v1"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}")
@@ -44,7 +46,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Node:
-    """One process of the pipeline, and the topics that it receives and sends."""
+    """One process of the pipeline or beside it, and the topics that it receives and sends."""
 
     name: str
     receives: tuple[str, ...]
@@ -54,17 +56,20 @@ class Node:
 NODES = {
     node.name: node
     for node in (
-        Node("capture", receives=("estimate",), sends=("frame", "health/capture")),  # estimates pace --rate max
+        Node("capture", receives=("estimate", "speed"), sends=("frame", "health/capture")),  # estimates: --rate max
         Node("perceive", receives=("frame",), sends=("measurements", "health/perceive")),
         Node("optimize", receives=("frame", "measurements"), sends=("estimate", "map", "health/optimize")),
     )
 }
 RECORDER = Node("record", receives=("frame", "measurements", "estimate", "map"), sends=("health/record",))
+CAR = Node("car", receives=(), sends=("speed",))  # no process of ours: what knows the speed of the wheels, if any does
 PROCESSES = {**NODES, RECORDER.name: RECORDER}  # the recorder is there only where a drive is recorded
 
 TOPICS = {
     topic.name: topic
     for topic in (
+        # As many as a frame bears (datasets/speed_log.py): what does not fit in no frame would have had
+        Topic("speed", SpeedReading, CAR.name, depth=200, pace="as often as the car says it, 20 to 100 times a second"),
         Topic("frame", FrameRef, "capture", depth=1, hot=True),
         # A lost one breaks the chain of edges: a few are queued, and an optimizer that begins anew asks for the last
         Topic("measurements", Measurements, "perceive", depth=8, kept=96),

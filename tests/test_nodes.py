@@ -45,10 +45,10 @@ class Inbox:
 
 class FakeBus:
     def __init__(self) -> None:
-        self.inbox = Inbox()
+        self.inbox, self.speeds = Inbox(), Inbox()
 
     def subscriber(self, topic: str, depth: int | None = None) -> Inbox:
-        return self.inbox
+        return self.speeds if topic == "speed" else self.inbox
 
 
 class Source:

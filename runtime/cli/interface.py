@@ -14,12 +14,13 @@ from typing import Any
 import msgspec
 
 import birdslam.types
+from birdslam.datasets.speed_log import KEPT_READINGS
 from birdslam.geometry.se2 import SE2
 from birdslam.runtime.cli.pages import comments, table, unit
 from birdslam.runtime.configuration import BudgetsConfig
 from birdslam.runtime.topology import NODES, QUERIES, TOPICS, VERSION, Topic, alive_key, key_of
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES, Part, Trace
-from birdslam.types import INVALIDATING, Estimate, Status
+from birdslam.types import INVALIDATING, Estimate, SpeedReading, Status
 
 _VEHICLE = "VEHICLE"
 _TRANSFORM = re.compile(r"T_([a-z]+)_([a-z]+)")
@@ -31,13 +32,15 @@ Made by `birdslam interface > docs/interface.md` from the records and the topolo
 with nothing but zenoh and MessagePack.
 
 Every message is one MessagePack map (or, where a record says so, an array) of at most {bytes:,} B under a zenoh key
-`birdslam/{vehicle}/{version}/...`. A number is always finite. Fields may be appended: ignore what you do not know. A
-changed meaning is another version in the key.
+`birdslam/{vehicle}/{version}/...`. A number is always finite, but in {reading}. Fields may be appended: ignore what you
+do not know. A changed meaning is another version in the key.
 
 On the vehicle's computer, as its own user: connect to `unixsock-stream/DIR/{vehicle}/hub.sock` with multicast
 scouting off, where DIR is `runtime.runtime_dir` (of the service: `/run/birdslam`). From elsewhere, or as another
 user: through the gate, by mutual TLS ([deploy/README.md](../deploy/README.md)). Planners may read `estimate`, `map`,
-`health/*` and `alive/*`, and send every query; `frame` and `measurements` are for the nodes alone.
+`health/*` and `alive/*`, and send every query; `frame` and `measurements` are for the nodes alone. `speed` is the one
+topic that comes from outside: the car's own computer sends it, and nobody else may ([The car's own
+speed](#the-cars-own-speed)).
 
 ## Keys
 
@@ -55,6 +58,17 @@ too slowly loses messages; nobody slows the vehicle down.
 Ask for the exact key (`{example}`): wildcards get no reply. Query with consolidation NONE: a long reply comes in
 several messages of the same record, whose lists belong together, each with a {part} attached. The payload of an error
 is its reason as text. A reader of `estimate` or `health/*` that comes late asks that same key for the last message.
+
+## The car's own speed
+
+A car that knows the speed of its wheels may send `speed`, each {reading} as a plain MessagePack map, 20 to 100 times a
+second; [examples/car_speed.py](examples/car_speed.py) does, with nothing but zenoh and MessagePack. `t_ns` is when the
+speed held, by the clock of `t_source_ns`: for a live camera that is CLOCK_MONOTONIC of the vehicle's computer. A car
+whose computer does not share that clock sends `t_ns` 0, and the reading bears the time when it came. Each frame bears
+the readings of the second before it, {kept} at the most and then the newest; what is lost beyond is counted in the
+health of capture (`speeds_dropped`), as are messages that are no readings (`malformed`). Numbers that no car has, NaN
+among them, are no malformed message: an estimate's status tells of them. `Estimate.speed_sources` says what the metres
+rest on. [speed.md](speed.md) has files, recordings and the rest.
 
 ## What may be driven by
 
@@ -99,6 +113,8 @@ def page() -> str:
     budgets = BudgetsConfig()
     return _PAGE.format(
         bytes=MAX_MESSAGE_BYTES,
+        reading=_link(SpeedReading),
+        kept=KEPT_READINGS,
         vehicle=_VEHICLE,
         version=VERSION,
         keys=table(_keys()),

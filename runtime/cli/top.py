@@ -69,7 +69,7 @@ class Watch:
             for name in PROCESSES
             if (health := self._health(name)) is not None and health.restarts
         ]
-        return "\n".join([self._line(now_ns), head, *rows, *causes])
+        return "\n".join([self._line(now_ns), *self._car(), head, *rows, *causes])
 
     def _health(self, name: str) -> Health | None:
         message = self._healths[name].newest
@@ -90,6 +90,14 @@ class Watch:
         )
         return _line_of(cells)
 
+    def _car(self) -> list[str]:
+        """What the car has said of its speed, where it says anything."""
+        capture = self._health("capture")
+        if capture is None or not (capture.speeds or capture.malformed):
+            return []
+        lost = f"{capture.speeds_dropped} lost, {capture.malformed} malformed"
+        return [f"the car's own speed: {capture.speeds} readings, {lost}"]
+
     def _line(self, now_ns: int) -> str:
         """The newest estimate."""
         message: Message | None = self._estimates.newest
@@ -102,7 +110,8 @@ class Watch:
         return (
             f"{self._bus.vehicle}: frame {estimate.frame_id}  epoch {estimate.epoch}  "
             f"{'valid' if estimate.valid else 'NOT VALID'}  {age_ms:.0f} ms old{left}  "
-            f"tracks {len(estimate.vehicles)}  {' '.join(estimate.status)}"
+            f"tracks {len(estimate.vehicles)}  metres from {' and '.join(estimate.speed_sources) or 'nothing yet'}  "
+            f"{' '.join(estimate.status)}"
         ).rstrip()
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from birdslam.datasets.recording import RecordedFrame
 from birdslam.geometry.camera import Undistorter
 from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.nodes.car_speeds import CarSpeeds
 from birdslam.runtime.nodes.degradation import Mode
 from birdslam.runtime.nodes.sources import EndOfSource, Pacer, ReadAhead, SourceError, open_source, to_frame
 from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
@@ -53,6 +54,9 @@ class CaptureNode:
         self._ring = FrameRing(path, camera.height_px, camera.width_px, slots=configuration.runtime.ring_slots)
         self._pacer = Pacer(configuration.source.rate)
         self._estimates = bus.subscriber("estimate")
+        # Those of a file go with the frames, and a run at rate "max" is to repeat: neither hears the bus
+        own = configuration.source.speed or configuration.lossless
+        self._speeds = None if own else CarSpeeds(bus.subscriber("speed"))
         self._reader: ReadAhead | None = None
         self._next: tuple[int, RecordedFrame] | None = None
         self._quiet_since_s = 0.0
@@ -139,14 +143,16 @@ class CaptureNode:
             return
         t_capture_ns = captured.t_capture_ns
         frame = to_frame(self._undistort, captured.frame_id, captured.recorded, t_capture_ns, _utc_ns(t_capture_ns))
+        if self._speeds is not None:
+            said = self._speeds.at(frame.t_source_ns, t_capture_ns)
+            frame = replace(frame, speeds=frame.speeds or said)  # a recording's own go before
         self._sent = frame.frame_id + 1
         self._t_source_ns = frame.t_source_ns
         yield self._reference(frame)
 
     def _reference(self, frame: Frame) -> FrameRef:
-        dropped = self.counters()["dropped"]
         if frame.image is None:
-            return FrameRef(**stamps(frame), status=frame.status, dropped=dropped)
+            return FrameRef(**stamps(frame), status=frame.status, dropped=self._dropped, speeds=frame.speeds)
         slot, sequence = self._ring.write(frame.image)
         height_px, width_px = frame.image.shape[:2]
         return FrameRef(
@@ -157,8 +163,9 @@ class CaptureNode:
             width_px=width_px,
             height_px=height_px,
             channels=1 if frame.image.ndim == 2 else frame.image.shape[2],
-            dropped=dropped,
+            dropped=self._dropped,
             status=frame.status,
+            speeds=frame.speeds,
         )
 
     def _end(self) -> Message:
@@ -168,7 +175,7 @@ class CaptureNode:
             t_source_ns=self._t_source_ns,
             t_capture_ns=now_ns,
             t_utc_ns=_utc_ns(now_ns),
-            dropped=self.counters()["dropped"],
+            dropped=self._dropped,
             status=(Status.END_OF_SOURCE,),
         )
         return Message(end, Trace(), now_ns)
@@ -177,8 +184,12 @@ class CaptureNode:
         if self._over_since_s is None:
             self._over_since_s = time.monotonic()
 
+    @property
+    def _dropped(self) -> int:
+        return self._reader.dropped if self._reader else 0
+
     def counters(self) -> dict[str, int]:
-        return {"dropped": self._reader.dropped if self._reader else 0}
+        return {"dropped": self._dropped, **(self._speeds.counters() if self._speeds else {})}
 
     def close(self) -> None:
         if self._reader is not None:

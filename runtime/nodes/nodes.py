@@ -108,7 +108,7 @@ class PerceiveNode:
             if image is None:  # overwritten meanwhile: the next frame says FRAMES_DROPPED
                 self._torn += 1
                 return
-        frame = Frame(ref.frame_id, ref.t_source_ns, ref.t_capture_ns, ref.t_utc_ns, image, ref.status)
+        frame = Frame(**stamps(ref), image=image, status=ref.status, speeds=ref.speeds)
         if self._degradation is None:
             yield self._frontend.measure(frame, self._inference.start(frame))
             return

@@ -41,6 +41,10 @@ def summarise(
         "dropped_by": by,
         "torn": stations["perceive"].total("torn"),
         "malformed": sum(station.total("malformed") for station in stations.values()),
+        "car_speeds": {
+            "taken": stations["capture"].total("speeds"),
+            "dropped": stations["capture"].total("speeds_dropped"),
+        },
         "restarts": {name: station.restarts.count for name, station in stations.items()},
         **logbook.figures(),
         "budget": _budget(configuration, logbook),
@@ -87,12 +91,18 @@ def table(summary: dict[str, Any], output: Path) -> str:
         *((f"  {name}", spread(figures)) for name, figures in summary["stages_ms"].items()),
         *((f"  {name} begun anew", f"{n} times") for name, n in summary["restarts"].items() if n),
         *((f"  {status}", f"{n} frames") for status, n in summary["statuses"].items()),
+        *((f"  metres from {source}", f"{n} frames") for source, n in summary["speed_sources"].items()),
+        *(("car's readings", _readings(speeds)) for speeds in [summary["car_speeds"]] if any(speeds.values())),
         *truth_rows(summary),
         *final_rows(summary),
         *(("recorded", _recorded(recording)) for recording in [summary.get("recording")] if recording),
         ("results in", str(output)),
     ]
     return "\n".join(f"{name:24}{value}" for name, value in rows)
+
+
+def _readings(speeds: dict[str, int]) -> str:
+    return f"{speeds['taken']} taken from the bus, {speeds['dropped']} lost"
 
 
 def _recorded(recording: dict[str, Any]) -> str:

@@ -16,7 +16,7 @@ from birdslam.runtime.process.restarts import Assignment, Restarts
 from birdslam.runtime.supervision.processes import NodeLog, NodeProcess
 from birdslam.runtime.transport.presence import remove_socket, runtime_dir_of
 
-_SUMMED = ("frames", "dropped", "malformed", "torn", "coasted", "outrun")
+_SUMMED = ("frames", "dropped", "malformed", "torn", "coasted", "outrun", "speeds", "speeds_dropped")
 
 MISSED_RECORDS = 10  # in a row that a node was sent and has not taken in: fewer may be on their way
 

@@ -1,0 +1,58 @@
+"""What the car says of its own speed on the bus, as the frames of a live drive bear it."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from typing import Protocol
+
+import msgspec
+
+from birdslam.datasets.speed_log import KEPT_NS, KEPT_READINGS
+from birdslam.runtime.transport.bus import Message
+from birdslam.types import SpeedReading
+
+log = logging.getLogger(__name__)
+
+
+class Readings(Protocol):
+    """What it needs of a bus.Subscriber of the topic `speed`."""
+
+    dropped: int
+    malformed: int
+
+    def recv(self, timeout_s: float | None = None) -> Message | None: ...
+
+
+class CarSpeeds:
+    """The readings of the last second by when they came, the newest few where too many come; of fixed size."""
+
+    def __init__(self, subscriber: Readings) -> None:
+        self._subscriber = subscriber
+        self._kept: deque[tuple[int, SpeedReading]] = deque(maxlen=KEPT_READINGS)  # when it came, by CLOCK_MONOTONIC
+        self._taken = 0
+        self._told = False
+
+    def at(self, t_source_ns: int, t_capture_ns: int) -> tuple[SpeedReading, ...]:
+        """For the frame of that time; one that says no time of its own bears the time when it came."""
+        for _ in range(KEPT_READINGS):  # a flood holds no frame up
+            message = self._subscriber.recv(0.0)
+            if message is None:
+                break
+            reading: SpeedReading = message.record
+            if reading.t_ns == 0:
+                came_ns = message.t_received_ns - t_capture_ns + t_source_ns
+                reading = msgspec.structs.replace(reading, t_ns=came_ns)
+            self._kept.append((message.t_received_ns, reading))
+            self._taken += 1
+        while self._kept and self._kept[0][0] <= t_capture_ns - KEPT_NS:
+            self._kept.popleft()
+        if self._subscriber.dropped and not self._told:
+            self._told = True
+            log.warning("the car's speed: readings are lost: more come than a frame bears, or some on their way")
+        return tuple(reading for _, reading in self._kept)
+
+    def counters(self) -> dict[str, int]:
+        """Since the start, as in wire.Health."""
+        taken = self._subscriber
+        return {"speeds": self._taken, "speeds_dropped": taken.dropped, "malformed": taken.malformed}

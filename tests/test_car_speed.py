@@ -1,0 +1,326 @@
+"""What the car says of its own speed on the bus: which frames bear it, what a flood costs, and who hears of it."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgpack
+import msgspec
+import numpy as np
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.datasets.recording import RecordedFrame
+from birdslam.datasets.speed_log import KEPT_READINGS, added
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.runtime.configuration import Configuration, RecordingConfig, RuntimeConfig, SourceConfig
+from birdslam.runtime.nodes import capture
+from birdslam.runtime.nodes.capture import CaptureNode
+from birdslam.runtime.nodes.car_speeds import CarSpeeds
+from birdslam.runtime.nodes.meter import Meter
+from birdslam.runtime.nodes.recorder import Recorder, about
+from birdslam.runtime.nodes.sources import open_source
+from birdslam.runtime.process.restarts import FIRST
+from birdslam.runtime.process.vitals import Vitals
+from birdslam.runtime.recording import scene
+from birdslam.runtime.recording.recording import Recording, RecordingWriter
+from birdslam.runtime.topology import key_of
+from birdslam.runtime.transport.bus import Bus, Message
+from birdslam.runtime.wire import Trace, decode, encode
+from birdslam.types import EgoEdge, FrameRef, Measurements, SpeedReading, SpeedSource, Status
+
+CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
+MS = 1_000_000
+LIMIT_S = 60.0
+
+
+def reading(t_ns: int, speed_mps: float = 5.0) -> SpeedReading:
+    return SpeedReading(t_ns=t_ns, speed_mps=speed_mps, sigma_mps=0.1)
+
+
+class Inbox:
+    """A subscriber that a test fills; as deep as the topology says."""
+
+    malformed = 0
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._messages: deque[Message] = deque()
+
+    def come(self, record: msgspec.Struct, t_received_ns: int) -> None:
+        if len(self._messages) == KEPT_READINGS:
+            self._messages.popleft()
+            self.dropped += 1
+        self._messages.append(Message(record, Trace(), t_received_ns))
+
+    def recv(self, timeout_s: float | None = None) -> Message | None:
+        return self._messages.popleft() if self._messages else None
+
+
+def test_a_frame_bears_the_last_second_in_order_of_coming() -> None:
+    inbox = Inbox()
+    speeds = CarSpeeds(inbox)
+    said = [reading(1), reading(2_000 * MS), reading(3, math.nan), reading(3)]  # whatever times the car may say
+    for number, one in enumerate(said):
+        inbox.come(one, number * 500 * MS)
+    assert speeds.at(0, 1_400 * MS) == tuple(said[1:])  # a second before it, and what came meanwhile
+    assert speeds.at(0, 1_700 * MS) == tuple(said[2:])
+    assert speeds.at(0, 2_499 * MS) == tuple(said[3:])
+    assert speeds.at(0, 9_000 * MS) == ()
+    assert speeds.counters() == {"speeds": 4, "speeds_dropped": 0, "malformed": 0}
+
+
+def test_a_reading_without_a_time_bears_the_one_when_it_came() -> None:
+    """By the source's clock: for a camera that is CLOCK_MONOTONIC, a recording that is paced has one of its own."""
+    inbox = Inbox()
+    inbox.come(reading(0), 7_000 * MS)
+    assert CarSpeeds(inbox).at(7_030 * MS, 7_030 * MS) == (reading(7_000 * MS),)
+    inbox.come(reading(0), 7_000 * MS)
+    assert CarSpeeds(inbox).at(130 * MS, 7_030 * MS) == (reading(100 * MS),)
+
+
+def test_a_flood_leaves_the_newest_and_is_counted(caplog: pytest.LogCaptureFixture) -> None:
+    inbox = Inbox()
+    speeds = CarSpeeds(inbox)
+    for frame in range(1, 4):
+        for number in range(5_000):
+            inbox.come(reading(5_000 * frame + number), frame * 30 * MS)
+        borne = speeds.at(frame * 30 * MS, frame * 30 * MS)
+        assert [one.t_ns for one in borne] == list(range(5_000 * frame + 4_800, 5_000 * (frame + 1)))
+    assert speeds.counters()["speeds"] == 3 * KEPT_READINGS
+    assert speeds.counters()["speeds_dropped"] == 3 * (5_000 - KEPT_READINGS)
+    assert len([record for record in caplog.records if "the car's speed" in record.message]) == 1
+    stamps = {"frame_id": 1 << 40, "t_source_ns": 1 << 62, "t_capture_ns": 1 << 62, "t_utc_ns": 1 << 62}
+    full = SpeedReading(t_ns=1 << 62, speed_mps=1.5, sigma_mps=0.5, yaw_rate_radps=0.5, yaw_rate_sigma_radps=0.5)
+    assert len(encode(FrameRef(**stamps, speeds=(full,) * KEPT_READINGS))) < 32_000  # half of a message
+
+
+# --- capture ---
+
+
+class Source:
+    """A camera whose frames a test lets go, by CLOCK_MONOTONIC; or a recording."""
+
+    name, camera, rate_hz = "source", CAMERA, 10.0
+
+    def __init__(self, live: bool, speeds: tuple[SpeedReading, ...] = ()) -> None:
+        self.live, self._speeds = live, speeds
+        self.tick = threading.Semaphore(0)
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        for index in range(1_000_000):
+            self.tick.acquire()
+            t_ns = time.monotonic_ns() if self.live else index
+            pixels = None if index == 1 else np.zeros((32, 64), dtype=np.uint8)
+            yield RecordedFrame(index, t_ns, pixels, None if pixels is not None else "torn", self._speeds)
+
+
+@dataclass
+class Capture:
+    """The node at work, frame by frame."""
+
+    node: CaptureNode
+    source: Source
+    configuration: Configuration
+
+    def frame(self) -> FrameRef:
+        self.source.tick.release()
+        while (message := self.node.receive(LIMIT_S)) is None:
+            pass
+        (ref,) = self.node.step(message.record)
+        return decode(encode(ref), FrameRef)
+
+    def close(self) -> None:
+        self.source.tick.release(10)  # who reads ahead ends too
+        self.node.close()
+
+
+def capturing(monkeypatch: pytest.MonkeyPatch, place: Path, bus: Bus, source: Source, **settings: object) -> Capture:
+    monkeypatch.setattr(capture, "open_source", lambda configuration, must_open: source)
+    configuration = Configuration(
+        vehicle="car",
+        camera=CAMERA,
+        source=SourceConfig(uri="kitti:none", **settings),  # type: ignore[arg-type]
+        runtime=RuntimeConfig(runtime_dir=str(place)),
+    )
+    return Capture(CaptureNode(configuration, bus, lambda timeout_s: None, FIRST), source, configuration)
+
+
+@pytest.mark.processes
+def test_frames_bear_what_a_car_says_at_50_hz_malformed_and_flooding(
+    monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    place = tmp_path_factory.mktemp("s")
+    with ExitStack() as stack:
+        stack.enter_context(Bus("car", "supervisor", hub=True, runtime_dir=place))
+        bus = stack.enter_context(Bus("car", "capture", runtime_dir=place))
+        node = capturing(monkeypatch, place, bus, Source(live=True))
+        stack.callback(node.close)
+        car = stack.enter_context(Bus("car", "car", runtime_dir=place))
+        speed = car.publisher("speed")
+        assert speed.wait_matched(LIMIT_S)
+        block = zenoh.CongestionControl.BLOCK  # each one arrives, however busy the machine is
+        plain = car._session.declare_publisher(key_of("car", "speed"), congestion_control=block)
+
+        def until_taken(count: int) -> FrameRef:
+            """The frame that bears what has been said."""
+            until_s = time.monotonic() + LIMIT_S
+            while time.monotonic() < until_s:
+                ref = node.frame()
+                if node.node.counters()["speeds"] >= count:
+                    return ref
+            raise AssertionError("nothing came")
+
+        assert node.frame().speeds == ()
+        t_ns = time.monotonic_ns()
+        said = [reading(t_ns + number * 20 * MS, 5.0 + number) for number in range(10)]
+        for one in said:
+            speed.put(one)
+        assert until_taken(10).speeds == tuple(said)
+        assert node.frame().speeds == tuple(said)  # a dropped frame loses none
+
+        for wrong in (b"", b"\xc1", msgpack.packb({"t_ns": 1}), msgpack.packb([1, 2.0]), bytes(5_000)):
+            plain.put(wrong)
+        plain.put(msgpack.packb({"t_ns": 0, "speed_mps": math.nan, "sigma_mps": 0.1}))  # is what a sensor says
+        last = until_taken(11).speeds[-1]
+        assert math.isnan(last.speed_mps)
+        assert t_ns < last.t_ns <= time.monotonic_ns()
+        assert node.node.counters()["malformed"] == 5
+
+        for number in range(5_000):
+            plain.put(encode(reading(t_ns, float(number))))
+        most, counters, until_s = 0, node.node.counters(), time.monotonic() + LIMIT_S
+        while counters["speeds"] + counters["speeds_dropped"] < 11 + 5_000:
+            ref = node.frame()
+            most, counters = max(most, len(ref.speeds)), node.node.counters()
+            assert time.monotonic() < until_s, counters
+        assert most == KEPT_READINGS
+        assert counters["dropped"] == ref.dropped == 0  # no frame is
+        health = Meter("capture", node.configuration, FIRST).health(time.monotonic_ns(), "full", counters)
+        assert (health.malformed, health.speeds_dropped) == (5, counters["speeds_dropped"])
+
+
+class FakeBus:
+    """Says which topics somebody has asked for."""
+
+    def __init__(self) -> None:
+        self.inboxes: dict[str, Inbox] = {}
+
+    def subscriber(self, topic: str, depth: int | None = None) -> Inbox:
+        return self.inboxes.setdefault(topic, Inbox())
+
+
+def test_a_recordings_own_readings_go_before_those_of_the_bus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    own, bus = (reading(0, 7.0),), FakeBus()
+    for name, speeds, wanted in (("own", own, own), ("none", (), (reading(3),))):
+        node = capturing(monkeypatch, tmp_path / name, bus, Source(False, speeds), rate=1e4)  # type: ignore[arg-type]
+        for frame in range(2):  # the second is torn, and bears them too
+            bus.inboxes["speed"].come(reading(3), time.monotonic_ns())
+            assert node.frame().speeds[-1:] == wanted, frame
+        node.close()
+
+
+@pytest.mark.parametrize("settings", [{"rate": "max"}, {"speed": "speed.csv"}])
+def test_a_run_that_repeats_hears_nothing_on_the_bus(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, settings: dict[str, object]
+) -> None:
+    bus = FakeBus()
+    node = capturing(monkeypatch, tmp_path, bus, Source(False, (reading(4),)), **settings)  # type: ignore[arg-type]
+    assert node.frame().speeds == (reading(4),)
+    assert "speed" not in bus.inboxes
+    node.close()
+
+
+# --- in a recording ---
+
+
+class RecorderBus(FakeBus):
+    """And lets the recorder say how it is."""
+
+    def publisher(self, topic: str) -> RecorderBus:
+        return self
+
+    def put(self, record: msgspec.Struct) -> None: ...
+
+    def on_alive(self, callback: object) -> None: ...
+
+
+@given(st.lists(st.integers(0, 3), max_size=12), st.data())
+def test_what_a_frame_adds_is_what_came_since_the_one_before(said: list[int], data: st.DataObject) -> None:
+    """Of a car that says something else each time; one that repeats itself may be taken to have said it once."""
+    readings = [reading(number, math.nan if kind == 0 else float(kind)) for number, kind in enumerate(said)]
+    begin = data.draw(st.integers(0, len(said)))
+    end = data.draw(st.integers(begin, len(said)))
+    later = data.draw(st.integers(begin, end))
+    before, after = tuple(readings[begin:end]), tuple(readings[later:])
+    before, after = (tuple(decode(encode(one), SpeedReading) for one in span) for span in (before, after))
+    assert added(before, after) == after[end - later :]
+
+
+def test_a_recording_gives_its_frames_the_readings_that_they_bore(tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap"
+    recorded = Configuration(recording=RecordingConfig(file=str(path), images=True), camera=CAMERA)
+    writer = RecordingWriter(path, about(recorded, {}), CAMERA, flush_ms=1e-3, sync=False)
+    bus = RecorderBus()
+    recorder = Recorder(Configuration(), bus, writer, Vitals())  # type: ignore[arg-type]
+    refs = []
+    said = tuple(reading(n * 10 * MS, math.nan if n % 7 == 3 else float(n)) for n in range(30))
+    for number in range(6):
+        t_ns, bore = number * 30 * MS, said[3 * number : 3 * number + 5]
+        ref = FrameRef(frame_id=number, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, speeds=bore)
+        refs.append(ref)
+        if number == 3:
+            continue  # it never came to the recorder
+        bus.inboxes["frame"].come(ref, t_ns)
+        recorder.record_received(0.0)
+        writer.draw(*scene.from_image(np.zeros((32, 64), dtype=np.uint8), 90, t_ns), t_ns)
+    writer.close({})
+
+    def borne(**settings: object) -> list[bytes]:
+        source = open_source(Configuration(source=SourceConfig(uri=f"mcap:{path}", **settings)))  # type: ignore[arg-type]
+        times = {"t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0}
+        return [encode(FrameRef(frame_id=f.index, speeds=f.speeds, **times)) for f in source.frames()]
+
+    def wanted(number: int, speeds: tuple[SpeedReading, ...]) -> bytes:
+        return encode(FrameRef(frame_id=number, speeds=speeds, t_source_ns=0, t_capture_ns=0, t_utc_ns=0))
+
+    assert borne() == [wanted(n, ref.speeds if n != 3 else ()) for n, ref in enumerate(refs)]
+    assert borne(stride=2) == [wanted(n, refs[2 * n].speeds) for n in range(3)]
+    (tmp_path / "speed.csv").write_text("0.01 7\n")
+    own = SpeedReading(t_ns=10 * MS, speed_mps=7.0, sigma_mps=0.1)
+    assert borne(speed=str(tmp_path / "speed.csv")) == [wanted(n, (own,) if n else ()) for n in range(6)]
+
+    drawn = [msgspec.json.decode(message.data) for message in Recording(path).messages(("/speed",))]
+    once = (*said[:11], *said[12:20])  # one that only the lost frame bore is not there
+    assert [one["t_ns"] for one in drawn] == [r.t_ns for r in once]
+    assert [one["speed_mps"] for one in drawn] == [None if math.isnan(r.speed_mps) else r.speed_mps for r in once]
+
+
+# --- what the metres rest on ---
+
+
+def test_an_estimate_says_what_its_metres_rest_on() -> None:
+    graph = PoseGraph(GraphConfig(), WeightsConfig())
+    said = []
+    for frame in range(4):
+        stamps = {"frame_id": frame, "t_source_ns": 30 * MS * frame, "t_capture_ns": 0, "t_utc_ns": 0}
+        cov = (1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-6)
+        edge = EgoEdge(from_frame=frame - 1, to_frame=frame, T_from_to=SE2(0.3, 0.0, 0.0), cov=cov) if frame else None
+        if frame == 3:
+            made = Measurements(**stamps, status=(Status.COASTING, Status.PERCEPTION_LATE))
+        else:
+            made = Measurements(**stamps, cc=edge, speed_sources=(SpeedSource.ROAD, SpeedSource.CAR)[: frame + 1])
+        said.append(graph.optimise(made).speed_sources)
+    assert said == [("road",), ("road", "car"), ("road", "car"), ("carried",)]
