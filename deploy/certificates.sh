@@ -1,8 +1,9 @@
 #!/bin/sh
-# Certificates for the gate: an authority of your own, the vehicle's certificate, and one for each planner.
+# Certificates for the gate: an authority of your own, the vehicle's certificate, one for each planner, and the car's.
 #
 #   certificates.sh DIR vehicle ADDRESS...   ca.pem, vehicle.pem, vehicle.key; ADDRESS: names and IPs planners connect to
 #   certificates.sh DIR planner NAME         NAME.pem, NAME.key; NAME must stand in gate.json5 (cert_common_names)
+#   certificates.sh DIR car                  car.pem, car.key: of the computer that says how fast the car is
 #
 # What exists is kept: remove a file to make it anew. ca.key can sign whatever the vehicle believes: keep it elsewhere.
 set -eu
@@ -40,7 +41,8 @@ certificate() { # FILE COMMON_NAME ALTERNATIVE_NAMES USAGE
     echo "$dir/$1.pem and its key are made"
 }
 
-[ $# -ge 3 ] || fail "usage: certificates.sh DIR vehicle ADDRESS... | certificates.sh DIR planner NAME"
+[ $# -ge 3 ] || [ "${2-}" = car ] ||
+    fail "usage: certificates.sh DIR vehicle ADDRESS... | certificates.sh DIR planner NAME | certificates.sh DIR car"
 dir=$1 what=$2
 shift 2
 mkdir -p "$dir"
@@ -64,12 +66,16 @@ vehicle)
     ;;
 planner)
     case $1 in
-    *[!A-Za-z0-9_-]* | ca | vehicle) fail "a planner's name has letters, digits, '_' and '-', and is not $1" ;;
+    *[!A-Za-z0-9_-]* | ca | vehicle | car) fail "a planner's name has letters, digits, '_' and '-', and is not $1" ;;
     esac
     authority
     certificate "$1" "$1" "DNS:$1" clientAuth
     ;;
-*) fail "$what: expected vehicle or planner" ;;
+car)
+    authority
+    certificate car "the car" "DNS:car" clientAuth # a name that no planner's certificate has
+    ;;
+*) fail "$what: expected vehicle, planner or car" ;;
 esac
 
 chmod 644 "$dir"/*.pem

@@ -27,11 +27,11 @@ from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import load
 from birdslam.runtime.gate import GateError, gate_config
 from birdslam.runtime.supervision.query_server import QueryServer
-from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, key_of
+from birdslam.runtime.topology import CAR, PROCESSES, QUERIES, TOPICS, alive_key, key_of
 from birdslam.runtime.transport.bus import Bus, Publisher, Subscriber
 from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
 from birdslam.runtime.wire import MAX_TRACE_BYTES, Health, Trace, WireError, decode, encode
-from birdslam.types import Estimate, MapUpdate
+from birdslam.types import Estimate, MapUpdate, SpeedReading
 from tests.mutations import Chance, mutated
 from tests.test_bus import estimate, measurements, until
 
@@ -52,12 +52,13 @@ def certificate(folder: Path, *what: str) -> None:
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`planner` and `stranger` of the vehicle's authority; in `other`, a planner and a vehicle of another one."""
+    """`planner`, `stranger` and `car` of the vehicle's authority; in `other`, a planner and a vehicle of another."""
     folder = tmp_path_factory.mktemp("tls")
     for place in (folder, folder / "other"):
         certificate(place, "vehicle", "127.0.0.1", "localhost")
         certificate(place, "planner", "planner")
     certificate(folder, "planner", "stranger")
+    certificate(folder, "car")
     return folder
 
 
@@ -159,7 +160,7 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Ite
         nodes = {name: stack.enter_context(Bus("car", name, runtime_dir=base)) for name in PROCESSES}
         for node in nodes.values():
             node.declare_alive()
-        publishers = {t: nodes[TOPICS[t].producer].publisher(t) for t in TOPICS if t != "frame"}
+        publishers = {t: nodes[TOPICS[t].producer].publisher(t) for t in TOPICS if t not in ("frame", *CAR.sends)}
         gate = subprocess.Popen(
             [
                 *(sys.executable, "-P", "-m", "birdslam.runtime.gate", str(base / "car.toml"), str(path)),
@@ -207,6 +208,8 @@ def test_the_gates_file_speaks_of_the_topology_and_of_nothing_else() -> None:
     access = json.loads(config.get_json("access_control"))
     alive = zenoh.KeyExpr(alive_key("car", "optimize"))
     for rule in access["rules"]:
+        if rule["key_exprs"] == ["birdslam/*/v1/speed"]:
+            continue  # see the test of the car
         allowed = [zenoh.KeyExpr(key) for key in rule["key_exprs"]]
         readable = {t for t in TOPICS if any(key.includes(zenoh.KeyExpr(key_of("car", t))) for key in allowed)}
         assert readable == READABLE, rule["id"]
@@ -257,7 +260,8 @@ def test_nobody_outside_writes(vehicle: Vehicle, certificates: Path) -> None:
         for listener in vehicle.listeners.values():
             while listener.recv(0.0):
                 pass
-        valid = {"estimate": estimate(9_999), "measurements": measurements(9_999)}
+        said = SpeedReading(t_ns=9_999, speed_mps=9.0, sigma_mps=0.1)
+        valid = {"estimate": estimate(9_999), "measurements": measurements(9_999), "speed": said}
         publishers = {topic: session.declare_publisher(key_of("car", topic)) for topic in TOPICS}
         token = session.liveliness().declare_token(alive_key("car", "impostor"))
         queryable = session.declare_queryable("birdslam/car/v1/**", lambda query: query.reply(query.key_expr, b"lie"))
@@ -285,6 +289,78 @@ def test_nobody_outside_writes(vehicle: Vehicle, certificates: Path) -> None:
             assert b"lie" not in [bytes(reply.ok.payload) for reply in asked if reply.ok], topic
         queryable.undeclare()
         token.undeclare()
+
+
+@needs_openssl
+def test_the_car_alone_says_its_speed_and_nothing_else(vehicle: Vehicle, certificates: Path) -> None:
+    """Beside it a planner with all its rights, and whoever is not on the list."""
+    with outside(certificates, vehicle.port, "car") as car, ExitStack() as others:
+        heard = Heard()
+        heard.listen(others.enter_context(outside(certificates, vehicle.port, "car")))
+        publishers = {topic: car.declare_publisher(key_of("car", topic)) for topic in TOPICS}
+        token = car.liveliness().declare_token(alive_key("car", "impostor"))
+        liars = [others.enter_context(outside(certificates, vehicle.port, name)) for name in ("planner", "stranger")]
+        reading = SpeedReading(t_ns=77, speed_mps=12.5, sigma_mps=0.1)
+        lie = SpeedReading(t_ns=9_999, speed_mps=40.0, sigma_mps=0.1)
+        came: list[int] = []
+
+        def comes() -> bool:
+            for liar in liars:
+                liar.put(key_of("car", "speed"), encode(lie))
+            for topic, publisher in publishers.items():
+                publisher.put(encode(reading if topic == "speed" else estimate(9_999)))
+            car.delete(key_of("car", "speed"))
+            message = vehicle.listeners["speed"].recv(0.1)
+            came.extend([message.record.t_ns] if message else [])
+            return len(came) >= 5
+
+        until(comes, "readings of the car")
+        vehicle.say_all(77)
+        until_heard(vehicle.listeners["estimate"], 77)
+        assert set(came) == {77}
+        for topic, listener in vehicle.listeners.items():
+            assert listener.malformed == 0, topic
+            while (message := listener.recv(0.0)) is not None:
+                assert getattr(message.record, "frame_id", 0) != 9_999, topic
+        assert not heard.keys
+        assert not heard.alive
+        assert "impostor" not in vehicle.nodes["capture"].alive
+        assert answers(car, "estimate", 0.3) == answers(car, "map", 0.3) == 0
+        token.undeclare()
+
+
+@needs_openssl
+def test_the_example_of_a_car(vehicle: Vehicle, certificates: Path, tmp_path: Path) -> None:
+    """From elsewhere by its certificate, and on the vehicle's own sockets."""
+    text = (DEPLOY / "car.json5").read_text().replace(":7447", f":{vehicle.port}")
+    text = re.sub(r'"(ca|car)\.(pem|key)"', lambda m: json.dumps(str(certificates / m[0].strip('"'))), text)
+    (tmp_path / "car.json5").write_text(text)
+    hub = socket_path(runtime_dir_of("car", vehicle.base), "hub")
+    for where, turn in ((tmp_path / "car.json5", None), (hub, -0.5)):
+        example = subprocess.Popen(
+            [sys.executable, str(ROOT / "docs" / "examples" / "car_speed.py"), str(where)],
+            stdin=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            assert example.stdin is not None
+            found: list[SpeedReading] = []
+
+            def comes(example: Any = example, found: list[SpeedReading] = found, turn: float | None = turn) -> bool:
+                example.stdin.write(f"12.5{'' if turn is None else f' {turn}'}\n")
+                example.stdin.flush()
+                message = vehicle.listeners["speed"].recv(0.1)
+                found.extend([message.record] if message else [])
+                return bool(found)
+
+            until(comes, "a reading of car_speed.py")
+            assert (found[0].speed_mps, found[0].yaw_rate_radps) == (12.5, turn)
+            assert (found[0].t_ns == 0) == (turn is None)
+        finally:
+            example.kill()
+            example.communicate()
+        while vehicle.listeners["speed"].recv(0.3) is not None:
+            pass
 
 
 @needs_openssl
@@ -418,6 +494,8 @@ def test_certificates_are_kept_and_made_only_by_the_authority(certificates: Path
         ("planner", "../up"),
         ("planner", "ca"),
         ("planner", "vehicle"),
+        ("planner", "car"),
+        ("planner", "the car"),
         ("vehicle", "a,b"),
         ("other", "x"),
         (),
@@ -445,6 +523,15 @@ def test_certificates_are_kept_and_made_only_by_the_authority(certificates: Path
         ("vehicle.key", "missing.key", "missing.key"),
         ('link_protocols: ["tls"], cert_common_names: ["planner"]', 'link_protocols: ["tls"]', "certificate"),
         ('"declare_subscriber", "query"', '"declare_subscriber", "put", "query"', "lets put in"),
+        ('cert_common_names: ["the car"]', 'cert_common_names: ["planner"]', "'what the car says' lets put in"),
+        ('cert_common_names: ["the car"]', 'cert_common_names: ["the car", "planner"]', "lets put in"),
+        ('subjects: ["the car"]', 'subjects: ["the car", "planners"]', "lets put in"),
+        (
+            'messages: ["put"],\n        key_exprs: ["birdslam/*/v1/speed"',
+            'messages: ["put"], key_exprs: ["**"',
+            "put in",
+        ),
+        ('flows: ["ingress"],\n        messages: ["put"]', 'messages: ["put", "delete"]', "lets delete, put in"),
         ("adminspace: {", "adminspaced: {", "gate.json5"),
         ("{\n", "", "gate.json5"),
     ],
