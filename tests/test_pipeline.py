@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from birdslam.datasets.opening import open_recording
+from birdslam.datasets.speed_file import read_speeds
 from birdslam.runtime.cli.evaluate_odometry import _pipeline
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import load
@@ -29,7 +30,7 @@ from birdslam.runtime.replay.replay import compare
 from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.wire import decode, encode
-from birdslam.types import INVALIDATING, Estimate, MapUpdate, Measurements, Status
+from birdslam.types import INVALIDATING, Estimate, FrameRef, MapUpdate, Measurements, Status
 
 pytestmark = pytest.mark.processes
 
@@ -231,9 +232,19 @@ def test_evaluation_drive_and_replay_agree_on_motions_that_no_car_makes(drive: P
 
 
 def test_three_processes_give_the_bytes_of_one(drive: Path, place: Path) -> None:
-    offline = evaluate(drive, place / "a")
-    run = run_all(place, drive, "--rate", "max", *WITH_NETWORKS)
+    """With what the car says of its speed, a sensor's failure among it."""
+    speed, file = place / "speed.csv", place / "three.mcap"
+    speed.write_text("".join(f"{0.02 * n:.2f} {'nan' if n == 30 else 8.0}\n" for n in range(60)))
+    offline = evaluate(drive, place / "a", "--speed", str(speed))
+    run = run_all(place, drive, "--rate", "max", "--speed", str(speed), "--record", str(file), *WITH_NETWORKS)
     assert (run.output / "ego.kitti.txt").read_bytes() == offline
+    refs = [decode(message.data, FrameRef) for message in Recording(file).messages(("v1/frame",))]
+    log = read_speeds(speed)
+    for ref in refs[:FRAMES]:
+        wanted = msgspec.structs.replace(ref, speeds=log.until(ref.t_source_ns))
+        assert encode(ref) == encode(wanted)
+        assert wanted.speeds
+    assert compare(Recording(file)).same
     assert len(offline.splitlines()) == FRAMES
     summary = run.summary()
     assert (summary["frames_in"], summary["frames_processed"], summary["frames_dropped"]) == (FRAMES, FRAMES, 0)
