@@ -39,6 +39,8 @@ if TYPE_CHECKING:  # the same names, for editors and mypy; a test holds them to 
     from birdslam.types import Frame as Frame
     from birdslam.types import MapUpdate as MapUpdate
     from birdslam.types import Measurements as Measurements
+    from birdslam.types import SpeedReading as SpeedReading
+    from birdslam.types import SpeedSource as SpeedSource
     from birdslam.types import Status as Status
     from birdslam.types import VehicleEstimate as VehicleEstimate
 
@@ -59,6 +61,8 @@ _MODULES = {
     "Recording": "birdslam.datasets.recording",
     "SE2": "birdslam.geometry.se2",
     "SlamConfig": "birdslam.slam",
+    "SpeedReading": "birdslam.types",
+    "SpeedSource": "birdslam.types",
     "Status": "birdslam.types",
     "Undistorter": "birdslam.geometry.camera",
     "VehicleEstimate": "birdslam.types",

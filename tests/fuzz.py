@@ -1,7 +1,7 @@
 """Mutated bytes at every target: `make fuzz`, or `python -m tests.fuzz --cases 1000000 --seed 6`.
 
 Targets are the messages of the bus, what a subscriber, a planner and the optimizer make of them, references to frames
-in shared memory, and the files that a user gives: configuration, camera, manifest. Whatever comes in is either
+in shared memory, and the files that a user gives: configuration, camera, manifest, speed. Whatever comes in is either
 accepted, and then is a whole valid record that can be sent on, or refused with the one exception that the target is
 there to raise. Anything else ends the run with status 1 and the case that did it. The same seed gives the same cases.
 """
@@ -29,6 +29,7 @@ import zenoh
 from birdslam.datasets.camera_file import load_camera
 from birdslam.datasets.kitti import read_image, read_projection, read_times
 from birdslam.datasets.recording import DatasetError
+from birdslam.datasets.speed_file import read_speeds
 from birdslam.geometry.camera import Camera
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.perception.manifest import Manifest, ModelError
@@ -45,6 +46,7 @@ from tests.mutations import Chance, mutated, mutated_text, with_other_fields
 from tests.test_wire import BY_NAME, EXAMPLES
 
 ROOT = Path(__file__).resolve().parent.parent
+SPEEDS = "# t v\n0 12.5\n0.02, 12.6, 0.05\n0.04, 12.7, , -0.01, 0.002\n0.06, nan\n"
 Target = Callable[[Chance], bool]  # makes a case and tries it; whether it was let in
 
 
@@ -241,6 +243,11 @@ def _read_camera(path: Path) -> None:
     assert msgspec.convert(msgspec.to_builtins(camera), Camera) == camera
 
 
+def _read_speeds(path: Path) -> None:
+    log = read_speeds(path)
+    assert log.until(max(reading.t_ns for reading in log.readings))
+
+
 def _read_manifest(path: Path) -> None:
     assert isinstance(read_manifest(path), Manifest)
 
@@ -296,7 +303,7 @@ def _cameras() -> list[str]:
 
 def targets(folder: Path) -> Iterator[tuple[str, float, Callable[[], object]]]:
     """Name, share of all cases, and what makes the target."""
-    yield "bytes of messages", 0.585, bytes_of_messages
+    yield "bytes of messages", 0.575, bytes_of_messages
     yield "fields of messages", 0.17, fields_of_messages
     yield "optimizer", 0.02, optimizer
     yield "subscribers and planner", 0.13, subscribers
@@ -306,6 +313,7 @@ def targets(folder: Path) -> Iterator[tuple[str, float, Callable[[], object]]]:
     times = "".join(f"{0.1 * i:e}\n" for i in range(8))
     projections = "".join(f"P{i}: 700 0 300 {-i} 0 700 100 0 0 0 1 0\n" for i in range(2))
     for name, share, goods, read, refusal in (
+        ("speed files", 0.01, [SPEEDS], _read_speeds, DatasetError),
         ("recordings' text files", 0.01, [times, projections], _read_recording, DatasetError),
         ("configuration files", 0.02, _configurations(), _read_configuration, ConfigurationError),
         ("camera files", 0.02, _cameras(), _read_camera, DatasetError),

@@ -18,7 +18,7 @@ from birdslam.evaluation.results import Recorder, ResultsError, Thinned, claim_d
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import read_kitti, read_tum
-from birdslam.types import Attitude, Estimate, MapUpdate, Status, VehicleEstimate
+from birdslam.types import Attitude, Estimate, MapUpdate, SpeedSource, Status, VehicleEstimate
 
 CAMERA = Camera(640, 192, 400.0, 400.0, 320.0, 96.0, 1.65, pitch_rad=0.01)
 COV3, COV2 = (0.0,) * 9, (0.0,) * 4
@@ -88,6 +88,16 @@ def test_a_drive(tmp_path: Path) -> None:
     assert (summary["frames"], summary["tracks"], summary["epochs"], summary["path_m"]) == (30, 2, 1, 29.0)
     assert summary["age_ms"] == {"p50": None, "p99": 3.0}
     assert summary["path"] == "x"
+
+
+def test_what_the_metres_rest_on_is_counted(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, CAMERA)
+    road, car, carried = SpeedSource.ROAD, SpeedSource.CAR, SpeedSource.CARRIED
+    for k, sources in enumerate([(), (road,), (road, car), (road, car), (carried,)]):
+        recorder.add(estimate(k, SE2(), speed_sources=sources))
+    recorder.finish({})
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["speed_sources"] == {"car": 2, "carried": 1, "road": 3}
 
 
 def test_a_changed_class_or_size_is_said_once(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from birdslam.runtime.configuration import BudgetsConfig, Configuration
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.wire import Health, Spread, Stage, Trace
-from birdslam.types import Estimate, Status
+from birdslam.types import Estimate, SpeedSource, Status
 
 pytestmark = pytest.mark.processes
 
@@ -44,6 +44,9 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
                 dropped=42,
                 restarts=2 * (name == "perceive"),
                 cause="was killed by SIGKILL" if name == "perceive" else "",
+                speeds=4_900 * (name == "capture"),
+                speeds_dropped=7 * (name == "capture"),
+                malformed=2 * (name == "capture"),
                 status=(Status.INPUT_STALE,) if name == "capture" else (),
             )
             bus.publisher(f"health/{name}").put(health)
@@ -65,6 +68,7 @@ def estimate() -> Estimate:
         cov=(0.0,) * 9,
         valid=False,
         status=(Status.CAMERA_DARK,),
+        speed_sources=(SpeedSource.ROAD, SpeedSource.CAR),
     )
 
 
@@ -82,6 +86,8 @@ def test_the_table_says_how_every_node_is(vehicle: Path) -> None:
     assert "frame 123  epoch 3  NOT VALID" in text
     assert "25 ms of its budget left" in text
     assert "camera_dark" in text
+    assert "metres from road and car" in text
+    assert "the car's own speed: 4900 readings, 7 lost, 2 malformed" in text
     assert "stale" in row(text, "capture")
     perceive = row(text, "perceive")
     for cell in ("alive", "34.0", "1.5 / 2.5", "77", "41", "42"):
@@ -95,7 +101,7 @@ def test_once_prints_one_table_without_control_characters(vehicle: Path) -> None
     out = io.StringIO()
     assert top("car", vehicle, once=True, out=out) == 0
     assert "\x1b" not in out.getvalue()
-    assert len(out.getvalue().splitlines()) == 6
+    assert len(out.getvalue().splitlines()) == 7
 
 
 def test_without_a_vehicle_it_says_so(tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -248,7 +248,7 @@ def _source(configuration: Configuration) -> Iterator[Finding]:
         source = open_source(configuration)
         first = next(source.frames())
     except (ConfigurationError, DatasetError, SourceError) as error:
-        yield Finding("camera", "error", str(error), "check the cable, the camera file, and the group 'video'")
+        yield Finding("camera", "error", str(error), "check the cable, the files, and the group 'video'")
         return
     except StopIteration:
         yield Finding("camera", "error", f"{source.name}: has no frame", "record it anew, or name another source")
