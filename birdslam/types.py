@@ -83,7 +83,7 @@ class SpeedReading(msgspec.Struct, frozen=True, kw_only=True):
     Plausibility is judged where readings are used: a wrong one is told of by a status, it is no malformed record.
     """
 
-    t_ns: int  # when it held, by the frames' t_source_ns; on the bus 0: when it came
+    t_ns: int  # when it held, by the frames' t_source_ns; in topic `speed` by CLOCK_MONOTONIC, 0: when it came
     speed_mps: float  # along the car's x axis, < 0 backwards
     sigma_mps: float  # 1-sigma of its noise, without the scale factor that the tyres make
     yaw_rate_radps: float | None = None  # counter-clockwise; None: the car does not say

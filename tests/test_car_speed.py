@@ -75,20 +75,23 @@ def test_a_frame_bears_the_last_second_in_order_of_coming() -> None:
     said = [reading(1), reading(2_000 * MS), reading(3, math.nan), reading(3)]  # whatever times the car may say
     for number, one in enumerate(said):
         inbox.come(one, number * 500 * MS)
-    assert speeds.at(0, 1_400 * MS) == tuple(said[1:])  # a second before it, and what came meanwhile
-    assert speeds.at(0, 1_700 * MS) == tuple(said[2:])
-    assert speeds.at(0, 2_499 * MS) == tuple(said[3:])
-    assert speeds.at(0, 9_000 * MS) == ()
+    for t_ns, wanted in ((1_400 * MS, said[1:]), (1_700 * MS, said[2:]), (2_499 * MS, said[3:]), (9_000 * MS, [])):
+        assert speeds.at(t_ns, t_ns) == tuple(wanted)  # a second before it, and what came meanwhile
     assert speeds.counters() == {"speeds": 4, "speeds_dropped": 0, "malformed": 0}
 
 
 def test_a_reading_without_a_time_bears_the_one_when_it_came() -> None:
     """By the source's clock: for a camera that is CLOCK_MONOTONIC, a recording that is paced has one of its own."""
+    said = (reading(0), reading(6_990 * MS), reading(-(1 << 63)), reading((1 << 64) - 1))
     inbox = Inbox()
-    inbox.come(reading(0), 7_000 * MS)
-    assert CarSpeeds(inbox).at(7_030 * MS, 7_030 * MS) == (reading(7_000 * MS),)
-    inbox.come(reading(0), 7_000 * MS)
-    assert CarSpeeds(inbox).at(130 * MS, 7_030 * MS) == (reading(100 * MS),)
+    for one in said:
+        inbox.come(one, 7_000 * MS)
+    assert CarSpeeds(inbox).at(7_030 * MS, 7_030 * MS) == (reading(7_000 * MS), *said[1:])
+    for one in said:
+        inbox.come(one, 7_000 * MS)
+    borne = CarSpeeds(inbox).at(130 * MS, 7_030 * MS)
+    assert [one.t_ns for one in borne[:2]] == [100 * MS, 90 * MS]
+    assert encode(FrameRef(frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, speeds=borne))  # of whatever clock
 
 
 def test_a_flood_leaves_the_newest_and_is_counted(caplog: pytest.LogCaptureFixture) -> None:
@@ -224,11 +227,11 @@ class FakeBus:
 
 def test_a_recordings_own_readings_go_before_those_of_the_bus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     own, bus = (reading(0, 7.0),), FakeBus()
-    for name, speeds, wanted in (("own", own, own), ("none", (), (reading(3),))):
+    for name, speeds in (("own", own), ("none", ())):
         node = capturing(monkeypatch, tmp_path / name, bus, Source(False, speeds), rate=1e4)  # type: ignore[arg-type]
         for frame in range(2):  # the second is torn, and bears them too
-            bus.inboxes["speed"].come(reading(3), time.monotonic_ns())
-            assert node.frame().speeds[-1:] == wanted, frame
+            bus.inboxes["speed"].come(reading(3, 3.0), time.monotonic_ns())
+            assert node.frame().speeds[-1].speed_mps == (7.0 if own == speeds else 3.0), frame
         node.close()
 
 

@@ -12,6 +12,7 @@ from birdslam.types import NS_PER_S, SpeedReading
 
 KEPT_NS = NS_PER_S  # a frame bears the readings of so long before it
 KEPT_READINGS = 200  # and no more of them: the newest
+_MOST_NS = (1 << 63) - 1
 
 
 class SpeedLog:
@@ -29,6 +30,11 @@ class SpeedLog:
         """Those of the last second that had come by `t_ns` (as t_source_ns of a frame), in order of coming."""
         begin, end = bisect_right(self._come_ns, t_ns - KEPT_NS), bisect_right(self._come_ns, t_ns)
         return self.readings[max(begin, end - KEPT_READINGS) : end]
+
+
+def shifted(reading: SpeedReading, by_ns: int) -> SpeedReading:
+    """By another clock. Whatever its computer may say, the time stays one of 63 bits."""
+    return msgspec.structs.replace(reading, t_ns=max(-_MOST_NS, min(reading.t_ns + by_ns, _MOST_NS)))
 
 
 def added(before: tuple[SpeedReading, ...], after: tuple[SpeedReading, ...]) -> tuple[SpeedReading, ...]:

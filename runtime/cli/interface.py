@@ -63,8 +63,9 @@ is its reason as text. A reader of `estimate` or `health/*` that comes late asks
 
 A car that knows the speed of its wheels may send `speed`, each {reading} as a plain MessagePack map, 20 to 100 times a
 second; [examples/car_speed.py](examples/car_speed.py) does, with nothing but zenoh and MessagePack. `t_ns` is when the
-speed held, by the clock of `t_source_ns`: for a live camera that is CLOCK_MONOTONIC of the vehicle's computer. A car
-whose computer does not share that clock sends `t_ns` 0, and the reading bears the time when it came. Each frame bears
+speed held, by CLOCK_MONOTONIC of the vehicle's computer, as `t_capture_ns`; a live camera's `t_source_ns` is of that
+clock too, and beside a paced recording capture puts readings into the recording's. A car whose computer does not share
+it sends `t_ns` 0, and the reading bears the time when it came. Each frame bears
 the readings of the second before it, {kept} at the most and then the newest; what is lost beyond is counted in the
 health of capture (`speeds_dropped`), as are messages that are no readings (`malformed`). Numbers that no car has, NaN
 among them, are no malformed message: an estimate's status tells of them. `Estimate.speed_sources` says what the metres

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import msgspec
 
-from birdslam.datasets.speed_log import KEPT_NS, KEPT_READINGS
+from birdslam.datasets.speed_log import KEPT_NS, KEPT_READINGS, shifted
 from birdslam.runtime.transport.bus import Message
 from birdslam.types import SpeedReading
 
@@ -34,15 +34,20 @@ class CarSpeeds:
         self._told = False
 
     def at(self, t_source_ns: int, t_capture_ns: int) -> tuple[SpeedReading, ...]:
-        """For the frame of that time; one that says no time of its own bears the time when it came."""
+        """For the frame of that time.
+
+        The car goes by CLOCK_MONOTONIC, as a live camera does; a reading of time 0 bears the time when it came. Beside
+        a recording that is paced they come into its clock.
+        """
         for _ in range(KEPT_READINGS):  # a flood holds no frame up
             message = self._subscriber.recv(0.0)
             if message is None:
                 break
             reading: SpeedReading = message.record
             if reading.t_ns == 0:
-                came_ns = message.t_received_ns - t_capture_ns + t_source_ns
-                reading = msgspec.structs.replace(reading, t_ns=came_ns)
+                reading = msgspec.structs.replace(reading, t_ns=message.t_received_ns)
+            if t_source_ns != t_capture_ns:
+                reading = shifted(reading, t_source_ns - t_capture_ns)
             self._kept.append((message.t_received_ns, reading))
             self._taken += 1
         while self._kept and self._kept[0][0] <= t_capture_ns - KEPT_NS:

@@ -14,18 +14,17 @@ from pathlib import Path
 from typing import Protocol
 
 import cv2
-import msgspec
 import numpy as np
 
 from birdslam.datasets.opening import open_recording
 from birdslam.datasets.recording import RecordedFrame, Recording, undistorted
 from birdslam.datasets.speed_file import with_speeds
+from birdslam.datasets.speed_log import shifted
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, SourceConfig
-from birdslam.types import Frame, SpeedReading, Status
+from birdslam.types import Frame, Status
 
 SOURCES = "kitti:DIR, video:FILE, mcap:FILE, demo, v4l2:/dev/videoN or rtsp://HOST/PATH"
-_LAST_NS = (1 << 63) - 1  # as a car's computer may say that is out of its mind
 LIVE_RATE_HZ = 30.0  # of a camera that does not say
 
 log = logging.getLogger(__name__)
@@ -115,19 +114,13 @@ class RecordedSource:
                     shift_ns = self._resume_ns - frame.t_source_ns
                 first_ns = frame.t_source_ns if first_ns is None else first_ns
                 last_ns = frame.t_source_ns
-                yield replace(frame, t_source_ns=frame.t_source_ns + shift_ns, speeds=_later(frame.speeds, shift_ns))
+                speeds = tuple(shifted(reading, shift_ns) for reading in frame.speeds) if shift_ns else frame.speeds
+                yield replace(frame, t_source_ns=frame.t_source_ns + shift_ns, speeds=speeds)
             if not self._config.loop or first_ns is None or last_ns is None or shift_ns is None:
                 return
             if start:  # the next pass begins at frame 0, whose time lies before this pass's first
                 first_ns, start = next(iter(self.recording.frames())).t_source_ns, 0
             shift_ns += last_ns - first_ns + round(1e9 / self.rate_hz)
-
-
-def _later(speeds: tuple[SpeedReading, ...], shift_ns: int) -> tuple[SpeedReading, ...]:
-    """In a loop the car's readings stay beside their frames."""
-    if not shift_ns:
-        return speeds
-    return tuple(msgspec.structs.replace(one, t_ns=min(one.t_ns + shift_ns, _LAST_NS)) for one in speeds)
 
 
 class CameraSource:
