@@ -102,6 +102,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     status: tuple[Status, ...] = ()  # INPUT_STALE: this node has received nothing for too long
     coasted: _Count = 0  # of optimize: frames that it had to estimate without measurements
     outrun: _Count = 0  # of optimize: measurements that came when a newer frame had been coasted over
+    looks: _Count = 0  # of perceive: frames on which a network was begun
     speeds: _Count = 0  # of capture: readings of the car's own speed that have come on the bus
     speeds_dropped: _Count = 0  # of capture: of them, those beyond what a frame bears, and those lost on their way
 

@@ -169,6 +169,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         status=(Status.INPUT_STALE,),
         coasted=4,
         outrun=1,
+        looks=2350,
         speeds=4900,
         speeds_dropped=7,
     ),

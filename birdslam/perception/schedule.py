@@ -124,6 +124,7 @@ class Networks:
         ]
         self._last_frame = -1
         self.sparing = 1
+        self.looks = 0  # frames on which a head was begun
 
     def start(self, frame_id: int, image: NDArray[np.uint8] | None, only: Collection[Role] | None = None) -> Pending:
         """Starts the heads that are due, of the roles in `only` (None: all).
@@ -135,6 +136,7 @@ class Networks:
         if frame_id <= self._last_frame:
             self._slots = [_Slot(s.head, s.fills, s.running, outdated=s.running is not None) for s in self._slots]
         self._last_frame = frame_id
+        begun = False
         for slot in self._slots:
             every = slot.head.schedule.every * self.sparing
             due = slot.started_frame is None or frame_id - slot.started_frame >= every
@@ -142,6 +144,8 @@ class Networks:
             if image is not None and due and wanted and slot.running is None:
                 slot.running = self._submit(slot.head.run, image)
                 slot.started_frame = frame_id
+                begun = True
+        self.looks += begun
         return _Started(self, frame_id)
 
     def _collect(self, frame_id: int) -> Perception:

@@ -157,7 +157,8 @@ class PerceiveNode:
         """Ends with END_OF_SOURCE, as ever."""
 
     def counters(self) -> dict[str, int]:
-        return {"dropped": self._frames.dropped, "malformed": self._frames.malformed, "torn": self._torn}
+        frames, looks = self._frames, self._inference.networks.looks
+        return {"dropped": frames.dropped, "malformed": frames.malformed, "torn": self._torn, "looks": looks}
 
     def close(self) -> None:
         self._inference.close()

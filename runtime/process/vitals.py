@@ -15,7 +15,7 @@ import numpy as np
 COUNTERS = (
     *("beat_ns", "prepared", "ready", "ended"),
     *("frames", "dropped", "malformed", "torn"),
-    *("next_frame", "t_source_ns", "t_capture_ns", "coasted", "outrun", "speeds", "speeds_dropped"),
+    *("next_frame", "t_source_ns", "t_capture_ns", "coasted", "outrun", "looks", "speeds", "speeds_dropped"),
 )
 
 

@@ -39,6 +39,7 @@ def summarise(
         "frames_processed": logbook.recorded,
         "frames_dropped": sum(by.values()),
         "dropped_by": by,
+        "looks": stations["perceive"].total("looks"),  # frames on which networks were begun
         "torn": stations["perceive"].total("torn"),
         "malformed": sum(station.total("malformed") for station in stations.values()),
         "car_speeds": {
@@ -86,6 +87,7 @@ def table(summary: dict[str, Any], output: Path) -> str:
             f"{summary['frames_dropped']} dropped{by}",
         ),
         ("rate", f"{summary['rate_hz']:.2f} Hz"),
+        ("networks began on", f"{summary['looks']} frames"),
         ("age at the planner", spread(summary["age_ms"])),
         ("  of its budget", budget),
         *((f"  {name}", spread(figures)) for name, figures in summary["stages_ms"].items()),
