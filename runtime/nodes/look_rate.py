@@ -67,7 +67,9 @@ class LookRate:
     def __init__(self, config: LooksConfig, costs: Mapping[str, Cost], cores: float, period_ms: float) -> None:
         self._config, self._period_ms, self._cores = config, period_ms, cores
         often = min((cost.every for cost in costs.values()), default=1)
-        self.most = max(1, int(1e3 / (period_ms * often * config.least_hz)))
+        most = max(1, int(1e3 / (period_ms * often * config.least_hz)))
+        slight = (n for n in range(1, most) if load(costs, period_ms, n) <= config.slight_load)
+        self.most = next(slight, most)
         room = config.room_share * max(cores - FRONT_END_CORES, 0.25)
         fits = (n for n in range(1, self.most + 1) if load(costs, period_ms, n) <= room)
         self.sparing = next(fits, self.most)
