@@ -14,10 +14,18 @@ from hypothesis import strategies as st
 
 from birdslam.datasets.opening import open_recording
 from birdslam.datasets.recording import DatasetError, RecordedFrame, Recording
-from birdslam.datasets.speed_file import SIGMA_MPS, YAW_RATE_SIGMA_RADPS, read_speed_curve, read_speeds, with_speeds
+from birdslam.datasets.speed_file import (
+    SIGMA_MPS,
+    YAW_RATE_SIGMA_RADPS,
+    of_sequence,
+    read_speed_curve,
+    read_speeds,
+    with_speeds,
+)
 from birdslam.datasets.speed_log import KEPT_NS, KEPT_READINGS, SpeedLog
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.cli.main import main
+from birdslam.runtime.cli.options import speeds_of
 from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_source
 from birdslam.types import SpeedReading
@@ -141,6 +149,15 @@ def test_a_speed_file_is_asked_for_by_the_configuration(tmp_path: Path) -> None:
     live = Configuration(camera=CAMERA, source=SourceConfig(uri="v4l2:/dev/video0", speed=str(path)))
     with pytest.raises(ConfigurationError, match="on the bus"):
         open_source(live)
+
+
+def test_several_drives_have_a_file_each(tmp_path: Path) -> None:
+    asked = Configuration(source=SourceConfig(speed=str(file(tmp_path, "0 1\n"))))
+    assert speeds_of(asked, 1) == tmp_path / "speed.csv"
+    with pytest.raises(ConfigurationError, match=r"for 2 give a directory of their NAME\.txt"):
+        speeds_of(asked, 2)
+    assert speeds_of(Configuration(source=SourceConfig(speed=str(tmp_path))), 2) == tmp_path
+    assert of_sequence(tmp_path, "06") == tmp_path / "06.txt"
 
 
 def test_bad_speed_files_of_an_evaluation_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

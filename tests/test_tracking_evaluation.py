@@ -17,10 +17,11 @@ from msgspec.structs import replace
 from birdslam.baselines.trajectories import Trajectories
 from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.datasets.recording import DatasetError
+from birdslam.datasets.speed_log import SpeedLog
 from birdslam.evaluation import ablation, tables
 from birdslam.evaluation.tables import Published, read_published
 from birdslam.evaluation.tracking import EGO, PAPER, Live, Row, Truth, make_log, methods, ours, run_trial, summarise
-from birdslam.frontend import FrontEndConfig
+from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.weights import weighted
@@ -29,10 +30,10 @@ from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.evaluate_tracking import PUBLISHED, evaluate
 from birdslam.runtime.cli.parser import METHODS, build_parser
 from birdslam.runtime.cli.tracking_job import frames_of
-from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig
 from birdslam.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig, Walk, fit_drift
 from birdslam.slam import SlamConfig
-from birdslam.types import Measurements
+from birdslam.types import Frame, Measurements, SpeedReading
 
 FRAMES = range(40)
 
@@ -402,6 +403,29 @@ def test_a_mistake_is_named(tmp_path: Path, arguments: list[str], said: str) -> 
     asked = options("tracking", str(root), *arguments, "--jobs", "1", "--output", str(tmp_path / "out"))
     with pytest.raises((ConfigurationError, DatasetError), match=said):
         evaluate(asked, Configuration())
+
+
+def test_a_speed_file_is_for_the_images_alone(tmp_path: Path) -> None:
+    root = tracking_world.write(tmp_path / "root")
+    asked = options("tracking", str(root), "--odometry", "truth", "--output", str(tmp_path / "out"))
+    beside = Configuration(source=SourceConfig(speed=str(tmp_path)))
+    with pytest.raises(ConfigurationError, match="the odometry is truth"):
+        evaluate(asked, beside)
+
+
+def test_the_log_bears_the_cars_speed(sequence: TrackingSequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[SpeedReading, ...]] = []
+
+    def measure(self: FrontEnd, frame: Frame, pending: object) -> Measurements:
+        seen.append(frame.speeds)
+        return Measurements(frame_id=frame.frame_id, t_source_ns=0, t_capture_ns=0, t_utc_ns=0)
+
+    monkeypatch.setattr(FrontEnd, "measure", measure)
+    log = SpeedLog([SpeedReading(t_ns=30_000_000 * n, speed_mps=8.0, sigma_mps=0.1) for n in range(20)])
+    nothing = Ready(Perception([], None, {}, ()))
+    make_log(sequence, range(2, 5), None, lambda frame, image: nothing, None, FrontEndConfig(), log)
+    assert seen == [log.until(k * 100_000_000) for k in range(2, 5)]
+    assert seen[0]
 
 
 def test_the_papers_frames_are_the_first(sequence: TrackingSequence, published: Published) -> None:

@@ -53,6 +53,11 @@ def read_speed_curve(path: Path) -> NDArray[np.float64]:
     return np.array([(reading.t_ns / NS_PER_S, reading.speed_mps) for _, reading in lines])
 
 
+def of_sequence(path: Path, name: str) -> Path:
+    """The speed file of a sequence: in a directory the one of its name."""
+    return path / f"{name}.txt" if path.is_dir() else path
+
+
 def with_speeds(recording: Recording, path: Path) -> Recording:
     """The recording with the car's speeds of a file, which go before its own. Raises DatasetError.
 

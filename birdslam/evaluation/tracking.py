@@ -19,6 +19,7 @@ from birdslam.baselines import batch_se3, cubeslam, nair, namdev
 from birdslam.baselines.trajectories import LiveTrajectories, Trajectories
 from birdslam.datasets.kitti import KITTI_RATE_HZ
 from birdslam.datasets.kitti_tracking import VEHICLE_KINDS, TrackingSequence
+from birdslam.datasets.speed_log import SpeedLog
 from birdslam.evaluation.tracking_metrics import (
     BoxFrame,
     PathErrors,
@@ -132,17 +133,20 @@ def make_log(
     perceive: Callable[[int, NDArray[np.uint8]], Pending],
     images: Callable[[int], NDArray[np.uint8] | None] | None,
     config: FrontEndConfig,
+    speeds: SpeedLog | None = None,
 ) -> list[Measurements]:
     """The front end's measurements of `frames`; frame ids are KITTI's.
 
-    `images` gives a frame's image, None where it is unreadable; without `images` the odometry needs none.
+    `images` gives a frame's image, None where it is unreadable; without `images` the odometry needs none. `speeds` are
+    the car's own, by the frames' time from 0 on.
     """
     frontend, log = FrontEnd(sequence.camera, config, odometry), []
     for index in frames:
         image = NO_IMAGE if images is None else images(index)
         t_ns = round(index / KITTI_RATE_HZ * NS_PER_S)
         pending = perceive(index, NO_IMAGE if image is None else image)
-        m = frontend.measure(Frame(index, t_ns, t_ns, t_ns, image), pending)
+        said = () if speeds is None else speeds.until(t_ns)
+        m = frontend.measure(Frame(index, t_ns, t_ns, t_ns, image, speeds=said), pending)
         if isinstance(odometry, SimulatedOdometry) and m.ground is not None:
             ground = GroundPlane(m.ground.height_m, m.ground.pitch_rad, m.ground.roll_rad)
             m = replace(m, cp=odometry.landmarks(index, ground, config.static_map))

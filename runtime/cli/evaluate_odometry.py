@@ -14,9 +14,9 @@ import msgspec
 
 from birdslam.datasets.opening import open_recording
 from birdslam.datasets.recording import Recording
-from birdslam.datasets.speed_file import with_speeds
+from birdslam.datasets.speed_file import of_sequence, with_speeds
 from birdslam.evaluation.odometry import OdometryReport, evaluate_recordings
-from birdslam.runtime.cli.options import configuration_of
+from birdslam.runtime.cli.options import configuration_of, speeds_of
 from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, complete
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
@@ -97,7 +97,7 @@ def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
         raise ConfigurationError(f"two sequences are named {twice[0]}: their results would overwrite each other")
     if source.speed:
         for recording in recordings:
-            with_speeds(recording, _speed_file(Path(source.speed).expanduser(), recordings, recording.name))
+            with_speeds(recording, of_sequence(speeds_of(configuration, len(recordings)), recording.name))
     if not configuration.models.in_use():
         print(WITHOUT_MODELS)
     with _pipeline(configuration) as drive:
@@ -109,15 +109,6 @@ def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
         )
     print(f"results in {configuration.output}")
     return reports
-
-
-def _speed_file(path: Path, recordings: list[Recording], name: str) -> Path:
-    """Of one recording: the file itself, or its own in a directory."""
-    if path.is_dir():
-        return path / f"{name}.txt"
-    if len(recordings) > 1:
-        raise ConfigurationError(f"{path}: is the speed of one drive: for several give a directory with their NAME.txt")
-    return path
 
 
 def _with_progress(drive: Drive) -> Drive:

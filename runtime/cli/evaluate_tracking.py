@@ -22,6 +22,7 @@ from birdslam.evaluation.results import claim_directory
 from birdslam.evaluation.tracking import Row
 from birdslam.evaluation.tracking_picture import draw_runtime
 from birdslam.evaluation.tracking_report import Outcome, Setting, render_report
+from birdslam.runtime.cli.options import speeds_of
 from birdslam.runtime.cli.parser import METHODS
 from birdslam.runtime.cli.tracking_job import Job, frames_to_make, run_sequence
 from birdslam.runtime.configuration import Configuration, ConfigurationError
@@ -77,6 +78,10 @@ def _jobs(options: argparse.Namespace, configuration: Configuration) -> list[Job
     detections = options.detections or ("rrc" if (root / "det_02_rrc").is_dir() else "network")
     if odometry == "images" and not with_images:
         raise ConfigurationError(f"--odometry images: {root} has no image_02 of every sequence")
+    if configuration.source.speed:
+        speeds_of(configuration, len(set(sequences)))
+        if odometry != "images":
+            raise ConfigurationError(f"--speed: the odometry is {odometry}, and fuses none; --odometry images does")
     if detections == "network":
         if not with_images:
             raise ConfigurationError(f"--detections network: {root} has no image_02 of every sequence")

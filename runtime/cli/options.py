@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from birdslam.runtime import model_store
@@ -31,6 +32,14 @@ def configuration_of(options: argparse.Namespace) -> Configuration:
         if value is not None:
             overrides[keys.get(name, name)] = _number(value) if name == "rate" else value
     return load(options.config, overrides, named)
+
+
+def speeds_of(configuration: Configuration, drives: int) -> Path:
+    """The car's own speed in so many drives: a file of one, or a directory. Raises ConfigurationError."""
+    path = Path(configuration.source.speed).expanduser()
+    if drives > 1 and not path.is_dir():
+        raise ConfigurationError(f"{path}: is the speed of one drive: for {drives} give a directory of their NAME.txt")
+    return path
 
 
 def _number(text: str) -> float | str:

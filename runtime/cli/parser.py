@@ -200,7 +200,7 @@ def _odometry(evaluate: Commands) -> None:
         parser.add_argument("sequences", nargs="+", metavar="SEQUENCE_DIR", help="a KITTI directory, or a source's URI")
         _add_config(parser)
         parser.add_argument("--frames", default=":", metavar="FIRST:END", help="compare these alone; all are driven")
-        parser.add_argument("--speed", metavar="FILE|DIR", help="the car's own speed; DIR: NAME.txt of each sequence")
+        _add_speeds(parser)
         _add_pipeline(parser)
         parser.set_defaults(command=command)
 
@@ -219,6 +219,7 @@ def _tracking(evaluate: Commands) -> None:
             "--odometry", default="", metavar="images|simulate|truth|FILE", help="FILE: KITTI rows of camera 0"
         )
         parser.add_argument("--detections", default="", metavar="rrc|network|DIR", help="DIR: as det_02_rrc")
+        _add_speeds(parser)
         parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help="of the simulated odometry")
         parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
         _add_config(parser)
@@ -261,6 +262,10 @@ def _add_pipeline(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame of a recording")
     parser.add_argument("--output", metavar="DIR", help="where results go")
     _add_settings(parser, "any key, e.g. perceive.deadline_ms=25")
+
+
+def _add_speeds(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--speed", metavar="FILE|DIR", help="the car's own speed; DIR: NAME.txt of each sequence")
 
 
 def _add_vehicle(parser: argparse.ArgumentParser) -> None:

@@ -17,6 +17,7 @@ from birdslam.baselines import batch_se3
 from birdslam.datasets.kitti import find_images, read_image
 from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.datasets.recording import DatasetError
+from birdslam.datasets.speed_file import of_sequence, read_speeds
 from birdslam.evaluation import ablation
 from birdslam.evaluation.tables import Published
 from birdslam.evaluation.tracking import (
@@ -155,6 +156,8 @@ def _log_maker(
         except (KeyError, ValueError):
             return None
 
+    beside = job.configuration.source.speed
+    speeds = read_speeds(of_sequence(Path(beside).expanduser(), sequence.name)) if beside else None
     network = job.detections == "network"
     folder = job.root / "det_02_rrc" if job.detections == "rrc" else Path(job.detections)
     found = [] if network else read_detections(folder, sequence.name, len(sequence))
@@ -174,7 +177,7 @@ def _log_maker(
             frame_made()
             return perceive(frame, image)
 
-        return make_log(sequence, frames, odometry, counted, image_of if looks else None, config)
+        return make_log(sequence, frames, odometry, counted, image_of if looks else None, config, speeds)
 
     return make
 
