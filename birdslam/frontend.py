@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import msgspec
@@ -17,7 +18,17 @@ from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
 from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
 from birdslam.perception import Perception
-from birdslam.types import EgoEdge, Frame, Ground, LandmarkEdge, Measurements, MotionEdge, Status, VehicleEdge
+from birdslam.types import (
+    EgoEdge,
+    Frame,
+    Ground,
+    LandmarkEdge,
+    Measurements,
+    MotionEdge,
+    SpeedReading,
+    Status,
+    VehicleEdge,
+)
 from birdslam.vehicles.camera_height import HeightWatch, HeightWatchConfig
 from birdslam.vehicles.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
@@ -63,6 +74,7 @@ class EgoMotion(Protocol):
         t_source_ns: int,
         vehicle_boxes_px: NDArray[np.float64],
         road_mask: NDArray[np.bool_] | None,
+        speeds: Sequence[SpeedReading],
     ) -> Motion | None: ...
 
     @property
@@ -128,6 +140,7 @@ class FrontEnd:
             attitude=self._reckoning.attitude,
             ground=Ground(height_m=ground.height_m, pitch_rad=ground.pitch_rad, roll_rad=ground.roll_rad),
             scale_sigma_rel=0.0 if motion is None else motion.scale_sigma_rel,
+            speed_sources=() if motion is None else motion.speed_sources,
             ages=dict(perception.ages if lanes.age is None else perception.ages | {"lanes": lanes.age}),
         )
         return self._plausibility.admit(measurements)
@@ -140,7 +153,9 @@ class FrontEnd:
     def _move(self, frame: Frame, tracks: Any, perception: Perception) -> tuple[Motion | None, EgoEdge | None]:
         """The ego's motion in metres and its CC edge; None where no motion to an earlier frame is known."""
         road = None if perception.segmentation is None else perception.segmentation.road
-        motion = self.odometry.estimate(tracks, frame.frame_id, frame.t_source_ns, _boxes_px(perception), road)
+        motion = self.odometry.estimate(
+            tracks, frame.frame_id, frame.t_source_ns, _boxes_px(perception), road, frame.speeds
+        )
         if motion is None:
             self._lanes.clear()
             return None, None

@@ -20,6 +20,10 @@ class Status(enum.StrEnum):
     MOTION_IMPLAUSIBLE = "motion_implausible"  # a motion of no car, or a long blindness; until all is steady again
     STANDSTILL = "standstill"  # the car stands: the pose is held
     GROUND_VIOLATED = "ground_violated"  # the road does not fit the ground plane
+    CAR_SPEED_LATE = "car_speed_late"  # the car's newest reading of its speed is old: it is let go on
+    CAR_SPEED_MISSING = "car_speed_missing"  # the car told its speed before and does not any more: it is not used
+    CAR_SPEED_IMPLAUSIBLE = "car_speed_implausible"  # it is no car's, or the images contradict it: it is not used
+    CAR_SPEED_FROZEN = "car_speed_frozen"  # it is the same number again and again, and the images contradict it
     VIEW_OBSTRUCTED = "view_obstructed"  # something stands still in the image while the car drives; it is left out
     CALIBRATION_DRIFT = "calibration_drift"  # the estimated pitch or height left the calibrated one
     DETECTIONS_CARRIED = "detections_carried"  # the detector did not run on this frame

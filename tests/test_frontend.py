@@ -59,7 +59,9 @@ class ScriptedOdometry:
     def track(self, image: np.ndarray) -> None:
         assert image is IMAGE
 
-    def estimate(self, tracks: None, frame_id: int, t_ns: int, boxes: np.ndarray, road: Any) -> Motion | None:
+    def estimate(
+        self, tracks: None, frame_id: int, t_ns: int, boxes: np.ndarray, road: Any, speeds: Any
+    ) -> Motion | None:
         self.boxes.append(boxes)
         return self.script.get(frame_id)
 

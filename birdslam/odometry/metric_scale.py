@@ -6,6 +6,7 @@ The scale comes from the known height of the camera over the road. Two strategie
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.pose import Pose
+from birdslam.odometry.car_scale import CarStep
 from birdslam.odometry.road_alignment import RoadFit
 from birdslam.odometry.sliding_window import SlidingWindow
-from birdslam.types import Status
+from birdslam.types import SpeedReading, SpeedSource, Status
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,7 @@ class RoadView:
     road_mask: NDArray[np.bool_] | None  # (H, W), may be some images old
     window: SlidingWindow  # its newest keyframe is this image
     near_px: float = 0.0  # how far corners on the near road have moved since the last image: in no unit of length
+    interval_ns: tuple[int, int] = (0, 0)  # of the motion, by t_source_ns
 
 
 class MetricScale(Protocol):
@@ -58,8 +61,21 @@ class MetricScale(Protocol):
     def turned_unseen(self) -> None:
         """The odometry lost sight of how the camera turned."""
 
+    def hear(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:
+        """The car's own speed, as it had come by the frame of this time."""
+
+    def car_step(self, from_ns: int, to_ns: int) -> CarStep | None:
+        """The car's motion by its own readings; None where there are none that can be trusted."""
+
     def measure_scale(self, step: Pose, view: RoadView) -> float:
         """The factor on all lengths, about the present camera, after a motion T_prev_curr of `step`."""
 
     def status(self) -> list[Status]:
         """What is wrong with the scale."""
+
+    def car_status(self) -> list[Status]:
+        """What is wrong with the car's own speed."""
+
+    @property
+    def sources(self) -> tuple[SpeedSource, ...]:
+        """What the metres rest on."""

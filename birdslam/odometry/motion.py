@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.se2 import SE2
-from birdslam.types import Status
+from birdslam.types import SpeedSource, Status
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -33,6 +33,7 @@ class MotionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     coast_speed_mps: Positive = 0.3  # uncertainty of the last measured speed
     coast_yaw_rate_radps: Positive = 0.01  # uncertainty of the last measured yaw rate
     unknown_speed_mps: Positive = 10.0  # where none was ever measured
+    turn_fades_s: Positive = 1.0  # where the car tells its speed and no yaw rate, and images show nothing
 
 
 class Motion(msgspec.Struct, frozen=True):
@@ -54,6 +55,7 @@ class Motion(msgspec.Struct, frozen=True):
     pitch_sigma_rad: float
     standstill: bool
     status: tuple[Status, ...]
+    speed_sources: tuple[SpeedSource, ...] = ()
 
 
 def planar(step: Pose, ground: GroundPlane) -> SE2:
@@ -64,6 +66,13 @@ def planar(step: Pose, ground: GroundPlane) -> SE2:
     t = to_ego @ step.p
     c, s = math.cos(yaw), math.sin(yaw)
     return SE2(float(c * t[0] - s * t[1]), float(s * t[0] + c * t[1]), yaw)
+
+
+def on_plane(motion: SE2, ground: GroundPlane) -> Pose:
+    """T_prev_curr of the camera, given the motion of ego on the road: `planar`'s inverse where the tilt stays."""
+    R, (c, s) = ground.R_ego_cam, (math.cos(motion.yaw_rad), math.sin(motion.yaw_rad))
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return Pose(R.T @ turn @ R, R.T @ np.array([motion.x_m, motion.y_m, 0.0]))
 
 
 def measured_cov(
@@ -85,6 +94,17 @@ def measured_cov(
 def standing_cov(config: MotionConfig) -> Floats:
     """(3, 3) of a pose that is held: small, since all images of one stop are compared with the same one."""
     return np.diag([config.standing_sigma_m**2, config.standing_sigma_m**2, config.standing_sigma_rad**2])
+
+
+def car_cov(config: MotionConfig, motion: SE2, sigma_m: float, scale_sigma_rel: float, yaw_sigma_rad: float) -> Floats:
+    """(3, 3) of a motion by the car's own readings: errors of its length, of its scale, and of its turn on an arc."""
+    xy = np.array([motion.x_m, motion.y_m, 0.0])
+    length = math.hypot(motion.x_m, motion.y_m)
+    floor = config.sigma_floor_m**2 + config.sigma_path_rel**2 * length**2
+    turn = np.array([-0.5 * motion.y_m, 0.5 * motion.x_m, 1.0])
+    yaw = yaw_sigma_rad**2 + config.sigma_floor_rad**2
+    out: Floats = np.diag([floor + sigma_m**2, floor, 0.0]) + yaw * np.outer(turn, turn)
+    return out + scale_sigma_rel**2 * np.outer(xy, xy)
 
 
 def coasting_cov(

@@ -11,6 +11,7 @@ last for a second to win, and some 20 m of a street in town, over which the visu
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.road_alignment import RoadFit
 from birdslam.odometry.road_filter import RoadScaleConfig
 from birdslam.odometry.road_points import on_road
-from birdslam.types import Status
+from birdslam.types import SpeedReading, SpeedSource, Status
 
 Floats = NDArray[np.float64]
 
@@ -75,6 +76,21 @@ class MedianScale:
 
     def turned_unseen(self) -> None:
         """Nothing here follows the camera's tilt."""
+
+    def hear(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:
+        """The paper has the road alone."""
+
+    def car_step(self, from_ns: int, to_ns: int) -> None:
+        """None: the paper has the road alone."""
+
+    def car_status(self) -> list[Status]:
+        """Nothing: the paper has the road alone."""
+        return []
+
+    @property
+    def sources(self) -> tuple[SpeedSource, ...]:
+        """The road, or an older scale of it."""
+        return (SpeedSource.CARRIED if Status.SCALE_CARRIED in self.status() else SpeedSource.ROAD,)
 
     def measure_scale(self, step: Pose, view: RoadView) -> float:
         """The factor by which the moving median has changed; 1 where no frame has given a scale yet."""

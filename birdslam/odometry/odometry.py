@@ -10,6 +10,8 @@ stays the one that all later ones are compared with until they differ.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -20,11 +22,21 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
 from birdslam.geometry.se2 import SE2
+from birdslam.odometry.car_scale import CarStep
 from birdslam.odometry.features import FeatureConfig, FeatureTracker, Tracks
 from birdslam.odometry.guided_two_view import guided_two_view
 from birdslam.odometry.keyframes import KeyframeConfig, KeyframeWindow
 from birdslam.odometry.metric_scale import MetricScale, RoadView
-from birdslam.odometry.motion import Motion, MotionConfig, coasting_cov, measured_cov, planar, standing_cov
+from birdslam.odometry.motion import (
+    Motion,
+    MotionConfig,
+    car_cov,
+    coasting_cov,
+    measured_cov,
+    on_plane,
+    planar,
+    standing_cov,
+)
 from birdslam.odometry.moving_median import MedianScale
 from birdslam.odometry.relative_pose import locate, two_view
 from birdslam.odometry.road_alignment import RoadAligner, RoadFit
@@ -33,7 +45,7 @@ from birdslam.odometry.road_points import on_road, outside
 from birdslam.odometry.road_scale import RoadScale
 from birdslam.odometry.standstill import StandstillConfig, near_displacement_px, stands
 from birdslam.odometry.start_search import StartSearch, StartSearchConfig
-from birdslam.types import Status
+from birdslam.types import SpeedReading, SpeedSource, Status
 
 __all__ = ["Motion", "Odometry", "OdometryConfig", "Tracks"]
 
@@ -46,6 +58,7 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 _MIN_INTERVAL_S = 0.004
 _STILL = Pose(np.eye(3), np.zeros(3))
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step that two images alone show: 1 cm, 0.25 deg
+_CAR_LENGTH_M = 0.05  # of a first step that the car's own speed gives
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
 _STRATEGIES: dict[str, type[RoadScale] | type[MedianScale]] = {"kalman": RoadScale, "paper": MedianScale}
 
@@ -106,6 +119,7 @@ class Odometry:
         self._pose = _STILL  # of the base image, in the window's frame
         self._base_frame: int | None = None  # the last image whose motion was measured
         self._base_t_ns = 0
+        self._base_seen = True  # False: no image shows where the base was, the car's own speed alone led there
         self._velocity: _Velocity | None = None
         self._guess: Pose | None = None  # of the step to the present image, where it had to be searched for
         self._interval_s = 0.1
@@ -159,28 +173,47 @@ class Odometry:
     # --- motion ---
 
     def estimate(
-        self, tracks: Tracks, frame_id: int, t_source_ns: int, vehicle_boxes_px: Floats, road_mask: Bools | None = None
+        self,
+        tracks: Tracks,
+        frame_id: int,
+        t_source_ns: int,
+        vehicle_boxes_px: Floats,
+        road_mask: Bools | None = None,
+        speeds: Sequence[SpeedReading] = (),
     ) -> Motion | None:
         """The motion since the last measured image; None for the very first image, and before one could be used.
 
-        `vehicle_boxes_px` (N, 4) is x1, y1, x2, y2; `road_mask` (H, W) may be some images old.
+        `vehicle_boxes_px` (N, 4) is x1, y1, x2, y2; `road_mask` (H, W) may be some images old; `speeds` are the car's
+        own that had come by this image, in any order, those of earlier images again or not.
         """
+        self._scale.hear(speeds, t_source_ns)
         boxes_px = np.asarray(vehicle_boxes_px, dtype=np.float64).reshape(-1, 4)
         blind = [Status.CAMERA_DARK] * tracks.dark + [Status.CAMERA_FROZEN] * tracks.frozen
         if self._base_frame is None:
             if not blind:
                 self._begin(tracks, frame_id, t_source_ns, boxes_px)
+            elif self._scale.car_step(t_source_ns - round(_MIN_INTERVAL_S * 1e9), t_source_ns) is not None:
+                self._begin_unseen(frame_id, t_source_ns)
             return None
         dt_s = (t_source_ns - self._base_t_ns) * 1e-9
         if dt_s < _MIN_INTERVAL_S:  # a clock that stands or steps back must not make a speed
             dt_s = self._interval_s
+        car = self._scale.car_step(t_source_ns - round(dt_s * 1e9), t_source_ns)
         if blind:
-            return self._coast(frame_id, dt_s, blind)
+            motion = self._coast(frame_id, dt_s, blind, car)
+            if car is not None and (dt_s > self.config.max_coast_s or not self._base_seen):
+                self._begin_unseen(frame_id, t_source_ns)
+            return motion
+        if not self._base_seen:
+            motion = self._coast(frame_id, dt_s, [], car)
+            self._begin(tracks, frame_id, t_source_ns, boxes_px)
+            self._scale.turned_unseen()
+            return motion
 
         corners = self._static_corners(tracks, boxes_px)
-        located = self._relative_pose(corners, dt_s)
+        located = self._relative_pose(corners, dt_s, car)
         if located is None:
-            motion = self._coast(frame_id, dt_s, [Status.LOW_TEXTURE])
+            motion = self._coast(frame_id, dt_s, [Status.LOW_TEXTURE], car)
             if dt_s > self.config.max_coast_s or len(corners.displacement_px) < self.config.min_fitting:
                 # Nothing links this image to the base any more: the window begins anew here, at the coasted pose.
                 self._begin(tracks, frame_id, t_source_ns, boxes_px)
@@ -188,12 +221,13 @@ class Odometry:
             return motion
         pose, info = located
         near_px = near_displacement_px(self.camera, self._scale.ground, self._tracker.base, tracks, boxes_px)
-        if self._stands(self._pose.between(pose), corners, near_px, dt_s):
+        if self._stands(self._pose.between(pose), corners, near_px, dt_s, car):
             # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.
             motion = self._stand(frame_id)
         else:
             pose = self._window.extend(frame_id, pose, corners.ids, corners.xy)  # bundle adjustment
-            step = self._scale_to_metres(pose, tracks, boxes_px, road_mask, near_px)
+            interval_ns = (t_source_ns - round(dt_s * 1e9), t_source_ns)
+            step = self._scale_to_metres(pose, tracks, boxes_px, road_mask, near_px, interval_ns)
             motion = self._move(frame_id, step, info, dt_s)
             self._tracker.accept(tracks)
         self._base_frame, self._base_t_ns = frame_id, t_source_ns
@@ -207,8 +241,14 @@ class Odometry:
         self._pose = _STILL
         static = outside(tracks.px, boxes_px)
         self._window.append(frame_id, self._pose, tracks.ids[static], self.camera.to_xy(tracks.px[static]))
-        self._base_frame, self._base_t_ns = frame_id, t_source_ns
+        self._base_frame, self._base_t_ns, self._base_seen = frame_id, t_source_ns, True
         self._scale.restart(tracks.image, self._pose, 0.3)
+
+    def _begin_unseen(self, frame_id: int, t_source_ns: int) -> None:
+        """What the car's own speed led to is the base: images have shown nothing for too long to come back to them."""
+        self._tracker.reset()
+        self._window, self._pose = self._new_window(), _STILL
+        self._base_frame, self._base_t_ns, self._base_seen = frame_id, t_source_ns, False
 
     def _new_window(self) -> KeyframeWindow:
         return KeyframeWindow(self._focal_px, self.config)
@@ -222,7 +262,7 @@ class Odometry:
 
     # --- relative pose ---
 
-    def _relative_pose(self, corners: _Corners, dt_s: float) -> tuple[Pose, Floats] | None:
+    def _relative_pose(self, corners: _Corners, dt_s: float, car: CarStep | None) -> tuple[Pose, Floats] | None:
         """The present image's pose in the window's frame and its information (6, 6); None where it is not known."""
         cfg, window, ids = self.config, self._window, corners.ids
         searched = [] if self._guess is None else [self._pose @ self._guess]
@@ -240,9 +280,9 @@ class Odometry:
             travelled_m = float(np.linalg.norm(best[1].p - self._pose.p))
             if travelled_m <= cfg.max_speed_mps * dt_s + 0.1:
                 return best[1], best[2]
-        return self._two_view_pose(corners, dt_s)
+        return self._two_view_pose(corners, dt_s, car)
 
-    def _two_view_pose(self, corners: _Corners, dt_s: float) -> tuple[Pose, Floats] | None:
+    def _two_view_pose(self, corners: _Corners, dt_s: float, car: CarStep | None) -> tuple[Pose, Floats] | None:
         """Starts the window anew from the base image and this one."""
         cfg, displacement_px = self.config, corners.displacement_px
         base = self._tracker.base
@@ -261,6 +301,8 @@ class Odometry:
         length = speed * dt_s if speed * dt_s > 0.05 else 0.5
         if self._guess is not None:
             length = float(np.linalg.norm(self._guess.p))
+        if car is not None and abs(car.forward_m) > _CAR_LENGTH_M:
+            length = abs(car.forward_m)
         frame = self._base_frame if self._base_frame is not None else 0
         self._window = self._new_window()
         self._window.append(frame, self._pose, base.ids[a], xy_a)
@@ -280,11 +322,17 @@ class Odometry:
     # --- metric scale ---
 
     def _scale_to_metres(
-        self, pose: Pose, tracks: Tracks, boxes_px: Floats, road_mask: Bools | None, near_px: float | None
+        self,
+        pose: Pose,
+        tracks: Tracks,
+        boxes_px: Floats,
+        road_mask: Bools | None,
+        near_px: float | None,
+        interval_ns: tuple[int, int],
     ) -> Pose:
         """T_base_present in metres; the window is rescaled to metres too."""
         step = self._pose.between(pose)
-        view = RoadView(tracks.image, pose, boxes_px, road_mask, self._window, near_px or 0.0)
+        view = RoadView(tracks.image, pose, boxes_px, road_mask, self._window, near_px or 0.0, interval_ns)
         factor = self._scale.measure_scale(step, view)
         self._window.rescale(factor)
         self._pose = pose
@@ -292,10 +340,15 @@ class Odometry:
 
     # --- moving, standing, coasting ---
 
-    def _stands(self, step: Pose, corners: _Corners, near_px: float | None, dt_s: float) -> bool:
+    def _stands(self, step: Pose, corners: _Corners, near_px: float | None, dt_s: float, car: CarStep | None) -> bool:
         if len(corners.displacement_px) < self.config.min_fitting:
             return False
-        return stands(self.config.standstill, step, corners.displacement_px, near_px, self._speed_mps(), dt_s)
+        speed_mps = self._speed_mps()
+        if car is not None:
+            speed_mps = abs(car.forward_m) / dt_s
+            if car.drives(self.config.standstill.length_m) and (near_px is None or car.agreed):
+                return False
+        return stands(self.config.standstill, step, corners.displacement_px, near_px, speed_mps, dt_s)
 
     def _speed_mps(self) -> float:
         """Of the last measured motion."""
@@ -316,16 +369,49 @@ class Odometry:
         self._velocity = _Velocity(np.zeros(3), np.zeros(3))
         return self._motion(frame_id, _STILL, SE2(), standing_cov(self.config.motion), [Status.STANDSTILL])
 
-    def _coast(self, frame_id: int, dt_s: float, status: list[Status]) -> Motion:
-        """The last velocity goes on; the base image stays."""
+    def _coast(self, frame_id: int, dt_s: float, status: list[Status], car: CarStep | None = None) -> Motion:
+        """The last velocity goes on, or what the car itself says of its motion; the base image stays."""
         self._road_tracks = _NO_TRACKS  # those of the last measured image would say that the car has not moved since
+        if car is not None:
+            return self._reckon(frame_id, dt_s, status, car)
         step, known = self._predicted_step(dt_s), self._velocity is not None
         T_prev_curr = planar(step, self._scale.ground)
         cov = coasting_cov(self.config.motion, T_prev_curr, dt_s, known, self._scale.sigma_rel)
         return self._motion(frame_id, step, T_prev_curr, cov, [*status, Status.ODOMETRY_COASTING])
 
-    def _motion(self, frame_id: int, step: Pose, T_prev_curr: SE2, cov: Floats, status: list[Status]) -> Motion:
-        if self._scale.unknown and Status.SCALE_INVALID not in status:
+    def _reckon(self, frame_id: int, dt_s: float, status: list[Status], car: CarStep) -> Motion:
+        """The motion by the car's own readings; without its yaw rate the last turn fades out."""
+        cfg = self.config.motion
+        yaw_rad, yaw_sigma_rad = car.yaw_rad, car.yaw_sigma_rad
+        if yaw_rad is None:
+            status = [*status, Status.ODOMETRY_COASTING]
+            rate_radps = (
+                0.0 if self._velocity is None else planar(self._predicted_step(1.0), self._scale.ground).yaw_rad
+            )
+            yaw_rad = rate_radps * cfg.turn_fades_s * (1.0 - math.exp(-dt_s / cfg.turn_fades_s))
+            yaw_sigma_rad = 0.5 * cfg.coast_yaw_acceleration_radps2 * dt_s**2 + cfg.coast_yaw_rate_radps * dt_s
+        # It rolls on its rear axle
+        T_prev_curr = SE2.exp(np.array([car.forward_m, self.config.start.camera_ahead_m * yaw_rad, yaw_rad]))
+        cov = car_cov(cfg, T_prev_curr, car.sigma_m, car.sigma_rel, yaw_sigma_rad)
+        step = on_plane(T_prev_curr, self._scale.ground)
+        return self._motion(frame_id, step, T_prev_curr, cov, status, car.sigma_rel)
+
+    def _motion(
+        self,
+        frame_id: int,
+        step: Pose,
+        T_prev_curr: SE2,
+        cov: Floats,
+        status: list[Status],
+        car_sigma_rel: float | None = None,
+    ) -> Motion:
+        """`car_sigma_rel` is of the metres where they are the car's alone."""
+        sources = self._scale.sources
+        if car_sigma_rel is not None:
+            sources = (SpeedSource.CAR,)
+        elif Status.ODOMETRY_COASTING in status:
+            sources = (SpeedSource.CARRIED,)
+        if car_sigma_rel is None and self._scale.unknown and Status.SCALE_INVALID not in status:
             status = [*status, Status.SCALE_INVALID]  # standing or coasting, in metres that nobody knows
         return Motion(
             from_frame=self._base_frame if self._base_frame is not None else frame_id,
@@ -334,11 +420,12 @@ class Odometry:
             t_prev_curr_m=step.p,
             T_prev_curr=T_prev_curr,
             cov=cov,
-            scale_sigma_rel=self._scale.sigma_rel,
+            scale_sigma_rel=self._scale.sigma_rel if car_sigma_rel is None else car_sigma_rel,
             ground=self._scale.ground,
             pitch_sigma_rad=self._scale.pitch_sigma_rad,
             standstill=Status.STANDSTILL in status,
-            status=tuple(status),
+            status=(*status, *self._scale.car_status()),
+            speed_sources=sources,
         )
 
     def _tracks_on_road(self, tracks: Tracks, boxes_px: Floats, road_mask: Bools | None) -> tuple[Ints, Floats]:

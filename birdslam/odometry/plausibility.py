@@ -12,7 +12,7 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
-from birdslam.types import EgoEdge, Measurements, Status
+from birdslam.types import EgoEdge, Measurements, SpeedSource, Status
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 _KEPT_FRAMES = 64
@@ -50,21 +50,28 @@ class PlausibilityGate:
         self._config = config
         self._times_ns: deque[tuple[int, int]] = deque(maxlen=_KEPT_FRAMES)  # (frame, source time)
         self._moved: deque[_Moved] = deque(maxlen=_KEPT_FRAMES)  # the measured ones
+        self._turned_ns = 0  # source time of the last frame whose turn was not the car's guessed one
         self._broken_ns: int | None = None  # source time of the last motion that was not measured or not possible
 
     def admit(self, measurements: Measurements) -> Measurements:
         """The measurements as they are, or with MOTION_IMPLAUSIBLE, or, to begin a new epoch, without the CC edge."""
         m, cc = measurements, measurements.cc
         self._times_ns.append((m.frame_id, m.t_source_ns))
-        moved = None if cc is None or Status.ODOMETRY_COASTING in m.status else self._measured(m, cc)
+        coasting = Status.ODOMETRY_COASTING in m.status
+        by_car = coasting and SpeedSource.CAR in m.speed_sources  # its way is measured, its turn is not
+        moved = None if cc is None or (coasting and not by_car) else self._measured(m, cc)
+        if not by_car:
+            self._turned_ns = m.t_source_ns
         if moved is not None:
             self._moved.append(moved)
             if not self._possible():
                 self._broken_ns = m.t_source_ns
         elif self._moved and (m.t_source_ns - self._moved[-1].t_ns) * 1e-9 > self._config.blind_s:
             self._broken_ns = m.t_source_ns
-        if self._broken_ns is None:
+        if self._broken_ns is None and (m.t_source_ns - self._turned_ns) * 1e-9 <= self._config.blind_s:
             return m
+        if self._broken_ns is None:
+            return msgspec.structs.replace(m, status=(*m.status, Status.MOTION_IMPLAUSIBLE))
         if moved is None:
             self._broken_ns = m.t_source_ns
         if (m.t_source_ns - self._broken_ns) * 1e-9 >= self._config.steady_s:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
+from birdslam.odometry.car_speed import CarSpeedConfig
 from birdslam.odometry.road_alignment import ROAD, RoadAlignConfig, RoadFit, plane_normal, plane_tilt
 from birdslam.odometry.standing_pattern import StandingPatternConfig
 from birdslam.odometry.tilt_watch import TiltWatchConfig
@@ -22,6 +23,7 @@ Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 STATES = ROAD + 2  # log lambda, pitch, roll, curvature; the mount's pitch and roll
+CAR_FACTOR, CAR_DELAY, ROAD_ERROR = STATES, STATES + 1, STATES + 2  # once the car has told of its speed
 
 
 class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -67,6 +69,7 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     carried_after_m: Positive = 6.0  # without a comparison, until the status says so
     invalid_sigma_rel: Positive = 0.15  # less sure of the scale than this, a frame is invalid
     watch: TiltWatchConfig = TiltWatchConfig()
+    car: CarSpeedConfig = CarSpeedConfig()
     # of mode "paper" alone
     median_frames: Annotated[int, msgspec.Meta(ge=1)] = 21  # over which the median moves; the paper states none
     median_landmarks: Annotated[int, msgspec.Meta(ge=1)] = 3  # on the road, or the frame gives no scale
@@ -79,11 +82,12 @@ class RoadFilter:
 
     - `x` (6,): log lambda (lambda: metres per unit of the odometry's length); pitch and roll (rad) of the camera
       against the plane that touches the road under it; the road's curvature (1/m, > 0 in a sag); pitch and roll (rad)
-      of the mount, which is the tilt in the mean. `cov` (6, 6).
+      of the mount, which is the tilt in the mean. `cov` (6, 6). Once the car tells of its own speed (`begin_car`) also
+      the log of its readings' scale factor, their delay (s), and the log error that the road's metres keep for long.
     - Predicted by the camera's rotation and the distance travelled (`predict`). Over a crest or through a sag the
       touching plane turns by curvature times distance, and so, in the mean, does the car.
     - Measured: the tilt is the mount's in the mean (in `predict`), the direction of travel lies in the road (`travel`),
-      comparisons of the road's image (`accept`).
+      comparisons of the road's image (`accept`), ways by the car's own readings (`measure_car`).
     - Readers: `RoadScale`, for the factor on all lengths, the ground plane and its sigma; through it `TiltWatch`.
 
     The mount is a state, since otherwise what it learned of a tilt would be believed twice. The odometry is rescaled
@@ -112,6 +116,37 @@ class RoadFilter:
         H = np.array([1.0, half_m])
         return self.tilt + np.array([self.x[3] * half_m, 0.0]), float(np.sqrt(H @ self.cov[1:4:2, 1:4:2] @ H))
 
+    @property
+    def expected(self) -> tuple[Floats, Floats]:
+        """(4,) and (4, 4): what a comparison of the road's image will show, and how surely."""
+        if not self.hears_car:
+            return self.x[:ROAD].copy(), self.cov[:ROAD, :ROAD]
+        H = self._of_comparison()
+        return H @ self.x, H @ self.cov @ H.T
+
+    @property
+    def hears_car(self) -> bool:
+        """Whether the readings' factor and delay are states."""
+        return len(self.x) > STATES
+
+    def begin_car(self) -> None:
+        """The car tells of its speed: from here on the road's metres may keep an error of their own."""
+        car, n = self.config.car, STATES
+        self.x = np.append(self.x, np.zeros(3))
+        cov = np.diag([0.0] * n + [car.sigma_factor_rel**2, car.sigma_delay_s**2, car.sigma_road_rel**2])
+        cov[:n, :n] = self.cov
+        if self.cov[0, 0] < self.config.doubt_sigma_rel**2:  # what the road said of lambda was lambda with its error
+            cov[0, 0] += car.sigma_road_rel**2
+            cov[0, ROAD_ERROR] = cov[ROAD_ERROR, 0] = -(car.sigma_road_rel**2)
+        self.cov = cov
+
+    def _of_comparison(self) -> Floats:
+        """(4, states): how a comparison of the road's image depends on the state."""
+        H = np.eye(len(self.x))[:ROAD]
+        if self.hears_car:
+            H[0, ROAD_ERROR] = 1.0
+        return H
+
     def forget_scale(self, sigma_rel: float) -> None:
         """The unit of length was lost (the window began anew) or doubted."""
         self.cov[0, :] = self.cov[:, 0] = 0.0
@@ -133,12 +168,19 @@ class RoadFilter:
         keep = float(np.exp(-travelled_m / cfg.curvature_memory_m))
         pitch_rad, roll_rad = plane_tilt(normal)
         self.x[1:ROAD] = pitch_rad + self.x[3] * travelled_m, roll_rad, keep * self.x[3]
-        F = np.eye(STATES)
+        F = np.eye(len(self.x))
         F[1, 3], F[3, 3] = travelled_m, keep
         walk = cfg.tilt_walk_rad_per_sqrt_m**2 * travelled_m + 1e-8
         mount = cfg.mount_walk_rad_per_sqrt_m**2 * travelled_m
         bend = (1.0 - keep**2) * cfg.sigma_curvature_per_m**2
-        self.cov = F @ self.cov @ F.T + np.diag([0.0, walk, walk, bend, mount, mount])
+        noise = [0.0, walk, walk, bend, mount, mount]
+        if self.hears_car:
+            lasts = float(np.exp(-travelled_m / cfg.car.road_error_m))
+            F[ROAD_ERROR, ROAD_ERROR] = lasts
+            self.x[ROAD_ERROR] *= lasts
+            factor = cfg.car.factor_walk_rel_per_sqrt_m**2 * travelled_m
+            noise += [factor, 0.0, (1.0 - lasts**2) * cfg.car.sigma_road_rel**2]
+        self.cov = F @ self.cov @ F.T + np.diag(noise)
         # Of landmarks that a turn takes out of sight at the side none hands the length on
         turned_rad = float(np.arctan2(R_prev_curr[0, 2], R_prev_curr[2, 2]))
         bend_per_m = min(abs(turned_rad) / max(travelled_m, 0.1), cfg.max_bend_per_m)
@@ -148,15 +190,17 @@ class RoadFilter:
         # The road under the car is, in the mean, where the mount says: holds the tilt where no comparison does.
         share = travelled_m / cfg.bounce_m
         if share > 0.0:
-            noise = np.eye(2) * (cfg.sigma_bounce_rad**2 / share)
-            self._update(self.x[4:] - self.tilt, np.eye(STATES)[1:3] - np.eye(STATES)[4:], noise)
+            states = np.eye(len(self.x))
+            self._update(
+                self.x[4:6] - self.tilt, states[1:3] - states[4:6], np.eye(2) * (cfg.sigma_bounce_rad**2 / share)
+            )
 
     def _update(self, innovation: Floats, H: Floats, noise: Floats) -> None:
         gain = self.cov @ H.T @ np.linalg.inv(H @ self.cov @ H.T + noise)
         self.x = self.x + gain @ innovation
         self.owed_log += float(self.x[0])  # what is now known of the tilt says something of earlier comparisons too
         self.x[0] = 0.0
-        keep = np.eye(STATES) - gain @ H
+        keep = np.eye(len(self.x)) - gain @ H
         self.cov = keep @ self.cov @ keep.T + gain @ noise @ gain.T
 
     def travel(self, t_prev_curr: Floats, travelled_m: float) -> None:
@@ -166,7 +210,7 @@ class RoadFilter:
             return
         normal, by_pitch, by_roll = plane_normal(*self.tilt)
         d = t_prev_curr / length
-        H = np.zeros((1, STATES))
+        H = np.zeros((1, len(self.x)))
         H[0, 1:3] = by_pitch @ d, by_roll @ d
         share = travelled_m / 1.0
         noise = np.array([[self.config.sigma_travel_rad**2 / share]])
@@ -181,7 +225,7 @@ class RoadFilter:
         if abs(off_rad) < self.config.wrong_pitch_rad or abs(off_rad) > self.config.max_wrong_pitch_rad:
             return
         self.cov[np.ix_([1, 4], [1, 4])] += off_rad**2
-        H = np.zeros((1, STATES))
+        H = np.zeros((1, len(self.x)))
         H[0, 1] = 1.0
         self._update(np.array([off_rad]), H, np.array([[self.config.sigma_travel_rad**2]]))
 
@@ -191,8 +235,9 @@ class RoadFilter:
         tilt_rad = cfg.sigma_tilt_floor_rad
         floor = np.array([cfg.sigma_scale_floor_rel, tilt_rad, tilt_rad, cfg.sigma_curvature_floor_per_m])
         noise = fit.cov + np.diag(floor**2)
-        beyond = fit.state - self.x[:ROAD]
-        return beyond, noise, float(np.sqrt(beyond @ np.linalg.solve(self.cov[:ROAD, :ROAD] + noise, beyond)))
+        mean, cov = self.expected
+        beyond = fit.state - mean
+        return beyond, noise, float(np.sqrt(beyond @ np.linalg.solve(cov + noise, beyond)))
 
     def accept(self, fit: RoadFit, share: float = 1.0) -> float:
         """Takes a comparison over and returns lambda, by which the visual scale is to be multiplied.
@@ -201,7 +246,28 @@ class RoadFilter:
         """
         beyond, noise, _ = self.innovation(fit)
         owed = self.owed_log
-        self._update(beyond, np.eye(STATES)[:ROAD], noise / max(share, 1e-3))
+        self._update(beyond, self._of_comparison(), noise / max(share, 1e-3))
         step, self.owed_log = self.owed_log - owed, owed
         self.carried_m = 0.0
         return float(np.exp(np.clip(step, -0.7, 0.7)))
+
+    def car_innovation(self, log_ratio: float, by_delay: float, var: float) -> tuple[Floats, float, float]:
+        """How a way by the car's readings depends on the state (1, states), what it says beyond what was expected,
+        and how many sigma that is away.
+
+        `log_ratio` is the log of that way, read at the delay of the state, over the way by images; `by_delay` (1/s)
+        its derivative by the delay, `var` its noise.
+        """
+        H = np.zeros((1, len(self.x)))
+        H[0, [0, CAR_FACTOR, CAR_DELAY]] = 1.0, 1.0, -by_delay
+        beyond = log_ratio - float(self.x[CAR_FACTOR])
+        return H, beyond, abs(beyond) / float(np.sqrt((H @ self.cov @ H.T)[0, 0] + var))
+
+    def measure_car(self, log_ratio: float, by_delay: float, var: float) -> float:
+        """Takes a way by the car's readings over and returns lambda, as `accept` does; as `car_innovation` has it."""
+        H, beyond, _ = self.car_innovation(log_ratio, by_delay, var)
+        owed, limit_s = self.owed_log, self.config.car.max_delay_s
+        self._update(np.array([beyond]), H, np.array([[var]]))
+        self.x[CAR_DELAY] = np.clip(self.x[CAR_DELAY], -limit_s, limit_s)
+        step, self.owed_log = self.owed_log - owed, owed
+        return float(np.exp(np.clip(step, -4.0, 4.0)))

@@ -7,6 +7,7 @@ only some combination of scale, pitch, roll and curvature, and the filter knows 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
+from birdslam.odometry.car_scale import CarScale, CarStep
 from birdslam.odometry.metric_scale import RoadView
+from birdslam.odometry.motion import planar
 from birdslam.odometry.road_alignment import ROAD, RoadAligner, RoadFit, RoadImage
 from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
 from birdslam.odometry.road_landmarks import length_unit
@@ -22,7 +25,7 @@ from birdslam.odometry.road_search import search_length
 from birdslam.odometry.sliding_window import SlidingWindow
 from birdslam.odometry.standing_pattern import StandingPattern
 from birdslam.odometry.tilt_watch import TiltWatch
-from birdslam.types import Status
+from birdslam.types import SpeedReading, SpeedSource, Status
 
 Floats = NDArray[np.float64]
 
@@ -57,6 +60,7 @@ class RoadScale:
         self.camera, self.config = camera, config
         self._aligner = RoadAligner(camera, config.align)
         self._filter = RoadFilter(camera, config)
+        self._car = CarScale(config, self._filter)
         self._watch = TiltWatch(camera, config.watch)
         self._standing = StandingPattern(config.standing)
         self._kept: list[_Kept] = []
@@ -96,16 +100,37 @@ class RoadScale:
         self._filter.forget_scale(sigma_rel)
         if sigma_rel > self.config.doubt_sigma_rel:
             self._confirmed = 0
+        self._car.restart()
 
     def turned_unseen(self) -> None:
         """The odometry lost sight of how the camera turned."""
         self._filter.turned_unseen()
 
+    def hear(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:
+        """The car's own speed, as it had come by the frame of this time."""
+        self._car.hear(readings, t_source_ns)
+
+    def car_step(self, from_ns: int, to_ns: int) -> CarStep | None:
+        """The car's motion by its own readings; None where there are none that can be trusted."""
+        return self._car.step(from_ns, to_ns)
+
     def measure_scale(self, step: Pose, view: RoadView) -> float:
-        """The factor on all lengths, by the road of this image against an earlier one's.
+        """The factor on all lengths, by the road of this image against an earlier one's and by the car's own speed.
 
         `step` is T_prev_curr, in the present unit of length.
         """
+        by_road = self._measure_road(step, view)
+        self._car.rescale(by_road)
+        travelled_m = by_road * float(np.linalg.norm(step.p))
+        forward_m = float(planar(Pose(step.R, step.p * by_road), self.ground).log()[0])
+        by_car = self._car.follow(*view.interval_ns, forward_m, travelled_m, self._known())
+        if by_car != 1.0:
+            self._car.rescale(by_car)
+            self._rescale(view.pose.p, by_car)
+        return by_road * by_car
+
+    def _measure_road(self, step: Pose, view: RoadView) -> float:
+        """The factor on all lengths, by the road alone."""
         self.fit = None
         travelled_m = float(np.linalg.norm(step.p))
         self._filter.predict(step.R, travelled_m)
@@ -153,17 +178,34 @@ class RoadScale:
         """Remembers the image for later comparisons, where it is far enough from the last one kept."""
         cfg = self.config
         if factor != 1.0:
-            centre = pose.p
-            moved = [Pose(k.pose.R, centre + factor * (k.pose.p - centre)) for k in self._kept]
-            self._kept = [_Kept(k.plain, k.image, T) for k, T in zip(self._kept, moved, strict=True)]
+            self._rescale(pose.p, factor)
         newest = self._kept[-1] if self._kept else None
         if newest is None or float(np.linalg.norm(newest.pose.p - pose.p)) > 0.5 * cfg.min_baseline_m:
             self._kept = [*self._kept[1 - cfg.kept_images :], _Kept(seen.plain, seen.image, pose)]
 
+    def _rescale(self, centre: Floats, factor: float) -> None:
+        """Multiplies the distances of all kept images from a point."""
+        moved = [Pose(k.pose.R, centre + factor * (k.pose.p - centre)) for k in self._kept]
+        self._kept = [_Kept(k.plain, k.image, T) for k, T in zip(self._kept, moved, strict=True)]
+
+    @property
+    def sources(self) -> tuple[SpeedSource, ...]:
+        """What the metres rest on."""
+        road = (SpeedSource.ROAD,) if self._sees_road() else ()
+        car = (SpeedSource.CAR,) if self._car.measures else ()
+        return road + car or (SpeedSource.CARRIED,)
+
+    def car_status(self) -> list[Status]:
+        """What is wrong with the car's own speed; nothing where it never told any."""
+        return self._car.status()
+
+    def _sees_road(self) -> bool:
+        return self._filter.carried_m <= self.config.carried_after_m and self._confirmed > 0
+
     def status(self) -> list[Status]:
         """What is wrong with the scale, the ground plane or the mount."""
         cfg, out = self.config, []
-        if self._filter.carried_m > cfg.carried_after_m or not self._confirmed:
+        if not self._sees_road() and not self._car.measures:
             out.append(Status.SCALE_CARRIED)
         if self.unknown:
             out.append(Status.SCALE_INVALID)
@@ -216,7 +258,8 @@ class RoadScale:
         if found is None:
             return 1.0
         fit, searched, prior_cov = found
-        expected = searched != 1.0 or not self._known() or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
+        known = self._known() or self._car.measures
+        expected = searched != 1.0 or not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
         if fit.correlation < cfg.min_correlation or not expected:
             self._refused += new
             self._tries += 1
@@ -225,8 +268,10 @@ class RoadScale:
         self.fit = fit
         filter_.cov = prior_cov
         factor = searched * filter_.accept(fit, min(1.0, filter_.carried_m / length))
+        if abs(np.log(factor)) > self.config.doubt_sigma_rel:
+            self._car.contradict(float(np.log(factor)))
         self._confirmed = 1 if abs(np.log(factor)) > 0.3 else self._confirmed + 1
-        if not self._known():
+        if not self._known() and not self._car.measures:
             filter_.cov[0, 0] = max(filter_.cov[0, 0], (1.1 * cfg.doubt_sigma_rel) ** 2)
         return factor
 
@@ -235,8 +280,8 @@ class RoadScale:
     ) -> tuple[RoadFit, float, Floats] | None:
         """The fit, the factor on T that it starts from, and the filter's covariance that it is to be joined with."""
         cfg, filter_ = self.config, self._filter
-        prior, prior_cov = filter_.x[:ROAD].copy(), filter_.cov.copy()
-        fit, factor, cov = self._aligner.align(past, image, T, px, prior, prior_cov[:ROAD, :ROAD]), 1.0, prior_cov
+        (prior, expected_cov), prior_cov = filter_.expected, filter_.cov.copy()
+        fit, factor, cov = self._aligner.align(past, image, T, px, prior, expected_cov), 1.0, prior_cov
         if fit is not None and _contradicts(fit.state[0], borne_out):
             fit = None
         if self._in_doubt():

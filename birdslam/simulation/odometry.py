@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Annotated
 
 import msgspec
@@ -27,7 +28,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
 from birdslam.odometry.motion import Motion, planar
 from birdslam.trajectory import Transform, inverse
-from birdslam.types import LandmarkEdge, Status
+from birdslam.types import LandmarkEdge, SpeedReading, Status
 
 Floats = NDArray[np.float64]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
@@ -137,8 +138,9 @@ class SimulatedOdometry:
         t_source_ns: int,
         vehicle_boxes_px: Floats,
         road_mask: NDArray[np.bool_] | None = None,
+        speeds: Sequence[SpeedReading] = (),
     ) -> Motion | None:
-        """The motion since the last frame; None for the first one."""
+        """The motion since the last frame; None for the first one. The car's own speed is not simulated."""
         last, self._last_frame = self._last_frame, frame_id
         if last is None:
             return None

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.odometry.motion import Motion
-from birdslam.types import Status, VehicleEdge
+from birdslam.types import SpeedSource, Status, VehicleEdge
 from birdslam.vehicles.localisation import LocalisationConfig, observe_boxes
 
 Floats = NDArray[np.float64]
@@ -126,7 +126,7 @@ class HeightWatch:
 
     def judge(self, edges: Sequence[VehicleEdge], motion: Motion | None) -> tuple[Status, ...]:
         """Edges of other frames than the motion's are passed over."""
-        if motion is not None and not LOST & set(motion.status):
+        if motion is not None and _sees_road(motion):
             here = [edge for edge in edges if edge.frame == motion.to_frame]
             if sum(self._add(box, motion) for box in measure_heights(here, self.camera, self._localisation)):
                 self._estimate = self._solve()
@@ -176,3 +176,9 @@ class HeightWatch:
             weight = 1.0 / np.maximum(1.0, misfit / cfg.gate_sigma)
         ratio = max(float(x[0]) / height_m, _LEAST_RATIO)
         return ratio, math.hypot(math.sqrt(float(cov[0, 0])) / (ratio * height_m), cfg.sigma_class_rel), len(vehicles)
+
+
+def _sees_road(motion: Motion) -> bool:
+    """Whether its tilt is measured: metres may be the car's own where the road is not seen."""
+    by_car_alone = SpeedSource.CAR in motion.speed_sources and SpeedSource.ROAD not in motion.speed_sources
+    return not by_car_alone and not LOST & set(motion.status)
