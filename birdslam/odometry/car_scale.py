@@ -211,5 +211,6 @@ class CarScale:
         out = self._speed.status
         if self.trusted or Status.CAR_SPEED_MISSING in out:
             return out
-        told = Status.CAR_SPEED_FROZEN if self._speed.frozen() else Status.CAR_SPEED_IMPLAUSIBLE
+        frozen = self._speed.frozen() and not self._barred
+        told = Status.CAR_SPEED_FROZEN if frozen else Status.CAR_SPEED_IMPLAUSIBLE
         return out if told in out else [told, *out]

@@ -6,6 +6,7 @@ what the images show is judged in `car_scale.py`, where the scale factor and the
 
 from __future__ import annotations
 
+import itertools
 import math
 from bisect import bisect_left, insort
 from collections.abc import Iterable
@@ -22,7 +23,8 @@ Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 _NS_PER_S = 1e9
-_KEPT_S = 4.0  # of readings: longer than any way that is asked for
+_KEPT_S = 3.5  # of readings: longer than any way that is asked for
+_FEWEST_BEFORE, _CHANGING = 10, 0.5  # readings before those that are alike, and the share of them that differed
 _FIT_S = 0.4  # before a moment, for the acceleration and the speed there
 _CERTAIN_SIGMAS = 4.0  # an acceleration that stands out of the readings' noise by less counts as none
 
@@ -48,7 +50,8 @@ class CarSpeedConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     future_s: Positive = 0.2  # a reading may be ahead of its frame by so much: the two clocks, the exposure
     late_s: Positive = 0.25  # the newest reading is older than this: late
     missing_s: Positive = 0.6  # ... older than this: missing
-    frozen_s: Positive = 1.0  # the same number for so long, against what the images show: the sensor hangs
+    # The same number for so long, after numbers that changed or against what the images show: the sensor hangs
+    frozen_s: Positive = 1.0
     # Joined with the metres by the road
     sigma_step_rel: Positive = 0.012  # of a way by images over a metre, beside its scale (as motion.sigma_path_rel)
     sigma_step_m: Positive = 0.01  # and of any way by images
@@ -91,6 +94,7 @@ class CarSpeed:
         self.jumps = 0  # how often the readings began anew after a jump
         self._used: list[tuple[int, SpeedReading]] = []  # by time
         self._waiting: list[SpeedReading] = []  # after a jump
+        self._hung_mps: float | None = None  # the number at which the sensor hangs
         self._status: list[Status] = []
         self._table = np.zeros((5, 0))  # of those used: s since `_origin_ns`, m/s, its variance, rad/s, its variance
         self._origin_ns = 0
@@ -113,13 +117,19 @@ class CarSpeed:
         fresh: dict[int, SpeedReading] = {}
         for reading in readings:
             self.heard = True
+            if reading.t_ns in known:
+                continue
             ahead_s = (reading.t_ns - t_source_ns) / _NS_PER_S
             if ahead_s > cfg.future_s or not _possible(cfg, reading):
                 implausible = True
-            elif reading.t_ns > oldest_ns and reading.t_ns not in known:
+            elif reading.t_ns > oldest_ns:
                 fresh.setdefault(reading.t_ns, reading)
         for t_ns in sorted(fresh):
-            self._judge(fresh[t_ns])
+            if fresh[t_ns].speed_mps != self._hung_mps:
+                self._hung_mps = None
+                self._judge(fresh[t_ns])
+        if fresh and self._hangs():
+            self._hang()
         self._used = [entry for entry in self._used if oldest_ns < entry[0] <= t_source_ns + cfg.future_s * _NS_PER_S]
         self._waiting = [reading for reading in self._waiting if reading.t_ns > oldest_ns]
         self._status = self._judged(t_source_ns, implausible or bool(self._waiting)) if self.heard else []
@@ -129,6 +139,8 @@ class CarSpeed:
         cfg, newest_ns = self.config, self.newest_ns
         age_s = math.inf if newest_ns is None else (t_source_ns - newest_ns) / _NS_PER_S
         out = [Status.CAR_SPEED_IMPLAUSIBLE] if implausible else []
+        if self._hung_mps is not None:
+            out.append(Status.CAR_SPEED_FROZEN)
         if age_s > cfg.missing_s:
             return [*out, Status.CAR_SPEED_MISSING]
         return [*out, Status.CAR_SPEED_LATE] if age_s > cfg.late_s else out
@@ -170,18 +182,35 @@ class CarSpeed:
                 return True
         return False
 
+    def _hangs(self) -> bool:
+        """Whether numbers that changed have become one and the same; a car that stands says 0 and does not hang."""
+        if not self._used or self._used[-1][1].speed_mps == 0.0 or not self.frozen():
+            return False
+        values = [reading.speed_mps for _, reading in self._used]
+        before = values[: len(values) - self._alike()]
+        changes = sum(one != other for one, other in itertools.pairwise(before))
+        return len(before) >= _FEWEST_BEFORE and changes >= _CHANGING * (len(before) - 1)
+
+    def _alike(self) -> int:
+        """How many of the last readings are the same number."""
+        last = self._used[-1][1].speed_mps
+        return sum(1 for _ in itertools.takewhile(lambda entry: entry[1].speed_mps == last, reversed(self._used)))
+
+    def _hang(self) -> None:
+        """Of a number that hangs the first reading alone is one."""
+        self._hung_mps = self._used[-1][1].speed_mps
+        self._used = self._used[: len(self._used) - self._alike() + 1]
+
     # --- ways ---
 
     def _tabulate(self, origin_ns: int) -> None:
-        cfg, n = self.config, len(self._used)
+        floor, rows = self.config.sigma_floor_mps**2, []
+        for t_ns, r in self._used:
+            rate = math.nan if r.yaw_rate_radps is None else r.yaw_rate_radps
+            at_s = (t_ns - origin_ns) / _NS_PER_S
+            rows.append((at_s, r.speed_mps, r.sigma_mps**2 + floor, rate, r.yaw_rate_sigma_radps**2))
         self._origin_ns = origin_ns
-        self._table = np.empty((5, n))
-        for k, (t_ns, reading) in enumerate(self._used):
-            rate = math.nan if reading.yaw_rate_radps is None else reading.yaw_rate_radps
-            noise = reading.sigma_mps**2 + cfg.sigma_floor_mps**2
-            self._table[:, k] = (
-                (t_ns - origin_ns) / _NS_PER_S, reading.speed_mps, noise, rate, reading.yaw_rate_sigma_radps**2,
-            )  # fmt: skip
+        self._table = np.array(rows, dtype=np.float64).reshape(-1, 5).T
 
     def covers_s(self, t_ns: int, delay_s: float) -> float:
         """By how much the newest reading is past a moment, of which they tell `delay_s` later."""
