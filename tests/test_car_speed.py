@@ -86,6 +86,13 @@ def test_a_way_is_the_less_sure_the_older_the_last_reading() -> None:
     assert heard(readings_of(lambda t: 10.0, 1.0), 2.5).way(2 * NS_PER_S, 5 * NS_PER_S // 2, 0.0) is None
 
 
+def test_noise_that_the_readings_do_not_own_up_to_is_seen() -> None:
+    rng = np.random.default_rng(0)
+    noisy = [reading(t, 20.0 + 0.4 * rng.normal(), 0.01) for t in np.arange(0.0, 3.0, 0.02)]
+    stated = [reading(t, 20.0, 0.4) for t in np.arange(0.0, 3.0, 0.02)]
+    assert way(heard(noisy, 3.0), 2.0, 2.5)[1] == pytest.approx(way(heard(stated, 3.0), 2.0, 2.5)[1], rel=0.5)
+
+
 def test_old_readings_are_told() -> None:
     readings = readings_of(lambda t: 10.0, 1.0)
     assert heard(readings, 1.1).status == []
@@ -148,7 +155,7 @@ class World:
         return float(np.sqrt(self.filter.cov[state, state]))
 
 
-@settings(max_examples=4)
+@settings(max_examples=3)
 @given(st.floats(0.95, 1.05), st.floats(-0.1, 0.15), st.floats(0.4, 0.7))
 def test_stop_and_go_under_a_seen_road_teaches_factor_and_delay(factor: float, delay_s: float, rate: float) -> None:
     def speed(t: float) -> float:

@@ -98,6 +98,7 @@ class CarSpeed:
         self._status: list[Status] = []
         self._table = np.zeros((5, 0))  # of those used: s since `_origin_ns`, m/s, its variance, rad/s, its variance
         self._origin_ns = 0
+        self._noise_mps = 0.0  # by how they differ from each other
 
     @property
     def status(self) -> list[Status]:
@@ -167,7 +168,7 @@ class CarSpeed:
     def _follows(self, one: SpeedReading, other: SpeedReading) -> bool:
         """Whether a car can have had both speeds, each at its time."""
         cfg, passed_s = self.config, abs(other.t_ns - one.t_ns) / _NS_PER_S
-        noise = cfg.sigmas * math.hypot(one.sigma_mps, other.sigma_mps)
+        noise = cfg.sigmas * max(math.hypot(one.sigma_mps, other.sigma_mps), math.sqrt(2.0) * self._noise_mps)
         return abs(other.speed_mps - one.speed_mps) <= cfg.change_mps + cfg.acceleration_mps2 * passed_s + noise
 
     def frozen(self) -> bool:
@@ -211,6 +212,11 @@ class CarSpeed:
             rows.append((at_s, r.speed_mps, r.sigma_mps**2 + floor, rate, r.yaw_rate_sigma_radps**2))
         self._origin_ns = origin_ns
         self._table = np.array(rows, dtype=np.float64).reshape(-1, 5).T
+        _, v, var, _, _ = self._table
+        if len(v) >= _FEWEST_BEFORE:  # what a reading says of itself may be too good
+            uneven = v[1:-1] - 0.5 * (v[:-2] + v[2:])
+            self._noise_mps = float(np.median(np.abs(uneven))) / 0.6745 / math.sqrt(1.5)
+            np.maximum(var, self._noise_mps**2 + floor, out=var)
 
     def covers_s(self, t_ns: int, delay_s: float) -> float:
         """By how much the newest reading is past a moment, of which they tell `delay_s` later."""
