@@ -301,11 +301,24 @@ def test_a_car_that_begins_in_the_dark_is_followed_by_its_speed_and_yaw_rate() -
     way = SE2()
     for motion in motions:
         way = way @ motion.T_prev_curr
-        assert set(motion.status) == {Status.CAMERA_DARK}
+        assert Status.CAMERA_DARK in motion.status
+        assert not {Status.ODOMETRY_COASTING, Status.SCALE_INVALID} & set(motion.status)
         assert np.linalg.eigvalsh(motion.cov).min() > 0.0
     assert way.log()[0] == pytest.approx(15.0, abs=0.05)
     assert way.yaw_rad == pytest.approx(0.6, abs=0.01)
     assert driven(street([(0.5, 0.0)] * 3), [], lambda k: True)[1] == []
+
+
+def test_a_camera_that_hangs_is_told_of_for_as_long_as_it_does() -> None:
+    odometry, image = Odometry(CAMERA), render(street([])[0])
+    for k in range(30):
+        now_ns = k * NS_PER_S // 10
+        come = [r for r in readings_of(lambda t: 8.0, 4.0) if now_ns - NS_PER_S < r.t_ns <= now_ns]
+        motion = odometry.estimate(odometry.track(image), k, now_ns, NO_BOXES, None, come)
+        if k:
+            assert motion is not None
+            assert Status.CAMERA_FROZEN in motion.status
+            assert motion.speed_sources == (SpeedSource.CAR,)
 
 
 def test_the_papers_scale_does_not_hear_the_car() -> None:

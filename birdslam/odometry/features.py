@@ -82,7 +82,7 @@ class FeatureTracker:
         self._candidate: NDArray[np.uint8] | None = None
         self._last_image: NDArray[np.uint8] | None = None
         self._search_in = 0  # images
-        self._base = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros((0, 0), np.uint8))
+        self.leave_base()
 
     @property
     def base(self) -> Tracks:
@@ -120,6 +120,11 @@ class FeatureTracker:
         """Makes the image last tracked the base of the next one."""
         if self._candidate is not None:
             self._base_image, self._base = self._candidate, tracks
+
+    def leave_base(self) -> None:
+        """The next image is followed from none; what it is compared with to be found frozen stays."""
+        self._base_image, self._candidate = None, None
+        self._base = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros((0, 0), np.uint8))
 
     def reset(self) -> None:
         """Forgets all tracks; ids go on counting."""

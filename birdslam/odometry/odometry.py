@@ -246,7 +246,7 @@ class Odometry:
 
     def _begin_unseen(self, frame_id: int, t_source_ns: int) -> None:
         """What the car's own speed led to is the base: images have shown nothing for too long to come back to them."""
-        self._tracker.reset()
+        self._tracker.leave_base()
         self._window, self._pose = self._new_window(), _STILL
         self._base_frame, self._base_t_ns, self._base_seen = frame_id, t_source_ns, False
 
