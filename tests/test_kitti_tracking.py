@@ -37,7 +37,7 @@ def test_camera_2_stands_beside_camera_0(tmp_path: Path) -> None:
     path = root / "calib" / "0002.txt"
     path.write_text(path.read_text().replace(f"{tracking_world.CX} 0 0", f"{tracking_world.CX} 43.3 0", 1))
     sequence = open_tracking(root, "0002")
-    assert sequence.T_cam0_cam2[0, 3] == pytest.approx(-43.3 / tracking_world.FX)
+    assert sequence.T_cam0_camera[0, 3] == pytest.approx(-43.3 / tracking_world.FX)
     label = sequence.labels_of(0)[0]
     assert sequence.vehicle_truth(label, 0).y_m == pytest.approx(-43.3 / tracking_world.FX)  # now further right
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from birdslam.datasets.kitti_tracking import Label, TrackingSequence, open_tracking, read_detections
+from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
+from birdslam.datasets.label_projection import Label
 from birdslam.evaluation.localisation import (
     INSIDE_1_SIGMA,
     INSIDE_2_SIGMA,

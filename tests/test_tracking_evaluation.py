@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny_networks as tiny
 import tracking_world
 from msgspec.structs import replace
+from test_label_projection import with_right_camera
 
 from birdslam.baselines.trajectories import Trajectories
 from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
@@ -30,7 +32,7 @@ from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.evaluate_tracking import PUBLISHED, evaluate
 from birdslam.runtime.cli.parser import METHODS, build_parser
 from birdslam.runtime.cli.tracking_job import frames_of
-from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig
+from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
 from birdslam.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig, Walk, fit_drift
 from birdslam.slam import SlamConfig
 from birdslam.types import Frame, Measurements, SpeedReading
@@ -316,11 +318,16 @@ def test_tables_have_every_cell_of_the_paper(published: Published) -> None:
         seeds=2,
         ate_m=1.234,
         ate_m_spread=0.0,
+        odometry="simulate",
     )
     text = tables.methods_table([row], published, ego=False)
-    assert "| 0002 | 1 | 30 of 42 | 5.01 | 6.35 | 6.02 | - | 2.09 | 1.23 ± 0.00 |" in text
-    assert "| 0020 | 122 |  | 12.86 |" in text
+    assert "| 0002 | 1 | simulated odometry | 30 of 42 | 5.01 | 6.35 | 6.02 | - | 2.09 | 1.23 ± 0.00 |" in text
+    assert "| 0020 | 122 |  |  | 12.86 |" in text
     assert text.count("\n") == 2 + 11 + 1
+    seen = replace(row, odometry="images", ate_m=1.5)
+    both = tables.methods_table([row, seen], published, ego=False)
+    assert "| 0002 | 1 | images | 30 of 42 | 5.01 | 6.35 | 6.02 | - | 2.09 | 1.50 ± 0.00 |" in both
+    assert both.count("\n") == 2 + 11 + 1 + 2  # a row and a mean more
     ego = tables.methods_table([], published, ego=True)
     assert ego.count("\n") == 2 + 7 + 1
     for columns, table in ((tables.CONSTRAINTS, published.table3), (tables.LANDMARKS, published.table4)):
@@ -370,6 +377,28 @@ def test_the_ablation_alone(tmp_path: Path) -> None:
     )
 
 
+def test_a_sequence_with_images_is_driven_by_them_too(tmp_path: Path) -> None:
+    root, out = with_right_camera(tmp_path / "root", frames=6), tmp_path / "out"
+    never = tiny.constant(tmp_path / "net.onnx", (1, 3, 64, 64), np.zeros((1, 84, 6), np.float32))
+    never.with_suffix(".toml").write_text(tiny.DETECTOR.replace("classes = 2", "classes = 1"))
+    without = {"models.shipped": False}
+    asked = [*("tracking", str(root), "--frames", "0:6", "--seeds", "1", "--jobs", "1", "--output", str(out))]
+    with pytest.raises(ConfigurationError, match="needs a network that detects"):
+        evaluate(options(*asked), load(None, without))
+    configuration = load(None, without | {"models.detector.path": str(never)})
+    assert evaluate(options(*asked, "--methods", "birdslam_live"), configuration) == 0
+    rows = json.loads((out / "report.json").read_text())
+    assert {(row["odometry"], row["detections"]) for row in rows} == {("simulate", "rrc"), ("images", "network")}
+    report = (out / "report.md").read_text()
+    assert "| 0002 | ego | images | 6 of 6 |" in report
+    assert "| 0002 | ego | simulated odometry | 6 of 6 |" in report
+    asked_for = [row["asked"] for row in json.loads((out / "told.json").read_text()) if "range" in row]
+    assert sum(asked_for) == 6 * 3
+    assert "| 0002 | 15-30 |" in report
+    with pytest.raises(ConfigurationError, match="no image_02, whose boxes these are, but image_03"):
+        evaluate(options(*asked, "--odometry", "images", "--detections", "rrc"), configuration)
+
+
 def test_a_trajectory_file_is_an_odometry(tmp_path: Path) -> None:
     root, out = tracking_world.write(tmp_path / "root"), tmp_path / "out"
     rows = np.array([tracking_world.pose_row(k) for k in range(40)])
@@ -390,7 +419,7 @@ def test_a_trajectory_file_is_an_odometry(tmp_path: Path) -> None:
         (["--sequences", "0007"], "no 0007"),
         (["--methods", "orb"], "there is no orb"),
         (["--odometry", "images"], "no image_02"),
-        (["--detections", "network"], "no image_02"),
+        (["--detections", "network"], "no image_02 or image_03"),
         (["--frames", "30:10"], "expected all, paper or A:B"),
         (["--frames", "x"], "expected all, paper or A:B"),
         (["--seeds", "0"], "--seeds 0"),

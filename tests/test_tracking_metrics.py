@@ -9,7 +9,7 @@ import pytest
 from evo.core import metrics
 from evo.core.trajectory import PosePath3D
 
-from birdslam.datasets.kitti_tracking import Label
+from birdslam.datasets.label_projection import Label
 from birdslam.evaluation.tracking_metrics import BoxFrame, count_boxes, hota, idf1, match_vehicles, path_errors
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import ego_pose

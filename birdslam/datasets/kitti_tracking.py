@@ -1,8 +1,10 @@
 """KITTI tracking (Geiger et al., 2012) as a benchmark: calibration, true poses, labels and 2-D detections.
 
 ROOT holds, for each sequence N: `calib/N.txt`, `label_02/N.txt`, `oxts/N.txt` (GPS/IMU) or `pose_cam0/N.txt` (KITTI
-3x4 rows), and, where they are at hand, `image_02/N/` and `det_02_rrc/{Car,Pedestrian}/N.txt`. A label's place is the
-bottom centre of the vehicle in the axes of camera 0. Errors are DatasetError and name file and line.
+3x4 rows), and, where they are at hand, `image_02/N/` or `image_03/N/` and `det_02_rrc/{Car,Pedestrian}/N.txt`. A
+label's place is the bottom centre of the vehicle in the axes of camera 0. The boxes of labels and detections are those
+of camera 2; of camera 3 they follow from the labels' bodies (label_projection.py). Errors are DatasetError and name
+file and line.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from birdslam.datasets.kitti import KITTI_HEIGHT_M, find_images, read_image, read_projection
+from birdslam.datasets.label_projection import Label, project_labels
 from birdslam.datasets.recording import DatasetError
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
@@ -25,7 +28,8 @@ from birdslam.trajectory import Transform, as_poses, inverse, read_kitti
 
 Floats = NDArray[np.float64]
 
-IMAGE_SIZE_PX = (1242, 375)  # of camera 2 where there is no image to ask
+COLOUR_CAMERAS = (2, 3)  # left, right
+IMAGE_SIZE_PX = (1242, 375)  # of those where there is no image to ask
 EARTH_RADIUS_M = 6378137.0
 DETECTED_LABELS = {"Car": "car", "Pedestrian": "person"}  # a detector's folder -> label
 VEHICLE_KINDS = ("Car", "Van", "Truck")  # of the labels
@@ -33,40 +37,24 @@ _LABEL_COLUMNS, _OXTS_COLUMNS, _DETECTION_COLUMNS = 17, 30, 6
 
 
 @dataclass(frozen=True)
-class Label:
-    """One labelled object in one frame; `place_m` (3,) is its bottom centre in camera 0 (x right, y down, z ahead)."""
-
-    frame: int
-    track: int
-    kind: str
-    truncated: float
-    occluded: int
-    box_px: tuple[float, float, float, float]
-    height_m: float
-    width_m: float
-    length_m: float
-    place_m: tuple[float, float, float]
-    rotation_y_rad: float
-
-
-@dataclass(frozen=True)
 class TrackingSequence:
-    """`poses` (N, 4, 4) are `T_first_i` of camera 0; `camera` is camera 2, in whose images labels and boxes are."""
+    """`poses` (N, 4, 4) are `T_first_i` of camera 0; labels' boxes are of `camera`, whose `number` is 2 or 3."""
 
     name: str
     camera: Camera
-    T_cam0_cam2: Transform
+    T_cam0_camera: Transform
     poses: Transform
     labels: tuple[Label, ...]
     images: Path | None
+    number: int = COLOUR_CAMERAS[0]
 
     def __len__(self) -> int:
         return len(self.poses)
 
     @property
     def camera_poses(self) -> Transform:
-        """(N, 4, 4) `T_first_i` of camera 2."""
-        out: Transform = inverse(self.T_cam0_cam2) @ self.poses @ self.T_cam0_cam2
+        """(N, 4, 4) `T_first_i` of `camera`."""
+        out: Transform = inverse(self.T_cam0_camera) @ self.poses @ self.T_cam0_camera
         return out
 
     def labels_of(self, frame: int) -> list[Label]:
@@ -84,7 +72,7 @@ class TrackingSequence:
         T_cam0_vehicle = np.eye(4)
         T_cam0_vehicle[:3, :3] = Rotation.from_euler("y", label.rotation_y_rad + math.pi / 2.0).as_matrix()  # z ahead
         T_cam0_vehicle[:3, 3] = label.place_m
-        poses = inverse(self.T_cam0_cam2) @ inverse(self.poses[first]) @ self.poses[label.frame]
+        poses = inverse(self.T_cam0_camera) @ inverse(self.poses[first]) @ self.poses[label.frame]
         return _laid_down(poses @ T_cam0_vehicle)
 
 
@@ -94,19 +82,29 @@ def _laid_down(T_first_i: Transform) -> SE2:
     return SE2(float(T_first_i[2, 3]), float(-T_first_i[0, 3]), math.atan2(-forward[0], forward[2]))
 
 
-def open_tracking(root: Path, name: str) -> TrackingSequence:
-    """One sequence of a KITTI tracking folder. Raises DatasetError naming what is missing or wrong."""
+def camera_with_images(root: Path, name: str) -> int | None:
+    """The colour camera whose images of a sequence are there, the left one first; None where there are none."""
+    return next((number for number in COLOUR_CAMERAS if (root / f"image_{number:02d}" / name).is_dir()), None)
+
+
+def open_tracking(root: Path, name: str, number: int | None = None) -> TrackingSequence:
+    """One sequence of a KITTI tracking folder as a colour camera sees it: 2 or 3, None for the one that has images.
+
+    Without any images that is camera 2. Raises DatasetError naming what is missing or wrong.
+    """
     if not root.is_dir():
         raise DatasetError(f"{root}: no such directory")
+    if number is None:
+        number = camera_with_images(root, name) or COLOUR_CAMERAS[0]
     calibration = root / "calib" / f"{name}.txt"
-    P = read_projection(calibration, "P2")
-    T_cam0_cam2 = np.eye(4)
-    T_cam0_cam2[:3, 3] = -np.linalg.solve(P[:, :3], P[:, 3])
+    P = read_projection(calibration, f"P{number}")
+    T_cam0_camera = np.eye(4)
+    T_cam0_camera[:3, 3] = -np.linalg.solve(P[:, :3], P[:, 3])
     labels = read_labels(root / "label_02" / f"{name}.txt")
     poses = _read_poses(root, name, calibration)
     if labels and labels[-1].frame >= len(poses):
         raise DatasetError(f"{root}: sequence {name} has {len(poses)} poses, but labels go on to {labels[-1].frame}")
-    images: Path | None = root / "image_02" / name
+    images: Path | None = root / f"image_{number:02d}" / name
     width_px, height_px = IMAGE_SIZE_PX
     if images is not None and images.is_dir():
         first = next(iter(find_images(images).values()))
@@ -119,8 +117,10 @@ def open_tracking(root: Path, name: str) -> TrackingSequence:
     try:
         camera = Camera(width_px, height_px, P[0, 0], P[1, 1], P[0, 2], P[1, 2], height_m=KITTI_HEIGHT_M)
     except ValueError as error:
-        raise DatasetError(f"{calibration}: P2: {error}") from None
-    return TrackingSequence(name, camera, T_cam0_cam2, poses, tuple(labels), images)
+        raise DatasetError(f"{calibration}: P{number}: {error}") from None
+    if number != COLOUR_CAMERAS[0]:
+        labels = project_labels(labels, camera, T_cam0_camera)
+    return TrackingSequence(name, camera, T_cam0_camera, poses, tuple(labels), images, number)
 
 
 def _read_poses(root: Path, name: str, calibration: Path) -> Transform:

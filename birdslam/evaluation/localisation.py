@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from birdslam.datasets.kitti_tracking import Label, TrackingSequence
+from birdslam.datasets.kitti_tracking import TrackingSequence
+from birdslam.datasets.label_projection import Label
 from birdslam.evaluation.tracking import make_log
 from birdslam.evaluation.tracking_metrics import match_vehicles
 from birdslam.frontend import FrontEndConfig
@@ -28,6 +29,7 @@ from birdslam.types import Measurements, VehicleEdge
 from birdslam.vehicles.ground_size_filter import GroundSizeConfig
 from birdslam.vehicles.localisation import LocalisationConfig
 
+CAMERA_OF_BOXES = 2  # labels and RRC detections were drawn in its images
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0))
 INSIDE_1_SIGMA, INSIDE_2_SIGMA = (float(chi2.ppf(chi2.cdf(k**2, 1), 2)) for k in (1, 2))  # 2.30, 6.18
 MEASURED_KIND = "Car"

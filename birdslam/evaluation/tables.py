@@ -13,8 +13,18 @@ from typing import Any
 import msgspec
 
 from birdslam.datasets.recording import DatasetError
+from birdslam.evaluation.told import MotionRow, RangeRow
 from birdslam.evaluation.tracking import EGO, Row, mean_ate_m
 
+ODOMETRIES = {  # as it is called in a row, and at length
+    "simulate": (
+        "simulated odometry",
+        "SIMULATED (true poses with the errors that our image odometry has on real clips, landmarks drawn beside the "
+        "true path)",
+    ),
+    "truth": ("true odometry", "TRUTH (no error)"),
+    "images": ("images", "from the images where a row says so"),
+}
 OURS = {"birdslam_live": "ours, live", "birdslam": "**ours**"}
 Cells = dict[str, dict[str, float]]  # sequence -> body -> metres
 
@@ -106,7 +116,7 @@ def methods_table(rows: Sequence[Row], published: Published, ego: bool) -> str:
     chosen = _chosen(rows)
     redone = [name for name in METHOD_TITLES if name in chosen]
     own = [name for name in OURS if name in chosen]
-    head = ["Seq", "Car", "frames"]
+    head = ["Seq", "Car", "odometry", "frames"]
     head += [f"published: {title}" for title in METHOD_TITLES.values()]
     head += [f"re-implemented: {METHOD_TITLES[name]}" for name in redone]
     head += [OURS[name] for name in own]
@@ -114,17 +124,28 @@ def methods_table(rows: Sequence[Row], published: Published, ego: bool) -> str:
     lines = []
     for sequence, names in bodies.items():
         for body in names:
-            of = {row.method: row for row in rows if (row.sequence, row.body) == (sequence, body)}
-            any_row = next(iter(of.values()), None)
-            line = [sequence, body, "" if any_row is None else f"{any_row.frames:g} of {any_row.frames_labelled}"]
-            line += [_number(table.ate_m.get(name, {}).get(sequence, {}).get(body)) for name in METHOD_TITLES]
-            line += [_row_number(of.get(name)) for name in (*redone, *own)]
-            lines.append(line)
-    present = _present(rows, bodies)
-    means: list[str] = ["mean", "of those at hand", ""]
-    means += [_number(_published_mean(table.ate_m.get(name, {}), present)) for name in METHOD_TITLES]
-    means += [_number(mean_ate_m(rows, name, present)) for name in (*redone, *own)]
-    return _markdown(head, [*lines, means])
+            here = [row for row in rows if (row.sequence, row.body) == (sequence, body)]
+            for odometry in dict.fromkeys(row.odometry for row in here) or ("",):
+                of = {row.method: row for row in here if row.odometry == odometry}
+                any_row = next(iter(of.values()), None)
+                line = [sequence, body, odometry_title(odometry)]
+                line.append("" if any_row is None else f"{any_row.frames:g} of {any_row.frames_labelled}")
+                line += [_number(table.ate_m.get(name, {}).get(sequence, {}).get(body)) for name in METHOD_TITLES]
+                line += [_row_number(of.get(name)) for name in (*redone, *own)]
+                lines.append(line)
+    for odometry in dict.fromkeys(row.odometry for row in rows) or ("",):
+        alike = [row for row in rows if row.odometry == odometry]
+        present = _present(alike, bodies)
+        means: list[str] = ["mean", "of those at hand", odometry_title(odometry), ""]
+        means += [_number(_published_mean(table.ate_m.get(name, {}), present)) for name in METHOD_TITLES]
+        means += [_number(mean_ate_m(alike, name, present)) for name in (*redone, *own)]
+        lines.append(means)
+    return _markdown(head, lines)
+
+
+def odometry_title(odometry: str) -> str:
+    """What a row says of where its ego motion comes from."""
+    return ODOMETRIES.get(odometry, (odometry,))[0]
 
 
 def variants_table(rows: Sequence[Row], published: Published, table: PublishedTable, columns: Sequence[str]) -> str:
@@ -176,15 +197,61 @@ def lanes_table(rows: Sequence[Row], published: Published) -> str:
 
 def tracks_table(rows: Sequence[Row], method: str) -> str:
     """What the paper does not report: relative errors, object motion, and the tracks in the image."""
-    head = ["Seq", "HOTA", "IDF1", "ego RPE m", "ego RPE deg", "vehicles", "ATE m", "RPE m", "RPE deg", "motion m"]
+    head = ["Seq", "odometry", "HOTA", "IDF1", "ego RPE m", "ego RPE deg", "vehicles", "tracks of each"]
+    head += ["ATE m", "RPE m", "RPE deg", "motion m"]
     lines = []
-    for ego in (row for row in rows if row.method == method and row.body == EGO):
-        cars = [row for row in rows if row.method == method and row.sequence == ego.sequence and row.body != EGO]
-        line = [ego.sequence, _number(ego.hota, 3), _number(ego.idf1, 3), _number(ego.rpe_t_m, 3)]
-        line += [_number(ego.rpe_r_deg, 3), str(len(cars))]
+    of_method = [row for row in rows if row.method == method]
+    for ego in (row for row in of_method if row.body == EGO):
+        alike = [row for row in of_method if (row.sequence, row.odometry) == (ego.sequence, ego.odometry)]
+        cars = [row for row in alike if row.body != EGO]
+        line = [
+            ego.sequence,
+            odometry_title(ego.odometry),
+            _number(ego.hota, 3),
+            _number(ego.idf1, 3),
+            _number(ego.rpe_t_m, 3),
+        ]
+        line += [_number(ego.rpe_r_deg, 3), str(len(cars)), _number(_mean(car.tracks for car in cars))]
         line += [_number(_mean(getattr(car, name) for car in cars)) for name in ("ate_m", "rpe_t_m", "rpe_r_deg")]
         lines.append([*line, _number(_mean(car.motion_error_m for car in cars))])
     return _markdown(head, lines)
+
+
+def ranges_table(rows: Sequence[RangeRow]) -> str:
+    """Of the cars asked for at each range: how many were found, and how far off."""
+    head = ["Seq", "range m", "asked", "found", "depth error", "depth bias", "across m"]
+    lines = [
+        [
+            row.sequence,
+            row.range,
+            str(row.asked),
+            _number(row.found / row.asked if row.asked else None),
+            _percent(row.depth_error_median_rel),
+            _percent(row.depth_bias_median_rel),
+            _number(row.across_error_median_m),
+        ]
+        for row in rows
+    ]
+    return _markdown(head, lines)
+
+
+def motion_table(rows: Sequence[MotionRow]) -> str:
+    """Of the found cars: their velocities, and how many standing and driving ones were told as the other."""
+    head = ["Seq", "sights", "velocity error m/s", "standing", "false movers", "driving", "missed movers"]
+    lines = [
+        [
+            row.sequence,
+            str(row.asked),
+            _number(row.velocity_error_median_mps),
+            *(str(n) for n in (row.standing, row.false_movers, row.driving, row.missed_movers)),
+        ]
+        for row in rows
+    ]
+    return _markdown(head, lines)
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100.0 * value:.1f} %"
 
 
 def _chosen(rows: Iterable[Row]) -> list[str]:

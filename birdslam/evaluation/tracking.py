@@ -193,6 +193,11 @@ class Truth:
                 out[frame] = pose
         return out
 
+    def tracks(self) -> dict[str, int]:
+        """How many tracks held each labelled vehicle, one after the other."""
+        held = {label: {m[label] for m in self.matches.values() if label in m} for label in self.vehicles}
+        return {str(label): len(tracks) for label, tracks in held.items()}
+
     def errors(self, result: Trajectories) -> dict[str, PathErrors | None]:
         """Errors of "ego" and of every labelled vehicle; None for one that was never found."""
         out = {EGO: path_errors(self.ego, result.ego)}
@@ -219,6 +224,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     idf1: float | None = None
     odometry: str = ""
     detections: str = ""
+    tracks: float | None = None  # how many of our tracks held the vehicle; the same for every method
 
 
 @dataclass(frozen=True)
@@ -227,6 +233,7 @@ class Trial:
 
     errors: Mapping[str, Mapping[str, PathErrors | None]]
     frames_labelled: Mapping[str, int]
+    tracks: Mapping[str, int]  # body -> tracks that held it
     hota: float | None
     idf1: float | None
 
@@ -236,7 +243,7 @@ def run_trial(sequence: TrackingSequence, log: Sequence[Measurements], chosen: M
     truth = Truth.of(sequence, log)
     labelled = {EGO: len(truth.ego)} | {str(label): len(poses) for label, poses in truth.vehicles.items()}
     errors = {name: truth.errors(method.run(log, sequence.camera)) for name, method in chosen.items()}
-    return Trial(errors, labelled, hota(truth.boxes), idf1(truth.boxes))
+    return Trial(errors, labelled, truth.tracks(), hota(truth.boxes), idf1(truth.boxes))
 
 
 def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odometry: str, detections: str) -> list[Row]:
@@ -267,6 +274,7 @@ def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odome
                     idf1=_median([trial.idf1 for trial in trials]) if is_ego else None,
                     odometry=odometry,
                     detections=detections,
+                    tracks=_median([trial.tracks.get(body) for trial in trials]),
                 )
             )
     return rows
@@ -278,7 +286,10 @@ def _median(values: Iterable[float | None]) -> float | None:
 
 
 def mean_ate_m(rows: Iterable[Row], method: str, bodies: Mapping[str, Iterable[str]]) -> float | None:
-    """Mean of `ate_m` over bodies by sequence; None where one of them is missing, or there are none."""
+    """Mean of `ate_m` over bodies by sequence; None where one of them is missing, or there are none.
+
+    The rows must be of one odometry.
+    """
     of = {(row.sequence, row.body): row.ate_m for row in rows if row.method == method}
     errors = [of.get((sequence, body)) for sequence, names in bodies.items() for body in names]
     return float(np.mean([e for e in errors if e is not None])) if errors and None not in errors else None

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.datasets.kitti_tracking import VEHICLE_KINDS, Label
+from birdslam.datasets.kitti_tracking import VEHICLE_KINDS
+from birdslam.datasets.label_projection import Label
 from birdslam.evaluation.odometry import rms, rpe
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import ego_pose

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.evaluation import tables
-from birdslam.evaluation.tables import Published
+from birdslam.evaluation.tables import ODOMETRIES, Published
+from birdslam.evaluation.told import MotionRow, RangeRow
 from birdslam.evaluation.tracking import Row
+
+ABOUT_TOLD = (
+    "Live, in the ego's frame: cars labelled 25 px or more high, hardly occluded and not truncated; found is an "
+    "estimate within 20 % of the distance ahead and 1.5 m across. A car stands under 0.5 m/s and drives over 2 m/s by "
+    "its labels; it is told as driving over 1.5 m/s."
+)
 
 
 @dataclass(frozen=True)
@@ -19,8 +26,6 @@ class Setting:
 
     frames: str
     methods: tuple[str, ...]
-    odometry: str
-    detections: str
     seeds: int
 
 
@@ -29,9 +34,12 @@ class Outcome:
     """What one sequence's process found."""
 
     sequence: str
+    odometry: str
     frames: range
     rows: list[Row]
     ablation: list[Row]
+    ranges: list[RangeRow]  # of the networks' own boxes alone, as `motion`
+    motion: list[MotionRow]
     incremental_s: float
     batch_s: float
     updates_ms: dict[str, NDArray[np.float64]]
@@ -41,7 +49,8 @@ def render_report(setting: Setting, published: Published, outcomes: Sequence[Out
     """The whole of report.md."""
     rows = [row for outcome in outcomes for row in outcome.rows]
     variants = [row for outcome in outcomes for row in outcome.ablation]
-    note = f"Odometry: {_odometry_note(setting)}. Detections: {setting.detections}."
+    detections = ", ".join(dict.fromkeys(row.detections for row in [*rows, *variants]))
+    note = f"Odometry: {_odometry_note(outcomes)}. Detections: {detections}."
     parts = ["# BirdSLAM on KITTI tracking\n", _preface(setting, outcomes)]
 
     def add(title: str, where: str, table: str) -> None:
@@ -67,6 +76,13 @@ def render_report(setting: Setting, published: Published, outcomes: Sequence[Out
             f"## Tracks and relative errors of {name}\n\nHOTA and IDF1 of cars in the image by KITTI's rules; the rest "
             f"are means over vehicles seen in 5 frames or more. {note}\n\n{tables.tracks_table(rows, name)}"
         )
+    told = [row for outcome in outcomes for row in outcome.ranges]
+    if told:
+        parts.append(
+            f"## What a planner was told of the cars that our own networks saw\n\n{ABOUT_TOLD}\n\n"
+            f"{tables.ranges_table(told)}\n"
+            f"{tables.motion_table([row for outcome in outcomes for row in outcome.motion])}"
+        )
     parts.append(_runtime(outcomes, published))
     return "\n".join(parts)
 
@@ -87,18 +103,13 @@ def _preface(setting: Setting, outcomes: Sequence[Outcome]) -> str:
     ]
     if setting.frames == "paper":
         lines.append("Frames: the first so many of each sequence; the paper gives their number, not where they start.")
-    taken = ", ".join(f"{o.sequence} [{o.frames.start}:{o.frames.stop}]" for o in outcomes)
+    taken = ", ".join(dict.fromkeys(f"{o.sequence} [{o.frames.start}:{o.frames.stop}]" for o in outcomes))
     return "\n\n".join([*lines, f"Sequences and frames: {taken}."]) + "\n"
 
 
-def _odometry_note(setting: Setting) -> str:
-    notes: Mapping[str, str] = {
-        "simulate": "SIMULATED (true poses with the errors that our image odometry has on real clips, landmarks drawn "
-        "beside the true path)",
-        "truth": "TRUTH (no error)",
-        "images": "from the images",
-    }
-    return notes.get(setting.odometry, f"from {setting.odometry}")
+def _odometry_note(outcomes: Sequence[Outcome]) -> str:
+    used = dict.fromkeys(outcome.odometry for outcome in outcomes)
+    return "; ".join(ODOMETRIES.get(name, ("", f"from {name}"))[1] for name in used)
 
 
 def _runtime(outcomes: Sequence[Outcome], published: Published) -> str:
@@ -115,5 +126,6 @@ def _runtime(outcomes: Sequence[Outcome], published: Published) -> str:
     ]
     for o in outcomes:
         ratio = o.batch_s / max(o.incremental_s, 1e-9)
-        lines.append(f"| {o.sequence} | {len(o.frames)} | {o.incremental_s:.3f} | {o.batch_s:.2f} | {ratio:.1f} |")
+        name = f"{o.sequence}, images" if o.odometry == "images" else o.sequence
+        lines.append(f"| {name} | {len(o.frames)} | {o.incremental_s:.3f} | {o.batch_s:.2f} | {ratio:.1f} |")
     return "\n".join(lines) + "\n"

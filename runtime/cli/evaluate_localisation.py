@@ -11,6 +11,7 @@ import msgspec
 from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.datasets.recording import DatasetError
 from birdslam.evaluation.localisation import (
+    CAMERA_OF_BOXES,
     PAPER,
     CarError,
     LocalisationRow,
@@ -30,7 +31,7 @@ def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
     output = Path(options.output)
     claim_directory(output)
     errors: list[CarError] = []
-    sequences = [open_tracking(options.root, name) for name in _sequences(options)]
+    sequences = [open_tracking(options.root, name, CAMERA_OF_BOXES) for name in _sequences(options)]
     with Progress("localisation", sum(map(len, sequences))) as progress:
         progress.reach(0)
         for sequence in sequences:

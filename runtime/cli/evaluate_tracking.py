@@ -16,10 +16,11 @@ from pathlib import Path
 
 import msgspec
 
+from birdslam.datasets.kitti_tracking import camera_with_images
 from birdslam.datasets.recording import DatasetError
 from birdslam.evaluation import tables
+from birdslam.evaluation.localisation import CAMERA_OF_BOXES
 from birdslam.evaluation.results import claim_directory
-from birdslam.evaluation.tracking import Row
 from birdslam.evaluation.tracking_picture import draw_runtime
 from birdslam.evaluation.tracking_report import Outcome, Setting, render_report
 from birdslam.runtime.cli.options import speeds_of
@@ -36,16 +37,19 @@ def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
     jobs = _jobs(options, configuration)
     output = Path(options.output)
     claim_directory(output)
-    outcomes = sorted(_run_all(jobs, max(1, options.jobs)), key=lambda outcome: outcome.sequence)
+    outcomes = sorted(_run_all(jobs, max(1, options.jobs)), key=lambda o: (o.sequence, o.odometry == "images"))
     rows = [row for outcome in outcomes for row in outcome.rows]
     variants = [row for outcome in outcomes for row in outcome.ablation]
     job = jobs[0]
     _write_json(output / "report.json", rows if job.methods else variants)
     if job.methods and variants:
         _write_json(output / "ablation.json", variants)
+    told: list[msgspec.Struct] = [row for outcome in outcomes for row in (*outcome.ranges, *outcome.motion)]
+    if told:
+        _write_json(output / "told.json", told)
     longest = max(outcomes, key=lambda outcome: len(outcome.frames))
     draw_runtime(longest.updates_ms, output / "runtime.png")
-    setting = Setting(job.frames, job.methods, job.odometry, job.detections, job.seeds)
+    setting = Setting(job.frames, job.methods, max(job.seeds for job in jobs))
     report = render_report(setting, job.published, outcomes)
     (output / "report.md").write_text(report, encoding="utf-8")
     print(report)
@@ -73,21 +77,7 @@ def _jobs(options: argparse.Namespace, configuration: Configuration) -> list[Job
     unknown = [name for name in chosen if name not in METHODS]
     if unknown:
         raise ConfigurationError(f"--methods: there is no {', '.join(unknown)}; there are {', '.join(METHODS)}")
-    with_images = all((root / "image_02" / name).is_dir() for name in sequences)
-    odometry = options.odometry or ("images" if with_images else "simulate")
-    detections = options.detections or ("rrc" if (root / "det_02_rrc").is_dir() else "network")
-    if odometry == "images" and not with_images:
-        raise ConfigurationError(f"--odometry images: {root} has no image_02 of every sequence")
-    if configuration.source.speed:
-        speeds_of(configuration, len(set(sequences)))
-        if odometry != "images":
-            raise ConfigurationError(f"--speed: the odometry is {odometry}, and fuses none; --odometry images does")
-    if detections == "network":
-        if not with_images:
-            raise ConfigurationError(f"--detections network: {root} has no image_02 of every sequence")
-        if configuration.models.detector is None:
-            raise ConfigurationError("--detections network: needs --model detector=PATH")
-    return [
+    jobs = [
         Job(
             root=root,
             sequence=name,
@@ -96,12 +86,49 @@ def _jobs(options: argparse.Namespace, configuration: Configuration) -> list[Job
             odometry=odometry,
             detections=detections,
             seeds=options.seeds if odometry == "simulate" else 1,
+            ablate=own or not compare,
             output=Path(options.output),
             configuration=configuration,
             published=published,
         )
         for name in dict.fromkeys(sequences)
+        for odometry, detections, own in _sources(options, root, name, compare, configuration)
     ]
+    if configuration.source.speed:
+        speeds_of(configuration, len(set(sequences)))
+        simulated = set(sequences) - {job.sequence for job in jobs if job.odometry == "images"}
+        if simulated:
+            names = ", ".join(sorted(simulated))
+            raise ConfigurationError(f"--speed: the odometry of {names} fuses none; --odometry images does")
+    return jobs
+
+
+def _sources(
+    options: argparse.Namespace, root: Path, name: str, compare: bool, configuration: Configuration
+) -> list[tuple[str, str, bool]]:
+    """Odometry and detections of a sequence's jobs, and whether the ablations go with it.
+
+    Where nothing is asked for, a sequence with images is driven by these too, with the networks' own boxes. Raises
+    ConfigurationError where the images or the networks that are asked for are not there.
+    """
+    camera = camera_with_images(root, name)
+    boxes = (root / "det_02_rrc").is_dir()
+    detections = options.detections or ("rrc" if boxes else "network")
+    seen = camera is not None and (detections == "network" or camera == CAMERA_OF_BOXES)
+    odometry = options.odometry or ("images" if seen and (options.detections or not boxes) else "simulate")
+    out = [(odometry, detections, True)]
+    if compare and camera is not None and boxes and not options.odometry and not options.detections:
+        out.append(("images", "network", False))
+    for odometry, detections, _ in out:
+        own = detections == "network"
+        if own and camera is None:
+            raise ConfigurationError(f"--detections network: {root} has no image_02 or image_03 of sequence {name}")
+        if odometry == "images" and not own and camera != CAMERA_OF_BOXES:
+            which = "no image_02" if camera is None else f"no image_02, whose boxes these are, but image_{camera:02d},"
+            raise ConfigurationError(f"--odometry images: {root} has {which} of sequence {name}")
+        if own and not {"detector", "multitask"} & set(configuration.models.in_use()):
+            raise ConfigurationError("--detections network: needs a network that detects: --model detector=PATH")
+    return out
 
 
 def _run_all(jobs: Sequence[Job], processes: int) -> list[Outcome]:
@@ -129,7 +156,7 @@ def _shown(outcome: Outcome, number: int, jobs: Sequence[Job], begun_s: float) -
     left = len(jobs) - number
     to_go = f", {time_to_go((time.monotonic() - begun_s) * left / number)} to go" if left else ""
     print(
-        f"sequence {outcome.sequence}: {len(outcome.frames)} frames, {jobs[0].seeds} seeds done "
+        f"sequence {outcome.sequence}: {len(outcome.frames)} frames, odometry: {outcome.odometry}, done "
         f"({number} of {len(jobs)}{to_go})",
         file=sys.stderr,
         flush=True,
@@ -137,5 +164,5 @@ def _shown(outcome: Outcome, number: int, jobs: Sequence[Job], begun_s: float) -
     return outcome
 
 
-def _write_json(path: Path, rows: Sequence[Row]) -> None:
+def _write_json(path: Path, rows: Sequence[msgspec.Struct]) -> None:
     path.write_bytes(msgspec.json.format(msgspec.json.encode(rows), indent=2) + b"\n")

@@ -19,7 +19,9 @@ from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, re
 from birdslam.datasets.recording import DatasetError
 from birdslam.datasets.speed_file import of_sequence, read_speeds
 from birdslam.evaluation import ablation
+from birdslam.evaluation.localisation import CAMERA_OF_BOXES
 from birdslam.evaluation.tables import Published
+from birdslam.evaluation.told import motion_row, range_rows, sights
 from birdslam.evaluation.tracking import (
     PAPER,
     Method,
@@ -41,7 +43,7 @@ from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.simulation.odometry import EXACT, SimulatedOdometry, SimulationConfig
 from birdslam.trajectory import as_poses, inverse, read_kitti
-from birdslam.types import Measurements
+from birdslam.types import Estimate, Measurements
 
 
 @dataclass(frozen=True)
@@ -55,9 +57,15 @@ class Job:
     odometry: str
     detections: str
     seeds: int
+    ablate: bool  # the variants of Tables 3-5 too
     output: Path
     configuration: Configuration
     published: Published
+
+    @property
+    def camera(self) -> int | None:
+        """Whose images and boxes count: with the networks' boxes that which has images."""
+        return None if self.detections == "network" else CAMERA_OF_BOXES
 
 
 def frames_of(text: str, sequence: TrackingSequence, published: Published) -> range:
@@ -83,14 +91,14 @@ def frames_of(text: str, sequence: TrackingSequence, published: Published) -> ra
 
 def frames_to_make(job: Job) -> int:
     """How many frames the front end goes through for a job, seeds and logs together."""
-    frames = frames_of(job.frames, open_tracking(job.root, job.sequence), job.published)
+    frames = frames_of(job.frames, open_tracking(job.root, job.sequence, job.camera), job.published)
     return len(frames) * job.seeds * (bool(job.methods) + bool(_variants(job)))
 
 
 def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> Outcome:
     """All methods and ablations on one sequence; `frame_made` is told of each frame of the front end."""
     cv2.setNumThreads(1)
-    sequence = open_tracking(job.root, job.sequence)
+    sequence = open_tracking(job.root, job.sequence, job.camera)
     frames = frames_of(job.frames, sequence, job.published)
     slam = job.configuration.slam
     chosen: dict[str, Method] = {name: methods(slam)[name] for name in job.methods}
@@ -110,7 +118,8 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
         name = next(iter(chosen))
         truth, result = Truth.of(sequence, log), chosen[name].run(log, sequence.camera)
         title = f"KITTI tracking {sequence.name}, {chosen[name].label}, odometry: {job.odometry}"
-        draw_sequence(title, truth, result, job.output / f"bev_{sequence.name}.png")
+        of_images = "_images" if job.odometry == "images" else ""
+        draw_sequence(title, truth, result, job.output / f"bev_{sequence.name}{of_images}.png")
     updates_ms = {"all vehicles": _updates_ms(log, job), "one vehicle": _updates_ms(_one_vehicle(log), job)}
     start = time.perf_counter()
     batch_se3.run(log, sequence.camera)
@@ -120,11 +129,15 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
     def rows_of(trials: Sequence[Trial]) -> list[Row]:
         return summarise(sequence.name, trials, bodies, job.odometry, job.detections) if trials else []
 
+    seen = sights(sequence, _estimates(log, job)) if chosen and job.detections == "network" else []
     return Outcome(
         sequence=sequence.name,
+        odometry=job.odometry,
         frames=frames,
         rows=rows_of(trials),
         ablation=rows_of(ablations),
+        ranges=range_rows(sequence.name, seen) if seen else [],
+        motion=[motion_row(sequence.name, seen)] if seen else [],
         incremental_s=float(updates_ms["all vehicles"].sum()) / 1e3,
         batch_s=time.perf_counter() - start,
         updates_ms=updates_ms,
@@ -134,6 +147,8 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
 def _variants(job: Job) -> dict[str, Method]:
     """The ablations by "METHOD/VARIANT"; of Table 5 by the variant alone."""
     out: dict[str, Method] = {}
+    if not job.ablate:
+        return out
     for name, base in (("paper", PAPER), ("birdslam", ours(job.configuration.slam))):
         if not job.methods or name in job.methods:
             for part in (ablation.constraint_variants(base), ablation.landmark_variants(base)):
@@ -156,7 +171,7 @@ def _log_maker(
         except (KeyError, ValueError):
             return None
 
-    beside = job.configuration.source.speed
+    beside = job.configuration.source.speed if job.odometry == "images" else ""
     speeds = read_speeds(of_sequence(Path(beside).expanduser(), sequence.name)) if beside else None
     network = job.detections == "network"
     folder = job.root / "det_02_rrc" if job.detections == "rrc" else Path(job.detections)
@@ -201,7 +216,7 @@ def _odometry(job: Job, sequence: TrackingSequence, frames: range, rng: np.rando
         rows = np.concatenate([np.tile(rows[:1], (frames.start, 1, 1)), rows])
     if len(rows) < frames.stop:
         raise DatasetError(f"{path}: {len(rows)} poses for {len(frames)} frames of sequence {sequence.name}")
-    poses = inverse(sequence.T_cam0_cam2) @ rows @ sequence.T_cam0_cam2
+    poses = inverse(sequence.T_cam0_camera) @ rows @ sequence.T_cam0_camera
     return SimulatedOdometry(sequence.camera, poses, EXACT, rng, true_poses=truth)
 
 
@@ -215,6 +230,12 @@ def _one_vehicle(log: Sequence[Measurements]) -> list[Measurements]:
         )
         for m in log
     ]
+
+
+def _estimates(log: Sequence[Measurements], job: Job) -> list[Estimate]:
+    """What a planner was told in each frame."""
+    graph = PoseGraph(job.configuration.slam.graph, job.configuration.slam.weights)
+    return [graph.optimise(measurements) for measurements in log]
 
 
 def _updates_ms(log: Sequence[Measurements], job: Job) -> NDArray[np.float64]:

@@ -1,0 +1,84 @@
+"""Labels of KITTI tracking in the image of a camera that they were not drawn in.
+
+A label's box in the image belongs to camera 2. Its body, a cuboid in camera 0, belongs to none: in another camera the
+box is the hull of the cuboid's outline there. That hull is a little wider and higher than a box that is drawn around
+what is seen of a car (a cuboid has corners where a car is round).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from birdslam.geometry.camera import Camera
+from birdslam.trajectory import Transform, inverse
+
+DONT_CARE = "DontCare"  # a region without a body
+NEAREST_M = 0.1  # what lies nearer to the camera's plane, or behind it, has no image
+LEAST_INSIDE = 0.98  # of a hull's area: with less of it in the image the object is truncated
+# A cuboid's corners by (length, height, width), and its edges: pairs of corners that differ in one of them
+_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-1.0, 0.0) for z in (-0.5, 0.5)])
+_EDGES = np.array([(i, j) for i in range(8) for j in range(i) if np.count_nonzero(_CORNERS[i] != _CORNERS[j]) == 1])
+
+
+@dataclass(frozen=True)
+class Label:
+    """One labelled object in one frame; `place_m` (3,) is its bottom centre in camera 0 (x right, y down, z ahead)."""
+
+    frame: int
+    track: int
+    kind: str
+    truncated: float
+    occluded: int
+    box_px: tuple[float, float, float, float]
+    height_m: float
+    width_m: float
+    length_m: float
+    place_m: tuple[float, float, float]
+    rotation_y_rad: float
+
+
+def project_labels(labels: Iterable[Label], camera: Camera, T_cam0_camera: Transform) -> list[Label]:
+    """The labels that are in the camera's image, with the boxes and the truncation that they have there.
+
+    Regions without a body keep their boxes: what they hide is far away. Occlusion stays as labelled.
+    """
+    out = []
+    for label in labels:
+        hull = None if label.kind == DONT_CARE else hull_px(label, camera, T_cam0_camera)
+        if label.kind == DONT_CARE:
+            out.append(label)
+        elif hull is not None:
+            low = np.clip(hull[:2], 0.0, [camera.width_px, camera.height_px])
+            high = np.clip(hull[2:], 0.0, [camera.width_px, camera.height_px])
+            inside = float(np.prod(high - low) / np.prod(hull[2:] - hull[:2]))
+            if inside > 0.0:
+                box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+                out.append(replace(label, box_px=box, truncated=float(inside < LEAST_INSIDE)))
+    return out
+
+
+def hull_px(label: Label, camera: Camera, T_cam0_camera: Transform) -> NDArray[np.float64] | None:
+    """(4,) x1, y1, x2, y2 of the body's outline in pixels, not cut by the image; None where it lies behind."""
+    R_cam0_body = Rotation.from_euler("y", label.rotation_y_rad).as_matrix()
+    size_m = np.array([label.length_m, label.height_m, label.width_m])
+    p_cam0 = (_CORNERS * size_m) @ R_cam0_body.T + label.place_m
+    T_camera_cam0 = inverse(T_cam0_camera)
+    corners = p_cam0 @ T_camera_cam0[:3, :3].T + T_camera_cam0[:3, 3]
+    ends = corners[_EDGES]  # (12, 2, 3)
+    near = ends[:, :, 2] < NEAREST_M
+    ends = ends[~near.all(axis=1)]
+    if not len(ends):
+        return None
+    for edge in ends:  # an edge through the camera's plane begins in front of it
+        (a, b) = edge if edge[0, 2] < edge[1, 2] else edge[::-1]
+        if a[2] < NEAREST_M:
+            a += (NEAREST_M - a[2]) / (b[2] - a[2]) * (b - a)
+    points = ends.reshape(-1, 3)
+    u = camera.fx_px * points[:, 0] / points[:, 2] + camera.cx_px
+    v = camera.fy_px * points[:, 1] / points[:, 2] + camera.cy_px
+    return np.array([u.min(), v.min(), u.max(), v.max()])
