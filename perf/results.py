@@ -85,7 +85,7 @@ def _localisation(report: Sequence[Mapping[str, Any]]) -> Kept:
 
 def _tracking(report: Sequence[Mapping[str, Any]]) -> Kept:
     every = msgspec.convert(report, list[Row])
-    rows = [row for row in every if row.odometry == "simulate"]
+    rows = [row for row in every if row.odometry != "images"]
     egos = dict.fromkeys(CARS, (EGO,))
     kept: dict[str, Any] = {"seeds": rows[0].seeds}
     for method in METHODS:

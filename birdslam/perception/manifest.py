@@ -20,6 +20,8 @@ Meaning = Literal["road", "lane"]
 Pixels = Annotated[int, msgspec.Meta(ge=8, le=8192)]
 Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
+Variance = Annotated[float, msgspec.Meta(gt=0.0, le=10.0)]
+Scoring = Literal["none", "sigmoid", "softmax"]  # what makes scores in [0, 1] of a detector's numbers
 Sha256 = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
 
 
@@ -89,16 +91,13 @@ class BoxSigma(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     px: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)]
 
 
-class Yolox(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="yolox"):
-    """(1, cells, 5 + classes): xy, log wh, objectness, classes (both already sigmoid) on square grids of `strides`.
+class DetectorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What every detector's table has.
 
-    centre = (xy + cell) * stride, size = exp(wh) * stride, score = objectness * class. A class without a label in
-    `labels` is not reported. Labels that stand together in `rivals` suppress each other in NMS as if they were one
-    class (one vehicle is not both a car and a truck).
+    A class without a label in `labels` is not reported. Labels that stand together in `rivals` suppress each other in
+    NMS as if they were one class (one vehicle is not both a car and a truck).
     """
 
-    output: str
-    strides: Annotated[tuple[Count, ...], msgspec.Meta(min_length=1)]
     classes: Count
     labels: Annotated[dict[int, Label], msgspec.Meta(min_length=1)]
     score_threshold: Fraction
@@ -112,15 +111,24 @@ class Yolox(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 raise ValueError(f"labels: there is no class {index} among {self.classes} classes")
 
 
+class Yolox(DetectorTable, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="yolox"):
+    """(1, cells, 5 + classes): xy, log wh, objectness, classes (both already sigmoid) on square grids of `strides`.
+
+    centre = (xy + cell) * stride, size = exp(wh) * stride, score = objectness * class.
+    """
+
+    output: str
+    strides: Annotated[tuple[Count, ...], msgspec.Meta(min_length=1)]
+
+
 class CenterNet(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="centernet"
+    DetectorTable, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="centernet"
 ):
     """Objects as points: a heat map (1, classes, h, w) with a peak at each centre, its size and its offset in the cell.
 
     `sizes` is (1, 2, h, w) width and height, in cells of the map or in pixels of the input; `offsets`, where there is
     one, (1, 2, h, w) x and y in cells, to be added to the peak's cell. `heat` says what the heat map holds: scores, or
-    logits that a sigmoid makes scores. A peak is the largest of its 3x3 cells. Labels and rivals as for YOLOX; NMS
-    joins tiles and rivals.
+    logits that a sigmoid makes scores. A peak is the largest of its 3x3 cells. NMS joins tiles and rivals.
     """
 
     heat_map: str
@@ -128,17 +136,39 @@ class CenterNet(
     offsets: str = ""
     heat: Literal["scores", "logits"] = "scores"
     size_unit: Literal["cells", "pixels"] = "cells"
-    classes: Count
-    labels: Annotated[dict[int, Label], msgspec.Meta(min_length=1)]
-    score_threshold: Fraction
     nms_iou: Fraction = 0.6
-    rivals: tuple[tuple[Label, ...], ...] = ()
-    box_sigma: BoxSigma | None = None  # as YOLOX
 
-    def __post_init__(self) -> None:
-        for index in self.labels:
-            if not 0 <= index < self.classes:
-                raise ValueError(f"labels: there is no class {index} among {self.classes} classes")
+
+class Ssd(DetectorTable, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="ssd"):
+    """Prior boxes (N, 4) as x1, y1, x2, y2 in fractions of the input, their shifts (1, N, 4), scores (1, N, classes).
+
+    With a prior's centre c and size s, and v of the `variances`: centre = c + v[:2] * shift[:2] * s,
+    size = s * exp(v[2:] * shift[2:]). `scoring` says what makes scores of the numbers; the background is a class too,
+    without a label.
+    """
+
+    locations: str
+    scores: str
+    priors: str
+    variances: tuple[Variance, Variance, Variance, Variance] = (0.1, 0.1, 0.2, 0.2)
+    scoring: Scoring = "none"
+
+
+class BoxList(DetectorTable, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="boxes"):
+    """Decoded boxes with a score for each class: (1, N, 4) and (1, N, classes), in one output or in two.
+
+    Without `scores` they follow the box in its own output, as YOLOv8 has them. `layout` says which axis comes first:
+    "boxes" (1, N, channels) or "channels" (1, channels, N). `form` is what the four numbers are, `unit` theirs:
+    pixels or fractions of the input. `scoring` makes scores of the numbers: a DETR's last class, of a softmax, is
+    no object and has no label.
+    """
+
+    boxes: str
+    scores: str = ""
+    layout: Literal["boxes", "channels"] = "boxes"
+    form: Literal["centre_size", "corners"] = "centre_size"
+    unit: Literal["pixels", "fractions"] = "pixels"
+    scoring: Scoring = "none"
 
 
 class ClassMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -280,7 +310,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     sha256: Sha256 = ""  # of the .onnx file; a file with another one is refused
     schedule: Schedule = Schedule()
     tiles: Tiles | None = None
-    detector: Yolox | CenterNet | None = None
+    detector: Yolox | CenterNet | Ssd | BoxList | None = None
     segmenter: ClassMaps | None = None
     depth: Disparity | MetricDepth | None = None
     multitask: MultiTask | None = None

@@ -13,11 +13,13 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
+from birdslam.perception.box_lists import BoxListDecoder, SsdDecoder
 from birdslam.perception.centernet import CenterNetDecoder
 from birdslam.perception.depth import DisparityDecoder, MetricDepthDecoder
 from birdslam.perception.detection import YoloxDecoder
 from birdslam.perception.findings import Findings
 from birdslam.perception.manifest import (
+    BoxList,
     CenterNet,
     ClassMaps,
     Count,
@@ -30,6 +32,7 @@ from birdslam.perception.manifest import (
     MultiTask,
     Role,
     Schedule,
+    Ssd,
     Yolox,
 )
 from birdslam.perception.manifest_file import find_manifest
@@ -75,6 +78,8 @@ DECODINGS: dict[type, tuple[Callable[..., Decoder], str, Callable[[Any], tuple[s
         "detections",
         lambda table: tuple(filter(None, (table.heat_map, table.sizes, table.offsets))),
     ),
+    Ssd: (SsdDecoder, "detections", lambda table: (table.locations, table.scores, table.priors)),
+    BoxList: (BoxListDecoder, "detections", lambda table: tuple(filter(None, (table.boxes, table.scores)))),
     Disparity: (DisparityDecoder, "depth", lambda table: (table.output,)),
     MetricDepth: (MetricDepthDecoder, "depth", lambda table: (table.output,)),
     ClassMaps: (ClassMapsDecoder, "segmentation", lambda table: tuple(dict.fromkeys(m.output for m in table.maps))),
@@ -153,6 +158,12 @@ class Network:
             parts.append(self.read(view))
         found = self.decoder.merge(parts, views)
         return Findings(**{self._finding: found}) if self._finding else cast(Findings, found)
+
+    def answer(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
+        """The outputs as they are for an image's first view."""
+        self.prepare(image, self.views(image)[0])
+        self.infer()
+        return {name: tensor.copy() for name, tensor in self._tensors.items()}
 
     @property
     def output_shapes(self) -> dict[str, tuple[int, ...]]:

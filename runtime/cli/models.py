@@ -19,10 +19,8 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 from urllib.parse import urlsplit
 
-import msgspec
 import numpy as np
 
 from birdslam.geometry.camera import Camera
@@ -30,41 +28,15 @@ from birdslam.perception import ModelError, ModelSpec, Network, load_network, sh
 from birdslam.perception.manifest_file import Glance, find_as
 from birdslam.perception.pointnet import PointNet, load_pointnet
 from birdslam.runtime import model_store
+from birdslam.runtime.cli.catalogue import Ir, catalogue, check_answers, converted
 from birdslam.runtime.cli.download import SCHEMES, download
 from birdslam.runtime.progress import Progress
 
-CATALOGUE = Path(__file__).parent / "catalogue.toml"
 TIMEOUT_S = 30.0  # without a byte
 MANIFEST_LIMIT_BYTES = 1 << 20
 TEST_IMAGE_PX = (720, 1280)
 TEST_BOXES = 8
 _SCRATCH = ".adding-"
-
-Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
-
-
-class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A network of the catalogue: a file of a public repository at one commit."""
-
-    title: str
-    manifest: str  # the name of a shipped one
-    repository: str
-    commit: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{40}$")]
-    path: str
-    sha256: Sha256
-    size_bytes: Annotated[int, msgspec.Meta(ge=1)]
-    licence: str
-
-
-class Catalogue(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The networks that can be added by name; `address` makes an URL of an entry."""
-
-    address: str
-    models: dict[str, Entry]
-
-    def address_of(self, entry: Entry) -> str:
-        """Where the entry's network lies."""
-        return self.address.format(repository=entry.repository, commit=entry.commit, path=entry.path)
 
 
 @dataclass(frozen=True)
@@ -76,16 +48,12 @@ class Order:
     manifest: str  # a path, an address, the name of a shipped one; "": found as for any network
     sha256: str  # "": what the manifest pins, or for a file of this machine what it has
     limit_bytes: int
+    ir: Ir | None = None  # where `source` is the XML of an OpenVINO IR
 
     @property
     def remote(self) -> bool:
         """Whether it comes over the network."""
         return _is_address(self.source)
-
-
-def catalogue() -> Catalogue:
-    """What the package's catalogue holds."""
-    return msgspec.toml.decode(CATALOGUE.read_bytes(), type=Catalogue)
 
 
 def list_models(options: argparse.Namespace) -> int:
@@ -145,9 +113,12 @@ def order_of(source: str, name: str, manifest: str, sha256: str, limit_bytes: in
             raise ModelError(f"no model {source!r} in the catalogue, which has {', '.join(known.models)}; no such file")
         entry = known.models[source]
         if sha256 and sha256.lower() != entry.sha256:
-            raise ModelError(f"{source}: --sha256 {sha256} is not the catalogue's {entry.sha256}")
-        size_bytes = min(entry.size_bytes, limit_bytes)
-        return Order(name or source, known.address_of(entry), manifest or entry.manifest, entry.sha256, size_bytes)
+            raise ModelError(f"{source}: --sha256 {sha256} is not the catalogue's {entry.sha256 or 'own: it is made'}")
+        if entry.ir is not None and manifest:
+            raise ModelError(f"{source}: --manifest: it is made for the catalogue's own, {entry.manifest}")
+        size_bytes, address = min(entry.size_bytes, limit_bytes), known.address_of(entry)
+        manifest = manifest or entry.manifest
+        return Order(name or source, address, manifest, entry.sha256 or "", size_bytes, entry.ir)
     stem = Path(urlsplit(source).path if _is_address(source) else source).stem
     if not name and not model_store.is_name(stem):
         raise ModelError(f"{source}: {stem!r} is no name for a model: state one by --name")
@@ -163,16 +134,21 @@ def install(order: Order, directory: Path) -> list[str]:
         made = scratch / order.name
         made.mkdir()
         network = made / f"{order.name}.onnx"
-        _fetch(order.source, network, order.limit_bytes)
+        if order.ir is None:
+            _fetch(order.source, network, order.limit_bytes)
+        else:
+            network.write_bytes(_fetch_ir(order, order.ir, scratch))
         has = hashlib.sha256(network.read_bytes()).hexdigest()
         if order.sha256 and has != order.sha256:
             raise ModelError(f"{order.source}: SHA-256 {has}, but {order.sha256} was expected: refused")
         text, pinned = _manifest_text(order, network, has, scratch)
-        if order.remote and not order.sha256 and pinned != has:
+        if order.remote and not order.sha256 and order.ir is None and pinned != has:
             raise ModelError(f"{order.source}: no SHA-256 is known for it: state it by --sha256 or in its manifest")
         network.with_suffix(".toml").write_text(text)
         try:
             lines = examine(network, "")
+            if order.ir is not None:
+                check_answers(order.ir, order.source, load_network("", ModelSpec(str(network))))
         except ModelError as error:  # named by where it came from, not by a place that is about to vanish
             raise ModelError(f"refused: {str(error).replace(str(network), order.source)}") from error
         target = directory / order.name
@@ -267,6 +243,15 @@ def _manifest_text(order: Order, network: Path, sha256: str, scratch: Path) -> t
             text = re.sub(r"(?m)^\s*sha256\s*=.*$", "", text, count=1)
         text = f'sha256 = "{sha256}"\n{text}'
     return text, manifest.sha256
+
+
+def _fetch_ir(order: Order, ir: Ir, scratch: Path) -> bytes:
+    """The network of an IR: its XML and the .bin beside it fetched and converted."""
+    parts = scratch / "network.xml", scratch / "network.bin"
+    for part in parts:
+        _fetch(f"{order.source.removesuffix('.xml')}{part.suffix}", part, order.limit_bytes)
+    xml, weights = (part.read_bytes() for part in parts)
+    return converted(ir, order.source, order.manifest, xml, weights)
 
 
 def _fetch(source: str, target: Path, limit_bytes: int) -> None:
