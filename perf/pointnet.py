@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.perception import DepthMap, ModelError, ModelSpec, Network, load_network
+from birdslam.perception.detection import EdgeSigma
 from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perception.pointnet import PointNet, load_pointnet
 from birdslam.perf.errors import PerfError
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
     from birdslam.rendered_world.truth import WorldFrame, WorldObject
 
 label = "vehicles' places by depth: Frustum-PointNet, geometric fit and Eq. 1 on held-out worlds"
+
+LOCALISATION = LocalisationConfig()
 
 IMAGE_PX, MAP_PX = (640, 192), (320, 96)
 FIRST_SEED = 1_000  # training draws from two million on
@@ -82,7 +85,6 @@ class Sample:
     seen: list[Observation]
     truth: list[WorldObject]
     bodies: list[DepthPlace | None]  # of the multi-task network
-    localisation: LocalisationConfig  # with what the network says of its boxes' edges
 
 
 def run(arguments: list[str]) -> None:
@@ -124,9 +126,9 @@ def measured(samples: Iterator[Sample], pointnet: PointNet) -> dict[tuple[str, f
         camera, true = sample.frame.camera, sample.frame.camera.ground
         pitch_rad = true.pitch_rad + float(rng.normal(0.0, PITCH_ERROR_RAD))
         ground = GroundPlane(true.height_m, pitch_rad, true.roll_rad)
-        by_box = [by_bottom(o, ground, sample.localisation) for o in sample.seen]
+        by_box = [by_bottom(o, ground, LOCALISATION) for o in sample.seen]
         headed = [
-            by_bottom(o, ground, sample.localisation, Assignment(0, None, o, body).yaw_rad(SE2()))
+            by_bottom(o, ground, LOCALISATION, Assignment(0, None, o, body).yaw_rad(SE2()))
             for o, body in zip(sample.seen, sample.bodies, strict=True)
         ]
         by_net = localise_by_depth(sample.seen, sample.depth, camera, ground, config, network=pointnet)
@@ -177,11 +179,17 @@ def _observed(
     boxes_px: NDArray[np.float64],
     labels: Sequence[str],
     truth: Sequence[WorldObject],
-    config: LocalisationConfig,
+    edge_sigma: EdgeSigma | None = None,
 ) -> tuple[list[Observation], list[WorldObject], list[int]]:
     """What `observe_boxes` makes of boxes, with truth and rows that go with it."""
     seen = observe_boxes(
-        boxes_px, np.full(len(boxes_px), 0.9), tuple(labels), frame.camera, frame.camera.ground, config
+        boxes_px,
+        np.full(len(boxes_px), 0.9),
+        tuple(labels),
+        frame.camera,
+        frame.camera.ground,
+        LOCALISATION,
+        edge_sigma,
     )
     rows = [o.row for o in seen]
     return seen, [truth[row] for row in rows], rows
@@ -200,7 +208,7 @@ def _noisy(frames: int) -> Iterator[Sample]:
         frustum_example,
     )
 
-    config, errors, localisation = FrustumConfig(), DepthErrorConfig(), LocalisationConfig()
+    config, errors = FrustumConfig(), DepthErrorConfig()
     for seed in range(FIRST_SEED, FIRST_SEED + frames):
         rng, frame = np.random.default_rng(seed), sample(seed, *MAP_PX)
         for body in chosen(frame, config):
@@ -209,9 +217,9 @@ def _noisy(frames: int) -> Iterator[Sample]:
             rows, columns = (slice(at, at + n) for at, n in zip(example.corner, example.own.shape, strict=True))
             depth_m[rows, columns] = erred(example, errors, rng)
             box_px = box_of(example, errors, rng)[None]
-            seen, truth, _ = _observed(frame, box_px, [body.label], [body], localisation)
+            seen, truth, _ = _observed(frame, box_px, [body.label], [body])
             if seen:
-                yield Sample(frame, DepthMap(depth_m, *MAP_PX), seen, truth, [None] * len(seen), localisation)
+                yield Sample(frame, DepthMap(depth_m, *MAP_PX), seen, truth, [None] * len(seen))
 
 
 def _seen_by(network: Network, frames: int) -> Iterator[Sample]:
@@ -228,11 +236,10 @@ def _seen_by(network: Network, frames: int) -> Iterator[Sample]:
         overlap = iou(boxes, np.array([v.box_px for v in vehicles]))
         rows = [row for row in range(len(boxes)) if overlap[row].max() >= SAME_IOU]
         labels = [found.detections.labels[row] for row in rows]
-        localisation = LocalisationConfig().with_edge_sigma(found.detections.edge_sigma)
         matched = [vehicles[overlap[row].argmax()] for row in rows]
-        seen, truth, kept = _observed(frame, boxes[rows], labels, matched, localisation)
+        seen, truth, kept = _observed(frame, boxes[rows], labels, matched, found.detections.edge_sigma)
         bodies = found.detections.boxes3d
         said: list[DepthPlace | None] = [None] * len(seen)
         if bodies is not None and seen:
             said = places_of(bodies.take([rows[i] for i in kept]), seen, frame.camera, frame.camera.ground)
-        yield Sample(frame, found.depth, seen, truth, said, localisation)
+        yield Sample(frame, found.depth, seen, truth, said)

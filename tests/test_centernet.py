@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from birdslam.perception import ModelError, ModelSpec, load_network
 from birdslam.perception.centernet import CenterNetDecoder
+from birdslam.perception.detection import EdgeSigma
 from birdslam.perception.manifest import CenterNet, FitPad, Input, Stretch, Tiles
 from birdslam.perception.views import make_views
 
@@ -140,7 +141,25 @@ def test_a_manifest_says_how_sure_the_edges_of_its_boxes_are(tmp_path: Path) -> 
     assert load(tmp_path, MANIFEST, maps(objects)).run(image).detections.edge_sigma is None
     said = MANIFEST + "box_sigma = { rel = 0.1, px = 1.5 }\n"
     found = load(tmp_path, said, maps(objects)).run(image).detections
-    assert found.edge_sigma == (0.1, 1.5 * 4)  # the image is four times as wide as the input, and twice as high
+    # The image is four times as wide as the input, and twice as high: to be safe the larger pixel counts
+    assert found.edge_sigma == EdgeSigma((0.1,) * 4, 1.5 * 4)
     assert found.only(("car",)).edge_sigma == found.edge_sigma
+    by_edge = MANIFEST + "box_sigma = { rel = 0.1, px = 1.5, upper = 0.05, lower = 0.02 }\n"
+    assert load(tmp_path, by_edge, maps(objects)).run(image).detections.edge_sigma.rel == (0.1, 0.1, 0.05, 0.02)
     with pytest.raises(ModelError, match=r"px.*\$\.detector\.box_sigma"):
         load(tmp_path, MANIFEST + "box_sigma = { rel = 0.1 }\n", maps(objects))
+
+
+def test_edges_that_are_drawn_inside_are_moved_out(tmp_path: Path) -> None:
+    image = np.zeros((64, 256, 3), np.uint8)
+    objects = [(0, (8.0, 8.0, 20.0, 16.0), 0.6), (0, (40.0, 16.0, 60.0, 32.0), 0.5)]  # the second is cut at the bottom
+    plain = load(tmp_path, MANIFEST, maps(objects)).run(image).detections.boxes_px
+    inside = "drawn_inside = { left = 0.1, right = -0.05, upper = 0.25, lower = 0.125 }\n"
+    (whole, cut) = load(tmp_path, MANIFEST + inside, maps(objects)).run(image).detections.boxes_px
+    width, height = plain[0, 2:] - plain[0, :2]
+    moves = [-0.1 * width, -0.25 * height, -0.05 * width, 0.125 * height]
+    np.testing.assert_allclose(whole, plain[0] + moves)
+    assert cut[3] == 64.0
+    assert cut[1] < plain[1, 1]
+    with pytest.raises(ModelError, match=r"drawn_inside"):
+        load(tmp_path, MANIFEST + "drawn_inside = { lower = 0.5 }\n", maps(objects))

@@ -15,6 +15,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections, Perception, Ready
+from birdslam.perception.detection import EdgeSigma
 from birdslam.types import Measurements
 from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
 from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, iou
@@ -206,12 +207,16 @@ def test_a_late_vehicle_whose_velocity_is_not_known_is_not_shown() -> None:
 
 def test_a_detector_that_is_less_sure_of_its_edges_gives_poorer_places() -> None:
     """`Detections.edge_sigma` takes the place of the configuration's own."""
-    covs, own = {}, (LocalisationConfig().sigma_box_rel, LocalisationConfig().sigma_box_px)
-    for said in (None, own, (0.2, 10.0)):
+    config = LocalisationConfig()
+    own, poor = EdgeSigma((config.sigma_box_rel,) * 4, config.sigma_box_px), EdgeSigma((0.2,) * 4, 10.0)
+    low = EdgeSigma((*own.rel[:3], 0.2), own.px)  # the lower edge alone is poor
+    covs = {}
+    for said in (None, own, poor, low):
         front = out_of_sequence()
         for k in range(4):
             front.open_frame(open_frame(k))
             tracks = front.ingest_detections(replace(detections(k), edge_sigma=said), k)
         covs[said] = tracks[0].place.cov
     np.testing.assert_array_equal(covs[None], covs[own])
-    assert np.linalg.eigvalsh(covs[0.2, 10.0] - covs[None]).min() > 0.0
+    assert np.linalg.eigvalsh(covs[poor] - covs[None]).min() > 0.0
+    assert covs[None][0, 0] < covs[low][0, 0] < covs[poor][0, 0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,6 @@ from birdslam.perception.detection import (
     Candidates,
     Detections,
     candidates_in_image,
-    edge_sigma,
     merge_views,
     rival_groups,
 )
@@ -47,9 +45,7 @@ class _ListDecoder:
 
     def merge(self, parts: Sequence[Candidates], views: Sequence[View]) -> Detections:
         """The boxes of all views of one image, each object once."""
-        table = self._detector
-        merged = merge_views(parts, views, self._groups, table.labels, table.nms_iou)
-        return replace(merged, edge_sigma=edge_sigma(table.box_sigma, views[0]))
+        return merge_views(parts, views, self._groups, self._detector)
 
 
 class SsdDecoder(_ListDecoder):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,7 +13,6 @@ from birdslam.perception.detection import (
     Candidates,
     Detections,
     candidates_in_image,
-    edge_sigma,
     merge_views,
     rival_groups,
 )
@@ -64,5 +62,4 @@ class CenterNetDecoder:
 
     def merge(self, parts: Sequence[Candidates], views: Sequence[View]) -> Detections:
         """The boxes of all views of one image, each object once."""
-        merged = merge_views(parts, views, self._groups, self.table.labels, self.table.nms_iou)
-        return replace(merged, edge_sigma=edge_sigma(self.table.box_sigma, views[0]))
+        return merge_views(parts, views, self._groups, self.table)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.perception.boxes3d import Boxes3d
-from birdslam.perception.manifest import BoxSigma, Input, Misfit, Yolox
+from birdslam.perception.manifest import BoxSigma, DetectorTable, DrawnInside, Input, Misfit, Yolox
 from birdslam.perception.views import View
 
 CUT_MARGIN = 0.015  # of a tile's width: a box that ends so near to a tile's inner edge is taken to go on behind it
@@ -19,18 +19,26 @@ SAME_ROWS = 0.5  # overlap over union of the rows of two halves of one object
 
 
 @dataclass(frozen=True)
+class EdgeSigma:
+    """1-sigma of a box's left, right, upper and lower edge as fractions of its side, and on top `px` of the image."""
+
+    rel: tuple[float, float, float, float]
+    px: float
+
+
+@dataclass(frozen=True)
 class Detections:
     """Boxes (N, 4) x1, y1, x2, y2 in pixels of the undistorted image, scores (N,) in [0, 1] falling, labels.
 
-    `boxes3d` holds a body for each box, where the network knows of bodies. `edge_sigma` is the 1-sigma of an edge, as a
-    fraction of the box's side and in pixels of the image on top of that; None: the network does not say.
+    `boxes3d` holds a body for each box, where the network knows of bodies. `edge_sigma` says how sure their edges are;
+    None: the network does not say.
     """
 
     boxes_px: NDArray[np.float64]
     scores: NDArray[np.float64]
     labels: tuple[str, ...]
     boxes3d: Boxes3d | None = None
-    edge_sigma: tuple[float, float] | None = None
+    edge_sigma: EdgeSigma | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -93,13 +101,27 @@ class YoloxDecoder:
 
     def merge(self, parts: Sequence[Candidates], views: Sequence[View]) -> Detections:
         """The boxes of all views of one image, each object once."""
-        merged = merge_views(parts, views, self._groups, self.table.labels, self.table.nms_iou)
-        return replace(merged, edge_sigma=edge_sigma(self.table.box_sigma, views[0]))
+        return merge_views(parts, views, self._groups, self.table)
 
 
-def edge_sigma(table: BoxSigma | None, view: View) -> tuple[float, float] | None:
-    """1-sigma of a box's edges by its manifest: a fraction of the box's side, and pixels of the image."""
-    return None if table is None else (table.rel, table.px / float(view.ratio.min()))
+def edge_sigma(table: BoxSigma | None, view: View) -> EdgeSigma | None:
+    """1-sigma of a box's edges by its manifest, in the image."""
+    if table is None:
+        return None
+    left, right, upper, lower = (
+        table.rel if own is None else own for own in (table.left, table.right, table.upper, table.lower)
+    )
+    return EdgeSigma((left, right, upper, lower), table.px / float(view.ratio.min()))
+
+
+def drawn_out(boxes_px: NDArray[np.float64], inside: DrawnInside, view: View) -> NDArray[np.float64]:
+    """Boxes (N, 4) of the image with each edge moved out to where the object ends; one at the border stays there."""
+    width, height = (boxes_px[:, 2:] - boxes_px[:, :2]).T
+    moves = [-inside.left * width, -inside.upper * height, inside.right * width, inside.lower * height]
+    limits = np.array([view.image_width_px, view.image_height_px] * 2, dtype=np.float64)
+    at_border = (boxes_px <= 0.0) | (boxes_px >= limits)
+    out: NDArray[np.float64] = np.where(at_border, boxes_px, np.clip(boxes_px + np.column_stack(moves), 0.0, limits))
+    return out
 
 
 def rival_groups(classes: int, labels: Mapping[int, str], rivals: Sequence[Sequence[str]]) -> NDArray[np.int64]:
@@ -130,22 +152,20 @@ def candidates_in_image(
 
 
 def merge_views(
-    parts: Sequence[Candidates],
-    views: Sequence[View],
-    groups: NDArray[np.int64],
-    labels: Mapping[int, str],
-    nms_iou: float,
+    parts: Sequence[Candidates], views: Sequence[View], groups: NDArray[np.int64], table: DetectorTable
 ) -> Detections:
     """The boxes of all views of one image, each object once; `groups` (classes,) as `rival_groups` gives them."""
     boxes, scores, classes, cut = (
         np.concatenate([getattr(part, field) for part in parts]) for field in ("boxes_px", "scores", "classes", "cut")
     )
-    kept = suppress(boxes, scores, groups[classes], cut, nms_iou)
+    kept = suppress(boxes, scores, groups[classes], cut, table.nms_iou)
     boxes, scores, classes, cut = boxes[kept], scores[kept], classes[kept], cut[kept]
     slack_px = 2.0 * CUT_MARGIN * (views[0].x1_px - views[0].x0_px)
     boxes, alive = join_halves(boxes, groups[classes], cut, slack_px)
     order = alive[np.argsort(-scores[alive], kind="stable")]
-    return Detections(boxes[order], scores[order], tuple(labels[int(c)] for c in classes[order]))
+    labels = tuple(table.labels[int(c)] for c in classes[order])
+    outlines = drawn_out(boxes[order], table.drawn_inside, views[0])
+    return Detections(outlines, scores[order], labels, edge_sigma=edge_sigma(table.box_sigma, views[0]))
 
 
 def _grid(width_px: int, height_px: int, strides: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

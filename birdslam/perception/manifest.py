@@ -21,6 +21,8 @@ Pixels = Annotated[int, msgspec.Meta(ge=8, le=8192)]
 Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Variance = Annotated[float, msgspec.Meta(gt=0.0, le=10.0)]
+SigmaRel = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
+BiasRel = Annotated[float, msgspec.Meta(ge=-0.3, le=0.3)]
 Scoring = Literal["none", "sigmoid", "softmax"]  # what makes scores in [0, 1] of a detector's numbers
 Sha256 = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
 
@@ -84,11 +86,29 @@ class Tiles(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class BoxSigma(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """1-sigma of each edge of a detector's boxes, as measured against the truth: `rel` of the box's side and `px`.
 
-    Pixels are those of the network's input. It says how much Eq. 1 on the bottom of a box is worth.
+    Pixels are those of the network's input. It says how much Eq. 1 on the bottom of a box is worth. An edge that is
+    named has its own number instead of `rel`; sides are the width for left and right, the height for upper and lower.
     """
 
-    rel: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
+    rel: SigmaRel
     px: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)]
+    left: SigmaRel | None = None
+    right: SigmaRel | None = None
+    upper: SigmaRel | None = None
+    lower: SigmaRel | None = None
+
+
+class DrawnInside(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How far inside of an object's outline a detector draws each edge in the median, as a fraction of the box's side.
+
+    Negative: outside of it. Sides are the width for left and right, the height for upper and lower. Every box is
+    corrected by it: Eq. 1 makes too large a depth of a lower edge that is too high.
+    """
+
+    left: BiasRel = 0.0
+    right: BiasRel = 0.0
+    upper: BiasRel = 0.0
+    lower: BiasRel = 0.0
 
 
 class DetectorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -104,6 +124,7 @@ class DetectorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     nms_iou: Fraction
     rivals: tuple[tuple[Label, ...], ...] = ()
     box_sigma: BoxSigma | None = None  # None: localisation.sigma_box_rel and sigma_box_px of the configuration
+    drawn_inside: DrawnInside = DrawnInside()
 
     def __post_init__(self) -> None:
         for index in self.labels:
@@ -282,6 +303,7 @@ class MultiTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     road_logit: float = 0.0
     lane_logit: float = 0.0
     box_sigma: BoxSigma = BoxSigma(rel=0.045, px=0.5)  # of the shipped one, on held-out worlds at two image sizes
+    drawn_inside: DrawnInside = DrawnInside()
     depth_sigma_rel: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.15  # 1-sigma of a pixel's depth, as a fraction
 
     def __post_init__(self) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.depth import DepthMap
-from birdslam.perception.detection import Detections, edge_sigma, suppress
+from birdslam.perception.detection import Detections, drawn_out, edge_sigma, suppress
 from birdslam.perception.findings import Findings
 from birdslam.perception.manifest import Input, Label, Misfit, MultiTask
 from birdslam.perception.segmentation import Segmentation
@@ -123,7 +123,8 @@ class MultiTaskDecoder:
         kinds = np.argmax(at[rows, _BODY["kind"]], axis=1)
         labels = tuple(KINDS[k] if c == 0 else "person" for c, k in zip(classes[rows], kinds, strict=True))
         bodies = self._bodies(at[rows], cells[rows], view, focal_rel)
-        return Detections(boxes[rows], scores[rows], labels, bodies, edge_sigma(self.table.box_sigma, view))
+        outlines = drawn_out(boxes[rows], self.table.drawn_inside, view)
+        return Detections(outlines, scores[rows], labels, bodies, edge_sigma(self.table.box_sigma, view))
 
     def _peaks(self, heat: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Class, row and column of the cells that are hotter than their neighbours, best first."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.perception.detection import EdgeSigma
 
 
 class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -45,7 +46,7 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """How boxes become places; the class table also says which labels are vehicles."""
 
     vehicles: dict[str, Dimensions] = msgspec.field(default_factory=lambda: dict(DIMENSIONS))
-    sigma_box_rel: float = 0.02  # 1-sigma of a box's edges as a fraction of its size
+    sigma_box_rel: float = 0.02  # 1-sigma of a box's edges as a fraction of its size, where its detector states none
     sigma_box_px: float = 0.7  # and beside it
     reach_rel: float = 1.0  # of the way from the nearest face to the centre; the paper stays at the face (0)
     sigma_cut_rel: float = 1.0  # an edge cut by the image says nothing within the whole box
@@ -59,12 +60,10 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
     max_range_m: float = 100.0  # by the height of its class
 
-    def with_edge_sigma(self, edge_sigma: tuple[float, float] | None) -> LocalisationConfig:
-        """With the 1-sigma (relative, px) that a detector states for its boxes' edges (see `perception.Detections`)."""
-        if edge_sigma is None:
-            return self
-        rel, px = edge_sigma
-        return msgspec.structs.replace(self, sigma_box_rel=rel, sigma_box_px=px)
+    @property
+    def edge_sigma(self) -> EdgeSigma:
+        """Of the boxes of a detector that does not state its own."""
+        return EdgeSigma((self.sigma_box_rel,) * 4, self.sigma_box_px)
 
 
 @dataclass(frozen=True)
@@ -203,10 +202,12 @@ def observe_boxes(
     camera: Camera,
     ground: GroundPlane,
     config: LocalisationConfig,
+    edge_sigma: EdgeSigma | None = None,
 ) -> list[Observation]:
     """Observations of the vehicles among the boxes (N, 4) with scores (N,), best score first.
 
-    A box that hangs over the road or lies past `max_range_m` is no vehicle on it and is left out.
+    A box that hangs over the road or lies past `max_range_m` is no vehicle on it and is left out. `edge_sigma` is what
+    the detector states, None the configuration's.
     """
     vehicles = np.array([label in config.vehicles for label in labels], dtype=np.bool_).reshape(-1)
     sizes = boxes_px[:, 2:] - boxes_px[:, :2]
@@ -222,7 +223,7 @@ def observe_boxes(
     hidden = hidden_edges(boxes)
     slopes = _slopes(camera, ground, boxes)
     found = (
-        _observe(i, box, float(scores[i]), labels[i], camera, slope, edges, config)
+        _observe(i, box, float(scores[i]), labels[i], camera, slope, edges, edge_sigma or config.edge_sigma, config)
         for i, box, slope, edges in zip(chosen.tolist(), boxes.tolist(), slopes.tolist(), hidden.tolist(), strict=True)
     )
     return [seen for seen in found if _is_on_road(seen, ground, config)]
@@ -257,6 +258,7 @@ def _observe(
     camera: Camera,
     slopes: list[float],
     hidden: list[bool],
+    edge_sigma: EdgeSigma,
     config: LocalisationConfig,
 ) -> Observation:
     x1, y1, x2, y2 = box
@@ -268,25 +270,27 @@ def _observe(
     cut_bottom = y2 > camera.height_px - margin_px - config.cut_margin_rel * height_px
     hidden_left, hidden_right, hidden_bottom = hidden
 
-    def sigma_px(size_px: float, cut: bool, covered: bool) -> float:
+    of_left, of_right, of_top, of_bottom = edge_sigma.rel
+
+    def sigma_px(size_px: float, edge_rel: float, cut: bool, covered: bool) -> float:
         rel = cut_rel if cut else config.sigma_hidden_rel if covered else 0.0
-        return math.hypot(size_px * config.sigma_box_rel, config.sigma_box_px, size_px * rel)
+        return math.hypot(size_px * edge_rel, edge_sigma.px, size_px * rel)
 
     return Observation(
         label=label,
         score=score,
         box_px=(x1, y1, x2, y2),
         left=slopes[0],
-        sigma_left=sigma_px(width_px, cut_left, hidden_left) / camera.fx_px,
+        sigma_left=sigma_px(width_px, of_left, cut_left, hidden_left) / camera.fx_px,
         right=slopes[1],
-        sigma_right=sigma_px(width_px, cut_right, hidden_right) / camera.fx_px,
+        sigma_right=sigma_px(width_px, of_right, cut_right, hidden_right) / camera.fx_px,
         slope_bottom=slopes[2],
-        sigma_bottom=sigma_px(height_px, cut_bottom, hidden_bottom) / camera.fy_px,
+        sigma_bottom=sigma_px(height_px, of_bottom, cut_bottom, hidden_bottom) / camera.fy_px,
         slope_top=slopes[3],
-        sigma_top=sigma_px(height_px, cut_top, False) / camera.fy_px,
+        sigma_top=sigma_px(height_px, of_top, cut_top, False) / camera.fy_px,
         cut_side=cut_left or cut_right,
         dimensions=config.vehicles[label],
-        sigma_cut=sigma_px(height_px, False, False) / camera.fy_px if cut_bottom else None,
+        sigma_cut=sigma_px(height_px, of_bottom, False, False) / camera.fy_px if cut_bottom else None,
         row=row,
     )
 

@@ -80,7 +80,8 @@ class Tracker:
             detections.labels,
             self.camera,
             ground_size.ground,
-            self.localisation.with_edge_sigma(detections.edge_sigma),
+            self.localisation,
+            detections.edge_sigma,
         )
         observations, by_depth = locate_by_depth(
             observations,
