@@ -86,6 +86,7 @@ def test_standing_cars_told_as_driving_are_counted_and_the_other_way_round(seque
         row = motion_row("0002", sights(sequence, [told(sequence, 10, speed_up_mps=speed_up_mps)]))
         assert (row.standing, row.driving) == (1, 2)
         assert (row.false_movers, row.missed_movers) == (false_movers, missed_movers), speed_up_mps
+        assert row.false_movers_sure == (abs(speed_up_mps) > 3.5)  # the sigma that is told with it is 1 m/s
         assert row.velocity_error_median_mps == pytest.approx(abs(speed_up_mps))
 
 

@@ -40,6 +40,7 @@ class Sight:
     velocity_mps: tuple[float, float] | None  # over the ground in the ego's axes; None at the ends of its labels
     error_m: tuple[float, float] | None = None  # ahead, across; None: not found
     told_mps: tuple[float, float] | None = None
+    told_sigma_mps: float = 0.0  # 1-sigma of the speed that was told
 
 
 class RangeRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -55,13 +56,18 @@ class RangeRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MotionRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Velocities of the found cars, and how many sights of standing (driving) ones were told as driving (standing)."""
+    """Velocities of the found cars, and how many sights of standing (driving) ones were told as driving (standing).
+
+    `false_movers_sure`: those whose speed is over the bar by twice its own sigma too. Of a vehicle just come into sight
+    the covariance says that nothing is known of its speed yet.
+    """
 
     sequence: str
     asked: int
     velocity_error_median_mps: float | None
     standing: int
     false_movers: int
+    false_movers_sure: int
     driving: int
     missed_movers: int
 
@@ -119,6 +125,7 @@ def _matched(
                 out[i].velocity_mps,
                 (float(errors[i, j, 0]), float(errors[i, j, 1])),
                 _velocity_in_ego(told[j][0], estimate),
+                _sigma_of_speed(told[j][0]),
             )
     return out
 
@@ -126,6 +133,14 @@ def _matched(
 def _velocity_in_ego(vehicle: VehicleEstimate, estimate: Estimate) -> tuple[float, float]:
     x, y = vehicle.velocity_mps
     return _turned(x, y, -estimate.T_world_ego.yaw_rad)
+
+
+def _sigma_of_speed(vehicle: VehicleEstimate) -> float:
+    """1-sigma along the velocity."""
+    (x, y), cov = vehicle.velocity_mps, vehicle.velocity_cov
+    speed = max(math.hypot(x, y), 1e-9)
+    x, y = x / speed, y / speed
+    return math.sqrt(max(x * x * cov[0] + x * y * (cov[1] + cov[2]) + y * y * cov[3], 0.0))
 
 
 def _turned(x: float, y: float, by_rad: float) -> tuple[float, float]:
@@ -159,16 +174,18 @@ def _range_row(sequence: str, span: str, seen: Sequence[Sight]) -> RangeRow:
 
 def motion_row(sequence: str, seen: Sequence[Sight]) -> MotionRow:
     """Over all found cars whose label's speed is known."""
-    pairs = [(s.velocity_mps, s.told_mps) for s in seen if s.velocity_mps is not None and s.told_mps is not None]
-    errors = [math.dist(truth, told) for truth, told in pairs]
-    standing = [told for truth, told in pairs if math.hypot(*truth) < STANDS_MPS]
-    driving = [told for truth, told in pairs if math.hypot(*truth) > DRIVES_MPS]
+    known = [(s.velocity_mps, s.told_mps, s.told_sigma_mps) for s in seen]
+    pairs = [(truth, told, sigma) for truth, told, sigma in known if truth is not None and told is not None]
+    errors = [math.dist(truth, told) for truth, told, _ in pairs]
+    standing = [(math.hypot(*told), sigma) for truth, told, sigma in pairs if math.hypot(*truth) < STANDS_MPS]
+    driving = [math.hypot(*told) for truth, told, _ in pairs if math.hypot(*truth) > DRIVES_MPS]
     return MotionRow(
         sequence=sequence,
         asked=len(pairs),
         velocity_error_median_mps=float(np.median(errors)) if errors else None,
         standing=len(standing),
-        false_movers=sum(math.hypot(*told) > TOLD_DRIVING_MPS for told in standing),
+        false_movers=sum(speed > TOLD_DRIVING_MPS for speed, _ in standing),
+        false_movers_sure=sum(speed - 2.0 * sigma > TOLD_DRIVING_MPS for speed, sigma in standing),
         driving=len(driving),
-        missed_movers=sum(math.hypot(*told) <= TOLD_DRIVING_MPS for told in driving),
+        missed_movers=sum(speed <= TOLD_DRIVING_MPS for speed in driving),
     )

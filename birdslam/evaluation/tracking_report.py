@@ -16,7 +16,7 @@ from birdslam.evaluation.tracking import Row
 ABOUT_TOLD = (
     "Live, in the ego's frame: cars labelled 25 px or more high, hardly occluded and not truncated; found is an "
     "estimate within 20 % of the distance ahead and 1.5 m across. A car stands under 0.5 m/s and drives over 2 m/s by "
-    "its labels; it is told as driving over 1.5 m/s."
+    "its labels; it is told as driving over 1.5 m/s, surely where it is over that by twice its own sigma."
 )
 
 
