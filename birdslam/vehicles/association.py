@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.localisation import Observation
+from birdslam.vehicles.localisation import Dimensions, Observation
 from birdslam.vehicles.track import Track
 
 HEIGHT_SHOWS_REL = 0.2  # 1-sigma of a box's height, as a fraction; past it the box says nothing of a size
+LEAST_TAN = 1e-3  # of a box's height
 NEAREST_M, FAR_M = 1.0, 1e4  # a nearer box is out of the image; from there one looks at the horizon
 
 
@@ -49,13 +50,18 @@ def predicted_boxes_px(
 def within_gate(
     tracks: Sequence[Track], observations: Sequence[Observation], T_world_ego: SE2, gate_sigma: float
 ) -> NDArray[np.bool_]:
-    """(tracks, observations): within the gate, by the box's height and the track's learned size alone."""
-    depth, bearing, sigma_rel, turned_m = np.array([_rough(observation) for observation in observations]).T
-    lengths = np.array([observation.dimensions.length_m for observation in observations])
+    """(tracks, observations): within the gate, by the box's height and the track's learned size alone.
+
+    A vehicle whose height is known has the length of its own class, whatever a box is called: a box twice as high, of a
+    bus behind it, is no box of a car.
+    """
+    seen = [[_rough(o, _class_of(track, o)) for o in observations] for track in tracks]
+    depth, sigma_rel, length_m, turned_m = np.moveaxis(np.array(seen).reshape(len(tracks), len(observations), 4), -1, 0)
+    bearing = np.array([observation.bearing for observation in observations])
     sigma_sides = np.array([max(observation.sigma_left, observation.sigma_right) for observation in observations])
     learned = np.array([_learned_height_m(track) for track in tracks])[:, None]
-    of_class = np.array([observation.dimensions.height_m for observation in observations])
-    x_m = np.where(np.isnan(learned), 1.0, learned / of_class) * depth + lengths / 2.0
+    of_class = np.array([track.observation.dimensions.height_m for track in tracks])[:, None]
+    x_m = np.where(np.isnan(learned), 1.0, learned / of_class) * depth + length_m / 2.0
     along = np.square(x_m * sigma_rel) + np.square(turned_m)
     across = np.square(x_m * sigma_sides) + np.square(turned_m / 2.0)
     R = T_world_ego.rotation()
@@ -73,19 +79,27 @@ def within_gate(
 def _learned_height_m(track: Track) -> float:
     """The height of the vehicle by its last box at the depth where it was placed; NaN where its height did not show."""
     seen = track.observation
-    return track.place.depth_m * seen.tan_height if _sigma_height_rel(seen) < HEIGHT_SHOWS_REL else math.nan
+    return track.place.depth_m * seen.tan_height if _shows_height(seen) else math.nan
 
 
-def _rough(seen: Observation) -> tuple[float, float, float, float]:
-    """Depth (m) by the height of its class, bearing, 1-sigma of the depth (relative), what its yaw may hide (m)."""
-    dimensions = seen.dimensions
+def _shows_height(seen: Observation) -> bool:
+    return _sigma_height_rel(seen) < HEIGHT_SHOWS_REL
+
+
+def _class_of(track: Track, seen: Observation) -> Dimensions:
+    """What a box is taken to be of, were it the track's: of the track's class where its height showed."""
+    return track.observation.dimensions if _shows_height(track.observation) else seen.dimensions
+
+
+def _rough(seen: Observation, dimensions: Dimensions) -> tuple[float, float, float, float]:
+    """Depth (m) by the height of a class, its 1-sigma (relative), the length (m), what the yaw may hide of it (m)."""
     turned_m = dimensions.length_m / (2.0 if seen.cut_side else 4.0)  # its yaw is not known here
     sigma_rel = math.hypot(_sigma_height_rel(seen), dimensions.sigma_height_rel)
-    return seen.depth_by_height_m, seen.bearing, sigma_rel, turned_m
+    return dimensions.height_m / max(seen.tan_height, LEAST_TAN), sigma_rel, dimensions.length_m, turned_m
 
 
 def _sigma_height_rel(seen: Observation) -> float:
-    return math.hypot(seen.sigma_top, seen.sigma_bottom) / max(seen.tan_height, 1e-3)
+    return math.hypot(seen.sigma_top, seen.sigma_bottom) / max(seen.tan_height, LEAST_TAN)
 
 
 def in_ego(T_world_ego: SE2, point: NDArray[np.float64]) -> tuple[float, float]:
