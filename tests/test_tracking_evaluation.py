@@ -438,7 +438,7 @@ def test_a_speed_file_is_for_the_images_alone(tmp_path: Path) -> None:
     root = tracking_world.write(tmp_path / "root")
     asked = options("tracking", str(root), "--odometry", "truth", "--output", str(tmp_path / "out"))
     beside = Configuration(source=SourceConfig(speed=str(tmp_path)))
-    with pytest.raises(ConfigurationError, match="the odometry is truth"):
+    with pytest.raises(ConfigurationError, match="the odometry of 0002 fuses none"):
         evaluate(asked, beside)
 
 
