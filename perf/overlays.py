@@ -2,10 +2,9 @@
 
     python -m perf overlays [SEQUENCE ...] [--output FILE.json] [--data DIR] [--networks] [--model ROLE=PATH ...]
 
-Each is drawn over the second half of each sequence, seeded, and stands still in the image: dirt is opaque, a drop shows
-the image upside down and blurred within a bright rim, a reflection is added to what lies behind it. Counts the frames
-of the second half that were called valid with a speed off by more than a tenth, and those called standstill while the
-car drove.
+Each is drawn over the second half of each sequence, seeded, and stands still in the image (`windscreen.Overlay`).
+Counts the frames of the second half that were called valid with a speed off by more than a tenth, and those called
+standstill while the car drove.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.datasets.recording import DatasetError
 from birdslam.odometry.odometry import Odometry
@@ -26,9 +24,8 @@ from birdslam.perception import ModelError
 from birdslam.perf.errors import PerfError
 from birdslam.perf.figures import Ledger
 from birdslam.perf.starts import Drive, Task, is_valid, is_wrong, networks_of, read, uri_of
+from birdslam.rendered_world.windscreen import KINDS, from_middle
 from birdslam.types import Status
-
-Image = NDArray[np.uint8]
 
 label = "drops, dirt and a reflection from the middle of recorded drives on"
 
@@ -37,46 +34,7 @@ SEQUENCES = (
     "kitti_odometry/sequences/06",
     "kitti_tracking/training/image_03/0005",
 )
-KINDS = ("nothing", "drops", "dirt", "reflection")
 DRIVES_M = 0.1  # in one image, by the truth: such a car does not stand
-
-
-class Overlay:
-    """`draw` puts one kind over an image, the same each time."""
-
-    def __init__(self, kind: str, width_px: int, height_px: int, seed: int) -> None:
-        self.kind = kind
-        rng = np.random.default_rng(seed)
-        count = {"drops": 60, "dirt": 45, "reflection": 40}.get(kind, 0)
-        cover = np.zeros((height_px, width_px), np.float32)  # share of the overlay in each pixel
-        brightness = np.zeros((height_px, width_px), np.float32)  # its own brightness
-        for _ in range(count):
-            centre = (int(rng.integers(0, width_px)), int(rng.integers(0, height_px)))
-            radius = int(rng.integers(5, 26) * width_px / 1242)
-            light = float(rng.uniform(15.0, 70.0))
-            if kind == "reflection":  # of what lies on the dashboard: edges over the lower half
-                centre = (centre[0], height_px // 2 + centre[1] // 2)
-                end = (centre[0] + int(rng.integers(-150, 150)), centre[1] + int(rng.integers(-20, 20)))
-                cv2.line(brightness, centre, end, light, int(rng.integers(1, 4)), cv2.LINE_AA)
-            else:
-                cv2.circle(cover, centre, radius, 1.0, -1, cv2.LINE_AA)
-                cv2.circle(brightness, centre, radius, light if kind == "dirt" else 0.0, -1, cv2.LINE_AA)
-                if kind == "drops":
-                    cv2.ellipse(brightness, centre, (radius, radius), 0.0, 200.0, 340.0, light, 2, cv2.LINE_AA)
-        self._cover = cv2.GaussianBlur(cover, (0, 0), 1.5)[..., None]
-        self._light = cv2.GaussianBlur(brightness, (0, 0), 1.0)[..., None]
-
-    def draw(self, image: Image) -> Image:
-        """(H, W) grey or (H, W, 3)."""
-        if self.kind == "nothing":
-            return image
-        seen = image.reshape(*image.shape[:2], -1).astype(np.float32)
-        if self.kind == "dirt":
-            drawn = (1.0 - self._cover) * seen + self._cover * self._light
-        else:
-            inside = cv2.GaussianBlur(image[::-1], (0, 0), 6.0).reshape(seen.shape)
-            drawn = (1.0 - self._cover) * seen + self._cover * inside + self._light
-        return np.clip(drawn, 0.0, 255.0).astype(np.uint8).reshape(image.shape)
 
 
 def run(arguments: list[str]) -> None:
@@ -101,18 +59,6 @@ def run(arguments: list[str]) -> None:
                     ledger.add(f"{name} {kind}", told(row), **row)
     except (DatasetError, ModelError) as error:
         raise PerfError(str(error)) from error
-
-
-def from_middle(kind: str, seed: int) -> Any:
-    """(index, count, image) -> image."""
-    overlays: dict[tuple[int, ...], Overlay] = {}
-
-    def edit(index: int, count: int, image: Image) -> Image:
-        size = (image.shape[1], image.shape[0])
-        overlay = overlays.setdefault(size, Overlay(kind, *size, seed))
-        return overlay.draw(image) if 2 * index >= count else image
-
-    return edit
 
 
 def measure(drive: Drive) -> dict[str, Any]:

@@ -214,6 +214,11 @@ def _looks(configuration: Configuration | None) -> Iterator[Any]:
 
 def cold_start(drive: Drive, over: range) -> dict[str, Any] | None:
     """The odometry from nothing over some images of a drive; None where the car does not move."""
+    return errors(drive, over, *follow(drive, over))
+
+
+def follow(drive: Drive, over: range) -> tuple[Floats, list[Motion]]:
+    """Where the odometry has the camera at each of the images, (N, 4, 4) from the first one, and all its motions."""
     odometry = Odometry(drive.camera)
     poses = {over[0]: np.eye(4)}
     motions: list[Motion] = []
@@ -225,7 +230,12 @@ def cold_start(drive: Drive, over: range) -> dict[str, Any] | None:
             step[:3, :3], step[:3, 3] = motion.R_prev_curr, motion.t_prev_curr_m
             poses[k] = poses.get(motion.from_frame, poses[k]) @ step
             motions.append(motion)
-    estimated, truth = np.stack([poses[k] for k in over]), drive.poses[over.start : over.stop]
+    return np.stack([poses[k] for k in over]), motions
+
+
+def errors(drive: Drive, over: range, estimated: Floats, motions: Sequence[Motion]) -> dict[str, Any] | None:
+    """What `follow` gave against the truth; None where the car does not move."""
+    truth = drive.poses[over.start : over.stop]
     way, true_way = (_way_m(track) for track in (estimated, truth))
     if true_way[-1] < LEAST_WAY_M:
         return None

@@ -15,8 +15,9 @@ from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road_alignment import RoadAlignConfig, RoadAligner, plane_normal
 from birdslam.odometry.start_search import StartSearch, StartSearchConfig
-from birdslam.perf.overlays import from_middle, measure
+from birdslam.perf.overlays import measure
 from birdslam.perf.starts import Task, mirrored_camera, read
+from birdslam.rendered_world.windscreen import from_middle
 from birdslam.trajectory import as_poses
 from birdslam.types import Status
 

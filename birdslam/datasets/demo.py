@@ -52,9 +52,8 @@ class TrueBody:
 class DemoRecording(Recording):
     """The shipped drive, or another of its kind in `directory`. Raises DatasetError where it can't be read."""
 
-    name = NAME
-
     def __init__(self, camera: Camera | None = None, stride: int = 1, directory: Path = DIRECTORY) -> None:
+        self.name = NAME if directory == DIRECTORY else directory.name
         path = directory / "drive.npz"
         try:
             with np.load(path, allow_pickle=False) as file:

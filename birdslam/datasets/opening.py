@@ -13,7 +13,8 @@ from birdslam.geometry.camera import Camera
 
 
 def open_recording(uri: str, camera: Camera | None = None, stride: int = 1, speeds: Path | None = None) -> Recording:
-    """Open `kitti:DIR`, `video:FILE` or `demo`, the drive that ships with birdslam, every `stride`-th frame of it.
+    """Open `kitti:DIR`, `video:FILE` or `demo`, the drive that ships with birdslam, every `stride`-th frame of it;
+    `demo:DIR` is another drive of the built-in world.
 
     `camera` goes before the recording's own calibration. `speeds` is a file of the car's own speed over the drive
     (datasets/speed_file.py).
@@ -30,9 +31,11 @@ def _open(uri: str, camera: Camera | None, stride: int) -> Recording:
     scheme, _, rest = uri.partition(":")
     if scheme == "demo" and not rest:
         return DemoRecording(camera, stride)
-    if not rest or scheme not in ("kitti", "video"):
-        raise DatasetError(f"{uri}: no recording; expected kitti:DIR, video:FILE or demo")
+    if not rest or scheme not in ("kitti", "video", "demo"):
+        raise DatasetError(f"{uri}: no recording; expected kitti:DIR, video:FILE, demo or demo:DIR")
     path = Path(rest).expanduser()
+    if scheme == "demo":
+        return DemoRecording(camera, stride, path)
     return KittiRecording(path, camera, stride) if scheme == "kitti" else VideoRecording(path, camera, stride)
 
 

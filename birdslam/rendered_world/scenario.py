@@ -12,6 +12,7 @@ import numpy as np
 
 from birdslam.geometry.camera import Camera
 from birdslam.rendered_world.labels import frame_of
+from birdslam.rendered_world.rendering.night import Night, lit
 from birdslam.rendered_world.rendering.photometrics import Lens, develop, draw_lens, draw_sky
 from birdslam.rendered_world.rendering.renderer import Renderer
 from birdslam.rendered_world.rendering.scene import Bodies
@@ -32,7 +33,10 @@ _STEPS = 4  # of the drivers' model within a frame
 
 @dataclass(frozen=True)
 class Scenario:
-    """A world at the begin of a drive. `ego` is the car that carries the camera, `shake_seed` how it shakes."""
+    """A world at the begin of a drive. `ego` is the car that carries the camera, `shake_seed` how it shakes.
+
+    At `night` the sky is `night.even_sky`, and the car's own lamps light what is rendered under it.
+    """
 
     street: Street
     standing: Bodies
@@ -41,6 +45,8 @@ class Scenario:
     sky: Floats
     lens: Lens
     shake_seed: int
+    camera_ahead_m: float = 0.0  # of the rear axle, whose way has no slip: in a bend the car is turned inwards by that
+    night: Night | None = None
 
 
 class Shake:
@@ -84,7 +90,8 @@ def drive(scenario: Scenario, camera: Camera, count: int, rate_hz: float, sample
     dt_s = 1.0 / rate_hz
     for frame_id in range(count):
         t_s = frame_id * dt_s
-        T_world_ego = ego_pose(street, ego.s_m, ego.d_m, ego.turn_rad)
+        bend = street.curvature(ego.s_m)
+        T_world_ego = ego_pose(street, ego.s_m, ego.d_m, ego.turn_rad - scenario.camera_ahead_m * bend)
         pitch, roll, heave = shake.at(t_s, ego.speed_mps, ego.acceleration_mps2)
         shaken = msgspec.structs.replace(
             camera,
@@ -97,7 +104,10 @@ def drive(scenario: Scenario, camera: Camera, count: int, rate_hz: float, sample
         close = np.linalg.norm(everybody.position_m[:, :2] - T_world_ego[:2, 3], axis=1) < SIGHT_M
         scene = scenario.standing.subset(near).plus(everybody.subset(close))
         rendered = renderer.render(scene, shaken, T_world_ego, ego.s_m)
-        image = develop(rendered.light, scenario.lens, np.random.default_rng([scenario.shake_seed, frame_id]))
+        light = rendered.light
+        if scenario.night is not None:
+            light = lit(scenario.night, rendered, scene, shaken, T_world_ego, ego.speed_mps, bend * ego.speed_mps)
+        image = develop(light, scenario.lens, np.random.default_rng([scenario.shake_seed, frame_id]))
         yield frame_of(
             image, rendered, scene, movers, street, shaken, T_world_ego, ego.s_m, frame_id,
             round(frame_id * NS_PER_S / rate_hz),

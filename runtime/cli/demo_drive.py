@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -34,23 +35,29 @@ def make(options: argparse.Namespace) -> int:
     count = FRAMES if options.frames is None else options.frames
     if not 1 <= count <= FRAMES:
         raise DatasetError(f"--frames {count}: expected 1 to {FRAMES}")
+    frames = shown(drive(demo_scenario(), CAMERA, count, RATE_HZ, SAMPLES), "demo drive", count)
+    keep(options.output, frames, CAMERA, RATE_HZ, options.quality)
+    size = (options.output / "drive.npz").stat().st_size
+    print(f"{count} frames, {size / 1e6:.1f} MB in {options.output}")
+    return 0
+
+
+def keep(directory: Path, frames: Iterable[WorldFrame], camera: Camera, rate_hz: float, quality: int) -> None:
+    """Write a rendered drive so that `DemoRecording` reads it; `quality` is WebP's, 1 to 100."""
     images: list[bytes] = []
     poses: list[Floats] = []
     ground: list[tuple[float, float, float]] = []
     bodies: list[tuple[float, ...]] = []
-    for frame in shown(drive(demo_scenario(), CAMERA, count, RATE_HZ, SAMPLES), "demo drive", count):
-        images.append(_webp(frame.image, options.quality))
+    for frame in frames:
+        images.append(_webp(frame.image, quality))
         poses.append(frame.T_world_cam)
         ground.append((frame.camera.height_m, frame.camera.pitch_rad, frame.camera.roll_rad))
         bodies.extend(_rows(frame))
     from_first = (np.linalg.inv(poses[0]) @ np.array(poses)).astype(np.float64)
     write_drive(
-        options.output, images, RATE_HZ, from_first[:, :3], np.array(ground), np.array(bodies).reshape(-1, len(COLUMNS))
+        directory, images, rate_hz, from_first[:, :3], np.array(ground), np.array(bodies).reshape(-1, len(COLUMNS))
     )
-    (options.output / "camera.toml").write_text(_toml(CAMERA), encoding="utf-8")
-    size = (options.output / "drive.npz").stat().st_size
-    print(f"{count} frames, {size / 1e6:.1f} MB in {options.output}")
-    return 0
+    (directory / "camera.toml").write_text(_toml(camera), encoding="utf-8")
 
 
 def _webp(image: NDArray[np.uint8], quality: int) -> bytes:
@@ -75,6 +82,6 @@ def _rows(frame: WorldFrame) -> Iterator[tuple[float, ...]]:
 
 
 def _toml(camera: Camera) -> str:
-    lines = ["# The camera of the shipped drive; its springs move it about this height, pitch and roll"]
+    lines = ["# The camera of a rendered drive; its springs move it about this height, pitch and roll"]
     lines += [f"{name} = {getattr(camera, name)}" for name in CAMERA_KEYS]
     return "\n".join(lines) + "\n"

@@ -48,7 +48,7 @@ def furnish(rng: np.random.Generator, street: Street, s0_m: float, s1_m: float) 
     for sign, front in ((-1.0, street.front_right_m), (1.0, street.front_left_m)):
         _houses(rng, street, out, sign, front, s0_m, s1_m)
         _roadside(rng, street, out, sign, front, s0_m, s1_m)
-        _background(rng, street, out, sign, front, s0_m, s1_m)
+        background(rng, street, out, sign, front, s0_m, s1_m)
     _over_the_road(rng, street, out, s0_m, s1_m)
     for s, half, left, right, *_ in street.crossings.tolist():
         if s0_m < s < s1_m:
@@ -62,7 +62,7 @@ def _free(street: Street, s: float, d: float, reach_m: float) -> bool:
     return not street.in_crossing(s, reach_m + 2.0, side) and street.curvature(s) * d < 0.7
 
 
-def _tree(rng: np.random.Generator, out: Standing, s: float, d: float, h: float, kind: int, cards: int) -> None:
+def tree(rng: np.random.Generator, out: Standing, s: float, d: float, h: float, kind: int, cards: int) -> None:
     u = rng.random(4)
     width = h * ((0.55 + 0.5 * u[0]) if kind == 0 else ((0.9 + u[0]) if kind == 1 else (0.3 + 0.2 * u[0])))
     P = out.add(m.TREE, s, d, 0.0, (width, width, h))
@@ -124,7 +124,7 @@ def _garden(
         P[:3] = _WALLS[int(rng.integers(0, 12))] * rng.uniform(0.4, 1.1)
         P[m.SEED], P[m.PICTURE] = rng.random(), rng.integers(0, 16) if rng.random() < 0.15 else -1
     for _ in range(int(rng.integers(0, 4))):
-        _tree(rng, out, s + rng.uniform(-0.5, 0.5) * long, d + sign * rng.uniform(0.3, 1.0) * min(setback, 4.0),
+        tree(rng, out, s + rng.uniform(-0.5, 0.5) * long, d + sign * rng.uniform(0.3, 1.0) * min(setback, 4.0),
               float(rng.uniform(0.7, 2.8)), 1, 1)  # fmt: skip
 
 
@@ -139,7 +139,7 @@ def _roadside(
         d = at if wide > 1.5 else front + sign * 1.0
         for s in np.arange(s0 + rng.uniform(0, gap), s1, gap):
             if rng.random() < 0.85 and _free(street, s, d, 2.0):
-                _tree(rng, out, float(s), d, h * float(rng.uniform(0.75, 1.25)), 0, int(rng.integers(5, 10)))
+                tree(rng, out, float(s), d, h * float(rng.uniform(0.75, 1.25)), 0, int(rng.integers(5, 10)))
     gap = float(rng.uniform(18, 40))
     arm = float(rng.choice([0.0, rng.uniform(0.8, 2.5)]))
     high, grey = float(rng.uniform(3.5, 9)), float(rng.uniform(0.03, 0.4))
@@ -176,7 +176,7 @@ def _roadside(
             P[8], P[:3], P[m.PICTURE] = (3.0 if h < 1.0 else 0.0), rng.uniform(0.25, 0.4), -1
 
 
-def _background(
+def background(
     rng: np.random.Generator, street: Street, out: Standing, sign: float, front: float, s0: float, s1: float
 ) -> None:
     """Trees and blocks further off, so that streets do not end in an empty sky."""
@@ -188,7 +188,7 @@ def _background(
         if abs(dd * street.curvature(float(s))) > 0.6:
             continue
         if wood or rng.random() < 0.5:
-            _tree(
+            tree(
                 rng,
                 out,
                 float(s),
@@ -222,7 +222,7 @@ def _over_the_road(rng: np.random.Generator, street: Street, out: Standing, s0: 
         P[8], P[9], P[10], P[:3], P[m.PICTURE] = 6.5, 3.0, 3.5, (0.02, 0.06, 0.3), rng.integers(0, 16)
     # where the street ends in sight, something stands
     for d in np.arange(-40.0, 41.0, 9.0):
-        _tree(
+        tree(
             rng,
             out,
             s1 + float(rng.uniform(2, 15)),
