@@ -43,6 +43,7 @@ GERMAN, AMERICAN = (18.0, 6.0), (12.2, 3.05)  # a dashed line's period and dash
 RAIL_M, RAIL_HIGH_M = 4.0, 0.75  # a guard rail's piece
 POST_EVERY_M = 50.0  # posts beside a road
 EGO_M = 30.0  # where the ego begins
+NIGHT_GREY = 1.0  # cd/m^2: of the road ten metres ahead in its own beams such a camera makes a light grey
 _BEYOND_M = 280.0  # of road behind the last place of a drive
 _ACROSS = 0.75  # of a bend's radius: no further aside is there ground
 
@@ -120,7 +121,7 @@ def night_street(seed: int, speed_mps: float) -> Scenario:
         for shape, at in (("hatchback", 70.0), ("suv", 190.0), ("van", 330.0))
     ]
     return Scenario(
-        street, standing, (ahead, *coming), ego, even_sky(), _dark_camera(), seed, AXLE_M, Night()
+        street, standing, (ahead, *coming), ego, even_sky(0.25), _dark_camera(), seed, AXLE_M, Night()
     )  # fmt: skip
 
 
@@ -223,7 +224,9 @@ def _camera(exposure: float = 1.0) -> Lens:
 
 def _dark_camera() -> Lens:
     """The same with all the gain that it has: noise, a glow about lamps."""
-    return Lens(0.5, 1.0 / 2.2, 1.05, (1.0, 1.0, 1.0), 0.6, 0.006, 0.025, 0.2, 0.1, 0.6, 0, 0.0)
+    return Lens(
+        1.0, 1.0 / 2.2, 1.05, (1.0, 1.0, 1.0), 0.6, 0.0015, 0.015, 0.2, 0.1, 0.6, 0, 0.0, fixed=NIGHT_GREY
+    )  # fmt: skip
 
 
 ROADS: dict[str, Road] = {

@@ -23,7 +23,7 @@ from birdslam.rendered_world.truth import CLASSES
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
-LEVEL_CLASSES = tuple(CLASSES.index(name) for name in ("road", "lane", "pavement", "vegetation"))
+LEVEL_CLASSES = tuple(CLASSES.index(name) for name in ("road", "lane", "pavement"))
 PAINTED_CLASSES = tuple(CLASSES.index(name) for name in ("road", "lane"))
 POSTS = CLASSES.index("pole_sign")
 ASPHALT_RETRO, PAINT_RETRO, FOIL_RETRO = 0.015, 0.15, 3.0  # cd/(m^2 lx)
@@ -44,11 +44,15 @@ class Night:
     exposure_s: float = 0.02
 
 
-def even_sky() -> Floats:
-    """Light from everywhere, without sun and haze: what is rendered under it is how surfaces reflect."""
+def even_sky(grit: float = 0.0) -> Floats:
+    """Light from everywhere, without sun and haze: what is rendered under it is how surfaces reflect.
+
+    `grit` is the contrast of the asphalt's stones.
+    """
     sky = np.zeros(SKY_SLOTS)
     sky[6:12] = _EVEN
     sky[15], sky[18], sky[21], sky[22], sky[23] = 1e9, 0.2, 1.0, 0.5, 0.5
+    sky[24], sky[25] = grit, 0.5
     return sky
 
 

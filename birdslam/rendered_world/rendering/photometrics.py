@@ -34,6 +34,7 @@ class Lens:
     sharpen: float
     flare: float = 0.0  # of the mean light, that the glass spreads over all of the image: no black is darker
     whole: float = 0.0  # how much the upper image, sky and walls, counts when the exposure is metered
+    fixed: float = 0.0  # the light that becomes middle grey where none is metered: all the gain that a camera has
 
 
 def draw_sky(rng: np.random.Generator) -> NDArray[np.float64]:
@@ -122,7 +123,7 @@ def _expose(image, bank, i, j, k, shot, noise, coloured, table, out):  # type: i
 def develop(light: Floats32, lens: Lens, rng: np.random.Generator) -> NDArray[np.uint8]:
     """(H, W, 3) linear BGR light to the image that the camera delivers."""
     height, width = light.shape[:2]
-    metered = _metered(light, lens.whole)
+    metered = lens.fixed or _metered(light, lens.whole)
     image = light * np.float32(0.2 * lens.exposure / max(metered, 1e-3))
     image *= np.array(lens.tint, np.float32)
     if lens.bloom > 0.02:
