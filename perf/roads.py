@@ -1,6 +1,6 @@
 """Roads of the built-in world that are hard on the ego-motion: bare motorways, ramps, nights; drops, dirt, a bonnet.
 
-    python -m perf roads [NAME ...] [--output DIR] [--keep DIR] [--drives DIR] [--frames N] [--quality Q]
+    python -m perf roads [NAME ...] [--output DIR] [--keep DIR] [--drives DIR] [--frames N] [--width PX]
 
 A NAME is a road of `rendered_world/roads.py` or `demo`, the shipped drive's first 12 s in 11 images a second; with one
 of EFFECTS behind a plus (`motorway_30+drops`) that is drawn over its images. Without names: all roads, and the effects
@@ -70,6 +70,7 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--keep", type=Path, metavar="DIR", help="write each drive that is rendered to DIR/NAME")
     parser.add_argument("--drives", type=Path, metavar="DIR", help="measure those that lie there; nothing is rendered")
     parser.add_argument("--frames", type=int, help="of each drive; else all that its road has")
+    parser.add_argument("--width", type=int, default=640, help="of the images in pixels; KITTI's have 1242")
     parser.add_argument("--quality", type=int, default=92, help="of the WebP images, 1 to 100")
     parser.add_argument("--every", type=int, default=20, help="images from one cold start to the next")
     parser.add_argument("--images", type=int, default=25, help="of each cold start")
@@ -78,6 +79,8 @@ def run(arguments: list[str]) -> None:
         raise PerfError(f"--every must be at least 1, --images {LEAST_IMAGES}, --quality 1 to 100")
     if options.frames is not None and options.frames < LEAST_IMAGES:
         raise PerfError(f"--frames must be at least {LEAST_IMAGES}")
+    if not 160 <= options.width <= 4096:
+        raise PerfError(f"--width {options.width}: expected 160 to 4096")
     cv2.setNumThreads(1)
     path = None if options.output is None else options.output / "roads.json"
     try:
@@ -130,13 +133,14 @@ class _Drives:
         return DemoRecording(directory=self._folder / road), edit
 
     def _render(self, name: str) -> None:
-        from birdslam.rendered_world.roads import CAMERA, ROADS
+        from birdslam.rendered_world.roads import ROADS, camera_of
         from birdslam.rendered_world.scenario import drive
 
         road = ROADS[name]
         count = min(road.frames, self._options.frames or road.frames)
-        frames = drive(road.scenario(), CAMERA, count, road.rate_hz, SAMPLES)
-        keep(self._folder / name, shown(frames, name, count), CAMERA, road.rate_hz, self._options.quality)
+        camera = camera_of(self._options.width)
+        frames = drive(road.scenario(), camera, count, road.rate_hz, SAMPLES)
+        keep(self._folder / name, shown(frames, name, count), camera, road.rate_hz, self._options.quality)
         self._rendered.add(name)
 
 

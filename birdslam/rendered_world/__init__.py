@@ -13,6 +13,6 @@ Three packages, each importing only those before it:
 - `traffic`: which vehicles and people there are (`fleet`), what stands beside the street (`placement`, `parking`),
   and how everybody moves (`flow`).
 
-Above them `labels` reads the truth off a rendered scene, `scenario` lets a world drive, and `demo_world` is the
-shipped one.
+Above them `labels` reads the truth off a rendered scene, `scenario` lets a world drive, `demo_world` is the shipped one
+and `roads` has hard ones. `windscreen` and `compression` change images that are done, with OpenCV and numpy alone.
 """

@@ -37,6 +37,7 @@ from birdslam.rendered_world.truth import Floats
 
 # The field of view of KITTI's cameras, at a size that renders in a sixth of a second
 CAMERA = Camera(640, 192, 371.2, 371.2, 319.5, 90.0, height_m=1.65, pitch_rad=0.008)
+
 AXLE_M = 1.7  # from the rear axle to the camera
 LANE_M, SHOULDER_M, MEDIAN_M = 3.6, 2.5, 3.0
 GERMAN, AMERICAN = (18.0, 6.0), (12.2, 3.05)  # a dashed line's period and dash
@@ -46,6 +47,15 @@ EGO_M = 30.0  # where the ego begins
 NIGHT_GREY = 1.0  # cd/m^2: of the road ten metres ahead in its own beams such a camera makes a light grey
 _BEYOND_M = 280.0  # of road behind the last place of a drive
 _ACROSS = 0.75  # of a bend's radius: no further aside is there ground
+
+
+def camera_of(width_px: int) -> Camera:
+    """The same field of view in images of another width."""
+    k = width_px / CAMERA.width_px
+    middle_u, middle_v = (k * (c + 0.5) - 0.5 for c in (CAMERA.cx_px, CAMERA.cy_px))
+    size = width_px, round(k * CAMERA.height_px)
+    lens = k * CAMERA.fx_px, k * CAMERA.fy_px, middle_u, middle_v
+    return Camera(*size, *lens, height_m=CAMERA.height_m, pitch_rad=CAMERA.pitch_rad)
 
 
 @dataclass(frozen=True)

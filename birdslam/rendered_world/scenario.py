@@ -45,7 +45,7 @@ class Scenario:
     sky: Floats
     lens: Lens
     shake_seed: int
-    camera_ahead_m: float = 0.0  # of the rear axle, whose way has no slip: in a bend the car is turned inwards by that
+    camera_ahead_m: float = 0.0  # of the rear axle: in a bend the axle is along its way, the camera is not
     night: Night | None = None
 
 

@@ -24,7 +24,7 @@ from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, SourceConfig
 from birdslam.types import Frame, Status
 
-SOURCES = "kitti:DIR, video:FILE, mcap:FILE, demo, v4l2:/dev/videoN or rtsp://HOST/PATH"
+SOURCES = "kitti:DIR, video:FILE, mcap:FILE, demo, demo:DIR, v4l2:/dev/videoN or rtsp://HOST/PATH"
 LIVE_RATE_HZ = 30.0  # of a camera that does not say
 
 log = logging.getLogger(__name__)

@@ -1,0 +1,170 @@
+"""Hard roads hold for ever: motorways, ramps and nights of the built-in world, and what comes to lie on the windscreen.
+
+The clips in tests/roads are rendered by
+
+    python -m perf roads motorway_20 motorway_40 ramp_20 ramp_21_glare night_street night_motorway \
+        --frames 26 --quality 70 --keep tests/roads
+
+From the first image, without networks: no valid frame has a speed off by more than a tenth, no way is off by more than
+5 %, nothing says standstill while the car drives, four frames in five are valid. What does not hold yet is expected to
+fail, with its figures (NOT_YET).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterable
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from birdslam.datasets.demo import DIRECTORY, DemoRecording
+from birdslam.perf.roads import EFFECTS, measure, read
+from birdslam.perf.starts import SCALE_LIMIT
+from birdslam.rendered_world.compression import VideoEncoder
+from birdslam.rendered_world.windscreen import KINDS, Overlay, bonnet
+
+CLIPS = Path(__file__).parent / "roads"
+NAMES = ("motorway_20", "motorway_40", "ramp_20", "ramp_21_glare", "night_street", "night_motorway")
+NOT_YET = {  # what fails, by how much; strict, so that whoever mends it must strike it out
+    "ramp_20": "two of 23 valid frames off by 10 and 13 %, way +4.9 %; in images of KITTI's size none, and +0.8 %",
+    "ramp_21_glare": "way +5.2 %, three of 23 valid frames off by 10 to 12 %; at KITTI's size none, and -0.1 %",
+    "night_street": "rotation off by 7 deg, five of 23 valid frames wrong; at KITTI's size none, and 1.7 deg",
+    "night_motorway": "way +5.1 %, six of 23 valid frames wrong: pitch off by half a degree, and the length with it",
+    "street+drops": "six valid frames off by 10 to 41 % after the drops came: comparisons are refused, NEES 27",
+    "street+dirt": "way -5.1 %, five valid frames wrong after the dirt came; rotation off by 2.6 deg",
+    "street+reflection": "one valid frame off by 11 %",
+    "street+bonnet": "way -8.2 %, ten valid frames wrong: the near road is hidden, the bonnet taken for road",
+    "street+compression": "way -6.8 %, eight valid frames wrong: the first seconds' pitch is off by half a degree",
+    "motorway+bonnet": "way -25 %, a third of the frames invalid: the same as in the street",
+}
+FRAMES = 26
+QUALITY = 70  # of the clips' WebP images
+TOWN_STRIDE, TOWN_FRAMES = 3, 44  # of the shipped drive: 44 m of a street; what comes, comes after half of them
+LEAST_VALID = 0.8  # of the frames: the first two or three of a cold start are in doubt
+
+
+def cases(names: Iterable[str], road: str = "") -> list[Any]:
+    """Each name a case; those of NOT_YET are expected to fail."""
+    reasons = {name: NOT_YET.get(f"{road}+{name}" if road else name) for name in names}
+    return [
+        pytest.param(name, marks=[pytest.mark.xfail(strict=True, reason=reason)] if reason else [])
+        for name, reason in reasons.items()
+    ]
+
+
+def holds(row: dict[str, Any]) -> None:
+    """The four things that are asked of every road."""
+    assert row["way_m"] > 20.0
+    assert row["standstill"] == 0
+    assert abs(row["scale_error"]) <= SCALE_LIMIT
+    assert row["wrong_valid"] == []
+    assert row["valid"] >= LEAST_VALID * row["motions"]
+
+
+@pytest.mark.parametrize("name", cases(NAMES))
+def test_a_cold_start(name: str) -> None:
+    holds(measure(read(DemoRecording(directory=CLIPS / name))))
+
+
+@pytest.mark.parametrize("effect", cases(EFFECTS, "street"))
+def test_a_street_behind_a_windscreen(effect: str) -> None:
+    town = DemoRecording(stride=TOWN_STRIDE, directory=DIRECTORY)
+    holds(measure(read(town, EFFECTS[effect](), TOWN_FRAMES)))
+
+
+@pytest.mark.parametrize("effect", cases(EFFECTS, "motorway"))
+def test_a_motorway_behind_a_windscreen(effect: str) -> None:
+    holds(measure(read(DemoRecording(directory=CLIPS / "motorway_20"), EFFECTS[effect]())))
+
+
+# --- what is drawn over images ---
+
+
+@pytest.fixture(scope="module")
+def images() -> list[np.ndarray]:
+    frames = islice(DemoRecording(stride=TOWN_STRIDE).frames(), 4)
+    return [frame.image for frame in frames if frame.image is not None]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_overlay_stands_still_and_is_drawn_the_same_each_time(kind: str, images: list[np.ndarray]) -> None:
+    height, width = images[0].shape[:2]
+    first, again = (Overlay(kind, width, height, seed=1) for _ in range(2))
+    changed = []
+    for image in images:
+        drawn = first.draw(image)
+        assert drawn.tobytes() == again.draw(image).tobytes()
+        changed.append((np.abs(drawn.astype(int) - image) > 12).any(axis=2))
+    if kind == "nothing":
+        assert not np.any(changed)
+    else:
+        assert 0.01 < changed[0].mean() < 0.3
+        assert (changed[0] & changed[-1]).sum() > 0.5 * changed[0].sum()
+        grey = cv2.cvtColor(images[0], cv2.COLOR_BGR2GRAY)
+        assert first.draw(grey).shape == grey.shape
+
+
+def test_a_bonnet_covers_the_lower_edge_alone(images: list[np.ndarray]) -> None:
+    image = images[0]
+    for one in (image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)):
+        drawn = bonnet(one)
+        rows = np.flatnonzero((drawn != one).reshape(len(one), -1).any(axis=1))
+        assert 0.8 * len(one) < rows.min()
+        assert rows.max() == len(one) - 1
+
+
+@pytest.mark.parametrize("size", [(640, 192), (621, 187)])
+def test_compression_loses_what_is_faint_and_keeps_what_is_strong(
+    images: list[np.ndarray], size: tuple[int, int]
+) -> None:
+    sized = [cv2.resize(image, size) for image in images]
+    coarse, fine = VideoEncoder(step=40.0), VideoEncoder(step=2.0)
+    errors = []
+    for image in sized:
+        lost, kept = coarse.code(image), fine.code(image)
+        assert lost.shape == kept.shape == image.shape
+        errors.append([float(np.abs(one.astype(float) - image).mean()) for one in (lost, kept)])
+    assert (np.array(errors)[:, 0] > 2.0).all()
+    assert (np.array(errors)[:, 0] < 12.0).all()
+    assert (np.array(errors)[:, 1] < 0.5 * np.array(errors)[:, 0]).all()
+
+
+def test_a_flat_road_stands_still_behind_an_encoder() -> None:
+    """What moves too faintly to be coded stays where it was: the encoder's worst for an odometry."""
+    rng = np.random.default_rng(2)
+    grain = cv2.GaussianBlur(rng.normal(0.0, 8.0, (64, 256)), (0, 0), 1.5)
+    encoder = VideoEncoder(step=32.0)
+    shown = [encoder.code(np.clip(90.0 + grain[:, k : k + 128], 0, 255).astype(np.uint8)) for k in range(0, 9, 3)]
+    assert np.abs(shown[1].astype(int) - shown[0]).max() <= 1
+    assert encoder.code(np.full((64, 128), 200, np.uint8)).mean() > 150.0  # another scene is coded
+
+
+# --- rendered anew ---
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_a_clip_is_what_its_seed_renders(name: str, tmp_path: Path) -> None:
+    """The truth to the bit; the images but for what another processor or another WebP rounds."""
+    if importlib.util.find_spec("numba") is None:
+        pytest.skip("the built-in world is rendered with numba (extra `train`)")
+    from birdslam.rendered_world.roads import ROADS, camera_of
+    from birdslam.rendered_world.scenario import drive
+    from birdslam.runtime.cli.demo_drive import SAMPLES, keep
+
+    kept, road, camera = DemoRecording(directory=CLIPS / name), ROADS[name], camera_of(640)
+    assert len(kept) == FRAMES
+    keep(tmp_path, drive(road.scenario(), camera, FRAMES, road.rate_hz, SAMPLES), camera, road.rate_hz, QUALITY)
+    again = DemoRecording(directory=tmp_path)
+    assert again.camera == kept.camera
+    assert again.rate_hz == kept.rate_hz
+    np.testing.assert_allclose(again.truth_poses(), kept.truth_poses(), atol=1e-9)
+    for one, other in zip(again.frames(), kept.frames(), strict=True):
+        assert one.image is not None
+        assert other.image is not None
+        assert np.abs(one.image.astype(int) - other.image).mean() < 1.0
