@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 import yaml
+from msgspec.structs import replace
 
 from birdslam.evaluation.tracking import Row
 from birdslam.perf import faults, results
@@ -129,6 +130,12 @@ def test_what_a_report_is_reduced_to() -> None:
         **{"2/1": 2.0, "3/0": 3.0, "3/1": 3.0, "4/2": 4.0, "5/31": 5.0},
         **{"mean, cars": 3.4, "mean, ego": 3.5},
     }
+    seen = [replace(row, odometry="images", ate_m=9.0) for row in rows if row.sequence == "0005"]
+    with_images = results.EVALUATIONS["tracking"].keep(msgspec.to_builtins(rows + seen))
+    assert with_images["birdslam, images"] == {"5/31": 9.0, "5/ego": 9.0}
+    assert {name: with_images[name] for name in kept} == kept  # the simulated ones are not mixed with them
+    made = results._tracking_table(with_images)
+    assert "| **ours, final**, images | - | - | - | - | 9.00 | - | - | 9.00 |" in made
 
 
 def test_every_link_leads_somewhere() -> None:
