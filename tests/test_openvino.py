@@ -162,6 +162,7 @@ def test_the_same_ir_gives_the_same_bytes_and_weights_whatever_their_names() -> 
         (lambda xml, data: (xml.replace(b'version="10"', b'version="7"'), data), "no IR of version 10"),
         (lambda xml, data: (xml.replace(b"<net", b"<!DOCTYPE net [<!ENTITY a 'b'>]><net", 1), data), "no entities"),
         (lambda xml, data: (xml.replace(b'from-layer="1"', b'from-layer="99"'), data), "a layer that is not there"),
+        (lambda xml, data: (xml.replace(b'from-layer="0"', b'from-layer="2"'), data), "in a circle"),
         (lambda xml, data: (xml.replace(b'strides="16,16"', b"", 1), data), "Convolution.*'strides'"),
         (lambda xml, data: (xml.replace(b'density=""', b'density="2"'), data), "prior boxes with density"),
         (lambda xml, data: (xml.replace(b"CENTER_SIZE", b"CORNER"), data), "boxes coded as .*CORNER"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 from xml.etree import ElementTree
 
 
@@ -68,12 +69,14 @@ def _layer(each: ElementTree.Element, sources: dict[tuple[str, str], tuple[str, 
 
 
 def _in_order(layers: dict[str, Layer]) -> list[Layer]:
-    done: dict[str, Layer] = {}
-    left = list(layers.values())
-    while left:
-        ready = [layer for layer in left if all(source in done for source, _ in layer.sources)]
-        if not ready:
-            raise IrError(f"layer {left[0].name!r} takes from itself, or from a layer that is not there")
-        done.update({layer.id: layer for layer in ready})
-        left = [layer for layer in left if layer.id not in done]
-    return list(done.values())
+    for layer in layers.values():
+        for source, _ in layer.sources:
+            if source not in layers:
+                raise IrError(f"layer {layer.name!r} takes from layer {source}, a layer that is not there")
+    try:
+        order = list(
+            TopologicalSorter({id: [s for s, _ in layer.sources] for id, layer in layers.items()}).static_order()
+        )
+    except CycleError as error:
+        raise IrError(f"layers take from each other in a circle: {error.args[1]}") from error
+    return [layers[id] for id in order]
