@@ -41,6 +41,7 @@ ODOMETRY_FIELDS = (
     *("sequence", "frames", "path_m", "ate_m", "ate_pct", "ate_se3_m", "scale_error", "rpe_t_m", "rpe_r_deg"),
     *("segment_t_pct", "standing_drift_m"),
 )
+MOTION_FIELDS = {"motion_nees": "frames", "stretch_nees": "stretches"}
 CARS = {"0002": ("1",), "0003": ("0", "1"), "0004": ("2",), "0005": ("31",)}  # of the paper, where labels are at hand
 METHODS = {
     "paper": "the paper's method, re-implemented, live",
@@ -65,6 +66,8 @@ def _odometry(report: Sequence[Mapping[str, Any]]) -> Kept:
     for row in report:
         ego, ahead = row["ego"], row["car_ahead"]
         few = {name: row[name] for name in ODOMETRY_FIELDS} | {"nees": ego and ego["nees"]}
+        motion = row.get("motion") or {}
+        few |= {name: motion.get(part, {}).get("nees_measured") for name, part in MOTION_FIELDS.items()}
         kept.append(few | {"car_ahead": ahead})
     return _short(kept)
 
@@ -146,6 +149,8 @@ COLUMNS = (  # of the odometry's table: field, title, format, what stands behind
     ("segment_t_pct", "KITTI segments", ".1f", "%"),
     ("standing_drift_m", "drift while standing", ".2f", " m"),
     ("nees", "NEES", ".1f", ""),
+    ("motion_nees", "NEES of a motion", ".2f", ""),
+    ("stretch_nees", "of 10 m", ".2f", ""),
 )
 DRIVES = {
     "odometry": "",

@@ -113,10 +113,12 @@ def test_the_readme_has_the_one_table_of_results_and_150_lines() -> None:
 
 def test_what_a_report_is_reduced_to() -> None:
     row = {"ate_m": 2.0962464820956, "ego": {"nees": 14.7083921, "frames": 3}, "car_ahead": None}
+    row["motion"] = {"frames": {"nees_measured": 0.91234567}, "stretches": {"nees_measured": None}}
     report = [dict.fromkeys(results.ODOMETRY_FIELDS) | row, dict.fromkeys(results.ODOMETRY_FIELDS) | {"ego": None}]
     report[1]["car_ahead"] = {"frames": 7}
     first, second = results.EVALUATIONS["odometry"].keep(report)
     assert (first["ate_m"], first["nees"], second["nees"]) == (2.0962, 14.708, None)
+    assert (first["motion_nees"], first["stretch_nees"], second["motion_nees"]) == (0.91235, None, None)
     assert second["car_ahead"] == {"frames": 7}
     rows = [
         Row(sequence=s, method=method, body=body, frames=1.0, frames_labelled=1, seeds=5, ate_m=float(s))

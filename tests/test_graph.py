@@ -86,14 +86,17 @@ def test_velocity_is_the_motion_over_time() -> None:
 # --- an error of the scale lasts ---
 
 
-def straight(frames: int, step_m: float, scale_sigma_rel: float, error_rel: Iterable[float]) -> list[Measurements]:
-    """A straight drive whose odometry says `error_rel` too much in each step, and states no noise of its own."""
+SCALE_ALONE = GraphConfig(lasting_direction_rad=0.0, lasting_turn_rel=0.0)
+
+
+def chain(steps: Iterable[SE2], scale_sigma_rel: float) -> list[Measurements]:
+    """A drive whose odometry states no noise of its own."""
     out = []
-    for k, error in zip(range(frames), error_rel, strict=False):
+    for k, step in enumerate([SE2(), *steps]):
         cc = None
         if k:
             exact = tuple(np.eye(3).ravel() * 1e-12)
-            cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(step_m * (1.0 + error), 0.0, 0.0), cov=exact)
+            cc = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=step, cov=exact)
         t_ns = k * 30_000_000
         out.append(
             Measurements(
@@ -103,22 +106,47 @@ def straight(frames: int, step_m: float, scale_sigma_rel: float, error_rel: Iter
     return out
 
 
+def wander(steps: int, step_m: float, sigma: float, rng: np.random.Generator) -> list[float]:
+    keep = np.exp(-step_m / GraphConfig().scale_memory_m)
+    error = [sigma * rng.standard_normal()]
+    for _ in range(steps - 1):
+        error.append(keep * error[-1] + np.sqrt(1.0 - keep**2) * sigma * rng.standard_normal())
+    return error
+
+
 def test_an_error_of_the_scale_that_lasts_is_told_in_the_ego_pose() -> None:
-    config, step_m, sigma, frames = GraphConfig(), 0.4, 0.02, 400
+    config, step_m, sigma, frames = SCALE_ALONE, 1.6, 0.02, 100
     rng = np.random.default_rng(3)
-    keep = np.exp(-step_m / config.scale_memory_m)
     ends = []
     for _ in range(60):  # an error that wanders as the graph has it
-        error = [sigma * rng.standard_normal()]
-        for _ in range(frames):
-            error.append(keep * error[-1] + np.sqrt(1.0 - keep**2) * sigma * rng.standard_normal())
-        estimates = run(straight(frames, step_m, sigma, error), config)
+        error = wander(frames - 1, step_m, sigma, rng)
+        estimates = run(chain([SE2(step_m * (1.0 + e), 0.0, 0.0) for e in error], sigma), config)
         last = estimates[-1]
         ends.append((last.T_world_ego.x_m - (frames - 1) * step_m) ** 2 / last.cov[0])
     assert 0.6 < np.mean(ends) < 1.5  # 60 squares of a normal number: 1 +- 0.18
     variances = [estimate.cov[0] for estimate in estimates]
     assert all(a < b for a, b in pairwise(variances))
     assert last.cov[4] < 1e-3 * last.cov[0]  # to the side it does nothing
+
+
+def test_errors_of_the_direction_and_the_turn_that_last_are_told_in_the_ego_pose() -> None:
+    config, step_m, turn_rad, frames = GraphConfig(), 1.6, 0.016, 40
+    rng = np.random.default_rng(4)
+    aside, turned = [], []
+    for _ in range(60):
+        direction = wander(frames, step_m, config.lasting_direction_rad, rng)
+        last = run(chain([SE2(step_m, step_m * e, 0.0) for e in direction], 1e-6), config)[-1]
+        aside.append(last.T_world_ego.y_m**2 / last.cov[4])
+        turn = wander(frames, step_m, config.lasting_turn_rel, rng)
+        last = run(chain([SE2(step_m, 0.0, turn_rad * (1.0 + e)) for e in turn], 1e-6), config)[-1]
+        turned.append((last.T_world_ego.yaw_rad - frames * turn_rad) ** 2 / last.cov[8])
+    assert 0.6 < np.mean(aside) < 1.5  # as above
+    assert 0.6 < np.mean(turned) < 1.5
+
+
+def test_of_an_odometry_that_is_no_cameras_nothing_lasts() -> None:
+    last = run(chain([SE2(0.4, 0.0, 0.01)] * 100, 0.0), GraphConfig())[-1]
+    assert max(last.cov) < 1e-5
 
 
 def test_an_error_of_the_scale_moves_everybody_alike() -> None:

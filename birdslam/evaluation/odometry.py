@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from birdslam.datasets.recording import Recording
 from birdslam.evaluation.car_ahead import CarAhead, CarAheadReport
 from birdslam.evaluation.consistency import Consistency, ConsistencyReport
+from birdslam.evaluation.motion_consistency import MotionConsistencyReport, Motions
 from birdslam.evaluation.results import Recorder, claim_directory
 from birdslam.trajectory import Transform, as_poses, inverse, read_kitti
 from birdslam.types import Estimate, MapUpdate, Measurements
@@ -49,6 +50,7 @@ class OdometryReport(msgspec.Struct, frozen=True, kw_only=True):
     speed_sources: dict[str, int] = {}  # on how many frames the metres rested on each source
     car_ahead: CarAheadReport | None = None  # where the recording has LiDAR
     ego: ConsistencyReport | None = None  # what the ego's covariance is worth; None where only some frames are compared
+    motion: MotionConsistencyReport | None = None  # ... and each motion's, and what the truth is worth; None: as above
     segment_t_pct: float | None = None  # mean error of stretches of SEGMENTS_M, each aligned at its own first pose:
     segment_r_deg_per_m: float | None = None  # what the truth's first poses lack touches only those that begin there
 
@@ -202,9 +204,9 @@ def evaluate_recordings(
 ) -> list[OdometryReport]:
     """Run the pipeline over each recording, keep its results in `directory/NAME`, and compare them with the truth.
 
-    `run` gives one Estimate a frame; before it the frame's Measurements, where the car ahead is to be compared with the
-    recording's LiDAR, and after it what the map gained. `summary` goes into each summary.json. Of what was run,
-    the frames `compared` are held to the truth, aligned at the first of them. Writes
+    `run` gives one Estimate a frame; before it the frame's Measurements, where motions or the car ahead are to be held
+    to the recording's truth or LiDAR, and after it what the map gained. `summary` goes into each summary.json. Of what
+    was run, the frames `compared` are held to the truth, aligned at the first of them. Writes
     `directory/report.json`, a list of OdometryReport. Raises ValueError before the first run where two recordings share
     a name, a truth file is torn or the directory can't be written to, and after a run that did not give one estimate a
     frame.
@@ -217,7 +219,8 @@ def evaluate_recordings(
     claim_directory(directory)
     report = []
     for recording, truth in zip(recordings, truths, strict=True):
-        ahead, ego = CarAhead.of(recording), Consistency(recording.camera.ground)
+        mount, ahead = recording.camera.ground, CarAhead.of(recording)
+        ego, motions = Consistency(mount), Motions(mount)
         with Recorder(directory / recording.name, recording.camera) as recorder:
             for record in run(recording):
                 if isinstance(record, MapUpdate):
@@ -227,8 +230,10 @@ def evaluate_recordings(
                     ego.add(record)
                     if ahead:
                         ahead.add_estimate(record)
-                elif ahead:
-                    ahead.add_measurements(record)
+                else:
+                    motions.add(record)
+                    if ahead:
+                        ahead.add_measurements(record)
             recorder.finish({"sequence": recording.name, **(summary or {})})
         rows = as_poses(read_kitti(directory / recording.name / "ego.kitti.txt"))
         estimated = in_camera0(rows, recording.T_cam0_cam())
@@ -237,7 +242,8 @@ def evaluate_recordings(
         row = msgspec.structs.replace(row, speed_sources=dict(sorted(recorder.speed_sources.items())))
         if goal is not None and compared == slice(None):
             T_cam0_cam = recording.T_cam0_cam()
-            row = msgspec.structs.replace(row, ego=ego.report(inverse(T_cam0_cam) @ goal @ T_cam0_cam))
+            of_camera = inverse(T_cam0_cam) @ goal @ T_cam0_cam
+            row = msgspec.structs.replace(row, ego=ego.report(of_camera), motion=motions.report(of_camera))
         report.append(msgspec.structs.replace(row, car_ahead=ahead.report()) if ahead else row)
         encoded = msgspec.json.format(msgspec.json.encode(report), indent=2)
         (directory / "report.json").write_bytes(

@@ -18,7 +18,7 @@ from birdslam.graph.pending_map import PendingState
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import WindowState
 
-VERSION = 3
+VERSION = 4
 _MAGIC = b"BirdSLAM graph\n"
 _SUM_BYTES = 16
 _KINDS = {"<f8": np.float64, "<c16": np.complex128, "<i8": np.int64}
@@ -38,6 +38,7 @@ class Epoch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     t_before_ns: int
     motion: SE2
     lasting_m: float
+    lasting_turn_rad: float
 
 
 class Checkpoint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

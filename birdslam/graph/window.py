@@ -213,12 +213,18 @@ class Window:
         P += G @ cov @ G.T
         self.P = P
 
-    def drift(self, along: complex, variance: float) -> None:
+    def drift(self, along: complex, variance: float, across_variance: float) -> None:
         """The ego, and with it all that is told from it, may have come this much further in the world than was told.
 
-        `along` is the direction in ego, of length 1, `variance` in m^2. Between what is in sight nothing changes.
+        `along` is the direction in ego, of length 1, the variances along it and across it are in m^2. Between what is
+        in sight nothing changes.
         """
-        self.P[:2, :2] += variance * np.outer((along.real, along.imag), (along.real, along.imag))
+        c, s = along.real, along.imag
+        self.P[:2, :2] += variance * np.outer((c, s), (c, s)) + across_variance * np.outer((-s, c), (-s, c))
+
+    def turn_drift(self, variance: float) -> None:
+        """The ego, and with it all that is told from it, may have turned this much more in the world (rad^2)."""
+        self.P[2, 2] += variance
 
     # --- the edges of a frame ---
 

@@ -151,6 +151,12 @@ def _odometry_table(reports: list[OdometryReport]) -> str:
         ("standing m", "standing_drift_m", 3),
         ("NEES", "ego.nees", 2),
         ("inside 95 %", "ego.inside_95", 2),
+        ("motion NEES", "motion.frames.nees", 2),
+        ("its median", "motion.frames.nees_median", 2),
+        ("measured", "motion.frames.nees_measured", 2),
+        ("10 m NEES", "motion.stretches.nees", 2),
+        ("its median", "motion.stretches.nees_median", 2),
+        ("measured", "motion.stretches.nees_measured", 2),
     )
     lines = [f"{'sequence':16}" + "".join(f"{title:>12}" for title, _, _ in columns)]
     for report in reports:

@@ -1,0 +1,136 @@
+"""What each motion's covariance is worth, and what the truth is worth that it is held to."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from birdslam.evaluation import truth_quality
+from birdslam.evaluation.motion_consistency import MotionConsistencyReport, Motions
+from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.trajectory import ego_pose, inverse, mount_pose
+from birdslam.types import Attitude, EgoEdge, Measurements, Status
+
+MOUNT = GroundPlane(height_m=1.6, pitch_rad=0.05, roll_rad=-0.02)
+COV = np.array([[4e-4, 1e-5, 0.0], [1e-5, 1e-4, 2e-6], [0.0, 2e-6, 1e-6]])
+
+
+def drive(steps: list[SE2]) -> NDArray[np.float64]:
+    """`T_first_i` of the camera that rides on the ego."""
+    poses = [SE2()]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    cameras = np.array([ego_pose(pose, Attitude()) @ mount_pose(MOUNT) for pose in poses])
+    out: NDArray[np.float64] = inverse(cameras[0]) @ cameras
+    return out
+
+
+def town(frames: int, rng: np.random.Generator) -> list[SE2]:
+    """Steps of a car that speeds up, brakes and steers."""
+    at = np.arange(frames)
+    speed, turn = 0.9 + 0.3 * np.sin(at / 15.0), 0.03 * np.sin(at / 9.0)
+    return [SE2(x, 0.0, yaw + 2e-4 * rng.standard_normal()) for x, yaw in zip(speed, turn, strict=True)]
+
+
+def measurements(frame: int, step: SE2 | None, cov: NDArray[np.float64], **fields: object) -> Measurements:
+    t_ns = frame * 100_000_000
+    edge = None
+    if step is not None:
+        edge = EgoEdge(from_frame=frame - 1, to_frame=frame, T_from_to=step, cov=tuple(cov.ravel().tolist()))
+    plain = Measurements(frame_id=frame, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=edge)
+    return msgspec.structs.replace(plain, **fields)
+
+
+def told(steps: list[SE2], cov: NDArray[np.float64]) -> Motions:
+    motions = Motions(MOUNT)
+    for frame, step in enumerate([None, *steps]):
+        motions.add(measurements(frame, step, cov))
+    return motions
+
+
+def judged(motions: Motions, truth: NDArray[np.float64]) -> MotionConsistencyReport:
+    report = motions.report(truth)
+    assert report is not None
+    return report
+
+
+@given(factor=st.floats(0.3, 3.0), seed=st.integers(0, 2**16))
+@settings(max_examples=3)
+def test_an_honest_covariance_has_a_nees_of_one_a_frame_and_a_stretch(factor: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true, L = town(200, rng), np.linalg.cholesky(COV)
+    erring = [step @ SE2.exp(L @ rng.standard_normal(3)) for step in true]
+    report = judged(told(erring, factor**2 * COV), drive(true))
+    assert report.frames.n == report.frames.n_measured == 200
+    assert report.frames.nees == pytest.approx(1.0 / factor**2, rel=0.25)
+    assert report.frames.nees_median == pytest.approx(1.0 / factor**2, rel=0.35)
+    assert report.stretches.n > 50
+    assert report.stretches.nees == pytest.approx(1.0 / factor**2, rel=0.5)
+
+
+def test_the_truths_own_noise_is_measured_and_counts_beside_the_covariance() -> None:
+    rng = np.random.default_rng(5)
+    true, sigma = town(400, rng), np.array([0.03, 0.01, 1e-3])
+    noisy = [step @ SE2.exp(sigma * rng.standard_normal(3)) for step in true]
+    erring = [step @ SE2.exp(np.linalg.cholesky(COV) @ rng.standard_normal(3)) for step in true]
+    report = judged(told(erring, COV), drive(noisy))
+    np.testing.assert_allclose([*report.truth_sigma_m, report.truth_sigma_rad], sigma, rtol=0.2)
+    assert report.frames.nees is not None
+    assert report.frames.nees > 1.8
+    assert report.frames.nees_measured == pytest.approx(1.0, rel=0.2)
+
+
+def test_an_interpolated_truth_is_found_and_left_out() -> None:
+    rng = np.random.default_rng(6)
+    true = town(120, rng)
+    told_truth = [SE2(0.8, 0.0, 0.002)] * 12 + true[12:]
+    poses = drive(told_truth)
+    assert np.flatnonzero(truth_quality.interpolated(poses)).tolist() == list(range(1, 13))
+    report = judged(told(true, COV), poses)
+    assert report.truth_interpolated == 12
+    assert (report.frames.n, report.frames.n_measured) == (120, 108)
+    assert report.frames.nees is not None
+    assert report.frames.nees_measured is not None
+    assert report.frames.nees > 1.0 > 0.1 > report.frames.nees_measured
+
+
+def test_a_standing_cars_truth_is_no_interpolation() -> None:
+    assert not truth_quality.interpolated(drive([SE2(0.001, 0.0, 0.0)] * 50)).any()
+
+
+def test_a_step_that_no_car_makes_is_found_at_both_its_ends() -> None:
+    steps = [SE2(1.0, 0.0, 0.0)] * 10
+    steps[4] = SE2(1.2, 0.0, 0.0)  # 20 m/s^2
+    t_ns = np.arange(11) * 100_000_000
+    assert np.flatnonzero(truth_quality.implausible(drive(steps), t_ns)).tolist() == [4, 5, 6]
+    steps[4] = SE2(1.1, 0.0, 0.0)
+    assert not truth_quality.implausible(drive(steps), t_ns).any()
+
+
+def test_what_is_invalid_coasts_or_stands_is_not_judged() -> None:
+    steps = [SE2(1.0, 0.0, 0.0)] * 8
+    motions = Motions(MOUNT)
+    status = {3: Status.SCALE_INVALID, 4: Status.ODOMETRY_COASTING, 5: Status.STANDSTILL}
+    for frame, step in enumerate([None, *steps]):
+        off = step if step is None or frame not in status else SE2(9.0, 0.0, 0.0)
+        motions.add(measurements(frame, off, COV, status=(status[frame],) if frame in status else ()))
+    motions.add(measurements(9, SE2(9.0, 0.0, 0.0), COV, status=(Status.END_OF_SOURCE,)))
+    report = judged(motions, drive(steps))
+    assert report.frames.n == 5
+    assert report.frames.nees == pytest.approx(0.0, abs=1e-9)
+    assert report.stretches.n == 0
+
+
+def test_a_recording_of_one_frame_has_no_figures() -> None:
+    report = judged(told([], COV), drive([]))
+    assert (report.frames.n, report.frames.nees, report.stretches.n) == (0, None, 0)
+    assert (report.truth_interpolated, report.truth_implausible, report.truth_sigma_m) == (0, 0, (0.0, 0.0))
+
+
+def test_without_measurements_there_is_nothing_to_judge() -> None:
+    assert Motions(MOUNT).report(drive([SE2(1.0, 0.0, 0.0)])) is None
