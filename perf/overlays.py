@@ -2,9 +2,10 @@
 
     python -m perf overlays [SEQUENCE ...] [--output FILE.json] [--data DIR] [--networks] [--model ROLE=PATH ...]
 
-Each is drawn over the second half of each sequence, seeded, and stands still in the image (`windscreen.Overlay`).
-Counts the frames of the second half that were called valid with a speed off by more than a tenth, and those called
-standstill while the car drove.
+Each is drawn over the second half of each sequence, seeded, and stands still in the image (`windscreen.Overlay`);
+`night` blackens all but the end of the street, over 30 images, after which the road is back. Counts the frames of the
+second half that were called valid with a speed off by more than a tenth, and those called standstill while the car
+drove.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from birdslam.perception import ModelError
 from birdslam.perf.errors import PerfError
 from birdslam.perf.figures import Ledger
 from birdslam.perf.starts import Drive, Task, is_valid, is_wrong, networks_of, read, uri_of
-from birdslam.rendered_world.windscreen import KINDS, from_middle
+from birdslam.rendered_world import windscreen
+from birdslam.rendered_world.windscreen import Image
 from birdslam.types import Status
 
 label = "drops, dirt and a reflection from the middle of recorded drives on"
@@ -34,6 +36,8 @@ SEQUENCES = (
     "kitti_odometry/sequences/06",
     "kitti_tracking/training/image_03/0005",
 )
+KINDS = (*windscreen.KINDS, "night")
+NIGHT_IMAGES = 30
 DRIVES_M = 0.1  # in one image, by the truth: such a car does not stand
 
 
@@ -54,11 +58,25 @@ def run(arguments: list[str]) -> None:
                 task = Task(uri_of(sequence, options.data), "", False, 1, 1, 0, None)
                 for kind in KINDS:
                     # The networks see the overlay as well
-                    name, drive = read(replace(task, configuration=configuration), from_middle(kind, options.seed))
+                    name, drive = read(replace(task, configuration=configuration), edit_of(kind, options.seed))
                     row = measure(drive)
                     ledger.add(f"{name} {kind}", told(row), **row)
     except (DatasetError, ModelError) as error:
         raise PerfError(str(error)) from error
+
+
+def edit_of(kind: str, seed: int) -> windscreen.Edit:
+    """What is drawn over the images of the second half."""
+    return _night if kind == "night" else windscreen.from_middle(kind, seed)
+
+
+def _night(index: int, count: int, image: Image) -> Image:
+    if not count <= 2 * index < count + 2 * NIGHT_IMAGES:
+        return image
+    out, (height_px, width_px) = np.full_like(image, 40), image.shape[:2]
+    far = slice(0, round(0.55 * height_px)), slice(round(0.35 * width_px), round(0.65 * width_px))
+    out[far] = image[far]
+    return out
 
 
 def measure(drive: Drive) -> dict[str, Any]:

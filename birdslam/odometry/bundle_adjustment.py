@@ -22,26 +22,30 @@ Bools = NDArray[np.bool_]
 _LEAST_LANDMARKS = 8
 _HUBER_SIGMA = 1.5
 _CONVERGED = 1e-5
+_HELD = 0.1
 
 
 def adjust(window: SlidingWindow, iterations: int, max_landmarks: int, prior: Floats) -> None:
     """Adjusts all poses of the window but the oldest, and the `max_landmarks` depths that most keyframes saw.
 
-    `prior` (6,) is the information of each pose (translation, rotation vector) against where it was before. It damps,
-    and it carries the unit of length: no image says anything of that, so the smallest step leaves it where all poses
-    together have it. Two poses held fixed would carry it as well, but from one short baseline whose error all the
-    others then take over.
+    A place that a held speed gave stays where it is, but for _HELD of its sigma: the images are in it already. `prior`
+    (6,) is the information of each pose (translation, rotation vector) against where it was before. It damps, and it
+    carries the unit of length: no image says anything of that, so the smallest step leaves it where all poses together
+    have it. Two poses held fixed would carry it as well, but from one short baseline whose error all the others then
+    take over.
     """
     problem = _choose(window, max_landmarks)
     if problem is None:
         return
     free = len(window.poses) - 1
+    priors = np.tile(prior, (free, 1))
+    priors[:, :3] += 1.0 / np.square(_HELD * np.array(window.held_m[1:]))[:, None]
     moved = np.zeros((free, 6))  # steps so far: (translation, rotation vector), both in the window's axes
     rho = window.rho[problem.landmarks].copy()
     for k in range(iterations):
         residuals = _reproject(window, problem, rho, outlier_factor=2.0 if k == 0 else 1.0)
         normal = _normal_equations(problem, residuals, rho)
-        pose_steps, rho_steps = _solve(normal, prior, moved)
+        pose_steps, rho_steps = _solve(normal, priors, moved)
         if not np.isfinite(pose_steps).all():
             return
         rho = np.maximum(rho - rho_steps, 0.0)
@@ -168,14 +172,14 @@ def _normal_equations(problem: _Problem, residuals: _Residuals, rho: Floats) -> 
     return _NormalEquations(A, B, C, g, (J_rho * rw).sum(axis=(0, 1)))
 
 
-def _solve(normal: _NormalEquations, prior: Floats, moved: Floats) -> tuple[Floats, Floats]:
+def _solve(normal: _NormalEquations, priors: Floats, moved: Floats) -> tuple[Floats, Floats]:
     """Steps of the poses but the oldest (F - 1, 6), and what is to be taken off the inverse depths (M,).
 
-    The depths are eliminated first (Schur complement).
+    `priors` (F - 1, 6) are those of the poses. The depths are eliminated first (Schur complement).
     """
     free, B, C = len(moved), normal.B, normal.C
-    A = normal.A[1:, :, 1:].reshape(6 * free, 6 * free) + np.diag(np.tile(prior, free))
-    g = (normal.g[1:] + prior * moved).reshape(-1)
+    A = normal.A[1:, :, 1:].reshape(6 * free, 6 * free) + np.diag(priors.ravel())
+    g = (normal.g[1:] + priors * moved).reshape(-1)
     S = A - B.T @ (B / C[:, None])
     step: Floats = np.negative(np.linalg.solve(S, g - B.T @ (normal.g_rho / C)))
     return step.reshape(free, 6), (normal.g_rho + B @ step) / C

@@ -42,15 +42,16 @@ class KeyframeWindow(SlidingWindow):
         self.config = config
         self._provisional = False  # the newest image is no keyframe yet
 
-    def extend(self, frame_id: int, pose: Pose, ids: Ints, xy: Floats) -> Pose:
+    def extend(self, frame_id: int, pose: Pose, ids: Ints, xy: Floats, held_m: float = np.inf) -> Pose:
         """Puts the present image into the window, triangulates and adjusts it; gives its pose after that.
 
-        `pose` is its relative pose, ids (N,) ascending and xy (N, 2) its corners in normalised coordinates.
+        `pose` is its relative pose, ids (N,) ascending and xy (N, 2) its corners in normalised coordinates; `held_m` is
+        1-sigma of its place where a held speed gave it.
         """
         cfg = self.config
         if self._provisional and not self._becomes_keyframe(pose, ids, xy):
             self.drop(len(self.poses) - 1)
-        self.append(frame_id, pose, ids, xy)
+        self.append(frame_id, pose, ids, xy, held_m)
         self._provisional = True
         while len(self.poses) > cfg.keyframes + 1:
             self.drop(0)

@@ -58,6 +58,9 @@ class MetricScale(Protocol):
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
         """The window begins anew with this image; its unit of length is known to `sigma_rel`."""
 
+    def length_held(self, sigma_rel: float) -> None:
+        """The newest motion is the last speed, held to `sigma_rel`: the unit of length is known no better."""
+
     def turned_unseen(self) -> None:
         """The odometry lost sight of how the camera turned."""
 

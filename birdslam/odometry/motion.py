@@ -102,11 +102,11 @@ def standing_cov(config: MotionConfig) -> Floats:
 def car_cov(config: MotionConfig, motion: SE2, sigma_m: float, scale_sigma_rel: float, yaw_sigma_rad: float) -> Floats:
     """(3, 3) of a motion by the car's own readings: errors of its length, of its scale, and of its turn on an arc."""
     xy = np.array([motion.x_m, motion.y_m, 0.0])
-    length = math.hypot(motion.x_m, motion.y_m)
-    floor = config.sigma_floor_m**2 + config.sigma_path_rel**2 * length**2
+    floor = config.sigma_floor_m**2
+    sideways = floor + (config.sigma_direction_rad * math.hypot(motion.x_m, motion.y_m)) ** 2
     turn = np.array([-0.5 * motion.y_m, 0.5 * motion.x_m, 1.0])
     yaw = yaw_sigma_rad**2 + config.sigma_floor_rad**2
-    out: Floats = np.diag([floor + sigma_m**2, floor, 0.0]) + yaw * np.outer(turn, turn)
+    out: Floats = np.diag([floor + sigma_m**2, sideways, 0.0]) + yaw * np.outer(turn, turn)
     return out + scale_sigma_rel**2 * np.outer(xy, xy)
 
 

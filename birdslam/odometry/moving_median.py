@@ -74,6 +74,9 @@ class MedianScale:
         self._scales.clear()
         self._given = 1.0
 
+    def length_held(self, sigma_rel: float) -> None:
+        """The moving median has a spread of its own."""
+
     def turned_unseen(self) -> None:
         """Nothing here follows the camera's tilt."""
 

@@ -25,6 +25,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.odometry.car_scale import CarStep
 from birdslam.odometry.features import FeatureConfig, FeatureTracker, Tracks
 from birdslam.odometry.guided_two_view import guided_two_view
+from birdslam.odometry.held_speed import HeldSpeed, HeldSpeedConfig, worst_sigma_m
 from birdslam.odometry.keyframes import KeyframeConfig, KeyframeWindow
 from birdslam.odometry.metric_scale import MetricScale, RoadView
 from birdslam.odometry.motion import (
@@ -80,6 +81,7 @@ class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
     max_speed_mps: Positive = 70.0  # a faster motion is no measurement
     max_coast_s: Positive = 1.0  # after that the window begins anew
     standstill: StandstillConfig = StandstillConfig()
+    held_speed: HeldSpeedConfig = HeldSpeedConfig()
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,7 @@ class Odometry:
         self._base_t_ns = 0
         self._base_seen = True  # False: no image shows where the base was, the car's own speed alone led there
         self._velocity: _Velocity | None = None
+        self._held = HeldSpeed(self.config.held_speed)
         self._guess: Pose | None = None  # of the step to the present image, where it had to be searched for
         self._interval_s = 0.1
         self._road_tracks: tuple[Ints, Floats] = _NO_TRACKS
@@ -228,7 +231,10 @@ class Odometry:
             # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.
             motion = self._stand(frame_id)
         else:
-            pose = self._window.extend(frame_id, pose, corners.ids, corners.xy)  # bundle adjustment
+            pose, info, held_m = self._hold_speed(pose, info, dt_s)
+            pose = self._window.extend(frame_id, pose, corners.ids, corners.xy, held_m)  # bundle adjustment
+            if np.isfinite(held_m):
+                self._scale.length_held(held_m / max(float(np.linalg.norm(pose.p - self._pose.p)), held_m))
             interval_ns = (t_source_ns - round(dt_s * 1e9), t_source_ns)
             step = self._scale_to_metres(pose, tracks, boxes_px, road_mask, near_px, interval_ns)
             motion = self._move(frame_id, step, info, dt_s)
@@ -354,6 +360,20 @@ class Odometry:
                 return False
         return stands(self.config.standstill, step, corners.displacement_px, near_px, speed_mps, dt_s)
 
+    def _hold_speed(self, pose: Pose, info: Floats, dt_s: float) -> tuple[Pose, Floats, float]:
+        """The pose, its information (6, 6), and 1-sigma of its place where the last speed had to give it, else inf."""
+        stated = info / self.config.motion.covariance_inflation
+        held = None
+        if self._velocity is not None:
+            held = self._held.hold(self._pose, pose, self._pose @ self._predicted_step(dt_s), stated, dt_s)
+        if held is None:
+            self._held.settle(worst_sigma_m(stated + np.eye(6) * 1e-3), dt_s)
+            return pose, info, np.inf
+        pose, sigma_m = held
+        self._held.settle(sigma_m, dt_s)
+        tie = np.diag([self.config.motion.covariance_inflation / sigma_m**2] * 3 + [0.0] * 3)
+        return pose, info + tie, sigma_m
+
     def _speed_mps(self) -> float:
         """Of the last measured motion."""
         return 0.0 if self._velocity is None else float(np.linalg.norm(self._velocity.linear_mps))
@@ -371,6 +391,7 @@ class Odometry:
 
     def _stand(self, frame_id: int) -> Motion:
         self._velocity = _Velocity(np.zeros(3), np.zeros(3))
+        self._held.settle(0.0, 1.0)
         return self._motion(frame_id, _STILL, SE2(), standing_cov(self.config.motion), [Status.STANDSTILL])
 
     def _coast(self, frame_id: int, dt_s: float, status: list[Status], car: CarStep | None = None) -> Motion:

@@ -152,6 +152,10 @@ class RoadFilter:
         self.cov[0, :] = self.cov[:, 0] = 0.0
         self.cov[0, 0] = sigma_rel**2
 
+    def loosen_scale(self, sigma_rel: float) -> None:
+        """The unit of length is known to `sigma_rel` at the best."""
+        self.cov[0, 0] = max(self.cov[0, 0], min(sigma_rel, 1.0) ** 2)
+
     def turned_unseen(self) -> None:
         """The camera turned and nobody saw by how much: all that is known of the tilt is what the mount gives."""
         cfg = self.config

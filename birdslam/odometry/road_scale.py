@@ -68,6 +68,8 @@ class RoadScale:
         self._refused = 0.0  # comparisons in a row, each counted by what of it is new: those of one view err together
         self._tries = 0  # and by number
         self._since_m = 0.0  # travelled since the last comparison
+        self._held = False  # whether the speed was held since a comparison was accepted
+        self._direction_held = False  # whether it is for the newest motion, whose direction the images do not show
         self.fit: RoadFit | None = None  # what the newest image's comparison alone said, where it was accepted
 
     @property
@@ -102,6 +104,11 @@ class RoadScale:
             self._confirmed = 0
         self._car.restart()
 
+    def length_held(self, sigma_rel: float) -> None:
+        """The newest motion is the last speed, held to `sigma_rel`: the unit of length is known no better."""
+        self._filter.loosen_scale(sigma_rel)
+        self._held = self._direction_held = True
+
     def turned_unseen(self) -> None:
         """The odometry lost sight of how the camera turned."""
         self._filter.turned_unseen()
@@ -134,7 +141,9 @@ class RoadScale:
         self.fit = None
         travelled_m = float(np.linalg.norm(step.p))
         self._filter.predict(step.R, travelled_m)
-        self._filter.travel(step.R.T @ step.p, travelled_m)
+        if not self._direction_held:
+            self._filter.travel(step.R.T @ step.p, travelled_m)
+        self._direction_held = False
         self._since_m += travelled_m
 
         image, pose = self._image(view.grey), view.pose
@@ -180,7 +189,11 @@ class RoadScale:
         if factor != 1.0:
             self._rescale(pose.p, factor)
         newest = self._kept[-1] if self._kept else None
-        if newest is None or float(np.linalg.norm(newest.pose.p - pose.p)) > 0.5 * cfg.min_baseline_m:
+        away_m = np.inf if newest is None else float(np.linalg.norm(newest.pose.p - pose.p))
+        if self._held:  # the earlier ones show no road, or from too vague a distance
+            if away_m > cfg.min_baseline_m:
+                self._kept = [_Kept(seen.plain, seen.image, pose)]
+        elif away_m > 0.5 * cfg.min_baseline_m:
             self._kept = [*self._kept[1 - cfg.kept_images :], _Kept(seen.plain, seen.image, pose)]
 
     def _rescale(self, centre: Floats, factor: float) -> None:
@@ -200,7 +213,8 @@ class RoadScale:
         return self._car.status()
 
     def _sees_road(self) -> bool:
-        return self._filter.carried_m <= self.config.carried_after_m and self._confirmed > 0
+        seen = self._filter.carried_m <= self.config.carried_after_m and not self._held
+        return seen and self._confirmed > 0
 
     def status(self) -> list[Status]:
         """What is wrong with the scale, the ground plane or the mount."""
@@ -264,7 +278,7 @@ class RoadScale:
             self._refused += new
             self._tries += 1
             return 1.0
-        self._refused, self._tries = 0.0, 0
+        self._refused, self._tries, self._held = 0.0, 0, False
         self.fit = fit
         filter_.cov = prior_cov
         factor = searched * filter_.accept(fit, min(1.0, filter_.carried_m / length))

@@ -27,6 +27,7 @@ class SlidingWindow:
         self.focal_px, self.sigma_px, self.reject_px = focal_px, sigma_px, reject_px
         self.poses: list[Pose] = []
         self.frames: list[int] = []
+        self.held_m: list[float] = []  # 1-sigma of a place that a held speed gave; infinite where the images showed it
         self.ids: Ints = np.zeros(0, np.int64)  # (M,) ascending
         self.obs: Floats = np.zeros((0, 0, 2))  # (F, M, 2), NaN where not seen
         self.rho: Floats = np.zeros(0)  # (M,) inverse depth along the anchor's ray (z = 1), NaN unknown
@@ -37,8 +38,8 @@ class SlidingWindow:
         out: Ints = np.isfinite(self.obs[..., 0]).argmax(axis=0)
         return out
 
-    def append(self, frame: int, pose: Pose, ids: Ints, xy: Floats) -> None:
-        """A new keyframe: ids (N,) ascending, xy (N, 2) normalised coordinates."""
+    def append(self, frame: int, pose: Pose, ids: Ints, xy: Floats, held_m: float = np.inf) -> None:
+        """A new keyframe: ids (N,) ascending, xy (N, 2) normalised coordinates; `held_m` as above."""
         merged = np.concatenate([self.ids, ids])
         merged.sort(kind="stable")
         merged = merged[np.concatenate([[True], merged[1:] != merged[:-1]])] if len(merged) else merged
@@ -51,12 +52,13 @@ class SlidingWindow:
         self.ids, self.obs, self.rho, self.rho_sigma = merged, obs, rho, sigma
         self.poses.append(pose)
         self.frames.append(frame)
+        self.held_m.append(held_m)
 
     def drop(self, index: int) -> None:
         """Forgets one keyframe. Landmarks anchored in it move to the next keyframe that saw them."""
         anchor, gone, xy = self.anchors(), self.poses[index], self.obs[index]
         self.obs = self.obs[np.arange(len(self.poses)) != index]
-        del self.poses[index], self.frames[index]
+        del self.poses[index], self.frames[index], self.held_m[index]
         seen = np.isfinite(self.obs[..., 0]).any(axis=0)
         moved = np.flatnonzero(seen & (anchor == index) & np.isfinite(self.rho))
         if len(moved):
@@ -75,6 +77,7 @@ class SlidingWindow:
         """Multiplies all lengths, about the newest camera."""
         centre = self.poses[-1].p
         self.poses = [Pose(T.R, centre + factor * (T.p - centre)) for T in self.poses]
+        self.held_m = [factor * sigma_m for sigma_m in self.held_m]
         self.rho = self.rho / factor
         self.rho_sigma = self.rho_sigma / factor
 
