@@ -27,6 +27,8 @@ _ONE_RATIO = 0.04  # spread of the log ratios of a contradiction that is a wrong
 _SURE_SIGMAS = 4.0
 _LATELY_S = 2.0
 _TICK_S = 0.02  # by which the newest reading may be older than the image that it is held against
+_MISFIT_SHARE, _MAX_MISFIT2 = 0.1, 9.0  # of the newest way in the mean; and no more than that
+_PROVEN = 10  # ways that agreed, before the readings may say which of the road's lengths are none
 _STRIKES = 3  # of the road in a row, with one ratio, against the readings that the metres rest on
 _ROAD_RATIO = 0.15  # spread of those log ratios
 _FEWEST_WAYS = 4  # that make a spread
@@ -42,6 +44,7 @@ class CarStep:
     yaw_rad: float | None  # counter-clockwise; None: the car does not say
     yaw_sigma_rad: float
     agreed: bool = False  # a way by them has agreed with the images lately
+    proven: bool = False  # and many did before
 
     def drives(self, least_m: float) -> bool:
         """Whether the car surely moved."""
@@ -70,7 +73,10 @@ class CarScale:
         self._settled = False  # the unit of length drifts slowly by now
         self._refused: list[tuple[int, float]] = []  # (time, log ratio) since a way agreed
         self._agreed_ns: int | None = None  # when the last way that agreed ended
+        self._misfit2 = 1.0  # of the last ways against their sigma, squared, in the mean
         self._strikes: list[float] = []  # log ratios by which the road's metres differed from those by the readings
+        self._refused_m = 0.0  # travelled since the first of those refused
+        self._agreements = 0  # of ways, since the road last spoke against them
         self._barred = False  # the road has spoken against the readings
         self._begun_m = 0.0  # travelled since the window began
         self._jumps = 0
@@ -89,6 +95,15 @@ class CarScale:
     def measures(self) -> bool:
         """Whether the metres rest on the readings now."""
         return self.trusted and self.since_m < self._road.carried_after_m
+
+    @property
+    def length(self) -> float | None:
+        """The factor on all lengths by the readings' last way; None where too few ways have agreed to ask them."""
+        if self._agreements < _PROVEN or self._speed.status:
+            return None
+        if not self._refused:
+            return 1.0
+        return math.exp(self._refused[-1][1] - float(self._filter.x[CAR_FACTOR]))
 
     def hear(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:
         """A frame's readings."""
@@ -111,7 +126,7 @@ class CarScale:
             return
         self._strikes = [*self._strikes[1 - _STRIKES :], log_ratio]
         if len(self._strikes) == _STRIKES and np.ptp(self._strikes) < _ROAD_RATIO:
-            self._barred, self._strikes, self.since_m = True, [], math.inf
+            self._barred, self._strikes, self.since_m, self._agreements = True, [], math.inf, 0
 
     def rescale(self, factor: float) -> None:
         """All lengths are multiplied."""
@@ -125,6 +140,7 @@ class CarScale:
         """
         self.since_m += travelled
         self._begun_m += travelled
+        self._refused_m += travelled
         if not self._speed.heard:
             return 1.0
         self._settled = confirmed or self._begun_m > self._road.carried_after_m
@@ -165,12 +181,18 @@ class CarScale:
         if ratio <= 0.05:
             return self._refuse(last.t_ns, math.log(0.05))
         log_ratio, by_delay = math.log(ratio), way.by_delay_mps / way.way_m
+        # By night a way by images may be five times as rough as by day: the last ways' misfit says so
+        var *= self._misfit2
         _, _, sigmas = filter_.car_innovation(log_ratio, by_delay, var)
+        misfit2 = self._misfit2 * min(sigmas, cfg.max_innovation_sigma) ** 2
+        self._misfit2 += _MISFIT_SHARE * (misfit2 - self._misfit2)
+        self._misfit2 = min(max(self._misfit2, 1.0), _MAX_MISFIT2)
         if self._barred:  # by the road: only a way that any car's factor explains makes up for it
             sigmas = max(sigmas, abs(log_ratio) / math.sqrt(2.0 * cfg.sigma_factor_rel**2 + var))
         if sigmas > cfg.max_innovation_sigma:
             return self._refuse(last.t_ns, log_ratio)
         self._refused, self._agreed_ns, self.since_m, self._barred = [], last.t_ns, 0.0, False
+        self._agreements += 1
         if not self._settled:
             var += (cfg.sigma_start_m / by_images) ** 2
         return filter_.measure_car(log_ratio, by_delay, var)
@@ -178,11 +200,16 @@ class CarScale:
     def _refuse(self, t_ns: int, log_ratio: float) -> float:
         """Remembers a way that does not fit, and decides which of the two is in doubt."""
         cfg = self.config
+        if not self._refused:
+            self._refused_m = 0.0
         self._refused = [*self._refused[-200:], (t_ns, log_ratio)]
         lately = [ratio for then_ns, ratio in self._refused if t_ns - then_ns <= cfg.doubt_s * NS_PER_S]
         lasting = (t_ns - self._refused[0][0]) / NS_PER_S >= cfg.doubt_s and len(lately) >= _FEWEST_WAYS
         unseen = self._filter.carried_m > self._road.carried_after_m and not self._barred
-        if lasting and unseen and float(np.std(lately)) < _ONE_RATIO and not self._speed.frozen():
+        one_ratio = lasting and unseen and float(np.std(lately)) < _ONE_RATIO
+        # Readings that have proved right go before images that have lost the road since: by night these run away
+        silent = self._filter.carried_m >= self._refused_m and len(self._refused) >= _STRIKES
+        if (one_ratio or (silent and self._agreements >= _PROVEN)) and not self._speed.frozen():
             self._filter.forget_scale(1.0)
             self._refused = []
         return 1.0
@@ -203,6 +230,7 @@ class CarScale:
             sigma_rel=math.sqrt(float(cov[CAR_FACTOR, CAR_FACTOR])),
             yaw_rad=way.yaw_rad,
             yaw_sigma_rad=math.sqrt(way.yaw_var),
+            proven=self._agreements >= _PROVEN,
             agreed=self._agreed_ns is not None and to_ns - self._agreed_ns < _LATELY_S * NS_PER_S,
         )
 

@@ -63,6 +63,7 @@ _CAR_LENGTH_M = 0.05  # of a first step that the car's own speed gives
 # Of a car's way along the camera's axis, where it is of unit length: in a bend of 5 m radius it is 0.95 at 1.7 m before
 # the rear axle. Five points of a ramp with one tree and rails found 0.68 (tests/roads/ramp_21_glare)
 _LEAST_FORWARD = 0.87
+_SIDEWAYS = 0.25  # of the way forwards: the camera may look 5 degrees aside, and a car drifts by as much
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
 _STRATEGIES: dict[str, type[RoadScale] | type[MedianScale]] = {"kalman": RoadScale, "paper": MedianScale}
 
@@ -218,9 +219,10 @@ class Odometry:
 
         corners = self._static_corners(tracks, boxes_px)
         located = self._relative_pose(corners, dt_s, car)
-        if located is None:
+        sideways = located is not None and car is not None and self._sideways(located[0], car)
+        if located is None or sideways:
             motion = self._coast(frame_id, dt_s, [Status.LOW_TEXTURE], car)
-            if dt_s > self.config.max_coast_s or len(corners.displacement_px) < self.config.min_fitting:
+            if sideways or dt_s > self.config.max_coast_s or len(corners.displacement_px) < self.config.min_fitting:
                 # Nothing links this image to the base any more: the window begins anew here, at the coasted pose.
                 self._begin(tracks, frame_id, t_source_ns, boxes_px)
                 self._scale.turned_unseen()
@@ -373,6 +375,15 @@ class Odometry:
         self._held.settle(sigma_m, dt_s)
         tie = np.diag([self.config.motion.covariance_inflation / sigma_m**2] * 3 + [0.0] * 3)
         return pose, info + tie, sigma_m
+
+    def _sideways(self, pose: Pose, car: CarStep) -> bool:
+        """Whether the images show a motion to the side that no car makes, while this one says that it drives.
+
+        By night they may, of lights and of their own noise.
+        """
+        forward, side, yaw_rad = planar(self._pose.between(pose), self._scale.ground).log()
+        drives = car.proven and car.drives(_CAR_LENGTH_M)
+        return drives and abs(side - self.config.start.camera_ahead_m * yaw_rad) > _SIDEWAYS * abs(forward)
 
     def _speed_mps(self) -> float:
         """Of the last measured motion."""

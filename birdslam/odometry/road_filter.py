@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 STATES = ROAD + 2  # log lambda, pitch, roll, curvature; the mount's pitch and roll
+_NO_TYRES = 2.0  # sigmas of the factor beforehand
 CAR_FACTOR, CAR_DELAY, ROAD_ERROR = STATES, STATES + 1, STATES + 2  # once the car has told of its speed
 
 
@@ -273,5 +274,12 @@ class RoadFilter:
         owed, limit_s = self.owed_log, self.config.car.max_delay_s
         self._update(np.array([beyond]), H, np.array([[var]]))
         self.x[CAR_DELAY] = np.clip(self.x[CAR_DELAY], -limit_s, limit_s)
+        off = float(self.x[CAR_FACTOR])
+        if abs(off) > _NO_TYRES * self.config.car.sigma_factor_rel:
+            # No tyres are off by so much: it is the road's metres that are (by night the car's own light travels along)
+            self.cov[ROAD_ERROR, ROAD_ERROR] += off**2
+            H = np.zeros((1, len(self.x)))
+            H[0, CAR_FACTOR] = 1.0
+            self._update(np.array([-off]), H, np.array([[self.config.car.sigma_factor_rel**2]]))
         step, self.owed_log = self.owed_log - owed, owed
         return float(np.exp(np.clip(step, -4.0, 4.0)))

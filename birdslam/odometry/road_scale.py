@@ -164,6 +164,8 @@ class RoadScale:
                     self._kept = []  # they are of the other kind
                     return factor
                 borne_out = None if unit is None else unit / factor
+                if self._car.length is not None:
+                    borne_out = self._car.length / factor
                 factor *= self._compare(past.image, image.image, Pose(T.R, T.p * factor), px, borne_out)
         measured = self._filter.carried_m == 0.0 and self._known()  # here, in metres
         self._watch.see(self._filter.tilt, factor * travelled_m, measured)
