@@ -182,8 +182,7 @@ class CarScale:
             return self._refuse(last.t_ns, math.log(0.05))
         log_ratio, by_delay = math.log(ratio), way.by_delay_mps / way.way_m
         # By night a way by images may be five times as rough as by day: the last ways' misfit says so
-        var *= self._misfit2
-        _, _, sigmas = filter_.car_innovation(log_ratio, by_delay, var)
+        _, _, sigmas = filter_.car_innovation(log_ratio, by_delay, var * self._misfit2)
         misfit2 = self._misfit2 * min(sigmas, cfg.max_innovation_sigma) ** 2
         self._misfit2 += _MISFIT_SHARE * (misfit2 - self._misfit2)
         self._misfit2 = min(max(self._misfit2, 1.0), _MAX_MISFIT2)

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 STATES = ROAD + 2  # log lambda, pitch, roll, curvature; the mount's pitch and roll
-_NO_TYRES = 2.0  # sigmas of the factor beforehand
+_NO_TYRES = 1.5  # sigmas of the factor beforehand; two rendered nights chose between 1.5 and 2
 CAR_FACTOR, CAR_DELAY, ROAD_ERROR = STATES, STATES + 1, STATES + 2  # once the car has told of its speed
 
 
