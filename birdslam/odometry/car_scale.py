@@ -70,13 +70,14 @@ class CarScale:
         self._road, self._filter = config, filter_
         self._speed = CarSpeed(config.car)
         self._seen: list[_Seen] = []
+        self._confirmed = False  # the unit of length is, by the road
         self._settled = False  # the unit of length drifts slowly by now
         self._refused: list[tuple[int, float]] = []  # (time, log ratio) since a way agreed
         self._agreed_ns: int | None = None  # when the last way that agreed ended
         self._misfit2 = 1.0  # of the last ways against their sigma, squared, in the mean
         self._strikes: list[float] = []  # log ratios by which the road's metres differed from those by the readings
         self._refused_m = 0.0  # travelled since the first of those refused
-        self._agreements = 0  # of ways, since the road last spoke against them
+        self._agreements = 0  # of ways with the road's metres too, since the readings last jumped
         self._barred = False  # the road has spoken against the readings
         self._begun_m = 0.0  # travelled since the window began
         self._jumps = 0
@@ -112,7 +113,7 @@ class CarScale:
             self._filter.begin_car()
         if self._speed.jumps != self._jumps:
             self._jumps = self._speed.jumps
-            self._seen = self._seen[-1:]
+            self._seen, self._agreements = self._seen[-1:], 0
 
     def restart(self) -> None:
         """The window begins anew: its unit of length is another."""
@@ -143,6 +144,7 @@ class CarScale:
         self._refused_m += travelled
         if not self._speed.heard:
             return 1.0
+        self._confirmed = confirmed
         self._settled = confirmed or self._begun_m > self._road.carried_after_m
         if not self._settled:
             walk = self.config.start_walk_rel_per_sqrt_m**2 * travelled
@@ -191,7 +193,8 @@ class CarScale:
         if sigmas > cfg.max_innovation_sigma:
             return self._refuse(last.t_ns, log_ratio)
         self._refused, self._agreed_ns, self.since_m, self._barred = [], last.t_ns, 0.0, False
-        self._agreements += 1
+        if self._confirmed and filter_.carried_m < self._road.carried_after_m:
+            self._agreements += 1
         if not self._settled:
             var += (cfg.sigma_start_m / by_images) ** 2
         return filter_.measure_car(log_ratio, by_delay, var)
