@@ -113,7 +113,9 @@ class CarScale:
             self._filter.begin_car()
         if self._speed.jumps != self._jumps:
             self._jumps = self._speed.jumps
-            self._seen, self._agreements = self._seen[-1:], 0
+            self._seen = self._seen[-1:]
+        if self._speed.jumping:
+            self._agreements = 0
 
     def restart(self) -> None:
         """The window begins anew: its unit of length is another."""

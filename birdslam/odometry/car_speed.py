@@ -106,6 +106,11 @@ class CarSpeed:
         return list(self._status)
 
     @property
+    def jumping(self) -> bool:
+        """Whether several readings in a row are none that could follow those before."""
+        return len(self._waiting) > 2
+
+    @property
     def newest_ns(self) -> int | None:
         """When the newest usable reading held; None where there is none."""
         return self._used[-1][0] if self._used else None
