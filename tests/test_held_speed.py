@@ -104,3 +104,11 @@ def test_the_worst_sigma_is_that_of_the_direction_known_worst() -> None:
     turn = np.kron(np.eye(2), rotation_exp(np.array([0.2, -0.5, 0.1])))
     info = turn @ np.diag([1e4, 25.0, 1e4, 1e6, 1e6, 1e6]) @ turn.T
     assert worst_sigma_m(info) == pytest.approx(0.2)
+
+
+def test_a_car_that_drives_off_at_33_hz_is_not_held_back() -> None:
+    """A standing car's speed changes by less within 30 ms than corners show; they are believed all the same."""
+    held = HeldSpeed(HeldSpeedConfig())
+    held.settle(0.0, 1.0)
+    moved = Pose(START.R, START.R @ np.array([0.0, 0.0, 0.02]))
+    assert held.hold(START, moved, START, np.diag([1e4] * 3 + [1e6] * 3), 0.03) is None
