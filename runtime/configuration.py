@@ -62,7 +62,7 @@ __all__ = [
 NO_MODEL = "none"  # as --model: no network but those that are named beside it, not the shipped one either
 _USER = re.compile(r"(?<=://)[^/@]*@|(?<=rtsp:)[^/@]*@")
 # Sources that are no cameras; the address of each is a path, relative to the file that names it; `demo` has none
-FILE_SCHEMES = ("kitti", "video", "mcap", "demo")
+FILE_SCHEMES = ("kitti", "video", "rosbag", "mcap", "demo")
 
 
 class ConfigurationError(ValueError):

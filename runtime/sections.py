@@ -8,6 +8,7 @@ import msgspec
 
 from birdslam.perception import ModelSpec
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS, Role
+from birdslam.ros.bag import BagTopics
 
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -17,10 +18,11 @@ Share = Annotated[float, msgspec.Meta(gt=0.0, le=1.0)]
 class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where frames come from, and how fast."""
 
-    uri: str = ""  # kitti:DIR, video:FILE, v4l2:/dev/videoN, rtsp://...
+    uri: str = ""  # kitti:DIR, video:FILE, rosbag:PATH, v4l2:/dev/videoN, rtsp://...
     rate: Positive | Literal["max"] | None = None  # Hz; None: by the source's own time stamps; "max": lossless
     stride: PositiveInt = 1  # one frame of a recording in so many
     speed: str = ""  # FILE of the car's own speed over a recording: lines of time in s, speed in m/s; "": none
+    topics: BagTopics = BagTopics()  # of a ROS bag
     frames: PositiveInt | None = None  # end after so many; None: all
     loop: bool = False  # a recording begins anew at its end
     prefetch_frames: PositiveInt = 4  # decoded ahead of their time, so that a slow file is not a late frame

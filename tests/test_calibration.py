@@ -100,7 +100,7 @@ def test_a_kitti_file(tmp_path: Path) -> None:
         ("a.yaml", ROS.replace("438.5", "wide"), "no number"),
         ("a.yaml", ROS.replace("438.5, 0.0,", "438.5, 9.0,"), "skew"),
         ("a.yaml", ROS.replace("438.5, ", ""), "8 numbers"),
-        ("a.yaml", ROS.replace("plumb_bob", "equidistant"), "equidistant is not supported"),
+        ("a.yaml", ROS.replace("plumb_bob", "mei"), "mei is not supported"),
         ("a.yaml", ROS.replace("image_width: 640", "image_width: wide"), "width is 'wide'"),
         ("a.yaml", ROS + "x: !!python/object/apply:sys.exit [3]\n", "no YAML"),
         ("a.txt", "P9: 1 2 3\n", "no KITTI calibration"),

@@ -22,7 +22,7 @@ from birdslam.datasets.recording import DatasetError
 
 Floats = NDArray[np.float64]
 
-DISTORTIONS = ("plumb_bob", "rational_polynomial", "radtan", "")  # of ROS; OpenCV's own files name none
+DISTORTIONS = ("plumb_bob", "rational_polynomial", "radtan", "equidistant", "")  # of ROS; OpenCV's own files name none
 FEWEST_BOARDS = 6
 MAX_REPROJECTION_PX = 1.0  # root mean square: past it something else than the lens was measured
 MAX_SIGMA_FOCAL_REL = 0.02
@@ -38,6 +38,7 @@ class Intrinsics(msgspec.Struct, frozen=True, kw_only=True):
     cx_px: float
     cy_px: float
     distortion: tuple[float, ...] = ()
+    fisheye: bool = False  # `distortion` is of the equidistant model (`Camera`)
     width_px: int | None = None
     height_px: int | None = None
     source: str = ""
@@ -119,13 +120,15 @@ def _read_yaml(path: Path) -> Intrinsics:
     distortion = _numbers(path, tree, keys) or []
     model = str(tree.get("distortion_model") or "")
     if model not in DISTORTIONS and any(distortion):
-        raise DatasetError(f"{path}: distortion_model {model} is not supported (only {', '.join(DISTORTIONS[:3])})")
+        raise DatasetError(f"{path}: distortion_model {model} is not supported (only {', '.join(DISTORTIONS[:4])})")
+    fisheye = model == "equidistant"  # which bends the image with zeros too
     return Intrinsics(
         fx_px=K[0],
         fy_px=K[4],
         cx_px=K[2],
         cy_px=K[5],
-        distortion=tuple(distortion) if any(distortion) else (),
+        distortion=tuple(distortion) if any(distortion) or fisheye else (),
+        fisheye=fisheye,
         width_px=_size(path, tree, "width"),
         height_px=_size(path, tree, "height"),
         source=str(path),

@@ -35,7 +35,7 @@ KITTI_HEIGHT_M = 1.65  # of every KITTI camera over the road (Geiger et al. 2013
 KITTI_RATE_HZ = 10.0
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 IMAGE_NUMBER = re.compile(r"[0-9]{1,12}")
-JPEG_END = b"\xff\xd9"
+JPEG_BEGIN, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,12 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         data = path.read_bytes()
     except OSError as error:
         raise ValueError(error.strerror) from None
-    if path.suffix.lower() != ".png" and JPEG_END not in data[-32:]:
+    return decode_image(data)
+
+
+def decode_image(data: bytes) -> NDArray[np.uint8]:
+    """The image of a PNG or JPEG file, 8 bit, grey or BGR. Raises ValueError with the reason."""
+    if data.startswith(JPEG_BEGIN) and JPEG_END not in data[-32:]:
         raise ValueError("the JPEG is cut off")  # OpenCV would fill the rest with grey and say nothing
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from birdslam.datasets.recording import Recording
+from birdslam.datasets.recording import DatasetError, Recording
 from birdslam.evaluation.car_ahead import CarAhead, CarAheadReport
 from birdslam.evaluation.consistency import Consistency, ConsistencyReport
 from birdslam.evaluation.motion_consistency import MotionConsistencyReport, Motions
@@ -195,6 +195,17 @@ def compare(
     )
 
 
+def _check_known(name: str, truth: NDArray[np.float64], compared: slice) -> None:
+    """Raises DatasetError where the truth of a frame to be compared is not known (nan)."""
+    known: NDArray[np.bool_] = np.atleast_1d(np.isfinite(truth).all(axis=(1, 2)))
+    if not known[compared].all():
+        first, last = np.flatnonzero(known)[[0, -1]].tolist()
+        raise DatasetError(
+            f"{name}: the truth is known of {known.sum()} of {len(known)} frames, from {first} to {last}: compare "
+            f"those (--frames {first}:{last + 1})"
+        )
+
+
 def evaluate_recordings(
     recordings: Iterable[Recording],
     run: Callable[[Recording], Iterable[Measurements | Estimate | MapUpdate]],
@@ -216,6 +227,9 @@ def evaluate_recordings(
     if twice:
         raise ValueError(f"two recordings of the name {', '.join(twice)}: their results would overwrite each other")
     truths = [recording.truth_poses() for recording in recordings]
+    for recording, truth in zip(recordings, truths, strict=True):
+        if truth is not None:
+            _check_known(recording.name, truth, compared)
     claim_directory(directory)
     report = []
     for recording, truth in zip(recordings, truths, strict=True):
@@ -237,7 +251,9 @@ def evaluate_recordings(
             recorder.finish({"sequence": recording.name, **(summary or {})})
         rows = as_poses(read_kitti(directory / recording.name / "ego.kitti.txt"))
         estimated = in_camera0(rows, recording.T_cam0_cam())
-        goal = None if truth is None else from_first(as_poses(truth))
+        goal = None if truth is None else as_poses(truth)
+        if goal is not None and compared == slice(None):
+            goal = from_first(goal)
         row = compare(recording.name, goal, estimated, dict(sorted(recorder.statuses.items())), compared)
         row = msgspec.structs.replace(row, speed_sources=dict(sorted(recorder.speed_sources.items())))
         if goal is not None and compared == slice(None):

@@ -42,7 +42,8 @@ class GroundPlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A pinhole camera over a road, as a camera file (TOML) states it.
 
-    `distortion` holds OpenCV's coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty for an undistorted image.
+    `distortion` holds OpenCV's coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty for an undistorted image; of a
+    `fisheye` lens those of its equidistant model (k1, k2, k3, k4; Kannala and Brandt 2006), as ROS and OpenCV have it.
     `tilt_sigma_rad` is how well pitch and roll are known; by default as well as a bracket is screwed on.
     Raises ValueError (on decoding: msgspec.ValidationError) where the numbers can't be a camera's.
     """
@@ -59,6 +60,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]; none: undistorted images
     distortion: tuple[float, ...] = ()
     tilt_sigma_rad: Positive = 0.015  # 1-sigma of pitch and roll: by default as well as a bracket is screwed on
+    fisheye: bool = False  # `distortion` is k1, k2, k3, k4 of the equidistant model
 
     def __post_init__(self) -> None:
         lens = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
@@ -81,6 +83,8 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("camera: pitch_rad and roll_rad must lie within 0.5 rad")
         if len(self.distortion) not in (0, 4, 5, 8):
             raise ValueError(f"camera: distortion needs 0, 4, 5 or 8 coefficients, got {len(self.distortion)}")
+        if self.fisheye and len(self.distortion) != 4:
+            raise ValueError(f"camera: a fisheye's distortion needs 4 coefficients, got {len(self.distortion)}")
 
     @property
     def K(self) -> NDArray[np.float64]:
@@ -110,7 +114,8 @@ class Undistorter:
         self.camera = camera
         self._maps: tuple[NDArray[np.int16], NDArray[np.uint16]] | None = None
         if camera.distortion:
-            self._maps = cv2.initUndistortRectifyMap(  # type: ignore[assignment]
+            make_maps = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
+            self._maps = make_maps(  # type: ignore[assignment]
                 camera.K,
                 np.array(camera.distortion),
                 np.eye(3),

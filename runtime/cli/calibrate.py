@@ -21,6 +21,7 @@ from birdslam.datasets.speed_file import read_speed_curve
 from birdslam.evaluation.results import ResultsError
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
+from birdslam.ros.bag import BagTopics
 from birdslam.runtime.cli.options import configuration_of
 from birdslam.runtime.configuration import FILE_SCHEMES, ConfigurationError
 from birdslam.runtime.nodes.inference import Inference
@@ -37,11 +38,12 @@ def calibrate_camera(options: argparse.Namespace) -> int:
     """Writes the camera file, prints what it rests on; gives the exit status."""
     configuration = configuration_of(options)
     uri = options.source if options.source.partition(":")[0] in FILE_SCHEMES else f"kitti:{options.source}"
-    lens, height_m = _lens(options)
-    size = frame_size(uri)
+    topics = configuration.source.topics
+    lens, height_m = _lens(options, uri, topics)
+    size = frame_size(uri, topics)
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
-    recording = _open(uri, lens, height_m, options)
+    recording = _open(uri, lens, height_m, options, topics)
     known_height = height_m is not None or lens is None  # KITTI's own cameras stand where datasets/kitti.py says
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     rate_max = msgspec.structs.replace(configuration.source, rate="max")
@@ -70,14 +72,14 @@ def calibrate_camera(options: argparse.Namespace) -> int:
 # --- what is given ---
 
 
-def _lens(options: argparse.Namespace) -> tuple[Intrinsics | None, float | None]:
+def _lens(options: argparse.Namespace, uri: str, topics: BagTopics) -> tuple[Intrinsics | None, float | None]:
     """Intrinsics from elsewhere than the recording, and the height that the user states."""
     height_m = options.height
     if height_m is not None and not 0.2 < height_m < 5.0:
         raise ConfigurationError(f"--height {height_m:g}: is no height of a camera over the road (0.2 to 5 m)")
     if options.camera is not None:
         old = load_camera(Path(options.camera))
-        numbers = {name: getattr(old, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")}
+        numbers = {name: getattr(old, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "fisheye")}
         lens = Intrinsics(**numbers, width_px=old.width_px, height_px=old.height_px, source=options.camera)
         return lens, height_m or old.height_m
     if options.intrinsics is not None:
@@ -87,10 +89,19 @@ def _lens(options: argparse.Namespace) -> tuple[Intrinsics | None, float | None]
         if board is None:
             raise ConfigurationError(f"--board {options.board}: expected COLSxROWS, as 9x6")
         return from_chessboard(options.chessboard, int(board[1]), int(board[2]), options.square_mm / 1000.0), height_m
+    scheme, _, path = uri.partition(":")
+    if scheme == "rosbag":  # its CameraInfo has no height, and /tf_static may lack it: one that has both is not needed
+        from birdslam.datasets.rosbag import read_bag_camera
+
+        own = read_bag_camera(Path(path).expanduser(), topics)
+        height_m = height_m or (None if own.mount is None else own.mount.height_m)
+        return Intrinsics(**own.lens._asdict(), source=own.topic), height_m
     return None, height_m
 
 
-def _open(uri: str, lens: Intrinsics | None, height_m: float | None, options: argparse.Namespace) -> Recording:
+def _open(
+    uri: str, lens: Intrinsics | None, height_m: float | None, options: argparse.Namespace, topics: BagTopics
+) -> Recording:
     stride = options.stride or 1
     if lens is None:
         recording = open_recording(uri, stride=stride)
@@ -99,10 +110,10 @@ def _open(uri: str, lens: Intrinsics | None, height_m: float | None, options: ar
         return recording
     width_px, height_px = lens.width_px, lens.height_px
     if width_px is None or height_px is None:
-        if not uri.startswith("kitti:"):
+        size = frame_size(uri, topics) if uri.startswith(("kitti:", "rosbag:")) else None
+        if size is None:
             raise DatasetError(f"{lens.source}: does not say for which size of image it is")
-        own = open_recording(uri, stride=stride).camera
-        width_px, height_px = own.width_px, own.height_px
+        width_px, height_px = size
     try:
         camera = Camera(
             width_px,
@@ -113,17 +124,18 @@ def _open(uri: str, lens: Intrinsics | None, height_m: float | None, options: ar
             lens.cy_px,
             height_m=height_m or UNKNOWN_HEIGHT_M,
             distortion=lens.distortion,
+            fisheye=lens.fisheye,
         )
     except ValueError as error:
         raise DatasetError(f"{lens.source}: {error}") from None
-    return open_recording(uri, camera, stride)
+    return open_recording(uri, camera, stride, topics=topics)
 
 
 def _lengths(recording: Recording, options: argparse.Namespace) -> dict[str, KnownLength]:
     """What else knows the way between two frames: the recording's poses, a speed file."""
     out: dict[str, KnownLength] = {}
     truth = recording.truth_poses()
-    if truth is not None:
+    if truth is not None and np.isfinite(truth).all():
         at = truth[:, :, 3]
 
         def by_poses(start: int, end: int, start_ns: int, end_ns: int) -> float:

@@ -91,7 +91,10 @@ def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
     source = configuration.source
     if source.frames is not None or source.loop:
         raise ConfigurationError("source.frames, source.loop: evaluate takes whole recordings, once")
-    recordings = [open_recording(_uri(text), configuration.camera, source.stride) for text in options.sequences]
+    recordings = [
+        open_recording(_uri(text), configuration.camera, source.stride, topics=source.topics)
+        for text in options.sequences
+    ]
     twice = [name for name, n in Counter(recording.name for recording in recordings).items() if n > 1]
     if twice:
         raise ConfigurationError(f"two sequences are named {twice[0]}: their results would overwrite each other")

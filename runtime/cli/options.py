@@ -26,6 +26,8 @@ def configuration_of(options: argparse.Namespace) -> Configuration:
             raise ConfigurationError(f"--model {text}: expected ROLE=PATH, or the name of a model")
     keys = {"source": "source.uri", "rate": "source.rate", "stride": "source.stride", "speed": "source.speed"}
     keys |= {"record": "recording.file", "record_images": "recording.images"}
+    keys |= {"topic": "source.topics.image", "camera_info_topic": "source.topics.camera_info"}
+    keys |= {"speed_topic": "source.topics.speed", "truth_topic": "source.topics.truth"}
     keys |= {"smooth": "results.smooth", "video": "results.video"}
     for name in ("camera", "vehicle", "output", *keys):
         value = getattr(options, name, None)

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TypeAlias
 
-USAGE_NOTE = "Sources: demo, kitti:DIR, video:FILE, mcap:FILE, v4l2:/dev/videoN, rtsp://HOST/PATH."
+USAGE_NOTE = "Sources: demo, kitti:DIR, video:FILE, rosbag:PATH, mcap:FILE, v4l2:/dev/videoN, rtsp://HOST/PATH."
 RECORDING = "FILE.mcap"
 METHODS = ("birdslam", "birdslam_live", "paper", "batch_se3", "nair", "namdev", "cubeslam")
 SEEDS = 5
@@ -62,6 +62,7 @@ def _run(commands: Commands) -> None:
     run.add_argument("--record-images", action="store_true", default=None, help="with its frames, as JPEG")
     _add_final_results(run)
     run.add_argument("--speed", metavar="FILE", help="the car's own speed over a recording: time in s, speed in m/s")
+    _add_topics(run, "speed")
     _add_pipeline(run)
     run.set_defaults(command="run")
 
@@ -137,7 +138,7 @@ def _configuration(commands: Commands) -> None:
 def _calibrate(commands: Commands) -> None:
     text = "a camera file from a drive: intrinsics read or measured, pitch and roll estimated, the height checked"
     parser = commands.add_parser("calibrate", help=text, description=text)
-    parser.add_argument("source", metavar="SOURCE", help="a KITTI directory, or kitti:DIR, video:FILE")
+    parser.add_argument("source", metavar="SOURCE", help="a KITTI directory, or kitti:DIR, video:FILE, rosbag:PATH")
     parser.add_argument("--output", required=True, metavar="CAMERA.toml", help="the camera file to write")
     lens = parser.add_mutually_exclusive_group()
     lens.add_argument("--camera", metavar="FILE", help="an older camera file: its intrinsics and height")
@@ -148,6 +149,7 @@ def _calibrate(commands: Commands) -> None:
     parser.add_argument("--height", type=float, metavar="M", help="the camera's height over the road, as measured")
     text = "lines of time in s, speed in m/s"
     parser.add_argument("--speed", dest="known_speed", type=Path, metavar="FILE", help=text)
+    _add_topics(parser)
     parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="networks: vehicles and road")
     parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame")
     _add_config(parser)
@@ -201,6 +203,7 @@ def _odometry(evaluate: Commands) -> None:
         _add_config(parser)
         parser.add_argument("--frames", default=":", metavar="FIRST:END", help="compare these alone; all are driven")
         _add_speeds(parser)
+        _add_topics(parser, "speed", "truth")
         _add_pipeline(parser)
         parser.set_defaults(command=command)
 
@@ -266,6 +269,17 @@ def _add_pipeline(parser: argparse.ArgumentParser) -> None:
 
 def _add_speeds(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--speed", metavar="FILE|DIR", help="the car's own speed; DIR: NAME.txt of each sequence")
+
+
+def _add_topics(parser: argparse.ArgumentParser, *more: str) -> None:
+    parser.add_argument("--topic", metavar="TOPIC", help="of a ROS bag's images, where it has several")
+    parser.add_argument("--camera-info-topic", metavar="TOPIC", help="of a ROS bag's camera")
+    if "speed" in more:
+        text = "the car's own speed in a ROS bag: TwistStamped, TwistWithCovarianceStamped or Odometry"
+        parser.add_argument("--speed-topic", metavar="TOPIC", help=text)
+    if "truth" in more:
+        text = "true poses in a ROS bag: nav_msgs/Odometry or sensor_msgs/NavSatFix"
+        parser.add_argument("--truth-topic", metavar="TOPIC", help=text)
 
 
 def _add_vehicle(parser: argparse.ArgumentParser) -> None:

@@ -24,7 +24,7 @@ from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, SourceConfig
 from birdslam.types import Frame, Status
 
-SOURCES = "kitti:DIR, video:FILE, mcap:FILE, demo, demo:DIR, v4l2:/dev/videoN or rtsp://HOST/PATH"
+SOURCES = "kitti:DIR, video:FILE, rosbag:PATH, mcap:FILE, demo, demo:DIR, v4l2:/dev/videoN or rtsp://HOST/PATH"
 LIVE_RATE_HZ = 30.0  # of a camera that does not say
 
 log = logging.getLogger(__name__)
@@ -64,7 +64,8 @@ def open_source(configuration: Configuration, must_open: bool = True) -> Source:
         images = RecordedImages(Path(address).expanduser(), configuration.camera, source.stride)
         return RecordedSource(with_speeds(images, speeds) if speeds else images, source)
     if scheme in FILE_SCHEMES and (colon or scheme == "demo"):
-        return RecordedSource(open_recording(source.uri, configuration.camera, source.stride, speeds), source)
+        recording = open_recording(source.uri, configuration.camera, source.stride, speeds, source.topics)
+        return RecordedSource(recording, source)
     if colon and scheme in ("v4l2", "rtsp") and address:
         if configuration.camera is None:
             raise ConfigurationError(f"{source.uri}: a live camera needs a camera file (--camera FILE)")

@@ -38,7 +38,7 @@ class RecordedImages(Recording):
         if own is None or not images:
             raise DatasetError(f"{path}: was recorded without images (--record-images)")
         self.name = path.stem
-        self.camera = camera or msgspec.structs.replace(own, distortion=())
+        self.camera = camera or msgspec.structs.replace(own, distortion=(), fisheye=False)
         self._stride = stride
         refs = [ref for message in self._file.messages(READ[:1]) if (ref := self._ref(message.data)) is not None]
         if not refs:

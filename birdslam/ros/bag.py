@@ -1,0 +1,118 @@
+"""A bag that is read: ROS 2 (a directory, .mcap, .db3) and ROS 1 (.bag), whatever its storage."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import msgspec
+
+from birdslam.types import NS_PER_S
+
+NEEDS_EXTRA = "ROS bags need the library rosbags: pip install 'birdslam[ros]'"
+
+
+class BagError(ValueError):
+    """A bag that can't be used; the message names it and says why."""
+
+
+class BagTopics(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Which topics of a ROS bag are read."""
+
+    image: str = ""  # sensor_msgs/Image or CompressedImage; "": the only one that is there
+    camera_info: str = ""  # sensor_msgs/CameraInfo; "": the one beside the image's topic, or the only one
+    speed: str = ""  # the car's own speed: TwistStamped, TwistWithCovarianceStamped or Odometry; "": none
+    truth: str = ""  # for `evaluate odometry`: nav_msgs/Odometry or sensor_msgs/NavSatFix; "": none
+
+
+class BagMessage(NamedTuple):
+    """One message; `t_ns` is when the bag received it."""
+
+    topic: str
+    t_ns: int
+    content: Any  # its fields, as rosbags names them
+
+
+class Bag:
+    """A bag that is open: a context. Raises BagError where it can't be opened or read on."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            from rosbags.highlevel import AnyReader
+        except ImportError:
+            raise BagError(f"{path}: {NEEDS_EXTRA}") from None
+        if not path.exists():
+            raise BagError(f"{path}: no such file or directory")
+        self._stack = ExitStack()
+        try:
+            reader = AnyReader([path], default_typestore=_types_of_humble())
+            self._reader = self._stack.enter_context(reader)
+        except Exception as error:  # a torn file raises whatever its storage, its YAML or its compression does
+            raise BagError(f"{path}: is no ROS bag that can be read: {_reason(error)}") from None
+        self.types: dict[str, str] = {}  # topic -> message type, as in "sensor_msgs/Image"
+        self.counts: dict[str, int] = {}  # topic -> messages
+        for connection in sorted(self._reader.connections, key=lambda one: one.topic):
+            self.types[connection.topic] = connection.msgtype.replace("/msg/", "/")
+            self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._stack.close()
+
+    def of_type(self, *types: str) -> list[str]:
+        """Topics with messages of one of these types, by name."""
+        return [topic for topic, kind in self.types.items() if kind in types and self.counts[topic]]
+
+    def find(self, topic: str, *types: str) -> str:
+        """The topic, which must be there with one of these types. Raises BagError, which lists the topics."""
+        if self.types.get(topic) in types and self.counts[topic]:
+            return topic
+        kind = self.types.get(topic)
+        reason = "is not in it" if kind is None else f"is {kind}" if kind not in types else "has no messages"
+        raise BagError(f"{self.path}: {topic} {reason}; expected {' or '.join(types)}. {self.listing(*types)}")
+
+    def listing(self, *types: str) -> str:
+        """What is there, for a message to the user: first those of the types asked for, else all."""
+        fitting = self.of_type(*types)
+        names = ", ".join(f"{topic} ({self.types[topic]})" for topic in fitting or self.types)
+        return f"{'Such topics' if fitting else 'Its topics'}: {names or 'none'}"
+
+    def messages(self, *topics: str) -> Iterator[BagMessage]:
+        """Those of some topics, in the order in which the bag received them."""
+        connections = [connection for connection in self._reader.connections if connection.topic in topics]
+        if not connections:
+            return
+        messages = self._reader.messages(connections=connections)
+        while True:
+            try:
+                connection, t_ns, data = next(messages)
+                content = self._reader.deserialize(data, connection.msgtype)
+            except StopIteration:
+                return
+            except Exception as error:  # as in __init__
+                raise BagError(f"{self.path}: can't be read on: {_reason(error)}") from None
+            yield BagMessage(connection.topic, t_ns, content)
+
+
+def stamp_ns(content: Any) -> int:
+    """The time in a message's header."""
+    stamp = content.header.stamp
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+@cache
+def _types_of_humble() -> Any:
+    """For bags of ROS 2 before Iron, which do not say what their types are: what is read here is alike in all."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,145 @@
+"""ROS messages of sensors in our own terms: images, cameras, speeds.
+
+After the definitions of sensor_msgs and geometry_msgs, and sensor_msgs/image_encodings.hpp.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.types import SpeedReading
+
+Floats = NDArray[np.float64]
+
+IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
+CAMERA_INFO = "sensor_msgs/CameraInfo"
+SPEEDS = ("geometry_msgs/TwistStamped", "geometry_msgs/TwistWithCovarianceStamped", "nav_msgs/Odometry")
+
+# ROS encoding -> bytes a pixel, and what OpenCV does to it
+ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "mono8": (1, None),
+    "8UC1": (1, None),
+    "bgr8": (3, None),
+    "8UC3": (3, None),
+    "rgb8": (3, cv2.COLOR_RGB2BGR),
+    "bgra8": (4, cv2.COLOR_BGRA2BGR),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR),
+    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2BGR),
+    "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2BGR),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2BGR),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2BGR),
+    "yuv422": (2, cv2.COLOR_YUV2BGR_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2BGR_YUY2),
+    "yuyv": (2, cv2.COLOR_YUV2BGR_YUY2),
+}
+MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}  # coefficients of each
+
+
+class Lens(NamedTuple):
+    """A camera without its place in the car, as the fields of `Camera` are named."""
+
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...]
+    fisheye: bool
+
+
+def pixels(image: Any) -> NDArray[np.uint8]:
+    """(H, W) grey or (H, W, 3) BGR of a sensor_msgs/Image. Raises ValueError with the reason."""
+    if image.encoding not in ENCODINGS:
+        raise ValueError(f"encoding {image.encoding!r} is none of {', '.join(ENCODINGS)}")
+    channels, conversion = ENCODINGS[image.encoding]
+    height_px, width_px, row = int(image.height), int(image.width), int(image.step)
+    data = np.frombuffer(memoryview(image.data), np.uint8)
+    if not (width_px > 0 and height_px > 0 and row >= width_px * channels and data.size >= height_px * row):
+        raise ValueError(
+            f"{data.size} bytes in rows of {row} are no image of {width_px}x{height_px} in {image.encoding}"
+        )
+    rows = data[: height_px * row].reshape(height_px, row)[:, : width_px * channels]
+    shape = (height_px, width_px) if channels == 1 else (height_px, width_px, channels)
+    out = np.ascontiguousarray(rows).reshape(shape)
+    try:
+        return out if conversion is None else cv2.cvtColor(out, conversion)  # type: ignore[return-value]
+    except cv2.error:  # a mosaic or a pair of pixels that the size has no room for
+        raise ValueError(f"{width_px}x{height_px} is no size of an image in {image.encoding}") from None
+
+
+def lens(info: Any, rectified: bool) -> Lens:
+    """Of a sensor_msgs/CameraInfo: of the raw image (K, D), or of the rectified one (P). Raises ValueError.
+
+    CameraInfo speaks of the full sensor: binning and region of interest say which part of it the image is.
+    """
+    P, K, D = (np.array(_field(info, name), dtype=np.float64) for name in ("p", "k", "d"))
+    fx, fy, cx, cy = (P[0], P[5], P[2], P[6]) if rectified else (K[0], K[4], K[2], K[5])
+    if not (fx > 0.0 and fy > 0.0):
+        raise ValueError("holds no calibration: its focal lengths are zero")
+    model, binning = str(info.distortion_model), (max(int(info.binning_x), 1), max(int(info.binning_y), 1))
+    fisheye = model == "equidistant" and not rectified
+    distortion: tuple[float, ...] = ()
+    if not rectified and (D.any() or fisheye):
+        if model not in MODELS:
+            raise ValueError(f"distortion_model {model!r} is none of {', '.join(MODELS)}")
+        if len(D) not in MODELS[model]:
+            raise ValueError(f"distortion_model {model!r} with {len(D)} coefficients")
+        distortion = tuple(D.tolist())
+    roi = info.roi
+    whole = int(roi.width) == 0 or int(roi.height) == 0
+    width_px, height_px = (int(info.width), int(info.height)) if whole else (int(roi.width), int(roi.height))
+    x0, y0 = (0, 0) if whole else (int(roi.x_offset), int(roi.y_offset))
+    return Lens(
+        width_px // binning[0],
+        height_px // binning[1],
+        float(fx) / binning[0],
+        float(fy) / binning[1],
+        float(cx - x0) / binning[0],
+        float(cy - y0) / binning[1],
+        distortion,
+        fisheye,
+    )
+
+
+def is_rectified(topic: str) -> bool:
+    """By image_proc's names: the images of `image_rect`, `image_rect_color` are rectified."""
+    return any(part.startswith("image_rect") for part in topic.split("/"))
+
+
+def speed(message: Any, t_ns: int, sigma_mps: float, yaw_rate_sigma_radps: float, turns: bool) -> SpeedReading:
+    """Of a message of one of SPEEDS; the sigmas hold where it has no covariance; not `turns`: no yaw rate is told."""
+    twist, cov = message.twist, None
+    if hasattr(twist, "covariance"):
+        twist, cov = twist.twist, twist.covariance
+    yaw_rate = float(twist.angular.z) if turns else None
+    return SpeedReading(
+        t_ns=t_ns,
+        speed_mps=float(twist.linear.x),
+        sigma_mps=_sigma(cov, 0, sigma_mps),
+        yaw_rate_radps=yaw_rate,
+        yaw_rate_sigma_radps=0.0 if yaw_rate is None else _sigma(cov, 35, yaw_rate_sigma_radps),
+    )
+
+
+def yaw_rate(message: Any) -> float:
+    """rad/s about z, of a message of one of SPEEDS."""
+    twist = message.twist
+    return float((twist.twist if hasattr(twist, "covariance") else twist).angular.z)
+
+
+def _sigma(cov: Any, index: int, otherwise: float) -> float:
+    """Zero and negative variances are ROS's way to say that nobody knows."""
+    variance = 0.0 if cov is None else float(cov[index])
+    return math.sqrt(variance) if math.isfinite(variance) and variance > 0.0 else otherwise
+
+
+def _field(message: Any, name: str) -> Any:
+    """ROS 1 writes the matrices of CameraInfo in capitals."""
+    return getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())

@@ -1,0 +1,99 @@
+"""A real drive as ROS bags: whatever the storage, the same estimates as from its files, byte for byte."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+import ros_bags as ros
+
+from birdslam.datasets.kitti import KittiRecording
+from birdslam.datasets.opening import open_recording
+from birdslam.datasets.recording import Recording
+from birdslam.geometry.camera import AXES_EGO_CAM, Camera
+from birdslam.slam import BirdSLAM
+
+DISTORTION = (-0.28, 0.09, 0.0006, -0.0004, -0.012)  # about that of KITTI's unrectified cameras
+
+
+def write(path: Path, drive: KittiRecording, count: int, storage: str, kind: str, lens: tuple[float, ...] = ()) -> str:
+    """The first frames of a KITTI drive as a bag: `kind` is raw or compressed, the latter with the very files."""
+    camera = drive.camera
+    rotation = ros.Rotation.from_matrix(AXES_EGO_CAM)
+    stand = ros.transform("base_footprint", "camera_optical", (0.0, 0.0, camera.height_m), rotation)
+    numbers = (camera.width_px, camera.height_px, camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
+    model = (*lens, *(0.0,) * (5 - len(lens)))
+    topic = "/camera/image_raw" if lens else "/camera/image_rect_color"
+
+    def messages() -> Iterable[ros.Written]:
+        yield "/tf_static", 0, ros.tf(stand)
+        yield "/camera/camera_info", 0, ros.camera_info(*numbers, distortion=model)
+        for number, frame in zip(drive.numbers, islice(drive.frames(), count), strict=False):
+            assert frame.image is not None
+            if kind == "raw":
+                encoding = "mono8" if frame.image.ndim == 2 else "bgr8"
+                yield topic, frame.t_source_ns, ros.image(frame.image, frame.t_source_ns, encoding)
+            else:
+                data = next(drive.directory.glob(f"{number:06d}.*")).read_bytes()
+                yield f"{topic}/compressed", frame.t_source_ns, ros.compressed(data, frame.t_source_ns)
+
+    return f"rosbag:{ros.write_bag(path, messages(), storage)}"
+
+
+def estimates(recording: Recording, count: int) -> list[bytes]:
+    slam = BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz)
+    return [msgspec.msgpack.encode(slam.step(f)[1]) for f in islice(recording.undistorted_frames(), count)]
+
+
+def small_drive(folder: Path, data_dir: Path, count: int, width: int = 310) -> KittiRecording:
+    """The first frames of a real drive, a quarter as wide, as a KITTI drive of its own."""
+    drive = KittiRecording(data_dir / "kitti_tracking" / "training" / "image_03" / "0005")
+    scale = width / drive.camera.width_px
+    images = folder / "image_02" / "0005"
+    images.mkdir(parents=True)
+    for frame in islice(drive.frames(), count):
+        assert frame.image is not None
+        height = round(drive.camera.height_px * scale)
+        small = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(images / f"{frame.index:06d}.png"), small)
+    (folder / "calib").mkdir()
+    c = drive.camera
+    P = np.array([[c.fx_px, 0, c.cx_px, 0], [0, c.fy_px, c.cy_px, 0], [0, 0, 1 / scale, 0]]) * scale
+    (folder / "calib" / "0005.txt").write_text(f"P2: {' '.join(f'{v:.12g}' for v in P.ravel())}\n")
+    return KittiRecording(images)
+
+
+@pytest.mark.parametrize(("storage", "kind"), [("mcap", "raw"), ("sqlite3", "compressed")])
+def test_a_few_small_frames_come_to_the_method_as_from_files(
+    tmp_path: Path, data_dir: Path, storage: str, kind: str
+) -> None:
+    drive = small_drive(tmp_path / "kitti", data_dir, 8)
+    recording = open_recording(write(tmp_path / "bag", drive, 8, storage, kind))
+    assert (recording.camera, recording.rate_hz) == (drive.camera, drive.rate_hz)
+    for ours, theirs in zip(recording.undistorted_frames(), drive.undistorted_frames(), strict=True):
+        assert np.array_equal(ours.image, theirs.image)
+        assert dataclasses.replace(ours, image=None) == dataclasses.replace(theirs, image=None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lens", [(), DISTORTION], ids=["rectified", "distorted"])
+def test_a_real_drive_gives_the_same_bytes_from_every_bag(
+    tmp_path: Path, data_dir: Path, lens: tuple[float, ...]
+) -> None:
+    """Distorted: the same images, said to be distorted by the bag's CameraInfo and by a camera file."""
+    count = 60
+    folder = data_dir / "kitti_tracking" / "training" / "image_03" / "0005"
+    own: Camera = KittiRecording(folder).camera
+    drive = KittiRecording(folder, msgspec.structs.replace(own, distortion=lens))
+    expected = estimates(drive, count)
+    for storage in ("sqlite3", "mcap"):
+        for kind in ("raw", "compressed"):
+            recording = open_recording(write(tmp_path / f"{storage}-{kind}", drive, count, storage, kind, lens))
+            assert recording.camera == drive.camera
+            assert estimates(recording, count) == expected, (storage, kind)
