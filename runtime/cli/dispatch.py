@@ -10,6 +10,7 @@ from birdslam.calibration.calibration import CalibrationError
 from birdslam.datasets.recording import DatasetError
 from birdslam.evaluation.results import ResultsError
 from birdslam.perception import ModelError
+from birdslam.ros.bag import BagError
 from birdslam.runtime.cli import (
     calibrate,
     configuration_page,
@@ -33,6 +34,7 @@ from birdslam.runtime.transport.bus import BusError
 from birdslam.runtime.transport.presence import VehicleBusy
 
 USER_ERRORS = (
+    BagError,
     CalibrationError,
     ConfigurationError,
     DatasetError,
@@ -67,6 +69,13 @@ def view(options: argparse.Namespace) -> int:
     return viewing.view(options)
 
 
+def export(options: argparse.Namespace) -> int:
+    """`birdslam export`; imported only here: scipy's rotations and Foxglove's types would lie in a drive's memory."""
+    from birdslam.runtime.cli import export as exporting
+
+    return exporting.export(options)
+
+
 def evaluate_tracking(options: argparse.Namespace) -> int:
     """`birdslam evaluate tracking` and `ablation`; imported only here: gtsam would lie in a drive's memory."""
     from birdslam.runtime.cli import evaluate_tracking as tracking
@@ -84,6 +93,7 @@ def evaluate_localisation(options: argparse.Namespace) -> int:
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "run": run,
     "replay": replay.replay,
+    "export": export,
     "view": view,
     "top": lambda options: top.top(options.vehicle, options.runtime_dir, options.once),
     "listen": listen.listen,

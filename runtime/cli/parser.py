@@ -30,6 +30,7 @@ def build_parser() -> argparse.ArgumentParser:
     for add_command in (
         _run,
         _replay,
+        _export,
         _view,
         _top,
         _listen,
@@ -84,6 +85,15 @@ def _add_final_results(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--smooth", action="store_true", default=None, help=text)
     text = "draw the frames with the estimated boxes beside the bird's-eye view, when the drive is over"
     parser.add_argument("--video", metavar="FILE.mp4", help=text)
+
+
+def _export(commands: Commands) -> None:
+    text = "a recording in the formats of others: a ROS 2 bag (pip install birdslam[ros])"
+    export = commands.add_parser("export", help=text, description=text)
+    export.add_argument("recording", type=Path, metavar=RECORDING)
+    export.add_argument("--ros2", type=Path, required=True, metavar="DIR", help="the bag to write: a new directory")
+    export.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="of the bag (mcap)")
+    export.set_defaults(command="export")
 
 
 def _view(commands: Commands) -> None:

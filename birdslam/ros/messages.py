@@ -1,0 +1,255 @@
+"""Our records as ROS messages, for whoever makes the messages: rosbags in an export, rclpy in a node.
+
+| topic                       | message                         | what                                                 |
+|-----------------------------|---------------------------------|-------------------------------------------------------|
+| /birdslam/odometry          | nav_msgs/Odometry               | the ego in `odom`; its motion since the last frame   |
+| /birdslam/path              | nav_msgs/Path                   | the whole way, at the end                            |
+| /birdslam/vehicles          | vision_msgs/Detection3DArray    | all vehicles that are followed: boxes, poses         |
+| /birdslam/vehicles/odometry | nav_msgs/Odometry               | each of them: pose and velocity with covariance      |
+| /birdslam/lanes             | visualization_msgs/MarkerArray  | points of lane lines that the map gained             |
+| /tf, /tf_static             | tf2_msgs/TFMessage              | odom -> base_link; base_link -> camera_optical_frame |
+| /diagnostics                | diagnostic_msgs/DiagnosticArray | the statuses of each estimate                        |
+
+Axes are REP-103's as everywhere in types.py. REP-105: `odom` is our world, which goes on where a new epoch begins (the
+car is put where the last one ended: nothing is known of the motion between); `base_link` is ego, the camera's foot on
+the road. Our covariances lie in the body's own axes, ROS has those of a pose in the axes of the frame that it is given
+in, those of a twist in the child's. What is not estimated has the variance UNKNOWN.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.trajectory import Transform, ego_pose, mount_pose
+from birdslam.types import NS_PER_S, Attitude, EgoEdge, Estimate, MapUpdate, VehicleEstimate
+
+Floats = NDArray[np.float64]
+Sent = tuple[str, Any]  # topic, message
+
+ODOM, BASE, CAMERA = "odom", "base_link", "camera_optical_frame"
+UNKNOWN = 1e6  # variance of what nobody estimates
+VEHICLE_HEIGHT_M = 1.5  # of boxes; no height is estimated
+LANE_WIDTH_M = 0.15  # drawn
+PLANE = (0, 1, 5)  # x, y and yaw among ROS' six: x, y, z, about x, about y, about z
+
+
+class Make(Protocol):
+    """Makes a message of its full name, as "nav_msgs/msg/Odometry"; fields that are not given are zero."""
+
+    def __call__(self, name: str, /, **fields: Any) -> Any: ...
+
+
+class RosMessages:
+    """Of one drive, in order: it remembers where the last epoch ended and, where `keeps_way`, all of the way."""
+
+    def __init__(self, make: Make, camera: Camera, name: str, keeps_way: bool = False) -> None:
+        self._make, self._camera, self._name = make, camera, name
+        self._T_odom_world = SE2()
+        self._last: tuple[Estimate, SE2] | None = None  # and T_odom_ego
+        self._keeps_way = keeps_way
+        self._way: list[tuple[int, Transform]] = []
+        self._markers: Counter[str] = Counter()
+
+    def fixed(self, t_ns: int) -> Sent:
+        """Where the camera stands on the car."""
+        stands = self._transform(BASE, CAMERA, mount_pose(self._camera.ground), t_ns)
+        return "/tf_static", self._make("tf2_msgs/msg/TFMessage", transforms=[stands])
+
+    def of_estimate(self, estimate: Estimate, t_ns: int, motion: EgoEdge | None = None) -> Iterator[Sent]:
+        """One frame; `motion` is the ego's since the frame before, as it was measured."""
+        before = self._last
+        if before is not None and before[0].epoch != estimate.epoch:
+            self._T_odom_world = before[1] @ estimate.T_world_ego.inverse()
+        T_odom_ego = self._T_odom_world @ estimate.T_world_ego
+        pose = ego_pose(T_odom_ego, estimate.attitude)
+        self._last = estimate, T_odom_ego
+        if self._keeps_way:
+            self._way.append((t_ns, pose))
+        yield "/tf", self._make("tf2_msgs/msg/TFMessage", transforms=[self._transform(ODOM, BASE, pose, t_ns)])
+        cov = _turned(np.reshape(estimate.cov, (3, 3)), T_odom_ego.yaw_rad)
+        twist, twist_cov = _twist(estimate, before, T_odom_ego, motion)
+        yield "/birdslam/odometry", self._odometry(BASE, pose, cov, twist, twist_cov, t_ns)
+        yield "/birdslam/vehicles", self._detections(estimate, t_ns)
+        for vehicle in estimate.vehicles:
+            yield "/birdslam/vehicles/odometry", self._vehicle(vehicle, estimate.attitude.z_m, t_ns)
+        yield "/diagnostics", self._diagnostics(estimate, t_ns)
+
+    def of_map(self, update: MapUpdate, t_ns: int) -> Iterator[Sent]:
+        """The lane points that the map gained, one marker a lane; those of an epoch that is over have no place."""
+        if not update.lanes_m or self._last is None or update.epoch != self._last[0].epoch:
+            return
+        lanes: dict[int, list[Any]] = {}
+        z_m = self._last[0].attitude.z_m
+        ids = update.lane_ids or (-1,) * len(update.lanes_m)
+        for lane, (x_m, y_m) in zip(ids, (self._T_odom_world @ np.array(update.lanes_m)).tolist(), strict=True):
+            lanes.setdefault(lane, []).append(self._make("geometry_msgs/msg/Point", x=x_m, y=y_m, z=z_m))
+        markers = [self._marker(lane, points, t_ns) for lane, points in sorted(lanes.items())]
+        yield "/birdslam/lanes", self._make("visualization_msgs/msg/MarkerArray", markers=markers)
+
+    def path(self) -> Iterator[Sent]:
+        """The whole way, when the drive is over; nothing where it is not kept."""
+        if self._way:
+            poses = [
+                self._make("geometry_msgs/msg/PoseStamped", header=self._header(ODOM, t_ns), pose=self._pose(pose))
+                for t_ns, pose in self._way
+            ]
+            header = self._header(ODOM, self._way[-1][0])
+            yield "/birdslam/path", self._make("nav_msgs/msg/Path", header=header, poses=poses)
+
+    def _vehicle(self, vehicle: VehicleEstimate, z_m: float, t_ns: int) -> Any:
+        T_odom_vehicle = self._T_odom_world @ vehicle.T_world_vehicle
+        pose = ego_pose(T_odom_vehicle, Attitude(z_m=z_m))
+        cov = _turned(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
+        c, s = math.cos(vehicle.T_world_vehicle.yaw_rad), math.sin(vehicle.T_world_vehicle.yaw_rad)
+        R_vehicle_world = np.array([[c, s], [-s, c]])
+        vx, vy = (R_vehicle_world @ vehicle.velocity_mps).tolist()
+        twist_cov = np.diag([0.0, 0.0, UNKNOWN])
+        twist_cov[:2, :2] = R_vehicle_world @ np.reshape(vehicle.velocity_cov, (2, 2)) @ R_vehicle_world.T
+        return self._odometry(f"vehicle_{vehicle.vehicle}", pose, cov, (vx, vy, 0.0), twist_cov, t_ns)
+
+    def _detections(self, estimate: Estimate, t_ns: int) -> Any:
+        header, detections = self._header(ODOM, t_ns), []
+        for vehicle in estimate.vehicles:
+            T_odom_vehicle = self._T_odom_world @ vehicle.T_world_vehicle
+            z_m = estimate.attitude.z_m
+            foot = self._pose(ego_pose(T_odom_vehicle, Attitude(z_m=z_m)))
+            middle = self._pose(ego_pose(T_odom_vehicle, Attitude(z_m=z_m + VEHICLE_HEIGHT_M / 2.0)))
+            cov = _turned(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
+            hypothesis = self._make(
+                "vision_msgs/msg/ObjectHypothesisWithPose",
+                hypothesis=self._make("vision_msgs/msg/ObjectHypothesis", class_id=vehicle.label, score=1.0),
+                pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=foot, covariance=_six(cov)),
+            )
+            size = self._vector(vehicle.length_m, vehicle.width_m, VEHICLE_HEIGHT_M)
+            box = self._make("vision_msgs/msg/BoundingBox3D", center=middle, size=size)
+            detections.append(
+                self._make(
+                    "vision_msgs/msg/Detection3D", header=header, results=[hypothesis], bbox=box,
+                    id=str(vehicle.vehicle),
+                )
+            )  # fmt: skip
+        return self._make("vision_msgs/msg/Detection3DArray", header=header, detections=detections)
+
+    def _diagnostics(self, estimate: Estimate, t_ns: int) -> Any:
+        said = ", ".join(status.value for status in estimate.status)
+        values = {
+            "frame_id": estimate.frame_id,
+            "epoch": estimate.epoch,
+            "valid": str(estimate.valid).lower(),
+            "scale_sigma_rel": f"{estimate.scale_sigma_rel:.6g}",
+            "speed_sources": ", ".join(source.value for source in estimate.speed_sources),
+            "vehicles": len(estimate.vehicles),
+        }
+        status = self._make(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            name="birdslam: estimate",
+            message=said or "ok",
+            hardware_id=self._name,
+            values=[self._make("diagnostic_msgs/msg/KeyValue", key=key, value=str(v)) for key, v in values.items()],
+        )
+        kind = type(status)
+        status.level = kind.ERROR if not estimate.valid else kind.WARN if estimate.status else kind.OK
+        return self._make("diagnostic_msgs/msg/DiagnosticArray", header=self._header("", t_ns), status=[status])
+
+    def _marker(self, lane: int, points: list[Any], t_ns: int) -> Any:
+        space = "lane" if lane < 0 else f"lane {lane}"
+        self._markers[space] += 1  # each stays, so that the map grows
+        return self._make(
+            "visualization_msgs/msg/Marker", header=self._header(ODOM, t_ns), ns=space, id=self._markers[space],
+            type=8, action=0, pose=self._pose(np.eye(4)), scale=self._vector(LANE_WIDTH_M, LANE_WIDTH_M, 0.0),
+            color=self._make("std_msgs/msg/ColorRGBA", r=1.0, g=1.0, b=1.0, a=1.0), points=points,
+        )  # fmt: skip
+
+    def _odometry(
+        self, child: str, pose: Transform, cov: Floats, twist: tuple[float, ...], twist_cov: Floats, t_ns: int
+    ) -> Any:
+        vx, vy, yaw_rate = twist
+        moving = self._make(
+            "geometry_msgs/msg/Twist", linear=self._vector(vx, vy, 0.0), angular=self._vector(0.0, 0.0, yaw_rate)
+        )
+        return self._make(
+            "nav_msgs/msg/Odometry",
+            header=self._header(ODOM, t_ns),
+            child_frame_id=child,
+            pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(pose), covariance=_six(cov)),
+            twist=self._make("geometry_msgs/msg/TwistWithCovariance", twist=moving, covariance=_six(twist_cov)),
+        )
+
+    def _transform(self, parent: str, child: str, T_parent_child: Transform, t_ns: int) -> Any:
+        pose = self._pose(T_parent_child)
+        at = pose.position
+        moved = self._make(
+            "geometry_msgs/msg/Transform", translation=self._vector(at.x, at.y, at.z), rotation=pose.orientation
+        )
+        header = self._header(parent, t_ns)
+        return self._make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=moved)
+
+    def _header(self, frame: str, t_ns: int) -> Any:
+        sec, nanosec = divmod(max(t_ns, 0), NS_PER_S)
+        stamp = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+    def _pose(self, T: Transform) -> Any:
+        from scipy.spatial.transform import Rotation  # here, as in trajectory.py
+
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist()
+        at_x, at_y, at_z = T[:3, 3].tolist()
+        return self._make(
+            "geometry_msgs/msg/Pose",
+            position=self._make("geometry_msgs/msg/Point", x=at_x, y=at_y, z=at_z),
+            orientation=self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        )
+
+    def _vector(self, x: float, y: float, z: float) -> Any:
+        return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def _twist(
+    estimate: Estimate, before: tuple[Estimate, SE2] | None, T_odom_ego: SE2, motion: EgoEdge | None
+) -> tuple[tuple[float, ...], Floats]:
+    """Speed ahead and to the left in m/s, yaw rate in rad/s since the frame before, and their covariance (3, 3)."""
+    unknown = UNKNOWN * np.eye(3)
+    if before is None or estimate.t_source_ns <= before[0].t_source_ns or before[0].epoch != estimate.epoch:
+        return (0.0, 0.0, 0.0), unknown
+    dt_s = (estimate.t_source_ns - before[0].t_source_ns) / NS_PER_S
+    step = before[1].between(T_odom_ego)
+    if motion is not None and (motion.from_frame, motion.to_frame) == (before[0].frame_id, estimate.frame_id):
+        step, unknown = motion.T_from_to, np.reshape(motion.cov, (3, 3)) / dt_s**2
+    return (step.x_m / dt_s, step.y_m / dt_s, step.yaw_rad / dt_s), unknown
+
+
+def _turned(cov: Floats, yaw_rad: float) -> Floats:
+    """A covariance (3, 3) of a body's own axes in those of the frame in which it has this yaw."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    out: Floats = R @ cov @ R.T
+    return out
+
+
+def _six(cov: Floats) -> Floats:
+    """(36,) of ROS: x, y, z and the turns about them; what the road leaves out is UNKNOWN."""
+    out = UNKNOWN * np.eye(6)
+    out[np.ix_(PLANE, PLANE)] = cov
+    return out.ravel()
+
+
+def t_of(estimate: Estimate, live: bool) -> int:
+    """The time of a message: UTC of a live camera, else the recording's own clock, as in the bag that it came from."""
+    return estimate.t_utc_ns if live and estimate.t_utc_ns else estimate.t_source_ns
+
+
+def rclpy_message(name: str, /, **fields: Any) -> Any:
+    """Makes messages in a ROS 2 installation; see docs/examples/ros2_node.py."""
+    from importlib import import_module
+
+    package, _, kind = name.split("/")
+    message: Callable[..., Any] = getattr(import_module(f"{package}.msg"), kind)
+    return message(**fields)
