@@ -76,6 +76,13 @@ def export(options: argparse.Namespace) -> int:
     return exporting.export(options)
 
 
+def batch(options: argparse.Namespace) -> int:
+    """`birdslam batch`; imported only here, since no drive needs it."""
+    from birdslam.runtime.cli import batch as batching
+
+    return batching.batch(options)
+
+
 def evaluate_tracking(options: argparse.Namespace) -> int:
     """`birdslam evaluate tracking` and `ablation`; imported only here: gtsam would lie in a drive's memory."""
     from birdslam.runtime.cli import evaluate_tracking as tracking
@@ -100,6 +107,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "doctor": doctor.check_machine,
     "interface": interface.print_page,
     "configuration": configuration_page.print_page,
+    "batch": batch,
     "calibrate": calibrate.calibrate_camera,
     "models list": models.list_models,
     "models check": models.check,

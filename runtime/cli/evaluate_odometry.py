@@ -3,64 +3,25 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
-
-import cv2
-import msgspec
 
 from birdslam.datasets.opening import open_recording
 from birdslam.datasets.recording import Recording
 from birdslam.datasets.speed_file import of_sequence, with_speeds
 from birdslam.evaluation.odometry import OdometryReport, evaluate_recordings
+from birdslam.runtime.batch.offline import Drive, pipeline
 from birdslam.runtime.cli.options import configuration_of, speeds_of
-from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, complete
-from birdslam.runtime.nodes.inference import Inference
-from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
+from birdslam.runtime.configuration import FILE_SCHEMES, ConfigurationError
 from birdslam.runtime.progress import Progress
 from birdslam.runtime.supervision.run import WITHOUT_MODELS
-from birdslam.slam import BirdSLAM
 from birdslam.types import Estimate, MapUpdate, Measurements
-
-Drive = Callable[[Recording], Iterator[Measurements | Estimate | MapUpdate]]
 
 
 def _uri(text: str) -> str:
     return text if text.partition(":")[0] in FILE_SCHEMES else f"kitti:{text}"
-
-
-@contextlib.contextmanager
-def _pipeline(configuration: Configuration) -> Iterator[Drive]:
-    """The whole method in this process, on frames as capture makes them, awaiting every network.
-
-    Gives each frame's Measurements, its Estimate, and what the map gained.
-    """
-    configuration = msgspec.structs.replace(
-        configuration, source=msgspec.structs.replace(configuration.source, rate="max")
-    )
-    cv2.setNumThreads(configuration.perceive.opencv_threads)
-    with contextlib.ExitStack() as stack:
-
-        def drive(recording: Recording) -> Iterator[Measurements | Estimate | MapUpdate]:
-            source = RecordedSource(recording, configuration.source)
-            inference = stack.enter_context(Inference(complete(configuration, recording.camera, source.rate_hz)))
-            slam = BirdSLAM(
-                recording.camera,
-                inference.networks,
-                configuration.slam,
-                frustum_network=inference.frustum_network,
-                lane_head=inference.lane_head,
-            )
-            for frame in offline_frames(source):
-                yield from slam.step(frame)
-                gained = slam.map_update()
-                if gained is not None:
-                    yield gained
-
-        yield drive
 
 
 def evaluate_odometry(options: argparse.Namespace) -> int:
@@ -103,7 +64,7 @@ def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
             with_speeds(recording, of_sequence(speeds_of(configuration, len(recordings)), recording.name))
     if not configuration.models.in_use():
         print(WITHOUT_MODELS)
-    with _pipeline(configuration) as drive:
+    with pipeline(configuration) as drive:
         reports = evaluate_recordings(
             recordings,
             _with_progress(drive),

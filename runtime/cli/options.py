@@ -12,6 +12,12 @@ from birdslam.runtime.configuration import NO_MODEL, Configuration, Configuratio
 
 def configuration_of(options: argparse.Namespace) -> Configuration:
     """The configuration file with the options of the command line on top. Raises ConfigurationError."""
+    overrides, named = overrides_of(options)
+    return load(options.config, overrides, named)
+
+
+def overrides_of(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
+    """What the options of the command line say: keys with their values, and names of models."""
     overrides: dict[str, Any] = dict(parse_setting(text) for text in options.set)
     named: list[str] = []
     for text in options.model:
@@ -33,7 +39,7 @@ def configuration_of(options: argparse.Namespace) -> Configuration:
         value = getattr(options, name, None)
         if value is not None:
             overrides[keys.get(name, name)] = _number(value) if name == "rate" else value
-    return load(options.config, overrides, named)
+    return overrides, named
 
 
 def speeds_of(configuration: Configuration, drives: int) -> Path:

@@ -37,6 +37,7 @@ def build_parser() -> argparse.ArgumentParser:
         _doctor,
         _interface,
         _configuration,
+        _batch,
         _calibrate,
         _models,
         _demo_drive,
@@ -143,6 +144,20 @@ def _interface(commands: Commands) -> None:
 def _configuration(commands: Commands) -> None:
     keys = commands.add_parser("configuration", help="print every key with its default: docs/configuration.md")
     keys.set_defaults(command="configuration")
+
+
+def _batch(commands: Commands) -> None:
+    text = "many drives, each through the whole pipeline offline, and one report of all; goes on where it was stopped"
+    parser = commands.add_parser("batch", help=text, description=text)
+    text = "a source, a KITTI directory, a bag, a recording, a video; a directory with such; a text file of them"
+    parser.add_argument("drives", nargs="+", metavar="DRIVE", help=text)
+    parser.add_argument("--jobs", type=int, metavar="N", help="drives at once (as many as fit this computer)")
+    text = "every drive with each of these settings; may be repeated: every combination"
+    parser.add_argument("--sweep", action="append", default=[], metavar="KEY=V1,V2", help=text)
+    _add_config(parser)
+    _add_topics(parser, "speed", "truth")
+    _add_pipeline(parser)
+    parser.set_defaults(command="batch")
 
 
 def _calibrate(commands: Commands) -> None:

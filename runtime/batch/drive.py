@@ -1,0 +1,218 @@
+"""One drive from its first frame to its results, which appear at once: a folder that is renamed when it is whole.
+
+As a program (`python -m birdslam.runtime.batch.drive PARENT`) it takes a Job as JSON on standard input and writes
+"done total" after each frame; what went wrong is the last line of standard error, and exit status 1.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from birdslam.runtime.environment import ENVIRONMENT
+
+os.environ.update(ENVIRONMENT)  # before numpy: this is the first that a worker imports
+
+import msgspec
+import numpy as np
+
+from birdslam.datasets.recording import DatasetError, Recording
+from birdslam.evaluation.odometry import OdometryReport, evaluate_recordings
+from birdslam.evaluation.results import ResultsError
+from birdslam.perception import ModelError
+from birdslam.runtime.batch.drives import Task
+from birdslam.runtime.batch.offline import Drive, pipeline
+from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.nodes.sources import RecordedSource, SourceError, open_source
+from birdslam.runtime.process.child import die_with
+from birdslam.types import NS_PER_S, Estimate, MapUpdate, Measurements
+
+DRIVES, WORKING, FAILED = "drives", ".working", "failed"
+RESULT = "result.json"
+TOP_PERCENTILE = 95.0  # of the speeds: a single wrong step is no top speed
+EXPECTED = (ConfigurationError, DatasetError, ModelError, ResultsError, SourceError, OSError)
+
+OnFrame = Callable[[int, int], object]  # told how many frames are done, and of how many (0: nobody knows)
+
+
+class Job(msgspec.Struct, frozen=True):
+    """A drive, and where its results go."""
+
+    task: Task
+    output: str
+
+
+class DriveResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What the report says of a drive; it depends on the drive and its settings alone."""
+
+    drive: str
+    source: str
+    settings: dict[str, Any]
+    identity: str
+    frames: int = 0
+    duration_s: float = 0.0
+    path_m: float = 0.0
+    mean_speed_mps: float = 0.0
+    top_speed_mps: float = 0.0  # the TOP_PERCENTILE of the frames' speeds
+    vehicles: int = 0  # tracks
+    invalid_frames: int = 0
+    epochs: int = 0
+    statuses: dict[str, int] = {}
+    truth: OdometryReport | None = None  # None: the drive has none
+
+
+class Failure(msgspec.Struct, frozen=True, kw_only=True):
+    """A drive without results, and why."""
+
+    drive: str
+    source: str
+    settings: dict[str, Any]
+    error: str  # one line
+    details: str = ""  # the end of what it wrote
+
+
+def done(output: Path, task: Task) -> bool:
+    """Whether a drive has its results. Raises ConfigurationError where those in its place are of something else."""
+    file = output / DRIVES / task.name / RESULT
+    if not file.exists():
+        return False
+    try:
+        result = msgspec.json.decode(file.read_bytes(), type=DriveResult)
+    except (OSError, msgspec.DecodeError) as error:
+        raise ConfigurationError(f"{file}: is no result of a drive: {error}") from None
+    if result.identity != task.identity:
+        raise ConfigurationError(
+            f"{file.parent}: are the results of another drive, of other settings or of another version: give another "
+            "--output, or remove the folder"
+        )
+    return True
+
+
+def failure_file(output: Path, name: str) -> Path:
+    """Where is written why a drive failed."""
+    return output / FAILED / f"{name}.json"
+
+
+def run_drive(job: Job, on_frame: OnFrame) -> None:
+    """Takes a drive through the pipeline, and puts its results in place. Raises one of EXPECTED, and what is a bug."""
+    task, output = job.task, Path(job.output)
+    if done(output, task):  # by a worker that was thought lost
+        return
+    configuration = msgspec.convert(task.configuration, Configuration)
+    source = open_source(configuration)
+    if not isinstance(source, RecordedSource):
+        raise ConfigurationError(f"{task.uri}: is no recording")
+    recording = source.recording
+    recording.name = task.name
+    working = output / WORKING / f"{os.uname().nodename}-{os.getpid()}"
+    place = output / DRIVES / task.name
+    try:
+        with pipeline(configuration) as drive:
+            motion = _Motion(len(recording), on_frame)
+            (report,) = evaluate_recordings([recording], motion.watched(drive), working, compared=_known(recording))
+        result = _result(task, working / task.name, motion, report)
+        encoded = msgspec.json.format(msgspec.json.encode(result), indent=2) + b"\n"
+        (working / task.name / RESULT).write_bytes(encoded)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            (working / task.name).rename(place)
+        except OSError:
+            if not done(output, task):
+                raise
+        failure_file(output, task.name).unlink(missing_ok=True)
+    finally:
+        shutil.rmtree(working, ignore_errors=True)
+
+
+def _known(recording: Recording) -> slice:
+    """Of the truth, the frames from the first to the last at which it is known."""
+    truth = recording.truth_poses()
+    if truth is None or np.isfinite(truth).all():
+        return slice(None)
+    known = np.flatnonzero(np.isfinite(truth).all(axis=(1, 2)))
+    return slice(int(known[0]), int(known[-1]) + 1)
+
+
+class _Motion:
+    """How long and how fast a drive is, by its estimates."""
+
+    def __init__(self, total: int, on_frame: OnFrame) -> None:
+        self._total, self._on_frame = total, on_frame
+        self.frames = 0
+        self.first_ns = self.last_ns = 0
+        self.speeds_mps: list[float] = []
+        self._before: Estimate | None = None
+
+    def watched(self, drive: Drive) -> Drive:
+        """The drive, looked at on its way."""
+
+        def watched(recording: Recording) -> Iterator[Measurements | Estimate | MapUpdate]:
+            for record in drive(recording):
+                yield record
+                if isinstance(record, Estimate):
+                    self._add(record)
+                    self._on_frame(self.frames, self._total)
+
+        return watched
+
+    def _add(self, estimate: Estimate) -> None:
+        before, self._before = self._before, estimate
+        self.first_ns = self.first_ns if self.frames else estimate.t_source_ns
+        self.last_ns = estimate.t_source_ns
+        self.frames += 1
+        if before is not None and before.epoch == estimate.epoch and estimate.t_source_ns > before.t_source_ns:
+            step = before.T_world_ego.between(estimate.T_world_ego)
+            dt_s = (estimate.t_source_ns - before.t_source_ns) / NS_PER_S
+            self.speeds_mps.append(float(np.hypot(step.x_m, step.y_m)) / dt_s)
+
+
+def _result(task: Task, folder: Path, motion: _Motion, report: OdometryReport) -> DriveResult:
+    summary = msgspec.json.decode((folder / "summary.json").read_bytes())
+    duration_s = (motion.last_ns - motion.first_ns) / NS_PER_S
+    top_mps = float(np.percentile(motion.speeds_mps, TOP_PERCENTILE)) if motion.speeds_mps else 0.0
+    return DriveResult(
+        drive=task.name,
+        source=task.uri,
+        settings=task.settings,
+        identity=task.identity,
+        frames=summary["frames"],
+        duration_s=round(duration_s, 3),
+        path_m=summary["path_m"],
+        mean_speed_mps=round(summary["path_m"] / duration_s, 3) if duration_s > 0.0 else 0.0,
+        top_speed_mps=round(top_mps, 3),
+        vehicles=summary["tracks"],
+        invalid_frames=summary["invalid_frames"],
+        epochs=summary["epochs"],
+        statuses=summary["statuses"],
+        truth=None if report.ate_m is None else report,
+    )
+
+
+def main() -> int:
+    """The program; gives the exit status."""
+    die_with(int(sys.argv[1]))
+    job = msgspec.json.decode(sys.stdin.buffer.read(), type=Job)
+
+    def on_frame(frames: int, total: int) -> None:
+        with contextlib.suppress(BrokenPipeError):  # who started this is gone, and its end on the way
+            print(frames, total, flush=True)
+
+    try:
+        run_drive(job, on_frame)
+    except EXPECTED as error:
+        print(" ".join(str(error).split()), file=sys.stderr)
+        return 1
+    except Exception:
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,163 @@
+"""Which drives: directories, bags, recordings, videos, lists of them; each by a name of its own, with its settings."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import re
+import shlex
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from birdslam.datasets.kitti import find_layout
+from birdslam.datasets.recording import DatasetError
+from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, dump, load, parse_setting
+
+VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm")
+BAGS = (".bag", ".db3")
+LISTS = (".txt", ".list")
+_MCAP_HEAD = 64  # the profile stands in the first record: ours is "", that of a bag "ros2"
+
+
+class Found(msgspec.Struct, frozen=True):
+    """A drive, and what a list says of it alone."""
+
+    uri: str
+    settings: dict[str, Any] = {}
+
+
+class Task(msgspec.Struct, frozen=True, kw_only=True):
+    """A drive with all its settings: what a worker needs."""
+
+    name: str  # of its folder of results
+    uri: str
+    settings: dict[str, Any]  # of a sweep, and of the drive alone
+    configuration: dict[str, Any]
+    identity: str  # of all that its results come from
+
+
+def find_drives(arguments: Sequence[str]) -> list[Found]:
+    """The drives of a command line. Raises ConfigurationError for a list that can't be read, or where there is none."""
+    found = [drive for argument in arguments for drive in _drives(argument)]
+    twice = [drive for drive, count in Counter((d.uri, str(d.settings)) for d in found).items() if count > 1]
+    if twice:
+        raise ConfigurationError(f"{twice[0][0]}: is named twice")
+    if not found:
+        raise ConfigurationError("no drives")
+    return found
+
+
+def _drives(argument: str, base: Path | None = None) -> Iterator[Found]:
+    scheme, colon, address = argument.partition(":")
+    if scheme in FILE_SCHEMES and (colon or scheme == "demo"):
+        place = ((base or Path()) / Path(address).expanduser()).absolute()
+        yield Found(f"{scheme}:{place}" if address else scheme)
+        return
+    path = ((base or Path()) / Path(argument).expanduser()).absolute()
+    if path.suffix.lower() in LISTS and path.is_file():
+        yield from _listed(path)
+        return
+    uri = _uri(path)
+    if uri is None and path.is_dir():
+        inside = [found for child in sorted(path.iterdir()) if (found := _uri(child)) is not None]
+        if inside:
+            yield from map(Found, inside)
+            return
+    yield Found(uri or f"kitti:{path}")  # opening it says what is wrong
+
+
+def _listed(path: Path) -> Iterator[Found]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path}: can't be read: {getattr(error, 'strerror', None) or 'not UTF-8'}") from None
+    for number, line in enumerate(lines, start=1):
+        try:
+            words = shlex.split(line, comments=True)
+            settings = dict(parse_setting(word) for word in words[1:])
+        except (ValueError, ConfigurationError) as error:
+            raise ConfigurationError(f"{path}: line {number}: {error}") from None
+        for key in ("camera", "source.speed"):  # paths in a list are relative to it
+            if isinstance(settings.get(key), str):
+                settings[key] = str(path.parent / Path(settings[key]).expanduser())
+        for drive in _drives(words[0], path.parent) if words else ():
+            yield Found(drive.uri, {**drive.settings, **settings})
+
+
+def _uri(path: Path) -> str | None:
+    """Of a drive by what lies there; None where that is none."""
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        if (path / "metadata.yaml").is_file():
+            return f"rosbag:{path}"
+        try:
+            find_layout(path)
+        except DatasetError:
+            return None
+        return f"kitti:{path}"
+    if suffix in BAGS or suffix in VIDEOS:
+        return f"{'rosbag' if suffix in BAGS else 'video'}:{path}"
+    if suffix == ".mcap":
+        try:
+            with path.open("rb") as file:
+                head = file.read(_MCAP_HEAD)
+        except OSError:
+            head = b""
+        return f"{'rosbag' if b'ros' in head else 'mcap'}:{path}"
+    return None
+
+
+def sweep(texts: Sequence[str]) -> list[dict[str, Any]]:
+    """Every combination of KEY=V1,V2. Raises ConfigurationError."""
+    axes = []
+    for text in texts:
+        key, equals, values = text.partition("=")
+        if not equals or not key.strip() or not all(value.strip() for value in values.split(",")):
+            raise ConfigurationError(f"--sweep {text}: expected KEY=V1,V2")
+        axes.append([parse_setting(f"{key}={value.strip()}") for value in values.split(",")])
+    return [dict(settings) for settings in itertools.product(*axes)]
+
+
+def tasks(
+    drives: Sequence[Found], settings: Sequence[Mapping[str, Any]], config: Path | None, overrides: Mapping[str, Any],
+    models: Sequence[str],
+) -> list[Task]:  # fmt: skip
+    """Each drive by each of the settings, drives first. Raises ConfigurationError for what can be none."""
+    made = []
+    for drive, name in zip(drives, _names(drives), strict=True):
+        for swept in settings:
+            own = {**drive.settings, **swept}
+            configuration = load(config, {**overrides, **own, "source.uri": drive.uri, "source.rate": "max"}, models)
+            if configuration.source.loop:
+                raise ConfigurationError("source.loop: a batch takes each drive once")
+            at = "".join(f"@{key}={value}" for key, value in swept.items())
+            made.append(_task(re.sub(r"[^\w.@=+-]", "_", name + at), configuration, own))
+    return made
+
+
+def _task(name: str, configuration: Configuration, settings: dict[str, Any]) -> Task:
+    tree = dump(configuration)
+    tree.pop("output")
+    encoded = msgspec.json.encode((version("birdslam"), tree), order="deterministic")
+    return Task(
+        name=name,
+        uri=configuration.source.uri,
+        settings=settings,
+        configuration=tree,
+        identity=hashlib.sha256(encoded).hexdigest(),
+    )
+
+
+def _names(drives: Sequence[Found]) -> list[str]:
+    """By their files and folders; where two would be alike, with a part of the hash of where they lie."""
+    plain = [Path(drive.uri.partition(":")[2] or drive.uri).stem for drive in drives]
+    counts = Counter(plain)
+    return [
+        name if counts[name] == 1 else f"{name}-{hashlib.sha256(str(drive).encode()).hexdigest()[:8]}"
+        for name, drive in zip(plain, drives, strict=True)
+    ]

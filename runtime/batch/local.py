@@ -1,0 +1,130 @@
+"""Drives on this computer, several at once, each in a process of its own: what one of them does ends no other."""
+
+from __future__ import annotations
+
+import os
+import queue
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import psutil
+
+from birdslam.runtime.batch.drive import Failure, Job
+from birdslam.runtime.batch.drives import Task
+from birdslam.runtime.process.cores import usable_cores
+
+# Of one drive's process with the shipped networks, at the most: measured on KITTI tracking 0005 it is some 0.5 GB
+PROCESS_BYTES = 1_200_000_000
+_PROGRESS = re.compile(rb"(\d+) (\d+)")
+DETAILS_BYTES = 4000  # of what a process wrote that are kept
+
+
+@dataclass(frozen=True)
+class Event:
+    """Of a drive: how far it is, or its end; `failure` is None where it went well."""
+
+    task: Task
+    share: float  # of its frames that are done
+    ended: bool = False
+    failure: Failure | None = None
+
+
+def fitting_jobs() -> int:
+    """How many drives at once: a core each, and memory for each."""
+    return max(1, min(int(usable_cores()), int(psutil.virtual_memory().available // PROCESS_BYTES)))
+
+
+def run_local(tasks: Sequence[Task], output: Path, jobs: int) -> Generator[Event]:
+    """Runs them, `jobs` at once. Where the iteration is given up, their processes are ended."""
+    waiting: queue.SimpleQueue[Task] = queue.SimpleQueue()
+    for task in tasks:
+        waiting.put(task)
+    pool = _Pool(waiting, output)
+    threads = [threading.Thread(target=pool.work, daemon=True) for _ in range(min(jobs, len(tasks)))]
+    for thread in threads:
+        thread.start()
+    left = len(tasks)
+    try:
+        while left:
+            event = pool.events.get()
+            if isinstance(event, BaseException):
+                raise event
+            left -= event.ended
+            yield event
+    finally:
+        pool.stop()
+        for thread in threads:
+            thread.join()
+
+
+class _Pool:
+    def __init__(self, waiting: queue.SimpleQueue[Task], output: Path) -> None:
+        self.events: queue.SimpleQueue[Event | BaseException] = queue.SimpleQueue()
+        self._waiting, self._output = waiting, output
+        self._lock = threading.Lock()
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._stopped = False
+
+    def work(self) -> None:
+        """A thread's: one drive after the other. It outlives its process, which would be ended with it."""
+        try:
+            while True:
+                try:
+                    task = self._waiting.get_nowait()
+                except queue.Empty:
+                    return
+                failure = self._run(task)
+                if self._stopped:
+                    return
+                self.events.put(Event(task, 1.0, True, failure))
+        except BaseException as error:  # handed to who reads the events
+            self.events.put(error)
+
+    def stop(self) -> None:
+        """Ends the processes."""
+        with self._lock:
+            self._stopped = True
+            for process in self._running:
+                process.terminate()
+
+    def _run(self, task: Task) -> Failure | None:
+        command = [sys.executable, "-m", "birdslam.runtime.batch.drive", str(os.getpid())]
+        with tempfile.TemporaryFile() as said:
+            with self._lock:
+                if self._stopped:
+                    return None
+                process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said)
+                self._running.add(process)
+            try:
+                status = self._attend(process, task)
+            finally:
+                with self._lock:
+                    self._running.discard(process)
+            if status == 0:
+                return None
+            said.seek(max(0, said.seek(0, os.SEEK_END) - DETAILS_BYTES))
+            details = said.read().decode(errors="replace").strip()
+        error = f"was killed by signal {-status}" if status < 0 else details.splitlines()[-1] if details else "failed"
+        return Failure(drive=task.name, source=task.uri, settings=task.settings, error=error, details=details)
+
+    def _attend(self, process: subprocess.Popen[bytes], task: Task) -> int:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        with process.stdin, process.stdout:
+            try:
+                process.stdin.write(msgspec.json.encode(Job(task, str(self._output))))
+                process.stdin.close()
+            except BrokenPipeError:  # it ended at once: its status says why
+                return process.wait()
+            for line in process.stdout:
+                if match := _PROGRESS.fullmatch(line.strip()):
+                    frames, total = map(int, match.groups())
+                    self.events.put(Event(task, min(frames / total, 1.0) if total else 0.0))
+        return process.wait()

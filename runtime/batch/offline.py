@@ -1,0 +1,46 @@
+"""The whole method in this process, on frames as capture makes them, awaiting every network: it repeats bit for bit."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+
+import cv2
+import msgspec
+
+from birdslam.datasets.recording import Recording
+from birdslam.runtime.configuration import Configuration, complete
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
+from birdslam.slam import BirdSLAM
+from birdslam.types import Estimate, MapUpdate, Measurements
+
+Drive = Callable[[Recording], Iterator[Measurements | Estimate | MapUpdate]]
+
+
+@contextlib.contextmanager
+def pipeline(configuration: Configuration) -> Iterator[Drive]:
+    """A function that drives a recording: each frame's Measurements, its Estimate, and what the map gained."""
+    configuration = msgspec.structs.replace(
+        configuration, source=msgspec.structs.replace(configuration.source, rate="max")
+    )
+    cv2.setNumThreads(configuration.perceive.opencv_threads)
+    with contextlib.ExitStack() as stack:
+
+        def drive(recording: Recording) -> Iterator[Measurements | Estimate | MapUpdate]:
+            source = RecordedSource(recording, configuration.source)
+            inference = stack.enter_context(Inference(complete(configuration, recording.camera, source.rate_hz)))
+            slam = BirdSLAM(
+                recording.camera,
+                inference.networks,
+                configuration.slam,
+                frustum_network=inference.frustum_network,
+                lane_head=inference.lane_head,
+            )
+            for frame in offline_frames(source):
+                yield from slam.step(frame)
+                gained = slam.map_update()
+                if gained is not None:
+                    yield gained
+
+        yield drive

@@ -1,0 +1,189 @@
+"""What is told of all drives: report.json, report.csv, and a page with a table and plots.
+
+It is made of what lies in the output folder, drive by drive, so that it takes no memory of the drives' number but what
+is plotted: some numbers each.
+"""
+
+from __future__ import annotations
+
+import csv
+import html
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import msgspec
+import numpy as np
+
+from birdslam.evaluation.results import ResultsError
+from birdslam.runtime.batch.drive import DRIVES, RESULT, DriveResult, Failure, failure_file
+from birdslam.runtime.batch.drives import Task
+
+MOST_BARS = 40  # of a plot; more drives are drawn as a histogram
+MOST_STATUSES = 12
+COLUMNS = (
+    "drive", "source", "settings", "error", "frames", "duration_s", "path_m", "mean_speed_mps", "top_speed_mps",
+    "vehicles", "invalid_frames", "epochs", "statuses", "ate_m", "ate_pct", "ate_se3_m", "ate_sim3_m", "scale_error",
+    "rpe_t_m", "rpe_r_deg",
+)  # fmt: skip
+PLOTS = (
+    ("path_m", "way (m)"),
+    ("mean_speed_mps", "mean speed (m/s)"),
+    ("vehicles", "vehicles"),
+    ("invalid_frames", "frames that may not be driven by"),
+    ("ate_m", "ATE (m), where truth is there"),
+)
+STYLE = (
+    "body{font:15px sans-serif;margin:2em;color:#222}table{border-collapse:collapse;margin:1em 0}"
+    "td,th{padding:.25em .7em;border-bottom:1px solid #ddd;text-align:right}"
+    "td:first-child,th:first-child{text-align:left}"
+    ".failed{color:#b00;text-align:left}img{max-width:100%}"
+)
+
+Outcome = DriveResult | Failure
+
+
+def outcomes(tasks: Sequence[Task], output: Path) -> Iterator[Outcome]:
+    """Of every drive that has ended, in order."""
+    for task in tasks:
+        result, failure = output / DRIVES / task.name / RESULT, failure_file(output, task.name)
+        if result.is_file():
+            yield msgspec.json.decode(result.read_bytes(), type=DriveResult)
+        elif failure.is_file():
+            yield msgspec.json.decode(failure.read_bytes(), type=Failure)
+
+
+def row(outcome: Outcome) -> dict[str, Any]:
+    """One line of the report; what is not known is None."""
+    out: dict[str, Any] = dict.fromkeys(COLUMNS)
+    truth = outcome.truth if isinstance(outcome, DriveResult) else None
+    for part in (outcome, truth):
+        if part is not None:
+            own = {name: value for name, value in msgspec.structs.asdict(part).items() if name in out}
+            out |= {name: value for name, value in own.items() if part is outcome or out[name] is None}
+    return out
+
+
+def write_report(tasks: Sequence[Task], output: Path) -> None:
+    """Writes report.json, report.csv, report.html and report.png. Raises ResultsError."""
+    try:
+        _whole(output / "report.json", lambda file: _write_json(file, tasks, output))
+        _whole(output / "report.csv", lambda file: _write_csv(file, tasks, output))
+        names, numbers, statuses = _numbers(tasks, output)
+        _plot(names, numbers, statuses, output / "report.png")
+        _whole(output / "report.html", lambda file: _write_page(file, tasks, output))
+    except OSError as error:
+        raise ResultsError(f"report in {output}: {error.strerror}") from None
+
+
+def _whole(path: Path, write: Callable[[IO[str]], None]) -> None:
+    """A file that is there whole, or as it was before."""
+    partial = path.with_name(f".{path.name}.partial")
+    with partial.open("w", encoding="utf-8", newline="") as file:
+        write(file)
+    os.replace(partial, path)
+
+
+def _write_json(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
+    counts = Counter("failed" if isinstance(o, Failure) else "done" for o in outcomes(tasks, output))
+    left = len(tasks) - counts.total()
+    file.write(f'{{"done": {counts["done"]}, "failed": {counts["failed"]}, "left": {left}, "drives": [')
+    for number, outcome in enumerate(outcomes(tasks, output)):
+        file.write(("," if number else "") + "\n" + msgspec.json.encode(outcome).decode())
+    file.write("\n]}\n")
+
+
+def _write_csv(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
+    table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+    table.writeheader()
+    for outcome in outcomes(tasks, output):
+        table.writerow({name: _cell(value) for name, value in row(outcome).items()})
+
+
+def _cell(value: Any) -> Any:
+    return " ".join(f"{key}={entry}" for key, entry in value.items()) if isinstance(value, dict) else value
+
+
+def _numbers(tasks: Sequence[Task], output: Path) -> tuple[list[str], np.ndarray, Counter[str]]:
+    """Names, (N, len(PLOTS)) with nan where nothing is known, and frames with each status."""
+    names, numbers, statuses = [], [], Counter[str]()
+    for outcome in outcomes(tasks, output):
+        if isinstance(outcome, DriveResult):
+            found = row(outcome)
+            names.append(outcome.drive)
+            numbers.append([np.nan if found[column] is None else found[column] for column, _ in PLOTS])
+            statuses.update(outcome.statuses)
+    return names, np.array(numbers, dtype=np.float64).reshape(-1, len(PLOTS)), statuses
+
+
+def _plot(names: list[str], numbers: np.ndarray, statuses: Counter[str], path: Path) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # here, since it takes half a second to import
+    from matplotlib.figure import Figure
+
+    bars = len(names) <= MOST_BARS
+    row_in = 1.5 + 0.25 * max(len(names), 4) if bars else 4.0
+    figure = Figure(figsize=(13.0, 3.0 * row_in), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(3, 2).ravel()
+    for plot, (_, title), values in zip(axes, PLOTS, numbers.T, strict=False):
+        known = np.isfinite(values)
+        if bars:
+            plot.barh(range(len(names)), np.where(known, values, 0.0), color="#3a7ca5")
+            plot.set_yticks(range(len(names)), [name[-32:] for name in names], fontsize=8)
+            plot.invert_yaxis()
+        elif known.any():
+            plot.hist(values[known], bins=30, color="#3a7ca5")
+            plot.set_ylabel("drives")
+        plot.set_title(title)
+    common = statuses.most_common(MOST_STATUSES)
+    axes[-1].barh([name for name, _ in common], [count for _, count in common], color="#c0504d")
+    axes[-1].invert_yaxis()
+    axes[-1].set_title("frames with each status")
+    partial = path.with_name(f".{path.name}.partial")
+    figure.savefig(partial, format="png")
+    os.replace(partial, path)
+
+
+def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
+    file.write(f'<!doctype html><meta charset="utf-8"><title>BirdSLAM: drives</title><style>{STYLE}</style>\n')
+    file.write('<h1>Drives</h1>\n<p><img src="report.png" alt="plots"></p>\n')
+    if any(task.settings for task in tasks):
+        _write_sweep(file, tasks, output)
+    heads = ("drive", "frames", "s", "m", "m/s", "top m/s", "vehicles", "invalid", "ATE m", "ATE %", "scale error")
+    file.write("<table><tr>" + "".join(f"<th>{head}</th>" for head in heads) + "</tr>\n")
+    for outcome in outcomes(tasks, output):
+        name = html.escape(outcome.drive)
+        if isinstance(outcome, Failure):
+            error = html.escape(outcome.error)
+            file.write(f'<tr><td>{name}</td><td class="failed" colspan="{len(heads) - 1}">{error}</td></tr>\n')
+            continue
+        found = row(outcome)
+        columns = ("frames", "duration_s", "path_m", "mean_speed_mps", "top_speed_mps", "vehicles", "invalid_frames")
+        cells = [found[column] for column in (*columns, "ate_m", "ate_pct", "scale_error")]
+        link = f'<a href="{DRIVES}/{name}/bev.png">{name}</a>'
+        file.write(f"<tr><td>{link}</td>" + "".join(f"<td>{_shown(cell)}</td>" for cell in cells) + "</tr>\n")
+    file.write("</table>\n")
+
+
+def _write_sweep(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
+    """Drives by settings: the ATE, or the way where no truth is there."""
+    cells: dict[str, dict[str, str]] = {}
+    heads: dict[str, None] = {}
+    for outcome in outcomes(tasks, output):
+        head = " ".join(f"{key}={value}" for key, value in outcome.settings.items())
+        heads[head] = None
+        found = row(outcome)
+        shown = f"{found['ate_m']:.3f} m ATE" if found["ate_m"] is not None else f"{_shown(found['path_m'])} m way"
+        cells.setdefault(outcome.source, {})[head] = "failed" if isinstance(outcome, Failure) else shown
+    file.write("<h2>By settings</h2>\n<table><tr><th>drive</th>")
+    file.write("".join(f"<th>{html.escape(head or 'as it is')}</th>" for head in heads) + "</tr>\n")
+    for source, own in cells.items():
+        row_cells = "".join(f"<td>{own.get(head, '')}</td>" for head in heads)
+        file.write(f"<tr><td>{html.escape(source)}</td>{row_cells}</tr>\n")
+    file.write("</table>\n")
+
+
+def _shown(value: Any) -> str:
+    return "" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)

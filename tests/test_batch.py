@@ -1,0 +1,246 @@
+"""Many drives: which there are, one report of all, and going on after whatever ended the batch."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from birdslam.runtime.batch import drive as driving
+from birdslam.runtime.batch.drive import DRIVES, DriveResult, Failure, Job, done, failure_file, run_drive
+from birdslam.runtime.batch.drives import Task, find_drives, sweep, tasks
+from birdslam.runtime.batch.local import run_local
+from birdslam.runtime.batch.report import MOST_BARS, write_report
+from birdslam.runtime.cli.main import main
+from birdslam.runtime.configuration import ConfigurationError
+
+P0 = "50 0 32 0 0 50 16 0 0 0 1 0"
+PLAIN = {"models.shipped": False}  # the ego alone: no network takes a second to load
+
+
+def kitti(folder: Path, frames: int = 4, truth: bool = False) -> Path:
+    """A drive along a random wall."""
+    wall = cv2.GaussianBlur(
+        np.random.default_rng(3).integers(0, 256, (64, 64 + 3 * frames), dtype=np.uint8), (0, 0), 1.0
+    )
+    (folder / "image_0").mkdir(parents=True)
+    for number in range(frames):
+        cv2.imwrite(str(folder / "image_0" / f"{number:06d}.png"), wall[16:48, 3 * number : 3 * number + 64])
+    (folder / "calib.txt").write_text(f"P0: {P0}\n")
+    if truth:
+        poses = folder.parent.parent / "poses"
+        poses.mkdir(exist_ok=True)
+        rows = [f"1 0 0 {0.1 * n} 0 1 0 0 0 0 1 0" for n in range(frames)]
+        (poses / f"{folder.name}.txt").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def made(places: list[Path], settings: tuple[str, ...] = ()) -> list[Task]:
+    return tasks(find_drives([str(p) for p in places]), sweep(settings), None, PLAIN, [])
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_every_kind_of_drive_is_known_by_what_lies_there(tmp_path: Path) -> None:
+    kitti(tmp_path / "sequences" / "00", 1)
+    kitti(tmp_path / "sequences" / "01", 1)
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").touch()
+    for name in ("a.bag", "a.db3", "a.MP4"):
+        (tmp_path / name).touch()
+    (tmp_path / "ros.mcap").write_bytes(b"\x89MCAP0\r\n\x01" + (12).to_bytes(8, "little") + b"\4\0\0\0ros2\0\0\0\0")
+    (tmp_path / "own.mcap").write_bytes(b"\x89MCAP0\r\n\x01" + (8).to_bytes(8, "little") + b"\0\0\0\0\0\0\0\0")
+    (tmp_path / "all.txt").write_text(
+        "# drives\nsequences\nbag\n\na.bag\na.db3\n'a.MP4' camera=c.toml source.stride=2\nros.mcap\nown.mcap\n"
+        "rosbag:bag source.topics.image=/b\ndemo\nnowhere\n"
+    )
+    found = find_drives([str(tmp_path / "all.txt")])
+    kinds = ["kitti", "kitti", "rosbag", "rosbag", "rosbag", "video", "rosbag", "mcap", "rosbag"]
+    places = ["sequences/00", "sequences/01", "bag", "a.bag", "a.db3", "a.MP4", "ros.mcap", "own.mcap", "bag"]
+    expected = [f"{kind}:{tmp_path / place}" for kind, place in zip(kinds, places, strict=True)]
+    assert [drive.uri for drive in found] == [*expected, "demo", f"kitti:{tmp_path / 'nowhere'}"]
+    assert found[5].settings == {"camera": str(tmp_path / "c.toml"), "source.stride": 2}
+    assert found[8].settings == {"source.topics.image": "/b"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["demo", "demo"], "demo: is named twice"),
+        (["list.txt"], "line 1: No closing quotation"),
+    ],
+)
+def test_a_list_that_is_none_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "list.txt").write_text("'demo\n")
+    with pytest.raises(ConfigurationError, match=said):
+        find_drives(arguments)
+
+
+def test_a_sweep_is_every_combination_and_each_has_a_folder(tmp_path: Path) -> None:
+    drive = kitti(tmp_path / "00", 1)
+    made_of = made([drive], ("slam.graph.ego_nodes=6,8", "slam.weights.mode=paper,measured"))
+    assert [task.settings for task in made_of] == [
+        {"slam.graph.ego_nodes": nodes, "slam.weights.mode": mode} for nodes in (6, 8) for mode in ("paper", "measured")
+    ]
+    assert len({task.identity for task in made_of}) == len({task.name for task in made_of}) == 4
+    assert made_of[0].name == "00@slam.graph.ego_nodes=6@slam.weights.mode=paper"
+    for wrong in ("a", "=1", "a=1,,2"):
+        with pytest.raises(ConfigurationError, match="expected KEY=V1,V2"):
+            sweep([wrong])
+    with pytest.raises(ConfigurationError, match="there is no such key"):
+        made([drive], ("slam.nothing=1",))
+
+
+def test_drives_of_one_name_have_folders_of_their_own(tmp_path: Path) -> None:
+    names = [task.name for task in made([kitti(tmp_path / "a" / "00", 1), kitti(tmp_path / "b" / "00", 1)])]
+    assert len(set(names)) == 2
+    assert all(name.startswith("00-") for name in names)
+
+
+def test_results_appear_whole_and_are_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (task,) = made([kitti(tmp_path / "sequences" / "00", truth=True)])
+    frames = []
+    for output in ("once", "again"):
+        run_drive(Job(task, str(tmp_path / output)), lambda *at: frames.append(at))
+    assert frames == [(1, 4), (2, 4), (3, 4), (4, 4)] * 2
+    once, again = (contents(tmp_path / output) for output in ("once", "again"))
+    assert once == again
+    assert {f"{DRIVES}/00/{name}" for name in ("ego.kitti.txt", "summary.json", "bev.png", "result.json")} <= set(once)
+    assert done(tmp_path / "once", task)
+    assert not list((tmp_path / "once" / ".working").iterdir())
+    monkeypatch.setattr(driving, "pipeline", None)  # what has its results is not driven again
+    run_drive(Job(task, str(tmp_path / "once")), lambda *at: None)
+    with pytest.raises(ConfigurationError, match="of other settings"):
+        done(tmp_path / "once", msgspec.structs.replace(task, identity="0"))
+
+
+def test_a_drive_that_fails_leaves_nothing(tmp_path: Path) -> None:
+    (task,) = made([kitti(tmp_path / "00")])
+
+    def full(*at: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space"):
+        run_drive(Job(task, str(tmp_path / "out")), full)
+    assert contents(tmp_path / "out") == {}
+    assert not done(tmp_path / "out", task)
+
+
+def result(task: Task, number: int) -> DriveResult:
+    return DriveResult(
+        drive=task.name, source=task.uri, settings=task.settings, identity=task.identity, frames=number, path_m=2.5,
+        statuses={"standstill": number},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [3, MOST_BARS + 1])
+def test_the_report_tells_of_every_drive(tmp_path: Path, count: int) -> None:
+    drive = kitti(tmp_path / "00", 1)
+    (one,) = made([drive])
+    todo = [msgspec.structs.replace(one, name=f"<{n}>", settings={"a": n}) for n in range(count)]
+    for number, task in enumerate(todo[:-2]):
+        place = tmp_path / DRIVES / task.name
+        place.mkdir(parents=True)
+        (place / "result.json").write_bytes(msgspec.json.encode(result(task, number)))
+    failure_file(tmp_path, "").parent.mkdir()
+    failure = Failure(drive=todo[-2].name, source="s", settings={"a": count - 2}, error="torn & gone")
+    failure_file(tmp_path, todo[-2].name).write_bytes(msgspec.json.encode(failure))
+    write_report(todo, tmp_path)
+    told = msgspec.json.decode((tmp_path / "report.json").read_bytes())
+    assert (told["done"], told["failed"], told["left"]) == (count - 2, 1, 1)
+    assert [one["drive"] for one in told["drives"]] == [task.name for task in todo[:-1]]
+    with (tmp_path / "report.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert (lines[0]["path_m"], lines[0]["ate_m"], lines[-1]["error"]) == ("2.5", "", "torn & gone")
+    page = (tmp_path / "report.html").read_text()
+    assert "&lt;0&gt;" in page
+    assert "torn &amp; gone" in page
+    assert "<th>a=0</th>" in page
+    assert (tmp_path / "report.png").read_bytes().startswith(b"\x89PNG")
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.processes
+def test_one_drive_ends_no_other_and_failed_ones_are_tried_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, broken = kitti(tmp_path / "sequences" / "00", truth=True), kitti(tmp_path / "sequences" / "01")
+    calibration = (broken / "calib.txt").read_text()
+    (broken / "calib.txt").unlink()
+    output = tmp_path / "out"
+    command = ["batch", str(good), str(broken), "--output", str(output), "--jobs", "2", "--model", "none"]
+    assert main(command) == 1
+    said = capsys.readouterr()
+    assert f"01: {broken / 'calib.txt'}: can't be read" in said.err
+    assert "1 of 2 drives" in said.out
+    first = contents(output / DRIVES / "00")
+    told = msgspec.json.decode((output / "report.json").read_bytes())
+    assert told["drives"][0]["truth"]["ate_m"] is not None
+    (broken / "calib.txt").write_text(calibration)
+    assert main(command) == 0
+    assert "1 of 2 drives are done already" in capsys.readouterr().out
+    assert contents(output / DRIVES / "00") == first
+    assert not (output / "failed" / "01.json").exists()
+
+
+@pytest.mark.processes
+def test_a_process_that_is_killed_is_a_failure_of_its_drive_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first drive's process kills itself, as the kernel does where memory is short."""
+    two = made([kitti(tmp_path / "00"), kitti(tmp_path / "01")])
+    start = subprocess.Popen
+
+    def killed(command: list[str], **options: object) -> subprocess.Popen[bytes]:
+        if not started:
+            command = [sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"]
+        started.append(command)
+        return start(command, **options)  # type: ignore[call-overload,no-any-return]
+
+    started: list[list[str]] = []
+    monkeypatch.setattr(subprocess, "Popen", killed)
+    ended = [event for event in run_local(two, tmp_path / "out", 1) if event.ended]
+    assert [event.failure and event.failure.error for event in ended] == ["was killed by signal 9", None]
+    assert done(tmp_path / "out", two[1])
+
+
+@pytest.mark.slow
+@pytest.mark.processes
+def test_a_batch_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:
+    """Killed while its second drive is on the way: its process ends with it, and the next batch does the rest."""
+    drives = [kitti(tmp_path / "00", 3), kitti(tmp_path / "01", 400)]
+    output, alone = tmp_path / "out", tmp_path / "alone"
+    command = [sys.executable, "-m", "birdslam.runtime.cli.main", "batch", *map(str, drives)]
+    command += ["--model", "none", "--jobs", "1", "--output", str(output)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    half = threading.Event()
+    for _ in range(6000):
+        rows = list((output / ".working").glob("*/01/ego.kitti.txt"))
+        if rows and rows[0].stat().st_size:
+            break
+        half.wait(0.02)
+    else:
+        pytest.fail("the second drive never began")
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert [path.name for path in (output / DRIVES).iterdir()] == ["00"]
+    before = (output / DRIVES / "00" / "result.json").stat().st_mtime_ns
+    assert subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode == 0
+    assert (output / DRIVES / "00" / "result.json").stat().st_mtime_ns == before
+    run_drive(Job(made(drives)[1], str(alone)), lambda *at: None)
+    assert contents(output / DRIVES / "01") == contents(alone / DRIVES / "01")
+    assert os.listdir(output / ".working") == []
