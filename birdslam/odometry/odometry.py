@@ -10,7 +10,6 @@ stays the one that all later ones are compared with until they differ.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -22,16 +21,17 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
 from birdslam.geometry.se2 import SE2
+from birdslam.odometry.car_reckoning import DRIVES_M, moves_sideways, reckoned
 from birdslam.odometry.car_scale import CarStep
+from birdslam.odometry.corner_prediction import corners_of_unknown_depth_px
 from birdslam.odometry.features import FeatureConfig, FeatureTracker, Tracks
-from birdslam.odometry.guided_two_view import guided_two_view
+from birdslam.odometry.guided_two_view import first_pose
 from birdslam.odometry.held_speed import HeldSpeed, HeldSpeedConfig, worst_sigma_m
 from birdslam.odometry.keyframes import KeyframeConfig, KeyframeWindow
 from birdslam.odometry.metric_scale import MetricScale, RoadView
 from birdslam.odometry.motion import (
     Motion,
     MotionConfig,
-    car_cov,
     coasting_cov,
     measured_cov,
     on_plane,
@@ -39,7 +39,7 @@ from birdslam.odometry.motion import (
     standing_cov,
 )
 from birdslam.odometry.moving_median import MedianScale
-from birdslam.odometry.relative_pose import locate, two_view
+from birdslam.odometry.relative_pose import locate
 from birdslam.odometry.road_alignment import RoadAligner, RoadFit
 from birdslam.odometry.road_filter import RoadScaleConfig
 from birdslam.odometry.road_points import on_road, outside
@@ -59,11 +59,6 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 _MIN_INTERVAL_S = 0.004
 _STILL = Pose(np.eye(3), np.zeros(3))
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step that two images alone show: 1 cm, 0.25 deg
-_CAR_LENGTH_M = 0.05  # of a first step that the car's own speed gives
-# Of a car's way along the camera's axis, where it is of unit length: in a bend of 5 m radius it is 0.95 at 1.7 m before
-# the rear axle. Five points of a ramp with one tree and rails found 0.68 (tests/roads/ramp_21_glare)
-_LEAST_FORWARD = 0.87
-_SIDEWAYS = 0.25  # of the way forwards: the camera may look 5 degrees aside, and a car drifts by as much
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
 _STRATEGIES: dict[str, type[RoadScale] | type[MedianScale]] = {"kalman": RoadScale, "paper": MedianScale}
 
@@ -152,12 +147,12 @@ class Odometry:
     def _search_px(self, past: NDArray[np.uint8], present: NDArray[np.uint8], base: Tracks) -> list[Floats]:
         """Where the base's corners are by the motions that are searched for."""
         turned, self._guess = self._search.guesses(past, present)
-        return [self._default_prediction(base.px, step) for step in (turned, self._guess)]
+        return [self._expected_px(base.px, step) for step in (turned, self._guess)]
 
     def _predict_px(self, base: Tracks) -> Floats:
         step = self._predicted_step(self._interval_s)
         pose = self._pose @ step
-        out = self._default_prediction(base.px, step)
+        out = self._expected_px(base.px, step)
         at = np.searchsorted(self._window.ids, base.ids)
         at = np.minimum(at, max(len(self._window.ids) - 1, 0))
         if len(self._window.ids):
@@ -167,15 +162,8 @@ class Odometry:
             out[known] = px[known]
         return out
 
-    def _default_prediction(self, px: Floats, step: Pose) -> Floats:
-        """Where a corner of unknown depth goes: as if on the road below the horizon, as if endless above."""
-        rays = np.column_stack([self.camera.to_xy(px), np.ones(len(px))])
-        rho = np.maximum(-(rays @ self._scale.ground.normal_cam) / self.camera.height_m, 0.0) * 0.5
-        q = (rays - rho[:, None] * step.p) @ step.R
-        out = self.camera.to_px(q[:, :2] / np.maximum(q[:, 2:], 0.2))
-        lost = (q[:, 2] < 0.3) | (np.abs(out - px) > 0.4 * self.camera.width_px).any(axis=1)
-        out[lost] = px[lost]
-        return out
+    def _expected_px(self, px: Floats, step: Pose) -> Floats:
+        return corners_of_unknown_depth_px(self.camera, self._scale.ground, px, step)
 
     # --- motion ---
 
@@ -217,12 +205,15 @@ class Odometry:
             self._scale.turned_unseen()
             return motion
 
-        corners = self._static_corners(tracks, boxes_px)
+        cfg, corners = self.config, self._static_corners(tracks, boxes_px)
         located = self._relative_pose(corners, dt_s, car)
-        sideways = located is not None and car is not None and self._sideways(located[0], car)
+        sideways = False
+        if located is not None and car is not None:
+            shown = planar(self._pose.between(located[0]), self._scale.ground)
+            sideways = moves_sideways(shown, car, cfg.start.camera_ahead_m)
         if located is None or sideways:
             motion = self._coast(frame_id, dt_s, [Status.LOW_TEXTURE], car)
-            if sideways or dt_s > self.config.max_coast_s or len(corners.displacement_px) < self.config.min_fitting:
+            if sideways or dt_s > cfg.max_coast_s or len(corners.displacement_px) < cfg.min_fitting:
                 # Nothing links this image to the base any more: the window begins anew here, at the coasted pose.
                 self._begin(tracks, frame_id, t_source_ns, boxes_px)
                 self._scale.turned_unseen()
@@ -304,7 +295,8 @@ class Odometry:
         still = float(np.median(displacement_px)) < cfg.standstill.still_px
         if still and float(np.quantile(displacement_px, 0.8)) < 1.5:
             return self._pose, _TWO_VIEW_INFORMATION
-        found = self._two_view(xy_a, xy_b, dt_s)
+        guess = self._guess if self._guess is not None else self._predicted_step(dt_s)
+        found = first_pose(xy_a, xy_b, guess, self._focal_px, cfg.two_view_px)
         if found is None or found[1].sum() < max(cfg.min_fitting, cfg.min_fitting_fraction * len(a)):
             return None
         step, _ = found
@@ -312,24 +304,13 @@ class Odometry:
         length = speed * dt_s if speed * dt_s > 0.05 else 0.5
         if self._guess is not None:
             length = float(np.linalg.norm(self._guess.p))
-        if car is not None and abs(car.forward_m) > _CAR_LENGTH_M:
+        if car is not None and abs(car.forward_m) > DRIVES_M:
             length = abs(car.forward_m)
         frame = self._base_frame if self._base_frame is not None else 0
         self._window = self._new_window()
         self._window.append(frame, self._pose, base.ids[a], xy_a)
         self._scale.restart(base.image, self._pose, 0.2 if speed * dt_s > 0.05 else 1.0)
         return self._pose @ Pose(step.R, step.p * length), _TWO_VIEW_INFORMATION
-
-    def _two_view(self, xy_a: Floats, xy_b: Floats, dt_s: float) -> tuple[Pose, Bools] | None:
-        """T_base_present with a translation of unit length, from a guess where there is one, else from five points."""
-        cfg = self.config
-        guess = self._guess if self._guess is not None else self._predicted_step(dt_s)
-        guided = guided_two_view(xy_a, xy_b, guess, self._focal_px, cfg.two_view_px)
-        free = two_view(xy_a, xy_b, self._focal_px, cfg.two_view_px)
-        if guided is None or free is None:
-            return free if guided is None else guided
-        no_car = abs(float(free[0].p[2])) < _LEAST_FORWARD
-        return guided if no_car or guided[1].sum() > 0.9 * free[1].sum() else free
 
     # --- metric scale ---
 
@@ -376,15 +357,6 @@ class Odometry:
         tie = np.diag([self.config.motion.covariance_inflation / sigma_m**2] * 3 + [0.0] * 3)
         return pose, info + tie, sigma_m
 
-    def _sideways(self, pose: Pose, car: CarStep) -> bool:
-        """Whether the images show a motion to the side that no car makes, while this one says that it drives.
-
-        By night they may, of lights and of their own noise.
-        """
-        forward, side, yaw_rad = planar(self._pose.between(pose), self._scale.ground).log()
-        drives = car.proven and car.drives(_CAR_LENGTH_M)
-        return drives and abs(side - self.config.start.camera_ahead_m * yaw_rad) > _SIDEWAYS * abs(forward)
-
     def _speed_mps(self) -> float:
         """Of the last measured motion."""
         return 0.0 if self._velocity is None else float(np.linalg.norm(self._velocity.linear_mps))
@@ -417,18 +389,12 @@ class Odometry:
 
     def _reckon(self, frame_id: int, dt_s: float, status: list[Status], car: CarStep) -> Motion:
         """The motion by the car's own readings; without its yaw rate the last turn fades out."""
-        cfg = self.config.motion
-        yaw_rad, yaw_sigma_rad = car.yaw_rad, car.yaw_sigma_rad
-        if yaw_rad is None:
+        if car.yaw_rad is None:
             status = [*status, Status.ODOMETRY_COASTING]
-            rate_radps = (
-                0.0 if self._velocity is None else planar(self._predicted_step(1.0), self._scale.ground).yaw_rad
-            )
-            yaw_rad = rate_radps * cfg.turn_fades_s * (1.0 - math.exp(-dt_s / cfg.turn_fades_s))
-            yaw_sigma_rad = 0.5 * cfg.coast_yaw_acceleration_radps2 * dt_s**2 + cfg.coast_yaw_rate_radps * dt_s
-        # It rolls on its rear axle
-        T_prev_curr = SE2.exp(np.array([car.forward_m, self.config.start.camera_ahead_m * yaw_rad, yaw_rad]))
-        cov = car_cov(cfg, T_prev_curr, car.sigma_m, car.sigma_rel, yaw_sigma_rad)
+        known = self._velocity is not None
+        last_radps = planar(self._predicted_step(1.0), self._scale.ground).yaw_rad if known else 0.0
+        ahead_m = self.config.start.camera_ahead_m
+        T_prev_curr, cov = reckoned(self.config.motion, car, last_radps, dt_s, ahead_m)
         step = on_plane(T_prev_curr, self._scale.ground)
         return self._motion(frame_id, step, T_prev_curr, cov, status, car.sigma_rel)
 
