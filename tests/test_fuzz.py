@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from birdslam.perception import ModelError, ModelSpec, load_network
-from birdslam.perception.manifest_file import shipped_manifests
+from birdslam.perception.manifest_file import read_manifest, shipped_manifests
 from tests import fuzz
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -62,5 +62,5 @@ def test_a_network_is_parsed_only_after_its_hash_was_checked(tmp_path: Path) -> 
     network.write_bytes(b"not a network at all")
     network.with_suffix(".toml").write_text(text)
     with pytest.raises(ModelError, match="sha256") as caught:
-        load_network("detector", ModelSpec(path=str(network)))
+        load_network(read_manifest(manifest).role, ModelSpec(path=str(network)))
     assert hashlib.sha256(network.read_bytes()).hexdigest() in str(caught.value)

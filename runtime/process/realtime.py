@@ -21,7 +21,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of mallopt(3)
 _OBJECT_BYTES, _ANCHORED = 400, 256  # of Python's small objects, and how many in a row have one that stays
 _MIB = 1 << 20
 
-_GIVES_WAY = 5  # nice: a third of the time that one gets that wants the same core and has none
+_GIVES_WAY = 5  # nicer: a third of the time that one gets that wants the same core and is not
+_NICEST = 19
 
 NODE_IMAGES = {"capture": 8, "perceive": 40}  # of the camera's size, in colour, that a node has at once at its worst
 NODE_OBJECTS_MIB, NODE_HEAP_MIB = 8.0, 4.0
@@ -61,7 +62,9 @@ def give_way() -> None:
         priority = os.sched_getparam(0).sched_priority
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(max(priority - 1, 1)))
     else:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _GIVES_WAY)
+        thread = threading.get_native_id()
+        nice = min(os.getpriority(os.PRIO_PROCESS, thread) + _GIVES_WAY, _NICEST)
+        os.setpriority(os.PRIO_PROCESS, thread, nice)
 
 
 def reserve_for(node: str, configuration: Configuration) -> None:
