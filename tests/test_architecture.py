@@ -16,6 +16,7 @@ ONLY_IN = {  # third-party library: the packages that may import it
     "gtsam": {"baselines"},
     "torch": {"training", "runtime.training", "perf"},
     "numba": {"rendered_world", "training", "perf"},
+    "ray": {"runtime.batch"},
     "rosbags": {"ros"},
     "zenoh": {"runtime.transport", "runtime.gate", "perf"},
 }

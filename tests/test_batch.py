@@ -105,6 +105,18 @@ def test_a_sweep_is_every_combination_and_each_has_a_folder(tmp_path: Path) -> N
         made([drive], ("slam.nothing=1",))
 
 
+def test_a_worker_that_stands_elsewhere_finds_every_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kitti(tmp_path / "00", 1)
+    (tmp_path / "speed.txt").write_text("0 1\n")
+    (tmp_path / "net.onnx").touch()
+    monkeypatch.chdir(tmp_path)
+    overrides = {"source.speed": "speed.txt", "models.detector.path": "net.onnx"}
+    (task,) = tasks(find_drives(["00"]), sweep([]), None, overrides, [])
+    assert task.uri == f"kitti:{tmp_path / '00'}"
+    assert task.configuration["source"]["speed"] == str(tmp_path / "speed.txt")
+    assert task.configuration["models"]["detector"]["path"] == str(tmp_path / "net.onnx")
+
+
 def test_drives_of_one_name_have_folders_of_their_own(tmp_path: Path) -> None:
     names = [task.name for task in made([kitti(tmp_path / "a" / "00", 1), kitti(tmp_path / "b" / "00", 1)])]
     assert len(set(names)) == 2

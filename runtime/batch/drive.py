@@ -27,6 +27,7 @@ from birdslam.evaluation.odometry import OdometryReport, evaluate_recordings
 from birdslam.evaluation.results import ResultsError
 from birdslam.perception import ModelError
 from birdslam.runtime.batch.drives import Task
+from birdslam.runtime.batch.fetch import at_hand
 from birdslam.runtime.batch.offline import Drive, pipeline
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.sources import RecordedSource, SourceError, open_source
@@ -104,7 +105,15 @@ def run_drive(job: Job, on_frame: OnFrame) -> None:
     task, output = job.task, Path(job.output)
     if done(output, task):  # by a worker that was thought lost
         return
+    with at_hand(task.uri) as uri:
+        _run(task, output, uri, on_frame)
+
+
+def _run(task: Task, output: Path, uri: str, on_frame: OnFrame) -> None:
     configuration = msgspec.convert(task.configuration, Configuration)
+    configuration = msgspec.structs.replace(
+        configuration, source=msgspec.structs.replace(configuration.source, uri=uri)
+    )
     source = open_source(configuration)
     if not isinstance(source, RecordedSource):
         raise ConfigurationError(f"{task.uri}: is no recording")

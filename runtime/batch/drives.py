@@ -16,6 +16,7 @@ import msgspec
 
 from birdslam.datasets.kitti import find_layout
 from birdslam.datasets.recording import DatasetError
+from birdslam.runtime.batch.fetch import is_url
 from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, dump, load, parse_setting
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm")
@@ -55,8 +56,9 @@ def find_drives(arguments: Sequence[str]) -> list[Found]:
 def _drives(argument: str, base: Path | None = None) -> Iterator[Found]:
     scheme, colon, address = argument.partition(":")
     if scheme in FILE_SCHEMES and (colon or scheme == "demo"):
-        place = ((base or Path()) / Path(address).expanduser()).absolute()
-        yield Found(f"{scheme}:{place}" if address else scheme)
+        if address and not is_url(address):
+            address = str(((base or Path()) / Path(address).expanduser()).absolute())
+        yield Found(f"{scheme}:{address}" if address else scheme)
         return
     path = ((base or Path()) / Path(argument).expanduser()).absolute()
     if path.suffix.lower() in LISTS and path.is_file():
@@ -143,6 +145,7 @@ def tasks(
 def _task(name: str, configuration: Configuration, settings: dict[str, Any]) -> Task:
     tree = dump(configuration)
     tree.pop("output")
+    _anchor(tree)
     encoded = msgspec.json.encode((version("birdslam"), tree), order="deterministic")
     return Task(
         name=name,
@@ -151,6 +154,16 @@ def _task(name: str, configuration: Configuration, settings: dict[str, Any]) -> 
         configuration=tree,
         identity=hashlib.sha256(encoded).hexdigest(),
     )
+
+
+def _anchor(tree: dict[str, Any]) -> None:
+    """Paths that count from the folder where the command was given; a worker may stand elsewhere."""
+    if tree["source"]["speed"]:
+        tree["source"]["speed"] = str(Path(tree["source"]["speed"]).expanduser().absolute())
+    for spec in tree["models"].values():
+        for key in ("path", "manifest") if isinstance(spec, dict) else ():
+            if Path(spec[key]).is_file():
+                spec[key] = str(Path(spec[key]).absolute())
 
 
 def _names(drives: Sequence[Found]) -> list[str]:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,36 +95,49 @@ class _Pool:
                 process.terminate()
 
     def _run(self, task: Task) -> Failure | None:
-        command = [sys.executable, "-m", "birdslam.runtime.batch.drive", str(os.getpid())]
-        with tempfile.TemporaryFile() as said:
+        def begun(process: subprocess.Popen[bytes]) -> None:
             with self._lock:
-                if self._stopped:
-                    return None
-                process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said)
                 self._running.add(process)
-            try:
-                status = self._attend(process, task)
-            finally:
-                with self._lock:
-                    self._running.discard(process)
-            if status == 0:
-                return None
-            said.seek(max(0, said.seek(0, os.SEEK_END) - DETAILS_BYTES))
-            details = said.read().decode(errors="replace").strip()
-        error = f"was killed by signal {-status}" if status < 0 else details.splitlines()[-1] if details else "failed"
-        return Failure(drive=task.name, source=task.uri, settings=task.settings, error=error, details=details)
+                if self._stopped:
+                    process.terminate()
 
-    def _attend(self, process: subprocess.Popen[bytes], task: Task) -> int:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        with process.stdin, process.stdout:
-            try:
-                process.stdin.write(msgspec.json.encode(Job(task, str(self._output))))
-                process.stdin.close()
-            except BrokenPipeError:  # it ended at once: its status says why
-                return process.wait()
-            for line in process.stdout:
-                if match := _PROGRESS.fullmatch(line.strip()):
-                    frames, total = map(int, match.groups())
-                    self.events.put(Event(task, min(frames / total, 1.0) if total else 0.0))
-        return process.wait()
+        if self._stopped:
+            return None
+        job = Job(task, str(self._output))
+        return run_job(job, begun, lambda share: self.events.put(Event(task, share)))
+
+
+def run_job(
+    job: Job,
+    begun: Callable[[subprocess.Popen[bytes]], object] = lambda process: None,
+    on_share: Callable[[float], object] = lambda share: None,
+) -> Failure | None:
+    """Runs a drive in a process of its own, and waits for its end; None where its results are in place."""
+    task = job.task
+    command = [sys.executable, "-m", "birdslam.runtime.batch.drive", str(os.getpid())]
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said)
+        begun(process)
+        status = _attend(process, job, on_share)
+        if status == 0:
+            return None
+        said.seek(max(0, said.seek(0, os.SEEK_END) - DETAILS_BYTES))
+        details = said.read().decode(errors="replace").strip()
+    error = f"was killed by signal {-status}" if status < 0 else details.splitlines()[-1] if details else "failed"
+    return Failure(drive=task.name, source=task.uri, settings=task.settings, error=error, details=details)
+
+
+def _attend(process: subprocess.Popen[bytes], job: Job, on_share: Callable[[float], object]) -> int:
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with process.stdin, process.stdout:
+        try:
+            process.stdin.write(msgspec.json.encode(job))
+            process.stdin.close()
+        except BrokenPipeError:  # it ended at once: its status says why
+            return process.wait()
+        for line in process.stdout:
+            if match := _PROGRESS.fullmatch(line.strip()):
+                frames, total = map(int, match.groups())
+                on_share(min(frames / total, 1.0) if total else 0.0)
+    return process.wait()

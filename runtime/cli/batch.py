@@ -7,7 +7,7 @@ import contextlib
 import fcntl
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import msgspec
@@ -15,7 +15,8 @@ import msgspec
 from birdslam.evaluation.results import ResultsError, claim_directory
 from birdslam.runtime.batch.drive import WORKING, Failure, done, failure_file
 from birdslam.runtime.batch.drives import Task, find_drives, sweep, tasks
-from birdslam.runtime.batch.local import fitting_jobs, run_local
+from birdslam.runtime.batch.local import Event, fitting_jobs, run_local
+from birdslam.runtime.batch.on_ray import run_ray
 from birdslam.runtime.batch.report import write_report
 from birdslam.runtime.cli.options import overrides_of
 from birdslam.runtime.configuration import ConfigurationError
@@ -30,15 +31,19 @@ def batch(options: argparse.Namespace) -> int:
     output = Path(options.output)
     overrides, models = overrides_of(options)
     overrides.pop("output", None)
-    jobs = fitting_jobs() if options.jobs is None else options.jobs
-    if jobs < 1:
+    jobs = options.jobs
+    if jobs is not None and jobs < 1:
         raise ConfigurationError(f"--jobs {jobs}: one or more")
     todo = tasks(find_drives(options.drives), sweep(options.sweep), options.config, overrides, models)
     with _alone(output):
         left = [task for task in todo if not done(output, task)]
         if len(left) < len(todo):
             print(f"{len(todo) - len(left)} of {len(todo)} drives are done already")
-        failed, interrupted = _run(left, output, jobs)
+        on_ray = options.engine == "ray"
+        events = (
+            run_ray(left, output, jobs, options.address) if on_ray else run_local(left, output, jobs or fitting_jobs())
+        )
+        failed, interrupted = _run(left, output, events)
         write_report(todo, output)
     print(f"{len(todo) - failed - interrupted} of {len(todo)} drives: {output / 'report.html'}")
     return INTERRUPTED_STATUS if interrupted else int(failed > 0)
@@ -57,12 +62,11 @@ def _alone(output: Path) -> Iterator[None]:
         yield
 
 
-def _run(left: list[Task], output: Path, jobs: int) -> tuple[int, int]:
+def _run(left: list[Task], output: Path, events: Generator[Event]) -> tuple[int, int]:
     """Runs what is left; gives how many failed, and how many were not ended when Ctrl-C came."""
     shares: dict[str, float] = {}
     failed = ended = 0
     with Progress("batch", len(left) * THOUSANDTHS, "drives", THOUSANDTHS) as progress:
-        events = run_local(left, output, jobs)
         try:
             with contextlib.closing(events):
                 for event in events:

@@ -152,6 +152,10 @@ def _batch(commands: Commands) -> None:
     text = "a source, a KITTI directory, a bag, a recording, a video; a directory with such; a text file of them"
     parser.add_argument("drives", nargs="+", metavar="DRIVE", help=text)
     parser.add_argument("--jobs", type=int, metavar="N", help="drives at once (as many as fit this computer)")
+    text = "ray: on a cluster (pip install birdslam[ray]); the output folder is on storage that all nodes share"
+    parser.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
+    text = "of the Ray cluster (auto: the one of this computer)"
+    parser.add_argument("--address", default="auto", metavar="HOST:PORT", help=text)
     text = "every drive with each of these settings; may be repeated: every combination"
     parser.add_argument("--sweep", action="append", default=[], metavar="KEY=V1,V2", help=text)
     _add_config(parser)

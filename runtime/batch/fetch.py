@@ -1,0 +1,37 @@
+"""Drives that lie elsewhere: fetched by their URL to a folder of this computer, for as long as they are read."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from birdslam.datasets.recording import DatasetError
+
+
+def is_url(address: str) -> bool:
+    """Whether the address of a source is a URL."""
+    return "://" in address
+
+
+@contextlib.contextmanager
+def at_hand(uri: str) -> Iterator[str]:
+    """The URI of a drive as this computer can read it. Raises DatasetError where it can't be fetched."""
+    scheme, _, address = uri.partition(":")
+    if not is_url(address):
+        yield uri
+        return
+    try:
+        import fsspec
+    except ImportError:
+        raise DatasetError(f"{uri}: fetching needs fsspec: pip install 'birdslam[ray]'") from None
+    with tempfile.TemporaryDirectory(prefix="birdslam-") as folder:
+        place = Path(folder) / PurePosixPath(address).name
+        try:
+            storage, path = fsspec.core.url_to_fs(address)
+            storage.get(path, str(place), recursive=bool(storage.isdir(path)))
+        except Exception as error:  # every storage has errors of its own
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise DatasetError(f"{uri}: can't be fetched: {reason}") from None
+        yield f"{scheme}:{place}"
