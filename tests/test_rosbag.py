@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -19,12 +21,16 @@ from birdslam.datasets.opening import frame_size, open_recording
 from birdslam.datasets.recording import DatasetError, Recording
 from birdslam.datasets.rosbag import read_bag_camera
 from birdslam.datasets.rosbag_truth import east_north_up
+from birdslam.evaluation.odometry import evaluate_recordings
 from birdslam.geometry.camera import AXES_EGO_CAM, Camera, GroundPlane, Undistorter
+from birdslam.geometry.se2 import SE2
 from birdslam.ros.bag import BagTopics
 from birdslam.ros.sensor import lens, pixels
+from birdslam.runtime.cli import calibrate
 from birdslam.runtime.configuration import load
 from birdslam.runtime.nodes.sources import open_source
 from birdslam.trajectory import as_poses, mount_pose
+from birdslam.types import Estimate
 
 WIDTH, HEIGHT = 64, 32
 PERIOD_NS = 100_000_000
@@ -300,6 +306,34 @@ def test_the_truth_of_an_odometry_is_that_of_the_camera(tmp_path: Path) -> None:
     late = [message for message in poses if message[2].header.stamp.nanosec > 400_000_000]
     rows = truth_of(open_recording(bag(tmp_path / "late", *late), topics=BagTopics(truth="/gt")))
     assert np.isfinite(rows).all(axis=(1, 2)).tolist() == [False, False, False, True, True, True]
+
+
+def test_frames_without_truth_are_named_and_left_out(tmp_path: Path) -> None:
+    poses = [("/gt", FIRST_NS + i, ros.odometry(FIRST_NS + 250_000_000 + i * PERIOD_NS, np.eye(4))) for i in range(5)]
+    recording = open_recording(bag(tmp_path / "drive", *poses), topics=BagTopics(truth="/gt"))
+
+    def standing(recording: Recording) -> Iterator[Estimate]:
+        for frame in recording.frames():
+            yield Estimate(
+                epoch=0, frame_id=frame.index, t_source_ns=frame.t_source_ns, t_capture_ns=0, t_utc_ns=0,
+                T_world_ego=SE2(), cov=(0.0,) * 9, valid=True,
+            )  # fmt: skip
+
+    with pytest.raises(DatasetError, match=r"known of 3 of 6 frames, from 3 to 5: compare those \(--frames 3:6\)"):
+        evaluate_recordings([recording], standing, tmp_path / "out")
+    (report,) = evaluate_recordings([recording], standing, tmp_path / "out", compared=slice(3, 6))
+    assert (report.frames, report.ate_m) == (3, pytest.approx(0.0, abs=1e-6))
+
+
+def test_calibrate_takes_the_lens_of_the_bag_and_the_height_where_it_is_known(tmp_path: Path) -> None:
+    none = argparse.Namespace(height=None, camera=None, intrinsics=None, chessboard=None)
+    found, height_m = calibrate._lens(none, bag(tmp_path / "drive"), BagTopics())
+    assert found is not None
+    assert (found.fx_px, found.width_px, found.source, height_m) == (50.0, WIDTH, CAMERA_INFO, pytest.approx(1.4))
+    without = ros.write_bag(tmp_path / "without", [message for message in drive() if message[0] != "/tf_static"])
+    assert calibrate._lens(none, f"rosbag:{without}", BagTopics())[1] is None
+    stated = argparse.Namespace(**{**vars(none), "height": 1.2})
+    assert calibrate._lens(stated, f"rosbag:{without}", BagTopics())[1] == 1.2
 
 
 def test_the_truth_of_a_satellites_fixes(tmp_path: Path) -> None:

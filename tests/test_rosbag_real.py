@@ -17,7 +17,13 @@ from birdslam.datasets.kitti import KittiRecording
 from birdslam.datasets.opening import open_recording
 from birdslam.datasets.recording import Recording
 from birdslam.geometry.camera import AXES_EGO_CAM, Camera
+from birdslam.ros.bag import Bag, stamp_ns
+from birdslam.ros.frames import StaticFrames
+from birdslam.runtime.cli.main import main
+from birdslam.runtime.configuration import Configuration, SourceConfig, dump
+from birdslam.runtime.recording.recording import About, RecordingWriter
 from birdslam.slam import BirdSLAM
+from birdslam.trajectory import mount_pose
 
 DISTORTION = (-0.28, 0.09, 0.0006, -0.0004, -0.012)  # about that of KITTI's unrectified cameras
 
@@ -97,3 +103,35 @@ def test_a_real_drive_gives_the_same_bytes_from_every_bag(
             recording = open_recording(write(tmp_path / f"{storage}-{kind}", drive, count, storage, kind, lens))
             assert recording.camera == drive.camera
             assert estimates(recording, count) == expected, (storage, kind)
+
+
+@pytest.mark.slow
+def test_a_real_bag_driven_recorded_and_exported_comes_back(tmp_path: Path, data_dir: Path) -> None:
+    """A bag in, the recording of its drive, a bag out: the same times and poses, in the axes of ROS."""
+    count = 30
+    drive = KittiRecording(data_dir / "kitti_tracking" / "training" / "image_03" / "0005")
+    uri = write(tmp_path / "bag", drive, count, "mcap", "compressed")
+    recording = open_recording(uri)
+    config = dump(Configuration(source=SourceConfig(uri=uri), camera=recording.camera))
+    about = About(configuration=config, models={}, versions={}, utc_offset_ns=0)
+    writer = RecordingWriter(tmp_path / "drive.mcap", about, recording.camera, 500.0)
+    slam = BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz)
+    said = []
+    for frame in recording.undistorted_frames():
+        measurements, estimate = slam.step(frame)
+        writer.add("measurements", measurements, frame.frame_id)
+        writer.add("estimate", estimate, frame.frame_id)
+        said.append(estimate)
+    writer.close({})
+    assert main(["export", str(tmp_path / "drive.mcap"), "--ros2", str(tmp_path / "out")]) == 0
+    with Bag(tmp_path / "out") as bag:
+        odometry = [message.content for message in bag.messages("/birdslam/odometry")]
+        cars = [message.content for message in bag.messages("/birdslam/vehicles/odometry")]
+        mount = StaticFrames(bag).find("base_link", "camera_optical_frame")
+    assert np.allclose(mount, mount_pose(recording.camera.ground))
+    assert [stamp_ns(message) for message in odometry] == [estimate.t_source_ns for estimate in said]
+    assert {estimate.epoch for estimate in said} == {0}
+    for message, estimate in zip(odometry, said, strict=True):
+        at, pose = message.pose.pose.position, estimate.T_world_ego
+        assert (at.x, at.y, at.z) == (pose.x_m, pose.y_m, estimate.attitude.z_m)
+    assert len(cars) == sum(len(estimate.vehicles) for estimate in said) > 0
