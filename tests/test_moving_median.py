@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from birdslam.evaluation.localisation import PAPER as PAPER_FRONT_END
 from birdslam.evaluation.tracking import PAPER
 from birdslam.geometry.camera import AXES_EGO_CAM, Camera
 from birdslam.geometry.pose import Pose
@@ -146,3 +147,5 @@ def test_the_papers_settings_are_those_that_are_evaluated_as_published() -> None
     slam = load(Path(__file__).parent.parent / "configs" / "paper.toml").slam
     assert (slam.weights, slam.graph) == (PAPER.weights, PAPER.graph)
     assert slam.frontend.odometry.road.mode == "paper"
+    ours = msgspec.structs.replace(slam.frontend, odometry=PAPER_FRONT_END.odometry)
+    assert ours == PAPER_FRONT_END

@@ -26,6 +26,7 @@ from birdslam.geometry.se2 import wrap
 from birdslam.perception import Detections, Perception, Ready
 from birdslam.simulation.odometry import EXACT, SimulatedOdometry
 from birdslam.types import Measurements, VehicleEdge
+from birdslam.vehicles.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.ground_size_filter import GroundSizeConfig
 from birdslam.vehicles.localisation import LocalisationConfig
 
@@ -34,7 +35,8 @@ RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0))
 INSIDE_1_SIGMA, INSIDE_2_SIGMA = (float(chi2.ppf(chi2.cdf(k**2, 1), 2)) for k in (1, 2))  # 2.30, 6.18
 MEASURED_KIND = "Car"
 
-# The paper's: Eq. 1 on the bottom of the box alone, on level ground as calibrated, and the point that it gives
+# The paper's: Eq. 1 on the bottom of the box alone, on level ground as calibrated, and the point that it gives; within
+# 20 m the depth, where there is a network for it
 PAPER = FrontEndConfig(
     localisation=LocalisationConfig(reach_rel=0.0),
     ground_size=GroundSizeConfig(
@@ -47,6 +49,7 @@ PAPER = FrontEndConfig(
         sigma_crown_rad=0.0,
         cues=("bottom",),
     ),
+    pseudolidar=PseudoLidarConfig(rule="paper"),
 )
 
 

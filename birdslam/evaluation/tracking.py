@@ -105,7 +105,23 @@ class Final:
         return out
 
 
-PAPER = Live("BirdSLAM as published", WeightsConfig(mode="paper"), GraphConfig(constant_velocity=False))
+NO_GATE = 1e6  # sigmas: nothing is an outlier
+
+PAPER = Live(
+    "BirdSLAM as published",
+    WeightsConfig(mode="paper"),
+    # CC, CP, CV and VV edges by Eqs. 5-8 and nothing else
+    GraphConfig(
+        ego_nodes=1,  # landmarks hold every frame
+        constant_velocity=False,
+        detection_gate_sigma=NO_GATE,
+        landmark_gate_sigma=NO_GATE,
+        landmark_common_m=0.0,
+        landmark_place_errs=False,
+        scale_memory_m=0.0,
+        hold_at_standstill=False,
+    ),
+)
 
 
 def ours(config: SlamConfig) -> Live:

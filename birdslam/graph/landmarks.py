@@ -103,11 +103,14 @@ class Landmarks:
         out._tied, out._information, out._moment, out._frames = tied, state.information, state.moment, state.frames
         return out
 
-    def sum_of_edges(self, seen: Sightings, window: Window, gate: float, common_variance: float) -> CpEdge | None:
+    def sum_of_edges(
+        self, seen: Sightings, window: Window, gate: float, common_variance: float, place_errs: bool = True
+    ) -> CpEdge | None:
         """A keyframe's CP edges to known landmarks as one edge to the key node before; None where none is known.
 
         A landmark whose squared Mahalanobis distance is past `gate` weighs less by the square of the excess.
         `common_variance` in m^2 is of what all landmarks of a frame share, which their sum does not average away.
+        Without `place_errs` the place that the key node saw a landmark at is taken for known.
         """
         rows = self._rows(seen)
         now = np.flatnonzero(rows >= 0)
@@ -116,8 +119,10 @@ class Landmarks:
         then = rows[now]
         node, heading, node_cov = window.key_node()
         residuals = landmark_residual(seen.points[now], node, heading, self._tied.points[then])  # Eq. 3
-        means = seen.means[now] + self._tied.means[then]
-        deviators = seen.deviators[now] + heading * heading * self._tied.deviators[then]
+        means, deviators = seen.means[now], seen.deviators[now]
+        if place_errs:
+            means = means + self._tied.means[then]
+            deviators = deviators + heading * heading * self._tied.deviators[then]
         # An outlier is one for which the key node's own uncertainty does not account either
         (xx, xy), (_, yy) = node_cov.tolist()
         distances = point_costs(residuals, means + 0.5 * (xx + yy), deviators + complex(0.5 * (xx - yy), xy))  # Eq. 5

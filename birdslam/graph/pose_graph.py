@@ -63,16 +63,20 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Static map
     landmark_gate_sigma: Positive = 3.0  # Mahalanobis distance past which a landmark weighs less
     landmark_common_m: NotNegative = 0.15  # 1-sigma of what is common to all landmarks of a frame (scale, pitch)
+    # Whether a landmark's place is as uncertain as its sight from the key frame was; False: known, as X_p of Eq. 3 is
+    landmark_place_errs: bool = True
     landmark_least_frames: Count = 2  # key frames that a landmark was seen in, to be put on the map
     max_landmarks: Count = 512  # of a keyframe
     max_pending_landmarks: Count = 10_000  # waiting for `map_update`
     max_pending_frames: Count = 1_000  # whose lane points wait for `map_update`
     # What is common to many CC edges in a row, and so moves all that is in sight against the world's origin alone
-    scale_memory_m: Positive = 20.0  # the way over which the errors of the metric scale, direction and turn last
+    # The way over which the errors of the metric scale, direction and turn last; 0: they do not
+    scale_memory_m: NotNegative = 20.0
     # The part of a camera's motion that lasts so: over 10 m the direction is off by 0.0033 to 0.0070 rad on KITTI 00,
     # 01, 06, 0005 and the shipped drive, and a turn by 0.8 % (01) and 1.8 % (00)
     lasting_direction_rad: NotNegative = 0.005  # 1-sigma of the direction of travel
     lasting_turn_rel: NotNegative = 0.01  # 1-sigma of a turn, as a fraction
+    hold_at_standstill: bool = True  # False: a car that stands has the CC edge of one that drives
     # Frames without a picture
     blind_mps: Positive = 1.0  # 1-sigma by which the ego's velocity may differ from the last one measured
     blind_radps: Positive = 0.1  # the same of its yaw rate
@@ -197,7 +201,7 @@ class PoseGraph:
             growth = ties.dt_s[:, None] * self._changes
         elif len(vv.rows):
             window.retwist(vv.rows, *rates(vv.motions, vv.dt_s), vv.covs / np.square(vv.dt_s)[:, None, None])
-        stands = Status.STANDSTILL in m.status
+        stands = self._stands(m)
         cov = np.zeros((3, 3)) if stands else edges.covs[0]
         self._motion = window.propagate(cc.T_from_to, cov, cc.from_frame, m.frame_id, ties.dt_s, growth)
         self._t_before_ns, self._t_ns = self._t_ns, m.t_source_ns
@@ -213,7 +217,7 @@ class PoseGraph:
         no camera's, and none of its errors lasts.
         """
         step, turn_rad = complex(self._motion.x_m, self._motion.y_m), self._motion.yaw_rad
-        if (length_m := abs(step)) and scale_sigma_rel:
+        if self.config.scale_memory_m and (length_m := abs(step)) and scale_sigma_rel:
             config, along = self.config, step / length_m
             common_m2 = 2.0 * self._lasting_m * length_m
             window.drift(along, scale_sigma_rel**2 * common_m2, config.lasting_direction_rad**2 * common_m2)
@@ -228,10 +232,18 @@ class PoseGraph:
         config, cp = self.config, None
         if seen is not None:
             cp = self._landmarks.sum_of_edges(  # Eq. 7
-                seen, window, config.landmark_gate_sigma**2, config.landmark_common_m**2
+                seen,
+                window,
+                config.landmark_gate_sigma**2,
+                config.landmark_common_m**2,
+                config.landmark_place_errs,
             )
         vv = ties.vv if config.constant_velocity else NO_VV  # else they have set the twists
-        return window.minimise(ties.cv, vv, cp, config.detection_gate_sigma**2, hold=Status.STANDSTILL in m.status)
+        return window.minimise(ties.cv, vv, cp, config.detection_gate_sigma**2, hold=self._stands(m))
+
+    def _stands(self, m: Measurements) -> bool:
+        """Whether the ego holds its pose."""
+        return self.config.hold_at_standstill and Status.STANDSTILL in m.status
 
     def _renew_vehicles(
         self, m: Measurements, window: Window, edges: PoseEdges, ties: Ties, outliers: list[int]

@@ -1,0 +1,125 @@
+"""Paper mode is the paper: what each edge adds to the information about a log without noise, and nothing else does."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from birdslam.baselines.batch_se2 import ego_key, solve, vehicle_key
+from birdslam.evaluation.tracking import PAPER
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.factors import CpEdge, CvEdges, VvEdges
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.window import Window
+from birdslam.simulation.drive import Drive, DriveConfig, drive
+from birdslam.types import Estimate, Measurements, Status
+
+Floats = NDArray[np.float64]
+
+# Sec. 3.3.2 of the paper
+LAMBDA_CP, LAMBDA_CV = 10_000.0, (10.0, 1_000.0)
+THRESHOLD_M = 20.0
+EXACT = DriveConfig(frames=40, rate_hz=10.0, vehicles=3, landmarks=12, lane_points=0, noise=0.0, traffic="convoy")
+FRAMES = range(5, 40)  # before, what is known of the first pose leaves nothing to be inverted
+
+
+def told_of_more(world: Drive) -> list[Measurements]:
+    """The log with what the paper's graph does not listen to: an error of the scale that lasts, and standstill."""
+    return [
+        replace(m, scale_sigma_rel=0.03, status=(*m.status, Status.STANDSTILL) if m.frame_id % 7 == 6 else m.status)
+        for m in world.measurements
+    ]
+
+
+def run(log: list[Measurements]) -> list[Estimate]:
+    graph = PoseGraph(PAPER.graph, PAPER.weights)
+    return [graph.optimise(m) for m in log]
+
+
+def added(log: list[Measurements], monkeypatch: pytest.MonkeyPatch) -> list[tuple[Window, CvEdges, Floats]]:
+    """What the edges of each frame add to the information about the state: the window, its CV edges, (n, n)."""
+    out = []
+    minimise = Window.minimise
+
+    def seen(self: Window, cv: CvEdges, vv: VvEdges, cp: CpEdge | None, gate: float, hold: bool = False) -> list[int]:
+        before = self.P.copy()
+        outliers = minimise(self, cv, vv, cp, gate, hold)
+        more = np.zeros_like(before)
+        if self.frame in FRAMES:
+            more = np.linalg.inv(self.P) - np.linalg.inv(before)
+        out.append((self, cv, more))
+        return outliers
+
+    monkeypatch.setattr(Window, "minimise", seen)
+    run(log)
+    return out
+
+
+def test_each_edge_adds_its_lambda_and_nothing_adds_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = told_of_more(drive(EXACT, 2))
+    landmarks = [{e.landmark for e in m.cp if e.x_m <= THRESHOLD_M} for m in log]
+    summed = 0
+    for m, (window, cv, more) in zip(log, added(log, monkeypatch), strict=True):
+        if m.frame_id not in FRAMES:
+            continue
+        expected = np.zeros_like(more)
+        node = window.layout.nodes.start
+        known = len(landmarks[m.frame_id] & landmarks[m.frame_id - 1])
+        summed += known
+        expected[[node, node + 1], [node, node + 1]] = LAMBDA_CP * known
+        assert len(cv.rows) == len(m.cv) == 3
+        far_to_near = sorted(zip((-e.T_ego_vehicle.x_m for e in m.cv), cv.rows.tolist(), strict=True))
+        weights = []
+        for _, row in far_to_near:
+            rows = window.layout.poses[row]
+            weights.append(more[rows[0], rows[0]])
+            expected[rows, rows] = weights[-1]
+        np.testing.assert_allclose(more, expected, rtol=1e-3, atol=1e-3 * LAMBDA_CP * known)
+        np.testing.assert_allclose(*(np.diag(one)[window.layout.poses] for one in (more, expected)), rtol=1e-2)
+        assert LAMBDA_CV[0] <= weights[0] * 1.01
+        assert weights[-1] <= LAMBDA_CV[1] * 1.01
+        assert weights == sorted(weights)
+    assert summed > 5 * len(FRAMES)
+
+
+def test_cc_cv_and_vv_are_the_batch_of_the_papers_edges() -> None:
+    """gtsam's marginals on a log that also tells of standstill and a scale that errs, to which the batch is deaf."""
+    log = told_of_more(drive(replace(EXACT, landmarks=0), 2))
+    estimate = run(log)[-1]
+    batch = solve(log, GraphConfig(constant_velocity=False), PAPER.weights)
+    marginals = gtsam.Marginals(batch.factors, batch.values)
+    last = log[-1].frame_id
+    covs = np.reshape(estimate.cov, (3, 3)), marginals.marginalCovariance(ego_key(last))
+    np.testing.assert_allclose(*covs, rtol=0.01, atol=1e-3 * covs[1].max())
+    assert len(estimate.vehicles) == 3
+    for v in estimate.vehicles:
+        covs = np.reshape(v.cov, (3, 3)), marginals.marginalCovariance(vehicle_key(v.vehicle, last))
+        np.testing.assert_allclose(*covs, rtol=0.02, atol=1e-2 * covs[1].max())
+
+
+@pytest.mark.parametrize("kind", ["cv", "cp"])
+def test_no_edge_is_an_outlier(kind: str) -> None:
+    """Twenty times the error of one edge moves the estimate twenty times as far."""
+    log = drive(EXACT, 2).measurements
+
+    def moved_m(error_m: float) -> float:
+        m = log[20]
+        if kind == "cv":
+            edge = replace(m.cv[0], T_ego_vehicle=SE2(error_m) @ m.cv[0].T_ego_vehicle)
+            m = replace(m, cv=(edge, *m.cv[1:]))
+        else:
+            m = replace(m, cp=(replace(m.cp[0], x_m=m.cp[0].x_m - error_m), *m.cp[1:]))
+        (before,), (after,) = ([e for e in run([*log[:20], one]) if e.frame_id == 20] for one in (log[20], m))
+        if kind == "cv":
+            poses = [
+                next(v.T_world_vehicle for v in e.vehicles if v.vehicle == m.cv[0].vehicle) for e in (before, after)
+            ]
+        else:
+            poses = [before.T_world_ego, after.T_world_ego]
+        return float(np.hypot(poses[1].x_m - poses[0].x_m, poses[1].y_m - poses[0].y_m))
+
+    assert moved_m(0.5) > 0.02
+    assert moved_m(10.0) == pytest.approx(20.0 * moved_m(0.5), rel=0.05)
