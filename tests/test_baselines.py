@@ -96,6 +96,22 @@ def test_lanes_can_be_left_out(world: Drive) -> None:
     assert batch_se3.run(lying, CAMERA, lanes=False) == batch_se3.run(without, CAMERA)
 
 
+def test_lanes_hold_an_odometry_that_slides() -> None:
+    """Exact landmarks take back most of what an odometry adds sideways; without them it stays."""
+    world = drive(msgspec.structs.replace(QUIET, vehicles=1), seed=4)
+    sliding = [
+        m
+        if m.cc is None
+        else msgspec.structs.replace(
+            m, cc=msgspec.structs.replace(m.cc, T_from_to=m.cc.T_from_to @ SE2(0.0, 0.03, 0.0))
+        )
+        for m in world.measurements
+    ]
+    with_m, without_m = (worst_m(world, batch_se3.run(sliding, CAMERA, lanes))[0] for lanes in (True, False))
+    assert without_m > 0.5
+    assert with_m < 0.7 * without_m
+
+
 def test_cuboids_are_recovered_from_boxes_of_known_size(world: Drive) -> None:
     config = cubeslam.CuboidConfig(height_m=HEIGHT_M)
     for edge in (edge for m in world.measurements for edge in m.cv):

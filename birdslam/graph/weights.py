@@ -13,6 +13,8 @@ from birdslam.types import LandmarkKind, Measurements
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 EdgeType = Literal["cc", "cp", "cv", "vv", "lanes"]
 
+NO_WEIGHT = 1e-3  # lambda of an edge that shall not count: not 0, since a graph needs a guess of where a pose is
+
 
 class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`measured`: each edge keeps its own covariance; `paper`: an edge's information is `lambda` times the unit matrix.
@@ -50,8 +52,7 @@ class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def weighted(measurements: Measurements, config: WeightsConfig) -> Measurements:
     """The measurements with the covariances that the graph shall believe.
 
-    Without "cc" the ego's motion stays in the graph as the guess it starts from (weight 1): other edges alone can't
-    carry a frame that sees no vehicle.
+    Without "cc" the ego's motion stays in the graph as the guess it starts from, 32 m uncertain (`NO_WEIGHT`): other edges alone can't carry a frame that sees no vehicle.
     """
     out = config.left_out
     threshold_m = config.depth_threshold_m
@@ -70,7 +71,7 @@ def weighted(measurements: Measurements, config: WeightsConfig) -> Measurements:
         vv = tuple(replace(edge, cov=vv_cov) for edge in vv)
         cc = cc and replace(cc, cov=effective_cov(config.cc, 3))
     if cc and "cc" in out:
-        cc = replace(cc, cov=effective_cov(1.0, 3))
+        cc = replace(cc, cov=effective_cov(NO_WEIGHT, 3))
     if cc is measurements.cc and cv is measurements.cv and vv is measurements.vv and cp is measurements.cp:
         return measurements
     return replace(measurements, cc=cc, cv=cv, vv=vv, cp=cp)
