@@ -58,7 +58,7 @@ STEPS = (
         "--frames 10000 --vehicles 0,5,10,15 --limit-s 15 --contenders ours,isam2,incremental_fixed_lag_qr",
         "--frames 10000 --limit-s 60",
     ),
-    Step("incremental", "incremental", "--frames 200", "--frames 414"),
+    Step("incremental", "incremental", "--frames 200", "--frames 50,100,200,414"),
     Step("transport", "transport", "--seconds 0.8", "--seconds 10"),
     Step("ratios", "ratios", "--rounds 1", "--rounds 5"),
 )

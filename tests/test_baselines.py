@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from birdslam.baselines import batch_se3, cubeslam, nair, namdev
+from birdslam.baselines.posegraph3 import solve_batch
 from birdslam.baselines.trajectories import LiveTrajectories, Trajectories, dead_reckoned
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
+from birdslam.perf import incremental
 from birdslam.simulation.drive import Drive, DriveConfig, drive
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
 
@@ -82,6 +84,27 @@ def test_the_batch_finds_the_scale_by_itself(world: Drive) -> None:
     ego_m, _ = worst_m(world, batch_se3.run(scaled, CAMERA))
     assert ego_m < 0.05
     assert worst_m(world, nair.run(scaled, CAMERA))[0] > 1.0  # which takes the odometry's word
+
+
+def test_a_solver_at_its_cap_says_so_and_one_that_converged_stays() -> None:
+    log = drive(msgspec.structs.replace(QUIET, noise=1.0), seed=4).measurements
+    _, cut = solve_batch(log, msgspec.structs.replace(batch_se3.CONFIG, iterations=2), check=True)
+    assert (cut.iterations, cut.at_cap, cut.converged) == (2, True, False)
+    _, done = solve_batch(log, batch_se3.CONFIG, check=True)
+    assert done.converged
+    assert done.step < 0.01 * cut.step
+    assert done.iterations < batch_se3.CONFIG.iterations
+    assert solve_batch([], batch_se3.CONFIG)[1].iterations == 0
+
+
+def test_no_ratio_is_told_of_a_batch_at_its_cap(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = drive(msgspec.structs.replace(QUIET, noise=1.0), seed=4).measurements
+    monkeypatch.setattr(batch_se3, "CONFIG", msgspec.structs.replace(batch_se3.CONFIG, iterations=2))
+    monkeypatch.setattr(incremental, "REPEATS", 1)
+    rows = {row["method"]: row for row in incremental.time_rows(log)}
+    cut = rows["batch SE(3), unscaled odometry, lanes"]
+    assert (cut["ratio"], cut["newest_ratio"], cut["converged"]) == (None, None, False)
+    assert rows["batch SE(3), metric odometry"]["ratio"] > 0.0
 
 
 def test_lanes_can_be_left_out(world: Drive) -> None:

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from birdslam.baselines.posegraph3 import BatchConfig
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.factors import sum_of_points
@@ -621,6 +622,8 @@ def test_the_batch_is_measured_against_the_incremental_graph(
         assert 0.0 < row["vehicle_ate_m"] < 2.0
     ours, *_, batch = found["rows"]
     assert ours["ratio"] == ours["newest_ratio"] == 1.0
+    assert batch["converged"]
+    assert 0 < batch["iterations"] < BatchConfig().iterations
     assert batch["newest_ratio"] > batch["ratio"] > 1.0
     assert "published" in capsys.readouterr().out
 

@@ -11,14 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from msgspec.structs import replace
+
 from birdslam.baselines.posegraph3 import BatchConfig, optimise_batch
 from birdslam.baselines.trajectories import Trajectories
 from birdslam.geometry.camera import Camera
 from birdslam.types import Measurements
 
 label = "Batch SE(3), unscaled odometry"
+CONFIG = BatchConfig(metric=False, landmarks=True)
 
 
 def run(log: Sequence[Measurements], camera: Camera, lanes: bool = True) -> Trajectories:
     """Trajectories of the whole log at once; `lanes=False` is "before lane constraints" of Table 5."""
-    return optimise_batch(log, BatchConfig(metric=False, landmarks=lanes))
+    return optimise_batch(log, CONFIG if lanes else replace(CONFIG, landmarks=False))

@@ -16,8 +16,9 @@ from birdslam.geometry.camera import Camera
 from birdslam.types import Measurements
 
 label = "Nair et al. (IV 2020)"
+CONFIG = BatchConfig(metric=True, landmarks=False)
 
 
 def run(log: Sequence[Measurements], camera: Camera) -> Trajectories:
     """Trajectories of the whole log at once."""
-    return optimise_batch(log, BatchConfig(metric=True, landmarks=False))
+    return optimise_batch(log, CONFIG)

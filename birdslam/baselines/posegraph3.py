@@ -6,7 +6,9 @@ level on the road. gtsam's tangent of Pose3 is (roll, pitch, yaw, x, y, z).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import gtsam
 import msgspec
@@ -34,14 +36,36 @@ class BatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_level_rad: float = 0.02  # of a vehicle's pitch and roll against the ego's road, which SE(2) edges don't state
     sigma_level_m: float = 0.2
     sigma_start: float = 1e-4  # of the first pose (m, rad), which is the world
-    iterations: int = 60
+    iterations: int = 500  # at the most; `Convergence` says whether they were enough
 
 
 _SCALE = gtsam.symbol("s", 0)
+_LARGEST_STEP = 0.01  # m or rad: farther no node may want to go from an answer that is one
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """How the solver ended. `step` is the farthest (m or rad) that one more Gauss-Newton step would take any node."""
+
+    iterations: int
+    at_cap: bool
+    step: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether the answer is the minimum."""
+        return not self.at_cap and self.step < _LARGEST_STEP
 
 
 def optimise_batch(log: Sequence[Measurements], config: BatchConfig) -> Trajectories:
     """The trajectories that minimise the graph, laid on the road. An empty log gives none."""
+    return solve_batch(log, config)[0]
+
+
+def solve_batch(
+    log: Sequence[Measurements], config: BatchConfig, check: bool = False
+) -> tuple[Trajectories, Convergence]:
+    """The same, and how the solver ended; without `check` the step is not taken, and is NaN."""
     log = [weighted(m, config.weights) for m in log]
     builder = _Builder(config)
     unit_m = 1.0 if config.metric else _mean_step_m(log)
@@ -51,7 +75,7 @@ def optimise_batch(log: Sequence[Measurements], config: BatchConfig) -> Trajecto
         builder.add_landmarks([edge for m in log for edge in m.cp if edge.frame in builder.poses])
     if config.steady_motion is not None:
         builder.add_steady_motion(np.array(config.steady_motion))
-    return builder.solve()
+    return builder.solve(check)
 
 
 def _mean_step_m(log: Sequence[Measurements]) -> float:
@@ -139,21 +163,26 @@ class _Builder:
                     keys = [_vehicle_key(vehicle, frame + k) for k in range(3)]
                     self.graph.add(gtsam.CustomFactor(noise, keys, _changed_motion))
 
-    def solve(self) -> Trajectories:
+    def solve(self, check: bool) -> tuple[Trajectories, Convergence]:
         out = Trajectories()
         if not self.poses:
-            return out
+            return out, Convergence(0, False, 0.0)
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(self.config.iterations)
         params.setRelativeErrorTol(1e-8)
-        solution = gtsam.LevenbergMarquardtOptimizer(self.graph, self.values, params).optimize()
+        optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, self.values, params)
+        solution = optimizer.optimize()
+        step = math.nan
+        if check:
+            step = float(np.abs(self.graph.linearize(solution).optimize().vector()).max())
+        convergence = Convergence(optimizer.iterations(), optimizer.iterations() >= self.config.iterations, step)
         for frame in self.poses:
             out.ego[frame] = split_pose(solution.atPose3(gtsam.symbol("x", frame)).matrix())[0]
         for vehicle, frames in self._seen.items():
             for frame in sorted(frames):
                 pose = solution.atPose3(_vehicle_key(vehicle, frame)).matrix()
                 out.put_vehicle(vehicle, frame, split_pose(pose)[0])
-        return out
+        return out, convergence
 
 
 def _vehicle_key(vehicle: int, frame: int) -> int:

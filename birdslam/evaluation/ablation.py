@@ -1,8 +1,8 @@
 """The paper's ablations as variants of the incremental method (its Tables 3 and 4) and of the batch (Table 5).
 
 A variant is a change of weights, so that it runs on the same log. "Without" is a weight of as good as zero (1e-3,
-against the paper's 1 to 10000): CC keeps its motion as the guess that the graph starts from, CV the first sight of a vehicle,
-as nothing else says where they are.
+against the paper's 1 to 10000): CC keeps its motion as the guess that the graph starts from, CV the first sight of a
+vehicle, as nothing else says where they are.
 """
 
 from __future__ import annotations

@@ -42,6 +42,8 @@ class Outcome:
     motion: list[MotionRow]
     incremental_s: float
     batch_s: float
+    batch_iterations: int
+    batch_at_cap: bool  # it stopped before it had converged
     updates_ms: dict[str, NDArray[np.float64]]
 
 
@@ -119,13 +121,15 @@ def _runtime(outcomes: Sequence[Outcome], published: Published) -> str:
         "",
         "Seconds for a whole sequence on this computer, other processes beside it; `runtime.png` shows each update.",
         "",
-        "| Seq | frames | incremental (ours) s | batch SE(3) s | ratio |",
-        "| --- | --- | --- | --- | --- |",
-        f"| published, {theirs.sequence} | {theirs.frames} | {theirs.incremental_s} | {theirs.batch_s} | "
+        "| Seq | frames | incremental (ours) s | batch SE(3) s | iterations | ratio |",
+        "| --- | --- | --- | --- | --- | --- |",
+        f"| published, {theirs.sequence} | {theirs.frames} | {theirs.incremental_s} | {theirs.batch_s} | - | "
         f"{theirs.batch_s / theirs.incremental_s:.0f} |",
     ]
     for o in outcomes:
-        ratio = o.batch_s / max(o.incremental_s, 1e-9)
+        ratio = "not converged" if o.batch_at_cap else f"{o.batch_s / max(o.incremental_s, 1e-9):.1f}"
         name = f"{o.sequence}, images" if o.odometry == "images" else o.sequence
-        lines.append(f"| {name} | {len(o.frames)} | {o.incremental_s:.3f} | {o.batch_s:.2f} | {ratio:.1f} |")
+        lines.append(
+            f"| {name} | {len(o.frames)} | {o.incremental_s:.3f} | {o.batch_s:.2f} | {o.batch_iterations} | {ratio} |"
+        )
     return "\n".join(lines) + "\n"

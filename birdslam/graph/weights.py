@@ -52,7 +52,8 @@ class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def weighted(measurements: Measurements, config: WeightsConfig) -> Measurements:
     """The measurements with the covariances that the graph shall believe.
 
-    Without "cc" the ego's motion stays in the graph as the guess it starts from, 32 m uncertain (`NO_WEIGHT`): other edges alone can't carry a frame that sees no vehicle.
+    Without "cc" the ego's motion stays in the graph as the guess it starts from, 32 m uncertain (`NO_WEIGHT`): other
+    edges alone can't carry a frame that sees no vehicle.
     """
     out = config.left_out
     threshold_m = config.depth_threshold_m
