@@ -61,13 +61,16 @@ def added(log: list[Measurements], monkeypatch: pytest.MonkeyPatch) -> list[tupl
 def test_each_edge_adds_its_lambda_and_nothing_adds_more(monkeypatch: pytest.MonkeyPatch) -> None:
     log = told_of_more(drive(EXACT, 2))
     landmarks = [{e.landmark for e in m.cp if e.x_m <= THRESHOLD_M} for m in log]
-    summed = 0
+    summed, every = 0, PAPER.graph.ego_nodes
     for m, (window, cv, more) in zip(log, added(log, monkeypatch), strict=True):
         if m.frame_id not in FRAMES:
             continue
         expected = np.zeros_like(more)
         node = window.layout.nodes.start
-        known = len(landmarks[m.frame_id] & landmarks[m.frame_id - 1])
+        known = 0  # but in key frames, where all that the last one saw too count
+        if m.frame_id % every == 0:
+            known = len(landmarks[m.frame_id] & landmarks[m.frame_id - every])
+            assert known > 2
         summed += known
         expected[[node, node + 1], [node, node + 1]] = LAMBDA_CP * known
         assert len(cv.rows) == len(m.cv) == 3
@@ -77,12 +80,12 @@ def test_each_edge_adds_its_lambda_and_nothing_adds_more(monkeypatch: pytest.Mon
             rows = window.layout.poses[row]
             weights.append(more[rows[0], rows[0]])
             expected[rows, rows] = weights[-1]
-        np.testing.assert_allclose(more, expected, rtol=1e-3, atol=1e-3 * LAMBDA_CP * known)
+        np.testing.assert_allclose(more, expected, rtol=1e-3, atol=1e-3 * LAMBDA_CP * max(known, 1))
         np.testing.assert_allclose(*(np.diag(one)[window.layout.poses] for one in (more, expected)), rtol=1e-2)
         assert LAMBDA_CV[0] <= weights[0] * 1.01
         assert weights[-1] <= LAMBDA_CV[1] * 1.01
         assert weights == sorted(weights)
-    assert summed > 5 * len(FRAMES)
+    assert summed > 30
 
 
 def test_cc_cv_and_vv_are_the_batch_of_the_papers_edges() -> None:

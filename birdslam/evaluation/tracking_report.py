@@ -98,10 +98,11 @@ def _preface(setting: Setting, outcomes: Sequence[Outcome]) -> str:
         f"{', ± their standard deviation' if setting.seeds > 1 else ''}.",
         '"Re-implemented" methods are ours after the papers\' descriptions (birdslam/baselines/ says what each keeps '
         "and what it can't), run on the same measurements as ours.",
-        '"Ours" are the vehicles\' ways as our system knows them once the sequence is over '
-        "(birdslam/vehicles/rts_smoother.py), as the paper's graph and every batch do. 'Ours, live' is what a planner "
-        "gets in each frame, which knows nothing of later ones, and so is 're-implemented: BirdSLAM'. "
-        "The ego's are the same. Tables 3 and 4 compare live estimates.",
+        "All rows of a sequence have the same log: the same boxes, tracker, placing of vehicles and odometry, those of "
+        "our front end; methods differ in their back ends alone. *Live* is what a planner gets in each frame, which "
+        "knows nothing of later ones. *Final* is the vehicles' ways once the sequence is over, from the live ones by "
+        "one smoother for both (birdslam/vehicles/rts_smoother.py); the egos' are the live ones. A batch knows the "
+        "whole sequence without that smoother. Tables 3 and 4 compare live estimates.",
     ]
     if setting.frames == "paper":
         lines.append("Frames: the first so many of each sequence; the paper gives their number, not where they start.")

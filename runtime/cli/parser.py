@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 USAGE_NOTE = "Sources: demo, kitti:DIR, video:FILE, rosbag:PATH, mcap:FILE, v4l2:/dev/videoN, rtsp://HOST/PATH."
 RECORDING = "FILE.mcap"
-METHODS = ("birdslam", "birdslam_live", "paper", "batch_se3", "nair", "namdev", "cubeslam")
+METHODS = ("birdslam", "birdslam_live", "paper", "paper_final", "batch_se3", "nair", "namdev", "cubeslam")
 SEEDS = 5
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
