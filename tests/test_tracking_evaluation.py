@@ -223,6 +223,32 @@ def test_the_weight_of_landmarks_is_against_that_of_the_odometry(noisy_log: list
         assert own[name].cp_inflation == pytest.approx(1.0 / factor)
 
 
+def test_each_idea_alone_is_one_change_of_the_papers_settings() -> None:
+    """And all of them together leave nothing of the back end that is the paper's."""
+    variants = ablation.idea_variants()
+    assert variants.pop("nothing (the paper)") == PAPER
+    fields = ("weights", "graph")
+    changed: set[str] = set()
+    for name, variant in variants.items():
+        if isinstance(variant, Live):
+            more = {
+                f"{part}.{f}"
+                for part in fields
+                for f in getattr(PAPER, part).__struct_fields__
+                if getattr(getattr(variant, part), f) != getattr(getattr(PAPER, part), f)
+            }
+            assert more, name
+            changed |= more
+    own = ours(SlamConfig())
+    apart = {
+        f"{part}.{f}"
+        for part in fields
+        for f in getattr(PAPER, part).__struct_fields__
+        if getattr(getattr(own, part), f) != getattr(getattr(PAPER, part), f)
+    }
+    assert apart - changed == {"graph.scale_memory_m"}  # which moves no pose, but what is known of the ego's
+
+
 def test_before_lanes_is_a_log_without_landmarks(sequence: TrackingSequence, noisy_log: list[Measurements]) -> None:
     variants = ablation.lane_variants()
     assert tuple(variants) == tables.LANES
@@ -371,6 +397,12 @@ def test_the_ablation_alone(tmp_path: Path) -> None:
     assert "## Table 1" not in report
     assert "## Table 3" in report
     assert "SIMULATED" in report
+    names = [*ablation.idea_variants(), *ablation.placed_variants(PAPER)]
+    ideas = {(row["method"], row["body"]): row["ate_m"] for row in json.loads((out / "ideas.json").read_text())}
+    assert {method for method, _ in ideas} == {f"ideas/{name}" for name in names}
+    assert all(f"| {name} |" in report for name in names)
+    # The tracking world's car 3 is placed on its centre by ours, on its rear by the paper's Eq. 1
+    assert ideas["ideas/vehicles placed by measured ground and size", "3"] < ideas["ideas/nothing (the paper)", "3"]
     found = {row["method"] for row in json.loads((out / "report.json").read_text())}
     assert found == {f"{m}/{v}" for m in ("paper", "birdslam") for v in tables.CONSTRAINTS + tables.LANDMARKS} | set(
         tables.LANES

@@ -15,10 +15,12 @@ import msgspec
 
 from birdslam.baselines import batch_se3
 from birdslam.baselines.trajectories import Trajectories
-from birdslam.evaluation.tracking import Live, Method
+from birdslam.evaluation.tracking import PAPER, Final, Live, Method
 from birdslam.geometry.camera import Camera
-from birdslam.graph.weights import NO_WEIGHT, EdgeType
+from birdslam.graph.pose_graph import GraphConfig
+from birdslam.graph.weights import NO_WEIGHT, EdgeType, WeightsConfig
 from birdslam.types import Measurements
+from birdslam.vehicles.rts_smoother import SmootherConfig
 
 CP_WEIGHTS = MappingProxyType({"cp_low": 0.01, "cp_medium": 1.0, "cp_high": 100.0})  # against CC's own
 DEPTHS_M = MappingProxyType(
@@ -49,6 +51,35 @@ def landmark_variants(base: Live) -> dict[str, Live]:
     for name, depth_m in DEPTHS_M.items():
         out[name] = _reweighted(base, depth_threshold_m=depth_m)
     return out
+
+
+def idea_variants() -> dict[str, Method]:
+    """What is ours in the back end, each alone over the paper's, by what it is; for a log of the paper's placing."""
+    default, paper = GraphConfig(), PAPER.graph
+    alone = {
+        "gates on outliers": ("detection_gate_sigma", "landmark_gate_sigma"),
+        "an error that all landmarks share": ("landmark_common_m",),
+        "landmarks as uncertain as their sights": ("landmark_place_errs",),
+        "standstill held": ("hold_at_standstill",),
+    }
+    out: dict[str, Method] = {"nothing (the paper)": PAPER}
+    for name, fields in alone.items():
+        more = {field: getattr(default, field) for field in fields}
+        out[name] = replace(PAPER, graph=msgspec.structs.replace(paper, **more))
+    out["measured covariances"] = replace(PAPER, weights=WeightsConfig(leave_out=()))
+    steady = replace(PAPER, graph=msgspec.structs.replace(paper, constant_velocity=True))
+    out["constant velocity in place of VV"] = _leave_out(steady, "vv")
+    out["the smoother"] = Final("", PAPER, SmootherConfig())
+    return out
+
+
+def placed_variants(base: Live) -> dict[str, Method]:
+    """The same for a log of our placing: that alone, and everything together, live and final."""
+    return {
+        "vehicles placed by measured ground and size": PAPER,
+        "all, live": base,
+        "all, final": Final("", base, SmootherConfig()),
+    }
 
 
 def lane_variants() -> dict[str, Method]:

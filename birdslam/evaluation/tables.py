@@ -182,6 +182,21 @@ def variants_table(rows: Sequence[Row], published: Published, table: PublishedTa
     return _markdown(head, [*lines, means])
 
 
+def ideas_table(rows: Sequence[Row], published: Published) -> str:
+    """A row for each idea ("ideas/NAME"), the paper's bodies that are at hand in columns."""
+    paper = {s: (*one.bodies, EGO) for s, one in published.sequences.items()}
+    bodies = list(dict.fromkeys((row.sequence, row.body) for row in rows if row.body in paper.get(row.sequence, ())))
+    egos, cars = ([at for at in bodies if (at[1] == EGO) is ego] for ego in (True, False))
+    lines = []
+    for name in _chosen(rows):
+        of = {(row.sequence, row.body): row for row in rows if row.method == name}
+        means = [_mean(of[at].ate_m for at in some if at in of) for some in (cars, egos)]
+        cells = [_row_number(of.get(at)) for at in (*cars, *egos)]
+        lines.append([name.removeprefix("ideas/"), *cells, *map(_number, means)])
+    titles = [f"{sequence}/{body}" for sequence, body in (*cars, *egos)]
+    return _markdown(["ours over the paper", *titles, "mean, cars", "mean, ego"], lines)
+
+
 def lanes_table(rows: Sequence[Row], published: Published) -> str:
     """Table 5, over the paper's bodies and then over what else is at hand."""
     head = ["Seq", "Car", "frames: published", "at hand"]

@@ -38,6 +38,7 @@ class Outcome:
     frames: range
     rows: list[Row]
     ablation: list[Row]
+    ideas: list[Row]  # what each of ours is worth over the paper's
     ranges: list[RangeRow]  # of the networks' own boxes alone, as `motion`
     motion: list[MotionRow]
     incremental_s: float
@@ -72,6 +73,13 @@ def render_report(setting: Setting, published: Published, outcomes: Sequence[Out
         add("Table 4: landmarks", t4.where, tables.variants_table(variants, published, t4, tables.LANDMARKS))
     if any(row.method in tables.LANES for row in variants):
         add("Table 5: lane constraints", published.table5.where, tables.lanes_table(variants, published))
+    ideas = [row for outcome in outcomes for row in outcome.ideas]
+    if ideas:
+        parts.append(
+            "## What each idea is worth\n\nEach of ours alone over the paper's method with the paper's placing of "
+            f"vehicles, and all together. ATE in m, live but where a row says otherwise. {note}\n\n"
+            f"{tables.ideas_table(ideas, published)}"
+        )
     if setting.methods:
         name = setting.methods[0]
         parts.append(

@@ -41,6 +41,9 @@ def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
     rows = [row for outcome in outcomes for row in outcome.rows]
     variants = [row for outcome in outcomes for row in outcome.ablation]
     job = jobs[0]
+    ideas = [row for outcome in outcomes for row in outcome.ideas]
+    if ideas:
+        _write_json(output / "ideas.json", ideas)
     _write_json(output / "report.json", rows if job.methods else variants)
     if job.methods and variants:
         _write_json(output / "ablation.json", variants)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -21,6 +21,7 @@ from birdslam.datasets.recording import DatasetError
 from birdslam.datasets.speed_file import of_sequence, read_speeds
 from birdslam.evaluation import ablation
 from birdslam.evaluation.localisation import CAMERA_OF_BOXES
+from birdslam.evaluation.localisation import PAPER as PAPER_FRONT_END
 from birdslam.evaluation.tables import Published
 from birdslam.evaluation.told import motion_row, range_rows, sights
 from birdslam.evaluation.tracking import (
@@ -93,7 +94,8 @@ def frames_of(text: str, sequence: TrackingSequence, published: Published) -> ra
 def frames_to_make(job: Job) -> int:
     """How many frames the front end goes through for a job, seeds and logs together."""
     frames = frames_of(job.frames, open_tracking(job.root, job.sequence, job.camera), job.published)
-    return len(frames) * job.seeds * (bool(job.methods) + bool(_variants(job)))
+    logs = 1 + bool(_variants(job)) + _with_ideas(job)
+    return len(frames) * job.seeds * logs
 
 
 def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> Outcome:
@@ -104,7 +106,8 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
     slam = job.configuration.slam
     chosen: dict[str, Method] = {name: methods(slam)[name] for name in job.methods}
     variants = _variants(job)
-    trials, ablations, log = [], [], []
+    ideas = {f"ideas/{name}": method for name, method in ablation.idea_variants().items()} if _with_ideas(job) else {}
+    trials, ablations, worth, log = [], [], [], []
     with ExitStack() as stack:
         make = _log_maker(job, sequence, frames, stack, frame_made)
         for seed in range(job.seeds):
@@ -115,6 +118,16 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
                 far = msgspec.structs.replace(slam.frontend.static_map, landmark_range_m=ablation.FARTHEST_LANDMARK_M)
                 far_log = make(seed, msgspec.structs.replace(slam.frontend, static_map=far))
                 ablations.append(run_trial(sequence, far_log, variants))
+            if ideas:
+                placing = (
+                    PAPER_FRONT_END
+                    if job.odometry != "images"
+                    else msgspec.structs.replace(PAPER_FRONT_END, odometry=slam.frontend.odometry)
+                )
+                theirs = run_trial(sequence, make(seed, placing), ideas)
+                placed = {f"ideas/{name}": m for name, m in ablation.placed_variants(ours(slam)).items()}
+                own = run_trial(sequence, log, placed)
+                worth.append(replace(theirs, errors={**theirs.errors, **own.errors}))
     if chosen:
         name = next(iter(chosen))
         truth, result = Truth.of(sequence, log), chosen[name].run(log, sequence.camera)
@@ -138,6 +151,7 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
         frames=frames,
         rows=rows_of(trials),
         ablation=rows_of(ablations),
+        ideas=rows_of(worth),
         ranges=range_rows(sequence.name, seen) if seen else [],
         motion=[motion_row(sequence.name, seen)] if seen else [],
         incremental_s=float(updates_ms["all vehicles"].sum()) / 1e3,
@@ -146,6 +160,10 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
         batch_at_cap=ended.at_cap,
         updates_ms=updates_ms,
     )
+
+
+def _with_ideas(job: Job) -> bool:
+    return job.ablate and not job.methods
 
 
 def _variants(job: Job) -> dict[str, Method]:
