@@ -38,6 +38,7 @@ from birdslam.status import Status as Status
 Cov3 = Annotated[tuple[float, ...], msgspec.Meta(min_length=9, max_length=9)]
 Cov2 = Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)]
 FrameId = Annotated[int, msgspec.Meta(ge=0)]
+Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 BodyId = Annotated[int, msgspec.Meta(ge=0)]
 NS_PER_S = 1_000_000_000
 IN_SIGHT_NS = 350_000_000  # three looks a second, the fewest of perceive, are a third of a second apart
@@ -75,6 +76,18 @@ class SpeedSource(enum.StrEnum):
     @classmethod
     def _missing_(cls, value: object) -> SpeedSource | None:
         return cls.UNKNOWN if isinstance(value, str) else None
+
+
+class Moves(enum.StrEnum):
+    """Whether a vehicle stands or drives, decided with hysteresis."""
+
+    UNDECIDED = "undecided"  # too little was seen of it, or nothing says
+    STANDING = "standing"  # its velocity is told as nil
+    DRIVING = "driving"
+
+    @classmethod
+    def _missing_(cls, value: object) -> Moves | None:
+        return cls.UNDECIDED if isinstance(value, str) else None
 
 
 class SpeedReading(msgspec.Struct, frozen=True, kw_only=True):
@@ -281,13 +294,15 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True):
     T_world_vehicle: SE2  # where it is
     cov: Cov3  # of the pose
     velocity_mps: Annotated[tuple[float, ...], msgspec.Meta(min_length=2, max_length=2)]  # (x, y) in world
-    velocity_cov: Cov2  # of the velocity
+    velocity_cov: Cov2  # of the velocity; that the vehicle may stand, or not, is in it
     age_ns: int  # source time since the frame that last told of it; 0: this frame does
     frames: int  # how many frames it has been seen in
     label: str = "car"  # its class
     length_m: float = 4.0  # of its footprint
     width_m: float = 1.7  # of its footprint
     delay_ns: int = 0  # by so much older was the image that it was seen in: it was last seen age_ns + delay_ns ago
+    moves: Moves = Moves.UNDECIDED  # whether it stands or drives: decided on strong evidence, and kept until that turns
+    standing: Probability = 0.5  # the probability that it stands, as last told of
 
     @property
     def in_sight(self) -> bool:
@@ -296,9 +311,9 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         cov, u = self.cov, self.velocity_cov
-        total = sum(cov) + sum(u) + sum(self.velocity_mps) + self.length_m + self.width_m
+        total = sum(cov) + sum(u) + sum(self.velocity_mps) + self.length_m + self.width_m + self.standing
         if not (math.isfinite(total) and min(cov[0], cov[4], cov[8], u[0], u[3]) >= 0.0):  # else no need to look closer
-            check_finite(self, "velocity_mps", "length_m", "width_m")
+            check_finite(self, "velocity_mps", "length_m", "width_m", "standing")
             _check_cov(self, "cov", "velocity_cov")
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.planar import advance, pairs
 from birdslam.geometry.se2 import SE2
+from birdslam.graph.standing import judge, told_velocities
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import Window
 from birdslam.types import VehicleEstimate
@@ -24,11 +25,12 @@ _TWIST = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1j, 0.0])
 
 
 def vehicle_estimates(
-    window: Window, vehicles: Sequence[VehicleNode], t_ns: int, changes: Floats
+    window: Window, vehicles: Sequence[VehicleNode], t_ns: int, changes: Floats, birth_det: float | None = None
 ) -> tuple[VehicleEstimate, ...]:
     """Every vehicle at source time `t_ns`; one whose newest pose is older is driven on with the twist it had.
 
-    `changes` (3,): the variances of a twist grow by so much a second.
+    `changes` (3,): the variances of a twist grow by so much a second. `birth_det`: the determinant of a velocity's
+    covariance at birth, to judge by whether a vehicle stands (standing.py); None: nobody judges.
     """
     if not vehicles:
         return ()
@@ -36,12 +38,16 @@ def vehicle_estimates(
     if any(v.node_ns < t_ns for v in vehicles):
         ahead_s = np.array([max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles])
     poses, velocities, covs = marginals_in_world(window, ahead_s, changes)
+    velocity_covs = covs[:, 3:, 3:]
+    if birth_det is not None:
+        judge(vehicles, velocities, velocity_covs, birth_det, t_ns)
+        velocities, velocity_covs = told_velocities(vehicles, velocities, velocity_covs)
     numbers = zip(
         vehicles,
         poses.tolist(),
         _tuples(covs[:, :3, :3], 9),
         _tuples(velocities, 2),
-        _tuples(covs[:, 3:, 3:], 4),
+        _tuples(velocity_covs, 4),
         strict=True,
     )
     return tuple(
@@ -58,6 +64,8 @@ def vehicle_estimates(
                 length_m=v.length_m,
                 width_m=v.width_m,
                 delay_ns=v.delay_ns,
+                moves=v.moves,
+                standing=0.5 if v.standing is None else v.standing,
             )
             for v, (x_m, y_m, yaw_rad), cov, velocity, velocity_cov in numbers
         ]

@@ -92,6 +92,8 @@ class PoseGraph:
         self._map = PendingMap(config.max_pending_landmarks, config.max_pending_frames)
         self._changes = np.square([config.change_forward_mps, config.change_sideways_mps, config.change_turn_radps])
         self._birth = np.diag(np.square([config.birth_forward_mps, config.birth_sideways_mps, config.birth_turn_radps]))
+        # Whether a vehicle stands is judged by its velocity's covariance: Eq. 6 alone has none that was measured
+        self._birth_det = float(self._birth[0, 0] * self._birth[1, 1]) if config.constant_velocity else None
         self._window: Window | None = None
 
     def optimise(self, measurements: Measurements) -> Estimate:
@@ -287,7 +289,7 @@ class PoseGraph:
         return self._estimate(m, m.status, cov, self._vehicle_estimates(m, window))
 
     def _vehicle_estimates(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
-        return vehicle_estimates(window, self._vehicles.nodes, m.t_source_ns, self._changes)
+        return vehicle_estimates(window, self._vehicles.nodes, m.t_source_ns, self._changes, self._birth_det)
 
     def _estimate(
         self, m: Measurements, status: tuple[Status, ...], cov: Floats, vehicles: tuple[VehicleEstimate, ...]

@@ -9,8 +9,9 @@ import numpy as np
 from birdslam.geometry.planar import Floats
 from birdslam.graph.edges import PoseEdges
 from birdslam.graph.factors import CvEdges, VvEdges
-from birdslam.types import VehicleEdge
+from birdslam.types import Moves, VehicleEdge
 
+PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/parallax.py
 SHORTEST_S = 1e-3  # source clocks that stand still or run backwards
 
 
@@ -29,6 +30,10 @@ class VehicleNode:
     length_m: float = 0.0
     width_m: float = 0.0
     delay_ns: int = 0  # of the detection at seen_ns
+    standing_seen: float | None = None  # the probability that it stands, by its last edge; None: that did not say
+    in_path: bool = False  # of the ego, by its last edge
+    standing: float | None = None  # the probability by all that is known; None: of that nothing
+    moves: Moves = Moves.UNDECIDED
 
 
 @dataclass(slots=True)
@@ -115,6 +120,8 @@ class VehicleNodes:
                     begun.append(k)
             v.seen_ns, v.frames, v.label = t_ns, v.frames + 1, edge.label
             v.length_m, v.width_m, v.delay_ns = edge.length_m, edge.width_m, edge.delay_ns
+            v.standing_seen = edge.standing or None  # 0: nobody said
+            v.in_path = abs(edge.T_ego_vehicle.y_m) < PATH_HALF_WIDTH_M
         before = len(self.nodes)
         alive = [row for row, v in enumerate(self.nodes) if (t_ns - v.seen_ns) * 1e-9 <= self._forget_s]
         if not born and len(alive) == before:

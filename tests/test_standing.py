@@ -1,0 +1,129 @@
+"""Whether vehicles stand or drive: the decision, and the velocity that planners are told."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.standing import DECIDED, GIVEN_UP, STANDING_MPS, decide, judge, told_velocities
+from birdslam.graph.vehicles import VehicleNode
+from birdslam.graph.weights import WeightsConfig
+from birdslam.types import EgoEdge, Measurements, Moves, VehicleEdge, VehicleEstimate
+
+BIRTH_DET = (12.0 * 2.0) ** 2
+probabilities = st.floats(0.0, 1.0)
+
+
+def node(standing_seen: float | None, **more: object) -> VehicleNode:
+    return VehicleNode(1, seen_ns=7, standing_seen=standing_seen, **more)  # type: ignore[arg-type]
+
+
+def judged(vehicle: VehicleNode, v_mps: tuple[float, float], sigma_mps: float) -> VehicleNode:
+    judge([vehicle], np.array([v_mps]), np.eye(2)[None] * sigma_mps**2, BIRTH_DET, 7)
+    return vehicle
+
+
+@given(probabilities)
+def test_between_the_bars_a_decision_stays_and_none_is_taken(standing: float) -> None:
+    assert (decide(Moves.UNDECIDED, standing) is Moves.STANDING) == (standing >= DECIDED)
+    assert (decide(Moves.UNDECIDED, standing) is Moves.DRIVING) == (standing <= 1.0 - DECIDED)
+    assert (decide(Moves.STANDING, standing) is Moves.STANDING) == (standing >= GIVEN_UP)
+    assert (decide(Moves.DRIVING, standing) is Moves.DRIVING) == (1.0 - standing >= GIVEN_UP)
+
+
+@given(
+    st.sampled_from(Moves), probabilities, st.tuples(*2 * [st.floats(-30.0, 30.0)]), st.tuples(*2 * [st.floats(0.1, 9)])
+)
+def test_the_covariance_is_the_mixtures_about_what_is_told(
+    moves: Moves, p: float, v: tuple[float, float], sigmas: tuple[float, float]
+) -> None:
+    """Its moments, from points that have the two parts' moments exactly."""
+    told, cov = told_velocities([node(p, standing=p, moves=moves)], np.array([v]), np.diag(np.square(sigmas))[None])
+    (u,), (C,) = told, cov
+    assert np.hypot(*u) <= np.hypot(*v) + 1e-9
+    spread = math.sqrt(2.0) * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    points = np.concatenate([STANDING_MPS * spread, v + spread * sigmas]) - u
+    weights = np.repeat([p, 1.0 - p], 4) / 4.0
+    np.testing.assert_allclose(np.einsum("n,ni,nj->ij", weights, points, points), C, atol=1e-9)
+
+
+def test_who_was_just_seen_is_not_decided_on_and_its_velocity_is_pulled_to_nil() -> None:
+    new = judged(node(0.4), (6.0, 0.0), 6.0)
+    assert new.moves is Moves.UNDECIDED
+    assert new.standing is not None
+    assert 0.2 < new.standing < 0.8
+    (u,), (C,) = told_velocities([new], np.array([[6.0, 0.0]]), 36.0 * np.eye(2)[None])
+    assert u[0] < 6.0 * (1.0 - new.standing) + 1e-9
+    assert u[0] - 2.0 * math.sqrt(C[0, 0]) < 0.0  # nor is it told to drive for sure
+
+
+def test_both_have_to_agree() -> None:
+    assert judged(node(0.995), (0.3, 0.0), 0.5).moves is Moves.STANDING
+    assert judged(node(0.005), (9.0, 0.0), 0.5).moves is Moves.DRIVING
+    assert judged(node(0.995), (9.0, 0.0), 0.5).moves is Moves.UNDECIDED
+    assert judged(node(0.005), (0.0, 0.0), 0.5).moves is Moves.UNDECIDED
+
+
+def test_in_the_egos_path_a_decision_is_kept_until_the_velocity_contradicts_it() -> None:
+    creeps = judged(node(0.999, in_path=True), (1.0, 0.0), 0.5)
+    assert creeps.moves is Moves.UNDECIDED
+    assert creeps.standing is None
+    stands = node(0.999, in_path=True, moves=Moves.STANDING, standing=0.95)
+    assert judged(stands, (0.5, 0.0), 0.5).moves is Moves.STANDING
+    assert judged(stands, (5.0, 0.0), 0.5).moves is Moves.UNDECIDED
+    assert stands.standing is None
+
+
+@pytest.mark.parametrize("vehicle", [node(None), VehicleNode(1, seen_ns=6, standing_seen=0.999)])
+def test_who_is_not_seen_or_not_spoken_of_is_not_judged(vehicle: VehicleNode) -> None:
+    judged(vehicle, (0.0, 0.0), 0.5)
+    assert vehicle.moves is Moves.UNDECIDED
+    assert vehicle.standing is None
+    (u,), (C,) = told_velocities([vehicle], np.array([[3.0, 1.0]]), np.eye(2)[None])
+    np.testing.assert_array_equal(u, [3.0, 1.0])
+    np.testing.assert_array_equal(C, np.eye(2))
+
+
+def driven_past(
+    speed_mps: float, standing: float, config: GraphConfig, weights: WeightsConfig
+) -> list[VehicleEstimate]:
+    """A vehicle 3 m to the side, placed with errors that last, as told by the graph in each of 40 frames at 10 Hz."""
+    graph, told = PoseGraph(config, weights), []
+    for k in range(40):
+        step = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(1.0), cov=tuple((1e-4 * np.eye(3)).ravel()))
+        off_m = 0.6 * math.sin(0.4 * k)
+        seen = VehicleEdge(
+            vehicle=1,
+            frame=k,
+            T_ego_vehicle=SE2(60.0 - k + speed_mps * k / 10.0 + off_m, 3.0),
+            cov=tuple(np.diag([0.5, 0.1, 0.01]).ravel()),
+            standing=standing,
+        )
+        times = dict.fromkeys(("t_source_ns", "t_capture_ns", "t_utc_ns"), k * 100_000_000)
+        m = Measurements(frame_id=k, **times, cc=step if k else None, cv=(seen,), vv=(), cp=())
+        told += graph.optimise(m).vehicles
+    return told
+
+
+def test_planners_are_told() -> None:
+    config, weights = GraphConfig(), WeightsConfig()
+    parked = driven_past(0.0, 0.97, config, weights)
+    assert max(math.hypot(*v.velocity_mps) for v in parked) < 1.0
+    assert parked[0].moves is Moves.UNDECIDED
+    assert parked[-1].moves is Moves.STANDING
+    assert parked[-1].standing > DECIDED
+    assert parked[-1].velocity_mps == (0.0, 0.0)
+    assert parked[-1].velocity_cov[0] >= (1.0 - parked[-1].standing) * 0.01
+    driving = driven_past(8.0, 0.02, config, weights)
+    assert driving[-1].moves is Moves.DRIVING
+    assert driving[-1].velocity_mps[0] == pytest.approx(8.0, abs=1.5)
+    nobody_says = driven_past(0.0, 0.0, config, weights)
+    assert {(v.moves, v.standing) for v in nobody_says} == {(Moves.UNDECIDED, 0.5)}
+    as_published = driven_past(0.0, 0.97, GraphConfig(constant_velocity=False), WeightsConfig(mode="paper"))
+    assert {v.moves for v in as_published} == {Moves.UNDECIDED}
