@@ -13,13 +13,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from birdslam.graph.g2o import g2o_lines
 from birdslam.perf import replay as perf_replay
 from birdslam.runtime.cli import replay as replay_command
 from birdslam.runtime.cli.parser import build_parser
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest
 from birdslam.runtime.nodes.recorder import about
-from birdslam.runtime.recording.recording import Alive, GraphCheckpoint, Recording, RecordingWriter
+from birdslam.runtime.recording.recording import Alive, GraphCheckpoint, Recording, RecordingError, RecordingWriter
 from birdslam.runtime.replay import replay
 from birdslam.runtime.replay.replay import compare
 from birdslam.runtime.replay.report import told
@@ -273,6 +274,24 @@ def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureF
         replay_command.replay(options(tape.path, ["slam.frontend.x=1"], tmp_path / "no"))
     with pytest.raises(ConfigurationError, match="no_such"):
         replay_command.replay(options(tape.path, ["slam.graph.no_such=1"], tmp_path / "no"))
+
+
+def test_the_graph_is_written_as_g2o(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tape, frames = Tape(tmp_path), measured(12)
+    for measurements in frames:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    asked = options(tape.path, ("slam.weights.mode=paper",))
+    asked.g2o = tmp_path / "drive.g2o"
+    assert replay_command.replay(asked) == 0
+    assert "graph in" in capsys.readouterr().out
+    _, weights = replay.back_end(Recording(tape.path))
+    expected = list(g2o_lines(frames, msgspec.structs.replace(weights, mode="paper")))
+    assert sum(line.startswith("EDGE_SE2 ") for line in expected) > len(frames)
+    assert asked.g2o.read_text().splitlines() == expected
+    asked.g2o = tmp_path / "nowhere" / "drive.g2o"
+    with pytest.raises(RecordingError, match="can't be written"):
+        replay_command.replay(asked)
 
 
 @pytest.mark.slow

@@ -78,6 +78,7 @@ def _replay(commands: Commands) -> None:
     _add_settings(replay, text)
     replay.add_argument("--output", type=Path, metavar="DIR", help="where results go; with it they are always written")
     _add_final_results(replay)
+    replay.add_argument("--g2o", type=Path, metavar="FILE.g2o", help="write the graph's edges for other solvers, alone")
     replay.set_defaults(command="replay")
 
 

@@ -14,6 +14,7 @@ import msgspec
 from birdslam.evaluation.final import FinalTracks, last_seen, write_final_ego
 from birdslam.evaluation.results import Recorder, claim_directory
 from birdslam.evaluation.video import DriveVideo, check_video
+from birdslam.graph.g2o import g2o_lines
 from birdslam.runtime.configuration import ConfigurationError, parse_setting
 from birdslam.runtime.progress import Progress
 from birdslam.runtime.recording.recorded_drive import measurements_of
@@ -29,7 +30,9 @@ def replay(options: argparse.Namespace) -> int:
     """`birdslam replay`: 0 where the back end gives the recorded estimates, 1 where not; or new results."""
     with Progress("replay", _size(options.recording), "MB", 1e6) as progress:
         recording = Recording(options.recording, progress.reach)
-        if options.set or options.output or options.smooth or options.video:
+        if options.g2o:
+            said, status = _written_g2o(recording, options), 0
+        elif options.set or options.output or options.smooth or options.video:
             said, status = _results(recording, options), 0
         else:
             said, status = _compared(recording)
@@ -47,6 +50,16 @@ def _compared(recording: Recording) -> tuple[str, int]:
             if now is not None and now != version:
                 lines.append(f"  recorded with {name} {version}, here it is {now}")
     return "\n".join(lines), int(not verdict.same)
+
+
+def _written_g2o(recording: Recording, options: argparse.Namespace) -> str:
+    """Writes the graph of the recorded measurements; says so."""
+    _, weights = _changed(replaying.back_end(recording), dict(parse_setting(text) for text in options.set))
+    try:
+        options.g2o.write_text("".join(f"{line}\n" for line in g2o_lines(measurements_of([recording]), weights)))
+    except OSError as error:
+        raise RecordingError(f"{options.g2o}: can't be written: {error.strerror}") from None
+    return f"graph in {options.g2o}"
 
 
 def _size(path: Path) -> int | None:
