@@ -4,7 +4,7 @@ Every contender takes the same log of `Measurements` in a fresh process with one
 and the same edges of it: CC, CV, VV and CP (Eqs. 6 and 7). "ours" is Eq. 8 on just these; "ours_live" is the graph as
 it is configured by default, with its constant-velocity factor in VV's place. The log has CP edges in one frame of
 four, on our keyframes, so that ours uses them all: as one edge between keyframes, where gtsam has a node for each
-landmark.
+landmark; "incremental_fixed_lag_summed" is gtsam's with that one edge.
 
 What is timed is one frame from decoded record to the poses and covariances of the newest ego and of every vehicle in
 Python: for ours the whole `PoseGraph.optimise`, with lanes, velocities and the finished `Estimate` besides.
@@ -184,6 +184,7 @@ CONTENDERS: dict[str, tuple[Callable[[], Contender], int | None]] = {
     "isam2": (lambda: Smoother("isam2", _LAG_FRAMES), None),
     "incremental_fixed_lag_qr": (lambda: Smoother("incremental_fixed_lag_qr", _LAG_FRAMES), _LAG_FRAMES),
     "incremental_fixed_lag_cholesky": (lambda: Smoother("incremental_fixed_lag_cholesky", _LAG_FRAMES), _LAG_FRAMES),
+    "incremental_fixed_lag_summed": (lambda: Smoother("incremental_fixed_lag_summed", _LAG_FRAMES), _LAG_FRAMES),
     "batch_fixed_lag": (lambda: Smoother("batch_fixed_lag", _LAG_FRAMES), _LAG_FRAMES),
 }
 
