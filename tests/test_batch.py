@@ -117,6 +117,13 @@ def test_a_worker_that_stands_elsewhere_finds_every_file(tmp_path: Path, monkeyp
     assert task.configuration["models"]["detector"]["path"] == str(tmp_path / "net.onnx")
 
 
+def test_many_drives_take_little_memory_each(tmp_path: Path) -> None:
+    (tmp_path / "all.txt").write_text("".join(f"video:film{n}.mp4\n" for n in range(200)))
+    many = made([tmp_path / "all.txt"], ("slam.graph.ego_nodes=6,8",))
+    assert len({task.identity for task in many}) == len(many) == 400
+    assert len({id(task.configuration) for task in many}) == 2
+
+
 def test_drives_of_one_name_have_folders_of_their_own(tmp_path: Path) -> None:
     names = [task.name for task in made([kitti(tmp_path / "a" / "00", 1), kitti(tmp_path / "b" / "00", 1)])]
     assert len(set(names)) == 2

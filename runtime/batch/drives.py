@@ -17,7 +17,7 @@ import msgspec
 from birdslam.datasets.kitti import find_layout
 from birdslam.datasets.recording import DatasetError
 from birdslam.runtime.batch.fetch import is_url
-from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, dump, load, parse_setting
+from birdslam.runtime.configuration import FILE_SCHEMES, ConfigurationError, dump, load, parse_setting
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm")
 BAGS = (".bag", ".db3")
@@ -38,7 +38,7 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
     name: str  # of its folder of results
     uri: str
     settings: dict[str, Any]  # of a sweep, and of the drive alone
-    configuration: dict[str, Any]
+    configuration: dict[str, Any]  # without the source's URI
     identity: str  # of all that its results come from
 
 
@@ -129,31 +129,36 @@ def tasks(
     drives: Sequence[Found], settings: Sequence[Mapping[str, Any]], config: Path | None, overrides: Mapping[str, Any],
     models: Sequence[str],
 ) -> list[Task]:  # fmt: skip
-    """Each drive by each of the settings, drives first. Raises ConfigurationError for what can be none."""
-    made = []
+    """Each drive by each of the settings, drives first. Raises ConfigurationError for what can be none.
+
+    Drives of the same settings share one configuration, without the source's URI: there may be many.
+    """
+    made: list[Task] = []
+    known: dict[bytes, tuple[dict[str, Any], bytes]] = {}
     for drive, name in zip(drives, _names(drives), strict=True):
         for swept in settings:
             own = {**drive.settings, **swept}
-            configuration = load(config, {**overrides, **own, "source.uri": drive.uri, "source.rate": "max"}, models)
-            if configuration.source.loop:
-                raise ConfigurationError("source.loop: a batch takes each drive once")
-            at = "".join(f"@{key}={value}" for key, value in swept.items())
-            made.append(_task(re.sub(r"[^\w.@=+-]", "_", name + at), configuration, own))
+            key = msgspec.json.encode(own, order="deterministic")
+            if key not in known:
+                configuration = load(config, {**overrides, **own, "source.uri": "", "source.rate": "max"}, models)
+                if configuration.source.loop:
+                    raise ConfigurationError("source.loop: a batch takes each drive once")
+                tree = dump(configuration)
+                tree.pop("output")
+                _anchor(tree)
+                known[key] = tree, msgspec.json.encode((version("birdslam"), tree), order="deterministic")
+            tree, encoded = known[key]
+            at = "".join(f"@{setting}={value}" for setting, value in swept.items())
+            made.append(
+                Task(
+                    name=re.sub(r"[^\w.@=+-]", "_", name + at),
+                    uri=drive.uri,
+                    settings=own,
+                    configuration=tree,
+                    identity=hashlib.sha256(encoded + drive.uri.encode()).hexdigest(),
+                )
+            )
     return made
-
-
-def _task(name: str, configuration: Configuration, settings: dict[str, Any]) -> Task:
-    tree = dump(configuration)
-    tree.pop("output")
-    _anchor(tree)
-    encoded = msgspec.json.encode((version("birdslam"), tree), order="deterministic")
-    return Task(
-        name=name,
-        uri=configuration.source.uri,
-        settings=settings,
-        configuration=tree,
-        identity=hashlib.sha256(encoded).hexdigest(),
-    )
 
 
 def _anchor(tree: dict[str, Any]) -> None:
