@@ -21,7 +21,7 @@ import pytest
 
 from birdslam.datasets.opening import open_recording
 from birdslam.datasets.speed_file import read_speeds
-from birdslam.runtime.cli.evaluate_odometry import _pipeline
+from birdslam.runtime.batch.offline import pipeline
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import load
 from birdslam.runtime.environment import ENVIRONMENT
@@ -193,7 +193,7 @@ def _pipeline_records(sequence: Path, overrides: dict[str, Any]) -> Records:
     records: Records = {topic: [] for topic in TOPICS}
     topic_of = {kind: topic for topic, kind in TOPICS.items()}
     recording = open_recording(f"kitti:{sequence}", stride=overrides.get("source.stride", 1))
-    with _pipeline(load(None, overrides)) as measure:
+    with pipeline(load(None, overrides)) as measure:
         for record in measure(recording):
             records[topic_of[type(record)]].append(untimed(record))
     return records
