@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,14 +12,17 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from birdslam.calibration.calibration import CalibrationConfig, CalibrationError, calibrate
 from birdslam.calibration.height_check import VehicleHeightConfig, solve_mounting
 from birdslam.calibration.intrinsics import from_chessboard, read_intrinsics
-from birdslam.datasets.camera_file import load_camera
+from birdslam.datasets.camera_file import camera_text, load_camera
 from birdslam.datasets.recording import DatasetError
 from birdslam.datasets.speed_file import read_speed_curve
 from birdslam.frontend import FrontEndConfig
+from birdslam.geometry.camera import Camera
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.main import main
 from birdslam.types import Frame
@@ -248,6 +252,27 @@ def _said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str
     status = main(["calibrate", *arguments])
     told = capsys.readouterr()
     return status, told.out + told.err
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+@given(
+    st.floats(700.0, 3000.0),
+    st.floats(0.3, 4.0),
+    st.floats(-0.3, 0.3),
+    st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4),
+)
+def test_a_camera_file_that_is_written_is_read_as_it_was(
+    fisheye: bool, focal_px: float, height_m: float, tilt_rad: float, distortion: list[float]
+) -> None:
+    camera = Camera(
+        1242, 375, focal_px, focal_px, 600.5, 180.25, height_m, tilt_rad, -tilt_rad, tuple(distortion), fisheye=fisheye
+    )
+    text = camera_text(camera, ("by hand", "pitch +1.0 +- 0.2 deg"))
+    assert text.startswith("# by hand\n")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "camera.toml"
+        path.write_text(text, encoding="utf-8")
+        assert load_camera(path) == camera
 
 
 @pytest.mark.slow

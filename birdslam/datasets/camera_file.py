@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 
 import msgspec
@@ -19,3 +21,11 @@ def load_camera(path: Path) -> Camera:
         raise DatasetError(f"camera file {path}: can't be read: {error.strerror}") from None
     except (ValueError, msgspec.ValidationError) as error:  # ValueError: no UTF-8, or no TOML
         raise DatasetError(f"camera file {path}: {error}") from None
+
+
+def camera_text(camera: Camera, comments: Iterable[str]) -> str:
+    """What a camera file holds: every field, each number to its last digit, below lines of comment."""
+    lines = [f"# {line}" for line in comments]
+    # A number, a truth value or a list of numbers is written in JSON as in TOML
+    lines += [f"{key} = {json.dumps(value)}" for key, value in msgspec.to_builtins(camera).items()]
+    return "\n".join(lines) + "\n"

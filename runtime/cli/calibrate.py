@@ -14,7 +14,7 @@ import numpy as np
 from birdslam.calibration.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
 from birdslam.calibration.height_check import HeightCheck, KnownLength
 from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
-from birdslam.datasets.camera_file import load_camera
+from birdslam.datasets.camera_file import camera_text, load_camera
 from birdslam.datasets.opening import frame_size, open_recording
 from birdslam.datasets.recording import DatasetError, Recording
 from birdslam.datasets.speed_file import read_speed_curve
@@ -220,12 +220,9 @@ def _report(
 
 
 def _write(path: Path, camera: Camera, report: list[str]) -> None:
-    numbers = msgspec.to_builtins(camera)
-    numbers["distortion"] = list(camera.distortion)
-    lines = [f"# {line}" for line in ("A camera file of BirdSLAM, by `birdslam calibrate`", *report)]
-    lines += [f"{key} = {value!r}" for key, value in numbers.items()]
+    text = camera_text(camera, ("A camera file of BirdSLAM, by `birdslam calibrate`", *report))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise ResultsError(f"camera file {path}: {error.strerror}") from None
