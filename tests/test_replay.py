@@ -295,6 +295,7 @@ def test_the_graph_is_written_as_g2o(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.slow
+@pytest.mark.processes
 @pytest.mark.timeout(600)
 def test_a_long_recording_of_the_running_system_replays(data_dir: Path, tmp_path: Path) -> None:
     clip = data_dir / "kitti_odometry" / "sequences" / "00"

@@ -20,7 +20,7 @@ from birdslam.runtime.batch.drive import Failure, Job
 from birdslam.runtime.batch.drives import Task
 from birdslam.runtime.process.cores import usable_cores
 
-# Of one drive's process with the shipped networks, at the most: measured on KITTI tracking 0005 it is some 0.5 GB
+# Of one drive's process, with room for larger networks: with the shipped ones KITTI tracking 0005 takes 0.6 GB
 PROCESS_BYTES = 1_200_000_000
 _PROGRESS = re.compile(rb"(\d+) (\d+)")
 DETAILS_BYTES = 4000  # of what a process wrote that are kept
