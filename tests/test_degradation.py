@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.frontend import FrontEnd
+from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections, Findings, ModelSpec, Segmentation
 from birdslam.perception.manifest import Schedule
-from birdslam.runtime.configuration import Configuration, DegradationConfig, ModelsConfig, SourceConfig
+from birdslam.runtime.configuration import Configuration, DegradationConfig, ModelsConfig, SourceConfig, complete
 from birdslam.runtime.nodes import inference
 from birdslam.runtime.nodes.degradation import Degradation, Mode, modes
 from birdslam.runtime.nodes.inference import Inference
@@ -143,3 +144,17 @@ def test_coasting_looks_at_few_frames_and_says_so() -> None:
     assert all(r.cc is None for r in coasted)
     assert Status.DEGRADED_ODOMETRY in records[5].status
     assert all(Status.INPUT_STALE in r.status for r in records if r.frame_id in frontend.shown)
+
+
+def test_what_runs_aside_runs_where_nothing_is_to_be_left_out() -> None:
+    configuration = Configuration(
+        vehicle="test", models=ModelsConfig(shipped=False), degradation=DegradationConfig(enabled=False)
+    )
+    configuration = complete(configuration, Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5), 33.0)
+    with Inference(configuration) as networks:
+        node = PerceiveNode(configuration, networks, Blind(), Bus(), FIRST)  # type: ignore[arg-type]
+        node._ring = Ring()  # type: ignore[assignment]
+        assert networks.aside is not None
+        done = networks.aside(lambda: "lanes")
+        assert len(list(node.step(FrameRef(frame_id=0, slot=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0)))) == 1
+        assert done.result(timeout=60.0) == "lanes"

@@ -111,13 +111,13 @@ class PerceiveNode:
         frame = Frame(**stamps(ref), image=image, status=ref.status, speeds=ref.speeds)
         if self._degradation is None:
             yield self._frontend.measure(frame, self._inference.start(frame))
-            return
-        mode = self._degradation.mode
-        yield self._coast(ref) if self._coasts(ref, mode) else self._look(frame, mode)
+        else:
+            mode = self._degradation.mode
+            yield self._coast(ref) if self._coasts(ref, mode) else self._look(frame, mode)
         self._inference.over()
         now_ns = time.monotonic_ns()
         self._keep_pace(ref.frame_id, (now_ns - begun_ns) / 1e6)
-        if self._degradation.judge((now_ns - ref.t_capture_ns) / 1e6):
+        if self._degradation is not None and self._degradation.judge((now_ns - ref.t_capture_ns) / 1e6):
             log.warning("frame %d: mode %s after %s", ref.frame_id, self._degradation.mode, mode)
 
     def _keep_pace(self, frame_id: int, step_ms: float) -> None:
