@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from birdslam.odometry.odometry import Odometry
 from birdslam.perception import ModelError
 from birdslam.perf.errors import PerfError
 from birdslam.perf.figures import Ledger
-from birdslam.perf.starts import SEQUENCES, Drive, Task, networks_of, read, uri_of
+from birdslam.perf.starts import SEQUENCES, Drive, Task, add_drive_options, networks_of, read, uri_of
 from birdslam.types import Status
 
 label = "camera files whose pitch or roll is wrong: found and told within how many metres"
@@ -39,15 +38,12 @@ WAY_M = 20.0
 
 def run(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m perf mounts", description=label)
-    parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="kitti:DIR, or a folder of --data")
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BIRDSLAM_DATA", "../shared/data")))
+    add_drive_options(parser)
     parser.add_argument(
         "--off", type=float, nargs="+", default=OFF_DEG, metavar="DEG", help="of the file, 0 among them"
     )
     parser.add_argument("--way", type=float, default=WAY_M, metavar="M", help="by which the error is to be found")
     parser.add_argument("--images", type=int, default=100, help="of each sequence")
-    parser.add_argument("--networks", action="store_true", help="with the configured networks")
-    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="with this network")
     parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     configuration = networks_of(options)

@@ -11,7 +11,6 @@ drove.
 from __future__ import annotations
 
 import argparse
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from birdslam.odometry.odometry import Odometry
 from birdslam.perception import ModelError
 from birdslam.perf.errors import PerfError
 from birdslam.perf.figures import Ledger
-from birdslam.perf.starts import Drive, Task, is_valid, is_wrong, networks_of, read, uri_of
+from birdslam.perf.starts import Drive, Task, add_drive_options, is_valid, is_wrong, networks_of, read, uri_of
 from birdslam.rendered_world import windscreen
 from birdslam.rendered_world.windscreen import Image
 from birdslam.types import Status
@@ -43,10 +42,7 @@ DRIVES_M = 0.1  # in one image, by the truth: such a car does not stand
 
 def run(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m perf overlays", description=label)
-    parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="kitti:DIR, or a folder of --data")
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BIRDSLAM_DATA", "../shared/data")))
-    parser.add_argument("--networks", action="store_true", help="with the configured networks")
-    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="with this network")
+    add_drive_options(parser)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)

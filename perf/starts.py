@@ -94,12 +94,9 @@ class Task:
 
 def run(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m perf starts", description=label)
-    parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="kitti:DIR, or a folder of --data")
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BIRDSLAM_DATA", "../shared/data")))
+    add_drive_options(parser)
     parser.add_argument("--every", type=int, default=5, help="images from one start to the next")
     parser.add_argument("--images", type=int, default=25, help="of each start")
-    parser.add_argument("--networks", action="store_true", help="with the configured networks")
-    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="with this network")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--output", type=Path, help="folder of starts.json and starts.png")
     options = parser.parse_args(arguments)
@@ -131,6 +128,14 @@ def run(arguments: list[str]) -> None:
     if options.output is not None:
         draw(rows, options.output / "starts.png")
         print(f"results in {options.output}")
+
+
+def add_drive_options(parser: argparse.ArgumentParser) -> None:
+    """Which drives, and which networks look at them."""
+    parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="kitti:DIR, or a folder of --data")
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BIRDSLAM_DATA", "../shared/data")))
+    parser.add_argument("--networks", action="store_true", help="with the configured networks")
+    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="with this network")
 
 
 def networks_of(options: argparse.Namespace) -> Configuration | None:
