@@ -1,9 +1,13 @@
 #!/bin/sh
 # Certificates for the gate: an authority of your own, the vehicle's certificate, one for each planner, and the car's.
+# And for a fleet, in a folder and of an authority of its own: the router's, one for each vehicle and each listener.
 #
 #   certificates.sh DIR vehicle ADDRESS...   ca.pem, vehicle.pem, vehicle.key; ADDRESS: names and IPs planners connect to
 #   certificates.sh DIR planner NAME         NAME.pem, NAME.key; NAME must stand in gate.json5 (cert_common_names)
 #   certificates.sh DIR car                  car.pem, car.key: of the computer that says how fast the car is
+#   certificates.sh DIR router ADDRESS...    router.pem, router.key; ADDRESS: names and IPs that vehicles connect to
+#   certificates.sh DIR uplink NAME          NAME.vehicle.pem, NAME.vehicle.key: of the vehicle NAME of a fleet
+#   certificates.sh DIR planner NAME         also who listens to a fleet; NAME must stand in [router] (listeners)
 #
 # What exists is kept: remove a file to make it anew. ca.key can sign whatever the vehicle believes: keep it elsewhere.
 set -eu
@@ -42,7 +46,7 @@ certificate() { # FILE COMMON_NAME ALTERNATIVE_NAMES USAGE
 }
 
 [ $# -ge 3 ] || [ "${2-}" = car ] ||
-    fail "usage: certificates.sh DIR vehicle ADDRESS... | certificates.sh DIR planner NAME | certificates.sh DIR car"
+    fail "usage: certificates.sh DIR vehicle|router ADDRESS... | certificates.sh DIR planner|uplink NAME | certificates.sh DIR car"
 dir=$1 what=$2
 shift 2
 mkdir -p "$dir"
@@ -50,7 +54,7 @@ work=$(mktemp -d "$dir/.new.XXXXXX")
 trap 'rm -rf "$work"' EXIT
 
 case $what in
-vehicle)
+vehicle | router)
     names=
     for address in "$@"; do
         case $address in
@@ -62,26 +66,36 @@ vehicle)
         names="$names${names:+,}$kind:$address"
     done
     authority
-    certificate vehicle vehicle "$names" serverAuth
+    certificate "$what" "$what" "$names" serverAuth
     ;;
 planner)
     case $1 in
-    *[!A-Za-z0-9_-]* | ca | vehicle | car) fail "a planner's name has letters, digits, '_' and '-', and is not $1" ;;
+    *[!A-Za-z0-9_-]* | ca | vehicle | router | car) fail "a planner's name has letters, digits, '_' and '-', and is not $1" ;;
     esac
     authority
     certificate "$1" "$1" "DNS:$1" clientAuth
+    ;;
+uplink)
+    case $1 in
+    *[!A-Za-z0-9_-]* | [_-]* | "") fail "a vehicle's name has letters, digits, '_' and '-', and is not $1" ;;
+    esac
+    [ ${#1} -le 32 ] || fail "a vehicle's name has 32 characters at most, and is not $1"
+    authority
+    certificate "$1.vehicle" "vehicle $1" "DNS:$1" clientAuth # no planner's name may have a blank in it
     ;;
 car)
     authority
     certificate car "the car" "DNS:car" clientAuth # a name that no planner's certificate has
     ;;
-*) fail "$what: expected vehicle, planner or car" ;;
+*) fail "$what: expected vehicle, planner, car, router or uplink" ;;
 esac
 
 chmod 644 "$dir"/*.pem
-# The service's user reads the vehicle's key, and no other.
-if [ "$(id -u)" = 0 ] && getent group birdslam >/dev/null && [ -e "$dir/vehicle.key" ]; then
-    chgrp birdslam "$dir" "$dir/vehicle.key"
-    chmod 750 "$dir"
-    chmod 640 "$dir/vehicle.key"
-fi
+# The service's user reads the key of the vehicle's gate or of the router, and no other.
+for key in vehicle.key router.key; do
+    if [ "$(id -u)" = 0 ] && getent group birdslam >/dev/null && [ -e "$dir/$key" ]; then
+        chgrp birdslam "$dir" "$dir/$key"
+        chmod 750 "$dir"
+        chmod 640 "$dir/$key"
+    fi
+done

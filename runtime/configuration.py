@@ -24,6 +24,7 @@ from birdslam.runtime import model_store
 from birdslam.runtime.sections import (
     BudgetsConfig,
     DegradationConfig,
+    FleetConfig,
     LooksConfig,
     ModelsConfig,
     NodeScheduling,
@@ -31,8 +32,10 @@ from birdslam.runtime.sections import (
     RealtimeConfig,
     RecordingConfig,
     ResultsConfig,
+    RouterConfig,
     RuntimeConfig,
     SourceConfig,
+    VehicleName,
 )
 from birdslam.slam import SlamConfig
 
@@ -43,6 +46,7 @@ __all__ = [
     "Configuration",
     "ConfigurationError",
     "DegradationConfig",
+    "FleetConfig",
     "LooksConfig",
     "ModelsConfig",
     "NodeScheduling",
@@ -50,6 +54,7 @@ __all__ = [
     "RealtimeConfig",
     "RecordingConfig",
     "ResultsConfig",
+    "RouterConfig",
     "RuntimeConfig",
     "SourceConfig",
     "complete",
@@ -72,7 +77,7 @@ class ConfigurationError(ValueError):
 class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All that a run can be told."""
 
-    vehicle: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")] = "car"  # its name on the bus
+    vehicle: VehicleName = "car"  # its name on the bus
     source: SourceConfig = SourceConfig()
     camera: Camera | None = None  # None: the recording's own; in a file: a table, or the path of a camera file
     # Of the camera file, where it is pinned
@@ -87,6 +92,8 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     atlas: AtlasConfig = AtlasConfig()  # what planners may ask for of the drive so far
     recording: RecordingConfig = RecordingConfig()
     results: ResultsConfig = ResultsConfig()  # beside the live ones, when the drive is over
+    fleet: FleetConfig = FleetConfig()  # of `birdslam uplink`, and of those who listen to many vehicles
+    router: RouterConfig = RouterConfig()  # of `birdslam router` alone
     output: str = "out"  # the folder of results
 
     @property
@@ -212,6 +219,8 @@ def _anchor_paths(tree: dict[str, Any], base: Path) -> None:
     anchor(tree, "camera", "output")
     anchor(tree.get("runtime"), "runtime_dir", "models_dir")
     anchor(tree.get("results"), "video")
+    for name in ("fleet", "router"):
+        anchor(tree.get(name), "ca", "certificate", "key")
     models = tree.get("models")
     for spec in models.values() if isinstance(models, dict) else ():
         if isinstance(spec, dict) and not model_store.is_name(str(spec.get("path", ""))):

@@ -10,6 +10,8 @@ from birdslam.perception import ModelSpec
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS, Role
 from birdslam.ros.bag import BagTopics
 
+VehicleName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")]
+ListenerName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Share = Annotated[float, msgspec.Meta(gt=0.0, le=1.0)]
@@ -227,6 +229,32 @@ class ResultsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     smooth: bool = False  # final trajectories too, by the RTS smoother: tracks/ID.final.tum.txt, ego.final.*
     video: str = ""  # FILE.mp4: the frames with the estimated boxes beside the bird's-eye view; "": none
+
+
+class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How this computer reaches the router of a fleet: as a vehicle that says its estimates, or who listens to all."""
+
+    router: str = ""  # tls/HOST:PORT; "": there is none
+    ca: str = ""  # FILE.pem: the fleet's authority
+    certificate: str = ""  # FILE.pem: this computer's own
+    key: str = ""  # FILE: its private key
+    estimates_hz: Positive | None = None  # of the vehicle's estimates at most so many a second are sent; None: all
+    # Whom a listener expects: it tells of them also where they have never said anything
+    vehicles: tuple[VehicleName, ...] = ()
+
+
+class RouterConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The router of a fleet: who may say something there, who may listen, and how much of it passes."""
+
+    listen: str = "tls/127.0.0.1:7448"  # where vehicles and listeners connect to
+    ca: str = ""  # FILE.pem: the fleet's authority
+    certificate: str = ""  # FILE.pem: the router's own
+    key: str = ""  # FILE: its private key
+    vehicles: tuple[VehicleName, ...] = ()  # each may write its own keys, by a certificate named "vehicle NAME"
+    # The common names of the certificates that may read all vehicles, and write nothing
+    listeners: tuple[ListenerName, ...] = ()
+    # Of a vehicle's messages on one key so many a second pass, the rest is dropped: a flood meets it alone
+    messages_hz: Positive = 200.0
 
 
 class NodeScheduling(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -22,6 +22,7 @@ from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedRea
 
 VERSION = "v1"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}")
+_KEY = re.compile(rf"birdslam/({_NAME.pattern})/{VERSION}/([A-Za-z0-9_/-]+)")
 
 
 @dataclass(frozen=True)
@@ -130,3 +131,14 @@ def alive_key(vehicle: str, node: str) -> str:
     """The key of a node's liveliness token; `node` = "*" stands for all of them."""
     name = node if node == "*" else check_name("node", node)
     return f"birdslam/{check_name('vehicle', vehicle)}/{VERSION}/alive/{name}"
+
+
+def every_key(topic: str) -> str:
+    """The key expression of a topic, a query or `alive/NODE` of every vehicle; `*` stands for all nodes."""
+    return f"birdslam/*/{VERSION}/{topic}"
+
+
+def vehicle_and_topic(key: str) -> tuple[str, str] | None:
+    """What `key_of` and `alive_key` made a key of; None for all that is none of their keys."""
+    match = _KEY.fullmatch(key)
+    return (match[1], match[2]) if match else None

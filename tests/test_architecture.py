@@ -18,7 +18,7 @@ ONLY_IN = {  # third-party library: the packages that may import it
     "numba": {"rendered_world", "training", "perf"},
     "ray": {"runtime.batch"},
     "rosbags": {"ros"},
-    "zenoh": {"runtime.transport", "runtime.gate", "perf"},
+    "zenoh": {"runtime.transport", "runtime.gate", "runtime.fleet", "perf"},
 }
 MOST_MODULES = 20  # that stand directly in birdslam/ and in runtime/
 

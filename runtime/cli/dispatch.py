@@ -76,6 +76,38 @@ def export(options: argparse.Namespace) -> int:
     return exporting.export(options)
 
 
+def top_or_all(options: argparse.Namespace) -> int:
+    """`birdslam top`: one vehicle, or all of a fleet; the latter is imported only here, as no vehicle needs it."""
+    if options.all is None:
+        return top.top(options.vehicle, options.runtime_dir, options.once)
+    from birdslam.runtime.cli import fleet
+
+    return fleet.top_all(options.all, options.once)
+
+
+def listen_or_all(options: argparse.Namespace) -> int:
+    """`birdslam listen`: one vehicle, or all of a fleet."""
+    if options.all is None:
+        return listen.listen(options)
+    from birdslam.runtime.cli import fleet
+
+    return fleet.listen_all(options)
+
+
+def uplink(options: argparse.Namespace) -> int:
+    """`birdslam uplink`."""
+    from birdslam.runtime.cli import fleet
+
+    return fleet.uplink(options)
+
+
+def router(options: argparse.Namespace) -> int:
+    """`birdslam router`."""
+    from birdslam.runtime.cli import fleet
+
+    return fleet.route(options)
+
+
 def batch(options: argparse.Namespace) -> int:
     """`birdslam batch`; imported only here, since no drive needs it."""
     from birdslam.runtime.cli import batch as batching
@@ -102,8 +134,10 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "replay": replay.replay,
     "export": export,
     "view": view,
-    "top": lambda options: top.top(options.vehicle, options.runtime_dir, options.once),
-    "listen": listen.listen,
+    "top": top_or_all,
+    "listen": listen_or_all,
+    "uplink": uplink,
+    "router": router,
     "doctor": doctor.check_machine,
     "interface": interface.print_page,
     "configuration": configuration_page.print_page,

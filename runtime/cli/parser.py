@@ -34,6 +34,8 @@ def build_parser() -> argparse.ArgumentParser:
         _view,
         _top,
         _listen,
+        _uplink,
+        _router,
         _doctor,
         _interface,
         _configuration,
@@ -112,6 +114,7 @@ def _view(commands: Commands) -> None:
 def _top(commands: Commands) -> None:
     top = commands.add_parser("top", help="a live table of the nodes: rates, ages, budgets, restarts")
     _add_vehicle(top)
+    _add_fleet(top)
     top.add_argument("--once", action="store_true", help="one table, and end; 1 where no node is there")
     top.set_defaults(command="top")
 
@@ -119,10 +122,26 @@ def _top(commands: Commands) -> None:
 def _listen(commands: Commands) -> None:
     listen = commands.add_parser("listen", help="print live estimates, as a planner gets them, until the source ends")
     _add_vehicle(listen)
+    _add_fleet(listen)
     listen.add_argument("--json", action="store_true", help="one JSON object a line")
     listen.add_argument("--count", metavar="N", type=int, help="end after N estimates")
     listen.add_argument("--timeout", metavar="S", type=float, help="end, with status 1, when none comes for so long")
     listen.set_defaults(command="listen")
+
+
+def _uplink(commands: Commands) -> None:
+    text = "say a vehicle's estimates at the router of its fleet (table [fleet]), beside its run"
+    uplink = commands.add_parser("uplink", help=text, description=text)
+    uplink.add_argument("config", type=Path, metavar="CONFIG.toml", help="of the vehicle")
+    uplink.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
+    uplink.set_defaults(command="uplink")
+
+
+def _router(commands: Commands) -> None:
+    text = "the router of a fleet (table [router]): each vehicle writes its own keys alone, listeners read"
+    router = commands.add_parser("router", help=text, description=text)
+    router.add_argument("config", type=Path, metavar="CONFIG.toml")
+    router.set_defaults(command="router")
 
 
 # --- the machine, the camera, the networks ---
@@ -315,6 +334,11 @@ def _add_topics(parser: argparse.ArgumentParser, *more: str) -> None:
 def _add_vehicle(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vehicle", metavar="NAME", default="car")
     parser.add_argument("--runtime-dir", metavar="DIR", type=Path, help="as runtime.runtime_dir of the run")
+
+
+def _add_fleet(parser: argparse.ArgumentParser) -> None:
+    text = "all vehicles at the router that this file names in [fleet]"
+    parser.add_argument("--all", type=Path, metavar="CONFIG.toml", help=text)
 
 
 def _add_config(parser: argparse.ArgumentParser) -> None:

@@ -16,14 +16,14 @@ Never fork after a Bus was opened (spawn instead), and always close it: zenoh's 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import zenoh
 
-from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, check_name, key_of
+from birdslam.runtime.topology import PROCESSES, TOPICS, alive_key, check_name, key_of
 from birdslam.runtime.transport.endpoints import (
     BusClosed,
     BusError,
@@ -31,16 +31,15 @@ from birdslam.runtime.transport.endpoints import (
     MessagesLost,
     Publisher,
     Subscriber,
-    attached,
     message_of,
 )
 from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
 from birdslam.runtime.transport.queries import QueryHandler, QueryResponder
+from birdslam.runtime.transport.replies import REPLY_S, replies, whole_reply
 from birdslam.runtime.transport.session import session_config
-from birdslam.runtime.wire import Part, WireError, decode
+from birdslam.runtime.wire import WireError
 
 _LOSSLESS_DEPTH = 4_096
-_REPLY_S, _REPLIES = 2.0, 256  # how long a query waits, and how many messages its reply may have
 
 __all__ = ["Bus", "BusClosed", "BusError", "Message", "MessagesLost", "Publisher", "Subscriber"]
 
@@ -100,51 +99,27 @@ class Bus:
         """Gives a subscriber that came late the topic's last message, when it comes; waits for nothing."""
         self._check_open()
         callback = zenoh.handlers.Callback(subscriber._receive_kept, indirect=False)
-        self._session.get(key_of(self.vehicle, topic), callback, timeout=_REPLY_S)
+        self._session.get(key_of(self.vehicle, topic), callback, timeout=REPLY_S)
 
-    def kept(self, topic: str, timeout_s: float = _REPLY_S) -> list[Message]:
+    def kept(self, topic: str, timeout_s: float = REPLY_S) -> list[Message]:
         """The topic's kept messages (Topic.kept), oldest first; empty where nobody answers in time.
 
         Raises BusError where one is no such record.
         """
         key, record = key_of(self.vehicle, topic), TOPICS[topic].record
         try:
-            return [message_of(sample, key, record) for sample in self._get(key, timeout_s)]
+            self._check_open()
+            return [message_of(sample, key, record) for sample in replies(self._session, key, timeout_s)]
         except WireError as error:
             raise BusError(f"{topic}: a kept message is malformed: {error}") from error
 
-    def query(self, name: str, timeout_s: float = _REPLY_S, **parameters: float) -> list[Any]:
+    def query(self, name: str, timeout_s: float = REPLY_S, **parameters: float) -> list[Any]:
         """The parts of the reply to one of topology.QUERIES, in order; empty where nobody answers in time.
 
         Raises BusError with the reason where the query is refused, or where the reply is incomplete or malformed.
         """
-        spec, key = QUERIES[name], key_of(self.vehicle, name)
-        given = {parameter: f"{value:g}" for parameter, value in parameters.items()}
-        parts: dict[int, Any] = {}
-        of = 0
-        try:
-            for sample in self._get(zenoh.Selector(key, given), timeout_s):
-                part = attached(sample, Part) or Part()
-                parts[part.number], of = decode(bytes(sample.payload), spec.record), part.of
-        except WireError as error:
-            raise BusError(f"{name}: the reply is malformed: {error}") from error
-        if sorted(parts) != list(range(of)):
-            raise BusError(f"{name}: {len(parts)} of the reply's {of} parts came")
-        return [parts[number] for number in range(of)]
-
-    def _get(self, selector: str | zenoh.Selector, timeout_s: float) -> Iterator[zenoh.Sample]:
         self._check_open()
-        replies = self._session.get(
-            selector,
-            zenoh.handlers.FifoChannel(_REPLIES),
-            timeout=timeout_s,
-            consolidation=zenoh.ConsolidationMode.NONE,  # all of them, not the last one alone
-        )
-        for reply in replies:
-            if reply.ok is not None:
-                yield reply.ok
-            elif reply.err is not None:
-                raise BusError(f"{selector}: {bytes(reply.err.payload).decode(errors='replace')}")
+        return whole_reply(self._session, self.vehicle, name, timeout_s, parameters)
 
     def answer_queries(self, handlers: Mapping[str, QueryHandler]) -> None:
         """Answers the queries of these names (topology.QUERIES) until the bus is closed."""

@@ -1,0 +1,7 @@
+"""Many vehicles on one network: each says its estimates at a router, and whoever is let in listens to all of them.
+
+    vehicle's bus --> [uplink] --mutual TLS--> [router] --mutual TLS--> listeners: `birdslam top --all`, Fleet
+
+`uplink` is a planner of its own vehicle's bus that says again what it hears; nothing comes in through it but queries.
+`router` lets each vehicle write its own keys alone. `listener` is the client of all vehicles. docs/fleet.md sets it up.
+"""

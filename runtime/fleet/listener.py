@@ -1,0 +1,338 @@
+"""The client of a whole fleet: each vehicle's newest estimate, with alive, on time and valid kept apart.
+
+    from birdslam.runtime.configuration import FleetConfig
+    from birdslam.runtime.fleet.listener import Fleet
+
+    here = FleetConfig(router="tls/10.0.0.1:7448", ca="ca.pem", certificate="operator.pem", key="operator.key")
+    with Fleet(here) as fleet:
+        for reading in fleet.estimates(max_age_ms=500):    # of whichever vehicle; each as it comes, or that none came
+            if not reading.usable:
+                look_after(reading.vehicle)                # not alive, not on time, or not valid
+
+    for reading in fleet.readings(max_age_ms=500):         # or the newest one of each, whenever you need them
+
+It keeps one message of each vehicle, the newest, and decodes it when it is read: whoever reads slowly reads less and
+newer, and a vehicle that floods takes nothing from the others, which are read in turn.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Self
+
+import zenoh
+
+from birdslam.queries import MapSnapshot, Trajectory
+from birdslam.runtime.configuration import FleetConfig
+from birdslam.runtime.fleet.link import open_link
+from birdslam.runtime.topology import TOPICS, check_name, every_key, key_of, vehicle_and_topic
+from birdslam.runtime.transport.bus import BusClosed
+from birdslam.runtime.transport.endpoints import attached
+from birdslam.runtime.transport.replies import REPLY_S, whole_reply
+from birdslam.runtime.transport.reply_parts import whole_map, whole_trajectory
+from birdslam.runtime.wire import Health, Trace, WireError, decode
+from birdslam.types import INVALIDATING, Estimate
+
+MOST_VEHICLES = 1_000  # of those that are not expected: what more says something is counted, not kept
+CLOCKS_APART_MS = 50.0  # an estimate that is younger than now by more is not on time: one of the two clocks is wrong
+_SWEEPS = 4  # so often within max_age_ms it is looked who has fallen silent
+_NO_TRACE = Trace()
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FleetReading:
+    """The newest estimate of one vehicle, and three different things to know about it.
+
+    `alive`: its optimizer runs, and is reached. `on_time`: the estimate is young enough. `valid`: it says that it may
+    be driven by. `age_ms` is the time since the camera took the frame (Estimate.t_utc_ns): keep the clocks of both
+    computers synchronised (PTP, NTP). `silent_ms` needs only this computer's: the time since its last message came.
+    Both are infinite where there is none.
+    """
+
+    vehicle: str
+    estimate: Estimate | None
+    alive: bool
+    on_time: bool
+    valid: bool
+    age_ms: float
+    silent_ms: float
+    lost: int = 0  # of its estimates, on the way here, since this client listens: its sender numbers them
+    trace: Trace = _NO_TRACE  # where its time went; the stamps are of the vehicle's own clock
+
+    @property
+    def usable(self) -> bool:
+        """Alive, on time and valid, all three."""
+        return self.alive and self.on_time and self.valid
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What has come of one vehicle since this client listens."""
+
+    estimates: int
+    received_bytes: int  # payloads and attachments of all its messages
+    lost: int
+    malformed: int
+
+
+@dataclass
+class _Slot:
+    """One vehicle. `fresh`: its newest estimate has not been read; `waiting`: those bytes have not been decoded."""
+
+    alive: set[str] = field(default_factory=set)
+    fresh: bool = False
+    waiting: bytes | None = None
+    estimate: Estimate | None = None
+    trace: Trace = _NO_TRACE
+    t_received_ns: int = 0
+    estimates: int = 0
+    received_bytes: int = 0
+    lost: int = 0
+    malformed: int = 0
+    t_told_ns: int = 0  # when a reading of it was last given by `estimates`
+    healths: dict[str, bytes] = field(default_factory=dict)
+
+
+class Fleet:
+    """A subscriber of all vehicles' estimates at one router; a context manager.
+
+    Vehicles that `config.vehicles` names are told of from the beginning, others once something of them was heard.
+    Raises ConfigurationError for a table that can't be, BusError where no router lets it in within `timeout_s`.
+    """
+
+    def __init__(self, config: FleetConfig, timeout_s: float = 10.0) -> None:
+        self._slots: dict[str, _Slot] = {check_name("vehicle", name): _Slot() for name in config.vehicles}
+        self._unread: deque[str] = deque()  # vehicles in the order in which their unread news began
+        self._changed = threading.Condition()
+        self._closed = False
+        self.refused = 0  # messages under keys that no vehicle has, or of more vehicles than are kept
+        self._session = open_link(config, timeout_s)
+        declare = self._session.declare_subscriber
+        self._subscribers: list[Any] = [
+            declare(every_key("estimate"), zenoh.handlers.Callback(self._receive, indirect=False)),
+            declare(every_key("health/*"), zenoh.handlers.Callback(self._receive_health, indirect=False)),
+            self._session.liveliness().declare_subscriber(
+                every_key("alive/*"), zenoh.handlers.Callback(self._liveliness_changed, indirect=False), history=True
+            ),
+        ]
+
+    # --- what zenoh calls, on its own threads ---
+
+    def _slot_of(self, key: str) -> tuple[str, str, _Slot] | None:
+        """(vehicle, topic, slot) of a key, with the lock held; None where nothing is kept of it."""
+        named = vehicle_and_topic(key)
+        if named is None or (named[0] not in self._slots and len(self._slots) >= MOST_VEHICLES):
+            self.refused += 1
+            if self.refused == 1:
+                log.warning("%.100s: nothing is kept of this, and of what is like it", key)
+            return None
+        return named[0], named[1], self._slots.setdefault(named[0], _Slot())
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        t_received_ns = time.monotonic_ns()
+        payload = bytes(sample.payload)
+        size = len(payload) + (0 if sample.attachment is None else len(sample.attachment))
+        with self._changed:
+            found = self._slot_of(str(sample.key_expr))
+            if found is None:
+                return
+            vehicle, _, slot = found
+            slot.received_bytes += size
+            try:
+                trace = attached(sample, Trace) or _NO_TRACE
+                if sample.kind != zenoh.SampleKind.PUT:
+                    raise WireError(f"sent as {sample.kind}")
+            except WireError as error:
+                self._count_malformed(vehicle, slot, error)
+                return
+            if slot.trace.number and trace.number:
+                slot.lost += max(0, trace.number - slot.trace.number - 1)  # a sender that began anew counts from 1 on
+            slot.waiting, slot.trace, slot.t_received_ns = payload, trace, t_received_ns
+            slot.estimates += 1
+            if not slot.fresh:
+                slot.fresh = True
+                self._unread.append(vehicle)
+                self._changed.notify_all()
+
+    def _receive_kept(self, reply: zenoh.Reply) -> None:
+        """A vehicle's last estimate of before this client; it counts only where none came since."""
+        if reply.ok is not None:
+            named = vehicle_and_topic(str(reply.ok.key_expr))
+            with self._changed:
+                missed = named is not None and named[0] in self._slots and not self._slots[named[0]].t_received_ns
+            if missed:
+                self._receive(reply.ok)
+
+    def _receive_health(self, sample: zenoh.Sample) -> None:
+        payload = bytes(sample.payload)
+        with self._changed:
+            found = self._slot_of(str(sample.key_expr))
+            if found is not None and found[1] in TOPICS:
+                found[2].healths[found[1].rpartition("/")[2]] = payload
+                found[2].received_bytes += len(payload) + (0 if sample.attachment is None else len(sample.attachment))
+
+    def _liveliness_changed(self, sample: zenoh.Sample) -> None:
+        alive = sample.kind == zenoh.SampleKind.PUT
+        with self._changed:
+            found = self._slot_of(str(sample.key_expr))
+            if found is None:
+                return
+            vehicle, topic, slot = found
+            node = topic.rpartition("/")[2]
+            (slot.alive.add if alive else slot.alive.discard)(node)
+            asks = alive and node == "optimize" and not slot.t_received_ns
+            self._changed.notify_all()
+        if asks:
+            callback = zenoh.handlers.Callback(self._receive_kept, indirect=False)
+            self._session.get(key_of(vehicle, "estimate"), callback, timeout=REPLY_S)
+
+    @staticmethod
+    def _count_malformed(vehicle: str, slot: _Slot, error: WireError) -> None:
+        slot.malformed += 1
+        if slot.malformed == 1:
+            log.warning("vehicle %s: a malformed message is ignored, and all that follow: %s", vehicle, error)
+
+    # --- what the user calls ---
+
+    @property
+    def connected(self) -> bool:
+        """Whether the router is reached now. Without it all vehicles are soon not alive."""
+        return bool(self._session.info.routers_zid())
+
+    @property
+    def vehicles(self) -> tuple[str, ...]:
+        """Those that were expected or heard of, by name."""
+        with self._changed:
+            return tuple(sorted(self._slots))
+
+    def alive(self, vehicle: str) -> frozenset[str]:
+        """The nodes of a vehicle that are alive. Raises KeyError for one that nobody has heard of."""
+        with self._changed:
+            return frozenset(self._slots[vehicle].alive)
+
+    def heard(self, vehicle: str) -> Heard:
+        """What has come of a vehicle so far. Raises KeyError for one that nobody has heard of."""
+        with self._changed:
+            slot = self._slots[vehicle]
+            return Heard(slot.estimates, slot.received_bytes, slot.lost, slot.malformed)
+
+    def latest(self, vehicle: str, max_age_ms: float = 500.0) -> FleetReading:
+        """The newest estimate of one vehicle so far, at once. Raises KeyError for one that nobody has heard of."""
+        with self._changed:
+            return self._reading(vehicle, self._slots[vehicle], max_age_ms)
+
+    def readings(self, max_age_ms: float = 500.0) -> tuple[FleetReading, ...]:
+        """The newest estimate of each vehicle so far, at once, by name; of those that fell silent too."""
+        return tuple(self.latest(vehicle, max_age_ms) for vehicle in self.vehicles)
+
+    def wait(self, timeout_s: float | None = None, max_age_ms: float = 500.0) -> FleetReading | None:
+        """The newest estimate of the vehicle whose news has waited longest; None where none came in time.
+
+        Raises BusClosed once closed, from another thread too.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._unread, timeout_s)
+            if self._closed:
+                raise BusClosed("the client of the fleet is closed")
+            if not self._unread:
+                return None
+            vehicle = self._unread.popleft()
+            slot = self._slots[vehicle]
+            slot.fresh = False
+            return self._reading(vehicle, slot, max_age_ms)
+
+    def estimates(self, max_age_ms: float = 500.0) -> Iterator[FleetReading]:
+        """A reading of each vehicle's estimates as they come, for as long as the client is open.
+
+        Never silence: of a vehicle whose newest estimate is older than `max_age_ms`, or that has none, a reading says
+        so once in each `max_age_ms`. Of a vehicle's estimates that come between two readings only the newest is left.
+        """
+        period_ns = round(max_age_ms * 1e6)
+        sweep_ns = time.monotonic_ns() + period_ns
+        while True:
+            try:
+                reading = self.wait(max(0.0, (sweep_ns - time.monotonic_ns()) / 1e9), max_age_ms)
+            except BusClosed:
+                return
+            now_ns = time.monotonic_ns()
+            if reading is not None and reading.estimate is not None:
+                self._slots[reading.vehicle].t_told_ns = now_ns
+                yield reading
+            if now_ns >= sweep_ns:
+                sweep_ns = now_ns + period_ns // _SWEEPS
+                for vehicle in self.vehicles:
+                    slot = self._slots[vehicle]
+                    if now_ns - slot.t_told_ns >= period_ns and not (late := self.latest(vehicle, max_age_ms)).on_time:
+                        slot.t_told_ns = now_ns
+                        yield late
+
+    def _reading(self, vehicle: str, slot: _Slot, max_age_ms: float) -> FleetReading:
+        """With the lock held."""
+        if slot.waiting is not None:
+            try:
+                slot.estimate = decode(slot.waiting, Estimate)
+            except WireError as error:
+                self._count_malformed(vehicle, slot, error)
+            slot.waiting = None
+        alive, estimate = "optimize" in slot.alive, slot.estimate
+        silent_ms = (time.monotonic_ns() - slot.t_received_ns) / 1e6 if slot.t_received_ns else float("inf")
+        if estimate is None:
+            return FleetReading(vehicle, None, alive, False, False, float("inf"), silent_ms, slot.lost)
+        age_ms = (time.time_ns() - estimate.t_utc_ns) / 1e6
+        on_time = -CLOCKS_APART_MS <= age_ms <= max_age_ms
+        valid = estimate.valid and INVALIDATING.isdisjoint(estimate.status)
+        return FleetReading(vehicle, estimate, alive, on_time, valid, age_ms, silent_ms, slot.lost, slot.trace)
+
+    def health(self, vehicle: str, node: str) -> Health | None:
+        """What a vehicle's node said last of itself; None where nothing of it was heard, or it was no health."""
+        with self._changed:
+            slot = self._slots.get(vehicle)
+            said = slot.healths.get(node) if slot else None
+        try:
+            return None if said is None else decode(said, Health)
+        except WireError:
+            return None
+
+    def map(self, vehicle: str, timeout_s: float = REPLY_S) -> MapSnapshot | None:
+        """A vehicle's whole map of its newest epoch; None where nobody answers.
+
+        Raises BusError with the reason where it is refused, or where a part of it was lost.
+        """
+        parts = whole_reply(self._session, vehicle, "map", timeout_s, {})
+        return whole_map(parts) if parts else None
+
+    def trajectory(self, vehicle: str, last_s: float | None = None, timeout_s: float = REPLY_S) -> Trajectory | None:
+        """Where a vehicle and all that it saw have been, in its newest epoch or its last `last_s`; else as `map`."""
+        parameters = {} if last_s is None else {"last_s": last_s}
+        parts = whole_reply(self._session, vehicle, "trajectory", timeout_s, parameters)
+        return whole_trajectory(parts) if parts else None
+
+    def configuration(self, vehicle: str, timeout_s: float = REPLY_S) -> dict[str, Any] | None:
+        """A vehicle's configuration as plain data, as in summary.json; else as `map`."""
+        parts = whole_reply(self._session, vehicle, "configuration", timeout_s, {})
+        return parts[0] if parts else None
+
+    def close(self) -> None:
+        """Leaves the router, and wakes who waits; a second call does nothing."""
+        with self._changed:
+            if self._closed:
+                return
+            self._closed = True
+            self._changed.notify_all()
+        self._session.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

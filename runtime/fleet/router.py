@@ -1,0 +1,124 @@
+"""The router of a fleet: `birdslam router CONFIG.toml`, with the tables [router] that says who may do what.
+
+A zenoh session in router mode. A vehicle's certificate, by its common name "vehicle NAME", may write the keys of NAME
+and answer queries of them, and read nothing; a listener's may read and query all, and write nothing; everything else
+is denied. A vehicle that floods is thinned as it comes in, before it meets anybody else's messages.
+"""
+
+from __future__ import annotations
+
+import signal
+from typing import Any
+
+import zenoh
+
+from birdslam.runtime.configuration import ConfigurationError, RouterConfig
+from birdslam.runtime.fleet.link import check, settings_of, zenoh_config
+from birdslam.runtime.process.notify import Notifier
+from birdslam.runtime.topology import QUERIES, VERSION, every_key
+
+_LOOK_S = 1.0
+SAID = ("estimate", "health/*")  # what leaves a vehicle by itself; no images, no measurements
+ASKED = (*SAID, *QUERIES)  # what it answers queries of
+ALIVE = "alive/*"
+
+
+def router_config(config: RouterConfig) -> zenoh.Config:
+    """Of the router's session. Raises ConfigurationError, which names the key."""
+    check("router", config, "listen")
+    if not config.vehicles:
+        raise ConfigurationError("router.vehicles: name those that may say something here")
+    settings = settings_of("router") | {
+        "listen/endpoints": [config.listen],
+        "transport/link/tls": {
+            "enable_mtls": True,
+            "root_ca_certificate": config.ca,
+            "listen_certificate": config.certificate,
+            "listen_private_key": config.key,
+        },
+        "access_control": access_control(config.vehicles, config.listeners),
+        "downsampling": [
+            {
+                "id": "no flood",
+                "flows": ["ingress"],
+                "messages": ["put", "delete"],
+                "rules": [{"key_expr": every_key(topic), "freq": config.messages_hz} for topic in SAID],
+            }
+        ],
+    }
+    return zenoh_config(settings)
+
+
+def access_control(vehicles: tuple[str, ...], listeners: tuple[str, ...]) -> dict[str, Any]:
+    """zenoh's access control: what is not allowed here is denied."""
+    rules = [
+        _rule("vehicles are asked", "egress", ["declare_subscriber", "query"], map(every_key, ASKED)),
+        _rule(
+            "vehicles are watched", "egress", ["declare_liveliness_subscriber", "liveliness_query"], [every_key(ALIVE)]
+        ),
+    ]
+    subjects: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+    for vehicle in vehicles:
+        base = f"birdslam/{vehicle}/{VERSION}"
+        rules += [
+            _rule(f"{vehicle} says", "ingress", ["put"], [f"{base}/{topic}" for topic in SAID]),
+            _rule(f"{vehicle} answers", "ingress", ["declare_queryable", "reply"], [f"{base}/{t}" for t in ASKED]),
+            _rule(f"{vehicle} is alive", "ingress", ["liveliness_token"], [f"{base}/{ALIVE}"]),
+        ]
+        subjects.append(_subject(f"vehicle {vehicle}", [f"vehicle {vehicle}"]))
+        own = [rule["id"] for rule in rules[-3:]]
+        policies.append(_policy(f"vehicle {vehicle}", [*own, "vehicles are asked", "vehicles are watched"]))
+    if listeners:
+        rules += [
+            _rule("listeners ask", "ingress", ["declare_subscriber", "query"], map(every_key, ASKED)),
+            _rule(
+                "listeners watch",
+                "ingress",
+                ["declare_liveliness_subscriber", "liveliness_query"],
+                [every_key(ALIVE)],
+            ),
+            _rule("listeners hear", "egress", ["put", "reply"], map(every_key, ASKED)),
+            _rule("listeners see who lives", "egress", ["liveliness_token"], [every_key(ALIVE)]),
+        ]
+        subjects.append(_subject("listeners", list(listeners)))
+        policies.append(_policy("listeners", [rule["id"] for rule in rules[-4:]]))
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def _rule(name: str, flow: str, messages: list[str], keys: Any) -> dict[str, Any]:
+    return {"id": name, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": list(keys)}
+
+
+def _subject(name: str, common_names: list[str]) -> dict[str, Any]:
+    return {"id": name, "link_protocols": ["tls"], "cert_common_names": common_names}
+
+
+def _policy(name: str, rules: list[str]) -> dict[str, Any]:
+    return {"id": name, "subjects": [name], "rules": rules}
+
+
+def run(config: RouterConfig) -> None:
+    """Routes until SIGTERM or SIGINT. Raises ConfigurationError."""
+    signals = {signal.SIGTERM, signal.SIGINT}
+    settings = router_config(config)
+    signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # before zenoh's threads, which inherit it
+    # Who was refused, and why, on standard error; RUST_LOG says otherwise
+    zenoh.init_log_from_env_or("error,zenoh_link_tls=warn,zenoh::net::routing::interceptor::access_control=info")
+    try:
+        session = zenoh.open(settings)
+    except zenoh.ZError as error:
+        raise ConfigurationError(f"router.listen {config.listen}: the router can't be opened: {error}") from error
+    notifier = Notifier()
+    with session:
+        print(f"the router is open for {len(config.vehicles)} vehicles: {config.listen}", flush=True)
+        notifier.once("READY=1")
+        while signal.sigtimedwait(signals, notifier.period_s or _LOOK_S) is None:
+            notifier.alive(f"{len(config.vehicles)} vehicles may speak, open at {config.listen}")
+        notifier.once("STOPPING=1")

@@ -1,0 +1,182 @@
+"""A vehicle's way to the router of its fleet: `birdslam uplink CONFIG.toml`, with the table [fleet].
+
+A process of its own, and of its vehicle's bus a planner like any other: it can slow nothing down, and only queries come
+in through it. It says again what it hears: estimates (`fleet.estimates_hz` of them at most), the nodes' healths, which
+nodes are alive; and it answers what a planner may query. Images and measurements stay in the vehicle. Everything is
+sent with congestion control DROP: a slow network loses messages, which the listener counts.
+"""
+
+from __future__ import annotations
+
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+import zenoh
+
+from birdslam.runtime.configuration import Configuration, ConfigurationError, FleetConfig
+from birdslam.runtime.fleet.link import check, open_link
+from birdslam.runtime.process.notify import Notifier
+from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, key_of
+from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, Publisher, Subscriber
+from birdslam.runtime.transport.queries import QueryRefused, QueryResponder, positive
+from birdslam.runtime.wire import Stage, Trace, WireError
+
+TOPICS_SAID = ("estimate", *(f"health/{node}" for node in PROCESSES))
+_NODE = "uplink"
+_MOST_STAGES = 7  # of a trace that comes in, so that one more fits
+_TRY_S = 2.0  # one attempt to reach the router
+_TELL_S = 60.0  # between two lines that say that there is none
+_LOOK_S = 1.0
+
+
+class Uplink:
+    """Says again at the router what a vehicle says on its bus, until it is closed, and the session with it.
+
+    A context manager. Raises as Bus does.
+    """
+
+    def __init__(self, vehicle: str, config: FleetConfig, session: zenoh.Session, runtime_dir: Path | None = None):
+        self._session, self._vehicle = session, vehicle
+        self._period_ns = 0 if config.estimates_hz is None else round(1e9 / config.estimates_hz)
+        self._bus = Bus(vehicle, f"{_NODE}-{threading.get_native_id()}", runtime_dir=runtime_dir)
+        self._subscribers = {topic: self._bus.subscriber(topic) for topic in TOPICS_SAID}
+        self._publishers = {
+            topic: Publisher(session, key_of(vehicle, topic), TOPICS[topic], _NODE, lossless=False)
+            for topic in TOPICS_SAID
+        }
+        handlers = {key_of(vehicle, name): self._handler(name) for name in QUERIES}
+        self._responder = QueryResponder(session, handlers)
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._changes: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
+        self._threads = [
+            threading.Thread(target=self._forward, args=(topic,), name=topic, daemon=True) for topic in TOPICS_SAID
+        ]
+        self._threads.append(threading.Thread(target=self._tell_who_lives, name="alive", daemon=True))
+        for thread in self._threads:
+            thread.start()
+        self._bus.on_alive(self._alive_changed)
+
+    @property
+    def alive(self) -> frozenset[str]:
+        """The vehicle's nodes that are alive."""
+        return self._bus.alive & set(PROCESSES)
+
+    def _alive_changed(self, node: str, alive: bool) -> None:
+        if node not in PROCESSES:  # others than the vehicle's nodes are nobody's business
+            return
+        self._changes.put((node, alive))
+        if alive:
+            for topic in (f"health/{node}", *(["estimate"] if node == "optimize" else [])):
+                if self._subscribers[topic].newest is None:
+                    self._bus.catch_up(topic, self._subscribers[topic])
+
+    def _tell_who_lives(self) -> None:
+        """On a thread of its own: zenoh's own is never kept waiting for the network."""
+        while (change := self._changes.get()) is not None:
+            node, alive = change
+            if alive and node not in self._tokens:
+                self._tokens[node] = self._session.liveliness().declare_token(alive_key(self._vehicle, node))
+            elif not alive and node in self._tokens:
+                self._tokens.pop(node).undeclare()
+
+    def _forward(self, topic: str) -> None:
+        subscriber: Subscriber = self._subscribers[topic]
+        publisher = self._publishers[topic]
+        period_ns, due_ns = self._period_ns if topic == "estimate" else 0, 0
+        while True:
+            try:
+                message = subscriber.recv()
+                if message is None:
+                    continue
+                now_ns = time.monotonic_ns()
+                if now_ns < due_ns:
+                    continue
+                due_ns = max(due_ns + period_ns, now_ns)  # the rate in the mean, and no burst after a pause
+                publisher.put(message.record, _lengthened(message.trace, message.t_received_ns, now_ns))
+            except BusClosed:
+                return
+            except (BusError, WireError) as error:  # this message alone
+                print(f"birdslam: uplink: {topic}: {error}", file=sys.stderr, flush=True)
+
+    def _handler(self, name: str) -> Any:
+        def ask(parameters: Mapping[str, str]) -> Sequence[msgspec.Struct]:
+            given = {key: value for key in QUERIES[name].parameters if (value := positive(parameters, key)) is not None}
+            try:
+                return self._bus.query(name, **given)
+            except BusError as error:
+                raise QueryRefused(str(error)) from error
+
+        return ask
+
+    def close(self) -> None:
+        """Says nothing more; the vehicle's nodes are then not alive for the fleet."""
+        self._bus.close()  # wakes those that forward
+        self._changes.put(None)
+        for thread in self._threads:
+            thread.join()
+        self._responder.close()
+        self._session.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _lengthened(trace: Trace, received_ns: int, done_ns: int) -> Trace:
+    """With the uplink's own stage; what was left of the budget stays in it."""
+    stages = (*trace.stages[:_MOST_STAGES], Stage(_NODE, received_ns, done_ns))
+    return msgspec.structs.replace(trace, stages=stages)
+
+
+def run(configuration: Configuration) -> None:
+    """Until SIGTERM or SIGINT; waits for the router, for ever. Raises ConfigurationError, and as Bus does."""
+    vehicle, config = configuration.vehicle, configuration.fleet
+    if not config.router:
+        raise ConfigurationError("fleet.router: there is none: where to does this vehicle speak?")
+    check("fleet", config, "router")
+    signals = {signal.SIGTERM, signal.SIGINT}
+    signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # before zenoh's threads, which inherit it
+    zenoh.init_log_from_env_or("error")
+    notifier = Notifier()
+    notifier.once("READY=1")  # the vehicle waits for no network
+    session = _wait_for_router(config, notifier, signals)
+    if session is None:
+        return
+    reached: bool | None = None
+    with Uplink(vehicle, config, session, configuration.runtime_dir) as uplink:
+        while True:
+            if (now := bool(session.info.routers_zid())) != reached:
+                reached = now
+                said = f"speaks at {config.router}" if now else f"has lost {config.router} and looks for it"
+                print(f"the uplink of vehicle {vehicle!r} {said}", flush=True)
+            notifier.alive(f"router {'reached' if reached else 'GONE'}, {len(uplink.alive)} nodes alive")
+            if signal.sigtimedwait(signals, notifier.period_s or _LOOK_S) is not None:
+                break
+        notifier.once("STOPPING=1")
+
+
+def _wait_for_router(config: FleetConfig, notifier: Notifier, signals: set[signal.Signals]) -> zenoh.Session | None:
+    """The session, as soon as it can be had; None where a signal came first."""
+    told_s = -_TELL_S
+    while True:
+        try:
+            return open_link(config, _TRY_S)
+        except BusError as error:
+            if time.monotonic() - told_s >= _TELL_S:
+                told_s = time.monotonic()
+                print(f"birdslam: uplink: {error}", file=sys.stderr, flush=True)
+        notifier.alive(f"looks for {config.router}")
+        if signal.sigtimedwait(signals, 0.0) is not None:
+            return None

@@ -1,0 +1,51 @@
+"""The asking side of a query: what came back, whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import zenoh
+
+from birdslam.runtime.topology import QUERIES, key_of
+from birdslam.runtime.transport.endpoints import BusError, attached
+from birdslam.runtime.wire import Part, WireError, decode
+
+REPLY_S, _REPLIES = 2.0, 256  # how long a query waits, and how many messages its reply may have
+
+
+def replies(session: zenoh.Session, selector: str | zenoh.Selector, timeout_s: float) -> Iterator[zenoh.Sample]:
+    """The messages that answer a query, as they come. Raises BusError with the reason where it is refused."""
+    found = session.get(
+        selector,
+        zenoh.handlers.FifoChannel(_REPLIES),
+        timeout=timeout_s,
+        consolidation=zenoh.ConsolidationMode.NONE,  # all of them, not the last one alone
+    )
+    for reply in found:
+        if reply.ok is not None:
+            yield reply.ok
+        elif reply.err is not None:
+            raise BusError(f"{selector}: {bytes(reply.err.payload).decode(errors='replace')}")
+
+
+def whole_reply(
+    session: zenoh.Session, vehicle: str, name: str, timeout_s: float, parameters: Mapping[str, float]
+) -> list[Any]:
+    """The parts of a vehicle's reply to one of topology.QUERIES, in order; empty where nobody answers in time.
+
+    Raises BusError with the reason where the query is refused, or where the reply is incomplete or malformed.
+    """
+    spec, key = QUERIES[name], key_of(vehicle, name)
+    given = {parameter: f"{value:g}" for parameter, value in parameters.items()}
+    parts: dict[int, Any] = {}
+    of = 0
+    try:
+        for sample in replies(session, zenoh.Selector(key, given), timeout_s):
+            part = attached(sample, Part) or Part()
+            parts[part.number], of = decode(bytes(sample.payload), spec.record), part.of
+    except WireError as error:
+        raise BusError(f"{name}: the reply is malformed: {error}") from error
+    if sorted(parts) != list(range(of)):
+        raise BusError(f"{name}: {len(parts)} of the reply's {of} parts came")
+    return [parts[number] for number in range(of)]
