@@ -11,7 +11,7 @@ set -eu
 prefix=/opt/birdslam
 etc=/etc/birdslam
 units=/etc/systemd/system
-services="birdslam.service birdslam-gate.service"
+services="birdslam.service birdslam-gate.service birdslam-uplink.service birdslam-router.service"
 source=$(cd "$(dirname "$0")/.." && pwd)
 python=${PYTHON:-/usr/bin/python3}
 
@@ -115,7 +115,7 @@ uninstall() {
     rm -rf "$prefix" /var/cache/birdslam
     ! systemd_runs || systemctl daemon-reload
     if [ "${1:-}" = --purge ]; then
-        rm -rf "$etc" /var/lib/birdslam "$units/birdslam.service.d" "$units/birdslam-gate.service.d"
+        rm -rf "$etc" /var/lib/birdslam "$units"/birdslam.service.d "$units"/birdslam-*.service.d
         ! getent passwd birdslam >/dev/null || userdel birdslam
         ! getent group birdslam >/dev/null || groupdel birdslam
         say "removed, with its configuration, results and user"

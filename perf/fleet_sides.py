@@ -19,7 +19,7 @@ from typing import Any
 import msgspec
 import zenoh
 
-from birdslam.runtime.configuration import FleetConfig
+from birdslam.runtime.configuration import FleetConfig, RuntimeConfig
 from birdslam.runtime.fleet.link import open_link
 from birdslam.runtime.fleet.listener import Fleet, FleetReading
 from birdslam.runtime.fleet.uplink import Uplink
@@ -94,7 +94,7 @@ class _Replayed:
             key_of(name, "estimate"),
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.REAL_TIME,
-            express=True,
+            express=False,
         )
         self._token = self._session.liveliness().declare_token(alive_key(name, "optimize"))
 
@@ -203,6 +203,7 @@ def main(arguments: list[str]) -> None:
         ended.set()
 
     threading.Thread(target=wait_for_the_end, daemon=True).start()
+    sys.setswitchinterval(RuntimeConfig().switch_interval_s)  # as in the processes of a run
     ROLES[role](plan, ended)
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ import zenoh
 
 from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.runtime.environment import USER_ERROR_STATUS
+from birdslam.runtime.process import signals
 from birdslam.runtime.process.notify import Notifier
 from birdslam.runtime.topology import CAR, PROCESSES, VERSION
 from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
@@ -125,8 +125,7 @@ def _is_cars(key_expr: str) -> bool:
 
 def run(path: Path, vehicle: str, runtime_dir: Path | None) -> None:
     """Opens the gate, until SIGTERM or SIGINT. Raises GateError."""
-    signals = {signal.SIGTERM, signal.SIGINT}
-    signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # before zenoh's threads, which inherit it
+    signals.block()
     config = gate_config(path, vehicle, runtime_dir)
     zenoh.init_log_from_env_or("error,zenoh_link_tls=warn")  # why somebody was refused; RUST_LOG says otherwise
     try:
@@ -138,7 +137,7 @@ def run(path: Path, vehicle: str, runtime_dir: Path | None) -> None:
         listen = ", ".join(json.loads(config.get_json("listen/endpoints")))
         print(f"the gate of vehicle {vehicle!r} is open: {listen}", flush=True)
         notifier.once("READY=1")
-        while signal.sigtimedwait(signals, notifier.period_s or _LOOK_S) is None:
+        while not signals.asked_to_end(notifier.period_s or _LOOK_S):
             notifier.alive(f"{len(session.info.peers_zid())} nodes of the vehicle reached, open at {listen}")
         notifier.once("STOPPING=1")
 

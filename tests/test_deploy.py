@@ -21,7 +21,7 @@ pytestmark = pytest.mark.processes
 __all__ = ["drive"]  # a fixture
 
 DEPLOY = ROOT / "deploy"
-UNITS = ("birdslam.service", "birdslam-gate.service")
+UNITS = ("birdslam.service", "birdslam-gate.service", "birdslam-uplink.service", "birdslam-router.service")
 EXPOSURE_AT_MOST = 2.0
 SYSTEMD_ANALYZE, SHELLCHECK = shutil.which("systemd-analyze"), shutil.which("shellcheck")
 UNIT_TEXT = (DEPLOY / "birdslam.service").read_text()

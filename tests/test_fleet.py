@@ -357,7 +357,7 @@ def test_a_flood_and_a_death_cost_the_others_nothing(
             thread.join()
             heard = fleet.heard("red").estimates - before["red"].estimates
             assert heard < sent[0] / 2  # the router has thinned it
-            red.uplink._session.close()  # as a process that was killed: nothing is taken back
+            red.uplink._session.close()
             until(lambda: not fleet.latest("red").alive, "red is not alive")
             for vehicle in (green, blue) * 5:
                 say(vehicle, fleet)
@@ -438,6 +438,10 @@ def test_the_commands_find_each_other_again(tmp_path_factory: pytest.TempPathFac
         until(lambda: fleet.connected and fleet.latest("red").alive, "red is alive again")
         until(comes, "an estimate through the second router")
 
+        uplink.send_signal(signal.SIGSTOP)  # as one whose network is gone: its connection stays, and is silent
+        until(lambda: not fleet.latest("red").alive, "red is given up")
+        uplink.send_signal(signal.SIGCONT)
+        until(comes, "an estimate of red after its silence")
         uplink.kill()
         until(lambda: not fleet.latest("red").alive, "red is not alive")
         second.send_signal(signal.SIGTERM)

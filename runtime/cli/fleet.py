@@ -32,8 +32,9 @@ def route(options: argparse.Namespace) -> int:
 
 def uplink(options: argparse.Namespace) -> int:
     """`birdslam uplink`."""
+    given = {"vehicle": options.vehicle, "runtime.runtime_dir": options.runtime_dir}
     try:
-        speaking.run(load(options.config, {} if options.vehicle is None else {"vehicle": options.vehicle}))
+        speaking.run(load(options.config, {key: value for key, value in given.items() if value is not None}))
     except PermissionError as error:
         raise ConfigurationError(str(error)) from error
     return 0

@@ -134,6 +134,7 @@ def _uplink(commands: Commands) -> None:
     uplink = commands.add_parser("uplink", help=text, description=text)
     uplink.add_argument("config", type=Path, metavar="CONFIG.toml", help="of the vehicle")
     uplink.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
+    uplink.add_argument("--runtime-dir", metavar="DIR", help="as runtime.runtime_dir of the run")
     uplink.set_defaults(command="uplink")
 
 

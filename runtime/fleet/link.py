@@ -14,8 +14,14 @@ from birdslam.runtime.wire import MAX_MESSAGE_BYTES
 
 LEASE_MS = 1_000  # who has said nothing for so long is gone
 MAX_ZENOH_BYTES = 2 * MAX_MESSAGE_BYTES + 4096  # zenoh would put together 1 GiB
-_URGENT_BATCHES = 16  # zenoh's largest: express messages go in batches of their own
+_URGENT_BATCHES = 16  # zenoh's largest
+# Of the socket, each way: the system's own would hold seconds of estimates for a listener that reads too slowly, all of
+# them old when they are read; what does not fit is dropped by the router
+_BUFFER_BYTES = 1 << 18
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
+
+
+BUFFERS = {"so_sndbuf": _BUFFER_BYTES, "so_rcvbuf": _BUFFER_BYTES}
 
 
 def settings_of(mode: str) -> dict[str, Any]:
@@ -69,6 +75,7 @@ def open_link(config: FleetConfig, timeout_s: float) -> zenoh.Session:
             "root_ca_certificate": config.ca,
             "connect_certificate": config.certificate,
             "connect_private_key": config.key,
+            **BUFFERS,
         },
     }
     try:

@@ -7,13 +7,13 @@ is denied. A vehicle that floods is thinned as it comes in, before it meets anyb
 
 from __future__ import annotations
 
-import signal
 from typing import Any
 
 import zenoh
 
 from birdslam.runtime.configuration import ConfigurationError, RouterConfig
-from birdslam.runtime.fleet.link import check, settings_of, zenoh_config
+from birdslam.runtime.fleet.link import BUFFERS, check, settings_of, zenoh_config
+from birdslam.runtime.process import signals
 from birdslam.runtime.process.notify import Notifier
 from birdslam.runtime.topology import QUERIES, VERSION, every_key
 
@@ -35,6 +35,7 @@ def router_config(config: RouterConfig) -> zenoh.Config:
             "root_ca_certificate": config.ca,
             "listen_certificate": config.certificate,
             "listen_private_key": config.key,
+            **BUFFERS,
         },
         "access_control": access_control(config.vehicles, config.listeners),
         "downsampling": [
@@ -106,9 +107,8 @@ def _policy(name: str, rules: list[str]) -> dict[str, Any]:
 
 def run(config: RouterConfig) -> None:
     """Routes until SIGTERM or SIGINT. Raises ConfigurationError."""
-    signals = {signal.SIGTERM, signal.SIGINT}
     settings = router_config(config)
-    signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # before zenoh's threads, which inherit it
+    signals.block()
     # Who was refused, and why, on standard error; RUST_LOG says otherwise
     zenoh.init_log_from_env_or("error,zenoh_link_tls=warn,zenoh::net::routing::interceptor::access_control=info")
     try:
@@ -119,6 +119,6 @@ def run(config: RouterConfig) -> None:
     with session:
         print(f"the router is open for {len(config.vehicles)} vehicles: {config.listen}", flush=True)
         notifier.once("READY=1")
-        while signal.sigtimedwait(signals, notifier.period_s or _LOOK_S) is None:
+        while not signals.asked_to_end(notifier.period_s or _LOOK_S):
             notifier.alive(f"{len(config.vehicles)} vehicles may speak, open at {config.listen}")
         notifier.once("STOPPING=1")

@@ -9,7 +9,6 @@ sent with congestion control DROP: a slow network loses messages, which the list
 from __future__ import annotations
 
 import queue
-import signal
 import sys
 import threading
 import time
@@ -23,6 +22,7 @@ import zenoh
 
 from birdslam.runtime.configuration import Configuration, ConfigurationError, FleetConfig
 from birdslam.runtime.fleet.link import check, open_link
+from birdslam.runtime.process import signals
 from birdslam.runtime.process.notify import Notifier
 from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, key_of
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, Publisher, Subscriber
@@ -49,7 +49,7 @@ class Uplink:
         self._bus = Bus(vehicle, f"{_NODE}-{threading.get_native_id()}", runtime_dir=runtime_dir)
         self._subscribers = {topic: self._bus.subscriber(topic) for topic in TOPICS_SAID}
         self._publishers = {
-            topic: Publisher(session, key_of(vehicle, topic), TOPICS[topic], _NODE, lossless=False)
+            topic: Publisher(session, key_of(vehicle, topic), TOPICS[topic], _NODE, lossless=False, express=False)
             for topic in TOPICS_SAID
         }
         handlers = {key_of(vehicle, name): self._handler(name) for name in QUERIES}
@@ -146,12 +146,11 @@ def run(configuration: Configuration) -> None:
     if not config.router:
         raise ConfigurationError("fleet.router: there is none: where to does this vehicle speak?")
     check("fleet", config, "router")
-    signals = {signal.SIGTERM, signal.SIGINT}
-    signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # before zenoh's threads, which inherit it
+    signals.block()
     zenoh.init_log_from_env_or("error")
     notifier = Notifier()
     notifier.once("READY=1")  # the vehicle waits for no network
-    session = _wait_for_router(config, notifier, signals)
+    session = _wait_for_router(config, notifier)
     if session is None:
         return
     reached: bool | None = None
@@ -162,12 +161,12 @@ def run(configuration: Configuration) -> None:
                 said = f"speaks at {config.router}" if now else f"has lost {config.router} and looks for it"
                 print(f"the uplink of vehicle {vehicle!r} {said}", flush=True)
             notifier.alive(f"router {'reached' if reached else 'GONE'}, {len(uplink.alive)} nodes alive")
-            if signal.sigtimedwait(signals, notifier.period_s or _LOOK_S) is not None:
+            if signals.asked_to_end(notifier.period_s or _LOOK_S):
                 break
         notifier.once("STOPPING=1")
 
 
-def _wait_for_router(config: FleetConfig, notifier: Notifier, signals: set[signal.Signals]) -> zenoh.Session | None:
+def _wait_for_router(config: FleetConfig, notifier: Notifier) -> zenoh.Session | None:
     """The session, as soon as it can be had; None where a signal came first."""
     told_s = -_TELL_S
     while True:
@@ -178,5 +177,5 @@ def _wait_for_router(config: FleetConfig, notifier: Notifier, signals: set[signa
                 told_s = time.monotonic()
                 print(f"birdslam: uplink: {error}", file=sys.stderr, flush=True)
         notifier.alive(f"looks for {config.router}")
-        if signal.sigtimedwait(signals, 0.0) is not None:
+        if signals.asked_to_end(0.0):
             return None

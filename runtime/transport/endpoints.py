@@ -57,9 +57,14 @@ def attached(sample: zenoh.Sample, kind: type[_Attached]) -> _Attached | None:
 
 
 class Publisher:
-    """Sends the records of one topic; made by Bus.publisher."""
+    """Sends the records of one topic; made by Bus.publisher.
 
-    def __init__(self, session: zenoh.Session, key: str, topic: Topic, node: str, lossless: bool) -> None:
+    `express`: each message at once and by itself; without it zenoh joins those that wait for the link.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, key: str, topic: Topic, node: str, lossless: bool, express: bool = True
+    ) -> None:
         self._topic, self._node = topic, node
         self._changed = threading.Condition()
         self._closed = False
@@ -69,7 +74,7 @@ class Publisher:
             key,
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.REAL_TIME if topic.urgent else zenoh.Priority.DATA_LOW,
-            express=True,
+            express=express,
         )
         self._kept = KeptMessages(session, key, topic.kept) if topic.kept else None
         callback = zenoh.handlers.Callback(self._matching_changed, indirect=False)
