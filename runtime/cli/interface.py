@@ -40,7 +40,8 @@ scouting off, where DIR is `runtime.runtime_dir` (of the service: `/run/birdslam
 user: through the gate, by mutual TLS ([deploy/README.md](../deploy/README.md)). Planners may read `estimate`, `map`,
 `health/*` and `alive/*`, and send every query; `frame` and `measurements` are for the nodes alone. `speed` is the one
 topic that comes from outside: the car's own computer sends it, and nobody else may ([The car's own
-speed](#the-cars-own-speed)).
+speed](#the-cars-own-speed)). At the router of a fleet ([fleet.md](fleet.md)) `estimate`, `health/*` and `alive/*` of
+many vehicles stand under the same keys; their traces end with the stage `uplink`.
 
 ## Keys
 
