@@ -120,6 +120,11 @@ loop = true
 stop_timeout_s = 8.0
 [recording]
 file = "/var/lib/birdslam/recordings"
+[fleet]
+router = "tls/127.0.0.1:7448"
+ca = "fleet/ca.pem"
+certificate = "fleet/car.vehicle.pem"
+key = "fleet/car.vehicle.key"
 """
 
 
@@ -268,6 +273,21 @@ def test_install_start_break_and_remove(machine: Machine) -> None:
     for secret in (f"{tls}/vehicle.key", f"{tls}/ca.key", "/run/birdslam/car/lock", "/var/lib/birdslam/drive"):
         assert machine("sh", "-c", f"test -r {secret} || echo refused", user="nobody") == "refused"
     machine("systemctl", "stop", "birdslam-gate")
+
+    # The fleet: its router here too; a listener follows the vehicle.
+    fleet, router = "/etc/birdslam/fleet", "/etc/birdslam/router.toml"
+    for what in (("router", "127.0.0.1"), ("uplink", "car"), ("planner", "operator")):
+        machine(f"{current}/deploy/certificates.sh", fleet, *what)
+    machine("sh", "-c", f"chgrp birdslam {fleet}/car.vehicle.key && chmod 640 {fleet}/car.vehicle.key")
+    files = [f'{key} = "fleet/router.{end}"\n' for key, end in (("certificate", "pem"), ("key", "key"))]
+    lists = 'vehicles = ["car"]\nlisteners = ["operator"]\n'
+    machine.write(router, f'[router]\nca = "fleet/ca.pem"\n{"".join(files)}{lists}')
+    machine.write("/etc/birdslam/operator.toml", LOOP.replace("car.vehicle", "operator"))
+    machine("systemctl", "enable", "--now", "birdslam-router", "birdslam-uplink")
+    top = (f"{current}/bin/birdslam", "top", "--once", "--all", "/etc/birdslam/operator.toml")
+    machine.until(lambda: "1 vehicles: 1 alive" in machine(*top, check=False), "the vehicle is followed")
+    machine("systemctl", "stop", "birdslam-router", "birdslam-uplink")
+    assert {machine.show(f"birdslam-{unit}", "Result") for unit in ("router", "uplink")} == {"success"}
 
     # An upgrade that fails changes nothing; one that succeeds restarts the service, on the configuration that was.
     main = machine.show("birdslam", "MainPID")

@@ -33,7 +33,7 @@ from birdslam.runtime.cli.fleet import FleetWatch
 from birdslam.runtime.configuration import ConfigurationError, FleetConfig, RouterConfig, load
 from birdslam.runtime.fleet.link import open_link
 from birdslam.runtime.fleet.listener import Fleet, FleetReading
-from birdslam.runtime.fleet.router import router_config
+from birdslam.runtime.fleet.router import access_control, router_config
 from birdslam.runtime.fleet.uplink import TOPICS_SAID, Uplink
 from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, every_key, key_of, vehicle_and_topic
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, Publisher
@@ -93,6 +93,34 @@ def test_a_name_with_a_wildcard_is_no_name_in_any_table(name: str) -> None:
             assert not good
         else:
             assert good
+
+
+@given(st.lists(st.from_regex(r"[ab0][ab_-]{0,3}", fullmatch=True), min_size=1, max_size=4, unique=True), st.data())
+def test_by_the_routers_rules_a_vehicle_writes_its_own_keys_alone(names: list[str], data: st.DataObject) -> None:
+    access = access_control(tuple(names), ("operator",))
+    rules = {rule["id"]: rule for rule in access["rules"]}
+    subjects = {subject["id"]: subject["cert_common_names"] for subject in access["subjects"]}
+    speaker, named = data.draw(st.sampled_from(names)), data.draw(st.sampled_from([*names, "other"]))
+    topic = data.draw(st.sampled_from(sorted({*TOPICS, *QUERIES})))
+    writing = {"put", "delete", "declare_queryable", "reply", "liveliness_token"}
+
+    def may(common_name: str, message: str, key: str) -> bool:
+        return any(
+            message in rules[name]["messages"]
+            and rules[name]["flows"] == ["ingress"]
+            and any(zenoh.KeyExpr(allowed).includes(zenoh.KeyExpr(key)) for allowed in rules[name]["key_exprs"])
+            for policy in access["policies"]
+            if any(common_name in subjects[subject] for subject in policy["subjects"])
+            for name in policy["rules"]
+        )
+
+    own = f"vehicle {speaker}"
+    assert may(own, "put", key_of(named, topic)) == (named == speaker and topic in TOPICS_SAID)
+    assert may(own, "liveliness_token", alive_key(named, "optimize")) == (named == speaker)
+    assert may(own, "reply", key_of(named, topic)) == (named == speaker and topic in {*TOPICS_SAID, *QUERIES})
+    assert not any(may(own, message, key_of(named, topic)) for message in ("delete", "declare_subscriber", "query"))
+    assert not any(may("operator", message, key_of(named, topic)) for message in writing)
+    assert not any(may(speaker, message, key_of(named, topic)) for message in (*writing, "query"))  # a name alone
 
 
 # --- real sessions ---
@@ -370,6 +398,24 @@ def test_a_flood_and_a_death_cost_the_others_nothing(
             assert not told.alive
 
 
+@processes
+@needs_openssl
+def test_a_router_that_comes_back_is_found(tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int) -> None:
+    """By a vehicle and by a listener; meanwhile the vehicle is told as not alive."""
+    table = router_table(tls, port)
+    router = zenoh.open(router_config(table))
+    red = Vehicle("red", tmp_path_factory.mktemp("f"), tls, port)
+    with opened(red), Fleet(link(tls, port, "operator")) as fleet:
+        first(red, fleet)
+        router.close()
+        until(lambda: not fleet.connected and not fleet.latest("red").alive, "the router is gone")
+        assert "THE ROUTER IS GONE" in FleetWatch(fleet).table()
+        with zenoh.open(router_config(table)):
+            first(red, fleet)
+            assert fleet.latest("red", 1e6).usable
+
+
+@pytest.mark.slow
 @processes
 @needs_openssl
 def test_the_commands_find_each_other_again(tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int) -> None:

@@ -12,10 +12,11 @@ from typing import TextIO
 import msgspec
 
 from birdslam.runtime.cli.top import CLEAR, PERIOD_S
-from birdslam.runtime.configuration import ConfigurationError, load
+from birdslam.runtime.configuration import load
 from birdslam.runtime.fleet import router as routing
 from birdslam.runtime.fleet import uplink as speaking
 from birdslam.runtime.fleet.listener import Fleet, FleetReading, Heard
+from birdslam.runtime.supervision.run import check_runtime_dir
 
 MAX_AGE_MS = 1000.0  # of an estimate that is told as on time: what a watching person needs
 _COLUMNS = (
@@ -33,10 +34,9 @@ def route(options: argparse.Namespace) -> int:
 def uplink(options: argparse.Namespace) -> int:
     """`birdslam uplink`."""
     given = {"vehicle": options.vehicle, "runtime.runtime_dir": options.runtime_dir}
-    try:
-        speaking.run(load(options.config, {key: value for key, value in given.items() if value is not None}))
-    except PermissionError as error:
-        raise ConfigurationError(str(error)) from error
+    configuration = load(options.config, {key: value for key, value in given.items() if value is not None})
+    check_runtime_dir(configuration.vehicle, configuration.runtime_dir)
+    speaking.run(configuration)
     return 0
 
 

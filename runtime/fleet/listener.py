@@ -22,7 +22,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
@@ -31,74 +30,19 @@ import zenoh
 from birdslam.queries import MapSnapshot, Trajectory
 from birdslam.runtime.configuration import FleetConfig
 from birdslam.runtime.fleet.link import open_link
+from birdslam.runtime.fleet.reading import FleetReading, Heard, VehicleSlot
 from birdslam.runtime.topology import TOPICS, check_name, every_key, key_of, vehicle_and_topic
 from birdslam.runtime.transport.bus import BusClosed
-from birdslam.runtime.transport.endpoints import attached
 from birdslam.runtime.transport.replies import REPLY_S, whole_reply
 from birdslam.runtime.transport.reply_parts import whole_map, whole_trajectory
-from birdslam.runtime.wire import Health, Trace, WireError, decode
-from birdslam.types import INVALIDATING, Estimate
+from birdslam.runtime.wire import Health, WireError, decode
 
 MOST_VEHICLES = 1_000  # of those that are not expected: what more says something is counted, not kept
-CLOCKS_APART_MS = 50.0  # an estimate that is younger than now by more is not on time: one of the two clocks is wrong
 _SWEEPS = 4  # so often within max_age_ms it is looked who has fallen silent
-_NO_TRACE = Trace()
+
+__all__ = ["Fleet", "FleetReading", "Heard"]
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class FleetReading:
-    """The newest estimate of one vehicle, and three different things to know about it.
-
-    `alive`: its optimizer runs, and is reached. `on_time`: the estimate is young enough. `valid`: it says that it may
-    be driven by. `age_ms` is the time since the camera took the frame (Estimate.t_utc_ns): keep the clocks of both
-    computers synchronised (PTP, NTP). `silent_ms` needs only this computer's: the time since its last message came.
-    Both are infinite where there is none.
-    """
-
-    vehicle: str
-    estimate: Estimate | None
-    alive: bool
-    on_time: bool
-    valid: bool
-    age_ms: float
-    silent_ms: float
-    lost: int = 0  # of its estimates, on the way here, since this client listens: its sender numbers them
-    trace: Trace = _NO_TRACE  # where its time went; the stamps are of the vehicle's own clock
-
-    @property
-    def usable(self) -> bool:
-        """Alive, on time and valid, all three."""
-        return self.alive and self.on_time and self.valid
-
-
-@dataclass(frozen=True)
-class Heard:
-    """What has come of one vehicle since this client listens."""
-
-    estimates: int
-    received_bytes: int  # payloads and attachments of all its messages
-    lost: int
-    malformed: int
-
-
-@dataclass
-class _Slot:
-    """One vehicle. `fresh`: its newest estimate has not been read; `waiting`: those bytes have not been decoded."""
-
-    alive: set[str] = field(default_factory=set)
-    fresh: bool = False
-    waiting: bytes | None = None
-    estimate: Estimate | None = None
-    trace: Trace = _NO_TRACE
-    t_received_ns: int = 0
-    estimates: int = 0
-    received_bytes: int = 0
-    lost: int = 0
-    malformed: int = 0
-    t_told_ns: int = 0  # when a reading of it was last given by `estimates`
-    healths: dict[str, bytes] = field(default_factory=dict)
 
 
 class Fleet:
@@ -109,7 +53,7 @@ class Fleet:
     """
 
     def __init__(self, config: FleetConfig, timeout_s: float = 10.0) -> None:
-        self._slots: dict[str, _Slot] = {check_name("vehicle", name): _Slot() for name in config.vehicles}
+        self._slots: dict[str, VehicleSlot] = {check_name("vehicle", name): VehicleSlot() for name in config.vehicles}
         self._unread: deque[str] = deque()  # vehicles in the order in which their unread news began
         self._changed = threading.Condition()
         self._closed = False
@@ -126,7 +70,7 @@ class Fleet:
 
     # --- what zenoh calls, on its own threads ---
 
-    def _slot_of(self, key: str) -> tuple[str, str, _Slot] | None:
+    def _slot_of(self, key: str) -> tuple[str, str, VehicleSlot] | None:
         """(vehicle, topic, slot) of a key, with the lock held; None where nothing is kept of it."""
         named = vehicle_and_topic(key)
         if named is None or (named[0] not in self._slots and len(self._slots) >= MOST_VEHICLES):
@@ -134,30 +78,16 @@ class Fleet:
             if self.refused == 1:
                 log.warning("%.100s: nothing is kept of this, and of what is like it", key)
             return None
-        return named[0], named[1], self._slots.setdefault(named[0], _Slot())
+        return named[0], named[1], self._slots.setdefault(named[0], VehicleSlot())
 
     def _receive(self, sample: zenoh.Sample) -> None:
         t_received_ns = time.monotonic_ns()
-        payload = bytes(sample.payload)
-        size = len(payload) + (0 if sample.attachment is None else len(sample.attachment))
         with self._changed:
             found = self._slot_of(str(sample.key_expr))
             if found is None:
                 return
             vehicle, _, slot = found
-            slot.received_bytes += size
-            try:
-                trace = attached(sample, Trace) or _NO_TRACE
-                if sample.kind != zenoh.SampleKind.PUT:
-                    raise WireError(f"sent as {sample.kind}")
-            except WireError as error:
-                self._count_malformed(vehicle, slot, error)
-                return
-            if slot.trace.number and trace.number:
-                slot.lost += max(0, trace.number - slot.trace.number - 1)  # a sender that began anew counts from 1 on
-            slot.waiting, slot.trace, slot.t_received_ns = payload, trace, t_received_ns
-            slot.estimates += 1
-            if not slot.fresh:
+            if slot.receive(vehicle, sample, t_received_ns) and not slot.fresh:
                 slot.fresh = True
                 self._unread.append(vehicle)
                 self._changed.notify_all()
@@ -172,12 +102,10 @@ class Fleet:
                 self._receive(reply.ok)
 
     def _receive_health(self, sample: zenoh.Sample) -> None:
-        payload = bytes(sample.payload)
         with self._changed:
             found = self._slot_of(str(sample.key_expr))
             if found is not None and found[1] in TOPICS:
-                found[2].healths[found[1].rpartition("/")[2]] = payload
-                found[2].received_bytes += len(payload) + (0 if sample.attachment is None else len(sample.attachment))
+                found[2].receive_health(found[1].rpartition("/")[2], sample)
 
     def _liveliness_changed(self, sample: zenoh.Sample) -> None:
         alive = sample.kind == zenoh.SampleKind.PUT
@@ -193,12 +121,6 @@ class Fleet:
         if asks:
             callback = zenoh.handlers.Callback(self._receive_kept, indirect=False)
             self._session.get(key_of(vehicle, "estimate"), callback, timeout=REPLY_S)
-
-    @staticmethod
-    def _count_malformed(vehicle: str, slot: _Slot, error: WireError) -> None:
-        slot.malformed += 1
-        if slot.malformed == 1:
-            log.warning("vehicle %s: a malformed message is ignored, and all that follow: %s", vehicle, error)
 
     # --- what the user calls ---
 
@@ -222,12 +144,12 @@ class Fleet:
         """What has come of a vehicle so far. Raises KeyError for one that nobody has heard of."""
         with self._changed:
             slot = self._slots[vehicle]
-            return Heard(slot.estimates, slot.received_bytes, slot.lost, slot.malformed)
+            return slot.heard
 
     def latest(self, vehicle: str, max_age_ms: float = 500.0) -> FleetReading:
         """The newest estimate of one vehicle so far, at once. Raises KeyError for one that nobody has heard of."""
         with self._changed:
-            return self._reading(vehicle, self._slots[vehicle], max_age_ms)
+            return self._slots[vehicle].reading(vehicle, max_age_ms)
 
     def readings(self, max_age_ms: float = 500.0) -> tuple[FleetReading, ...]:
         """The newest estimate of each vehicle so far, at once, by name; of those that fell silent too."""
@@ -247,7 +169,7 @@ class Fleet:
             vehicle = self._unread.popleft()
             slot = self._slots[vehicle]
             slot.fresh = False
-            return self._reading(vehicle, slot, max_age_ms)
+            return slot.reading(vehicle, max_age_ms)
 
     def estimates(self, max_age_ms: float = 500.0) -> Iterator[FleetReading]:
         """A reading of each vehicle's estimates as they come, for as long as the client is open.
@@ -273,23 +195,6 @@ class Fleet:
                     if now_ns - slot.t_told_ns >= period_ns and not (late := self.latest(vehicle, max_age_ms)).on_time:
                         slot.t_told_ns = now_ns
                         yield late
-
-    def _reading(self, vehicle: str, slot: _Slot, max_age_ms: float) -> FleetReading:
-        """With the lock held."""
-        if slot.waiting is not None:
-            try:
-                slot.estimate = decode(slot.waiting, Estimate)
-            except WireError as error:
-                self._count_malformed(vehicle, slot, error)
-            slot.waiting = None
-        alive, estimate = "optimize" in slot.alive, slot.estimate
-        silent_ms = (time.monotonic_ns() - slot.t_received_ns) / 1e6 if slot.t_received_ns else float("inf")
-        if estimate is None:
-            return FleetReading(vehicle, None, alive, False, False, float("inf"), silent_ms, slot.lost)
-        age_ms = (time.time_ns() - estimate.t_utc_ns) / 1e6
-        on_time = -CLOCKS_APART_MS <= age_ms <= max_age_ms
-        valid = estimate.valid and INVALIDATING.isdisjoint(estimate.status)
-        return FleetReading(vehicle, estimate, alive, on_time, valid, age_ms, silent_ms, slot.lost, slot.trace)
 
     def health(self, vehicle: str, node: str) -> Health | None:
         """What a vehicle's node said last of itself; None where nothing of it was heard, or it was no health."""

@@ -18,6 +18,7 @@ from birdslam.runtime.process.notify import Notifier
 from birdslam.runtime.topology import QUERIES, VERSION, every_key
 
 _LOOK_S = 1.0
+_ACCEPT_MS = 2_000  # who connects and then says nothing is let go
 SAID = ("estimate", "health/*")  # what leaves a vehicle by itself; no images, no measurements
 ASKED = (*SAID, *QUERIES)  # what it answers queries of
 ALIVE = "alive/*"
@@ -30,6 +31,7 @@ def router_config(config: RouterConfig) -> zenoh.Config:
         raise ConfigurationError("router.vehicles: name those that may say something here")
     settings = settings_of("router") | {
         "listen/endpoints": [config.listen],
+        "transport/unicast/accept_timeout": _ACCEPT_MS,
         "transport/link/tls": {
             "enable_mtls": True,
             "root_ca_certificate": config.ca,
