@@ -44,7 +44,7 @@ WHOLE = 3  # vehicles that go the whole way, each a process
 REPLAYERS = 2  # processes for all others
 FLOOD = "flood"
 FLOOD_TIMES = 100  # of the rate
-PATIENCE_S = 120.0
+_END_S = 10.0  # for a process to end
 CONDITIONS = ("each", "newest", "flood", "death")
 
 
@@ -63,13 +63,12 @@ class Process:
         return line.strip()
 
     def end(self) -> None:
-        if self.process.poll() is None and self.process.stdin is not None:
-            self.process.stdin.close()
-            try:
-                self.process.wait(10.0)
-            except subprocess.TimeoutExpired:
-                self.process.kill()
-        self.process.wait()
+        """By the end of its standard input; killed where that takes too long."""
+        try:
+            self.process.communicate(timeout=_END_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.communicate()
 
 
 class Place:
@@ -111,8 +110,8 @@ class Place:
                 continue
             yield psutil.Process(router.process.pid)
         finally:
-            router.process.send_signal(signal.SIGTERM)
-            router.process.wait()
+            router.process.terminate()
+            router.end()
 
 
 def _popen(*arguments: str) -> subprocess.Popen[str]:

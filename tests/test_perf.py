@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -291,6 +292,20 @@ def test_carriers_deliver_every_message_of_a_slow_stream() -> None:
         assert row["sent"] == 10
         assert row["latency_ms"]["n"] + row["dropped"] == 10
         assert row["latency_ms"]["n"] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.processes
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+def test_a_fleet_is_followed_also_when_one_of_it_dies(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.json"
+    what = ["--vehicles", "5", "--frames", "2", "--seconds", "2", "--rate", "10"]
+    assert main(["fleet", *what, "--output", str(path)]) == 0
+    rows = {row["condition"]: row for row in json.loads(path.read_text())["rows"]}
+    assert set(rows) == {"each", "newest", "flood", "death"}
+    assert all(row["heard"] > 0 for row in rows.values())
+    assert rows["death"]["told_dead_after_ms"] > 0
+    assert rows["flood"]["flood_heard_hz"] < rows["flood"]["flood_sent_hz"]
 
 
 @pytest.mark.processes

@@ -15,7 +15,7 @@ def block() -> None:
 def asked_to_end(timeout_s: float) -> bool:
     """Whether one of the two came within the time; they are blocked (`block`).
 
-    A process that was stopped (SIGSTOP, a suspended computer's debugger) and goes on after the time-out gets a result
+    A process that was stopped (SIGSTOP) and goes on after the time-out gets a result
     from Python in which nothing is set: only a number that was asked for counts.
     """
     found = signal.sigtimedwait(ENDING, timeout_s)
