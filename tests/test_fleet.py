@@ -413,6 +413,8 @@ def test_a_router_that_comes_back_is_found(tmp_path_factory: pytest.TempPathFact
         with zenoh.open(router_config(table)):
             first(red, fleet)
             assert fleet.latest("red", 1e6).usable
+            red.bus.close()  # the run ends, its uplink stays
+            until(lambda: not fleet.latest("red").alive, "red's run has ended")
 
 
 @pytest.mark.slow

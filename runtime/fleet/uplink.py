@@ -43,7 +43,9 @@ class Uplink:
     A context manager. Raises as Bus does.
     """
 
-    def __init__(self, vehicle: str, config: FleetConfig, session: zenoh.Session, runtime_dir: Path | None = None):
+    def __init__(
+        self, vehicle: str, config: FleetConfig, session: zenoh.Session, runtime_dir: Path | None = None
+    ) -> None:
         self._session, self._vehicle = session, vehicle
         self._period_ns = 0 if config.estimates_hz is None else round(1e9 / config.estimates_hz)
         self._bus = Bus(vehicle, f"{_NODE}-{threading.get_native_id()}", runtime_dir=runtime_dir)
