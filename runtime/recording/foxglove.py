@@ -174,28 +174,34 @@ class ImageAnnotations(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def schema(record: type[msgspec.Struct]) -> bytes:
-    """The JSON schema of a struct as Foxglove takes it: an object at the top, internal references, no unions."""
-    (top,), parts = msgspec.json.schema_components([record], ref_template="#/$defs/{name}")
-    name = str(top["$ref"]).rpartition("/")[2]
-    inner = {key: part for key, part in parts.items() if key != name}
-    return msgspec.json.encode(_simple({**parts[name], **({"$defs": inner} if inner else {})}))
+    """The JSON schema of a struct as Foxglove takes it: an object at the top, no unions.
+
+    What Foxglove allows and its open forks (Lichtblick) do not is left out too: references, objects of unknown fields.
+    """
+    (top,), parts = msgspec.json.schema_components([record], ref_template="{name}")
+    return msgspec.json.encode(_simple(top, parts))
 
 
-def _simple(part: Any) -> Any:
-    """Tuples of one type as arrays, what may be null as what it is else, enumerations as strings."""
+def _simple(part: Any, parts: dict[str, Any]) -> Any:
+    """References as what they refer to, tuples of one type as arrays, what may be null as what it is else."""
     if isinstance(part, list):
-        return [_simple(item) for item in part]
+        return [_simple(item, parts) for item in part]
     if not isinstance(part, dict):
         return part
+    if "$ref" in part:
+        return _simple(parts[part["$ref"]], parts)
     if "anyOf" in part:
         (kept,) = [choice for choice in part["anyOf"] if choice.get("type") != "null"]
-        return _simple(kept)
-    part = {key: value for key, value in part.items() if key not in ("default", "examples")}
+        return _simple(kept, parts)
+    part = {key: value for key, value in part.items() if key not in ("default", "examples", "additionalProperties")}
     if "prefixItems" in part:
-        first, *others = part.pop("prefixItems")
-        if any(other != first for other in others):
-            return {"type": "array"}
-        part["items"] = first
+        part["items"], *others = part.pop("prefixItems")
+        if any(other != part["items"] for other in others):
+            part["items"] = {}  # of any type: no channel that Foxglove reads has them
     if "enum" in part:
         part = {"type": "string"}
-    return {key: _simple(value) for key, value in part.items()}
+    if part.get("type") == "object":
+        part.setdefault("properties", {})
+    if part.get("type") == "array":
+        part.setdefault("items", {"type": "object", "properties": {}})  # an array that stays empty
+    return {key: _simple(value, parts) for key, value in part.items()}
