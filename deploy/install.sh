@@ -1,11 +1,11 @@
 #!/bin/sh
 # Installs BirdSLAM as a service of systemd, or brings an installation up to date; the configuration is never touched.
 #
-#   sudo deploy/install.sh                       install or upgrade, from this checkout
+#   sudo deploy/install.sh                       install or upgrade, from this checkout or folder of `birdslam deploy`
 #   sudo deploy/install.sh uninstall [--purge]   remove it; --purge: configuration, certificates, results and user too
 #
 # PYTHON (default /usr/bin/python3, 3.11 or newer) makes the virtual environment; BIRDSLAM_PACKAGE, a wheel, takes the
-# checkout's place. pip's own variables (PIP_INDEX_URL, PIP_FIND_LINKS, ...) hold. Run it as often as you like.
+# place of the checkout, or of what pip finds by the name that `birdslam deploy` wrote down. pip's own variables (PIP_INDEX_URL, PIP_FIND_LINKS, ...) hold. Run it as often as you like.
 set -eu
 
 prefix=/opt/birdslam
@@ -43,10 +43,14 @@ new_release() {
     chmod 755 "$release"
     trap 'rm -rf "$release"' EXIT
     "$python" -m venv "$release"
-    package=${BIRDSLAM_PACKAGE:-$release/source}
-    if [ "$package" = "$release/source" ]; then # built from a copy: nothing of root's is left in the checkout
+    if [ -n "${BIRDSLAM_PACKAGE:-}" ]; then
+        package=$BIRDSLAM_PACKAGE
+    elif [ -f "$source/package" ]; then
+        package=$(cat "$source/package")
+    else # built from a copy: nothing of root's is left in the checkout
+        package=$release/source
         mkdir "$package"
-        (cd "$source" && cp -R pyproject.toml README.md LICENSE birdslam runtime "$package")
+        (cd "$source" && cp -R pyproject.toml README.md LICENSE birdslam runtime deploy configs "$package")
     fi
     "$release/bin/python" -m pip install --quiet --disable-pip-version-check "$package"
     rm -rf "$release/source"

@@ -40,7 +40,11 @@ def build(folder: Path) -> Path:
 def files_of(package: Path) -> set[str]:
     """What the package consists of, by the links to runtime/ and perf/ too."""
     found = (Path(folder, name) for folder, _, names in os.walk(package, followlinks=True) for name in names)
-    return {path.relative_to(package.parent).as_posix() for path in found if path.suffix not in NOT_PACKED}
+    return {
+        path.relative_to(package.parent).as_posix()
+        for path in found
+        if path.suffix not in NOT_PACKED or path.parent.name == "deploy"
+    }
 
 
 def check_contents(wheel: Path) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import signal
 import subprocess
 import zipfile
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
+from birdslam.runtime.cli.main import main
 from tests.systemd_machine import ROOT, Machine, why_not
 from tests.test_pipeline import drive
 
@@ -81,9 +84,10 @@ def wheel(folder: Path) -> Path:
     """The checkout as a wheel without dependencies: they come from the packages that this Python has."""
     path, info = folder / "birdslam-0.1.0-py3-none-any.whl", "birdslam-0.1.0.dist-info"
     with zipfile.ZipFile(path, "w") as archive:
-        for folder_of, name in (("birdslam", "birdslam"), ("runtime", "birdslam/runtime")):
+        for folder_of in ("birdslam", "runtime", "deploy", "configs"):
+            name = "birdslam" if folder_of == "birdslam" else f"birdslam/{folder_of}"
             for file in sorted((ROOT / folder_of).rglob("*")):
-                if file.suffix in {".py", ".toml", ".onnx"}:
+                if file.suffix in {".py", ".toml", ".onnx"} or file.parent == DEPLOY:
                     archive.write(file, Path(name) / file.relative_to(ROOT / folder_of))
         archive.writestr("packages.pth", "/srv/packages\n")
         archive.writestr(f"{info}/METADATA", "Metadata-Version: 2.1\nName: birdslam\nVersion: 0.1.0\n")
@@ -107,9 +111,24 @@ def machine(tmp_path_factory: pytest.TempPathFactory, drive: Path) -> Iterator[M
         yield machine
 
 
-def install(machine: Machine, *arguments: str) -> str:
+def install(machine: Machine, *arguments: str, script: str = "/srv/birdslam/deploy/install.sh") -> str:
     package = {"BIRDSLAM_PACKAGE": "/srv/birdslam-0.1.0-py3-none-any.whl", "PIP_NO_INDEX": "1"}
-    return machine("/srv/birdslam/deploy/install.sh", *arguments, env=package)
+    return machine(script, *arguments, env=package)
+
+
+def test_the_package_bears_what_installs_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = tmp_path / "service"
+    assert main(["deploy", str(target)]) == 0
+    assert str(target / "deploy" / "install.sh") in capsys.readouterr().out
+    told = {p.relative_to(target).as_posix(): p.read_bytes() for p in target.rglob("*") if p.is_file()}
+    own = {f"deploy/{path.name}": path.read_bytes() for path in DEPLOY.iterdir() if path.is_file()}
+    vehicle = (ROOT / "configs" / "vehicle.toml").read_bytes()
+    assert told == {**own, "configs/vehicle.toml": vehicle, "package": f"birdslam=={version('birdslam')}\n".encode()}
+    assert os.access(target / "deploy" / "install.sh", os.X_OK)
+    for named in re.findall(r'"\$source/([\w./]+)"', (DEPLOY / "install.sh").read_text()):
+        assert (target / named).exists(), named
+    assert main(["deploy", str(target)]) == 2
+    assert "is there already" in capsys.readouterr().err
 
 
 LOOP = """
@@ -298,7 +317,9 @@ def test_install_start_break_and_remove(machine: Machine) -> None:
     assert machine("readlink", "/opt/birdslam/current") == before
     assert len(machine("ls", "/opt/birdslam/releases").split()) == 2
     assert machine.show("birdslam", "MainPID") == main
-    install(machine)
+    machine("/opt/birdslam/current/bin/birdslam", "deploy", "/srv/of-wheel")  # this one without a checkout
+    install(machine, script="/srv/of-wheel/deploy/install.sh")
+    assert machine("readlink", "/opt/birdslam/current") != before
     assert machine.show("birdslam", "MainPID") != main
     assert estimates(machine)
 

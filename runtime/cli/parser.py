@@ -37,6 +37,7 @@ def build_parser() -> argparse.ArgumentParser:
         _uplink,
         _router,
         _doctor,
+        _deploy,
         _interface,
         _configuration,
         _batch,
@@ -155,6 +156,13 @@ def _doctor(commands: Commands) -> None:
     doctor.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
     _add_pipeline(doctor)
     doctor.set_defaults(command="doctor")
+
+
+def _deploy(commands: Commands) -> None:
+    text = "write what installs the service on a vehicle computer: DIR/deploy/install.sh, units, configuration"
+    deploy = commands.add_parser("deploy", help=text, description=text)
+    deploy.add_argument("directory", type=Path, metavar="DIR", help="a new directory")
+    deploy.set_defaults(command="deploy")
 
 
 def _interface(commands: Commands) -> None:

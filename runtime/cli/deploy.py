@@ -1,0 +1,32 @@
+"""`birdslam deploy`: what installs the service, out of the package: deploy/install.sh needs no checkout."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from importlib.metadata import version
+from pathlib import Path
+
+import birdslam
+from birdslam.runtime.configuration import ConfigurationError
+
+PARTS = ("deploy", "configs/vehicle.toml")
+PACKAGE = "package"  # what install.sh hands to pip
+
+
+def deploy(options: argparse.Namespace) -> int:
+    """Writes the folder; gives the exit status."""
+    target: Path = options.directory
+    if target.exists():
+        raise ConfigurationError(f"{target}: is there already")
+    source = Path(birdslam.__file__).parent
+    try:
+        for part in PARTS:
+            copy = shutil.copytree if (source / part).is_dir() else shutil.copy
+            (target / part).parent.mkdir(parents=True, exist_ok=True)
+            copy(source / part, target / part)
+        (target / PACKAGE).write_text(f"birdslam=={version('birdslam')}\n", encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(f"{error.filename or target}: {error.strerror}") from None
+    print(f"as root: {target / 'deploy' / 'install.sh'}; {target / 'deploy' / 'README.md'} says more")
+    return 0
