@@ -147,6 +147,18 @@ def test_results_appear_whole_and_are_the_same_bytes(tmp_path: Path, monkeypatch
         done(tmp_path / "once", msgspec.structs.replace(task, identity="0"))
 
 
+def test_the_first_frames_of_a_drive_are_held_to_their_truth(tmp_path: Path) -> None:
+    drive = kitti(tmp_path / "sequences" / "00", frames=6, truth=True)
+    (task,) = tasks(find_drives([str(drive)]), sweep([]), None, {**PLAIN, "source.frames": 4}, [])
+    told = []
+    run_drive(Job(task, str(tmp_path / "out")), lambda *at: told.append(at))
+    assert told[-1] == (4, 4)
+    result = msgspec.json.decode((tmp_path / "out" / DRIVES / "00" / "result.json").read_bytes(), type=DriveResult)
+    assert result.frames == 4
+    assert result.truth is not None
+    assert result.truth.ate_m is not None
+
+
 def test_a_drive_that_fails_leaves_nothing(tmp_path: Path) -> None:
     (task,) = made([kitti(tmp_path / "00")])
 

@@ -160,9 +160,9 @@ def compare(
 ) -> OdometryReport:
     """The report of one sequence; where not all are `compared`, of those, the first of them aligned.
 
-    Raises ValueError where the two don't have the same number of poses.
+    Raises ValueError where the two don't have the same number of poses; a run may end with the last that is compared.
     """
-    if truth is not None and len(truth) != len(estimated):
+    if truth is not None and len(estimated) not in (len(truth), compared.stop):
         raise ValueError(f"sequence {sequence}: {len(estimated)} poses estimated for {len(truth)} frames")
     if compared != slice(None):
         estimated = from_first(estimated[compared])

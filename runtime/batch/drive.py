@@ -123,8 +123,9 @@ def _run(task: Task, output: Path, uri: str, on_frame: OnFrame) -> None:
     place = output / DRIVES / task.name
     try:
         with pipeline(configuration) as drive:
-            motion = _Motion(len(recording), on_frame)
-            (report,) = evaluate_recordings([recording], motion.watched(drive), working, compared=_known(recording))
+            frames = min(len(recording), configuration.source.frames or len(recording))
+            motion, known = _Motion(frames, on_frame), _known(recording, frames)
+            (report,) = evaluate_recordings([recording], motion.watched(drive), working, compared=known)
         result = _result(task, working / task.name, motion, report)
         encoded = msgspec.json.format(msgspec.json.encode(result), indent=2) + b"\n"
         (working / task.name / RESULT).write_bytes(encoded)
@@ -139,13 +140,14 @@ def _run(task: Task, output: Path, uri: str, on_frame: OnFrame) -> None:
         shutil.rmtree(working, ignore_errors=True)
 
 
-def _known(recording: Recording) -> slice:
-    """Of the truth, the frames from the first to the last at which it is known."""
+def _known(recording: Recording, frames: int) -> slice:
+    """Of the truth of so many frames, those from the first to the last at which it is known; all: slice(None)."""
     truth = recording.truth_poses()
-    if truth is None or np.isfinite(truth).all():
-        return slice(None)
-    known = np.flatnonzero(np.isfinite(truth).all(axis=(1, 2)))
-    return slice(int(known[0]), int(known[-1]) + 1)
+    every = slice(None) if frames == len(recording) else slice(0, frames)
+    if truth is None or np.isfinite(truth[:frames]).all():
+        return every
+    known = np.flatnonzero(np.isfinite(truth[:frames]).all(axis=(1, 2)))
+    return slice(int(known[0]), int(known[-1]) + 1) if known.size else every
 
 
 class _Motion:
