@@ -9,7 +9,7 @@ MODELS := $(or $(BIRDSLAM_MODELS),../shared/models)
 CORES := $(or $(shell nproc 2>/dev/null),2)
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: setup test test-slow wheel-test fuzz faults onroad perf lint train demo demo-kitti clean
+.PHONY: setup test test-slow wheel-test wheels fuzz faults onroad perf lint train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -34,6 +34,10 @@ test-slow: setup
 # What a user installs: the wheel in an empty environment, without the checkout
 wheel-test: setup
 	$(BIN)/python -m tests.installed_wheel
+
+# Which wheels there are of what is needed, by architecture and Python: docs/wheels.csv; it asks pip's index
+wheels: setup
+	$(BIN)/python -m tests.wheels
 
 # A million mutated messages, references and files; FUZZ_SEED=N gives others.
 fuzz: setup

@@ -137,8 +137,11 @@ def cluster(cpus: int) -> Iterator[str]:
 
 def _cluster_mb() -> float:
     """What Ray's own processes hold beside the drives', when these are over: each page once."""
-    own = psutil.Process().children(recursive=True)
-    return round(sum(child.memory_full_info().pss for child in own) / 2**20, 1)
+    held = 0
+    for child in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.NoSuchProcess):  # a worker that ends now
+            held += child.memory_full_info().pss
+    return round(held / 2**20, 1)
 
 
 def ratios(rows: list[dict[str, Any]]) -> dict[int, float]:

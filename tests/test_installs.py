@@ -1,0 +1,91 @@
+"""What can be installed, and where: wheels of what is needed, the package's own words, the Containerfile."""
+
+from __future__ import annotations
+
+import csv
+import re
+import shlex
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from birdslam.runtime.cli.parser import build_parser
+from tests import containerfile, wheels
+
+PROJECT = tomllib.loads((wheels.ROOT / "pyproject.toml").read_text())["project"]
+
+
+def rows() -> dict[str, dict[str, str]]:
+    with wheels.TABLE.open(encoding="utf-8") as file:
+        return {row["package"]: row for row in csv.DictReader(file)}
+
+
+@pytest.mark.parametrize("requirement", wheels.requirements())
+def test_what_is_needed_has_wheels_everywhere(requirement: str) -> None:
+    """The table is of the requirements as they are now: `make wheels` writes it anew."""
+    name, bounds = re.fullmatch(r"([A-Za-z0-9._-]+)(.*)", requirement).groups()  # type: ignore[union-attr]
+    row = rows()[wheels.normalised(name)]
+    assert row["asked by"] == " ".join(wheels.requirements()[requirement]).strip()
+    for combination in wheels.COMBINATIONS:
+        version, needs = row[combination].split()
+        assert needs == "any" or int(needs.removeprefix("2.")) <= wheels.GLIBC
+        numbers = [int(part) for part in re.findall(r"\d+", version)]
+        for operator, bound in re.findall(r"(>=|<)([0-9.]+)", bounds):
+            limit = [int(part) for part in bound.split(".")]
+            assert numbers >= limit if operator == ">=" else numbers < limit
+
+
+def test_what_they_need_has_wheels_too() -> None:
+    others = [row for row in rows().values() if row["asked by"] == "-"]
+    assert len(others) > 20
+    for row in others:
+        assert all(row[combination] for combination in wheels.COMBINATIONS), row
+
+
+def test_the_package_says_on_which_pythons_it_runs() -> None:
+    told = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["classifiers"]))
+    assert tuple(told) == wheels.PYTHONS
+    assert PROJECT["requires-python"] == f">={wheels.PYTHONS[0]}"
+
+
+def test_the_containerfile_is_one() -> None:
+    steps = containerfile.instructions()
+    names = [step.name for step in steps]
+    assert set(names) <= set(containerfile.KNOWN)
+    assert names[0] == "FROM"
+    stages = [step.words[2] for step in steps if step.name == "FROM" and len(step.words) == 3]
+    for step in steps:
+        if step.name == "FROM":
+            assert re.fullmatch(r"python:3\.11-slim", step.words[0])  # a short name: no registry's host
+        if step.name == "COPY":
+            flags, (*sources, _) = [
+                [w for w in step.words if w.startswith("--") == is_flag] for is_flag in (True, False)
+            ]
+            assert all(flag.removeprefix("--from=") in stages for flag in flags)
+            assert flags or all((wheels.ROOT / source).exists() for source in sources)
+    last = {step.name: step for step in steps}
+    assert "useradd" in " ".join(step.text for step in steps if step.name == "RUN")
+    assert last["USER"].words == ["birdslam"]
+    smoke = [step for step in steps if step.name == "RUN" and "--source demo" in step.text]
+    assert len(smoke) == 1
+    assert steps.index(last["USER"]) < steps.index(smoke[0])  # not as root
+    commands = [shlex.split(smoke[0].text.partition("&&")[0]), last["ENTRYPOINT"].words + last["CMD"].words]
+    commands.append(containerfile.Instruction("CMD", last["HEALTHCHECK"].text.partition("CMD ")[2]).words)
+    assert [build_parser().parse_args(words[1:]).command for words in commands] == ["run", "run", "top"]
+    assert {words[0] for words in commands} == {"birdslam"}
+
+
+@pytest.mark.slow
+@pytest.mark.processes
+@pytest.mark.timeout(1200)
+def test_the_containerfile_can_be_carried_out(tmp_path: Path) -> None:
+    reason = containerfile.why_not()
+    if reason:
+        pytest.skip(reason)
+    said = containerfile.carry_out(
+        tmp_path, "id -un; command -v birdslam; birdslam --version; ls -A /data /run/birdslam"
+    )
+    assert "ended" not in said or "end of source" in said
+    assert f"birdslam\n/opt/birdslam/bin/birdslam\nbirdslam {PROJECT['version']}\n" in said
+    assert not Path("/opt/birdslam/bin").exists() or "/opt/birdslam" not in str(tmp_path)
