@@ -78,6 +78,7 @@ def test_every_kind_of_drive_is_known_by_what_lies_there(tmp_path: Path) -> None
     ("arguments", "said"),
     [
         (["demo", "demo"], "demo: is named twice"),
+        (["s3://store/drive.mcap"], "say what it is, as in rosbag:s3://store/drive.mcap"),
         (["list.txt"], "line 1: No closing quotation"),
     ],
 )
@@ -201,6 +202,7 @@ def test_the_report_tells_of_every_drive(tmp_path: Path, count: int) -> None:
     assert "&lt;0&gt;" in page
     assert "torn &amp; gone" in page
     assert "<th>a=0</th>" in page
+    assert "<td>standstill 0</td>" in page
     assert (tmp_path / "report.png").read_bytes().startswith(b"\x89PNG")
     assert not list(tmp_path.glob(".*"))
 

@@ -35,8 +35,10 @@ def test_a_drive_is_fetched_for_as_long_as_it_is_read(tmp_path: Path) -> None:
         at_hand("video:memory://store/none.mp4"),
     ):
         pass
-    (drive,) = find_drives(["video:memory://store/drive.mp4"])
-    assert drive.uri == "video:memory://store/drive.mp4"
+    for argument in ("video:memory://store/drive.mp4", "memory://store/drive.mp4"):
+        (drive,) = find_drives([argument])
+        assert drive.uri == "video:memory://store/drive.mp4"
+    assert find_drives(["memory://store/a.bag"])[0].uri == "rosbag:memory://store/a.bag"
 
 
 def test_a_fetched_drive_gives_the_same_bytes(tmp_path: Path) -> None:

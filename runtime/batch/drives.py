@@ -60,6 +60,9 @@ def _drives(argument: str, base: Path | None = None) -> Iterator[Found]:
             address = str(((base or Path()) / Path(address).expanduser()).absolute())
         yield Found(f"{scheme}:{address}" if address else scheme)
         return
+    if is_url(argument):
+        yield Found(_uri_of_url(argument))
+        return
     path = ((base or Path()) / Path(argument).expanduser()).absolute()
     if path.suffix.lower() in LISTS and path.is_file():
         yield from _listed(path)
@@ -112,6 +115,16 @@ def _uri(path: Path) -> str | None:
             head = b""
         return f"{'rosbag' if b'ros' in head else 'mcap'}:{path}"
     return None
+
+
+def _uri_of_url(url: str) -> str:
+    """By its name alone. Raises ConfigurationError where that does not say it."""
+    suffix = Path(url).suffix.lower()
+    if suffix in VIDEOS:
+        return f"video:{url}"
+    if suffix in BAGS:
+        return f"rosbag:{url}"
+    raise ConfigurationError(f"{url}: say what it is, as in rosbag:{url} or mcap:{url}")
 
 
 def sweep(texts: Sequence[str]) -> list[dict[str, Any]]:

@@ -23,6 +23,7 @@ from birdslam.runtime.batch.drives import Task
 
 MOST_BARS = 40  # of a plot; more drives are drawn as a histogram
 MOST_STATUSES = 12
+MOST_IN_A_CELL = 4  # statuses of one drive
 COLUMNS = (
     "drive", "source", "settings", "error", "frames", "duration_s", "path_m", "mean_speed_mps", "top_speed_mps",
     "vehicles", "invalid_frames", "epochs", "statuses", "ate_m", "ate_pct", "ate_se3_m", "ate_sim3_m", "scale_error",
@@ -151,7 +152,20 @@ def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
     file.write('<h1>Drives</h1>\n<p><img src="report.png" alt="plots"></p>\n')
     if any(task.settings for task in tasks):
         _write_sweep(file, tasks, output)
-    heads = ("drive", "frames", "s", "m", "m/s", "top m/s", "vehicles", "invalid", "ATE m", "ATE %", "scale error")
+    heads = (
+        "drive",
+        "frames",
+        "s",
+        "m",
+        "m/s",
+        "top m/s",
+        "vehicles",
+        "invalid",
+        "ATE m",
+        "ATE %",
+        "scale error",
+        "statuses",
+    )
     file.write("<table><tr>" + "".join(f"<th>{head}</th>" for head in heads) + "</tr>\n")
     for outcome in outcomes(tasks, output):
         name = html.escape(outcome.drive)
@@ -162,6 +176,8 @@ def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
         found = row(outcome)
         columns = ("frames", "duration_s", "path_m", "mean_speed_mps", "top_speed_mps", "vehicles", "invalid_frames")
         cells = [found[column] for column in (*columns, "ate_m", "ate_pct", "scale_error")]
+        most = sorted(outcome.statuses.items(), key=lambda one: -one[1])[:MOST_IN_A_CELL]
+        cells.append(", ".join(f"{name} {count}" for name, count in most))
         link = f'<a href="{DRIVES}/{name}/bev.png">{name}</a>'
         file.write(f"<tr><td>{link}</td>" + "".join(f"<td>{_shown(cell)}</td>" for cell in cells) + "</tr>\n")
     file.write("</table>\n")
