@@ -73,11 +73,11 @@ def carry_out(place: Path, after: str = "true") -> str:
     settings: dict[str, str] = {}
 
     def in_stage(command: str) -> str:
-        home = "/root" if user == "root" else f"/home/{user}"
         passed = {name: value for name, value in os.environ.items() if name.startswith("PIP_")}
-        environment = {"PATH": PATH, "HOME": home, **passed, **settings}
+        environment = {"PATH": PATH, **passed, **settings}
         words = " ".join(shlex.quote(f"{name}={value}") for name, value in environment.items())
-        inner = shlex.quote(f"cd {workdir} && {command}")
+        home = 'HOME=$(getent passwd "$(id -un)" | cut -d: -f6)'
+        inner = shlex.quote(f"export {home}; cd {workdir} && {command}")
         return f'chroot --userspec={user}:{user} "$root" env -i {words} sh -c {inner}'
 
     for instruction in instructions():
