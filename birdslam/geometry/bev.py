@@ -35,7 +35,9 @@ def road_slope(depth_m: Numbers, height_m: Numbers | float) -> Numbers:
 
 def rays_cam(camera: Camera, px: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 3) rays of z = 1 in camera axes, K^-1 x, of pixels (N, 2)."""
-    return np.column_stack([camera.to_xy(px), np.ones(len(px))])
+    rays = np.ones((len(px), 3))
+    rays[:, :2] = camera.to_xy(px)
+    return rays
 
 
 def bearing_and_slope(camera: Camera, ground: GroundPlane, px: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -70,7 +72,7 @@ def ego_to_pixel(camera: Camera, ground: GroundPlane, points: NDArray[np.float64
         points = np.column_stack([points, np.zeros(len(points))])
     cam = (points - np.array([0.0, 0.0, ground.height_m])) @ ground.R_ego_cam
     with np.errstate(divide="ignore", invalid="ignore"):
-        px = cam[:, :2] / cam[:, 2:] * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+        px = camera.to_px(cam[:, :2] / cam[:, 2:])
     px[cam[:, 2] <= 0.0] = np.nan
     return px
 
@@ -91,19 +93,19 @@ def road_point_cov(
     px = np.atleast_2d(np.asarray(px, dtype=np.float64))
     sigma_u, sigma_v = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (2,))
     step_px, step_rad = 0.5, 1e-4
-
-    def slope(d_px: list[float]) -> NDArray[np.float64]:
-        ahead, behind = (pixel_to_ego(camera, ground, px + s * np.array(d_px)) for s in (1.0, -1.0))
-        return (ahead - behind) / (2.0 * step_px)
+    steps_px = np.array([[0.0, 0.0], [step_px, 0.0], [-step_px, 0.0], [0.0, step_px], [0.0, -step_px]])
+    here, right, left, below, above = pixel_to_ego(camera, ground, (px + steps_px[:, None]).reshape(-1, 2)).reshape(
+        5, -1, 2
+    )
 
     def tilted(d_rad: float) -> NDArray[np.float64]:
         return pixel_to_ego(camera, GroundPlane(ground.height_m, ground.pitch_rad + d_rad, ground.roll_rad), px)
 
     columns = [
-        slope([step_px, 0.0]) * sigma_u,
-        slope([0.0, step_px]) * sigma_v,
+        (right - left) / (2.0 * step_px) * sigma_u,
+        (below - above) / (2.0 * step_px) * sigma_v,
         (tilted(step_rad) - tilted(-step_rad)) / (2.0 * step_rad) * sigma_pitch_rad,
-        pixel_to_ego(camera, ground, px) * sigma_height_rel,
+        here * sigma_height_rel,
     ]
     J = np.stack(columns, axis=-1)  # (N, 2, 4), already scaled by the sigmas
     out: NDArray[np.float64] = J @ np.swapaxes(J, 1, 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Annotated
 
 import cv2
@@ -25,18 +26,24 @@ class GroundPlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def R_ego_cam(self) -> NDArray[np.float64]:
-        """(3, 3): turns vectors of the camera into ego."""
-        cp, sp = math.cos(self.pitch_rad), math.sin(self.pitch_rad)
-        cr, sr = math.cos(self.roll_rad), math.sin(self.roll_rad)
-        Ry = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-        Rx = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-        out: NDArray[np.float64] = Ry @ Rx @ AXES_EGO_CAM
-        return out
+        """(3, 3): turns vectors of the camera into ego; read-only."""
+        return _rotation(self.pitch_rad, self.roll_rad)
 
     @property
     def normal_cam(self) -> NDArray[np.float64]:
         """(3,): the road's unit normal in camera axes, up; [0, -1, 0] on level ground as in Eq. 1."""
         return self.R_ego_cam[2]
+
+
+@lru_cache(maxsize=64)  # a frame asks for the same few rotations tens of times
+def _rotation(pitch_rad: float, roll_rad: float) -> NDArray[np.float64]:
+    cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
+    cr, sr = math.cos(roll_rad), math.sin(roll_rad)
+    Ry = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    Rx = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    out: NDArray[np.float64] = Ry @ Rx @ AXES_EGO_CAM
+    out.flags.writeable = False
+    return out
 
 
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -93,12 +100,16 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def to_xy(self, px: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 2) rays of z = 1 from pixels (N, 2)."""
-        out: NDArray[np.float64] = (px - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
+        out = np.empty(px.shape)
+        out[:, 0] = (px[:, 0] - self.cx_px) / self.fx_px
+        out[:, 1] = (px[:, 1] - self.cy_px) / self.fy_px
         return out
 
     def to_px(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 2) pixels of rays (N, 2) of z = 1."""
-        out: NDArray[np.float64] = xy * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
+        out = np.empty(xy.shape)
+        out[:, 0] = xy[:, 0] * self.fx_px + self.cx_px
+        out[:, 1] = xy[:, 1] * self.fy_px + self.cy_px
         return out
 
     @property

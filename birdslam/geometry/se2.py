@@ -50,7 +50,10 @@ class SE2(msgspec.Struct, frozen=True, array_like=True):
             )
         points = np.asarray(other, dtype=np.float64)
         x, y = points[..., 0], points[..., 1]
-        return np.stack([self.x_m + c * x - s * y, self.y_m + s * x + c * y], axis=-1)
+        out = np.empty(points.shape)
+        out[..., 0] = self.x_m + c * x - s * y
+        out[..., 1] = self.y_m + s * x + c * y
+        return out
 
     def inverse(self) -> SE2:
         """`T_b_a` of this `T_a_b`."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.localisation import Dimensions, Observation
+from birdslam.vehicles.localisation import Observation
 from birdslam.vehicles.track import Track
 
 HEIGHT_SHOWS_REL = 0.2  # 1-sigma of a box's height, as a fraction; past it the box says nothing of a size
@@ -55,12 +55,19 @@ def within_gate(
     A vehicle whose height is known has the length of its own class, whatever a box is called: a box twice as high, of a
     bus behind it, is no box of a car.
     """
-    seen = [[_rough(o, _class_of(track, o)) for o in observations] for track in tracks]
-    depth, sigma_rel, length_m, turned_m = np.moveaxis(np.array(seen).reshape(len(tracks), len(observations), 4), -1, 0)
-    bearing = np.array([observation.bearing for observation in observations])
-    sigma_sides = np.array([max(observation.sigma_left, observation.sigma_right) for observation in observations])
+    tan_height, sigma_box_rel, turned_share, bearing, sigma_sides = np.array([_of_box(o) for o in observations]).T
+    # A box is taken to be of the track's class where the track's height showed, else of its own
+    shows = np.array([_shows_height(track.observation) for track in tracks])[:, None]
+    of_tracks, of_boxes = (
+        np.array([(d.height_m, d.sigma_height_rel, d.length_m) for d in classes]).T
+        for classes in ([t.observation.dimensions for t in tracks], [o.dimensions for o in observations])
+    )
+    height_m, sigma_class_rel, length_m = np.where(shows, of_tracks[..., None], of_boxes[:, None])
+    depth = height_m / tan_height
+    sigma_rel = np.hypot(sigma_box_rel, sigma_class_rel)
+    turned_m = length_m * turned_share  # its yaw is not known here
     learned = np.array([_learned_height_m(track) for track in tracks])[:, None]
-    of_class = np.array([track.observation.dimensions.height_m for track in tracks])[:, None]
+    of_class = of_tracks[0][:, None]
     x_m = np.where(np.isnan(learned), 1.0, learned / of_class) * depth + length_m / 2.0
     along = np.square(x_m * sigma_rel) + np.square(turned_m)
     across = np.square(x_m * sigma_sides) + np.square(turned_m / 2.0)
@@ -86,16 +93,11 @@ def _shows_height(seen: Observation) -> bool:
     return _sigma_height_rel(seen) < HEIGHT_SHOWS_REL
 
 
-def _class_of(track: Track, seen: Observation) -> Dimensions:
-    """What a box is taken to be of, were it the track's: of the track's class where its height showed."""
-    return track.observation.dimensions if _shows_height(track.observation) else seen.dimensions
-
-
-def _rough(seen: Observation, dimensions: Dimensions) -> tuple[float, float, float, float]:
-    """Depth (m) by the height of a class, its 1-sigma (relative), the length (m), what the yaw may hide of it (m)."""
-    turned_m = dimensions.length_m / (2.0 if seen.cut_side else 4.0)  # its yaw is not known here
-    sigma_rel = math.hypot(_sigma_height_rel(seen), dimensions.sigma_height_rel)
-    return dimensions.height_m / max(seen.tan_height, LEAST_TAN), sigma_rel, dimensions.length_m, turned_m
+def _of_box(seen: Observation) -> tuple[float, float, float, float, float]:
+    """Height at a depth of 1, its 1-sigma (relative), the share of the length that the yaw may hide, bearing, sigma."""
+    turned_share = 0.5 if seen.cut_side else 0.25
+    sigma_sides = max(seen.sigma_left, seen.sigma_right)
+    return max(seen.tan_height, LEAST_TAN), _sigma_height_rel(seen), turned_share, seen.bearing, sigma_sides
 
 
 def _sigma_height_rel(seen: Observation) -> float:

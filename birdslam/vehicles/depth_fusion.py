@@ -6,7 +6,6 @@ They are fused by their covariances, or by the paper's rule: the depth where the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import msgspec
@@ -40,8 +39,7 @@ class PseudoLidarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     road_far_m: Positive = 25.0  # and where that stretch of road ends
 
 
-@dataclass(frozen=True)
-class DepthPlace:
+class DepthPlace(msgspec.Struct, frozen=True):
     """Where the depth map puts a vehicle, in ego: its footprint's centre (2,) and yaw, with their covariances.
 
     The yaw is of the axis, in (-pi/2, pi/2], where `flip` is 0.5: which end is the front is then not known. `flip` is

@@ -9,7 +9,6 @@ footprint where the box's edges and the vehicle's yaw want it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -66,8 +65,7 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
         return EdgeSigma((self.sigma_box_rel,) * 4, self.sigma_box_px)
 
 
-@dataclass(frozen=True)
-class Observation:
+class Observation(msgspec.Struct, frozen=True):
     """One vehicle's box in one frame.
 
     `left` and `right` are the bearings (y/x in ego) of its edges at the bottom. Slopes (-z/x in ego) count downwards
@@ -112,8 +110,7 @@ class Observation:
         return self.dimensions.height_m / max(self.tan_height, 1e-3)
 
 
-@dataclass(frozen=True)
-class AssumedSize:
+class AssumedSize(msgspec.Struct, frozen=True):
     """The size that a vehicle was placed with, for the smoother (rts_smoother.py): later frames know the size better.
 
     `log_height` is the logarithm of its height in metres, `depth_per_height` the derivative of the logarithm of its
@@ -126,8 +123,7 @@ class AssumedSize:
     standing: float  # the probability that it stands
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(msgspec.Struct, frozen=True):
     """Where an observed vehicle is in ego: its nearest face's depth, its footprint's centre (2,), and cov (2, 2)."""
 
     depth_m: float
@@ -147,44 +143,70 @@ def iou(a_px: NDArray[np.float64], b_px: NDArray[np.float64]) -> NDArray[np.floa
     return out
 
 
-def corners_of(dimensions: Dimensions, yaw_rad: float) -> list[tuple[float, float]]:
-    """The footprint's corners about its centre, in ego's axes; `yaw_rad` is the vehicle's against the ego."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+def corners_of(dimensions: Dimensions, yaw_rad: float, size: float = 1.0) -> list[tuple[float, float]]:
+    """The footprint's corners about its centre, in ego's axes; `yaw_rad` is the vehicle's against the ego.
+
+    `size` is a factor of its length and width.
+    """
+    c, s = size * math.cos(yaw_rad), size * math.sin(yaw_rad)
     half_l, half_w = dimensions.length_m / 2.0, dimensions.width_m / 2.0
-    return [(sl * half_l * c - sw * half_w * s, sl * half_l * s + sw * half_w * c) for sl in (-1, 1) for sw in (-1, 1)]
+    lc, ls, wc, ws = half_l * c, half_l * s, half_w * c, half_w * s
+    return [(-lc + ws, -ls - wc), (-lc - ws, -ls + wc), (lc + ws, ls - wc), (lc - ws, ls + wc)]
 
 
 def extent_m(dimensions: Dimensions, yaw_rad: float, depth_m: float, bearing: float) -> tuple[float, float]:
     """(extent along ego's x, width of its outline as seen at the depth of its nearest face) of a vehicle, in metres."""
     corners = corners_of(dimensions, yaw_rad)
-    reach_m = -min(x for x, _ in corners)
+    reach_m = _reach_m(corners)
     x_m = depth_m + reach_m
     y_m = bearing * x_m
-    outline = [(y_m + y) / max(x_m + x, 0.1) for x, y in corners]
-    return 2.0 * reach_m, (max(outline) - min(outline)) * depth_m
+    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = corners
+    a, b = (y_m + y0) / max(x_m + x0, 0.1), (y_m + y1) / max(x_m + x1, 0.1)
+    c, d = (y_m + y2) / max(x_m + x2, 0.1), (y_m + y3) / max(x_m + x3, 0.1)
+    return 2.0 * reach_m, (max(a, b, c, d) - min(a, b, c, d)) * depth_m
 
 
-def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float, config: LocalisationConfig) -> Place:
-    """The observation's place in ego at a depth with its variance, both of the logarithm; yaw against the ego.
+def _reach_m(corners: list[tuple[float, float]]) -> float:
+    """From the nearest corner to the centre, along ego's x."""
+    (a, _), (b, _), (c, _), (d, _) = corners
+    return -min(a, b, c, d)
+
+
+def centre_at(
+    seen: Observation, depth_m: float, yaw_rad: float, config: LocalisationConfig
+) -> tuple[float, float, float, float]:
+    """(x, y, reach, outline): the footprint's centre in ego by `place`, how far it lies behind the nearest face, in
+    metres, and the width of its outline at a depth of 1.
 
     The middle of an oblique vehicle's outline is not the column of its centre: the centre is moved sideways until the
     bearings of its outermost corners have those of the box's edges, each weighted by its information.
     """
-    depth_m = math.exp(log_depth)
-    corners = [(config.reach_rel * x, config.reach_rel * y) for x, y in corners_of(seen.dimensions, yaw_rad)]
-    reach_m = -min(x for x, _ in corners)
+    corners = corners_of(seen.dimensions, yaw_rad, config.reach_rel)
+    reach_m = _reach_m(corners)
     x_m = depth_m + reach_m
-    y_m = seen.bearing * x_m
+    left, right = seen.left, seen.right
+    y_m = (left + right) / 2.0 * x_m
     of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
+    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = corners
+    x0, x1, x2, x3 = max(x_m + x0, 0.1), max(x_m + x1, 0.1), max(x_m + x2, 0.1), max(x_m + x3, 0.1)
+    widest = least = 0.0
     for _ in range(CENTRE_STEPS):
-        outline = [(y_m + y) / max(x_m + x, 0.1) for x, y in corners]
-        error = (seen.left - max(outline)) * of_left + (seen.right - min(outline)) * of_right
-        y_m += error / (of_left + of_right) * x_m
+        a, b, c, d = (y_m + y0) / x0, (y_m + y1) / x1, (y_m + y2) / x2, (y_m + y3) / x3
+        widest, least = max(a, b, c, d), min(a, b, c, d)
+        y_m += ((left - widest) * of_left + (right - least) * of_right) / (of_left + of_right) * x_m
+    return x_m, y_m, reach_m, widest - least
+
+
+def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float, config: LocalisationConfig) -> Place:
+    """The observation's place in ego at a depth with its variance, both of the logarithm; yaw against the ego."""
+    depth_m = math.exp(log_depth)
+    x_m, y_m, reach_m, outline = centre_at(seen, depth_m, yaw_rad, config)
+    of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
 
     # An edge alone gives the centre as well as half of the outline is known; of a vehicle that leaves the image at its
     # side the nearest face is not seen
     lopsided = (of_left - of_right) / (of_left + of_right)
-    sigma_half = seen.dimensions.sigma_width_rel * max(seen.tan_width, max(outline) - min(outline)) / 2.0
+    sigma_half = seen.dimensions.sigma_width_rel * max(seen.tan_width, outline) / 2.0
     sigma_across = math.hypot(
         1.0 / math.sqrt(of_left + of_right), lopsided * sigma_half, config.shape_floor_m / max(x_m, 1.0)
     )

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfcx
@@ -21,7 +22,15 @@ from birdslam.vehicles.association import NEAREST_M, in_ego
 from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
 from birdslam.vehicles.ground_size_filter import Depths, GroundSizeFilter
 from birdslam.vehicles.heading import HeadingConfig, Headings, marginalise_yaw
-from birdslam.vehicles.localisation import AssumedSize, LocalisationConfig, Observation, Place, extent_m, place
+from birdslam.vehicles.localisation import (
+    AssumedSize,
+    LocalisationConfig,
+    Observation,
+    Place,
+    centre_at,
+    extent_m,
+    place,
+)
 from birdslam.vehicles.parallax import LearnedSize, Parallax, ParallaxConfig, measure_boxes
 from birdslam.vehicles.track import Track
 
@@ -56,7 +65,7 @@ class Assignment:
         """Of the nearest face, before it is measured: as the track predicts it, or by the height of its class."""
         if self.track is None:
             return self.observation.depth_by_height_m
-        reach_m = self.track.place.centre_m[0] - self.track.place.depth_m
+        reach_m = float(self.track.place.centre_m[0]) - self.track.place.depth_m
         return max(NEAREST_M, in_ego(T_world_ego, self.track.state[:2])[0] - reach_m)
 
     def turned_rad(self, T_world_ego: SE2) -> float:
@@ -113,7 +122,9 @@ class Placing:
         # The two sources of Fig. 2 become one
         fused = [fuse(where, a.by_depth, self.pseudolidar) for where, a in zip(by_eq_1, assignments, strict=True)]
         return [
-            replace(both, assumed=self._assumed(depths, k, a.serial, float(both.cov[0, 0] / one.cov[0, 0])))
+            msgspec.structs.replace(
+                both, assumed=self._assumed(depths, k, a.serial, float(both.cov[0, 0] / one.cov[0, 0]))
+            )
             for k, (both, one, a) in enumerate(zip(fused, by_eq_1, assignments, strict=True))
         ]
 
@@ -122,7 +133,7 @@ class Placing:
         depths = [a.expected_depth_m(T_world_ego) for a in assignments]
         turned = [a.turned_rad(T_world_ego) for a in assignments]
         each = [(a.observation, yaw, depth) for a, yaw, depth in zip(assignments, yaws, depths, strict=True)]
-        centres = [place(o, math.log(depth), 0.0, yaw, self.localisation).centre_m for o, yaw, depth in each]
+        centres = [centre_at(o, depth, yaw, self.localisation)[:2] for o, yaw, depth in each]
         extents = [extent_m(o.dimensions, yaw, depth, o.bearing) for o, yaw, depth in each]
         return _Expected(
             yaws, np.array(centres).reshape(-1, 2), np.array(extents).reshape(-1, 2), np.array(turned, dtype=np.float64)
@@ -160,7 +171,7 @@ class Placing:
         out = []
         for observation, log_depth, variance, yaw_rad, d, C in numbers:
             where = place(observation, log_depth, variance, yaw_rad, self.localisation)
-            out.append(replace(where, centre_m=where.centre_m + d, cov=where.cov + C))
+            out.append(Place(where.depth_m, where.centre_m + d, where.cov + C))
         return out
 
     def _assumed(self, depths: Depths, k: int, serial: int, share: float) -> AssumedSize:

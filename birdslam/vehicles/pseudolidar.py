@@ -69,7 +69,7 @@ def bodies_by_detector(
         return list(seen), [None] * len(seen)
     bodies = detections.boxes3d.take([o.row for o in seen])
     measured = [
-        replace(o, dimensions=_with_length(o.dimensions, *lengths))
+        msgspec.structs.replace(o, dimensions=_with_length(o.dimensions, *lengths))
         for o, *lengths in zip(seen, bodies.size_m[:, 0].tolist(), bodies.sigma_size_m[:, 0].tolist(), strict=True)
     ]
     places = places_of(bodies, measured, camera, ground)
@@ -118,7 +118,7 @@ def _behind_its_face(place: DepthPlace, seen: Observation) -> DepthPlace:
     assert place.size_m is not None
     own = msgspec.structs.replace(seen.dimensions, length_m=place.size_m[0])
     own_m, together_m = (max(x for x, _ in corners_of(d, place.yaw_rad)) for d in (own, seen.dimensions))
-    return replace(place, centre_m=place.centre_m * (1.0 + (together_m - own_m) / place.centre_m[0]))
+    return msgspec.structs.replace(place, centre_m=place.centre_m * (1.0 + (together_m - own_m) / place.centre_m[0]))
 
 
 def places_of(
@@ -130,15 +130,23 @@ def places_of(
     return [
         DepthPlace(
             np.array([x_m, y_m]),
-            line_of_sight_cov(x_m, y_m, float(bodies.sigma_depth_m[i]) ** 2, across_var(o, x_m)),
+            line_of_sight_cov(x_m, y_m, sigma_depth_m**2, across_var(o, x_m)),
             wrap(yaw_rad),
-            float(bodies.sigma_alpha_rad[i]),
-            float(bodies.flip[i]),
-            tuple(bodies.size_m[i].tolist()),
+            sigma_yaw_rad,
+            flip,
+            tuple(size_m),
         )
-        if x_m > 0.0 and math.isfinite(bodies.sigma_depth_m[i])
+        if x_m > 0.0 and math.isfinite(sigma_depth_m)
         else None
-        for i, (o, (x_m, y_m, yaw_rad)) in enumerate(zip(seen, poses.tolist(), strict=True))
+        for o, (x_m, y_m, yaw_rad), sigma_depth_m, sigma_yaw_rad, flip, size_m in zip(
+            seen,
+            poses.tolist(),
+            bodies.sigma_depth_m.tolist(),
+            bodies.sigma_alpha_rad.tolist(),
+            bodies.flip.tolist(),
+            bodies.size_m.tolist(),
+            strict=True,
+        )
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 
@@ -41,6 +42,17 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     heading: HeadingConfig = HeadingConfig()
     stands: float = 0.5  # the probability from which on a vehicle does, by its parallax: its yaw is kept
     late_sigma_m: float = 3.0  # a late detection that the velocity puts so far off is not shown in the present frame
+
+
+def turned_back(cov: NDArray[np.float64], yaw_rad: float) -> tuple[float, float, float]:
+    """(xx, xy, yy) of a covariance (2, 2) in axes that are turned by `yaw_rad`, R' cov R, without arrays."""
+    (xx, xy), (_, yy) = cov.tolist()
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return (
+        c * c * xx + 2.0 * c * s * xy + s * s * yy,
+        c * s * (yy - xx) + (c * c - s * s) * xy,
+        s * s * xx - 2.0 * c * s * xy + c * c * yy,
+    )
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from birdslam.vehicles.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes
 from birdslam.vehicles.placing import Assignment, Placing
 from birdslam.vehicles.pseudolidar import FrustumNetwork, locate_by_depth
-from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig
+from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig, turned_back
 from birdslam.vehicles.yaw_filter import YawFilter
 
 
@@ -112,11 +112,10 @@ class Tracker:
             known.missed += observations is not None
         assignments = self._assignments(frame, observations or [], by_depth, ground_size.ground)
         places = self.placing.locate(assignments, frame.T_world_ego, ground_size)
+        self._correct(assignments, places, frame, ground_size)
         for assignment, where in zip(assignments, places, strict=True):
             if assignment.track is None:
                 self.tracks.append(self._begin(assignment, where, frame))
-            else:
-                self._correct(assignment.track, assignment, where, frame, ground_size)
         self._forget(frame, ground_size)
         return self._confirmed(frame)
 
@@ -129,9 +128,11 @@ class Tracker:
         F[0, 2] = F[1, 3] = dt_s
         G = np.array([[dt_s**2 / 2, 0.0], [0.0, dt_s**2 / 2], [dt_s, 0.0], [0.0, dt_s]])
         Q = G @ G.T * self.config.sigma_accel_mps2**2
-        for track in self.tracks:
-            track.state = F @ track.state
-            track.cov = F @ track.cov @ F.T + Q
+        if self.tracks:
+            states = np.array([track.state for track in self.tracks]) @ F.T
+            covs = F @ np.array([track.cov for track in self.tracks]) @ F.T + Q
+            for track, state, cov in zip(self.tracks, states, covs, strict=True):
+                track.state, track.cov = state, cov
         self._last = frame
 
     def _assignments(
@@ -174,50 +175,56 @@ class Tracker:
         return [(self.tracks[i], int(j)) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
 
     def _correct(
-        self, track: Track, assignment: Assignment, seen: Place, frame: EgoFrame, ground_size: GroundSizeFilter
+        self, assignments: Sequence[Assignment], places: Sequence[Place], frame: EgoFrame, ground_size: GroundSizeFilter
     ) -> None:
-        """The track by the place of its observation in this frame."""
-        track.motion = self._predicted_motion(track, frame)
+        """The known tracks among the assignments, all at once, by the places of their observations in this frame."""
+        known = [(a.track, a, place) for a, place in zip(assignments, places, strict=True) if a.track is not None]
+        if not known:
+            return
+        state = np.array([track.state for track, *_ in known])
+        cov = np.array([track.cov for track, *_ in known])
         R = frame.T_world_ego.rotation()
-        R_seen = R @ seen.cov @ R.T
-        S = track.cov[:2, :2] + R_seen
-        innovation = frame.T_world_ego @ seen.centre_m - track.state[:2]
+        R_seen = R @ np.array([seen.cov for *_, seen in known]) @ R.T
+        S = cov[:, :2, :2] + R_seen
+        innovation = frame.T_world_ego @ np.array([seen.centre_m for *_, seen in known]) - state[:, :2]
         information = np.linalg.inv(S)
-        track.stands = self.placing.parallax.standing(track.serial) > self.config.stands
-        if track.stands and innovation @ information @ innovation > self.config.gate_sigma**2:
-            # Its size was estimated anew, which moves its place: that is no motion
-            track.state[:2] += innovation
-            track.first_m = track.first_m + innovation
-            track.cov[:2, :], track.cov[2:, :2] = 0.0, 0.0
-            track.cov[:2, :2] = R_seen
-        else:
-            gain = track.cov[:, :2] @ information
-            track.state = track.state + gain @ innovation
-            track.cov = track.cov - gain @ S @ gain.T
-        track.observation, track.place = assignment.observation, seen
-        track.seen_frame, track.seen_ns, track.T_world_ego = frame.frame_id, frame.t_source_ns, frame.T_world_ego
-        track.hits += 1
-        track.missed = 0
-        track.votes[assignment.observation.label] += 1
-        self.yaw.turn_to_motion(track, frame.T_world_ego, ground_size)
-        self.yaw.turn_to_body(track, assignment.by_depth, frame.T_world_ego, ground_size)
+        misfit = np.einsum("na,nab,nb->n", innovation, information, innovation).tolist()
+        gain = cov[:, :, :2] @ information
+        corrected = state + (gain @ innovation[..., None])[..., 0]
+        corrected_cov = cov - gain @ S @ gain.swapaxes(1, 2)
+        for k, (track, assignment, seen) in enumerate(known):
+            track.motion = self._predicted_motion(track, frame)
+            track.stands = self.placing.parallax.standing(track.serial) > self.config.stands
+            if track.stands and misfit[k] > self.config.gate_sigma**2:
+                # Its size was estimated anew, which moves its place: that is no motion
+                track.state[:2] += innovation[k]
+                track.first_m = track.first_m + innovation[k]
+                track.cov[:2, :], track.cov[2:, :2] = 0.0, 0.0
+                track.cov[:2, :2] = R_seen[k]
+            else:
+                track.state, track.cov = corrected[k], corrected_cov[k]
+            track.observation, track.place = assignment.observation, seen
+            track.seen_frame, track.seen_ns, track.T_world_ego = frame.frame_id, frame.t_source_ns, frame.T_world_ego
+            track.hits += 1
+            track.missed = 0
+            track.votes[assignment.observation.label] += 1
+            self.yaw.turn_to_motion(track, frame.T_world_ego, ground_size)
+            self.yaw.turn_to_body(track, assignment.by_depth, frame.T_world_ego, ground_size)
 
     def _predicted_motion(self, track: Track, frame: EgoFrame) -> MotionEdge | None:
         """VV by constant velocity; None for a track that no edge has shown yet."""
         if track.shown is None:
             return None
         dt_s = (frame.t_source_ns - track.shown.t_ns) * 1e-9
-        R = SE2(yaw_rad=track.yaw_rad).rotation()
-        growth = track.cov[2:, 2:] * dt_s**2 + np.eye(2) * (self.config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
-        cov = np.zeros((3, 3))
-        cov[:2, :2] = R.T @ growth @ R
-        cov[2, 2] = (self.config.sigma_yaw_rate_radps * dt_s) ** 2
+        xx, xy, yy = turned_back(track.cov[2:, 2:], track.yaw_rad)
+        by_acceleration = (self.config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
+        xx, xy, yy = xx * dt_s**2 + by_acceleration, xy * dt_s**2, yy * dt_s**2 + by_acceleration
         return MotionEdge(
             vehicle=track.vehicle,
             from_frame=track.shown.frame,
             to_frame=frame.frame_id,
             T_from_to=track.shown.T_world_vehicle.between(track.pose()),
-            cov=tuple(cov.ravel().tolist()),
+            cov=(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, (self.config.sigma_yaw_rate_radps * dt_s) ** 2),
         )
 
     def _begin(self, assignment: Assignment, seen: Place, frame: EgoFrame) -> Track:

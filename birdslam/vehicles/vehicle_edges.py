@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.geometry.se2 import SE2
+from birdslam.geometry.se2 import SE2, wrap
 from birdslam.types import MotionEdge, VehicleEdge
 from birdslam.vehicles.association import predicted_boxes_px
-from birdslam.vehicles.track import EgoFrame, Shown, Track, TrackingConfig
+from birdslam.vehicles.track import EgoFrame, Shown, Track, TrackingConfig, turned_back
 
 
 def vehicle_edges(
@@ -41,24 +41,22 @@ def vehicle_edges(
 
 def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> VehicleEdge:
     seen, place = track.observation, track.place
-    yaw_rad = track.T_world_ego.between(track.pose()).yaw_rad
-    cov = np.zeros((3, 3))
-    R_vehicle_ego = SE2(yaw_rad=-yaw_rad).rotation()
-    cov[:2, :2] = R_vehicle_ego @ place.cov @ R_vehicle_ego.T  # the tangent at the vehicle's pose
+    yaw_rad = wrap(wrap(-track.T_world_ego.yaw_rad) + track.yaw_rad)
+    xx, xy, yy = turned_back(place.cov, yaw_rad)  # the tangent at the vehicle's pose
     sigma_yaw_rad = math.hypot(config.sigma_yaw_moving_rad, track.sigma_yaw_rad)
-    cov[2, 2] = (sigma_yaw_rad if track.yaw_known else config.sigma_yaw_unknown_rad) ** 2
+    var_yaw = (sigma_yaw_rad if track.yaw_known else config.sigma_yaw_unknown_rad) ** 2
     return VehicleEdge(
         vehicle=track.vehicle,
         frame=track.seen_frame,
         T_ego_vehicle=SE2(float(place.centre_m[0]), float(place.centre_m[1]), yaw_rad),
-        cov=tuple(cov.ravel().tolist()),
+        cov=(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, var_yaw),
         label=track.label,
         score=seen.score,
         box_px=seen.box_px,
         length_m=seen.dimensions.length_m,
         width_m=seen.dimensions.width_m,
         delay_ns=max(delay_ns, 0),
-        **({} if place.assumed is None else vars(place.assumed)),
+        **({} if place.assumed is None else msgspec.structs.asdict(place.assumed)),
     )
 
 
@@ -82,8 +80,8 @@ def _moved_on(
     cov_world = R_world_then @ track.place.cov @ R_world_then.T + drift
     cov_world += dt_s * (track.cov[2:, :2] + track.cov[:2, 2:])
     centre = present.T_world_ego.inverse() @ (track.T_world_ego @ track.place.centre_m + velocity * dt_s)
-    moved.place = replace(track.place, centre_m=centre, cov=R_now_world @ cov_world @ R_now_world.T)
-    moved.observation = replace(track.observation, box_px=tuple(box.tolist()))
+    moved.place = msgspec.structs.replace(track.place, centre_m=centre, cov=R_now_world @ cov_world @ R_now_world.T)
+    moved.observation = msgspec.structs.replace(track.observation, box_px=tuple(box.tolist()))
     moved.seen_frame, moved.seen_ns, moved.T_world_ego = present.frame_id, present.t_source_ns, present.T_world_ego
     if track.motion is not None:
         moved.motion = _motion_on(track.motion, track, present.frame_id, velocity * dt_s, drift, config, dt_s)

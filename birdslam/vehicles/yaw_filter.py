@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
+import msgspec
 import numpy as np
 
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.vehicles.depth_fusion import DepthPlace
 from birdslam.vehicles.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.localisation import LocalisationConfig, extent_m, place
+from birdslam.vehicles.localisation import LocalisationConfig, centre_at, extent_m
 from birdslam.vehicles.track import Track, TrackingConfig
 
 MOTION_LOGIT = 6.0  # log odds of the front of a vehicle that was seen to move
@@ -43,7 +43,7 @@ class YawFilter:
             return
         vx, vy = track.state[2:].tolist()
         speed = math.hypot(vx, vy)
-        sigma = math.sqrt(max(float(np.trace(track.cov[2:, 2:])) / 2.0, 1e-12))
+        sigma = math.sqrt(max(float(track.cov[2, 2] + track.cov[3, 3]) / 2.0, 1e-12))
         config = self.config
         slowest = max(config.moving_mps, config.moving_sigma * sigma, config.moving_of_ego * self._ego_speed_mps)
         if speed < slowest or not self._has_moved(track):
@@ -85,19 +85,15 @@ class YawFilter:
         track.yaw_known = True
         seen, depth_m = track.observation, track.place.depth_m
         yaw_ego_rad = wrap(track.yaw_rad - T_world_ego.yaw_rad)
-        outlines = [
-            extent_m(seen.dimensions, yaw_rad, depth_m, seen.bearing)[1]
-            for yaw_rad in (yaw_ego_rad, yaw_ego_rad - gain * turn)
-        ]
-        ground_size.rescale_outline(track.serial, math.log(outlines[0] / outlines[1]))
-        after_m, before_m = (
-            place(seen, math.log(depth_m), 0.0, yaw_rad, self.localisation).centre_m
-            for yaw_rad in (yaw_ego_rad, yaw_ego_rad - gain * turn)
-        )
-        shift_m = T_world_ego.rotation() @ (after_m - before_m)
-        track.state[:2] += shift_m
-        track.first_m = track.first_m + shift_m
-        track.place = replace(track.place, centre_m=track.place.centre_m + (after_m - before_m))
+        yaws_rad = yaw_ego_rad, yaw_ego_rad - gain * turn
+        after, before_it = (extent_m(seen.dimensions, yaw_rad, depth_m, seen.bearing)[1] for yaw_rad in yaws_rad)
+        ground_size.rescale_outline(track.serial, math.log(after / before_it))
+        (x, y, *_), (x0, y0, *_) = (centre_at(seen, depth_m, yaw_rad, self.localisation) for yaw_rad in yaws_rad)
+        shift_m = SE2(yaw_rad=T_world_ego.yaw_rad) @ SE2(x - x0, y - y0)
+        shift_world_m = np.array([shift_m.x_m, shift_m.y_m])
+        track.state[:2] += shift_world_m
+        track.first_m = track.first_m + shift_world_m
+        track.place = msgspec.structs.replace(track.place, centre_m=track.place.centre_m + np.array([x - x0, y - y0]))
 
     def _has_moved(self, track: Track) -> bool:
         """Whether it has left the place where it was first seen by more than the error of that place explains."""
