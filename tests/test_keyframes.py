@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.keyframes import KeyframeConfig, KeyframeWindow
+from birdslam.odometry.median import quantile
 from birdslam.odometry.relative_pose import locate
 from birdslam.odometry.road_filter import RoadScaleConfig
+from birdslam.odometry.sliding_window import common
 
 Floats = NDArray[np.float64]
 
@@ -54,3 +59,17 @@ def test_the_unit_of_length_walks_no_faster_than_the_road_filter_is_told() -> No
         unit = np.log(unit_of_length(seed, way_m, 0.35))
         walked.append(unit[-8:].mean() - unit[:8].mean())
     assert np.sqrt(np.mean(np.square(walked))) < RoadScaleConfig().scale_walk_rel_per_sqrt_m * np.sqrt(way_m)
+
+
+@given(st.sets(st.integers(0, 40)), st.sets(st.integers(0, 40)))
+def test_common_ids_stand_where_numpy_finds_them(a: set[int], b: set[int]) -> None:
+    first, second = (np.array(sorted(ids), dtype=np.int64) for ids in (a, b))
+    _, at_first, at_second = np.intersect1d(first, second, return_indices=True)
+    found = common(first, second)
+    assert found[0].tolist() == at_first.tolist()
+    assert found[1].tolist() == at_second.tolist()
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=30), st.floats(0.0, 1.0))
+def test_a_quantile_is_that_of_numpy(values: list[float], share: float) -> None:
+    assert quantile(np.array(values), share) == pytest.approx(float(np.quantile(values, share)), abs=1e-9)

@@ -67,8 +67,7 @@ class _Problem:
     rays: Floats  # (3, M) of the anchor's observation
     observed: Bools  # (F, M) by another keyframe than the anchor
     target: Floats  # (F, 2, M) normalised coordinates
-    J_anchor: Floats  # (F, 6, 2, M) buffers: whitened derivatives by the anchor's pose
-    J_seen: Floats  # (F, 6, 2, M) ... and by the pose of the keyframe that sees
+    J_anchor: Floats  # (F, 6, 2, M) a buffer: whitened derivatives by the anchor's pose
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,6 @@ class _Residuals:
 
     base: Floats  # (3, M) the rays in the window's axes
     between: Floats  # (F, 3, M) from each keyframe to the anchor
-    c: Floats  # (F, 3, M) from each keyframe to the landmark, times its inverse depth
     norm: Floats  # (F, M) in sigma
     whitened: Floats  # (F, 2, M)
     E: Floats  # (F, 3, 2, M) whitened derivative of both coordinates by the landmark in the window's axes
@@ -102,12 +100,12 @@ def _choose(window: SlidingWindow, max_landmarks: int) -> _Problem | None:
     F = len(window.poses)
     if usable.sum() < _LEAST_LANDMARKS or F < 2:
         return None
-    rank = np.lexsort((window.ids, -count))
-    chosen = np.sort(rank[usable[rank]][:max_landmarks])
+    chosen = np.flatnonzero(usable)
+    if len(chosen) > max_landmarks:
+        chosen = np.sort(chosen[np.argsort(-count[chosen], kind="stable")][:max_landmarks])
     chosen = chosen[np.argsort(anchor[chosen], kind="stable")]
     anchor, xy = anchor[chosen], window.obs[:, chosen]
     observed = np.isfinite(xy[..., 0]) & (np.arange(F)[:, None] != anchor[None])
-    J_anchor, J_seen = np.zeros((2, F, 6, 2, len(chosen)))
     return _Problem(
         landmarks=chosen,
         anchor=anchor,
@@ -115,8 +113,7 @@ def _choose(window: SlidingWindow, max_landmarks: int) -> _Problem | None:
         rays=np.concatenate([xy[anchor, np.arange(len(chosen))].T, np.ones((1, len(chosen)))]),
         observed=observed,
         target=np.where(observed[:, None], xy.transpose(0, 2, 1), 0.0),
-        J_anchor=J_anchor,
-        J_seen=J_seen,
+        J_anchor=np.empty((F, 6, 2, len(chosen))),
     )
 
 
@@ -137,36 +134,45 @@ def _reproject(window: SlidingWindow, problem: _Problem, rho: Floats, outlier_fa
     w = np.where(inlier, 1.0 / np.maximum(1.0, norm / _HUBER_SIGMA), 0.0) / sigma_px**2
     sw = np.sqrt(w)
     E = (R[:, :, :2, None] - R[:, :, 2, None, None] * uv[:, None]) * (f * sw / z)[:, None, None]
-    return _Residuals(base, between, c, norm, r * sw[:, None], E)
+    return _Residuals(base, between, norm, r * sw[:, None], E)
 
 
 def _normal_equations(problem: _Problem, residuals: _Residuals, rho: Floats) -> _NormalEquations:
-    """The linearised problem."""
+    """The linearised problem.
+
+    A pose that sees a landmark of another's moves it as the anchor does, but the other way and about itself: by -L
+    times the derivatives by the anchor, where L = [I 0; [b]x I] is one for all landmarks of an anchor, and b lies
+    between the two places. So the derivatives by the anchor alone are multiplied.
+    """
     F, anchor = len(problem.groups), problem.anchor
-    E, J_anchor, J_seen = residuals.E, problem.J_anchor, problem.J_seen
-    rw = residuals.whitened
+    E, J_anchor, rw = residuals.E, problem.J_anchor, residuals.whitened
     J_rho = (E * residuals.between[:, :, None]).sum(axis=1)  # (F, 2, M)
     np.multiply(E, rho, out=J_anchor[:, :3])
-    np.negative(J_anchor[:, :3], out=J_seen[:, :3])
     _cross(residuals.base[None, :, None], E, J_anchor[:, 3:])
-    _cross(-residuals.c[:, :, None], E, J_seen[:, 3:])
 
-    seen = J_seen.reshape(F, 6, -1)
-    A = np.zeros((F, 6, F, 6))
-    A[range(F), :, range(F)] = seen @ seen.transpose(0, 2, 1)
-    g = (seen @ rw.reshape(F, -1, 1))[..., 0]
+    N, n = np.zeros((F, F, 6, 6)), np.zeros((F, F, 6))  # J J^T and J r of the derivatives, (anchor, seen by)
+    L = np.zeros((F, F, 6, 6))
+    L[..., range(6), range(6)] = 1.0
     for i, of in enumerate(problem.groups):
         if of.start == of.stop:
             continue
-        of_i, seen_i = J_anchor[..., of].reshape(F, 6, -1), J_seen[..., of].reshape(F, 6, -1)
-        A[i, :, i] += (of_i @ of_i.transpose(0, 2, 1)).sum(axis=0)
-        g[i] += (of_i @ rw[..., of].reshape(F, -1, 1)).sum(axis=0)[:, 0]
-        mixed = of_i @ seen_i.transpose(0, 2, 1)  # (F, 6, 6); nothing where the keyframe is the anchor
-        A[i] += mixed.transpose(1, 0, 2)
-        A[:, :, i] += mixed.transpose(0, 2, 1)
+        of_i = J_anchor[..., of].reshape(F, 6, -1)
+        N[i] = of_i @ of_i.transpose(0, 2, 1)
+        n[i] = (of_i @ rw[..., of].reshape(F, -1, 1))[..., 0]
+        x, y, z = residuals.between[:, :, of.start].T
+        L[i, :, 3, 1], L[i, :, 3, 2], L[i, :, 4, 2] = -z, y, -x
+        L[i, :, 4, 0], L[i, :, 5, 0], L[i, :, 5, 1] = z, -y, x
+    mixed = -N @ L.swapaxes(2, 3)  # nothing where the keyframe is the anchor
+    A = mixed.transpose(0, 2, 1, 3) + mixed.transpose(1, 3, 0, 2)
+    A[range(F), :, range(F)] += N.sum(axis=1) - (L @ mixed).sum(axis=0)
+    g = n.sum(axis=1) - (L @ n[..., None])[..., 0].sum(axis=0)
 
-    B = (J_rho[:, None] * J_seen).sum(axis=2)  # (F, 6, M)
-    B[anchor, :, np.arange(len(anchor))] += (J_rho[:, None] * J_anchor).sum(axis=(0, 2)).T
+    by_depth = J_rho[:, None, 0] * J_anchor[:, :, 0] + J_rho[:, None, 1] * J_anchor[:, :, 1]  # (F, 6, M)
+    B = np.empty_like(by_depth)
+    np.negative(by_depth[:, :3], out=B[:, :3])
+    _cross(by_depth[:, :3], residuals.between, B[:, 3:])
+    B[:, 3:] -= by_depth[:, 3:]
+    B[anchor, :, np.arange(len(anchor))] += by_depth.sum(axis=0).T
     B = B[1:].reshape(6 * (F - 1), -1).T
     C = (J_rho**2).sum(axis=(0, 1)) + 1e-6
     return _NormalEquations(A, B, C, g, (J_rho * rw).sum(axis=(0, 1)))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.bundle_adjustment import adjust
+from birdslam.odometry.median import quantile
 from birdslam.odometry.sliding_window import SlidingWindow
 
 Floats = NDArray[np.float64]
@@ -78,5 +79,6 @@ class KeyframeWindow(SlidingWindow):
         both = (self.ids[at] == ids) & np.isfinite(then[:, 0])
         if both.sum() < _LEAST_SHARED:
             return np.inf
-        turned = np.column_stack([xy[both], np.ones(int(both.sum()))]) @ R_key_curr.T
-        return float(np.median(np.abs(turned[:, :2] / turned[:, 2:] - then[both]).max(axis=1))) * self.focal_px
+        turned = xy[both] @ R_key_curr[:, :2].T + R_key_curr[:, 2]
+        moved = np.abs(turned[:, :2] / turned[:, 2:] - then[both])
+        return quantile(np.maximum(moved[:, 0], moved[:, 1]), 0.5) * self.focal_px

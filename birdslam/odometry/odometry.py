@@ -44,6 +44,7 @@ from birdslam.odometry.road_alignment import RoadAligner, RoadFit
 from birdslam.odometry.road_filter import RoadScaleConfig
 from birdslam.odometry.road_points import on_road, outside
 from birdslam.odometry.road_scale import RoadScale
+from birdslam.odometry.sliding_window import common
 from birdslam.odometry.standstill import StandstillConfig, near_displacement_px, stands
 from birdslam.odometry.start_search import StartSearch, StartSearchConfig
 from birdslam.types import SpeedReading, SpeedSource, Status
@@ -258,7 +259,7 @@ class Odometry:
     def _static_corners(self, tracks: Tracks, boxes_px: Floats) -> _Corners:
         static, base = outside(tracks.px, boxes_px), self._tracker.base
         ids, px = tracks.ids[static], tracks.px[static]
-        _, a, b = np.intersect1d(base.ids, ids, return_indices=True)
+        a, b = common(base.ids, ids)
         displacement: Floats = np.sqrt(((px[b] - base.px[a]) ** 2).sum(axis=1))
         return _Corners(ids, self.camera.to_xy(px), displacement)
 
@@ -270,7 +271,7 @@ class Odometry:
         searched = [] if self._guess is None else [self._pose @ self._guess]
         guesses = [*searched, self._pose @ self._predicted_step(dt_s), self._pose]
         best: tuple[int, Pose, Floats] | None = None
-        shared = int(np.isin(ids, window.ids[np.isfinite(window.rho)]).sum())
+        shared = len(common(ids, window.ids[np.isfinite(window.rho)])[0])
         if shared >= cfg.min_fitting:
             for guess in guesses:
                 pose, inliers, info = locate(window, guess, ids, corners.xy)
@@ -288,7 +289,7 @@ class Odometry:
         """Starts the window anew from the base image and this one."""
         cfg, displacement_px = self.config, corners.displacement_px
         base = self._tracker.base
-        _, a, b = np.intersect1d(base.ids, corners.ids, return_indices=True)
+        a, b = common(base.ids, corners.ids)
         if len(a) < cfg.min_fitting:
             return None
         xy_a, xy_b = self.camera.to_xy(base.px[a]), corners.xy[b]

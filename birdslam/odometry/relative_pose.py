@@ -27,10 +27,10 @@ _SOFT_ITERATIONS = 3  # the first ones, in which the limit of outliers follows t
 class _Landmarks:
     """The N landmarks of known depth that the image shows."""
 
-    base: Floats  # (N, 3) the anchors' rays in the window's axes
+    scaled: Floats  # (3, N) where they are in the window's axes, times their inverse depths
     rho: Floats  # (N,) inverse depth
     rho_sigma: Floats  # (N,) 0 where it is not known
-    p_anchor: Floats  # (N, 3)
+    p_anchor: Floats  # (3, N)
     target: Floats  # (2, N) where the image shows them, in normalised coordinates
 
 
@@ -50,7 +50,7 @@ def locate(window: SlidingWindow, guess: Pose, ids: Ints, xy: Floats) -> tuple[P
     J = np.zeros((6, 2, len(landmarks.rho)))
     for k in range(_ITERATIONS):
         r, variance, ahead = _linearise(window, landmarks, pose, J)
-        norm = np.sqrt((r**2).sum(axis=0) / variance)
+        norm = np.sqrt((r[0] ** 2 + r[1] ** 2) / variance)
         gate = max(limit, 3.0 * 1.2 * upper_median(norm)) if k < _SOFT_ITERATIONS else limit
         w = np.where(ahead & (norm < gate), 1.0 / (np.maximum(1.0, norm / _HUBER_SIGMA) * variance), 0.0)
         flat = J.reshape(6, -1)
@@ -79,32 +79,39 @@ def _landmarks(window: SlidingWindow, m: Ints, xy: Floats) -> _Landmarks:
     anchor = window.anchors()[m]
     R, p = window.stacked()
     rays = np.column_stack([window.obs[anchor, m], np.ones(len(m))])
+    rho, p_anchor = window.rho[m], np.ascontiguousarray(p[anchor].T)
     return _Landmarks(
-        base=(R[anchor] @ rays[:, :, None])[:, :, 0],
-        rho=window.rho[m],
+        scaled=(R[anchor] @ rays[:, :, None])[:, :, 0].T + rho * p_anchor,
+        rho=rho,
         rho_sigma=np.where(np.isfinite(window.rho_sigma[m]), window.rho_sigma[m], 0.0),
-        p_anchor=p[anchor],
-        target=xy.T,
+        p_anchor=p_anchor,
+        target=np.ascontiguousarray(xy.T),
     )
 
 
 def _linearise(window: SlidingWindow, seen: _Landmarks, pose: Pose, J: Floats) -> tuple[Floats, Floats, Bools]:
     """Residuals (2, N) in px, their variances (N,), and which landmarks lie ahead; J (6, 2, N) is filled."""
     f, rho = window.focal_px, seen.rho
-    q = pose.R.T @ (seen.base + rho[:, None] * seen.p_anchor - rho[:, None] * pose.p).T
+    place = (pose.R.T @ pose.p)[:, None]
+    q = pose.R.T @ seen.scaled - rho * place
     ahead = q[2] > MIN_DEPTH
     z = np.maximum(q[2], MIN_DEPTH)
     u, v = uv = q[:2] / z
     by_z = f / z
-    J[0, 0] = J[1, 1] = -rho * by_z
-    J[2] = rho * by_z * uv
-    J[3, 0], J[3, 1] = f * u * v, f * (q[2] / z + v * v)
-    J[4, 0], J[4, 1] = -f * (q[2] / z + u * u), -f * u * v
-    J[5, 0], J[5, 1] = f * v, -f * u
+    along_z, fu, fv = rho * by_z, f * u, f * v
+    J[0, 0] = J[1, 1] = -along_z
+    np.multiply(along_z, uv, out=J[2])
+    J[3, 0] = fu * v
+    np.negative(J[3, 0], out=J[4, 1])
+    f_z = f * (q[2] / z)
+    J[3, 1] = f_z + fv * v
+    J[4, 0] = -(f_z + fu * u)
+    J[5, 0] = fv
+    np.negative(fu, out=J[5, 1])
     # An uncertain depth blurs the observation along its epipolar line; isotropic is near enough.
-    a = pose.R.T @ (seen.p_anchor - pose.p).T
+    a = pose.R.T @ seen.p_anchor - place
     along = (a[:2] - uv * a[2]) * (by_z * seen.rho_sigma)
-    return (uv - seen.target) * f, window.sigma_px**2 + (along**2).sum(axis=0), ahead
+    return (uv - seen.target) * f, window.sigma_px**2 + (along[0] ** 2 + along[1] ** 2), ahead
 
 
 def two_view(xy_a: Floats, xy_b: Floats, focal_px: float, threshold_px: float) -> tuple[Pose, Bools] | None:

@@ -199,7 +199,8 @@ class RoadAligner:
         at = np.flatnonzero(keep.ravel())
         if len(at) > cfg.max_samples:
             at = at[(np.arange(cfg.max_samples) * (len(at) / cfg.max_samples)).astype(np.int64)]
-        return np.column_stack([np.broadcast_to(u, keep.shape).ravel()[at], np.broadcast_to(v, keep.shape).ravel()[at]])
+        row, column = np.divmod(at, keep.shape[1])
+        return np.column_stack([u[0, column], v[row, 0]])
 
     def align(
         self, past: RoadImage, present: RoadImage, T_past_present: Pose, px: Ints, prior: Floats, prior_cov: Floats

@@ -17,6 +17,14 @@ Ints = NDArray[np.int64]
 MIN_DEPTH = 1e-3  # of a ray's own length: nearer or behind counts as not visible
 
 
+def common(a: Ints, b: Ints) -> tuple[Ints, Ints]:
+    """Where each number that both have stands in a (N,) and in b (M,), which ascend; numpy.intersect1d sorts anew."""
+    at = np.searchsorted(b, a)
+    at[at == len(b)] = 0
+    both = np.flatnonzero(b[at] == a) if len(b) else np.zeros(0, np.int64)
+    return both, at[both]
+
+
 class SlidingWindow:
     """F keyframes, oldest first (the newest may be provisional), and M landmarks.
 
@@ -136,4 +144,4 @@ class SlidingWindow:
 
     def stacked(self) -> tuple[Floats, Floats]:
         """The poses as arrays: (F, 3, 3) rotations, (F, 3) places."""
-        return np.stack([T.R for T in self.poses]), np.stack([T.p for T in self.poses])
+        return np.array([T.R for T in self.poses]), np.array([T.p for T in self.poses])

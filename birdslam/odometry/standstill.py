@@ -13,10 +13,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.bev import rays_cam
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose, rotation_log
 from birdslam.odometry.features import Tracks
+from birdslam.odometry.median import quantile
 from birdslam.odometry.road_points import outside
+from birdslam.odometry.sliding_window import common
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -45,14 +48,14 @@ def near_displacement_px(
     `boxes_px` (N, 4) are vehicles. Infinite where most of them were lost: of a car that stands they would have been
     found.
     """
-    rays = np.column_stack([camera.to_xy(base.px), np.ones(len(base.px))])
+    rays = rays_cam(camera, base.px)
     near = (rays @ ground.normal_cam < -camera.height_m / _NEAR_M) & outside(base.px, boxes_px)
     if near.sum() < _FEWEST_NEAR:
         return None
-    _, a, b = np.intersect1d(base.ids[near], tracks.ids, return_indices=True)
+    a, b = common(base.ids[near], tracks.ids)
     if len(a) < _LEAST_NEAR_SHARE * near.sum():
         return math.inf
-    return float(np.quantile(np.sqrt(((tracks.px[b] - base.px[near][a]) ** 2).sum(axis=1)), 0.75))
+    return quantile(np.sqrt(((tracks.px[b] - base.px[near][a]) ** 2).sum(axis=1)), 0.75)
 
 
 def stands(
@@ -63,13 +66,13 @@ def stands(
     `step` is what the corners make of its motion (m), `displacement_px` (N,) how far each has moved, N >= 1, and
     `near_px` is `near_displacement_px`.
     """
-    if float(np.median(displacement_px)) > config.still_px:
+    if quantile(displacement_px, 0.5) > config.still_px:
         return False
     if near_px is None and speed_mps > config.braking_mps2 * dt_s + config.speed_mps:
         return False  # no car stops so soon, and no near road says that it did: the glass stands, or the horizon
     if near_px is not None and near_px > config.near_px:
         return False
-    if float(np.quantile(displacement_px, 0.8)) < config.still_px:
+    if quantile(displacement_px, 0.8) < config.still_px:
         return True  # four corners of five have not moved: what the others make of the pose does not count
     turn_rad = float(np.linalg.norm(rotation_log(step.R)))
     return float(np.linalg.norm(step.p)) < config.length_m and turn_rad < config.turn_rad
