@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,10 +57,11 @@ def pose_edges(m: Measurements) -> PoseEdges:
         numbers += [e.cov for e in vv]
     if cc is not None:
         transforms, numbers = [cc.T_from_to, *transforms], [cc.cov, *numbers]
-    poses = np.array([number for T in transforms for number in (T.x_m, T.y_m, T.yaw_rad)]).reshape(-1, 3)
-    covs = np.fromiter(chain.from_iterable(numbers), np.float64, 9 * len(numbers)).reshape(-1, 3, 3)
+    flat = [(T.x_m, T.y_m, T.yaw_rad, *cov) for T, cov in zip(transforms, numbers, strict=True)]
+    table = np.array(flat, dtype=np.float64).reshape(-1, 12)
+    poses, covs = table[:, :3], table[:, 3:].reshape(-1, 3, 3)
     edges = PoseEdges(cc, cv, vv, poses, covs)
-    if np.abs(poses).max(initial=0.0) > LARGEST_M or np.abs(covs).max(initial=0.0) > LARGEST_M:
+    if np.abs(table).max(initial=0.0) > LARGEST_M:
         return _sound(edges)
     try:
         np.linalg.cholesky(covs + _LEAST_COV)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import cmath
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.planar import advance, pairs
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.standing import judge, told_velocities
+from birdslam.graph.standing import judge, told_velocity
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import Window
 from birdslam.types import VehicleEstimate
@@ -38,38 +38,29 @@ def vehicle_estimates(
     if any(v.node_ns < t_ns for v in vehicles):
         ahead_s = np.array([max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles])
     poses, velocities, covs = marginals_in_world(window, ahead_s, changes)
-    velocity_covs = covs[:, 3:, 3:]
-    if birth_det is not None:
-        judge(vehicles, velocities, velocity_covs, birth_det, t_ns)
-        velocities, velocity_covs = told_velocities(vehicles, velocities, velocity_covs)
-    numbers = zip(
-        vehicles,
-        poses.tolist(),
-        _tuples(covs[:, :3, :3], 9),
-        _tuples(velocities, 2),
-        _tuples(velocity_covs, 4),
-        strict=True,
-    )
-    return tuple(
-        [
-            VehicleEstimate(
-                vehicle=v.vehicle,
-                T_world_vehicle=SE2(x_m, y_m, yaw_rad),
-                cov=cov,
-                velocity_mps=velocity,
-                velocity_cov=velocity_cov,
-                age_ns=max(t_ns - v.seen_ns, 0),
-                frames=v.frames,
-                label=v.label,
-                length_m=v.length_m,
-                width_m=v.width_m,
-                delay_ns=v.delay_ns,
-                moves=v.moves,
-                standing=0.5 if v.standing is None else v.standing,
-            )
-            for v, (x_m, y_m, yaw_rad), cov, velocity, velocity_cov in numbers
-        ]
-    )
+    out = []
+    for v, pose, (vx, vy), cov in zip(vehicles, poses.tolist(), velocities.tolist(), covs.tolist(), strict=True):
+        velocity, velocity_cov = (vx, vy), (cov[3][3], cov[3][4], cov[4][3], cov[4][4])
+        if birth_det is not None:
+            judge(v, velocity, velocity_cov, birth_det, t_ns)
+            velocity, velocity_cov = told_velocity(v, velocity, velocity_cov)
+        told = VehicleEstimate(
+            vehicle=v.vehicle,
+            T_world_vehicle=SE2(*pose),
+            cov=(*cov[0][:3], *cov[1][:3], *cov[2][:3]),
+            velocity_mps=velocity,
+            velocity_cov=velocity_cov,
+            age_ns=max(t_ns - v.seen_ns, 0),
+            frames=v.frames,
+            label=v.label,
+            length_m=v.length_m,
+            width_m=v.width_m,
+            delay_ns=v.delay_ns,
+            moves=v.moves,
+            standing=0.5 if v.standing is None else v.standing,
+        )
+        out.append(told)
+    return tuple(out)
 
 
 def marginals_in_world(window: Window, ahead_s: Floats | None, changes: Floats) -> tuple[Floats, Floats, Floats]:
@@ -105,7 +96,3 @@ def marginals_in_world(window: Window, ahead_s: Floats | None, changes: Floats) 
     poses[:, 0], poses[:, 1] = at.real, at.imag
     np.arctan2(heading.imag, heading.real, out=poses[:, 2])
     return poses, velocity.view(np.float64).reshape(M, 2), covs
-
-
-def _tuples(rows: Floats, length: int) -> Iterator[tuple[float, ...]]:
-    return zip(*[iter(rows.ravel().tolist())] * length, strict=True)

@@ -33,7 +33,7 @@ from birdslam.graph.marginals import vehicle_estimates
 from birdslam.graph.pending_map import PendingMap
 from birdslam.graph.vehicles import SHORTEST_S, Ties, VehicleNodes
 from birdslam.graph.weights import WeightsConfig, weighted
-from birdslam.graph.window import Window
+from birdslam.graph.window import Window, solver
 from birdslam.types import INVALIDATING, Estimate, MapUpdate, Measurements, SpeedSource, Status, VehicleEstimate
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -95,6 +95,7 @@ class PoseGraph:
         # Whether a vehicle stands is judged by its velocity's covariance: Eq. 6 alone has none that was measured
         self._birth_det = float(self._birth[0, 0] * self._birth[1, 1]) if config.constant_velocity else None
         self._window: Window | None = None
+        solver()
 
     def optimise(self, measurements: Measurements) -> Estimate:
         """One frame's edges in; the newest frame's poses, velocities and covariances out.

@@ -23,15 +23,12 @@ parked car that was just found is not told to drive.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-
-import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.types import Moves
 
-Floats = NDArray[np.float64]
+Pair = tuple[float, float]
+Quad = tuple[float, float, float, float]
 
 PRIOR = 1.0 / 3.0  # of the vehicles stand when first seen, as parallax.py has it
 SUREST = 0.99  # and 1 less it: neither of the two is believed to be surer
@@ -39,26 +36,27 @@ SUREST = 0.99  # and 1 less it: neither of the two is believed to be surer
 # tracking 0000-0018 by RRC's boxes, and of 0005 by two networks', are told alike but for some 10 sights of 5,600
 DECIDED, GIVEN_UP = 0.9, 0.7
 STANDING_MPS = 0.05  # 1-sigma of the velocity of what stands, as of the final trajectories
+_LEAST_DET = 1e-12  # of a velocity's covariance, (m/s)^4
 _SHARE = {Moves.STANDING: 1.0, Moves.DRIVING: 0.0}
 
 
-def judge(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats, birth_det: float, t_ns: int) -> None:
-    """Renews `standing` and `moves` of the vehicles that an edge of this frame, at source time `t_ns`, told of.
+def judge(v: VehicleNode, velocity: Pair, cov: Quad, birth_det: float, t_ns: int) -> None:
+    """Renews `standing` and `moves` of a vehicle, if an edge of this frame, at source time `t_ns`, told of it.
 
-    `velocities` (M, 2) in m/s with `covs` (M, 2, 2) are the graph's, `birth_det` is the determinant of such a
-    covariance at birth.
+    `velocity` (x, y) in m/s with `cov`, row-major, is the graph's; `birth_det` is the determinant of such a covariance
+    at birth.
     """
-    z2 = np.einsum("ni,ni->n", velocities, np.linalg.solve(covs, velocities[..., None])[..., 0])
-    ratio = 0.5 * (math.log(birth_det) - np.log(np.maximum(np.linalg.det(covs), 1e-12)) - z2)
-    for v, log_ratio in zip(vehicles, ratio.tolist(), strict=True):
-        if v.seen_ns != t_ns or v.standing_seen is None:
-            continue
-        by_velocity = _clipped(_logit(PRIOR) + log_ratio)
-        if not v.in_path:
-            v.standing = _probability((by_velocity + _clipped(_logit(v.standing_seen))) / 2.0)
-            v.moves = decide(v.moves, v.standing)
-        elif v.moves is not Moves.DRIVING and _probability(by_velocity) <= 1.0 - DECIDED:
-            v.standing, v.moves = None, Moves.UNDECIDED
+    if v.seen_ns != t_ns or v.standing_seen is None:
+        return
+    (x, y), (xx, xy, _, yy) = velocity, cov
+    det = max(xx * yy - xy * xy, _LEAST_DET)
+    z2 = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / det
+    by_velocity = _clipped(_logit(PRIOR) + 0.5 * (math.log(birth_det / det) - z2))
+    if not v.in_path:
+        v.standing = _probability((by_velocity + _clipped(_logit(v.standing_seen))) / 2.0)
+        v.moves = decide(v.moves, v.standing)
+    elif v.moves is not Moves.DRIVING and _probability(by_velocity) <= 1.0 - DECIDED:
+        v.standing, v.moves = None, Moves.UNDECIDED
 
 
 def decide(before: Moves, standing: float) -> Moves:
@@ -71,13 +69,19 @@ def decide(before: Moves, standing: float) -> Moves:
     return Moves.UNDECIDED if given_up else before
 
 
-def told_velocities(vehicles: Sequence[VehicleNode], velocities: Floats, covs: Floats) -> tuple[Floats, Floats]:
-    """Velocities (M, 2) in m/s and their covariances (M, 2, 2), from the graph's; see the module."""
-    p = np.array([0.0 if v.standing is None else v.standing for v in vehicles])
-    w = np.array([_SHARE.get(v.moves, one) for v, one in zip(vehicles, p.tolist(), strict=True)])
-    outer = ((1.0 - p) * w**2 + p * (1.0 - w) ** 2)[:, None, None] * velocities[:, :, None] * velocities[:, None, :]
-    told = (1.0 - p)[:, None, None] * covs + outer + (p * STANDING_MPS**2)[:, None, None] * np.eye(2)
-    return (1.0 - w)[:, None] * velocities, told
+def told_velocity(v: VehicleNode, velocity: Pair, cov: Quad) -> tuple[Pair, Quad]:
+    """A vehicle's velocity in m/s and its covariance, row-major, from the graph's; see the module."""
+    (x, y), (xx, xy, yx, yy) = velocity, cov
+    p = v.standing or 0.0
+    w = _SHARE.get(v.moves, p)
+    drives, spread, stands = 1.0 - p, (1.0 - p) * w * w + p * (1.0 - w) ** 2, p * STANDING_MPS**2
+    told = (
+        drives * xx + spread * x * x + stands,
+        drives * xy + spread * x * y,
+        drives * yx + spread * x * y,
+        drives * yy + spread * y * y + stands,
+    )
+    return ((1.0 - w) * x, (1.0 - w) * y), told
 
 
 def _clipped(log_odds: float) -> float:

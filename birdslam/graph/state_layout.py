@@ -24,6 +24,8 @@ class StateLayout:
         self.of_vehicles = first + np.arange(6 * vehicles, dtype=np.int64).reshape(vehicles, 6)  # (M, 6)
         self.poses, self.twists = self.of_vehicles[:, :3], self.of_vehicles[:, 3:]  # (M, 3) each
         self.twist_rows = self.twists.ravel()
+        # (nodes + M, 3) of all poses but the newest ego's
+        self.moved = np.concatenate([3 + np.arange(3 * nodes, dtype=np.int64).reshape(nodes, 3), self.poses])
         own = np.empty((vehicles, 9), dtype=np.int64)
         own[:, :3] = np.arange(3)
         own[:, 3:] = self.of_vehicles

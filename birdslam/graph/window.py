@@ -26,11 +26,12 @@ without bound. Its answers on the same edges are what tests/test_consistency.py 
 from __future__ import annotations
 
 import cmath
+import functools
 import math
+from typing import Any
 
 import msgspec
 import numpy as np
-from scipy.linalg import lapack
 
 from birdslam.geometry.planar import Complexes, Floats, advance, pairs, turned, unit
 from birdslam.geometry.se2 import SE2
@@ -55,6 +56,14 @@ _KEY_PLACE = np.r_[StateLayout.node(KEY_NODE)][:2]
 _LEAST = 1e-8 * np.eye(3)  # 0.1 mm, 0.1 mrad: edges more exact than that would cost the covariances their digits
 _LEFT_OUT = 1e12 * np.eye(3)  # so uncertain an edge says nothing
 _EYE3 = np.eye(3)
+
+
+@functools.cache
+def solver() -> Any:
+    """LAPACK, which takes 22 MB and a second to load: who solves asks for it at the start, the others never."""
+    from scipy.linalg import lapack
+
+    return lapack
 
 
 class WindowState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -241,11 +250,12 @@ class Window:
         PHt = self.P[:, cost.index]
         S = PHt[cost.index]  # of the residuals: what the window does not know, and the edges' own noise
         outliers = _add_noise(S, cost, len(cv.rows), gate)
-        L, failed = lapack.dpotrf(S, lower=1)
+        lapack = solver()
+        L, failed = lapack.dpotrf(S, lower=1, overwrite_a=1)
         if failed:  # no numbers of a road: nothing here is a covariance any more, which the caller sees
             self.P[:] = np.nan
             return outliers
-        L_inverse, _ = lapack.dtrtri(L, lower=1)
+        L_inverse, _ = lapack.dtrtri(L, lower=1, overwrite_c=1)
         W = L_inverse @ PHt.T  # P H' S^-1 H P = W'W
         dx = (L_inverse @ cost.residual) @ W  # Eq. 8: where the sum of the window's own cost and F is least
         held = self.ego_cov.copy() if hold else None
@@ -273,12 +283,13 @@ class Window:
         """Moves the mean by `dx` (n,)."""
         layout = self.layout
         self.world = self.world @ SE2(*dx[EGO].tolist())
-        nodes, vehicles = dx[layout.nodes].reshape(-1, 3), dx[layout.vehicles].reshape(-1, 6)
-        moved = np.concatenate([nodes, vehicles[:, :3]])
-        self.at += moved[:, 0] + 1j * moved[:, 1]
-        self.heading *= unit(moved[:, 2])
-        self.velocity += vehicles[:, 3] + 1j * vehicles[:, 4]
-        self.turn_radps += vehicles[:, 5]
+        moved, changed = dx[layout.moved].T, dx[layout.twists].T
+        self.at.real += moved[0]
+        self.at.imag += moved[1]
+        self.heading *= unit(moved[2])
+        self.velocity.real += changed[0]
+        self.velocity.imag += changed[1]
+        self.turn_radps += changed[2]
 
     def _turn_about(self, rows: Rows) -> None:
         """Vehicles `rows` (k,) have their front where their back was; they move as before.
