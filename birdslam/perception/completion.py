@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
 from birdslam.perception.manifest import ModelError
-from birdslam.perception.network import session_options
 
 SHIPPED = Path(__file__).parent / "shipped" / "lanes.onnx"
 
@@ -26,10 +24,12 @@ class GridCompletion:
     """
 
     def __init__(self, shape: tuple[int, int], path: Path = SHIPPED) -> None:
+        import onnxruntime as ort  # here, as in network.py
+
+        from birdslam.perception.session import PROVIDERS, session_options
+
         try:
-            self._session = ort.InferenceSession(
-                path.read_bytes(), session_options(threads=1), providers=["CPUExecutionProvider"]
-            )
+            self._session = ort.InferenceSession(path.read_bytes(), session_options(threads=1), providers=PROVIDERS)
         except OSError as error:
             raise ModelError(f"{path}: the network can't be read: {error.strerror}") from error
         except Exception as error:  # onnxruntime's own kinds have no common name

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Protocol, cast, get_args
 
 import msgspec
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
-from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from birdslam.perception.box_lists import BoxListDecoder, SsdDecoder
 from birdslam.perception.centernet import CenterNetDecoder
@@ -24,7 +23,6 @@ from birdslam.perception.manifest import (
     ClassMaps,
     Count,
     Disparity,
-    Input,
     Manifest,
     MetricDepth,
     Misfit,
@@ -39,14 +37,7 @@ from birdslam.perception.manifest_file import find_manifest
 from birdslam.perception.multitask import OUTPUTS, MultiTaskDecoder
 from birdslam.perception.onnx_file import has_weights_elsewhere
 from birdslam.perception.segmentation import ClassMapsDecoder
-from birdslam.perception.subnormal import without_tiny_weights
 from birdslam.perception.views import Preparation, View, make_views
-
-SESSION_ERRORS = tuple(
-    error for error in vars(ort_errors).values() if isinstance(error, type) and issubclass(error, Exception)
-)
-PROVIDERS = ["CPUExecutionProvider"]
-_FLOAT32 = "tensor(float)"
 
 
 class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -107,7 +98,9 @@ class Network:
         make_decoder, self._finding, outputs_of = DECODINGS[type(table)]
         self._outputs = outputs_of(table)
         self._preparation = Preparation(manifest.input)
-        self._session = _open_session(content, manifest.input, self._outputs, schedule.threads)
+        from birdslam.perception.session import open_session  # here: only who runs networks holds onnxruntime's 18 MB
+
+        self._session = open_session(content, manifest.input, self._outputs, schedule.threads)
         tensor = self._preparation.tensor
         shapes = dict(zip(self._outputs, self._shapes(tensor), strict=True))  # the first run: what is really there
         self._tensors = {output: np.empty(shape, dtype=np.float32) for output, shape in shapes.items()}
@@ -183,7 +176,7 @@ class Network:
             "every": self.schedule.every,
             "threads": self.schedule.threads,
             "awaited": self.schedule.awaited,
-            "onnxruntime": ort.__version__,
+            "onnxruntime": version("onnxruntime"),
         }
 
 
@@ -208,6 +201,8 @@ def load_network(name: str, spec: ModelSpec, most_threads: int | None = None) ->
     if most_threads is not None and spec.threads is None:
         schedule = msgspec.structs.replace(schedule, threads=min(schedule.threads, most_threads))
     refuse_weights_elsewhere(path, content)
+    from birdslam.perception.session import SESSION_ERRORS
+
     try:
         return Network(name, path, manifest, sha256, content, schedule)
     except Misfit as error:
@@ -224,46 +219,3 @@ def refuse_weights_elsewhere(path: Path, content: bytes) -> None:
         raise ModelError(f"{path}: no network that onnxruntime can run: {error}") from error
     if elsewhere:
         raise ModelError(f"{path}: its weights lie in another file (external data): a network must be whole in its own")
-
-
-def session_options(threads: int) -> ort.SessionOptions:
-    """As every network here runs: on so many threads, which sleep when they wait."""
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
-    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    options.log_severity_level = 4  # what goes wrong is raised; its logger would write it to the terminal too
-    return options
-
-
-def _open_session(content: bytes, input: Input, outputs: tuple[str, ...], threads: int) -> ort.InferenceSession:
-    """A session with the input's shape fixed, after its inputs and outputs were compared with the manifest."""
-    probe_options = session_options(1)
-    probe_options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    probe = ort.InferenceSession(content, probe_options, providers=PROVIDERS)
-    has_inputs = [i.name for i in probe.get_inputs()]
-    if has_inputs != [input.name]:
-        raise Misfit("input.name", repr(input.name), f"the inputs {has_inputs}")
-    (has,) = probe.get_inputs()
-    if has.type != _FLOAT32:
-        raise Misfit("input", f"{_FLOAT32} (all that manifests can say)", has.type)
-    axes = {"N": 1, "C": 3, "H": input.height_px, "W": input.width_px}
-    if len(has.shape) != 4:
-        raise Misfit("input.layout", input.layout, f"the shape {has.shape}")
-    options = session_options(threads)
-    for axis, size in zip(input.layout, has.shape, strict=True):
-        key = {"H": "input.height_px", "W": "input.width_px"}.get(axis, "input.layout")
-        if isinstance(size, str):
-            options.add_free_dimension_override_by_name(size, axes[axis])
-        elif size is not None and size != axes[axis]:
-            raise Misfit(key, f"{axis} = {axes[axis]} in {input.layout}", f"{size} in {has.shape}")
-    has_outputs = {o.name: o.type for o in probe.get_outputs()}
-    for output in outputs:
-        if output not in has_outputs:
-            raise Misfit("output", repr(output), f"the outputs {list(has_outputs)}")
-        if has_outputs[output] != _FLOAT32:
-            raise Misfit("output", f"{output} as {_FLOAT32} (all that manifests can say)", has_outputs[output])
-    return ort.InferenceSession(without_tiny_weights(content), options, providers=PROVIDERS)

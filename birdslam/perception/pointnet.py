@@ -11,12 +11,12 @@ import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
@@ -24,11 +24,8 @@ from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.manifest import Misfit, ModelError, Schedule
 from birdslam.perception.manifest_file import find_as
 from birdslam.perception.network import (
-    PROVIDERS,
-    SESSION_ERRORS,
     ModelSpec,
     refuse_weights_elsewhere,
-    session_options,
 )
 from birdslam.perception.pointnet_manifest import Bins, Body, PointNetManifest, Points
 
@@ -88,6 +85,10 @@ class PointNet:
         """Raises Misfit where manifest and network contradict each other, an onnxruntime error where it can't run."""
         self.name = self.role = "pointnet"
         self.path, self.manifest, self.sha256, self.schedule = path, manifest, sha256, schedule
+        import onnxruntime as ort  # here, as in network.py
+
+        from birdslam.perception.session import PROVIDERS, session_options
+
         self._session = ort.InferenceSession(content, session_options(schedule.threads), providers=PROVIDERS)
         points, table = manifest.points, manifest.pointnet
         has = {i.name: i for i in self._session.get_inputs()}
@@ -174,7 +175,7 @@ class PointNet:
             "points": self.manifest.points.count,
             "every": self.schedule.every,
             "threads": self.schedule.threads,
-            "onnxruntime": ort.__version__,
+            "onnxruntime": version("onnxruntime"),
         }
 
 
@@ -253,6 +254,8 @@ def load_pointnet(spec: ModelSpec) -> PointNet:
     manifest, origin = find_as(path, sha256, spec.manifest, PointNetManifest)
     stated: dict[str, int] = {k: v for k in ("every", "threads") if (v := getattr(spec, k)) is not None}
     refuse_weights_elsewhere(path, content)
+    from birdslam.perception.session import SESSION_ERRORS
+
     try:
         return PointNet(path, manifest, sha256, content, msgspec.structs.replace(manifest.schedule, **stated))
     except Misfit as error:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfcx
 
 from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2, wrap
@@ -100,6 +99,8 @@ class Placing:
         pseudolidar: PseudoLidarConfig,
         heading: HeadingConfig,
     ) -> None:
+        import scipy.special  # noqa: F401  # with the tracker, not with its first box that is cut
+
         self.localisation = localisation
         self.heading = heading
         self.pseudolidar = pseudolidar
@@ -212,6 +213,8 @@ def no_farther_than_cut(
     }
     if not bounds:
         return depths
+    from scipy.special import erfcx  # here: only who tracks holds it (see `Placing`)
+
     cut, (slope, sigma_cut) = list(bounds), np.array(list(bounds.values())).T
     sigma_slope = np.hypot(sigma_cut, ground_size.sigma_pitch_rad)
     height_m = ground_size.ground.height_m

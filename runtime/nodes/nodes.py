@@ -16,6 +16,7 @@ import msgspec
 
 from birdslam.frontend import FrontEnd
 from birdslam.geometry.camera import Camera
+from birdslam.graph.window import solver
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.capture import CaptureNode, stamps
 from birdslam.runtime.nodes.degradation import STATUS, Degradation, Mode
@@ -183,5 +184,6 @@ def prepare(name: str, configuration: Configuration) -> Callable[[Bus, Callable[
         frontend = front_end(configuration, inference)
         return lambda bus, wait, assignment: PerceiveNode(configuration, inference, frontend, bus, assignment)
     if name == "optimize":
+        solver()
         return lambda bus, wait, assignment: OptimizeNode(configuration, bus, assignment)
     return lambda bus, wait, assignment: CaptureNode(configuration, bus, wait, assignment)

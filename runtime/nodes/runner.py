@@ -165,11 +165,11 @@ def main(arguments: list[str]) -> int:
     vitals = Vitals(int(vitals_fd))
     try:
         make = prepare(name, configuration)
-        realtime.reserve_for(name, configuration)
         give_back_memory()
         vitals.count(prepared=1)
         line = sys.stdin.buffer.readline()
         if line:  # else this spare is needed no more
+            realtime.reserve_for(name, configuration)  # a spare would hold it for nothing
             for refused in realtime.apply(name, configuration):
                 log.warning("%s", refused)
             run(name, configuration, make, msgspec.json.decode(line, type=Assignment), vitals, stop)

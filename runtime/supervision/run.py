@@ -7,7 +7,9 @@ can't be used; the reason is one line on standard error.
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from birdslam.datasets.recording import DatasetError
 from birdslam.evaluation.results import Recorder, ResultsError, claim_directory
 from birdslam.perception import load_network
 from birdslam.perception.pointnet import load_pointnet
-from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
+from birdslam.runtime.configuration import Configuration, ConfigurationError, ModelsConfig, complete
 from birdslam.runtime.environment import INTERRUPTED_STATUS
 from birdslam.runtime.nodes.sources import CameraSource, RecordedSource, open_source
 from birdslam.runtime.process import realtime
@@ -129,12 +131,18 @@ def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any], 
     if recording.file:
         file = choose_file(recording, configuration.vehicle)
         configuration = msgspec.structs.replace(configuration, recording=msgspec.structs.replace(recording, file=file))
-    models: dict[str, Any] = {
-        role: load_network(role, spec).describe() for role, spec in configuration.models.in_use().items()
-    }
-    if configuration.models.pointnet is not None:
-        models["pointnet"] = load_pointnet(configuration.models.pointnet).describe()
+    # In a process that ends: the supervisor would hold for all of the drive what loading them took, 50 MB
+    with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
+        models = pool.submit(_described, configuration.models).result()
     return configuration, models, frames
+
+
+def _described(models: ModelsConfig) -> dict[str, Any]:
+    """What each network is. Raises ModelError where one can't be used."""
+    out = {role: load_network(role, spec).describe() for role, spec in models.in_use().items()}
+    if models.pointnet is not None:
+        out["pointnet"] = load_pointnet(models.pointnet).describe()
+    return out
 
 
 def check_runtime_dir(vehicle: str, runtime_dir: Path | None) -> None:
