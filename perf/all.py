@@ -48,6 +48,7 @@ STEPS = (
     Step("system", "system", "--seconds 120", "--seconds 600", "source"),
     Step("system-loaded", "system", "--seconds 60 --load 1", "--seconds 120 --load 1", "source"),
     Step("system-planners", "system", "--seconds 10 --planners 4", "--seconds 60 --planners 4", "source"),
+    Step("cores", "cores", "", "", "source"),
     Step("vehicles", "system", "--vehicles 0,5,10,15 --seconds 31", "--vehicles 0,1,3,6,10,15 --seconds 60"),
     Step("accuracy", "accuracy", "", "--rates 10,33", "source"),
     Step("accuracy-data", "accuracy", "", "--rates 10,20,33", "data"),

@@ -1,6 +1,8 @@
 """Two reports, figure by figure, with the noise of both: better, worse or not distinguishable.
 
     python -m perf compare A.json B.json          # A is the old one; A1.json,A2.json: several runs of one side
+    python -m perf compare REPORT.json            # the scorecard against the last release (scorecard.py)
+    python -m perf compare REPORT.json --keep     # and these are the results of the version at hand from now on
 
 Each figure is compared by the blocks that its series was cut into (Mann-Whitney U, two-sided, with the false
 discoveries of all figures together held below 1 %), and only a shift of more than 5 % counts. Several runs of a side
@@ -19,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.stats import binomtest, false_discovery_control, mannwhitneyu
 
+from birdslam.perf import scorecard
 from birdslam.perf.errors import PerfError
 
 label = "two reports: better, worse or not distinguishable"
@@ -42,9 +45,13 @@ class Verdicts:
 def run(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m perf compare", description=label)
     parser.add_argument("old", metavar="A.json", help="a report, or one benchmark's JSON; a list of several runs")
-    parser.add_argument("new", metavar="B.json")
+    parser.add_argument("new", metavar="B.json", nargs="?", help="without it: A against the last release")
     parser.add_argument("--all", action="store_true", help="show what is not distinguishable, too")
+    parser.add_argument("--keep", action="store_true", help="keep A as the results of its version, in perf/results")
     options = parser.parse_args(arguments)
+    if options.new is None:
+        _scorecard(options)
+        return 0
     old, new = _read(options.old), _read(options.new)
     machines = {report["machine"]["cpu"] for report in (*old, *new) if isinstance(report, dict) and "machine" in report}
     if len(machines) > 1:
@@ -56,6 +63,13 @@ def run(arguments: list[str]) -> int:
     counts = {verdict: sum(line.verdict == verdict for line in found) for verdict in ("better", "worse")}
     print(f"{len(found)} figures: {counts['better']} better, {counts['worse']} worse, the rest not distinguishable")
     return int(counts["worse"] > 0)
+
+
+def _scorecard(options: argparse.Namespace) -> None:
+    new = scorecard.card(_read(options.old)[0])
+    print("\n".join(scorecard.lines(scorecard.last(new.version), new)))
+    if options.keep:
+        print(f"kept in {scorecard.keep(new)}")
 
 
 def _read(paths: str) -> list[Any]:

@@ -142,6 +142,29 @@ def _system(benchmarks: Benchmarks) -> Iterator[str]:
     )
 
 
+def _cores(benchmarks: Benchmarks) -> Iterator[str]:
+    rows = benchmarks.get("cores", {}).get("rows", [])
+    if rows:
+        yield "The source once, on the first so many cores by affinity:\n"
+        titles = ("on", "rate Hz", "dropped", "age p50", "p99", "cores", "MB", "MB shared once", "found", "ego ATE m")
+        there = [row for row in rows if "missing" not in row]
+        yield from table(
+            titles,
+            (
+                [
+                    row["name"],
+                    row["rate_hz"],
+                    f"{row['dropped']} of {row['frames']}",
+                    *_percentiles(row["age_ms"], ("p50", "p99")),
+                    *(row.get(name) for name in ("cpu_cores", "rss_mb", "pss_mb", "found", "ate_m")),
+                ]
+                for row in there
+            ),
+        )
+        missing = [f"- **{row['name']} is missing**: {row['missing']}" for row in rows if "missing" in row]
+        yield from ["", *missing] if missing else []
+
+
 def _vehicles(benchmarks: Benchmarks) -> Iterator[str]:
     rows = benchmarks.get("vehicles", {}).get("rows", [])
     if rows:
@@ -271,6 +294,7 @@ def _ratios(benchmarks: Benchmarks) -> Iterator[str]:
 
 SECTIONS = (
     ("The whole system", _system),
+    ("On fewer cores", _cores),
     ("Vehicles", _vehicles),
     ("Accuracy, offline and live", _accuracy),
     ("Networks and the perceive step", _inference),

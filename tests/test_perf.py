@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
 from birdslam.perf import all as everything
-from birdslam.perf import compare, convoy, optimizer, ratios, report, system, transport
+from birdslam.perf import compare, convoy, optimizer, ratios, report, scorecard, system, transport
 from birdslam.perf.__main__ import main
 from birdslam.perf.errors import PerfError
 from birdslam.perf.figures import BLOCKS, Ledger, curve, noise, spread
@@ -370,3 +370,48 @@ def test_the_renderer_is_timed_on_worlds_and_on_a_drive(tmp_path: Path) -> None:
 def test_what_is_rendered_names_the_extra_that_it_needs(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([name]) == 2
     assert "[train]" in capsys.readouterr().err
+
+
+def _measured(age_p99_ms: float, dropped: int = 0, version: str = "0.2.0", found: float = 0.9) -> dict[str, Any]:
+    with Ledger(None, "") as ledger:
+        machine = {**ledger.content["machine"], "versions": {"birdslam": version}}
+    run = {
+        **{"rate_hz": 33.0, "dropped": dropped, "frames": 1000, "cpu_cores": 1.3, "rss_mb": 900.0, "pss_mb": 500.0},
+        "age_ms": {"p50": 20.0, "p99": age_p99_ms, "max": 50.0, "n": 1000},
+    }
+    cores = [{"name": "1 core", "cores": 1, **run, "found": found}, {"name": "4 cores", "missing": "2 are at hand"}]
+    return {"machine": machine, "benchmarks": {"system": run, "cores": {"rows": cores}}}
+
+
+def test_the_scorecard_holds_a_report_against_the_last_release(tmp_path: Path) -> None:
+    for version, age_ms in (("0.1.0", 60.0), ("0.9.0", 50.0), ("0.10.0", 40.0), ("2.0.0", 10.0)):
+        scorecard.keep(scorecard.card(_measured(age_ms, version=version)), tmp_path)
+    new = scorecard.card(_measured(30.0, dropped=9, version="1.0.0", found=0.5))
+    old = scorecard.last(new.version, tmp_path)
+    assert old.version == "0.10.0"
+    text = "\n".join(scorecard.lines(old, new))
+    assert "4 cores:" not in text
+    said = {line[:52].strip(): line.split()[-1] for line in text.splitlines() if line[52:63].strip()}
+    assert said["system: age p99 ms"] == "better"
+    assert said["1 core: found"] == "worse"
+    assert said["system: dropped %"] == "worse"
+    assert said["system: age p50 ms"] == "before"
+    with pytest.raises(PerfError, match="keeps no results"):
+        scorecard.last("0.0.9", tmp_path)
+    with pytest.raises(PerfError, match="no figure of the scorecard"):
+        scorecard.card({"benchmarks": {}})
+
+
+def test_the_last_release_is_kept_and_a_report_is_compared_with_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps(_measured(30.0)))
+    assert main(["compare", str(path)]) == 0
+    assert "last release 0.1.0" in capsys.readouterr().out
+
+
+def test_the_report_has_a_table_of_cores() -> None:
+    text = report.markdown(_content(_measured(30.0)["benchmarks"] | {"system": {}}))
+    assert "| 1 core | 33 | 0 of 1000 | 20 | 30 |" in text
+    assert "**4 cores is missing**: 2 are at hand" in text
