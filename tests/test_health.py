@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.runtime.cli import doctor
+from birdslam.runtime.cli import doctor, doctor_costs
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import (
     BudgetsConfig,
@@ -155,8 +155,21 @@ def test_what_is_not_permitted_is_a_line(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_node_runs_where_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, tuple[int, ...]]] = []
     monkeypatch.setattr(os, "sched_setaffinity", lambda thread, cpus: asked.append((thread, cpus)))
+    monkeypatch.setattr(os, "setpriority", lambda *of: None)
     assert list(realtime.apply("capture", scheduled(capture=NodeScheduling(cpus=(1, 2))))) == []
     assert (os.getpid(), (1, 2)) in asked
+
+
+def test_who_computes_little_goes_before_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(os, "setpriority", lambda which, thread, nice: asked.append(nice))
+    assert list(realtime.apply("perceive", scheduled())) == []
+    assert asked == []
+    assert list(realtime.apply("optimize", scheduled())) == []
+    assert asked
+    assert max(asked) < 0
+    monkeypatch.setattr(os, "setpriority", refused)  # of whoever may not
+    assert list(realtime.apply("optimize", scheduled())) == []
 
 
 def test_the_doctor_has_a_row_for_everything(tmp_path: Path) -> None:
@@ -175,6 +188,19 @@ def test_the_doctor_has_a_row_for_everything(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
     lines = doctor.table(findings).splitlines()
     assert len(lines) == len(findings)
+
+
+@pytest.mark.processes
+def test_the_doctor_measures_what_settings_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor_costs, "WAKES", 10)
+    monkeypatch.setattr(doctor_costs, "PIECES", 3)
+    rows = dict(doctor_costs.costs(1))
+    assert all(rows.values())
+    assert "ms" in rows["every core wanted"]
+    monkeypatch.setattr(os, "sched_setscheduler", refused)
+    assert "not permitted" in dict(doctor_costs.costs(1))["the same, SCHED_FIFO"]
+    with doctor_costs.others(1):
+        assert len(doctor_costs.lateness_ms()) == 10
 
 
 def test_the_doctor_s_exit_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -341,8 +367,10 @@ def test_what_a_drive_fills_can_be_reserved() -> None:
 
 
 _SETTLED = """
+import gc
 import sys
 from birdslam.runtime.process import realtime
+gc.collect()  # which empties the store
 if sys.argv[1] == "settled":
     realtime.settle()
 before = sys.getallocatedblocks()

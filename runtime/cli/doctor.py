@@ -21,6 +21,7 @@ from typing import Literal
 
 from birdslam.datasets.recording import DatasetError
 from birdslam.perception import ModelError, load_network
+from birdslam.runtime.cli.doctor_costs import costs
 from birdslam.runtime.cli.options import configuration_of
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.look_rate import threads_of_a_network
@@ -51,6 +52,10 @@ def check_machine(options: argparse.Namespace) -> int:
     """`birdslam doctor`: a row for each check; 1 where one is an error."""
     findings = list(examine(configuration_of(options)))
     print(table(findings))
+    if options.measure:
+        print("\nwhat the settings cost, measured now:")
+        for what, cost in costs(len(os.sched_getaffinity(0))):
+            print(f"{what:26}{cost}", flush=True)
     return int(any(finding.verdict == "error" for finding in findings))
 
 

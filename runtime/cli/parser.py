@@ -154,6 +154,7 @@ def _doctor(commands: Commands) -> None:
     doctor.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help="of the run to come")
     doctor.add_argument("--source", metavar="URI", help="where frames will come from")
     doctor.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
+    doctor.add_argument("--measure", action="store_true", help="and what its settings cost, in some six seconds")
     _add_pipeline(doctor)
     doctor.set_defaults(command="doctor")
 
