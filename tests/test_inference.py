@@ -90,6 +90,24 @@ def test_a_frame_goes_on_as_soon_as_what_it_awaits_is_there(made: Made) -> None:
         assert perception.status == (Status.SEGMENTATION_CARRIED,)
 
 
+def test_a_frame_waits_no_longer_than_what_comes_after_leaves_of_its_budget(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock_ns = [10**12]
+    monkeypatch.setattr(inference.time, "monotonic_ns", lambda: clock_ns[0])
+    monkeypatch.setattr(inference, "wait", lambda awaited, timeout: waited_s.append(timeout))
+    waited_s: list[float] = []
+    detector, segmenter = Head("detector"), Head("segmenter")
+    with made(detector, segmenter, deadline_ms=100.0) as networks:
+        for frame_id in range(2):  # the front end takes 1 s after the first: that is past any budget
+            networks.start(Frame(frame_id, 0, clock_ns[0], 0, IMAGE)).result()
+            clock_ns[0] += 10**9
+            networks.over()
+        networks.start(Frame(9, 0, clock_ns[0], 0, None, (Status.FRAME_UNREADABLE,)))
+        networks.over()  # nothing was waited for: it says nothing
+    assert waited_s == [0.1, 0.0]
+
+
 def test_rate_max_awaits_all(made: Made) -> None:
     detector, segmenter = Head("detector"), Head("segmenter", awaited=False)
     with made(detector, segmenter, deadline_ms=0.001, rate="max") as networks:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import statistics
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
@@ -54,6 +56,10 @@ class Inference:
         if configuration.models.completion and any("segmenter" in ROLES.get(h.role, (h.role,)) for h in heads):
             self.completion = shipped_completion(configuration.slam.frontend.lanes.shape)
         self._deadline_ns = configuration.deadline_ns
+        # What a frame has of its budget, with as much left over as lets a mode of degradation end
+        self._budget_ns = round(configuration.budgets.perceived_ms * configuration.degradation.calm_share * 1e6)
+        self._after_ns: deque[int] = deque(maxlen=looks.window_frames)  # what frames took when they had waited
+        self._resumed_ns: int | None = None
         self._awaited: set[Run] = {head.run for head in heads if head.schedule.awaited}
         self._rate_divisor = configuration.degradation.rate_divisor
         self._ran_frame = -self._rate_divisor  # the last frame that networks were offered
@@ -109,6 +115,9 @@ class Inference:
     def over(self) -> None:
         """What the frame at hand gave is sent."""
         self._frame_over.set()
+        if self._resumed_ns is not None:
+            self._after_ns.append(time.monotonic_ns() - self._resumed_ns)
+            self._resumed_ns = None
 
     @property
     def lane_head(self) -> LaneHead:
@@ -139,7 +148,20 @@ class Inference:
             pending = _BoxesOnly(pending)
         if self._deadline_ns is None:
             return pending
-        return _UntilDeadline(pending, self._started, frame.t_capture_ns + self._deadline_ns)
+        return _UntilDeadline(pending, self._started, frame.t_capture_ns + self._patience_ns(), self._resume)
+
+    def _patience_ns(self) -> int:
+        """From its capture on, how long a frame waits: no longer than what comes after leaves of its budget.
+
+        A slow computer would wait for networks to the deadline, be late with each frame for it, and leave networks out.
+        """
+        assert self._deadline_ns is not None
+        if not (self._adapts and self._after_ns):
+            return self._deadline_ns
+        return min(self._deadline_ns, max(0, self._budget_ns - round(statistics.fmean(self._after_ns))))
+
+    def _resume(self) -> None:
+        self._resumed_ns = time.monotonic_ns()
 
     def close(self) -> None:
         """Ends the threads, after the runs at hand."""
@@ -176,7 +198,9 @@ class _UntilDeadline:
     pending: Pending
     awaited: list[Future[Any]]
     deadline_ns: int  # CLOCK_MONOTONIC
+    resumed: Callable[[], None]  # told when the wait is over
 
     def result(self) -> Perception:
         wait(self.awaited, timeout=max(0.0, (self.deadline_ns - time.monotonic_ns()) / 1e9))
+        self.resumed()
         return self.pending.result()
