@@ -98,6 +98,9 @@ def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
         "rss_mb": round(sum(rss_mb.values()), 1),
         "rss_mb_by": {name: round(value, 1) for name, value in rss_mb.items()},
         "pss_mb": round(max((sum(sample.pss_mb.values()) for sample in result.samples), default=0.0), 1) or None,
+        "pss_mb_by": {
+            name: round(max(sample.pss_mb.get(name, 0.0) for sample in result.samples), 1) for name in rss_mb
+        },
         "age_ms": spread(age_ms) | {"mean": _mean(age_ms)},
         "period_ms": spread(periods_ms),
         "start_late_ms": spread(lateness(result.messages, result.rate_hz)),
@@ -213,6 +216,10 @@ def table(content: dict[str, Any]) -> str:
         f"{'dropped':32}{content['dropped']} of {content['frames']} frames, {content['coasted']} coasted",
         f"{'cores':32}{content['cpu_cores']:.2f} ({cpu})",
         f"{'memory':32}{content['rss_mb']:.0f} MB, {content['pss_mb'] or 0:.0f} MB with shared pages counted once",
+        *(
+            f"  {name:30}{mb:.0f} MB, {content['pss_mb_by'][name]:.0f} with its part of what is shared"
+            for name, mb in content["rss_mb_by"].items()
+        ),
         f"{'steal':32}{content['steal_during_percent']:.2f} %",
         f"{'age at the planner':32}{shown(content['age_ms'], 'ms')}  mean {content['age_ms']['mean']:.2f}",
     ]

@@ -86,7 +86,7 @@ class Head:
 )
 def test_what_runs_in_each_mode(monkeypatch: pytest.MonkeyPatch, mode: Mode, runs: dict[str, int], road: bool) -> None:
     heads = {role: Head(role) for role in BOTH}
-    monkeypatch.setattr(inference, "load_network", lambda role, spec, threads: heads[role])
+    monkeypatch.setattr(inference, "load_network", lambda role, spec, *others: heads[role])
     spec = ModelSpec("none.onnx")
     configuration = Configuration(
         source=SourceConfig(rate="max"), models=ModelsConfig(detector=spec, segmenter=spec, shipped=False)

@@ -49,7 +49,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Made:
     @contextmanager
     def make(detector: Head, segmenter: Head, deadline_ms: float, rate: object = None) -> Iterator[Inference]:
         heads = {"detector": detector, "segmenter": segmenter}
-        monkeypatch.setattr(inference, "load_network", lambda role, spec, threads: heads[role])
+        monkeypatch.setattr(inference, "load_network", lambda role, spec, *others: heads[role])
         spec = ModelSpec("none.onnx")
         configuration = Configuration(
             source=SourceConfig(rate=rate),  # type: ignore[arg-type]

@@ -28,6 +28,7 @@ from birdslam.perception.multitask import (
     MultiTaskDecoder,
     body_slices,
 )
+from birdslam.perception.unread_outputs import without_outputs
 from birdslam.perception.views import make_views
 from birdslam.rendered_world.truth import CLASSES as SURFACES
 from birdslam.rendered_world.truth import WorldFrame, WorldObject
@@ -456,6 +457,18 @@ def test_the_shipped_network_takes_any_image(shipped: Any, size: tuple[int, int]
     assert (np.diff(found.detections.scores) <= 0.0).all()
     assert ((bodies.flip >= 0.0) & (bodies.flip <= 0.5)).all()
     assert set(found.detections.labels) <= {*KINDS, "person"}
+
+
+def test_what_nobody_reads_is_not_computed_and_the_rest_is_the_same_to_the_bit(shipped: Any) -> None:
+    image = np.random.default_rng(5).integers(0, 256, (192, 640, 3), dtype=np.uint8)
+    cut = load_network("multitask", ModelSpec(path=str(shipped.path)), unread=("depth",))
+    assert cut.run(image).depth is None
+    whole, part = shipped.answer(image), cut.answer(image)
+    assert set(part) == set(whole) - {"depth"}
+    assert all(part[name].tobytes() == whole[name].tobytes() for name in part)
+    content = shipped.path.read_bytes()
+    assert without_outputs(content, ()) == content
+    assert len(without_outputs(content, ("depth",))) < len(content)
 
 
 def test_the_shipped_network_says_the_same_twice(shipped: Any) -> None:

@@ -96,7 +96,7 @@ class Head:
 def test_each_head_runs_on_its_frames_and_a_late_one_is_skipped_and_said_so(monkeypatch: pytest.MonkeyPatch) -> None:
     heads: dict[str, Head] = {}
 
-    def loaded(role: str, spec: ModelSpec, threads: int | None) -> Head:
+    def loaded(role: str, spec: ModelSpec, *others: object) -> Head:
         heads[role] = Head(role, spec)
         return heads[role]
 

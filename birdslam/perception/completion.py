@@ -24,12 +24,10 @@ class GridCompletion:
     """
 
     def __init__(self, shape: tuple[int, int], path: Path = SHIPPED) -> None:
-        import onnxruntime as ort  # here, as in network.py
-
-        from birdslam.perception.session import PROVIDERS, session_options
+        from birdslam.perception.session import plain_session  # here, as in network.py
 
         try:
-            self._session = ort.InferenceSession(path.read_bytes(), session_options(threads=1), providers=PROVIDERS)
+            self._session = plain_session(path.read_bytes(), threads=1)
         except OSError as error:
             raise ModelError(f"{path}: the network can't be read: {error.strerror}") from error
         except Exception as error:  # onnxruntime's own kinds have no common name

@@ -64,6 +64,8 @@ class MultiTaskDecoder:
         self.table, self.input = table, input
         channels = (len(MASKS), 1, len(CLASSES), sum(BODY_CHANNELS.values()))
         for output, count in zip(OUTPUTS, channels, strict=True):
+            if output not in shapes:  # nobody reads it
+                continue
             shape = shapes[output]
             if len(shape) != 4 or shape[:2] != (1, count):
                 raise Misfit("multitask", f"{output} of shape (1, {count}, h, w)", shape)
@@ -79,7 +81,7 @@ class MultiTaskDecoder:
         return Findings(
             detections=self._detections(tensors["heat"][0], tensors["body"][0], view, focal_rel),
             segmentation=self._segmentation(tensors["segmentation"][0], view),
-            depth=self._depth(tensors["depth"][0, 0], view, focal_rel),
+            depth=self._depth(tensors["depth"][0, 0], view, focal_rel) if "depth" in tensors else None,
         )
 
     def merge(self, parts: Sequence[Findings], views: Sequence[View]) -> Findings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Protocol, cast, get_args
@@ -37,6 +37,7 @@ from birdslam.perception.manifest_file import find_manifest
 from birdslam.perception.multitask import OUTPUTS, MultiTaskDecoder
 from birdslam.perception.onnx_file import has_weights_elsewhere
 from birdslam.perception.segmentation import ClassMapsDecoder
+from birdslam.perception.unread_outputs import without_outputs
 from birdslam.perception.views import Preparation, View, make_views
 
 
@@ -85,9 +86,18 @@ class Network:
     """
 
     def __init__(
-        self, name: str, path: Path, manifest: Manifest, sha256: str, content: bytes, schedule: Schedule
+        self,
+        name: str,
+        path: Path,
+        manifest: Manifest,
+        sha256: str,
+        content: bytes,
+        schedule: Schedule,
+        unread: Collection[str] = (),
     ) -> None:
-        """Raises Misfit where manifest and network contradict each other, an onnxruntime error where it can't run."""
+        """`unread` are outputs that are not to be computed.
+
+        Raises Misfit where manifest and network contradict each other, an onnxruntime error where it can't run."""
         self.name = name
         self.role: Role = manifest.role
         self.path = path
@@ -96,10 +106,11 @@ class Network:
         self.schedule = schedule
         table = getattr(manifest, manifest.role)
         make_decoder, self._finding, outputs_of = DECODINGS[type(table)]
-        self._outputs = outputs_of(table)
+        self._outputs = tuple(output for output in outputs_of(table) if output not in unread)
         self._preparation = Preparation(manifest.input)
         from birdslam.perception.session import open_session  # here: only who runs networks holds onnxruntime's 18 MB
 
+        content = without_outputs(content, unread) if unread else content
         self._session = open_session(content, manifest.input, self._outputs, schedule.threads)
         tensor = self._preparation.tensor
         shapes = dict(zip(self._outputs, self._shapes(tensor), strict=True))  # the first run: what is really there
@@ -180,11 +191,12 @@ class Network:
         }
 
 
-def load_network(name: str, spec: ModelSpec, most_threads: int | None = None) -> Network:
+def load_network(name: str, spec: ModelSpec, most_threads: int | None = None, unread: Collection[str] = ()) -> Network:
     """Opens a network, checks its manifest against its real inputs and outputs, and warms it up.
 
     Where the `spec` does not say how many threads it has, these are its manifest's, but no more than `most_threads`.
-    A `name` that is a role's must be the manifest's. Raises ModelError naming the file, the key, what the manifest says
+    Of a multi-task network the outputs `unread` are not computed, which "depth" alone may be. A `name` that is a role's
+    must be the manifest's. Raises ModelError naming the file, the key, what the manifest says
     and what the network has.
     """
     path = Path(spec.path)
@@ -204,7 +216,7 @@ def load_network(name: str, spec: ModelSpec, most_threads: int | None = None) ->
     from birdslam.perception.session import SESSION_ERRORS
 
     try:
-        return Network(name, path, manifest, sha256, content, schedule)
+        return Network(name, path, manifest, sha256, content, schedule, unread if manifest.role == "multitask" else ())
     except Misfit as error:
         raise ModelError(f"{path}: {error} (manifest {origin})") from error
     except SESSION_ERRORS as error:

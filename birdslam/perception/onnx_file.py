@@ -18,8 +18,8 @@ _CONTENTS = {
 _TENSOR_EXTERNAL, _TENSOR_LOCATION = 13, 14
 
 
-def fields(data: bytes | bytearray, at: int, end: int) -> Iterator[tuple[int, int, range]]:
-    """(field number, value of a varint, where the bytes of a length-delimited field lie) of one record.
+def fields(data: bytes | bytearray, at: int, end: int) -> Iterator[tuple[int, int, range, int]]:
+    """(field number, value of a varint, where the bytes of a length-delimited field lie, where it ends) of one record.
 
     Raises ValueError where the bytes are no record.
     """
@@ -41,7 +41,7 @@ def fields(data: bytes | bytearray, at: int, end: int) -> Iterator[tuple[int, in
                 raise ValueError(f"no ONNX file: wire type {kind} at byte {at}")
         if at > end:
             raise ValueError(f"no ONNX file: a record ends at byte {at}, past its container's end at {end}")
-        yield key >> 3, value, span
+        yield key >> 3, value, span, at
 
 
 def has_weights_elsewhere(content: bytes) -> bool:
@@ -52,7 +52,7 @@ def has_weights_elsewhere(content: bytes) -> bool:
     left = [("model", range(len(content)))]
     while left:
         kind, record = left.pop()
-        for number, value, inside in fields(content, record.start, record.stop):
+        for number, value, inside, _ in fields(content, record.start, record.stop):
             if kind == "tensor" and (number == _TENSOR_EXTERNAL or (number == _TENSOR_LOCATION and value != 0)):
                 return True
             if number in _CONTENTS[kind]:

@@ -85,11 +85,9 @@ class PointNet:
         """Raises Misfit where manifest and network contradict each other, an onnxruntime error where it can't run."""
         self.name = self.role = "pointnet"
         self.path, self.manifest, self.sha256, self.schedule = path, manifest, sha256, schedule
-        import onnxruntime as ort  # here, as in network.py
+        from birdslam.perception.session import plain_session  # here, as in network.py
 
-        from birdslam.perception.session import PROVIDERS, session_options
-
-        self._session = ort.InferenceSession(content, session_options(schedule.threads), providers=PROVIDERS)
+        self._session = plain_session(content, schedule.threads)
         points, table = manifest.points, manifest.pointnet
         has = {i.name: i for i in self._session.get_inputs()}
         wanted = [points.name, *([points.class_name] if points.class_name else [])]

@@ -28,6 +28,11 @@ def session_options(threads: int) -> ort.SessionOptions:
     return options
 
 
+def plain_session(content: bytes, threads: int) -> ort.InferenceSession:
+    """Of a network as it is, compared with no manifest."""
+    return ort.InferenceSession(content, session_options(threads), providers=PROVIDERS)
+
+
 def open_session(content: bytes, input: Input, outputs: tuple[str, ...], threads: int) -> ort.InferenceSession:
     """A session with the input's shape fixed, after its inputs and outputs were compared with the manifest."""
     probe_options = session_options(1)

@@ -24,9 +24,9 @@ def without_tiny_weights(content: bytes) -> bytes:
     `content` must be a network that onnxruntime has read.
     """
     out = bytearray(content)
-    for number, _, graph in fields(out, 0, len(out)):
+    for number, _, graph, _ in fields(out, 0, len(out)):
         if number == MODEL_GRAPH:
-            for inner, _, tensor in fields(out, graph.start, graph.stop):
+            for inner, _, tensor, _ in fields(out, graph.start, graph.stop):
                 if inner == GRAPH_INITIALIZER:
                     _flush(out, tensor)
     return bytes(out)
@@ -34,7 +34,7 @@ def without_tiny_weights(content: bytes) -> bytes:
 
 def _flush(out: bytearray, tensor: range) -> None:
     axes, data_type, values = 0, 0, None
-    for number, value, span in fields(out, tensor.start, tensor.stop):
+    for number, value, span, _ in fields(out, tensor.start, tensor.stop):
         if number == _TENSOR_DIMS:
             # Packed or one by one, as the writer liked; a packed axis ends with each byte below 0x80.
             axes += sum(byte < 0x80 for byte in out[span.start : span.stop]) if span else 1

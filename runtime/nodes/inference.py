@@ -30,6 +30,9 @@ from birdslam.types import Frame
 
 Run = Callable[..., Any]
 
+# Of a multi-task network: vehicles that come with bodies are placed by these, and no map is asked (pseudolidar.py)
+UNREAD_WITH_BODIES = ("depth",)
+
 log = logging.getLogger(__name__)
 
 
@@ -47,10 +50,11 @@ class Inference:
         specs = {role: schedule.of(role, spec) for role, spec in configuration.models.in_use().items()}
         self._adapts = looks.adaptive and not configuration.lossless
         most_threads = threads_of_a_network(usable_cores()) if self._adapts else None
-        heads = [load_network(role, spec, most_threads) for role, spec in specs.items()]
+        pointnet = configuration.models.pointnet
+        unread = UNREAD_WITH_BODIES if pointnet is None else ()
+        heads = [load_network(role, spec, most_threads, unread) for role, spec in specs.items()]
         self._specs = specs
         self._lanes_every = schedule.lanes.every or 1
-        pointnet = configuration.models.pointnet
         self.frustum_network: PointNet | None = None if pointnet is None else load_pointnet(pointnet)
         self.completion: GridCompletion | None = None  # of lane grids, where there are lanes to see
         if configuration.models.completion and any("segmenter" in ROLES.get(h.role, (h.role,)) for h in heads):
