@@ -15,7 +15,7 @@ from birdslam.graph.factors import CpEdge, CvEdges, VvEdges
 from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.graph.window import Window
 from birdslam.simulation.drive import Drive, DriveConfig, drive
-from birdslam.types import Estimate, Measurements, Status
+from birdslam.types import Estimate, LandmarkEdge, Measurements, Status
 
 Floats = NDArray[np.float64]
 
@@ -44,9 +44,11 @@ def added(log: list[Measurements], monkeypatch: pytest.MonkeyPatch) -> list[tupl
     out = []
     minimise = Window.minimise
 
-    def seen(self: Window, cv: CvEdges, vv: VvEdges, cp: CpEdge | None, gate: float, hold: bool = False) -> list[int]:
+    def seen(
+        self: Window, cv: CvEdges, vv: VvEdges, cp: CpEdge | None, gate: float, hold: bool, ends_alike: bool
+    ) -> list[int]:
         before = self.P.copy()
-        outliers = minimise(self, cv, vv, cp, gate, hold)
+        outliers = minimise(self, cv, vv, cp, gate, hold, ends_alike)
         more = np.zeros_like(before)
         if self.frame in FRAMES:
             more = np.linalg.inv(self.P) - np.linalg.inv(before)
@@ -61,18 +63,16 @@ def added(log: list[Measurements], monkeypatch: pytest.MonkeyPatch) -> list[tupl
 def test_each_edge_adds_its_lambda_and_nothing_adds_more(monkeypatch: pytest.MonkeyPatch) -> None:
     log = told_of_more(drive(EXACT, 2))
     landmarks = [{e.landmark for e in m.cp if e.x_m <= THRESHOLD_M} for m in log]
-    summed, every = 0, PAPER.graph.ego_nodes
+    summed = 0
     for m, (window, cv, more) in zip(log, added(log, monkeypatch), strict=True):
         if m.frame_id not in FRAMES:
             continue
         expected = np.zeros_like(more)
-        node = window.layout.nodes.start
-        known = 0  # but in key frames, where all that the last one saw too count
-        if m.frame_id % every == 0:
-            known = len(landmarks[m.frame_id] & landmarks[m.frame_id - every])
-            assert known > 2
+        known = len(
+            landmarks[m.frame_id] & landmarks[m.frame_id - 1]
+        )  # those that the world has, from their first sight
         summed += known
-        expected[[node, node + 1], [node, node + 1]] = LAMBDA_CP * known
+        expected[[0, 1], [0, 1]] = LAMBDA_CP * known  # of the ego's place in the world: not its yaw, no other pose
         assert len(cv.rows) == len(m.cv) == 3
         far_to_near = sorted(zip((-e.T_ego_vehicle.x_m for e in m.cv), cv.rows.tolist(), strict=True))
         weights = []
@@ -80,12 +80,12 @@ def test_each_edge_adds_its_lambda_and_nothing_adds_more(monkeypatch: pytest.Mon
             rows = window.layout.poses[row]
             weights.append(more[rows[0], rows[0]])
             expected[rows, rows] = weights[-1]
-        np.testing.assert_allclose(more, expected, rtol=1e-3, atol=1e-3 * LAMBDA_CP * max(known, 1))
+        np.testing.assert_allclose(more, expected, rtol=2e-3, atol=1e-3 * LAMBDA_CP * max(known, 1))
         np.testing.assert_allclose(*(np.diag(one)[window.layout.poses] for one in (more, expected)), rtol=1e-2)
         assert LAMBDA_CV[0] <= weights[0] * 1.01
         assert weights[-1] <= LAMBDA_CV[1] * 1.01
         assert weights == sorted(weights)
-    assert summed > 30
+    assert summed > 100
 
 
 def test_cc_cv_and_vv_are_the_batch_of_the_papers_edges() -> None:
@@ -101,6 +101,50 @@ def test_cc_cv_and_vv_are_the_batch_of_the_papers_edges() -> None:
     for v in estimate.vehicles:
         covs = np.reshape(v.cov, (3, 3)), marginals.marginalCovariance(vehicle_key(v.vehicle, last))
         np.testing.assert_allclose(*covs, rtol=0.02, atol=1e-2 * covs[1].max())
+
+
+def test_a_landmark_stays_where_it_was_first_seen() -> None:
+    """Without noise but for one step of the ego that is told 0.5 m too long: a landmark seen before and after it takes
+    the ego back by the share of its weight, and so do the frames after, since X_p of Eq. 3 moves with none of them."""
+    log = drive(replace(EXACT, vehicles=0, landmarks=0), 2).measurements
+    poses = [SE2()]
+    for m in log[1:]:
+        assert m.cc is not None
+        poses.append(poses[-1] @ m.cc.T_from_to)
+    seen = range(20, 26)
+    for k in seen:
+        x_m, y_m = (poses[k].inverse() @ (poses[20] @ np.array([15.0, 2.0]))).tolist()
+        log[k] = replace(log[k], cp=(LandmarkEdge(landmark=1, frame=k, x_m=x_m, y_m=y_m, cov=(1.0, 0.0, 0.0, 1.0)),))
+    step = log[22].cc
+    assert step is not None
+    log[22] = replace(log[22], cc=replace(step, T_from_to=SE2(0.5) @ step.T_from_to))
+    graph = PoseGraph(PAPER.graph, PAPER.weights)
+    errors_m = []
+    for m, pose in zip(log, poses, strict=True):
+        gap = pose.inverse() @ graph.optimise(m).T_world_ego
+        errors_m.append(gap.x_m)
+    assert abs(errors_m[21]) < 1e-6
+    # CC and CP weigh alike: two CC edges and the CP edge between them leave the ego's place 1.95 of their variance
+    assert errors_m[22] == pytest.approx(0.5 * 1.0 / 2.95, rel=0.02)
+    assert max(map(abs, errors_m[23:])) < 0.5 * errors_m[22]  # and nothing brings it back
+
+
+def test_a_yaw_turned_about_is_a_yaw_that_errs() -> None:
+    """One detection the wrong way round turns the vehicle by its weight, not by half a turn at no cost."""
+    log = drive(replace(EXACT, landmarks=0), 2).measurements
+    edge = log[20].cv[0]
+    about = replace(edge, T_ego_vehicle=edge.T_ego_vehicle @ SE2(0.0, 0.0, 3.0))
+    (before,), (after,) = (
+        [v.T_world_vehicle for v in run([*log[:20], one])[-1].vehicles if v.vehicle == edge.vehicle]
+        for one in (log[20], replace(log[20], cv=(about, *log[20].cv[1:])))
+    )
+    assert 0.01 < abs(before.between(after).yaw_rad) < 2.9
+    default = PoseGraph(replace(PAPER.graph, ends_alike=True), PAPER.weights)
+    for m in log[:20]:
+        default.optimise(m)
+    turned = default.optimise(replace(log[20], cv=(about, *log[20].cv[1:])))
+    (there,) = (v.T_world_vehicle for v in turned.vehicles if v.vehicle == edge.vehicle)
+    assert abs(before.between(there).yaw_rad) > 2.9
 
 
 @pytest.mark.parametrize("kind", ["cv", "cp"])

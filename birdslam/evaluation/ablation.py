@@ -59,8 +59,9 @@ def idea_variants() -> dict[str, Method]:
     alone = {
         "gates on outliers": ("detection_gate_sigma", "landmark_gate_sigma"),
         "an error that all landmarks share": ("landmark_common_m",),
-        "landmarks as uncertain as their sights": ("landmark_place_errs",),
+        "landmarks where the last key frame saw them": ("landmark_anchor",),
         "standstill held": ("hold_at_standstill",),
+        "a front that may be a back": ("ends_alike",),
     }
     out: dict[str, Method] = {"nothing (the paper)": PAPER}
     for name, fields in alone.items():

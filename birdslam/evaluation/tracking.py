@@ -116,9 +116,10 @@ PAPER = Live(
         detection_gate_sigma=NO_GATE,
         landmark_gate_sigma=NO_GATE,
         landmark_common_m=0.0,
-        landmark_place_errs=False,
+        landmark_anchor="first_sight",
         scale_memory_m=0.0,
         hold_at_standstill=False,
+        ends_alike=False,
     ),
 )
 

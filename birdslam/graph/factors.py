@@ -50,8 +50,9 @@ NO_VV = VvEdges(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((
 class CpEdge:
     """All CP edges of a frame as one (Eq. 7)."""
 
-    residual: Floats  # (2,) metres in ego: by how much the key node lies further on than the window has it
+    residual: Floats  # (2,) metres in ego: by how much the ego node lies further on than the window has it
     cov: Floats  # (2, 2)
+    place: Rows  # (2,) which numbers of the state are the place of that node
 
 
 @dataclass(slots=True)
@@ -91,10 +92,10 @@ def binary_residual(measured: Floats, headings: Complexes, at: Complexes, headin
 
 
 def landmark_residual(points: Complexes, node: complex, heading: complex, tied: Complexes) -> Complexes:
-    """(N,) how much further on, in ego, each landmark says that the key node is.
+    """(N,) how much further on, in ego, each landmark says that an ego node is.
 
-    `points` (N,) are the landmarks seen from the ego, `tied` (N,) the same landmarks as the key node saw them: X_p is
-    carried by that node, which stands at `node` with `heading` in ego.
+    `points` (N,) are where the landmarks are, in ego, `tied` (N,) the same landmarks as that node saw them, which
+    stands at `node` with `heading` in ego.
     """
     return points - node - heading * tied  # Eq. 3
 
@@ -190,9 +191,9 @@ def sum_of_points(residuals: Complexes, means: Floats, deviators: Complexes) -> 
 # --- Eq. 8: the cost of a frame ---
 
 
-def collective_cost(dynamic: Cost, static: CpEdge | None, place: Rows) -> Cost:
-    """F = F_D + F_S. `place` (2,): which numbers of the state are the place of the key node."""
+def collective_cost(dynamic: Cost, static: CpEdge | None) -> Cost:
+    """F = F_D + F_S."""
     if static is None:
         return dynamic
-    index, residual = np.concatenate([dynamic.index, place]), np.concatenate([dynamic.residual, static.residual])
+    index, residual = np.concatenate([dynamic.index, static.place]), np.concatenate([dynamic.residual, static.residual])
     return Cost(index, residual, dynamic.covs, static.cov)  # Eq. 8

@@ -1,7 +1,19 @@
-"""Landmarks in the back end: those of the last keyframe, and what CP edges to them say of the ego (Eqs. 3 and 7).
+"""Landmarks in the back end, and what CP edges to them say of the ego (Eqs. 3 and 7).
 
 A landmark is a point of the road or a station of a lane; mapping/landmark_edges.py and mapping/lane_edges.py make the
 edges. Points and their covariances are complex numbers, as in factors.py.
+
+Where X_p of Eq. 3 is, is a choice (`LandmarkAnchor`):
+
+- "key_frame": where the last keyframe saw the landmark. X_p is carried by the window's key node: the error of the pose
+  that put a landmark on the map is the node's own, so that a landmark ties the ego to where it was and never claims to
+  know the world better than the ego did. Keyframes are a few frames apart: between them the same points of the same
+  road would say the same thing again.
+- "first_sight": a point of the world, put there once by the first frame that sees the landmark and known from then on,
+  as the paper's text has it: its edge is unary, and X_p no node of the graph. Every frame has CP edges. What a frame
+  sees is turned to world by the heading that the CC edges alone give: the edge of Eq. 3 is one on the place, "does not
+  constrain the orientation", and so must not depend on it either. Turned by the graph's own heading, a heading that is
+  off looks like a place that is off by far more, and the next heading overshoots.
 """
 
 from __future__ import annotations
@@ -10,6 +22,7 @@ import cmath
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import chain
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -18,10 +31,11 @@ from numpy.typing import NDArray
 from birdslam.geometry.planar import Complexes, Floats
 from birdslam.graph.edges import LARGEST_M
 from birdslam.graph.factors import CpEdge, Rows, inflation, landmark_residual, point_costs, sum_of_points
-from birdslam.graph.window import Window
+from birdslam.graph.window import EGO_PLACE, KEY_PLACE, Window
 from birdslam.types import LandmarkEdge, LandmarkKind
 
 LandmarkKey = tuple[LandmarkKind, int]  # each kind has ids of its own
+LandmarkAnchor = Literal["key_frame", "first_sight"]
 
 _LEAST_VARIANCE_M2 = 1e-12  # a landmark without noise must not make the sum singular
 
@@ -65,65 +79,78 @@ class LandmarksState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     information: Floats
     moment: Complexes
     frames: Rows
+    yaw_rad: float
 
 
 class Landmarks:
-    """The landmarks in sight at the last keyframe: those that the window's key node is tied to.
+    """The landmarks of the last frame that had CP edges, anchored as `anchor` says; see the module."""
 
-    The position X_p of Eq. 3 is carried by that node: the error of the pose that put a landmark on the map is the
-    node's own, so a landmark ties the ego to where it was and never claims to know the world better than the ego did.
-    Keyframes are a few frames apart: between them the same points of the same road would say the same thing again.
-    """
-
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int, anchor: LandmarkAnchor = "key_frame") -> None:
         self._capacity = capacity
+        self._fixed = anchor == "first_sight"
         self._row: dict[LandmarkKey, int] = {}
-        self._tied = sightings(())  # in the ego of the keyframe
-        # Sums over the keyframes that each was seen in: information, information times position in world, frames
+        self._tied = sightings(())  # in the ego of the keyframe; where fixed, in world
+        # Sums over the frames that each was seen in: information, information times position in world, frames
         self._information = np.zeros(0)
         self._moment = np.zeros(0, dtype=np.complex128)
         self._frames = np.zeros(0, dtype=np.int64)
+        self._yaw_rad = 0.0  # of the ego in world by the CC edges alone
 
     def __len__(self) -> int:
         return len(self._row)
 
     def state(self) -> LandmarksState:
         """For `from_state`; the arrays are the landmarks' own."""
-        return LandmarksState(tied=self._tied, information=self._information, moment=self._moment, frames=self._frames)
+        return LandmarksState(
+            tied=self._tied,
+            information=self._information,
+            moment=self._moment,
+            frames=self._frames,
+            yaw_rad=self._yaw_rad,
+        )
 
     @staticmethod
-    def from_state(state: LandmarksState, capacity: int) -> Landmarks:
+    def from_state(state: LandmarksState, capacity: int, anchor: LandmarkAnchor = "key_frame") -> Landmarks:
         """The landmarks that had this state. Raises ValueError where its arrays do not belong together."""
         tied = state.tied
         parts = (tied.points, tied.means, tied.deviators, state.information, state.moment, state.frames)
         if any(len(part) != len(tied.keys) for part in parts):
             raise ValueError(f"{len(tied.keys)} landmarks with arrays of {[len(part) for part in parts]}")
-        out = Landmarks(capacity)
+        out = Landmarks(capacity, anchor)
         out._row = {key: row for row, key in enumerate(tied.keys)}
         out._tied, out._information, out._moment, out._frames = tied, state.information, state.moment, state.frames
+        out._yaw_rad = state.yaw_rad
         return out
 
-    def sum_of_edges(
-        self, seen: Sightings, window: Window, gate: float, common_variance: float, place_errs: bool = True
-    ) -> CpEdge | None:
-        """A keyframe's CP edges to known landmarks as one edge to the key node before; None where none is known.
+    def turn(self, yaw_rad: float) -> None:
+        """The ego turned by so much since the last frame, as its CC edge says."""
+        self._yaw_rad += yaw_rad
+
+    def sum_of_edges(self, seen: Sightings, window: Window, gate: float, common_variance: float) -> CpEdge | None:
+        """A frame's CP edges to known landmarks as one edge; None where none is known.
 
         A landmark whose squared Mahalanobis distance is past `gate` weighs less by the square of the excess.
         `common_variance` in m^2 is of what all landmarks of a frame share, which their sum does not average away.
-        Without `place_errs` the place that the key node saw a landmark at is taken for known.
         """
         rows = self._rows(seen)
         now = np.flatnonzero(rows >= 0)
         if not len(now):
             return None
         then = rows[now]
-        node, heading, node_cov = window.key_node()
-        residuals = landmark_residual(seen.points[now], node, heading, self._tied.points[then])  # Eq. 3
-        means, deviators = seen.means[now], seen.deviators[now]
-        if place_errs:
+        points, means, deviators = seen.points[now], seen.means[now], seen.deviators[now]
+        if self._fixed:  # known, where the world has it
+            place, node_cov = EGO_PLACE, window.ego_cov[:2, :2]
+            T = window.world
+            back, off = cmath.exp(-1j * T.yaw_rad), cmath.exp(1j * (self._yaw_rad - T.yaw_rad))
+            there = (self._tied.points[then] - complex(T.x_m, T.y_m)) * back
+            residuals = landmark_residual(there, 0.0, off, points)  # Eq. 3
+        else:
+            place = KEY_PLACE
+            node, heading, node_cov = window.key_node()
+            residuals = landmark_residual(points, node, heading, self._tied.points[then])  # Eq. 3
             means = means + self._tied.means[then]
             deviators = deviators + heading * heading * self._tied.deviators[then]
-        # An outlier is one for which the key node's own uncertainty does not account either
+        # An outlier is one for which the node's own uncertainty does not account either
         (xx, xy), (_, yy) = node_cov.tolist()
         distances = point_costs(residuals, means + 0.5 * (xx + yy), deviators + complex(0.5 * (xx - yy), xy))  # Eq. 5
         if distances.max() > gate:
@@ -131,13 +158,13 @@ class Landmarks:
             means, deviators = means * excess, deviators * excess
         gap, m, d = sum_of_points(residuals, means, deviators)  # Eq. 7
         m += common_variance
-        return CpEdge(np.array([gap.real, gap.imag]), np.array([[m + d.real, d.imag], [d.imag, m - d.real]]))
+        return CpEdge(np.array([gap.real, gap.imag]), np.array([[m + d.real, d.imag], [d.imag, m - d.real]]), place)
 
     def tie(self, seen: Sightings, window: Window, least_frames: int) -> list[tuple[float, float]]:
-        """Ties a keyframe's landmarks to the ego, now that it is corrected; returns those that settled, in world.
+        """Ties a frame's landmarks to the ego, now that it is corrected; returns those that settled, in world.
 
-        A landmark that is out of sight settles: it is on the map where it was seen in `least_frames` keyframes, at
-        its mean over them, weighted by information. A lane's stations do not: their lane is on the map.
+        A landmark that is out of sight settles: it is on the map where it was seen in `least_frames` frames, at its
+        mean over them, weighted by information. A lane's stations do not: their lane is on the map.
         """
         seen = seen[: self._capacity]
         rows = self._rows(seen)
@@ -148,8 +175,13 @@ class Landmarks:
 
         T = window.world
         information = 1.0 / seen.means
-        moment = information * (seen.points * cmath.exp(1j * T.yaw_rad) + complex(T.x_m, T.y_m))
+        at = complex(T.x_m, T.y_m)
+        moment = information * (at + seen.points * cmath.exp(1j * T.yaw_rad))
         old = np.flatnonzero(rows >= 0)
+        if self._fixed:
+            fixed = at + seen.points * cmath.exp(1j * self._yaw_rad)
+            fixed[old] = self._tied.points[rows[old]]
+            seen = Sightings(seen.keys, fixed, seen.means, seen.deviators)
         frames = np.ones(len(rows), dtype=np.int64)
         for sums, before in ((information, self._information), (moment, self._moment), (frames, self._frames)):
             sums[old] += before[rows[old]]

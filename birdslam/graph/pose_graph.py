@@ -28,7 +28,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, plain, unpack
 from birdslam.graph.edges import PoseEdges, pose_edges
 from birdslam.graph.factors import NO_VV
-from birdslam.graph.landmarks import Landmarks, Sightings, sightings
+from birdslam.graph.landmarks import LandmarkAnchor, Landmarks, Sightings, sightings
 from birdslam.graph.marginals import vehicle_estimates
 from birdslam.graph.pending_map import PendingMap
 from birdslam.graph.vehicles import SHORTEST_S, Ties, VehicleNodes
@@ -60,13 +60,15 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_vehicles: Count = 32  # the longest out of sight go first
     detection_gate_sigma: Positive = 4.0  # Mahalanobis distance past which a detection weighs less; twice it: nothing
     detection_contradictions: Count = 5  # so many left out in a row begin the vehicle anew
+    ends_alike: bool = True  # a CV edge may take a vehicle's front for its back; False: its yaw counts as it is
     # Static map
     landmark_gate_sigma: Positive = 3.0  # Mahalanobis distance past which a landmark weighs less
     landmark_common_m: NotNegative = 0.15  # 1-sigma of what is common to all landmarks of a frame (scale, pitch)
-    # Whether a landmark's place is as uncertain as its sight from the key frame was; False: known, as X_p of Eq. 3 is
-    landmark_place_errs: bool = True
-    landmark_least_frames: Count = 2  # key frames that a landmark was seen in, to be put on the map
-    max_landmarks: Count = 512  # of a keyframe
+    # Where X_p of Eq. 3 is. key_frame: where the last key frame saw it, as uncertain as that sight and that pose;
+    # first_sight: in the world, put there once by the frame that saw it first and known from then on, as in the paper
+    landmark_anchor: LandmarkAnchor = "key_frame"
+    landmark_least_frames: Count = 2  # frames with CP edges that a landmark was seen in, to be put on the map
+    max_landmarks: Count = 512  # of a frame
     max_pending_landmarks: Count = 10_000  # waiting for `map_update`
     max_pending_frames: Count = 1_000  # whose lane points wait for `map_update`
     # What is common to many CC edges in a row, and so moves all that is in sight against the world's origin alone
@@ -113,7 +115,8 @@ class PoseGraph:
         ties = self._vehicles.tie(edges, m.frame_id, m.t_source_ns, self.config.constant_velocity)
         if follows:
             self._move_on(m, window, edges, ties)  # CC, and the vehicles' constant velocity
-        seen = sightings(m.cp) if window.is_keyframe else None
+        every = self.config.landmark_anchor == "first_sight"
+        seen = sightings(m.cp) if every or window.is_keyframe else None
         outliers = self._minimise(m, window, ties, seen)  # Eq. 8
         self._renew_vehicles(m, window, edges, ties, outliers)
         self._renew_map(m, window, seen)
@@ -159,7 +162,7 @@ class PoseGraph:
             return graph
         try:
             graph._window = Window.from_state(begun.window)
-            graph._landmarks = Landmarks.from_state(begun.landmarks, config.max_landmarks)
+            graph._landmarks = Landmarks.from_state(begun.landmarks, config.max_landmarks, config.landmark_anchor)
         except ValueError as error:
             raise CheckpointError(f"does not fit together: {error}") from None
         if len(begun.vehicles) != len(graph._window.velocity):
@@ -175,7 +178,7 @@ class PoseGraph:
         self.epoch += int(reset)
         self._window = Window(config.ego_nodes, m.frame_id)
         self._vehicles = VehicleNodes(config.forget_s, config.max_vehicles, config.detection_contradictions)
-        self._landmarks = Landmarks(config.max_landmarks)
+        self._landmarks = Landmarks(config.max_landmarks, config.landmark_anchor)
         self._t_ns = self._t_before_ns = m.t_source_ns  # of the newest pose and of the one before
         self._motion = SE2()  # between them
         self._lasting_m = 0.0  # the way that the present error of the scale is common to, its older parts less
@@ -207,6 +210,7 @@ class PoseGraph:
         stands = self._stands(m)
         cov = np.zeros((3, 3)) if stands else edges.covs[0]
         self._motion = window.propagate(cc.T_from_to, cov, cc.from_frame, m.frame_id, ties.dt_s, growth)
+        self._landmarks.turn(self._motion.yaw_rad)
         self._t_before_ns, self._t_ns = self._t_ns, m.t_source_ns
         if not stands:
             self._drift(window, m.scale_sigma_rel)
@@ -239,10 +243,10 @@ class PoseGraph:
                 window,
                 config.landmark_gate_sigma**2,
                 config.landmark_common_m**2,
-                config.landmark_place_errs,
             )
         vv = ties.vv if config.constant_velocity else NO_VV  # else they have set the twists
-        return window.minimise(ties.cv, vv, cp, config.detection_gate_sigma**2, hold=self._stands(m))
+        gate = config.detection_gate_sigma**2
+        return window.minimise(ties.cv, vv, cp, gate, self._stands(m), config.ends_alike)
 
     def _stands(self, m: Measurements) -> bool:
         """Whether the ego holds its pose."""

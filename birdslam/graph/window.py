@@ -52,7 +52,8 @@ from birdslam.graph.factors import (
 from birdslam.graph.state_layout import EGO, StateLayout, diagonal, diagonal_blocks
 
 KEY_NODE = 0  # the ego node that landmarks are tied to; it is renewed once in every round of the nodes
-_KEY_PLACE = np.r_[StateLayout.node(KEY_NODE)][:2]
+KEY_PLACE = np.r_[StateLayout.node(KEY_NODE)][:2]
+EGO_PLACE = np.r_[EGO][:2]
 _LEAST = 1e-8 * np.eye(3)  # 0.1 mm, 0.1 mrad: edges more exact than that would cost the covariances their digits
 _LEFT_OUT = 1e12 * np.eye(3)  # so uncertain an edge says nothing
 _EYE3 = np.eye(3)
@@ -237,16 +238,25 @@ class Window:
 
     # --- the edges of a frame ---
 
-    def minimise(self, cv: CvEdges, vv: VvEdges, cp: CpEdge | None, gate: float, hold: bool = False) -> list[int]:
+    def minimise(
+        self,
+        cv: CvEdges,
+        vv: VvEdges,
+        cp: CpEdge | None,
+        gate: float,
+        hold: bool = False,
+        ends_alike: bool = True,
+    ) -> list[int]:
         """The minimum of Eq. 8 over the edges of the newest frame, all at once, linearised at the prediction.
 
         A CV edge whose squared Mahalanobis distance is past `gate` has its covariance multiplied by the square of the
         excess; past four times `gate` it is an outlier and left out. `hold` keeps the ego where it is (standstill).
+        `ends_alike`: a CV edge may take the front of a vehicle for its back.
         Returns which CV edges are outliers. Where the numbers leave all bounds, the window is not finite afterwards.
         """
         if not len(cv.rows) + len(vv.rows) + (cp is not None):
             return []
-        cost = self._cost(cv, vv, cp)
+        cost = self._cost(cv, vv, cp, ends_alike)
         PHt = self.P[:, cost.index]
         S = PHt[cost.index]  # of the residuals: what the window does not know, and the edges' own noise
         outliers = _add_noise(S, cost, len(cv.rows), gate)
@@ -266,18 +276,18 @@ class Window:
         self._shift(dx)
         return outliers
 
-    def _cost(self, cv: CvEdges, vv: VvEdges, cp: CpEdge | None) -> Cost:
+    def _cost(self, cv: CvEdges, vv: VvEdges, cp: CpEdge | None, ends_alike: bool) -> Cost:
         """F of Eq. 8 as far as it is of this frame."""
         layout = self.layout
         vehicles, headings = self.nodes + cv.rows, unit(cv.poses[:, 2])
         opposed = (headings * self.heading[vehicles].conj()).real < 0.0
-        if opposed.any():
+        if ends_alike and opposed.any():
             self._turn_about(cv.rows[opposed])
         seen = cv_cost(cv, headings, layout.poses[cv.rows], self.at[vehicles], self.heading[vehicles])
         moved = None
         if len(vv.rows):
             moved = vv_cost(vv, layout.twists[vv.rows], self.velocity[vv.rows], self.turn_radps[vv.rows])
-        return collective_cost(dynamic_cost(seen, moved), cp, _KEY_PLACE)
+        return collective_cost(dynamic_cost(seen, moved), cp)
 
     def _shift(self, dx: Floats) -> None:
         """Moves the mean by `dx` (n,)."""
