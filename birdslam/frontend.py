@@ -15,6 +15,7 @@ from birdslam.mapping.lane_edges import LaneEdgesConfig
 from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneOutput
 from birdslam.mapping.lanes import LanesConfig
 from birdslam.odometry.dead_reckoning import DeadReckoning
+from birdslam.odometry.external import ExternalConfig
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
 from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
 from birdslam.perception import Perception
@@ -44,6 +45,7 @@ class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The parts of the front end."""
 
     odometry: OdometryConfig = OdometryConfig()
+    external: ExternalConfig = ExternalConfig()  # of somebody else's odometry, where a file of it is given
     plausibility: PlausibilityConfig = PlausibilityConfig()
     localisation: LocalisationConfig = LocalisationConfig()
     ground_size: GroundSizeConfig = GroundSizeConfig()

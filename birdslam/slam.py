@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from birdslam.frontend import FrontEnd, FrontEndConfig
+from birdslam.frontend import EgoMotion, FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera
 from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.graph.weights import WeightsConfig
@@ -35,7 +35,8 @@ class BirdSLAM:
     The three processes of `birdslam run` run the same front end and the same graph, and get the same bytes at
     `--rate max`. `networks` find vehicles, road and lanes (`perception.shipped_networks()`, `load_networks`);
     `lane_head` says how often lanes are made out, and what completes them where something hid the road;
-    `frustum_network` reads bodies from a depth network's points. Not for several threads at once.
+    `frustum_network` reads bodies from a depth network's points; `odometry` is another than that of the images
+    (`odometry.external.ExternalOdometry`). Not for several threads at once.
     """
 
     def __init__(
@@ -45,9 +46,10 @@ class BirdSLAM:
         config: SlamConfig = SlamConfig(),  # noqa: B008
         frustum_network: FrustumNetwork | None = None,
         lane_head: LaneHead = LaneHead(),  # noqa: B008
+        odometry: EgoMotion | None = None,
     ) -> None:
         self.networks = networks
-        self.frontend = FrontEnd(camera, config.frontend, frustum_network=frustum_network, lane_head=lane_head)
+        self.frontend = FrontEnd(camera, config.frontend, odometry, frustum_network, lane_head)
         self.graph = PoseGraph(config.graph, config.weights)
 
     @staticmethod

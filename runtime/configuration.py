@@ -227,7 +227,7 @@ def _anchor_paths(tree: dict[str, Any], base: Path) -> None:
             anchor(spec, "path")
         if isinstance(spec, dict) and str(spec.get("manifest", "")).endswith(".toml"):  # else a shipped one's name
             anchor(spec, "manifest")
-    anchor(tree.get("source"), "speed")
+    anchor(tree.get("source"), "speed", "odometry")
     source = tree.get("source")
     if isinstance(source, dict) and isinstance(source.get("uri"), str):
         scheme, _, address = source["uri"].partition(":")

@@ -24,6 +24,8 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     rate: Positive | Literal["max"] | None = None  # Hz; None: by the source's own time stamps; "max": lossless
     stride: PositiveInt = 1  # one frame of a recording in so many
     speed: str = ""  # FILE of the car's own speed over a recording: lines of time in s, speed in m/s; "": none
+    # FILE of another odometry over a recording, in place of the images': TUM lines or KITTI rows, metric; "": none
+    odometry: str = ""
     topics: BagTopics = BagTopics()  # of a ROS bag
     frames: PositiveInt | None = None  # end after so many; None: all
     loop: bool = False  # a recording begins anew at its end

@@ -10,6 +10,7 @@ import msgspec
 
 from birdslam.datasets.recording import Recording
 from birdslam.runtime.configuration import Configuration, complete
+from birdslam.runtime.nodes.ego_motion import external_odometry
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
 from birdslam.slam import BirdSLAM
@@ -36,6 +37,7 @@ def pipeline(configuration: Configuration) -> Iterator[Drive]:
                 configuration.slam,
                 frustum_network=inference.frustum_network,
                 lane_head=inference.lane_head,
+                odometry=external_odometry(configuration, recording.camera, recording.name),
             )
             for frame in offline_frames(source):
                 yield from slam.step(frame)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
+from birdslam.datasets.odometry_file import check_odometry
 from birdslam.datasets.opening import open_recording
 from birdslam.datasets.recording import Recording
 from birdslam.datasets.speed_file import of_sequence, with_speeds
@@ -62,6 +63,9 @@ def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
     if source.speed:
         for recording in recordings:
             with_speeds(recording, of_sequence(speeds_of(configuration, len(recordings)), recording.name))
+    if source.odometry:
+        for recording in recordings:
+            check_odometry(recording, of_sequence(Path(source.odometry).expanduser(), recording.name), source.stride)
     if not configuration.models.in_use():
         print(WITHOUT_MODELS)
     with pipeline(configuration) as drive:

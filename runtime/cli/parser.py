@@ -67,6 +67,7 @@ def _run(commands: Commands) -> None:
     run.add_argument("--record-images", action="store_true", default=None, help="with its frames, as JPEG")
     _add_final_results(run)
     run.add_argument("--speed", metavar="FILE", help="the car's own speed over a recording: time in s, speed in m/s")
+    _add_other_odometry(run, "FILE")
     _add_topics(run, "speed")
     _add_pipeline(run)
     run.set_defaults(command="run")
@@ -262,6 +263,7 @@ def _odometry(evaluate: Commands) -> None:
         _add_config(parser)
         parser.add_argument("--frames", default=":", metavar="FIRST:END", help="compare these alone; all are driven")
         _add_speeds(parser)
+        _add_other_odometry(parser, "FILE|DIR")
         _add_topics(parser, "speed", "truth")
         _add_pipeline(parser)
         parser.set_defaults(command=command)
@@ -324,6 +326,12 @@ def _add_pipeline(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame of a recording")
     parser.add_argument("--output", metavar="DIR", help="where results go")
     _add_settings(parser, "any key, e.g. perceive.deadline_ms=25")
+
+
+def _add_other_odometry(parser: argparse.ArgumentParser, metavar: str) -> None:
+    text = "another odometry in place of the images': TUM lines or KITTI rows, in metres"
+    text += "; DIR: NAME.txt of each sequence" * ("DIR" in metavar)
+    parser.add_argument("--odometry", dest="other_odometry", metavar=metavar, help=text)
 
 
 def _add_speeds(parser: argparse.ArgumentParser) -> None:

@@ -20,6 +20,7 @@ from birdslam.graph.window import solver
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.capture import CaptureNode, stamps
 from birdslam.runtime.nodes.degradation import STATUS, Degradation, Mode
+from birdslam.runtime.nodes.ego_motion import external_odometry
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.optimize import OptimizeNode
 from birdslam.runtime.process.restarts import Assignment
@@ -168,9 +169,11 @@ class PerceiveNode:
 
 def front_end(configuration: Configuration, inference: Inference) -> FrontEnd:
     """As perceive has it."""
+    camera = calibrated(configuration)
     return FrontEnd(
-        calibrated(configuration),
+        camera,
         configuration.slam.frontend,
+        external_odometry(configuration, camera),
         frustum_network=inference.frustum_network,
         lane_head=inference.lane_head,
     )

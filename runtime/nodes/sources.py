@@ -16,9 +16,10 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from birdslam.datasets.odometry_file import check_odometry
 from birdslam.datasets.opening import open_recording
 from birdslam.datasets.recording import RecordedFrame, Recording, undistorted
-from birdslam.datasets.speed_file import with_speeds
+from birdslam.datasets.speed_file import of_sequence, with_speeds
 from birdslam.datasets.speed_log import shifted
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, SourceConfig
@@ -62,21 +63,32 @@ def open_source(configuration: Configuration, must_open: bool = True) -> Source:
         )
 
         images = RecordedImages(Path(address).expanduser(), configuration.camera, source.stride)
+        _check_odometry(images, source)
         return RecordedSource(with_speeds(images, speeds) if speeds else images, source)
     if scheme in FILE_SCHEMES and (colon or scheme == "demo"):
         recording = open_recording(source.uri, configuration.camera, source.stride, speeds, source.topics)
+        _check_odometry(recording, source)
         return RecordedSource(recording, source)
     if colon and scheme in ("v4l2", "rtsp") and address:
         if configuration.camera is None:
             raise ConfigurationError(f"{source.uri}: a live camera needs a camera file (--camera FILE)")
         if speeds is not None:
             raise ConfigurationError(f"{source.uri}: a speed file is for recordings; live the car says it on the bus")
+        if source.odometry:
+            raise ConfigurationError(f"{source.uri}: an odometry file is for recordings")
         if source.rate == "max":
             raise ConfigurationError(f'{source.uri}: rate "max" is for recordings; a live camera has its own')
         return CameraSource(source, configuration.camera, must_open)
     if not source.uri:
         raise ConfigurationError(f"no source: give --source {SOURCES}")
     raise ConfigurationError(f"source {source.uri!r}: expected {SOURCES}")
+
+
+def _check_odometry(recording: Recording, source: SourceConfig) -> None:
+    if source.odometry and source.loop:
+        raise ConfigurationError(f"{source.odometry}: an odometry file is of one way through the recording: no loop")
+    if source.odometry:
+        check_odometry(recording, of_sequence(Path(source.odometry).expanduser(), recording.name), source.stride)
 
 
 class RecordedSource:
