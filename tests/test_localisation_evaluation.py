@@ -74,8 +74,8 @@ def test_untruncated_cars_are_compared_and_a_tilted_road_is_found_out() -> None:
 def test_rows_are_medians_by_range_and_shares_inside_the_right_ellipses() -> None:
     rng = np.random.default_rng(0)
     z = rng.standard_normal((20000, 2))
-    errors = [CarError("a", k, 0, 20.0, e, float(e @ e), 0.0) for k, e in enumerate(z)]
-    errors.append(CarError("b", 0, 0, 45.0, np.array([-4.5, 0.2]), 9.0, math.pi))
+    errors = [CarError("a", k, 0, 20.0, e, float(e @ e), 0.0, 0.0) for k, e in enumerate(z)]
+    errors.append(CarError("b", 0, 0, 45.0, np.array([-4.5, 0.2]), 9.0, math.pi, 0.0))
     rows = {(row.sequence, row.range): row for row in summarise_ranges(errors)}
     assert list(rows) == [(s, r) for s in ("a", "b", "all") for r in ("0-15", "15-30", "30-50")]
     assert rows["a", "0-15"] == LocalisationRow(sequence="a", range="0-15", n=0)

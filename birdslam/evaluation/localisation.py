@@ -64,6 +64,7 @@ class CarError:
     error_m: NDArray[np.float64]
     mahalanobis2: float
     yaw_error_rad: float
+    log_det_cov: float  # of the place's covariance (2, 2), in m^4
 
 
 class LocalisationRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -116,6 +117,7 @@ def _error(sequence: TrackingSequence, label: Label, edge: VehicleEdge) -> CarEr
         depth_m=truth.x_m,
         error_m=error,
         mahalanobis2=float(error @ np.linalg.solve(cov, error)),
+        log_det_cov=float(np.linalg.slogdet(cov)[1]),
         yaw_error_rad=wrap(edge.T_ego_vehicle.yaw_rad - truth.yaw_rad),
     )
 

@@ -299,6 +299,8 @@ def _localisation(evaluate: Commands) -> None:
     _add_tracking_root(parser)
     parser.add_argument("--detections", default="rrc", metavar="rrc|DIR", help="DIR: as det_02_rrc")
     parser.add_argument("--mode", choices=("default", "paper"), default="default", help="paper: Eq. 1 on level ground")
+    text = "how each sequence fares by a constant that the others chose of these values; may be repeated"
+    parser.add_argument("--leave-one-out", action="append", default=[], metavar="KEY=V1,V2", help=text)
     _add_config(parser)
     _add_settings(parser)
     parser.add_argument("--output", required=True, metavar="DIR", help="where the report goes")
