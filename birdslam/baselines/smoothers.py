@@ -22,8 +22,9 @@ _FREE_RAD = 1e3  # landmarks summed over say nothing of the heading
 class Smoother:
     """The graph of Eqs. 6 and 7 from records, and its newest poses back.
 
-    A landmark is a node (Point2); of the kind "..._summed" all that two frames saw are one edge between them, as in our
-    graph (landmarks.py): the centroid weighted by information, at the heading that is known then.
+    A landmark is a node (Point2); of the kind "..._summed..." all that two frames saw are one edge between them, as in
+    our graph (landmarks.py): the centroid weighted by information, at the heading that is known then. "..._qr" and
+    "..._once" are settings: the factorisation, and never to linearise again, which ours does not either.
     """
 
     def __init__(self, kind: str, lag_frames: int) -> None:
@@ -32,6 +33,9 @@ class Smoother:
         params = gtsam.ISAM2Params()
         params.setFactorization("QR" if kind.endswith("qr") else "CHOLESKY")
         params.relinearizeSkip = 1 if kind == "isam2" else _RELINEARIZE_SKIP
+        if kind.endswith("once"):
+            params.enableRelinearization = False
+        self._summed = "summed" in kind
         params.findUnusedFactorSlots = True
         self.solver: Any
         if kind == "isam2":
@@ -70,9 +74,9 @@ class Smoother:
             if self.frame is not None and self.seen.get(link.vehicle) == link.from_frame == self.frame:
                 before, key = _vehicle(link.vehicle, link.from_frame), _vehicle(link.vehicle, m.frame_id)
                 factors.add(gtsam.BetweenFactorPose2(before, key, _pose(link.T_from_to), _noise(link.cov)))
-        if self.kind.endswith("summed") and m.cp:
+        if self._summed and m.cp:
             self._add_summed(factors, ego, m)
-        for sight in () if self.kind.endswith("summed") else m.cp:
+        for sight in () if self._summed else m.cp:
             key = landmark_key(sight.kind, sight.landmark)
             factors.add(_landmark_factor(ego, key, sight))
             if key not in self.landmarks:
