@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 
 DRIVES_M = 0.05  # from one image to the next: a car that says less may stand
 _SIDEWAYS = 0.25  # of the way forwards: the camera may look 5 degrees aside, and a car drifts by as much
+_LONGEST_AHEAD_M = 2.5  # a bus's camera is so much farther before the rear axle than a passenger car's
+_SIDESTEP_M = 0.05  # what images of a near scene may be wrong by
 
 
 def reckoned(
@@ -32,11 +34,11 @@ def reckoned(
     return T_prev_curr, car_cov(config, T_prev_curr, car.sigma_m, car.sigma_rel, yaw_sigma_rad)
 
 
-def moves_sideways(T_prev_curr: SE2, car: CarStep, camera_ahead_m: float) -> bool:
-    """Whether images show a motion to the side that no car makes, while this one says that it drives.
+def moves_sideways(T_prev_curr: SE2, camera_ahead_m: float) -> bool:
+    """Whether images show a motion to the side that no driving car makes.
 
-    By night they may, of lights and of their own noise.
+    By night they may, of lights and of their own noise; so may dirt on the windscreen.
     """
-    forward, side, yaw_rad = T_prev_curr.log()
-    drives = car.proven and car.drives(DRIVES_M)
-    return drives and abs(side - camera_ahead_m * yaw_rad) > _SIDEWAYS * abs(forward)
+    forward_m, side_m, yaw_rad = T_prev_curr.log()
+    limit_m = _SIDEWAYS * abs(forward_m) + _LONGEST_AHEAD_M * abs(yaw_rad) + _SIDESTEP_M
+    return bool(abs(side_m - camera_ahead_m * yaw_rad) > limit_m)

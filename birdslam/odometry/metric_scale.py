@@ -32,6 +32,8 @@ class RoadView:
     window: SlidingWindow  # its newest keyframe is this image
     near_px: float = 0.0  # how far corners on the near road have moved since the last image: in no unit of length
     interval_ns: tuple[int, int] = (0, 0)  # of the motion, by t_source_ns
+    sigma_across_m: float = 0.0  # 1-sigma of the pose by the corners: its place across the way
+    sigma_rotation_rad: float = 0.0  # ... and its rotation
 
 
 class MetricScale(Protocol):

@@ -78,11 +78,16 @@ def on_plane(motion: SE2, ground: GroundPlane) -> Pose:
     return Pose(R.T @ turn @ R, R.T @ np.array([motion.x_m, motion.y_m, 0.0]))
 
 
+def step_cov(config: MotionConfig, info: Floats) -> Floats:
+    """(6, 6) of the camera's step from its information, both of (translation, rotation) in its own axes."""
+    return np.asarray(np.linalg.inv(info + np.eye(6) * 1e-3) * config.covariance_inflation, np.float64)
+
+
 def measured_cov(
     config: MotionConfig, info: Floats, motion: SE2, ground: GroundPlane, scale_sigma_rel: float
 ) -> Floats:
     """(3, 3) from the information (6, 6) of the camera's step, in its own axes: (translation, rotation)."""
-    cov6 = np.linalg.inv(info + np.eye(6) * 1e-3) * config.covariance_inflation
+    cov6 = step_cov(config, info)
     G = np.zeros((3, 6))
     G[:2, :3] = ground.R_ego_cam[:2]
     G[2, 3:] = ground.R_ego_cam[2]

@@ -37,6 +37,7 @@ from birdslam.odometry.motion import (
     on_plane,
     planar,
     standing_cov,
+    step_cov,
 )
 from birdslam.odometry.moving_median import MedianScale
 from birdslam.odometry.relative_pose import locate
@@ -45,6 +46,7 @@ from birdslam.odometry.road_filter import RoadScaleConfig
 from birdslam.odometry.road_points import on_road, outside
 from birdslam.odometry.road_scale import RoadScale
 from birdslam.odometry.sliding_window import common
+from birdslam.odometry.standing_corners import StandingCorners, StandingCornersConfig
 from birdslam.odometry.standstill import StandstillConfig, near_displacement_px, stands
 from birdslam.odometry.start_search import StartSearch, StartSearchConfig
 from birdslam.types import SpeedReading, SpeedSource, Status
@@ -58,6 +60,9 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 _MIN_INTERVAL_S = 0.004
+_WAY_SIGMA_REL = 0.3  # a way known so well says by how much the road's image has moved
+_SAME_RAD, _SAME_REL = 0.0007, 0.05  # poses that differ by less say the same: rotation, place over the way
+_DRIVES_MPS = 3.0  # from one image to the next a car does not stop from this
 _STILL = Pose(np.eye(3), np.zeros(3))
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step that two images alone show: 1 cm, 0.25 deg
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
@@ -78,6 +83,7 @@ class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
     max_speed_mps: Positive = 70.0  # a faster motion is no measurement
     max_coast_s: Positive = 1.0  # after that the window begins anew
     standstill: StandstillConfig = StandstillConfig()
+    standing_corners: StandingCornersConfig = StandingCornersConfig()
     held_speed: HeldSpeedConfig = HeldSpeedConfig()
 
 
@@ -96,6 +102,10 @@ class _Corners:
     ids: Ints  # (N,) ascending
     xy: Floats  # (N, 2) normalised coordinates
     displacement_px: Floats  # of those that the base image shows too
+    on_street: Bools  # (N,) False: stands in the image while the car drives, on the glass or on a line along the way
+
+    def without_glass(self) -> _Corners:
+        return _Corners(self.ids[self.on_street], self.xy[self.on_street], self.displacement_px, self.on_street)
 
 
 class Odometry:
@@ -124,6 +134,7 @@ class Odometry:
         self._base_seen = True  # False: no image shows where the base was, the car's own speed alone led there
         self._velocity: _Velocity | None = None
         self._held = HeldSpeed(self.config.held_speed)
+        self._glass = StandingCorners(self.camera, self.config.standing_corners)
         self._guess: Pose | None = None  # of the step to the present image, where it had to be searched for
         self._interval_s = 0.1
         self._road_tracks: tuple[Ints, Floats] = _NO_TRACKS
@@ -206,12 +217,13 @@ class Odometry:
             self._scale.turned_unseen()
             return motion
 
-        cfg, corners = self.config, self._static_corners(tracks, boxes_px)
+        cfg, corners = self.config, self._static_corners(tracks, boxes_px, dt_s)
+        corners = self._leave_out_glass(corners, dt_s)
         located = self._relative_pose(corners, dt_s, car)
         sideways = False
-        if located is not None and car is not None:
+        if located is not None and self._drives(car):
             shown = planar(self._pose.between(located[0]), self._scale.ground)
-            sideways = moves_sideways(shown, car, cfg.start.camera_ahead_m)
+            sideways = moves_sideways(shown, cfg.start.camera_ahead_m)
         if located is None or sideways:
             motion = self._coast(frame_id, dt_s, [Status.LOW_TEXTURE], car)
             if sideways or dt_s > cfg.max_coast_s or len(corners.displacement_px) < cfg.min_fitting:
@@ -230,7 +242,7 @@ class Odometry:
             if np.isfinite(held_m):
                 self._scale.length_held(held_m / max(float(np.linalg.norm(pose.p - self._pose.p)), held_m))
             interval_ns = (t_source_ns - round(dt_s * 1e9), t_source_ns)
-            step = self._scale_to_metres(pose, tracks, boxes_px, road_mask, near_px, interval_ns)
+            step = self._scale_to_metres(pose, info, tracks, boxes_px, road_mask, near_px, interval_ns)
             motion = self._move(frame_id, step, info, dt_s)
             self._tracker.accept(tracks)
         self._base_frame, self._base_t_ns = frame_id, t_source_ns
@@ -256,17 +268,37 @@ class Odometry:
     def _new_window(self) -> KeyframeWindow:
         return KeyframeWindow(self._focal_px, self.config)
 
-    def _static_corners(self, tracks: Tracks, boxes_px: Floats) -> _Corners:
+    def _static_corners(self, tracks: Tracks, boxes_px: Floats, dt_s: float) -> _Corners:
+        driven_m = self._speed_mps() * dt_s if self._scale.sigma_rel < _WAY_SIGMA_REL else 0.0
         static, base = outside(tracks.px, boxes_px), self._tracker.base
         ids, px = tracks.ids[static], tracks.px[static]
+        on_street = ~self._glass.see(ids, px, self._scale.ground, driven_m)
         a, b = common(base.ids, ids)
         displacement: Floats = np.sqrt(((px[b] - base.px[a]) ** 2).sum(axis=1))
-        return _Corners(ids, self.camera.to_xy(px), displacement)
+        return _Corners(ids, self.camera.to_xy(px), displacement, on_street)
 
     # --- relative pose ---
 
     def _relative_pose(self, corners: _Corners, dt_s: float, car: CarStep | None) -> tuple[Pose, Floats] | None:
         """The present image's pose in the window's frame and its information (6, 6); None where it is not known."""
+        located = self._among_landmarks(corners, dt_s)
+        return self._two_view_pose(corners, dt_s, car) if located is None else located
+
+    def _leave_out_glass(self, corners: _Corners, dt_s: float) -> _Corners:
+        """The corners without those that stand on the glass, where these lead to another pose than the street's."""
+        if not self._glass.present:
+            return corners
+        street = corners.without_glass()
+        both, alone = self._among_landmarks(corners, dt_s), self._among_landmarks(street, dt_s)
+        if both is None or alone is None:
+            return street
+        between, step = both[0].between(alone[0]), self._pose.between(alone[0])
+        turned = float(np.linalg.norm(rotation_log(between.R))) > _SAME_RAD
+        moved = float(np.linalg.norm(between.p)) > _SAME_REL * float(np.linalg.norm(step.p))
+        return street if turned or moved else corners
+
+    def _among_landmarks(self, corners: _Corners, dt_s: float) -> tuple[Pose, Floats] | None:
+        """The same by the landmarks of the window alone."""
         cfg, window, ids = self.config, self._window, corners.ids
         searched = [] if self._guess is None else [self._pose @ self._guess]
         guesses = [*searched, self._pose @ self._predicted_step(dt_s), self._pose]
@@ -283,7 +315,7 @@ class Odometry:
             travelled_m = float(np.linalg.norm(best[1].p - self._pose.p))
             if travelled_m <= cfg.max_speed_mps * dt_s + 0.1:
                 return best[1], best[2]
-        return self._two_view_pose(corners, dt_s, car)
+        return None
 
     def _two_view_pose(self, corners: _Corners, dt_s: float, car: CarStep | None) -> tuple[Pose, Floats] | None:
         """Starts the window anew from the base image and this one."""
@@ -318,6 +350,7 @@ class Odometry:
     def _scale_to_metres(
         self,
         pose: Pose,
+        info: Floats,
         tracks: Tracks,
         boxes_px: Floats,
         road_mask: Bools | None,
@@ -326,7 +359,18 @@ class Odometry:
     ) -> Pose:
         """T_base_present in metres; the window is rescaled to metres too."""
         step = self._pose.between(pose)
-        view = RoadView(tracks.image, pose, boxes_px, road_mask, self._window, near_px or 0.0, interval_ns)
+        sigma = np.sqrt(np.diag(step_cov(self.config.motion, info)))
+        view = RoadView(
+            tracks.image,
+            pose,
+            boxes_px,
+            road_mask,
+            self._window,
+            near_px or 0.0,
+            interval_ns,
+            sigma_across_m=float(np.hypot(*sigma[:2])) / np.sqrt(2.0),
+            sigma_rotation_rad=float(np.linalg.norm(sigma[3:])) / np.sqrt(3.0),
+        )
         factor = self._scale.measure_scale(step, view)
         self._window.rescale(factor)
         self._pose = pose
@@ -343,6 +387,12 @@ class Odometry:
             if car.drives(self.config.standstill.length_m) and (near_px is None or car.agreed):
                 return False
         return stands(self.config.standstill, step, corners.displacement_px, near_px, speed_mps, dt_s)
+
+    def _drives(self, car: CarStep | None) -> bool:
+        """Whether the car is known to drive: it says so itself, or it has just done so, in metres that are known."""
+        if car is not None:
+            return car.proven and car.drives(DRIVES_M)
+        return not self._scale.unknown and self._speed_mps() > _DRIVES_MPS
 
     def _hold_speed(self, pose: Pose, info: Floats, dt_s: float) -> tuple[Pose, Floats, float]:
         """The pose, its information (6, 6), and 1-sigma of its place where the last speed had to give it, else inf."""

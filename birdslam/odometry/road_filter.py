@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
+from birdslam.odometry.bonnet import BonnetConfig
 from birdslam.odometry.car_speed import CarSpeedConfig
 from birdslam.odometry.road_alignment import ROAD, RoadAlignConfig, RoadFit, plane_normal, plane_tilt
 from birdslam.odometry.standing_pattern import StandingPatternConfig
@@ -37,6 +38,7 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mode: Literal["kalman", "paper"] = "kalman"  # of the metric scale: a Kalman filter, or the paper's moving median
     align: RoadAlignConfig = RoadAlignConfig()
     standing: StandingPatternConfig = StandingPatternConfig()
+    bonnet: BonnetConfig = BonnetConfig()
     min_baseline_m: Positive = 0.35  # travelled between the two images; shorter says too little
     target_baseline_m: Positive = 1.1  # of the kept images the one nearest to this is compared
     kept_images: Annotated[int, msgspec.Meta(ge=2)] = 8  # earlier images of the road, to compare with
@@ -208,8 +210,11 @@ class RoadFilter:
         keep = np.eye(len(self.x)) - gain @ H
         self.cov = keep @ self.cov @ keep.T + gain @ noise @ gain.T
 
-    def travel(self, t_prev_curr: Floats, travelled_m: float) -> None:
-        """A car travels along the road, not into it: the direction of travel lies in the plane, in the mean."""
+    def travel(self, t_prev_curr: Floats, travelled_m: float, sigma_across_m: float = 0.0) -> None:
+        """A car travels along the road, not into it: the direction of travel lies in the plane, in the mean.
+
+        `sigma_across_m` is how well the images show that direction.
+        """
         length = float(np.linalg.norm(t_prev_curr))
         if length < 0.05:
             return
@@ -218,7 +223,8 @@ class RoadFilter:
         H = np.zeros((1, len(self.x)))
         H[0, 1:3] = by_pitch @ d, by_roll @ d
         share = travelled_m / 1.0
-        noise = np.array([[self.config.sigma_travel_rad**2 / share]])
+        sigma_rad = max(self.config.sigma_travel_rad, sigma_across_m / travelled_m)
+        noise = np.array([[sigma_rad**2 / share]])
         self._update(np.array([-(normal @ d)]), H, noise)
 
     def begin_travelling(self, t_prev_curr: Floats) -> None:

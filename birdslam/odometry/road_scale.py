@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
+from birdslam.odometry.bonnet import Bonnet
 from birdslam.odometry.car_scale import CarScale, CarStep
 from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.motion import planar
@@ -63,6 +64,7 @@ class RoadScale:
         self._car = CarScale(config, self._filter)
         self._watch = TiltWatch(camera, config.watch)
         self._standing = StandingPattern(config.standing)
+        self._bonnet = Bonnet(config.bonnet)
         self._kept: list[_Kept] = []
         self._confirmed = 0
         self._refused = 0.0  # comparisons in a row, each counted by what of it is new: those of one view err together
@@ -142,10 +144,11 @@ class RoadScale:
         travelled_m = float(np.linalg.norm(step.p))
         self._filter.predict(step.R, travelled_m)
         if not self._direction_held:
-            self._filter.travel(step.R.T @ step.p, travelled_m)
+            self._filter.travel(step.R.T @ step.p, travelled_m, view.sigma_across_m)
         self._direction_held = False
         self._since_m += travelled_m
 
+        self._learn_bonnet(view.grey, travelled_m)
         image, pose = self._image(view.grey), view.pose
         factor = float(np.exp(np.clip(self._filter.owed_log, -0.1, 0.1)))
         self._filter.owed_log = 0.0
@@ -156,6 +159,7 @@ class RoadScale:
                 self._filter.begin_travelling(T.R.T @ T.p)
             bend_per_m = _bend_per_m(step.R, travelled_m)
             px = self._aligner.samples(self._tilt, view.boxes_px, view.road_mask, bend_per_m, self._standing.present)
+            px = self._bonnet.above(px)
             if len(px) >= self.config.align.min_samples:
                 unit = self._unit_of_landmarks(view.window)
                 baseline_m = float(np.linalg.norm(T.p)) * (unit or factor)
@@ -166,7 +170,7 @@ class RoadScale:
                 borne_out = None if unit is None else unit / factor
                 if self._car.length is not None:
                     borne_out = self._car.length / factor
-                factor *= self._compare(past.image, image.image, Pose(T.R, T.p * factor), px, borne_out)
+                factor *= self._compare(past.image, image.image, Pose(T.R, T.p * factor), px, borne_out, view)
         measured = self._filter.carried_m == 0.0 and self._known()  # here, in metres
         self._watch.see(self._filter.tilt, factor * travelled_m, measured)
         self._keep(image, pose, factor)
@@ -178,6 +182,14 @@ class RoadScale:
         if not standing.present:
             return _Seen(plain, plain)
         return _Seen(plain, RoadImage.of(standing.without(grey, top_px), top_px))
+
+    def _learn_bonnet(self, grey: NDArray[np.uint8], travelled_m: float) -> None:
+        """Where a bonnet turns out to have been taken for road, all that it said is forgotten."""
+        driven_m = travelled_m if self._confirmed else np.inf  # of an unknown length: images that differ will do
+        if self._bonnet.learn(grey, self._aligner.top_px, driven_m):
+            self._filter.forget_scale(1.0)
+            self._filter.turned_unseen()
+            self._confirmed = 0
 
     def _unit_of_landmarks(self, window: SlidingWindow) -> float | None:
         """Metres in the window's unit of length by its landmarks on the road, where the length is in doubt."""
@@ -227,7 +239,7 @@ class RoadScale:
             out.append(Status.SCALE_INVALID)
         if self._refused >= cfg.violated_after:
             out.append(Status.GROUND_VIOLATED)
-        if self._standing.present:
+        if self._standing.present or self._bonnet.present:
             out.append(Status.VIEW_OBSTRUCTED)
         if self._watch.drifted:
             out.append(Status.CALIBRATION_DRIFT)
@@ -259,7 +271,13 @@ class RoadScale:
         return self._kept[int(usable[np.argmin(np.abs(np.log(distance[usable] / cfg.target_baseline_m)))])]
 
     def _compare(
-        self, past: RoadImage, image: RoadImage, T: Pose, px: NDArray[np.int64], borne_out: float | None
+        self,
+        past: RoadImage,
+        image: RoadImage,
+        T: Pose,
+        px: NDArray[np.int64],
+        borne_out: float | None,
+        view: RoadView,
     ) -> float:
         """The factor by which T_past_present is too short, 1 where the comparison is refused.
 
@@ -270,7 +288,8 @@ class RoadScale:
         if length < 1e-6:
             return 1.0
         new, self._since_m = min(1.0, self._since_m / length), 0.0
-        found = self._align(past, image, T, px, borne_out)
+        sigma_motion = (view.sigma_rotation_rad, view.sigma_across_m / length)
+        found = self._align(past, image, T, px, borne_out, sigma_motion)
         if found is None:
             return 1.0
         fit, searched, prior_cov = found
@@ -292,12 +311,18 @@ class RoadScale:
         return factor
 
     def _align(
-        self, past: RoadImage, image: RoadImage, T: Pose, px: NDArray[np.int64], borne_out: float | None
+        self,
+        past: RoadImage,
+        image: RoadImage,
+        T: Pose,
+        px: NDArray[np.int64],
+        borne_out: float | None,
+        sigma_motion: tuple[float, float],
     ) -> tuple[RoadFit, float, Floats] | None:
         """The fit, the factor on T that it starts from, and the filter's covariance that it is to be joined with."""
         cfg, filter_ = self.config, self._filter
         (prior, expected_cov), prior_cov = filter_.expected, filter_.cov.copy()
-        fit, factor, cov = self._aligner.align(past, image, T, px, prior, expected_cov), 1.0, prior_cov
+        fit, factor, cov = self._aligner.align(past, image, T, px, prior, expected_cov, sigma_motion), 1.0, prior_cov
         if fit is not None and _contradicts(fit.state[0], borne_out):
             fit = None
         if self._in_doubt():
@@ -311,7 +336,9 @@ class RoadScale:
             # What was confirmed before has to be beaten clearly: the dark below a car ahead agrees with standing still.
             lead = 0.02 if not self._confirmed else 0.1
             for begin in (searched,) if borne_out is None else (searched, borne_out):
-                other = self._aligner.align(past, image, Pose(T.R, T.p * begin), px, prior, loose[:ROAD, :ROAD])
+                other = self._aligner.align(
+                    past, image, Pose(T.R, T.p * begin), px, prior, loose[:ROAD, :ROAD], sigma_motion
+                )
                 if other is None or _contradicts(float(np.log(begin)) + other.state[0], borne_out):
                     continue
                 if fit is None or other.correlation > fit.correlation + lead:
