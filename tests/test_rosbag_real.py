@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 
@@ -16,20 +16,29 @@ import ros_bags as ros
 from birdslam.datasets.kitti import KittiRecording
 from birdslam.datasets.opening import open_recording
 from birdslam.datasets.recording import Recording
+from birdslam.datasets.rosbag_truth import WGS84_A_M, WGS84_E2
+from birdslam.evaluation.odometry import evaluate_recordings
 from birdslam.geometry.camera import AXES_EGO_CAM, Camera
-from birdslam.ros.bag import Bag, stamp_ns
+from birdslam.ros.bag import Bag, BagTopics, stamp_ns
 from birdslam.ros.frames import StaticFrames
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import Configuration, SourceConfig, dump
 from birdslam.runtime.recording.recording import About, RecordingWriter
 from birdslam.slam import BirdSLAM
-from birdslam.trajectory import mount_pose
+from birdslam.trajectory import Transform, as_poses, inverse, mount_pose
+from birdslam.types import Estimate
 
 DISTORTION = (-0.28, 0.09, 0.0006, -0.0004, -0.012)  # about that of KITTI's unrectified cameras
 
 
-def write(path: Path, drive: KittiRecording, count: int, storage: str, kind: str, lens: tuple[float, ...] = ()) -> str:
-    """The first frames of a KITTI drive as a bag: `kind` is raw or compressed, the latter with the very files."""
+def write(
+    path: Path, drive: KittiRecording, count: int, storage: str, kind: str, lens: tuple[float, ...] = (),
+    truth: Transform | None = None,
+) -> str:  # fmt: skip
+    """The first frames of a KITTI drive as a bag: `kind` is raw or compressed, the latter with the very files.
+
+    `truth` are the camera's poses: they become /gnss/odometry, and their places, as if z went north, /gnss/fix.
+    """
     camera = drive.camera
     rotation = ros.Rotation.from_matrix(AXES_EGO_CAM)
     stand = ros.transform("base_footprint", "camera_optical", (0.0, 0.0, camera.height_m), rotation)
@@ -48,8 +57,20 @@ def write(path: Path, drive: KittiRecording, count: int, storage: str, kind: str
             else:
                 data = next(drive.directory.glob(f"{number:06d}.*")).read_bytes()
                 yield f"{topic}/compressed", frame.t_source_ns, ros.compressed(data, frame.t_source_ns)
+            if truth is not None:
+                pose, t_ns = truth[frame.index], frame.t_source_ns
+                yield "/gnss/odometry", t_ns, ros.odometry(t_ns, pose, child="camera_optical")
+                yield "/gnss/fix", t_ns, ros.fix(t_ns, *geodetic(*pose[[0, 2, 1], 3]))
 
     return f"rosbag:{ros.write_bag(path, messages(), storage)}"
+
+
+def geodetic(east_m: float, north_m: float, down_m: float) -> tuple[float, float, float]:
+    """Latitude, longitude, altitude near 49 degrees north, by the ellipsoid's radii there."""
+    latitude, flat = np.radians(49.0), 1.0 - WGS84_E2 * np.sin(np.radians(49.0)) ** 2
+    across, along = WGS84_A_M / np.sqrt(flat), WGS84_A_M * (1.0 - WGS84_E2) / flat**1.5
+    longitude = 8.0 + np.degrees(east_m / (across * np.cos(latitude)))
+    return 49.0 + float(np.degrees(north_m / along)), float(longitude), 100.0 - down_m
 
 
 def estimates(recording: Recording, count: int) -> list[bytes]:
@@ -135,3 +156,34 @@ def test_a_real_bag_driven_recorded_and_exported_comes_back(tmp_path: Path, data
         at, pose = message.pose.pose.position, estimate.T_world_ego
         assert (at.x, at.y, at.z) == (pose.x_m, pose.y_m, estimate.attitude.z_m)
     assert len(cars) == sum(len(estimate.vehicles) for estimate in said) > 0
+
+
+@pytest.mark.slow
+def test_a_real_drive_is_held_to_the_truth_of_its_bag(tmp_path: Path, data_dir: Path) -> None:
+    """nav_msgs/Odometry gives the ATE that KITTI's poses give; fixes, which have no attitude, that after alignment."""
+    count = 60
+    drive = KittiRecording(data_dir / "kitti_tracking" / "training" / "image_03" / "0005")
+    T_cam0_cam, rows = drive.T_cam0_cam(), drive.truth_poses()
+    assert rows is not None
+    uri = write(
+        tmp_path / "bag", drive, count, "mcap", "compressed", (), inverse(T_cam0_cam) @ as_poses(rows) @ T_cam0_cam
+    )
+
+    def run(recording: Recording) -> Iterator[Estimate]:
+        slam = BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz)
+        for frame in islice(recording.undistorted_frames(), count):
+            yield slam.step(frame)[1]
+
+    by_poses = evaluate_recordings([drive], run, tmp_path / "files", compared=slice(0, count))[0]
+    assert by_poses.ate_m is not None
+    for topic in ("/gnss/odometry", "/gnss/fix"):
+        bag = open_recording(uri, topics=BagTopics(truth=topic))
+        place = tmp_path / topic.rpartition("/")[2]
+        (by_bag,) = evaluate_recordings([bag], run, place)
+        trajectories = {
+            path.read_bytes() for path in (*tmp_path.glob("files/*/ego.kitti.txt"), place / "bag/ego.kitti.txt")
+        }
+        assert len(trajectories) == 1
+        assert by_bag.ate_se3_m == pytest.approx(by_poses.ate_se3_m, rel=0.02)
+        if topic == "/gnss/odometry":
+            assert by_bag.ate_m == pytest.approx(by_poses.ate_m, rel=0.01)
