@@ -22,9 +22,11 @@ def deploy(options: argparse.Namespace) -> int:
     source = Path(birdslam.__file__).parent
     try:
         for part in PARTS:
-            copy = shutil.copytree if (source / part).is_dir() else shutil.copy
             (target / part).parent.mkdir(parents=True, exist_ok=True)
-            copy(source / part, target / part)
+            if (source / part).is_dir():
+                shutil.copytree(source / part, target / part, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                shutil.copy(source / part, target / part)
         (target / PACKAGE).write_text(f"birdslam=={version('birdslam')}\n", encoding="utf-8")
     except OSError as error:
         raise ConfigurationError(f"{error.filename or target}: {error.strerror}") from None
