@@ -91,6 +91,16 @@ def test_lanes_are_found_on_their_schedule_and_say_their_age(every: int) -> None
     assert not any(n.status for n in news)
 
 
+def test_a_busy_computer_finds_them_less_often() -> None:
+    complete, sparing = Counted(), [1]
+    drive = Driver(LaneHead(complete, None, 3, lambda: sparing[0]))
+    ages = []
+    for k in range(18):
+        sparing[0] = 1 if k < 6 else 2
+        ages.append(drive.step().age)
+    assert ages == [0, 1, 2, 0, 1, 2, 3, 4, 5, 0, 1, 2, 3, 4, 5, 0, 1, 2]
+
+
 def test_a_frame_without_a_segmentation_does_not_starve_them() -> None:
     complete = Counted()
     drive = Driver(LaneHead(complete, None, 4))

@@ -38,12 +38,13 @@ class LaneHead:
 
     `complete` is the network that fills the grids where something hid the road; None leaves them as they were seen.
     `aside` runs a function beside the frames, so that none waits for it; None: the frame does. Lanes are found anew
-    after `every` frames.
+    after `every` frames, times what `sparing` says at the time: a computer that is busy finds them less often.
     """
 
     complete: Completion | None = None
     aside: Aside | None = None
     every: int = 1
+    sparing: Callable[[], int] = lambda: 1
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,8 @@ class LaneMapper:
         earlier = self._finished()
         status: tuple[Status, ...] = ()
         if segmentation is not None and segmented_frame != self._used_frame:
-            due = self._due_frame is None or not 0 <= frame_id - self._due_frame < self.head.every
+            every = self.head.every * self.head.sparing()
+            due = self._due_frame is None or not 0 <= frame_id - self._due_frame < every
             then = next((f for f in self._frames if f.frame_id == segmented_frame), None)
             if self._running is not None:
                 status = (Status.LANES_CARRIED,) if due else ()

@@ -32,6 +32,7 @@ Run = Callable[..., Any]
 
 # Of a multi-task network: vehicles that come with bodies are placed by these, and no map is asked (pseudolidar.py)
 UNREAD_WITH_BODIES = ("depth",)
+LANES_SPARING = 2  # lanes are found half as often at the least: a run takes the interpreter 20 ms from the frames
 
 log = logging.getLogger(__name__)
 
@@ -125,8 +126,10 @@ class Inference:
 
     @property
     def lane_head(self) -> LaneHead:
-        """Lanes, on their schedule."""
-        return LaneHead(self.completion, self.aside, self._lanes_every)
+        """Lanes, on their schedule; half as often where the networks look less often than on theirs."""
+        return LaneHead(
+            self.completion, self.aside, self._lanes_every, lambda: min(self.networks.sparing, LANES_SPARING)
+        )
 
     @property
     def roles(self) -> frozenset[str]:
