@@ -224,7 +224,8 @@ def table(content: dict[str, Any]) -> str:
         f"{'age at the planner':32}{shown(content['age_ms'], 'ms')}  mean {content['age_ms']['mean']:.2f}",
     ]
     for name, stage in content["stages"].items():
-        lines.append(f"  {name:30}{shown(stage, 'ms')}  mean {stage['mean']:.2f}")
+        means = f"mean {stage['mean']:.2f}, in the slowest 1 % {stage['mean_in_tail']:.2f}"
+        lines.append(f"  {name:30}{shown(stage, 'ms')}  {means}")
     for row in content["budgets"]:
         verdict = "met" if row["met"] else "NOT MET"
         line = f"p{row['percentile']:g} {row['measured_ms']:.2f} of {row['limit_ms']:g} ms: {verdict}"
