@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import msgspec
 
 from birdslam.datasets.recording import DatasetError
 from birdslam.evaluation.results import Recorder, ResultsError, claim_directory
-from birdslam.perception import load_network
+from birdslam.perception import ModelError, load_network
 from birdslam.perception.pointnet import load_pointnet
 from birdslam.runtime.configuration import Configuration, ConfigurationError, ModelsConfig, complete
 from birdslam.runtime.environment import INTERRUPTED_STATUS
@@ -131,18 +131,38 @@ def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any], 
     if recording.file:
         file = choose_file(recording, configuration.vehicle)
         configuration = msgspec.structs.replace(configuration, recording=msgspec.structs.replace(recording, file=file))
-    # In a process that ends: the supervisor would hold for all of the drive what loading them took, 50 MB
-    with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
-        models = pool.submit(_described, configuration.models).result()
-    return configuration, models, frames
+    return configuration, _described(configuration.models), frames
 
 
 def _described(models: ModelsConfig) -> dict[str, Any]:
-    """What each network is. Raises ModelError where one can't be used."""
-    out = {role: load_network(role, spec).describe() for role, spec in models.in_use().items()}
-    if models.pointnet is not None:
-        out["pointnet"] = load_pointnet(models.pointnet).describe()
-    return out
+    """What each network is. Raises ModelError where one can't be used.
+
+    They are loaded in a process that ends: the supervisor would hold for all of the drive what that took, 50 MB.
+    """
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_describe, args=(models, sender), daemon=True)
+    process.start()
+    sender.close()
+    try:
+        found: dict[str, Any] | ModelError = receiver.recv()
+    except EOFError:
+        process.join()
+        raise ModelError(f"the process that loads the networks ended with status {process.exitcode}") from None
+    process.join()
+    if isinstance(found, ModelError):
+        raise found
+    return found
+
+
+def _describe(models: ModelsConfig, sender: Connection) -> None:
+    try:
+        out = {role: load_network(role, spec).describe() for role, spec in models.in_use().items()}
+        if models.pointnet is not None:
+            out["pointnet"] = load_pointnet(models.pointnet).describe()
+        sender.send(out)
+    except ModelError as error:
+        sender.send(error)
 
 
 def check_runtime_dir(vehicle: str, runtime_dir: Path | None) -> None:
