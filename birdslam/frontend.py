@@ -13,6 +13,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
 from birdslam.mapping.lane_edges import LaneEdgesConfig
 from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneOutput
+from birdslam.mapping.lane_view import LaneView
 from birdslam.mapping.lanes import LanesConfig
 from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.external import ExternalConfig
@@ -146,6 +147,10 @@ class FrontEnd:
             ages=dict(perception.ages if lanes.age is None else perception.ages | {"lanes": lanes.age}),
         )
         return self._plausibility.admit(measurements)
+
+    def lane_view(self) -> LaneView:
+        """What the lanes around the newest frame's ego are made of, for a picture."""
+        return self._lanes.view(self._reckoning.T_world_ego)
 
     def _dropped(self, frame: Frame) -> tuple[Status, ...]:
         gap = self._last_frame is not None and frame.frame_id > self._last_frame + 1

@@ -21,6 +21,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.mapping.landmark_edges import StaticMapConfig
 from birdslam.mapping.lane_edges import LaneEdgesConfig, Station, lane_stations
 from birdslam.mapping.lane_ids import NO_LANE, cell_keys
+from birdslam.mapping.lane_view import LaneView, lane_view
 from birdslam.mapping.lanes import AmodalLanes, Completion, LanesConfig, points_of
 from birdslam.perception import Segmentation
 from birdslam.types import LandmarkEdge, LanePoint, Status
@@ -126,6 +127,10 @@ class LaneMapper:
         self._outdated = self._running is not None
         if not self._outdated:
             self._amodal.clear()
+
+    def view(self, T_world_ego: SE2) -> LaneView:
+        """What the lanes around the ego are made of, for a picture; not while a run is under way aside."""
+        return lane_view(self._amodal, T_world_ego)
 
     def map_lanes(
         self,

@@ -147,7 +147,8 @@ def _run_all(jobs: Sequence[Job], processes: int) -> list[Outcome]:
             return outcomes
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
-        running = [pool.submit(run_sequence, job) for job in jobs]
+        # The longest first: a long one that begins last is waited for alone
+        running = [pool.submit(run_sequence, job) for job in sorted(jobs, key=frames_to_make, reverse=True)]
         try:
             return [_shown(done.result(), k, jobs, begun_s) for k, done in enumerate(as_completed(running), start=1)]
         except BaseException:

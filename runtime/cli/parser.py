@@ -49,7 +49,7 @@ def build_parser() -> argparse.ArgumentParser:
     evaluate = commands.add_parser("evaluate", help="compare with ground truth").add_subparsers(
         required=True, metavar="WHAT"
     )
-    for add_evaluation in (_odometry, _tracking, _localisation):
+    for add_evaluation in (_odometry, _tracking, _localisation, _lanes):
         add_evaluation(evaluate)
     return parser
 
@@ -291,6 +291,16 @@ def _tracking(evaluate: Commands) -> None:
         _add_settings(parser)
         parser.add_argument("--output", required=True, metavar="DIR", help="where the report goes")
         parser.set_defaults(command=f"evaluate {command}")
+
+
+def _lanes(evaluate: Commands) -> None:
+    text = "a picture of what a frame's lanes are made of: road and lane cells, seen and completed"
+    parser = evaluate.add_parser("lanes", help=text, description=text)
+    parser.add_argument("drive", metavar="DRIVE", help="a KITTI directory, or a source's URI")
+    parser.add_argument("--frame", type=int, metavar="N", help="which one; default: the last")
+    _add_config(parser)
+    _add_pipeline(parser)
+    parser.set_defaults(command="evaluate lanes")
 
 
 def _localisation(evaluate: Commands) -> None:

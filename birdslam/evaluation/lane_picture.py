@@ -1,0 +1,54 @@
+"""Fig. 4 of the paper on any drive: a frame, its cells of lane boundary and road, the lanes without and with ENet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.mapping.lane_view import LaneView
+from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig
+
+TITLES = (
+    "lane boundary, seen",
+    "road, seen",
+    "lanes without ENet",
+    "lane boundary, completed",
+    "road, completed",
+    "lanes",
+)
+HIDDEN_ALPHA = 0.25  # of cells, behind lanes
+
+
+def draw_lanes(title: str, image: NDArray[np.uint8], view: LaneView, config: LanesConfig, path: Path) -> None:
+    """`image` (H, W) grey or (H, W, 3) BGR above; below it the grids from above, forward up and left to the left."""
+    # Here, since matplotlib takes half a second to import
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    width = 11.0
+    above = width * image.shape[0] / image.shape[1]
+    figure = Figure(figsize=(width, above + 2.9), dpi=80, layout="constrained")
+    FigureCanvasAgg(figure)
+    rows = figure.add_gridspec(2, 6, height_ratios=(above, 2.4))
+    top = figure.add_subplot(rows[0, :])
+    top.imshow(image if image.ndim == 2 else image[:, :, ::-1], cmap="gray")
+    top.set_axis_off()
+    top.set_title(title)
+    extent = (config.half_width_m, -config.half_width_m, -config.behind_m, config.ahead_m)
+    grids = (view.seen[BOUNDARY], view.seen[ROAD], view.seen[BOUNDARY], view.completed[BOUNDARY], view.completed[ROAD])
+    for k, (name, grid) in enumerate(zip(TITLES, (*grids, view.completed[BOUNDARY]), strict=True)):
+        axes = figure.add_subplot(rows[1, k])
+        lanes = {2: view.lanes_seen, 5: view.lanes}.get(k)
+        alpha = 1.0 if lanes is None else HIDDEN_ALPHA
+        # Columns of a grid begin on the right, rows behind
+        axes.imshow(grid[:, ::-1], origin="lower", extent=extent, cmap="Greys", vmin=0.0, vmax=1.0, alpha=alpha)
+        for j, cloud in enumerate(lanes or ()):
+            axes.scatter(cloud[:, 1], cloud[:, 0], s=4, color=f"C{j % 10}")
+        axes.plot(0.0, 0.0, "^", color="#35a0d0")
+        axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
+        axes.set_title(name, fontsize=9)
+        axes.tick_params(labelsize=7)
+    figure.supxlabel("left of the ego (m)", fontsize=9)
+    figure.savefig(path)
