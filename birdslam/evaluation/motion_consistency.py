@@ -24,7 +24,9 @@ Floats = NDArray[np.float64]
 
 DIMENSIONS = 3
 MEDIAN = 2.366  # of the chi-square of three degrees of freedom: what a consistent error's squared distance is as often
+MEDIAN_LENGTH = 0.455  # the same of one degree of freedom
 STRETCH_M = 10.0
+LEAST_M = 0.05  # a shorter motion's length says nothing of the scale
 
 
 def _alone(measurements: Measurements) -> Measurements:
@@ -40,6 +42,8 @@ class MotionConsistency(msgspec.Struct, frozen=True, kw_only=True):
     nees_median: float | None = None  # its median over that of a consistent error: outliers of the truth do not count
     n_measured: int = 0  # of them those whose truth is no interpolation
     nees_measured: float | None = None  # of these, the truth's own noise added to P
+    length_nees: float | None = None  # of the way's length alone, which is the scale's error; also of the measured
+    length_nees_median: float | None = None  # over that of a consistent error
 
 
 class MotionConsistencyReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -92,15 +96,18 @@ class Motions:
         implausible = truth_quality.implausible(truth, np.array(self._t_ns, np.int64))
         return MotionConsistencyReport(
             frames=self._judge(frames, truth, interpolated, noise),
-            stretches=self._judge(self._stretches(truth), truth, interpolated, noise),
+            stretches=self._judge(self.stretches(truth), truth, interpolated, noise),
             truth_interpolated=int(interpolated.sum()),
             truth_implausible=int(implausible.sum()),
             truth_sigma_m=(float(sigma[0]), float(sigma[1])),
             truth_sigma_rad=float(sigma[2]),
         )
 
-    def _stretches(self, truth: Transform) -> list[tuple[int, int, SE2, Floats]]:
-        """Each STRETCH_M of the truth's way, every quarter of that, where all between is known."""
+    def stretches(self, truth: Transform) -> list[tuple[int, int, SE2, Floats]]:
+        """(first, last, T_first_last, its covariance (3, 3)) of each STRETCH_M of the truth's way.
+
+        One begins every quarter of that, where all between is known.
+        """
         way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
         begins = np.unique(np.searchsorted(way_m, np.arange(0.0, max(way_m[-1] - STRETCH_M, 0.0), 0.25 * STRETCH_M)))
         found = []
@@ -135,17 +142,28 @@ class Motions:
         if not motions:
             return MotionConsistency(n=0)
         mount = mount_pose(self._mount)
-        plain, measured = [], []
+        plain, measured, lengths = [], [], []
         for first, last, T_first_last, cov in motions:
             goal, _ = split_pose(mount @ inverse(truth[first]) @ truth[last] @ inverse(mount))
             error = T_first_last.between(goal).log()
             plain.append(float(error @ np.linalg.solve(cov, error)))
             if not interpolated[first + 1 : last + 1].any():
                 measured.append(float(error @ np.linalg.solve(cov + noise, error)))
+                if (length_m := np.hypot(goal.x_m, goal.y_m)) > LEAST_M:
+                    lengths.append(_of_length(T_first_last, cov + noise, float(length_m)))
         return MotionConsistency(
             n=len(plain),
             nees=float(np.mean(plain)) / DIMENSIONS,
             nees_median=float(np.median(plain)) / MEDIAN,
             n_measured=len(measured),
             nees_measured=float(np.mean(measured)) / DIMENSIONS if measured else None,
+            length_nees=float(np.mean(lengths)) if lengths else None,
+            length_nees_median=float(np.median(lengths)) / MEDIAN_LENGTH if lengths else None,
         )
+
+
+def _of_length(T_first_last: SE2, cov: Floats, truth_m: float) -> float:
+    """Squared error of a motion's length over its variance; `cov` (3, 3) is of the tangent at its end."""
+    length_m = np.hypot(T_first_last.x_m, T_first_last.y_m)
+    along = T_first_last.rotation().T @ np.array([T_first_last.x_m, T_first_last.y_m]) / max(length_m, 1e-9)
+    return float((length_m - truth_m) ** 2 / (along @ cov[:2, :2] @ along))

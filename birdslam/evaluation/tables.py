@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 
 from birdslam.datasets.recording import DatasetError
+from birdslam.evaluation.relative_nees import NeesRow
 from birdslam.evaluation.told import MotionRow, RangeRow
 from birdslam.evaluation.tracking import EGO, Row, mean_ate_m
 
@@ -42,6 +43,8 @@ REDONE_TITLES = {  # of the re-implemented; a batch knows the whole log, as what
     "cubeslam": "CubeSLAM, batch",
     "paper": "BirdSLAM, live",
     "paper_final": "BirdSLAM, final",
+    "paper_eq1": "BirdSLAM by Eq. 1, live",
+    "paper_eq1_final": "BirdSLAM by Eq. 1, final",
 }
 VARIANT_TITLES = {
     "without_cc": "without CC",
@@ -268,6 +271,24 @@ def motion_table(rows: Sequence[MotionRow]) -> str:
             str(row.asked),
             _number(row.velocity_error_median_mps),
             *(str(n) for n in (row.standing, row.false_movers, row.false_movers_sure, row.driving, row.missed_movers)),
+        ]
+        for row in rows
+    ]
+    return _markdown(head, lines)
+
+
+def nees_table(rows: Sequence[NeesRow]) -> str:
+    """Relative NEES of ego, scale and vehicles, by frame and by 10 m."""
+    head = ["Seq", "odometry", "of", "per", "n", "NEES", "median"]
+    lines = [
+        [
+            row.sequence,
+            odometry_title(row.odometry),
+            row.of,
+            row.per,
+            f"{row.n} of {row.bodies}" if row.of == "vehicles" else str(row.n),
+            _number(row.nees),
+            _number(row.nees_median),
         ]
         for row in rows
     ]

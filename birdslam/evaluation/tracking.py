@@ -171,6 +171,18 @@ def make_log(
     return log
 
 
+def most_labelled(sequence: TrackingSequence, cars: Iterable[int], frames: int) -> range:
+    """So many frames in which the labels of `cars` are the most together: the first of such stretches."""
+    length = len(sequence)
+    labels = np.zeros(length + 1)
+    for label in sequence.labels:
+        labels[label.frame + 1] += label.track in set(cars)
+    frames = min(frames, length)
+    so_far = np.cumsum(labels)
+    start = int(np.argmax(so_far[frames:] - so_far[: length + 1 - frames]))
+    return range(start, start + frames)
+
+
 @dataclass(frozen=True)
 class Truth:
     """What a log is held to: poses in the world of its first frame, and each frame's label -> track of ours."""
@@ -215,10 +227,11 @@ class Truth:
         held = {label: {m[label] for m in self.matches.values() if label in m} for label in self.vehicles}
         return {str(label): len(tracks) for label, tracks in held.items()}
 
-    def errors(self, result: Trajectories) -> dict[str, PathErrors | None]:
-        """Errors of "ego" and of every labelled vehicle; None for one that was never found."""
+    def errors(self, result: Trajectories, bodies: Iterable[str] | None = None) -> dict[str, PathErrors | None]:
+        """Errors of "ego" and of every labelled vehicle, or those of `bodies`; None for one that was never found."""
         out = {EGO: path_errors(self.ego, result.ego)}
-        for label in sorted(self.vehicles):
+        asked = self.vehicles if bodies is None else {label for label in self.vehicles if str(label) in bodies}
+        for label in sorted(asked):
             out[str(label)] = path_errors(self.vehicles[label], self.found(label, result))
         return out
 
@@ -255,11 +268,16 @@ class Trial:
     idf1: float | None
 
 
-def run_trial(sequence: TrackingSequence, log: Sequence[Measurements], chosen: Mapping[str, Method]) -> Trial:
-    """Every method on one log."""
+def run_trial(
+    sequence: TrackingSequence,
+    log: Sequence[Measurements],
+    chosen: Mapping[str, Method],
+    bodies: Sequence[str] | None = None,
+) -> Trial:
+    """Every method on one log; the errors of the labelled vehicles `bodies` alone, where these are named."""
     truth = Truth.of(sequence, log)
     labelled = {EGO: len(truth.ego)} | {str(label): len(poses) for label, poses in truth.vehicles.items()}
-    errors = {name: truth.errors(method.run(log, sequence.camera)) for name, method in chosen.items()}
+    errors = {name: truth.errors(method.run(log, sequence.camera), bodies) for name, method in chosen.items()}
     return Trial(errors, labelled, truth.tracks(), hota(truth.boxes), idf1(truth.boxes))
 
 

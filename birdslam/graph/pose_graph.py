@@ -17,6 +17,7 @@ a vehicle in a row: the twist (velocity in its own frame) changes little from on
 
 from __future__ import annotations
 
+import cmath
 import math
 from typing import Annotated
 
@@ -34,7 +35,7 @@ from birdslam.graph.pending_map import PendingMap
 from birdslam.graph.vehicles import SHORTEST_S, Ties, VehicleNodes
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window, solver
-from birdslam.types import INVALIDATING, Estimate, MapUpdate, Measurements, SpeedSource, Status, VehicleEstimate
+from birdslam.types import INVALIDATING, BodyId, Estimate, MapUpdate, Measurements, SpeedSource, Status, VehicleEstimate
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
@@ -124,6 +125,21 @@ class PoseGraph:
             window, reset = self._begin(m, True), True
         status = (*m.status, Status.GRAPH_RESET) if reset else m.status
         return self._estimate(m, status, window.ego_cov, self._vehicle_estimates(m, window))
+
+    def vehicles_in_ego(self) -> dict[BodyId, tuple[SE2, Floats]]:
+        """T_ego_vehicle with its covariance (3, 3) in ego, of the vehicles that the newest frame tells of.
+
+        It has nothing of the ego's error in world, which the covariances of an estimate have.
+        """
+        window, out = self._window, {}
+        if window is None:
+            return {}
+        for row, v in enumerate(self._vehicles.nodes):
+            if v.seen_ns == self._t_ns:
+                k, states = window.nodes + row, window.layout.poses[row]
+                at, yaw_rad = window.at[k], cmath.phase(complex(window.heading[k]))
+                out[v.vehicle] = SE2(float(at.real), float(at.imag), yaw_rad), window.P[np.ix_(states, states)]
+        return out
 
     def map_update(self) -> MapUpdate | None:
         """What the map gained since the last call, in world; None where it gained nothing."""
