@@ -148,7 +148,7 @@ class RoadScale:
         self._direction_held = False
         self._since_m += travelled_m
 
-        self._learn_bonnet(view.grey, travelled_m)
+        self._learn_bonnet(view, travelled_m)
         image, pose = self._image(view.grey), view.pose
         factor = float(np.exp(np.clip(self._filter.owed_log, -0.1, 0.1)))
         self._filter.owed_log = 0.0
@@ -183,10 +183,12 @@ class RoadScale:
             return _Seen(plain, plain)
         return _Seen(plain, RoadImage.of(standing.without(grey, top_px), top_px))
 
-    def _learn_bonnet(self, grey: NDArray[np.uint8], travelled_m: float) -> None:
+    def _learn_bonnet(self, view: RoadView, travelled_m: float) -> None:
         """Where a bonnet turns out to have been taken for road, all that it said is forgotten."""
+        if view.near_px < _DRIVEN_PX:  # a standing car's whole image stands
+            return
         driven_m = travelled_m if self._confirmed else np.inf  # of an unknown length: images that differ will do
-        if self._bonnet.learn(grey, self._aligner.top_px, driven_m):
+        if self._bonnet.learn(view.grey, self._aligner.top_px, driven_m):
             self._filter.forget_scale(1.0)
             self._filter.turned_unseen()
             self._confirmed = 0
