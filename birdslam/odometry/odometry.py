@@ -23,6 +23,7 @@ from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
 from birdslam.geometry.se2 import SE2
 from birdslam.odometry.car_reckoning import DRIVES_M, moves_sideways, reckoned
 from birdslam.odometry.car_scale import CarStep
+from birdslam.odometry.corner_pose import Corners, Fitting, pose_among_landmarks, without_glass
 from birdslam.odometry.corner_prediction import corners_of_unknown_depth_px
 from birdslam.odometry.features import FeatureConfig, FeatureTracker, Tracks
 from birdslam.odometry.guided_two_view import first_pose
@@ -40,7 +41,6 @@ from birdslam.odometry.motion import (
     step_cov,
 )
 from birdslam.odometry.moving_median import MedianScale
-from birdslam.odometry.relative_pose import locate
 from birdslam.odometry.road_alignment import RoadAligner, RoadFit
 from birdslam.odometry.road_filter import RoadScaleConfig
 from birdslam.odometry.road_points import on_road, outside
@@ -61,7 +61,6 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 _MIN_INTERVAL_S = 0.004
 _WAY_SIGMA_REL = 0.3  # a way known so well says by how much the road's image has moved
-_SAME_RAD, _SAME_REL = 0.0007, 0.05  # poses that differ by less say the same: rotation, place over the way
 _DRIVES_MPS = 3.0  # from one image to the next a car does not stop from this
 _STILL = Pose(np.eye(3), np.zeros(3))
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step that two images alone show: 1 cm, 0.25 deg
@@ -95,19 +94,6 @@ class _Velocity:
     angular_radps: Floats  # (3,)
 
 
-@dataclass(frozen=True)
-class _Corners:
-    """The N corners of one image outside vehicles."""
-
-    ids: Ints  # (N,) ascending
-    xy: Floats  # (N, 2) normalised coordinates
-    displacement_px: Floats  # of those that the base image shows too
-    on_street: Bools  # (N,) False: stands in the image while the car drives, on the glass or on a line along the way
-
-    def without_glass(self) -> _Corners:
-        return _Corners(self.ids[self.on_street], self.xy[self.on_street], self.displacement_px, self.on_street)
-
-
 class Odometry:
     """From images of one undistorted, calibrated camera to metric motion, image by image.
 
@@ -135,6 +121,7 @@ class Odometry:
         self._velocity: _Velocity | None = None
         self._held = HeldSpeed(self.config.held_speed)
         self._glass = StandingCorners(self.camera, self.config.standing_corners)
+        self._obstructed = False  # corners on the glass were left out of the newest motion
         self._guess: Pose | None = None  # of the step to the present image, where it had to be searched for
         self._interval_s = 0.1
         self._road_tracks: tuple[Ints, Floats] = _NO_TRACKS
@@ -218,7 +205,6 @@ class Odometry:
             return motion
 
         cfg, corners = self.config, self._static_corners(tracks, boxes_px, dt_s)
-        corners = self._leave_out_glass(corners, dt_s)
         located = self._relative_pose(corners, dt_s, car)
         sideways = False
         if located is not None and self._drives(car):
@@ -268,56 +254,38 @@ class Odometry:
     def _new_window(self) -> KeyframeWindow:
         return KeyframeWindow(self._focal_px, self.config)
 
-    def _static_corners(self, tracks: Tracks, boxes_px: Floats, dt_s: float) -> _Corners:
+    def _static_corners(self, tracks: Tracks, boxes_px: Floats, dt_s: float) -> Corners:
         driven_m = self._speed_mps() * dt_s if self._scale.sigma_rel < _WAY_SIGMA_REL else 0.0
         static, base = outside(tracks.px, boxes_px), self._tracker.base
         ids, px = tracks.ids[static], tracks.px[static]
-        on_street = ~self._glass.see(ids, px, self._scale.ground, driven_m)
+        stands = self._glass.see(ids, px, self._scale.ground, driven_m)
         a, b = common(base.ids, ids)
         displacement: Floats = np.sqrt(((px[b] - base.px[a]) ** 2).sum(axis=1))
-        return _Corners(ids, self.camera.to_xy(px), displacement, on_street)
+        corners = Corners(ids, self.camera.to_xy(px), displacement, stands)
+        self._obstructed = False
+        if self._glass.present:
+            every = corners
+            corners = without_glass(self._window, every, self._pose, self._guesses(dt_s), self._fitting(dt_s))
+            self._obstructed = corners is not every
+        return corners
 
     # --- relative pose ---
 
-    def _relative_pose(self, corners: _Corners, dt_s: float, car: CarStep | None) -> tuple[Pose, Floats] | None:
+    def _relative_pose(self, corners: Corners, dt_s: float, car: CarStep | None) -> tuple[Pose, Floats] | None:
         """The present image's pose in the window's frame and its information (6, 6); None where it is not known."""
-        located = self._among_landmarks(corners, dt_s)
+        guesses, fitting = self._guesses(dt_s), self._fitting(dt_s)
+        located = pose_among_landmarks(self._window, corners, self._pose, guesses, fitting)
         return self._two_view_pose(corners, dt_s, car) if located is None else located
 
-    def _leave_out_glass(self, corners: _Corners, dt_s: float) -> _Corners:
-        """The corners without those that stand on the glass, where these lead to another pose than the street's."""
-        if not self._glass.present:
-            return corners
-        street = corners.without_glass()
-        both, alone = self._among_landmarks(corners, dt_s), self._among_landmarks(street, dt_s)
-        if both is None or alone is None:
-            return street
-        between, step = both[0].between(alone[0]), self._pose.between(alone[0])
-        turned = float(np.linalg.norm(rotation_log(between.R))) > _SAME_RAD
-        moved = float(np.linalg.norm(between.p)) > _SAME_REL * float(np.linalg.norm(step.p))
-        return street if turned or moved else corners
-
-    def _among_landmarks(self, corners: _Corners, dt_s: float) -> tuple[Pose, Floats] | None:
-        """The same by the landmarks of the window alone."""
-        cfg, window, ids = self.config, self._window, corners.ids
+    def _guesses(self, dt_s: float) -> list[Pose]:
         searched = [] if self._guess is None else [self._pose @ self._guess]
-        guesses = [*searched, self._pose @ self._predicted_step(dt_s), self._pose]
-        best: tuple[int, Pose, Floats] | None = None
-        shared = len(common(ids, window.ids[np.isfinite(window.rho)])[0])
-        if shared >= cfg.min_fitting:
-            for guess in guesses:
-                pose, inliers, info = locate(window, guess, ids, corners.xy)
-                if best is None or inliers.sum() > best[0]:
-                    best = (int(inliers.sum()), pose, info)
-                if best[0] > 0.7 * shared:
-                    break
-        if best is not None and best[0] >= max(cfg.min_fitting, cfg.min_fitting_fraction * shared):
-            travelled_m = float(np.linalg.norm(best[1].p - self._pose.p))
-            if travelled_m <= cfg.max_speed_mps * dt_s + 0.1:
-                return best[1], best[2]
-        return None
+        return [*searched, self._pose @ self._predicted_step(dt_s), self._pose]
 
-    def _two_view_pose(self, corners: _Corners, dt_s: float, car: CarStep | None) -> tuple[Pose, Floats] | None:
+    def _fitting(self, dt_s: float) -> Fitting:
+        cfg = self.config
+        return Fitting(cfg.min_fitting, cfg.min_fitting_fraction, cfg.max_speed_mps * dt_s + 0.1)
+
+    def _two_view_pose(self, corners: Corners, dt_s: float, car: CarStep | None) -> tuple[Pose, Floats] | None:
         """Starts the window anew from the base image and this one."""
         cfg, displacement_px = self.config, corners.displacement_px
         base = self._tracker.base
@@ -378,7 +346,7 @@ class Odometry:
 
     # --- moving, standing, coasting ---
 
-    def _stands(self, step: Pose, corners: _Corners, near_px: float | None, dt_s: float, car: CarStep | None) -> bool:
+    def _stands(self, step: Pose, corners: Corners, near_px: float | None, dt_s: float, car: CarStep | None) -> bool:
         if len(corners.displacement_px) < self.config.min_fitting:
             return False
         speed_mps = self._speed_mps()
@@ -421,7 +389,10 @@ class Odometry:
         self._velocity, self._interval_s = _Velocity(step.p / dt_s, rotation_log(step.R) / dt_s), dt_s
         T_prev_curr = planar(step, self._scale.ground)
         cov = measured_cov(self.config.motion, info, T_prev_curr, self._scale.ground, self._scale.sigma_rel)
-        return self._motion(frame_id, step, T_prev_curr, cov, self._scale.status())
+        status = self._scale.status()
+        if self._obstructed and Status.VIEW_OBSTRUCTED not in status:
+            status.append(Status.VIEW_OBSTRUCTED)
+        return self._motion(frame_id, step, T_prev_curr, cov, status)
 
     def _stand(self, frame_id: int) -> Motion:
         self._velocity = _Velocity(np.zeros(3), np.zeros(3))
