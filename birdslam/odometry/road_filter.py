@@ -223,9 +223,8 @@ class RoadFilter:
         H = np.zeros((1, len(self.x)))
         H[0, 1:3] = by_pitch @ d, by_roll @ d
         share = travelled_m / 1.0
-        sigma_rad = max(
-            self.config.sigma_travel_rad, sigma_across_m / max(travelled_m, 1.0)
-        )  # the places' errors do not add up
+        # Over one metre: the errors of the places do not add up over many short steps
+        sigma_rad = max(self.config.sigma_travel_rad, sigma_across_m / max(travelled_m, 1.0))
         noise = np.array([[sigma_rad**2 / share]])
         self._update(np.array([-(normal @ d)]), H, noise)
 
