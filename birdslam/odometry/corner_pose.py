@@ -15,6 +15,7 @@ from birdslam.odometry.sliding_window import SlidingWindow, common
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+Located = tuple[Pose, Floats]  # a pose and its information (6, 6), of (translation, rotation) in its own axes
 
 _SAME_RAD, _SAME_REL = 0.0007, 0.05  # poses that differ by less say the same: rotation, place over the way
 _ENOUGH = 0.7  # of the landmarks in sight that fit: no other guess is tried
@@ -44,9 +45,29 @@ class Fitting:
     longest_m: float  # a longer step is no measurement
 
 
+def pose_beside_glass(
+    window: SlidingWindow, corners: Corners, base: Pose, guesses: Sequence[Pose], fitting: Fitting
+) -> tuple[Corners, Located | None]:
+    """The corners to use and the pose by them: the street's alone where those that stand lead to another pose.
+
+    Parameters are those of `pose_among_landmarks`; `corners` themselves are given back where none is left out.
+    """
+    both = pose_among_landmarks(window, corners, base, guesses, fitting)
+    if not corners.stands.any():
+        return corners, both
+    street = corners.of_street()
+    alone = pose_among_landmarks(window, street, base, guesses, fitting)
+    if both is None or alone is None:
+        return street, alone
+    between, step = both[0].between(alone[0]), base.between(alone[0])
+    turned = float(np.linalg.norm(rotation_log(between.R))) > _SAME_RAD
+    moved = float(np.linalg.norm(between.p)) > _SAME_REL * float(np.linalg.norm(step.p))
+    return (street, alone) if turned or moved else (corners, both)
+
+
 def pose_among_landmarks(
     window: SlidingWindow, corners: Corners, base: Pose, guesses: Sequence[Pose], fitting: Fitting
-) -> tuple[Pose, Floats] | None:
+) -> Located | None:
     """The image's pose in the window's frame and its information (6, 6); None where too few landmarks agree on one.
 
     `base` is the pose of the image before, `guesses` are tried until one fits well.
@@ -63,18 +84,3 @@ def pose_among_landmarks(
     if best is None or best[0] < max(fitting.least, fitting.least_fraction * shared):
         return None
     return best[1:] if float(np.linalg.norm(best[1].p - base.p)) <= fitting.longest_m else None
-
-
-def without_glass(
-    window: SlidingWindow, corners: Corners, base: Pose, guesses: Sequence[Pose], fitting: Fitting
-) -> Corners:
-    """The corners of the street alone, where those that stand lead to another pose; else all."""
-    street = corners.of_street()
-    both = pose_among_landmarks(window, corners, base, guesses, fitting)
-    alone = pose_among_landmarks(window, street, base, guesses, fitting)
-    if both is None or alone is None:
-        return street
-    between, step = both[0].between(alone[0]), base.between(alone[0])
-    turned = float(np.linalg.norm(rotation_log(between.R))) > _SAME_RAD
-    moved = float(np.linalg.norm(between.p)) > _SAME_REL * float(np.linalg.norm(step.p))
-    return street if turned or moved else corners

@@ -84,10 +84,9 @@ def step_cov(config: MotionConfig, info: Floats) -> Floats:
 
 
 def measured_cov(
-    config: MotionConfig, info: Floats, motion: SE2, ground: GroundPlane, scale_sigma_rel: float
+    config: MotionConfig, cov6: Floats, motion: SE2, ground: GroundPlane, scale_sigma_rel: float
 ) -> Floats:
-    """(3, 3) from the information (6, 6) of the camera's step, in its own axes: (translation, rotation)."""
-    cov6 = step_cov(config, info)
+    """(3, 3) from that of the camera's step, `step_cov`."""
     G = np.zeros((3, 6))
     G[:2, :3] = ground.R_ego_cam[:2]
     G[2, 3:] = ground.R_ego_cam[2]

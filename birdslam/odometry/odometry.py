@@ -11,7 +11,6 @@ stays the one that all later ones are compared with until they differ.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 import msgspec
@@ -19,16 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
+from birdslam.geometry.pose import Pose
 from birdslam.geometry.se2 import SE2
 from birdslam.odometry.car_reckoning import DRIVES_M, moves_sideways, reckoned
 from birdslam.odometry.car_scale import CarStep
-from birdslam.odometry.corner_pose import Corners, Fitting, pose_among_landmarks, without_glass
+from birdslam.odometry.corner_pose import Corners, Fitting, Located, pose_beside_glass
 from birdslam.odometry.corner_prediction import corners_of_unknown_depth_px
 from birdslam.odometry.features import FeatureConfig, FeatureTracker, Tracks
 from birdslam.odometry.guided_two_view import first_pose
 from birdslam.odometry.held_speed import HeldSpeed, HeldSpeedConfig, worst_sigma_m
 from birdslam.odometry.keyframes import KeyframeConfig, KeyframeWindow
+from birdslam.odometry.last_motion import STILL, LastMotion
 from birdslam.odometry.metric_scale import MetricScale, RoadView
 from birdslam.odometry.motion import (
     Motion,
@@ -62,7 +62,6 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 _MIN_INTERVAL_S = 0.004
 _WAY_SIGMA_REL = 0.3  # a way known so well says by how much the road's image has moved
 _DRIVES_MPS = 3.0  # from one image to the next a car does not stop from this
-_STILL = Pose(np.eye(3), np.zeros(3))
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step that two images alone show: 1 cm, 0.25 deg
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
 _STRATEGIES: dict[str, type[RoadScale] | type[MedianScale]] = {"kalman": RoadScale, "paper": MedianScale}
@@ -86,14 +85,6 @@ class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
     held_speed: HeldSpeedConfig = HeldSpeedConfig()
 
 
-@dataclass(frozen=True)
-class _Velocity:
-    """The last measured motion, as a rate."""
-
-    linear_mps: Floats  # (3,) camera axes
-    angular_radps: Floats  # (3,)
-
-
 class Odometry:
     """From images of one undistorted, calibrated camera to metric motion, image by image.
 
@@ -114,16 +105,15 @@ class Odometry:
         self._tracker.reset()
         self._scale: MetricScale = _STRATEGIES[self.config.road.mode](self.camera, self.config.road)
         self._window = self._new_window()
-        self._pose = _STILL  # of the base image, in the window's frame
+        self._pose = STILL  # of the base image, in the window's frame
         self._base_frame: int | None = None  # the last image whose motion was measured
         self._base_t_ns = 0
         self._base_seen = True  # False: no image shows where the base was, the car's own speed alone led there
-        self._velocity: _Velocity | None = None
+        self._last = LastMotion()
         self._held = HeldSpeed(self.config.held_speed)
         self._glass = StandingCorners(self.camera, self.config.standing_corners)
         self._obstructed = False  # corners on the glass were left out of the newest motion
         self._guess: Pose | None = None  # of the step to the present image, where it had to be searched for
-        self._interval_s = 0.1
         self._road_tracks: tuple[Ints, Floats] = _NO_TRACKS
 
     @property
@@ -141,7 +131,7 @@ class Odometry:
     def track(self, image: NDArray[np.uint8]) -> Tracks:
         """Follows the corners into an image, (H, W) grey or (H, W, 3) BGR uint8, undistorted."""
         self._guess = None
-        return self._tracker.track(image, self._predict_px if self._velocity is not None else None, self._search_px)
+        return self._tracker.track(image, self._predict_px if self._last.known else None, self._search_px)
 
     def _search_px(self, past: NDArray[np.uint8], present: NDArray[np.uint8], base: Tracks) -> list[Floats]:
         """Where the base's corners are by the motions that are searched for."""
@@ -149,7 +139,7 @@ class Odometry:
         return [self._expected_px(base.px, step) for step in (turned, self._guess)]
 
     def _predict_px(self, base: Tracks) -> Floats:
-        step = self._predicted_step(self._interval_s)
+        step = self._last.over(self._last.interval_s)
         pose = self._pose @ step
         out = self._expected_px(base.px, step)
         at = np.searchsorted(self._window.ids, base.ids)
@@ -191,7 +181,7 @@ class Odometry:
             return None
         dt_s = (t_source_ns - self._base_t_ns) * 1e-9
         if dt_s < _MIN_INTERVAL_S:  # a clock that stands or steps back must not make a speed
-            dt_s = self._interval_s
+            dt_s = self._last.interval_s
         car = self._scale.car_step(t_source_ns - round(dt_s * 1e9), t_source_ns)
         if blind:
             motion = self._coast(frame_id, dt_s, blind, car)
@@ -204,8 +194,8 @@ class Odometry:
             self._scale.turned_unseen()
             return motion
 
-        cfg, corners = self.config, self._static_corners(tracks, boxes_px, dt_s)
-        located = self._relative_pose(corners, dt_s, car)
+        cfg = self.config
+        corners, located = self._relative_pose(tracks, boxes_px, dt_s, car)
         sideways = False
         if located is not None and self._drives(car):
             shown = planar(self._pose.between(located[0]), self._scale.ground)
@@ -228,8 +218,9 @@ class Odometry:
             if np.isfinite(held_m):
                 self._scale.length_held(held_m / max(float(np.linalg.norm(pose.p - self._pose.p)), held_m))
             interval_ns = (t_source_ns - round(dt_s * 1e9), t_source_ns)
-            step = self._scale_to_metres(pose, info, tracks, boxes_px, road_mask, near_px, interval_ns)
-            motion = self._move(frame_id, step, info, dt_s)
+            cov6 = step_cov(cfg.motion, info)
+            step = self._scale_to_metres(pose, cov6, tracks, boxes_px, road_mask, near_px, interval_ns)
+            motion = self._move(frame_id, step, cov6, dt_s)
             self._tracker.accept(tracks)
         self._base_frame, self._base_t_ns = frame_id, t_source_ns
         self._road_tracks = self._tracks_on_road(tracks, boxes_px, road_mask)
@@ -239,7 +230,7 @@ class Odometry:
         """A new window that holds this image alone."""
         self._tracker.accept(tracks)
         self._window = self._new_window()
-        self._pose = _STILL
+        self._pose = STILL
         static = outside(tracks.px, boxes_px)
         self._window.append(frame_id, self._pose, tracks.ids[static], self.camera.to_xy(tracks.px[static]))
         self._base_frame, self._base_t_ns, self._base_seen = frame_id, t_source_ns, True
@@ -248,44 +239,42 @@ class Odometry:
     def _begin_unseen(self, frame_id: int, t_source_ns: int) -> None:
         """What the car's own speed led to is the base: images have shown nothing for too long to come back to them."""
         self._tracker.leave_base()
-        self._window, self._pose = self._new_window(), _STILL
+        self._window, self._pose = self._new_window(), STILL
         self._base_frame, self._base_t_ns, self._base_seen = frame_id, t_source_ns, False
 
     def _new_window(self) -> KeyframeWindow:
         return KeyframeWindow(self._focal_px, self.config)
 
+    # --- relative pose ---
+
+    def _relative_pose(
+        self, tracks: Tracks, boxes_px: Floats, dt_s: float, car: CarStep | None
+    ) -> tuple[Corners, Located | None]:
+        """The corners in use, and the present image's pose by them in the window's frame; None where it is unknown."""
+        every = self._static_corners(tracks, boxes_px, dt_s)
+        guesses, fitting = self._guesses(dt_s), self._fitting(dt_s)
+        corners, located = pose_beside_glass(self._window, every, self._pose, guesses, fitting)
+        self._obstructed = corners is not every
+        return corners, located if located is not None else self._two_view_pose(corners, dt_s, car)
+
     def _static_corners(self, tracks: Tracks, boxes_px: Floats, dt_s: float) -> Corners:
-        driven_m = self._speed_mps() * dt_s if self._scale.sigma_rel < _WAY_SIGMA_REL else 0.0
+        driven_m = self._last.speed_mps * dt_s if self._scale.sigma_rel < _WAY_SIGMA_REL else 0.0
         static, base = outside(tracks.px, boxes_px), self._tracker.base
         ids, px = tracks.ids[static], tracks.px[static]
         stands = self._glass.see(ids, px, self._scale.ground, driven_m)
         a, b = common(base.ids, ids)
         displacement: Floats = np.sqrt(((px[b] - base.px[a]) ** 2).sum(axis=1))
-        corners = Corners(ids, self.camera.to_xy(px), displacement, stands)
-        self._obstructed = False
-        if self._glass.present:
-            every = corners
-            corners = without_glass(self._window, every, self._pose, self._guesses(dt_s), self._fitting(dt_s))
-            self._obstructed = corners is not every
-        return corners
-
-    # --- relative pose ---
-
-    def _relative_pose(self, corners: Corners, dt_s: float, car: CarStep | None) -> tuple[Pose, Floats] | None:
-        """The present image's pose in the window's frame and its information (6, 6); None where it is not known."""
-        guesses, fitting = self._guesses(dt_s), self._fitting(dt_s)
-        located = pose_among_landmarks(self._window, corners, self._pose, guesses, fitting)
-        return self._two_view_pose(corners, dt_s, car) if located is None else located
+        return Corners(ids, self.camera.to_xy(px), displacement, stands & self._glass.present)
 
     def _guesses(self, dt_s: float) -> list[Pose]:
         searched = [] if self._guess is None else [self._pose @ self._guess]
-        return [*searched, self._pose @ self._predicted_step(dt_s), self._pose]
+        return [*searched, self._pose @ self._last.over(dt_s), self._pose]
 
     def _fitting(self, dt_s: float) -> Fitting:
         cfg = self.config
         return Fitting(cfg.min_fitting, cfg.min_fitting_fraction, cfg.max_speed_mps * dt_s + 0.1)
 
-    def _two_view_pose(self, corners: Corners, dt_s: float, car: CarStep | None) -> tuple[Pose, Floats] | None:
+    def _two_view_pose(self, corners: Corners, dt_s: float, car: CarStep | None) -> Located | None:
         """Starts the window anew from the base image and this one."""
         cfg, displacement_px = self.config, corners.displacement_px
         base = self._tracker.base
@@ -296,13 +285,14 @@ class Odometry:
         still = float(np.median(displacement_px)) < cfg.standstill.still_px
         if still and float(np.quantile(displacement_px, 0.8)) < 1.5:
             return self._pose, _TWO_VIEW_INFORMATION
-        guess = self._guess if self._guess is not None else self._predicted_step(dt_s)
+        guess = self._guess if self._guess is not None else self._last.over(dt_s)
         found = first_pose(xy_a, xy_b, guess, self._focal_px, cfg.two_view_px)
         if found is None or found[1].sum() < max(cfg.min_fitting, cfg.min_fitting_fraction * len(a)):
             return None
         step, _ = found
-        speed = self._speed_mps()
-        length = speed * dt_s if speed * dt_s > 0.05 else 0.5
+        length = driven_m = self._last.speed_mps * dt_s
+        if driven_m <= 0.05:
+            length = 0.5
         if self._guess is not None:
             length = float(np.linalg.norm(self._guess.p))
         if car is not None and abs(car.forward_m) > DRIVES_M:
@@ -310,7 +300,7 @@ class Odometry:
         frame = self._base_frame if self._base_frame is not None else 0
         self._window = self._new_window()
         self._window.append(frame, self._pose, base.ids[a], xy_a)
-        self._scale.restart(base.image, self._pose, 0.2 if speed * dt_s > 0.05 else 1.0)
+        self._scale.restart(base.image, self._pose, 0.2 if driven_m > 0.05 else 1.0)
         return self._pose @ Pose(step.R, step.p * length), _TWO_VIEW_INFORMATION
 
     # --- metric scale ---
@@ -318,7 +308,7 @@ class Odometry:
     def _scale_to_metres(
         self,
         pose: Pose,
-        info: Floats,
+        cov6: Floats,
         tracks: Tracks,
         boxes_px: Floats,
         road_mask: Bools | None,
@@ -327,7 +317,7 @@ class Odometry:
     ) -> Pose:
         """T_base_present in metres; the window is rescaled to metres too."""
         step = self._pose.between(pose)
-        sigma = np.sqrt(np.diag(step_cov(self.config.motion, info)))
+        sigma = np.sqrt(np.diag(cov6))
         view = RoadView(
             tracks.image,
             pose,
@@ -349,7 +339,7 @@ class Odometry:
     def _stands(self, step: Pose, corners: Corners, near_px: float | None, dt_s: float, car: CarStep | None) -> bool:
         if len(corners.displacement_px) < self.config.min_fitting:
             return False
-        speed_mps = self._speed_mps()
+        speed_mps = self._last.speed_mps
         if car is not None:
             speed_mps = abs(car.forward_m) / dt_s
             if car.drives(self.config.standstill.length_m) and (near_px is None or car.agreed):
@@ -360,14 +350,14 @@ class Odometry:
         """Whether the car is known to drive: it says so itself, or it has just done so, in metres that are known."""
         if car is not None:
             return car.proven and car.drives(DRIVES_M)
-        return not self._scale.unknown and self._speed_mps() > _DRIVES_MPS
+        return not self._scale.unknown and self._last.speed_mps > _DRIVES_MPS
 
     def _hold_speed(self, pose: Pose, info: Floats, dt_s: float) -> tuple[Pose, Floats, float]:
         """The pose, its information (6, 6), and 1-sigma of its place where the last speed had to give it, else inf."""
         stated = info / self.config.motion.covariance_inflation
         held = None
-        if self._velocity is not None:
-            held = self._held.hold(self._pose, pose, self._pose @ self._predicted_step(dt_s), stated, dt_s)
+        if self._last.known:
+            held = self._held.hold(self._pose, pose, self._pose @ self._last.over(dt_s), stated, dt_s)
         if held is None:
             self._held.settle(worst_sigma_m(stated + np.eye(6) * 1e-3), dt_s)
             return pose, info, np.inf
@@ -376,45 +366,35 @@ class Odometry:
         tie = np.diag([self.config.motion.covariance_inflation / sigma_m**2] * 3 + [0.0] * 3)
         return pose, info + tie, sigma_m
 
-    def _speed_mps(self) -> float:
-        """Of the last measured motion."""
-        return 0.0 if self._velocity is None else float(np.linalg.norm(self._velocity.linear_mps))
-
-    def _predicted_step(self, dt_s: float) -> Pose:
-        if self._velocity is None:
-            return _STILL
-        return Pose(rotation_exp(self._velocity.angular_radps * dt_s), self._velocity.linear_mps * dt_s)
-
-    def _move(self, frame_id: int, step: Pose, info: Floats, dt_s: float) -> Motion:
-        self._velocity, self._interval_s = _Velocity(step.p / dt_s, rotation_log(step.R) / dt_s), dt_s
+    def _move(self, frame_id: int, step: Pose, cov6: Floats, dt_s: float) -> Motion:
+        self._last.measured(step, dt_s)
         T_prev_curr = planar(step, self._scale.ground)
-        cov = measured_cov(self.config.motion, info, T_prev_curr, self._scale.ground, self._scale.sigma_rel)
+        cov = measured_cov(self.config.motion, cov6, T_prev_curr, self._scale.ground, self._scale.sigma_rel)
         status = self._scale.status()
         if self._obstructed and Status.VIEW_OBSTRUCTED not in status:
             status.append(Status.VIEW_OBSTRUCTED)
         return self._motion(frame_id, step, T_prev_curr, cov, status)
 
     def _stand(self, frame_id: int) -> Motion:
-        self._velocity = _Velocity(np.zeros(3), np.zeros(3))
+        self._last.stood()
         self._held.settle(0.0, 1.0)
-        return self._motion(frame_id, _STILL, SE2(), standing_cov(self.config.motion), [Status.STANDSTILL])
+        return self._motion(frame_id, STILL, SE2(), standing_cov(self.config.motion), [Status.STANDSTILL])
 
     def _coast(self, frame_id: int, dt_s: float, status: list[Status], car: CarStep | None = None) -> Motion:
         """The last velocity goes on, or what the car itself says of its motion; the base image stays."""
         self._road_tracks = _NO_TRACKS  # those of the last measured image would say that the car has not moved since
         if car is not None:
             return self._reckon(frame_id, dt_s, status, car)
-        step, known = self._predicted_step(dt_s), self._velocity is not None
+        step = self._last.over(dt_s)
         T_prev_curr = planar(step, self._scale.ground)
-        cov = coasting_cov(self.config.motion, T_prev_curr, dt_s, known, self._scale.sigma_rel)
+        cov = coasting_cov(self.config.motion, T_prev_curr, dt_s, self._last.known, self._scale.sigma_rel)
         return self._motion(frame_id, step, T_prev_curr, cov, [*status, Status.ODOMETRY_COASTING])
 
     def _reckon(self, frame_id: int, dt_s: float, status: list[Status], car: CarStep) -> Motion:
         """The motion by the car's own readings; without its yaw rate the last turn fades out."""
         if car.yaw_rad is None:
             status = [*status, Status.ODOMETRY_COASTING]
-        known = self._velocity is not None
-        last_radps = planar(self._predicted_step(1.0), self._scale.ground).yaw_rad if known else 0.0
+        last_radps = planar(self._last.over(1.0), self._scale.ground).yaw_rad
         ahead_m = self.config.start.camera_ahead_m
         T_prev_curr, cov = reckoned(self.config.motion, car, last_radps, dt_s, ahead_m)
         step = on_plane(T_prev_curr, self._scale.ground)

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.bev import rays_cam
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.odometry.road_alignment import plane_normal
 from birdslam.odometry.sliding_window import common
@@ -78,7 +79,7 @@ class StandingCorners:
         Of what is no road, above the horizon, that of something at `1 / least_by_depth` (m).
         """
         cam = self.camera
-        rays = np.column_stack([(px - [cam.cx_px, cam.cy_px]) / [cam.fx_px, cam.fy_px], np.ones(len(px))])
+        rays = rays_cam(cam, px)
         by_depth = -(rays @ plane_normal(ground.pitch_rad, ground.roll_rad)[0]) / cam.height_m
         from_centre_px = np.hypot(rays[:, 0] * cam.fx_px, (rays[:, 1] + np.tan(ground.pitch_rad)) * cam.fy_px)
         nearer = way_m * np.maximum(by_depth, least_by_depth)
