@@ -24,11 +24,11 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from birdslam.queries import MapSnapshot, Trajectory
 from birdslam.runtime.transport.bus import Bus, BusClosed, Message
+from birdslam.runtime.transport.closing import Closing
 from birdslam.runtime.transport.reply_parts import whole_map, whole_trajectory
 from birdslam.runtime.wire import Health, Trace
 from birdslam.types import INVALIDATING, Estimate
@@ -60,7 +60,7 @@ class Reading:
         return self.alive and self.on_time and self.valid
 
 
-class Planner:
+class Planner(Closing):
     """A subscriber of one vehicle's estimates; a context manager.
 
     Raises ValueError for a bad vehicle name, PermissionError where the runtime directory is open to other users.
@@ -145,11 +145,3 @@ class Planner:
     def close(self) -> None:
         """Leaves the bus, and wakes who waits; a second call does nothing."""
         self._bus.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

@@ -18,10 +18,8 @@ _URGENT_BATCHES = 16  # zenoh's largest
 # Of the socket, each way: the system's own would hold seconds of estimates for a listener that reads too slowly, all of
 # them old when they are read; what does not fit is dropped by the router
 _BUFFER_BYTES = 1 << 18
-_RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
-
-
 BUFFERS = {"so_sndbuf": _BUFFER_BYTES, "so_rcvbuf": _BUFFER_BYTES}
+_RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
 
 
 def settings_of(mode: str) -> dict[str, Any]:

@@ -22,8 +22,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import zenoh
 
@@ -33,6 +32,7 @@ from birdslam.runtime.fleet.link import open_link
 from birdslam.runtime.fleet.reading import FleetReading, Heard, VehicleSlot
 from birdslam.runtime.topology import TOPICS, check_name, every_key, key_of, vehicle_and_topic
 from birdslam.runtime.transport.bus import BusClosed
+from birdslam.runtime.transport.closing import Closing
 from birdslam.runtime.transport.replies import REPLY_S, whole_reply
 from birdslam.runtime.transport.reply_parts import whole_map, whole_trajectory
 from birdslam.runtime.wire import Health, WireError, decode
@@ -45,7 +45,7 @@ __all__ = ["Fleet", "FleetReading", "Heard"]
 log = logging.getLogger(__name__)
 
 
-class Fleet:
+class Fleet(Closing):
     """A subscriber of all vehicles' estimates at one router; a context manager.
 
     Vehicles that `config.vehicles` names are told of from the beginning, others once something of them was heard.
@@ -233,11 +233,3 @@ class Fleet:
             self._closed = True
             self._changed.notify_all()
         self._session.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

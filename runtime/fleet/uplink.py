@@ -14,8 +14,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import msgspec
 import zenoh
@@ -26,6 +25,7 @@ from birdslam.runtime.process import signals
 from birdslam.runtime.process.notify import Notifier
 from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, key_of
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, Publisher, Subscriber
+from birdslam.runtime.transport.closing import Closing
 from birdslam.runtime.transport.queries import QueryRefused, QueryResponder, positive
 from birdslam.runtime.wire import Stage, Trace, WireError
 
@@ -37,7 +37,7 @@ _TELL_S = 60.0  # between two lines that say that there is none
 _LOOK_S = 1.0
 
 
-class Uplink:
+class Uplink(Closing):
     """Says again at the router what a vehicle says on its bus, until it is closed, and the session with it.
 
     A context manager. Raises as Bus does.
@@ -127,14 +127,6 @@ class Uplink:
         self._responder.close()
         self._session.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
 
 def _lengthened(trace: Trace, received_ns: int, done_ns: int) -> Trace:
     """With the uplink's own stage; what was left of the budget stays in it."""
@@ -179,5 +171,5 @@ def _wait_for_router(config: FleetConfig, notifier: Notifier) -> zenoh.Session |
                 told_s = time.monotonic()
                 print(f"birdslam: uplink: {error}", file=sys.stderr, flush=True)
         notifier.alive(f"looks for {config.router}")
-        if signals.asked_to_end(0.0):
+        if signals.asked_to_end(_LOOK_S):  # a refusal may come at once
             return None

@@ -10,8 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
@@ -26,6 +25,7 @@ from birdslam.runtime.nodes.degradation import Mode
 from birdslam.runtime.nodes.look_rate import Cost, LookRate, measure, threads_of_a_network
 from birdslam.runtime.process import realtime
 from birdslam.runtime.process.cores import usable_cores
+from birdslam.runtime.transport.closing import Closing
 from birdslam.types import Frame
 
 Run = Callable[..., Any]
@@ -37,7 +37,7 @@ LANES_SPARING = 2  # lanes are found half as often at the least: a run takes the
 log = logging.getLogger(__name__)
 
 
-class Inference:
+class Inference(Closing):
     """The configured networks, checked against their manifests and warm. A context manager.
 
     At rate "max" every network is awaited, so that a run can be repeated. Else a frame waits for those that are worth
@@ -176,14 +176,6 @@ class Inference:
         self._beside.shutdown(wait=True, cancel_futures=True)
         self._behind.shutdown(wait=True, cancel_futures=True)
         self._threads.shutdown(wait=True, cancel_futures=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 @dataclass(frozen=True)

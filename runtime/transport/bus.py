@@ -18,12 +18,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import zenoh
 
 from birdslam.runtime.topology import PROCESSES, TOPICS, alive_key, check_name, key_of
+from birdslam.runtime.transport.closing import Closing
 from birdslam.runtime.transport.endpoints import (
     BusClosed,
     BusError,
@@ -44,7 +44,7 @@ _LOSSLESS_DEPTH = 4_096
 __all__ = ["Bus", "BusClosed", "BusError", "Message", "MessagesLost", "Publisher", "Subscriber"]
 
 
-class Bus:
+class Bus(Closing):
     """One node's session on its vehicle's bus. A context manager; `close` it always.
 
     `hub` is the supervisor's: the socket that everybody connects to. `lossless` sends with back pressure and queues
@@ -184,11 +184,3 @@ class Bus:
         for responder in self._responders:
             responder.close()
         self._session.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

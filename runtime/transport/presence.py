@@ -13,10 +13,9 @@ import os
 import socket
 import stat
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from birdslam.runtime.topology import check_name
+from birdslam.runtime.transport.closing import Closing
 
 _MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux, without its final zero
 _SHARED_MEMORY = Path("/dev/shm")
@@ -72,7 +71,7 @@ def ring_path(vehicle: str, runtime_dir: Path | None = None) -> Path:
     return _SHARED_MEMORY / f"birdslam-{os.getuid()}-{vehicle}-{place}.ring"
 
 
-class VehicleLock:
+class VehicleLock(Closing):
     """One running instance for each vehicle name. A context manager, held by the supervisor.
 
     The kernel frees it with its process, by kill -9 too. Whoever gets it removes what dead processes left behind.
@@ -105,14 +104,6 @@ class VehicleLock:
             os.ftruncate(self._fd, 0)
             os.close(self._fd)
             self._fd = -1
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _remove_dead_sockets(directory: Path) -> None:

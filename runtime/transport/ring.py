@@ -21,12 +21,11 @@ import mmap
 import os
 import time
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.runtime.transport.closing import Closing
 from birdslam.types import FrameRef
 
 _MAGIC = int.from_bytes(b"BIRDRING", "little")
@@ -84,7 +83,7 @@ class _Mapping:
         return self.words[head : head + _SLOT_WORDS], pixels
 
 
-class FrameRing:
+class FrameRing(Closing):
     """The writer's side: makes the ring at `path`, sized by the camera's largest frame; a context manager.
 
     Replaces what a dead process left there (VehicleLock keeps a second writer away), and removes its file on close.
@@ -154,16 +153,8 @@ class FrameRing:
         except FileNotFoundError:
             return  # somebody cleaned up before us
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-class FrameReader:
+class FrameReader(Closing):
     """The reader's side. It may be made before the ring, and outlives its writers; a context manager."""
 
     def __init__(self, path: Path) -> None:
@@ -223,11 +214,3 @@ class FrameReader:
     def close(self) -> None:
         """Lets go of the ring."""
         self._mapping, self._epoch = None, 0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
