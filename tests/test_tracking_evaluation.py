@@ -42,8 +42,9 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.weights import weighted
 from birdslam.mapping.landmark_edges import StaticMapConfig
 from birdslam.perception import Perception, Ready
+from birdslam.runtime.cli.evaluate_parser import METHODS
 from birdslam.runtime.cli.evaluate_tracking import PUBLISHED, evaluate
-from birdslam.runtime.cli.parser import METHODS, build_parser
+from birdslam.runtime.cli.parser import build_parser
 from birdslam.runtime.cli.tracking_job import EQ_1, frames_of
 from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
 from birdslam.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig, Walk, fit_drift

@@ -23,8 +23,8 @@ from birdslam.evaluation.localisation import CAMERA_OF_BOXES
 from birdslam.evaluation.results import claim_directory
 from birdslam.evaluation.tracking_picture import draw_runtime
 from birdslam.evaluation.tracking_report import Outcome, Setting, render_report
+from birdslam.runtime.cli.evaluate_parser import METHODS
 from birdslam.runtime.cli.options import speeds_of
-from birdslam.runtime.cli.parser import METHODS
 from birdslam.runtime.cli.tracking_job import Job, frames_to_make, run_sequence
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.progress import Progress, time_to_go

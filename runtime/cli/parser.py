@@ -7,17 +7,23 @@ stands in dispatch.py.
 from __future__ import annotations
 
 import argparse
-import os
 from importlib.metadata import version
 from pathlib import Path
-from typing import TypeAlias
+
+from birdslam.runtime.cli.arguments import (
+    Commands,
+    add_config,
+    add_fleet,
+    add_other_odometry,
+    add_pipeline,
+    add_settings,
+    add_topics,
+    add_vehicle,
+)
+from birdslam.runtime.cli.evaluate_parser import add_evaluations
 
 USAGE_NOTE = "Sources: demo, kitti:DIR, video:FILE, rosbag:PATH, mcap:FILE, v4l2:/dev/videoN, rtsp://HOST/PATH."
 RECORDING = "FILE.mcap"
-METHODS = ("birdslam", "birdslam_live", "paper", "paper_final", "batch_se3", "nair", "namdev", "cubeslam")
-SEEDS = 5
-
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -46,11 +52,7 @@ def build_parser() -> argparse.ArgumentParser:
         _demo_drive,
     ):
         add_command(commands)
-    evaluate = commands.add_parser("evaluate", help="compare with ground truth").add_subparsers(
-        required=True, metavar="WHAT"
-    )
-    for add_evaluation in (_odometry, _tracking, _localisation, _lanes):
-        add_evaluation(evaluate)
+    add_evaluations(commands)
     return parser
 
 
@@ -67,9 +69,9 @@ def _run(commands: Commands) -> None:
     run.add_argument("--record-images", action="store_true", default=None, help="with its frames, as JPEG")
     _add_final_results(run)
     run.add_argument("--speed", metavar="FILE", help="the car's own speed over a recording: time in s, speed in m/s")
-    _add_other_odometry(run, "FILE")
-    _add_topics(run, "speed")
-    _add_pipeline(run)
+    add_other_odometry(run, "FILE")
+    add_topics(run, "speed")
+    add_pipeline(run)
     run.set_defaults(command="run")
 
 
@@ -79,7 +81,7 @@ def _replay(commands: Commands) -> None:
     )
     replay.add_argument("recording", type=Path, metavar=RECORDING)
     text = "with another back end (slam.graph.*, slam.weights.*): nothing is compared, results are written"
-    _add_settings(replay, text)
+    add_settings(replay, text)
     replay.add_argument("--output", type=Path, metavar="DIR", help="where results go; with it they are always written")
     _add_final_results(replay)
     replay.add_argument("--g2o", type=Path, metavar="FILE.g2o", help="write the graph's edges for other solvers, alone")
@@ -108,23 +110,23 @@ def _view(commands: Commands) -> None:
     )
     view.add_argument("what", metavar=f"{RECORDING}|live")
     view.add_argument("--save", type=Path, metavar="FILE.rrd", help="write it down for rerun instead of showing it")
-    _add_vehicle(view)
+    add_vehicle(view)
     view.add_argument("--seconds", type=float, metavar="S", help="of live: end after so long")
     view.set_defaults(command="view")
 
 
 def _top(commands: Commands) -> None:
     top = commands.add_parser("top", help="a live table of the nodes: rates, ages, budgets, restarts")
-    _add_vehicle(top)
-    _add_fleet(top)
+    add_vehicle(top)
+    add_fleet(top)
     top.add_argument("--once", action="store_true", help="one table, and end; 1 where no node is there")
     top.set_defaults(command="top")
 
 
 def _listen(commands: Commands) -> None:
     listen = commands.add_parser("listen", help="print live estimates, as a planner gets them, until the source ends")
-    _add_vehicle(listen)
-    _add_fleet(listen)
+    add_vehicle(listen)
+    add_fleet(listen)
     listen.add_argument("--json", action="store_true", help="one JSON object a line")
     listen.add_argument("--count", metavar="N", type=int, help="end after N estimates")
     listen.add_argument("--timeout", metavar="S", type=float, help="end, with status 1, when none comes for so long")
@@ -156,7 +158,7 @@ def _doctor(commands: Commands) -> None:
     doctor.add_argument("--source", metavar="URI", help="where frames will come from")
     doctor.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
     doctor.add_argument("--measure", action="store_true", help="and what its settings cost, in some six seconds")
-    _add_pipeline(doctor)
+    add_pipeline(doctor)
     doctor.set_defaults(command="doctor")
 
 
@@ -189,9 +191,9 @@ def _batch(commands: Commands) -> None:
     parser.add_argument("--address", default="auto", metavar="HOST:PORT", help=text)
     text = "every drive with each of these settings; may be repeated: every combination"
     parser.add_argument("--sweep", action="append", default=[], metavar="KEY=V1,V2", help=text)
-    _add_config(parser)
-    _add_topics(parser, "speed", "truth")
-    _add_pipeline(parser)
+    add_config(parser)
+    add_topics(parser, "speed", "truth")
+    add_pipeline(parser)
     parser.set_defaults(command="batch")
 
 
@@ -209,11 +211,11 @@ def _calibrate(commands: Commands) -> None:
     parser.add_argument("--height", type=float, metavar="M", help="the camera's height over the road, as measured")
     text = "lines of time in s, speed in m/s"
     parser.add_argument("--speed", dest="known_speed", type=Path, metavar="FILE", help=text)
-    _add_topics(parser)
+    add_topics(parser)
     parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="networks: vehicles and road")
     parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame")
-    _add_config(parser)
-    _add_settings(parser)
+    add_config(parser)
+    add_settings(parser)
     parser.set_defaults(command="calibrate")
 
 
@@ -250,130 +252,3 @@ def _demo_drive(commands: Commands) -> None:
     make.add_argument("--frames", type=int, metavar="N", help="end after N frames")
     make.add_argument("--quality", type=int, default=32, metavar="1-100", help="of its WebP images (32)")
     make.set_defaults(command="demo-drive make")
-
-
-# --- evaluation ---
-
-
-def _odometry(evaluate: Commands) -> None:
-    odometry = evaluate.add_parser("odometry", help="ego trajectories against KITTI poses, in one process, repeatable")
-    ahead = evaluate.add_parser("car-ahead", help="distance to the car ahead against LiDAR; odometry's report too")
-    for command, parser in (("evaluate odometry", odometry), ("evaluate car-ahead", ahead)):
-        parser.add_argument("sequences", nargs="+", metavar="SEQUENCE_DIR", help="a KITTI directory, or a source's URI")
-        _add_config(parser)
-        parser.add_argument("--frames", default=":", metavar="FIRST:END", help="compare these alone; all are driven")
-        _add_speeds(parser)
-        _add_other_odometry(parser, "FILE|DIR")
-        _add_topics(parser, "speed", "truth")
-        _add_pipeline(parser)
-        parser.set_defaults(command=command)
-
-
-def _tracking(evaluate: Commands) -> None:
-    for command, text in (
-        ("tracking", "vehicles and ego on KITTI tracking: the paper's Tables 1-5"),
-        ("ablation", "the paper's Tables 3-5 alone: constraints, landmark weights and thresholds, lanes"),
-    ):
-        parser = evaluate.add_parser(command, help=text, description=text)
-        _add_tracking_root(parser)
-        parser.add_argument("--frames", default="all", metavar="all|paper|A:B", help="paper: its first so many frames")
-        if command == "tracking":
-            parser.add_argument("--methods", default=",".join(METHODS), metavar="NAME,NAME", help=", ".join(METHODS))
-        parser.add_argument(
-            "--odometry", default="", metavar="images|simulate|truth|FILE", help="FILE: KITTI rows of camera 0"
-        )
-        parser.add_argument("--detections", default="", metavar="rrc|network|DIR", help="DIR: as det_02_rrc")
-        _add_speeds(parser)
-        parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help="of the simulated odometry")
-        parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
-        _add_config(parser)
-        parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="for network, images")
-        _add_settings(parser)
-        parser.add_argument("--output", required=True, metavar="DIR", help="where the report goes")
-        parser.set_defaults(command=f"evaluate {command}")
-
-
-def _lanes(evaluate: Commands) -> None:
-    text = "a picture of what a frame's lanes are made of: road and lane cells, seen and completed"
-    parser = evaluate.add_parser("lanes", help=text, description=text)
-    parser.add_argument("drive", metavar="DRIVE", help="a KITTI directory, or a source's URI")
-    parser.add_argument("--frame", type=int, metavar="N", help="which one; default: the last")
-    _add_config(parser)
-    _add_pipeline(parser)
-    parser.set_defaults(command="evaluate lanes")
-
-
-def _localisation(evaluate: Commands) -> None:
-    text = "where the front end puts the labelled cars of KITTI tracking, by range, from a detector's boxes"
-    parser = evaluate.add_parser("localisation", help=text, description=text)
-    _add_tracking_root(parser)
-    parser.add_argument("--detections", default="rrc", metavar="rrc|DIR", help="DIR: as det_02_rrc")
-    parser.add_argument("--mode", choices=("default", "paper"), default="default", help="paper: Eq. 1 on level ground")
-    text = "how each sequence fares by a constant that the others chose of these values; may be repeated"
-    parser.add_argument("--leave-one-out", action="append", default=[], metavar="KEY=V1,V2", help=text)
-    _add_config(parser)
-    _add_settings(parser)
-    parser.add_argument("--output", required=True, metavar="DIR", help="where the report goes")
-    parser.set_defaults(command="evaluate localisation", model=[])
-
-
-def _add_tracking_root(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("root", type=Path, metavar="ROOT", help="KITTI tracking: calib, label_02, oxts, ...")
-    parser.add_argument("--sequences", metavar="N,N", help="e.g. 0002,0003; default: all at hand")
-
-
-# --- options of several commands ---
-
-
-def _add_pipeline(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--model",
-        action="append",
-        default=[],
-        metavar="[ROLE=]PATH|NAME",
-        help="an ONNX network for a role (detector, segmenter, depth, multitask), or a model's name; may be repeated; "
-        "without both a detector and a segmenter the shipped network fills in, unless `none` is named",
-    )
-    parser.add_argument("--camera", metavar="FILE", help="a camera file (TOML) instead of the recording's calibration")
-    parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame of a recording")
-    parser.add_argument("--output", metavar="DIR", help="where results go")
-    _add_settings(parser, "any key, e.g. perceive.deadline_ms=25")
-
-
-def _add_other_odometry(parser: argparse.ArgumentParser, metavar: str) -> None:
-    text = "another odometry in place of the images': TUM lines or KITTI rows, in metres"
-    text += "; DIR: NAME.txt of each sequence" * ("DIR" in metavar)
-    parser.add_argument("--odometry", dest="other_odometry", metavar=metavar, help=text)
-
-
-def _add_speeds(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--speed", metavar="FILE|DIR", help="the car's own speed; DIR: NAME.txt of each sequence")
-
-
-def _add_topics(parser: argparse.ArgumentParser, *more: str) -> None:
-    parser.add_argument("--topic", metavar="TOPIC", help="of a ROS bag's images, where it has several")
-    parser.add_argument("--camera-info-topic", metavar="TOPIC", help="of a ROS bag's camera")
-    if "speed" in more:
-        text = "the car's own speed in a ROS bag: TwistStamped, TwistWithCovarianceStamped or Odometry"
-        parser.add_argument("--speed-topic", metavar="TOPIC", help=text)
-    if "truth" in more:
-        text = "true poses in a ROS bag: nav_msgs/Odometry or sensor_msgs/NavSatFix"
-        parser.add_argument("--truth-topic", metavar="TOPIC", help=text)
-
-
-def _add_vehicle(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--vehicle", metavar="NAME", default="car")
-    parser.add_argument("--runtime-dir", metavar="DIR", type=Path, help="as runtime.runtime_dir of the run")
-
-
-def _add_fleet(parser: argparse.ArgumentParser) -> None:
-    text = "all vehicles at the router that this file names in [fleet]"
-    parser.add_argument("--all", type=Path, metavar="CONFIG.toml", help=text)
-
-
-def _add_config(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--config", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
-
-
-def _add_settings(parser: argparse.ArgumentParser, text: str = "any key") -> None:
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=text)

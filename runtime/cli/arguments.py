@@ -1,0 +1,71 @@
+"""Arguments that several commands have in common. As light as parser.py."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TypeAlias
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
+def add_pipeline(parser: argparse.ArgumentParser) -> None:
+    """The pipeline of a drive: networks, camera, stride, results, any key."""
+    parser.add_argument(
+        "--model",
+        action="append",
+        default=[],
+        metavar="[ROLE=]PATH|NAME",
+        help="an ONNX network for a role (detector, segmenter, depth, multitask), or a model's name; may be repeated; "
+        "without both a detector and a segmenter the shipped network fills in, unless `none` is named",
+    )
+    parser.add_argument("--camera", metavar="FILE", help="a camera file (TOML) instead of the recording's calibration")
+    parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame of a recording")
+    parser.add_argument("--output", metavar="DIR", help="where results go")
+    add_settings(parser, "any key, e.g. perceive.deadline_ms=25")
+
+
+def add_other_odometry(parser: argparse.ArgumentParser, metavar: str) -> None:
+    """A trajectory in place of our own odometry."""
+    text = "another odometry in place of the images': TUM lines or KITTI rows, in metres"
+    text += "; DIR: NAME.txt of each sequence" * ("DIR" in metavar)
+    parser.add_argument("--odometry", dest="other_odometry", metavar=metavar, help=text)
+
+
+def add_speeds(parser: argparse.ArgumentParser) -> None:
+    """The car's own speed, of one drive or of several."""
+    parser.add_argument("--speed", metavar="FILE|DIR", help="the car's own speed; DIR: NAME.txt of each sequence")
+
+
+def add_topics(parser: argparse.ArgumentParser, *more: str) -> None:
+    """Of a ROS bag; `more` are what else may be read from it: speed, truth."""
+    parser.add_argument("--topic", metavar="TOPIC", help="of a ROS bag's images, where it has several")
+    parser.add_argument("--camera-info-topic", metavar="TOPIC", help="of a ROS bag's camera")
+    if "speed" in more:
+        text = "the car's own speed in a ROS bag: TwistStamped, TwistWithCovarianceStamped or Odometry"
+        parser.add_argument("--speed-topic", metavar="TOPIC", help=text)
+    if "truth" in more:
+        text = "true poses in a ROS bag: nav_msgs/Odometry or sensor_msgs/NavSatFix"
+        parser.add_argument("--truth-topic", metavar="TOPIC", help=text)
+
+
+def add_vehicle(parser: argparse.ArgumentParser) -> None:
+    """Which vehicle on the bus."""
+    parser.add_argument("--vehicle", metavar="NAME", default="car")
+    parser.add_argument("--runtime-dir", metavar="DIR", type=Path, help="as runtime.runtime_dir of the run")
+
+
+def add_fleet(parser: argparse.ArgumentParser) -> None:
+    """All vehicles of a fleet in place of one."""
+    text = "all vehicles at the router that this file names in [fleet]"
+    parser.add_argument("--all", type=Path, metavar="CONFIG.toml", help=text)
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """A configuration file."""
+    parser.add_argument("--config", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
+
+
+def add_settings(parser: argparse.ArgumentParser, text: str = "any key") -> None:
+    """Single keys of the configuration."""
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=text)
