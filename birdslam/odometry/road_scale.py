@@ -185,9 +185,13 @@ class RoadScale:
 
     def _learn_bonnet(self, view: RoadView, travelled_m: float) -> None:
         """Where a bonnet turns out to have been taken for road, all that it said is forgotten."""
-        if view.near_px < _DRIVEN_PX:  # a standing car's whole image stands
-            return
-        driven_m = travelled_m if self._confirmed else np.inf  # of an unknown length: images that differ will do
+        driven_m = travelled_m
+        if (
+            not self._confirmed
+        ):  # of an unknown length: images that differ will do, but a standing car's whole image stands
+            if view.near_px < _DRIVEN_PX:
+                return
+            driven_m = np.inf
         if self._bonnet.learn(view.grey, self._aligner.top_px, driven_m):
             self._filter.forget_scale(1.0)
             self._filter.turned_unseen()
