@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -40,6 +39,7 @@ from birdslam.perf.errors import PerfError
 from birdslam.perf.figures import Ledger
 from birdslam.runtime.configuration import Configuration, SourceConfig, load
 from birdslam.runtime.nodes.inference import Inference
+from birdslam.runtime.process.workers import workers
 from birdslam.status import INVALIDATING
 from birdslam.trajectory import as_poses, inverse
 from birdslam.types import Frame, Status
@@ -111,8 +111,8 @@ def run(arguments: list[str]) -> None:
     path = None if options.output is None else options.output / "starts.json"
     settings = {"every": options.every, "images": options.images, "networks": configuration is not None}
     try:
-        with Ledger(path, label, **settings) as ledger, _workers(min(options.jobs, len(tasks))) as workers:
-            for task, (sequence, starts) in zip(tasks, workers.imap(measure, tasks), strict=True):
+        with Ledger(path, label, **settings) as ledger, workers(min(options.jobs, len(tasks))) as pool:
+            for task, (sequence, starts) in zip(tasks, pool.map(measure, tasks), strict=True):
                 figures = summary(starts)
                 ledger.add(f"{sequence} {task.name}", told(figures), **figures, starts=starts)
             rows = ledger.content["rows"]
@@ -148,10 +148,6 @@ def networks_of(options: argparse.Namespace) -> Configuration | None:
 
 def uri_of(sequence: str, data: Path) -> str:
     return sequence if ":" in sequence else f"kitti:{data / sequence}"
-
-
-def _workers(jobs: int) -> Any:
-    return multiprocessing.get_context("spawn").Pool(jobs)
 
 
 def measure(task: Task) -> tuple[str, list[dict[str, Any]]]:

@@ -7,11 +7,10 @@ files are here.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from pathlib import Path
 
 import msgspec
@@ -27,6 +26,7 @@ from birdslam.runtime.cli.evaluate_parser import METHODS
 from birdslam.runtime.cli.options import speeds_of
 from birdslam.runtime.cli.tracking_job import Job, frames_to_make, run_sequence
 from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.process.workers import workers
 from birdslam.runtime.progress import Progress, time_to_go
 
 PUBLISHED = Path(tables.__file__).with_name("published.toml")
@@ -145,15 +145,10 @@ def _run_all(jobs: Sequence[Job], processes: int) -> list[Outcome]:
                 progress.clear()
                 outcomes.append(_shown(outcome, k, jobs, begun_s))
             return outcomes
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
+    with workers(min(processes, len(jobs))) as pool:
         # The longest first: a long one that begins last is waited for alone
         running = [pool.submit(run_sequence, job) for job in sorted(jobs, key=frames_to_make, reverse=True)]
-        try:
-            return [_shown(done.result(), k, jobs, begun_s) for k, done in enumerate(as_completed(running), start=1)]
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        return [_shown(done.result(), k, jobs, begun_s) for k, done in enumerate(as_completed(running), start=1)]
 
 
 def _shown(outcome: Outcome, number: int, jobs: Sequence[Job], begun_s: float) -> Outcome:

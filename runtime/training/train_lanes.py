@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import argparse
 import csv
-import multiprocessing
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +18,7 @@ from numpy.typing import NDArray
 
 from birdslam.mapping.lanes import LanesConfig
 from birdslam.perception.completion import SHIPPED
+from birdslam.runtime.process.workers import workers
 from birdslam.training.lanes import ENet, LaneSamplesConfig, loss, samples
 
 DRIVE_FRAMES, RATE_HZ = 60, 10.0
@@ -42,8 +41,7 @@ def drive_samples(seed: int) -> NDArray[np.uint8]:
 
 def drives(first_seed: int, count: int, processes: int) -> Iterator[NDArray[np.uint8]]:
     """The samples of `count` worlds, in the order of their seeds."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context) as pool:
+    with workers(processes) as pool:
         yield from pool.map(drive_samples, range(first_seed, first_seed + count))
 
 

@@ -11,17 +11,16 @@ from __future__ import annotations
 import argparse
 import csv
 import hashlib
-import multiprocessing
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from birdslam.perception.manifest import SHIPPED_NETWORKS
+from birdslam.runtime.process.workers import workers
 from birdslam.training.pointnet import (
     POINTS,
     DepthErrorConfig,
@@ -57,7 +56,7 @@ def render(first_seed: int) -> list[FrustumExample]:
 def rendered(first_seed: int, frames: int, processes: int) -> list[FrustumExample]:
     """The bodies of `frames` frames, in the order of their seeds."""
     out: list[FrustumExample] = []
-    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with workers(processes) as pool:
         for part in pool.map(render, range(first_seed, first_seed + frames, WORLDS_A_TASK)):
             out += part
             print(f"\r{len(out)} bodies", end="", file=sys.stderr, flush=True)

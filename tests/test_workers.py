@@ -1,0 +1,47 @@
+"""The pool of worker processes: they do not outlive who began them, however that ends."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from birdslam.runtime.process.workers import workers
+
+LIMIT_S = 60.0
+BUSY = """
+import signal
+from birdslam.runtime.process.workers import workers
+
+def work(number):
+    print(f"task {number} begun", flush=True)
+    signal.pause()
+
+if __name__ == "__main__":
+    with workers(2) as pool:
+        list(pool.map(work, range(4)))
+"""
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_a_process_that_is_killed(how: signal.Signals, tmp_path: Path) -> None:
+    script = tmp_path / "busy.py"
+    script.write_text(BUSY)
+    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    begun = {process.stdout.readline() for _ in range(2)}
+    assert begun == {"task 0 begun\n", "task 1 begun\n"}
+    process.send_signal(how)
+    out, _ = process.communicate(timeout=LIMIT_S)  # returns once nobody holds the workers' standard output any more
+    assert process.returncode == -how
+    assert out == ""  # the tasks that waited were not begun
+
+
+@pytest.mark.processes
+def test_workers_give_results_in_order() -> None:
+    with workers(2) as pool:
+        assert list(pool.map(abs, [-3, 1, -2])) == [3, 1, 2]
