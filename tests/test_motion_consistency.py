@@ -112,6 +112,22 @@ def test_a_step_that_no_car_makes_is_found_at_both_its_ends() -> None:
     assert not truth_quality.implausible(drive(steps), t_ns).any()
 
 
+def test_motions_simulated_from_poses_that_scatter_are_judged_without_that_scatter() -> None:
+    """GPS that lies centimetres beside the images is no noise of a truth that the motions were made from."""
+    rng = np.random.default_rng(5)
+    steps = [step @ SE2.exp([*(0.05 * rng.standard_normal(2)), 0.0]) for step in town(600, rng)]
+    sigma = np.array([0.01, 0.01, 0.001])
+    motions = told([step @ SE2.exp(sigma * rng.standard_normal(3)) for step in steps], np.diag(sigma**2))
+    exact, measured = (motions.report(drive(steps), exact) for exact in (True, False))
+    assert exact is not None
+    assert measured is not None
+    assert exact.frames.nees_measured == pytest.approx(1.0, abs=0.15)
+    assert exact.frames.length_nees == pytest.approx(1.0, abs=0.2)
+    assert (exact.truth_sigma_m, exact.frames.n_measured) == ((0.0, 0.0), 600)
+    assert measured.frames.length_nees is not None
+    assert measured.frames.length_nees < 0.3
+
+
 def test_what_is_invalid_coasts_or_stands_is_not_judged() -> None:
     steps = [SE2(1.0, 0.0, 0.0)] * 8
     motions = Motions(MOUNT)

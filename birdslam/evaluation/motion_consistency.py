@@ -78,15 +78,16 @@ class Motions:
         if cc is not None and cc.from_frame in self._index and not status & (INVALIDATING | {Status.ODOMETRY_COASTING}):
             self._moved[frame] = self._index[cc.from_frame], cc, measurements
 
-    def report(self, truth: Transform) -> MotionConsistencyReport | None:
+    def report(self, truth: Transform, exact: bool = False) -> MotionConsistencyReport | None:
         """Against `T_first_i` (N, 4, 4) of the camera in its own axes, of all frames of the recording.
 
-        None where not every frame has told its measurements.
+        `exact`: the motions were simulated from these very poses, which have no noise of their own and no
+        interpolated steps then. None where not every frame has told its measurements.
         """
         if len(self._t_ns) != len(truth):
             return None
-        interpolated = truth_quality.interpolated(truth)
-        sigma = truth_quality.step_noise(truth, self._mount)
+        interpolated = np.zeros(len(truth), np.bool_) if exact else truth_quality.interpolated(truth)
+        sigma = np.zeros(DIMENSIONS) if exact else truth_quality.step_noise(truth, self._mount)
         noise = np.diag(sigma**2)
         frames = [
             (first, last, cc.T_from_to, np.reshape(cc.cov, (DIMENSIONS, DIMENSIONS)))
