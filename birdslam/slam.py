@@ -6,7 +6,7 @@ import msgspec
 
 from birdslam.frontend import EgoMotion, FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.pose_graph import GraphConfig, PoseGraph, check_together
 from birdslam.graph.weights import WeightsConfig
 from birdslam.mapping.lane_mapper import LaneHead
 from birdslam.perception import Networks, shipped_networks
@@ -27,6 +27,9 @@ class SlamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     frontend: FrontEndConfig = FrontEndConfig()
     weights: WeightsConfig = WeightsConfig()
     graph: GraphConfig = GraphConfig()
+
+    def __post_init__(self) -> None:
+        check_together(self.graph, self.weights)
 
 
 class BirdSLAM:

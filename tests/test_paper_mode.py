@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from birdslam.baselines.batch_se2 import ego_key, solve, vehicle_key
 from birdslam.evaluation.tracking import PAPER
 from birdslam.geometry.se2 import SE2
+from birdslam.graph import vehicle_places
 from birdslam.graph.factors import CpEdge, CvEdges, VvEdges
 from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.weights import WeightsConfig
 from birdslam.graph.window import Window
 from birdslam.simulation.drive import Drive, DriveConfig, drive
+from birdslam.slam import SlamConfig
 from birdslam.types import Estimate, LandmarkEdge, Measurements, Status
 
 Floats = NDArray[np.float64]
@@ -170,3 +173,63 @@ def test_no_edge_is_an_outlier(kind: str) -> None:
 
     assert moved_m(0.5) > 0.02
     assert moved_m(10.0) == pytest.approx(20.0 * moved_m(0.5), rel=0.05)
+
+
+def test_cp_of_vehicles_adds_its_lambda_to_their_place_in_the_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eq. 7 with A a vehicle: one edge for each known landmark, to the place, of no agent the orientation."""
+    log = drive(EXACT, 2).measurements
+    landmarks = [{e.landmark for e in m.cp if e.x_m <= THRESHOLD_M} for m in log]
+    correct, checked = vehicle_places.correct, 0
+
+    def seen(window: Window, rows: NDArray[np.int64], residuals: NDArray[np.complex128], *more: float) -> None:
+        nonlocal checked
+        before = window.P.copy()
+        correct(window, rows, residuals, *more)
+        np.testing.assert_allclose(residuals, 0.0, atol=1e-6)  # nothing errs
+        frame = window.frame
+        if frame in FRAMES:
+            known = len(landmarks[frame] & landmarks[frame - 1])
+            added = np.linalg.inv(window.P) - np.linalg.inv(before)
+            expected = np.zeros_like(added)
+            for row in rows:
+                at = window.at[window.nodes + row]
+                H = np.zeros((2, len(added)))
+                H[:, [0, 1]] = H[:, window.layout.poses[row][:2]] = np.eye(2)
+                H[:, 2] = -at.imag, at.real
+                expected += LAMBDA_CP * known * H.T @ H
+            np.testing.assert_allclose(added, expected, rtol=2e-3, atol=1e-3 * expected.max())
+            checked += known
+
+    monkeypatch.setattr(vehicle_places, "correct", seen)
+    graph = PoseGraph(PAPER.graph, replace(PAPER.weights, cp_vehicles=LAMBDA_CP))
+    estimates = [graph.optimise(m) for m in log]
+    assert checked > 100
+    for with_them, without in zip(estimates, run(log), strict=True):
+        assert with_them.T_world_ego.between(without.T_world_ego).log() == pytest.approx(np.zeros(3), abs=1e-6)
+
+
+def test_cp_of_a_vehicle_takes_it_to_where_its_landmark_says() -> None:
+    """One CV edge that is 1 m off, against a landmark seen with it: the car goes there by CP's share of the weights."""
+    log = drive(replace(EXACT, vehicles=1, landmarks=12), 2).measurements
+    last = log[-1]
+    (edge,) = last.cv
+    off = replace(
+        edge, T_ego_vehicle=SE2(edge.T_ego_vehicle.x_m + 1.0, edge.T_ego_vehicle.y_m, edge.T_ego_vehicle.yaw_rad)
+    )
+    log[-1] = replace(last, cv=(off,))
+    moved = []
+    for weight in (None, LAMBDA_CP):
+        graph = PoseGraph(PAPER.graph, replace(PAPER.weights, cp_vehicles=weight))
+        seen = [graph.optimise(m) for m in log][-1]
+        T = seen.T_world_ego.between(seen.vehicles[0].T_world_vehicle)
+        moved.append(T.x_m - edge.T_ego_vehicle.x_m)
+    left = 1.0 - np.array(moved)  # what the vehicle's way until then still counts
+    assert left[0] > 0.005
+    assert abs(left[1]) < 0.1 * left[0]  # CP's weight beside CV's is ten times as large, and more
+
+
+def test_cp_of_vehicles_needs_landmarks_in_the_world() -> None:
+    with pytest.raises(ValueError, match="first_sight"):
+        PoseGraph(GraphConfig(), WeightsConfig(cp_vehicles=1.0))
+    with pytest.raises(ValueError, match="first_sight"):
+        SlamConfig(weights=WeightsConfig(cp_vehicles=1.0))

@@ -70,6 +70,7 @@ def idea_variants() -> dict[str, Method]:
     out["measured covariances"] = replace(PAPER, weights=WeightsConfig(leave_out=()))
     steady = replace(PAPER, graph=msgspec.structs.replace(paper, constant_velocity=True))
     out["constant velocity in place of VV"] = _leave_out(steady, "vv")
+    out["CP of vehicles (Eq. 7)"] = _reweighted(PAPER, cp_vehicles=PAPER.weights.cp)
     out["the smoother"] = Final("", PAPER, SmootherConfig())
     return out
 

@@ -23,8 +23,10 @@ ABOUT_TOLD = (
 ABOUT_NEES = (
     "Squared errors over what was stated, a degree of freedom: 1 is honest, more is too sure. *Median* is the median "
     "over that of an honest error, which a few wild errors do not move. The ego's are those of each frame's motion and "
-    "of 10 m of motions, the scale's the part of these along the way (truth's own noise is added, but not to simulated odometry, "
-    "which errs from the true poses themselves). Of simulated odometry they say how well the simulation knows itself: rows of images alone are of our odometry. "
+    "of 10 m of motions, the scale's the part of these along the way. Truth's own noise is added, but not to simulated "
+    "odometry, which errs from the true poses themselves. Its rows say how well the simulation knows itself: over 10 m "
+    "its scale errs less than the graph takes for granted, which is told of odometry whose error lasts. Rows of images "
+    "alone are of our odometry. "
     "A vehicle's are of its place in the ego's frame as the live graph has it, in the frames that see it, and in the "
     "frame that the ego had 10 m before. Vehicles' errors last: a few vehicles are few samples, however many frames."
 )

@@ -140,9 +140,7 @@ class Landmarks:
         points, means, deviators = seen.points[now], seen.means[now], seen.deviators[now]
         if self._fixed:  # known, where the world has it
             place, node_cov = EGO_PLACE, window.ego_cov[:2, :2]
-            T = window.world
-            back, off = cmath.exp(-1j * T.yaw_rad), cmath.exp(1j * (self._yaw_rad - T.yaw_rad))
-            there = (self._tied.points[then] - complex(T.x_m, T.y_m)) * back
+            there, off = self._in_ego(then, window)
             residuals = landmark_residual(there, 0.0, off, points)  # Eq. 3
         else:
             place = KEY_PLACE
@@ -159,6 +157,28 @@ class Landmarks:
         gap, m, d = sum_of_points(residuals, means, deviators)  # Eq. 7
         m += common_variance
         return CpEdge(np.array([gap.real, gap.imag]), np.array([[m + d.real, d.imag], [d.imag, m - d.real]]), place)
+
+    def vehicle_residuals(
+        self, seen: Sightings, window: Window, rows: Rows, places: Complexes
+    ) -> tuple[Complexes, int]:
+        """The CP edges of vehicles (Eq. 7) that a frame sees at `places` (k,) in ego, those of each summed.
+
+        How much further on, in ego, the vehicles `rows` (k,) of the window stand (k,), and the number of edges of each:
+        0 where no landmark is known. All landmarks weigh alike. They must be anchored at their first sight.
+        """
+        known = self._rows(seen)
+        now = np.flatnonzero(known >= 0)
+        if not len(now):
+            return np.zeros(len(rows), np.complex128), 0
+        there, off = self._in_ego(known[now], window)
+        ego = complex(landmark_residual(there, 0.0, off, seen.points[now]).mean())  # Eq. 7
+        return ego + off * places - window.at[window.nodes + rows], len(now)  # Eq. 3, of the vehicle
+
+    def _in_ego(self, rows: Rows, window: Window) -> tuple[Complexes, complex]:
+        """Known landmarks in ego, and the heading there of what a frame sees: that of the CC edges alone."""
+        T = window.world
+        there = (self._tied.points[rows] - complex(T.x_m, T.y_m)) * cmath.exp(-1j * T.yaw_rad)
+        return there, cmath.exp(1j * (self._yaw_rad - T.yaw_rad))
 
     def tie(self, seen: Sightings, window: Window, least_frames: int) -> list[tuple[float, float]]:
         """Ties a frame's landmarks to the ego, now that it is corrected; returns those that settled, in world.

@@ -26,6 +26,7 @@ import numpy as np
 
 from birdslam.geometry.planar import Floats, rates
 from birdslam.geometry.se2 import SE2
+from birdslam.graph import vehicle_places
 from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, plain, unpack
 from birdslam.graph.edges import PoseEdges, pose_edges
 from birdslam.graph.factors import NO_VV
@@ -85,13 +86,21 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     blind_radps: Positive = 0.1  # the same of its yaw rate
 
 
+def check_together(graph: GraphConfig, weights: WeightsConfig) -> None:
+    """Raises ValueError where the weights ask for edges that the graph does not have."""
+    if weights.cp_vehicles is not None and graph.landmark_anchor != "first_sight":
+        raise ValueError('weights.cp_vehicles needs graph.landmark_anchor = "first_sight": X_p in the world')
+
+
 class PoseGraph:
     """Bounded in time and memory; deterministic; raises nothing for what a record may say."""
 
     def __init__(self, config: GraphConfig, weights: WeightsConfig, epoch: int = 0) -> None:
+        """Raises ValueError as `check_together`."""
         self.config = config
         self.weights = weights
         self.epoch = epoch
+        check_together(config, weights)
         self._map = PendingMap(config.max_pending_landmarks, config.max_pending_frames)
         self._changes = np.square([config.change_forward_mps, config.change_sideways_mps, config.change_turn_radps])
         self._birth = np.diag(np.square([config.birth_forward_mps, config.birth_sideways_mps, config.birth_turn_radps]))
@@ -120,6 +129,8 @@ class PoseGraph:
         seen = sightings(m.cp) if every or window.is_keyframe else None
         outliers = self._minimise(m, window, ties, seen)  # Eq. 8
         self._renew_vehicles(m, window, edges, ties, outliers)
+        if seen is not None and edges.cv and self.weights.cp_vehicles is not None:
+            self._tie_vehicles(m, window, edges, seen, self.weights.cp_vehicles)
         self._renew_map(m, window, seen)
         if not window.is_finite:  # numbers that no road has: begin anew rather than publish them
             window, reset = self._begin(m, True), True
@@ -279,6 +290,14 @@ class PoseGraph:
             at = [self._vehicles.begin(edges.cv[k].vehicle, m.frame_id, m.t_source_ns) for k in begun]
             poses, covs = edges.poses[edges.cv_at][begun], edges.covs[edges.cv_at][begun]
             window.place(np.array(at, dtype=np.int64), poses, covs, self._birth_covs(covs))
+
+    def _tie_vehicles(self, m: Measurements, window: Window, edges: PoseEdges, seen: Sightings, weight: float) -> None:
+        """The CP edges of the vehicles that the frame sees, each of information `weight` (Eqs. 4 and 7)."""
+        every = np.array([self._vehicles.row(edge.vehicle) for edge in edges.cv])
+        rows, poses = every[every >= 0], edges.poses[edges.cv_at][every >= 0]
+        residuals, count = self._landmarks.vehicle_residuals(seen, window, rows, poses[:, 0] + 1j * poses[:, 1])
+        if count:
+            vehicle_places.correct(window, rows, residuals, 1.0 / (weight * count), self._stands(m))
 
     def _birth_covs(self, covs: Floats) -> Floats:
         """(k, 3, 3) of the twists of vehicles first seen with `covs` (k, 3, 3), at rest for all that is known.

@@ -89,6 +89,10 @@ class VehicleNodes:
             dt_s,
         )
 
+    def row(self, vehicle: int) -> int:
+        """Of a vehicle in the window; -1: it is not there."""
+        return self._row.get(vehicle, -1)
+
     def _starts_at_newest(self, vehicle: int, from_frame: int) -> bool:
         row = self._row.get(vehicle)
         return row is not None and self.nodes[row].node_frame == from_frame

@@ -29,6 +29,9 @@ class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mode: Literal["measured", "paper"] = "measured"
     cc: Positive = 10_000.0  # lambda of Eq. 4, as those below
     cp: Positive = 10_000.0  # of landmarks
+    # Of vehicles' CP edges to the landmarks of their frame (Eq. 7 has them of ego and vehicles); None: there are none.
+    # It needs slam.graph.landmark_anchor = "first_sight"
+    cp_vehicles: Positive | None = None
     cv_near: Positive = 1_000.0  # of a vehicle at the camera
     cv_far: Positive = 10.0  # of a vehicle at cv_far_m and farther
     cv_far_m: Positive = 60.0  # the paper says that CV weighs less with depth, not where it ends

@@ -273,7 +273,7 @@ class Window:
         if held is not None:
             dx[EGO] = 0.0
             self.P[EGO, EGO] = held
-        self._shift(dx)
+        self.shift(dx)
         return outliers
 
     def _cost(self, cv: CvEdges, vv: VvEdges, cp: CpEdge | None, ends_alike: bool) -> Cost:
@@ -289,7 +289,7 @@ class Window:
             moved = vv_cost(vv, layout.twists[vv.rows], self.velocity[vv.rows], self.turn_radps[vv.rows])
         return collective_cost(dynamic_cost(seen, moved), cp)
 
-    def _shift(self, dx: Floats) -> None:
+    def shift(self, dx: Floats) -> None:
         """Moves the mean by `dx` (n,)."""
         layout = self.layout
         self.world = self.world @ SE2(*dx[EGO].tolist())
