@@ -45,7 +45,8 @@ def landmark_variants(base: Live) -> dict[str, Live]:
     out = {}
     for name, factor in CP_WEIGHTS.items():
         if base.weights.mode == "paper":
-            out[name] = _reweighted(base, cp=factor * base.weights.cc)
+            weight = factor * base.weights.cc
+            out[name] = _reweighted(base, cp=weight, cp_vehicles=base.weights.cp_vehicles and weight)
         else:
             out[name] = replace(base, cp_inflation=1.0 / factor)
     for name, depth_m in DEPTHS_M.items():
@@ -66,11 +67,12 @@ def idea_variants() -> dict[str, Method]:
     out: dict[str, Method] = {"nothing (the paper)": PAPER}
     for name, fields in alone.items():
         more = {field: getattr(default, field) for field in fields}
-        out[name] = replace(PAPER, graph=msgspec.structs.replace(paper, **more))
+        base = _of_ego_alone(PAPER) if "landmark_anchor" in fields else PAPER
+        out[name] = replace(base, graph=msgspec.structs.replace(paper, **more))
+    out["CP of the ego alone"] = _of_ego_alone(PAPER)
     out["measured covariances"] = replace(PAPER, weights=WeightsConfig(leave_out=()))
     steady = replace(PAPER, graph=msgspec.structs.replace(paper, constant_velocity=True))
     out["constant velocity in place of VV"] = _leave_out(steady, "vv")
-    out["CP of vehicles (Eq. 7)"] = _reweighted(PAPER, cp_vehicles=PAPER.weights.cp)
     out["the smoother"] = Final("", PAPER, SmootherConfig())
     return out
 
@@ -102,6 +104,11 @@ def _leave_out(base: Live, edge: EdgeType) -> Live:
     return _reweighted(base, leave_out=tuple({*base.weights.left_out, edge}))
 
 
+def _of_ego_alone(base: Live) -> Live:
+    """Without CP edges of vehicles, which say something only where landmarks stand in the world."""
+    return _reweighted(base, cp_vehicles=None)
+
+
 def _without_vv(base: Live) -> Live:
     """Neither VV edges nor what stands in for them in our graph."""
     base = _leave_out(base, "vv")
@@ -109,8 +116,9 @@ def _without_vv(base: Live) -> Live:
 
 
 def _without_cv(base: Live) -> Live:
+    """Nor CP edges of vehicles, which tell once more what the CV edges told."""
     if base.weights.mode == "paper":
-        return _reweighted(base, cv_near=NO_WEIGHT, cv_far=NO_WEIGHT)
+        return _reweighted(base, cv_near=NO_WEIGHT, cv_far=NO_WEIGHT, cp_vehicles=None)
     return replace(base, cv_inflation=1.0 / NO_WEIGHT)
 
 

@@ -109,7 +109,7 @@ NO_GATE = 1e6  # sigmas: nothing is an outlier
 
 PAPER = Live(
     "BirdSLAM as published",
-    WeightsConfig(mode="paper"),
+    WeightsConfig(mode="paper", cp_vehicles=10_000.0),
     # CC, CP, CV and VV edges by Eqs. 5-8 and nothing else
     GraphConfig(
         constant_velocity=False,
