@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from birdslam.baselines import batch_se3, cubeslam, nair, namdev
+from birdslam.baselines.shape_prior import Initialised
 from birdslam.baselines.trajectories import LiveTrajectories, Trajectories
 from birdslam.datasets.kitti import KITTI_RATE_HZ
 from birdslam.datasets.kitti_tracking import VEHICLE_KINDS, TrackingSequence
@@ -138,6 +139,8 @@ def methods(config: SlamConfig) -> dict[str, Method]:
         "paper_final": Final("BirdSLAM as published, our smoother", PAPER, SmootherConfig()),
         "batch_se3": batch_se3,
         "nair": nair,
+        "batch_se3_shape": Initialised("Batch SE(3), unscaled odometry, shape prior", batch_se3),
+        "nair_shape": Initialised("Nair et al. (IV 2020), shape prior", nair),
         "namdev": namdev,
         "cubeslam": cubeslam,
     }

@@ -16,7 +16,10 @@ from birdslam.runtime.cli.arguments import (
     add_topics,
 )
 
-METHODS = ("birdslam", "birdslam_live", "paper", "paper_final", "batch_se3", "nair", "namdev", "cubeslam")
+METHODS = (
+    *("birdslam", "birdslam_live", "paper", "paper_final", "batch_se3", "nair", "batch_se3_shape", "nair_shape"),
+    *("namdev", "cubeslam"),
+)
 SEEDS = 5
 
 
