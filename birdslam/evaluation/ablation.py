@@ -15,11 +15,12 @@ import msgspec
 
 from birdslam.baselines import batch_se3
 from birdslam.baselines.trajectories import Trajectories
+from birdslam.evaluation.completed_lanes import of_kind, with_completed_lanes
 from birdslam.evaluation.tracking import PAPER, Final, Live, Method
 from birdslam.geometry.camera import Camera
 from birdslam.graph.pose_graph import GraphConfig
 from birdslam.graph.weights import NO_WEIGHT, EdgeType, WeightsConfig
-from birdslam.types import Measurements
+from birdslam.types import LandmarkKind, Measurements
 from birdslam.vehicles.rts_smoother import SmootherConfig
 
 CP_WEIGHTS = MappingProxyType({"cp_low": 0.01, "cp_medium": 1.0, "cp_high": 100.0})  # against CC's own
@@ -86,18 +87,26 @@ def placed_variants(base: Live) -> dict[str, Method]:
     }
 
 
-def lane_variants() -> dict[str, Method]:
-    """Table 5: the batch before and after lane constraints."""
-    return {"before_lanes": _Batch("Batch SE(3) before lane constraints", False), "after_lanes": batch_se3}
+def lane_variants(images: bool = False) -> dict[str, Method]:
+    """Table 5: the batch before and after lane constraints; of a log of `images`, which has lanes, also with either."""
+    out: dict[str, Method] = {"before_lanes": _Batch("Batch SE(3) before lane constraints", False)}
+    out["after_lanes"] = batch_se3
+    if images:
+        out["corners_alone"] = _Batch("Batch SE(3), corners alone", of=LandmarkKind.ROAD_POINT)
+        out["completed_lanes"] = _Batch("Batch SE(3), completed lanes alone", of=LandmarkKind.LANE_STATION)
+    return out
 
 
 @dataclass(frozen=True)
 class _Batch:
     label: str
-    lanes: bool
+    landmarks: bool = True
+    of: LandmarkKind | None = None  # lanes are the completed ones then
 
     def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
-        return batch_se3.run(log, camera, self.lanes)
+        if self.of is not None:
+            log = of_kind(with_completed_lanes(log), self.of)
+        return batch_se3.run(log, camera, self.landmarks)
 
 
 def _leave_out(base: Live, edge: EdgeType) -> Live:

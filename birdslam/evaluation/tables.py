@@ -64,9 +64,11 @@ VARIANT_TITLES = {
     "depth_none": "no T",
     "before_lanes": "before lanes",
     "after_lanes": "after lanes",
+    "corners_alone": "corners alone",
+    "completed_lanes": "completed lanes alone",
 }
 CONSTRAINTS, LANDMARKS = tuple(VARIANT_TITLES)[:5], tuple(VARIANT_TITLES)[5:13]
-LANES = tuple(VARIANT_TITLES)[13:]
+LANES, LANES_OF_IMAGES = tuple(VARIANT_TITLES)[13:15], tuple(VARIANT_TITLES)[15:]
 
 
 class PaperSequence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -203,23 +205,29 @@ def ideas_table(rows: Sequence[Row], published: Published) -> str:
 
 
 def lanes_table(rows: Sequence[Row], published: Published) -> str:
-    """Table 5, over the paper's bodies and then over what else is at hand."""
-    head = ["Seq", "Car", "frames: published", "at hand"]
+    """Table 5, over the paper's bodies, by odometry; what only a log of images has is in columns of its own."""
+    head = ["Seq", "Car", "odometry", "frames: published", "at hand"]
     for column in LANES:
         head += [f"{VARIANT_TITLES[column]}: published", "re-implemented"]
+    head += [f"{VARIANT_TITLES[column]}: re-implemented" for column in LANES_OF_IMAGES]
+    rows = [row for row in rows if row.method in (*LANES, *LANES_OF_IMAGES)]
     table, lines = published.table5, []
     for sequence, paper in published.sequences.items():
         for body in (*paper.bodies, EGO):
-            of = {row.method: row for row in rows if (row.sequence, row.body) == (sequence, body)}
+            here = [row for row in rows if (row.sequence, row.body) == (sequence, body)]
             frames = table.frames.get(sequence, {}).get(body)
-            if frames is None and not of:
+            if frames is None and not here:
                 continue
-            any_row = next(iter(of.values()), None)
-            line = [sequence, body, _number(frames, 0), "" if any_row is None else f"{any_row.frames:g}"]
-            for column in LANES:
-                line.append(_number(table.ate_m[column].get(sequence, {}).get(body)))
-                line.append(_row_number(of.get(column), spread=False))
-            lines.append(line)
+            for odometry in dict.fromkeys(row.odometry for row in here) or ("",):
+                of = {row.method: row for row in here if row.odometry == odometry}
+                any_row = next(iter(of.values()), None)
+                line = [sequence, body, odometry_title(odometry), _number(frames, 0)]
+                line.append("" if any_row is None else f"{any_row.frames:g}")
+                for column in LANES:
+                    line.append(_number(table.ate_m[column].get(sequence, {}).get(body)))
+                    line.append(_row_number(of.get(column), spread=False))
+                line += [_row_number(of.get(column), spread=False) for column in LANES_OF_IMAGES]
+                lines.append(line)
     return _markdown(head, lines)
 
 
