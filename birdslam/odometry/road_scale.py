@@ -8,7 +8,6 @@ only some combination of scale, pitch, roll and curvature, and the filter knows 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.bonnet import Bonnet
 from birdslam.odometry.car_scale import CarScale, CarStep
+from birdslam.odometry.kept_images import Kept, KeptImages, Seen
 from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.motion import planar
 from birdslam.odometry.road_alignment import ROAD, RoadAligner, RoadFit, RoadImage
@@ -37,19 +37,6 @@ _BEND_PER_M = 0.2  # no car turns more tightly
 _LENGTHS_M = np.geomspace(0.03, 6.0, 84)  # tried where the length is not known at all
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """The road in one image."""
-
-    plain: RoadImage
-    image: RoadImage  # the same, or without what stands still in it
-
-
-@dataclass(frozen=True)
-class _Kept(_Seen):
-    pose: Pose  # in the odometry's frame and unit
-
-
 class RoadScale:
     """A `metric_scale.MetricScale`: chooses the earlier image, compares, and lets the filter accept or refuse.
 
@@ -65,7 +52,7 @@ class RoadScale:
         self._watch = TiltWatch(camera, config.watch)
         self._standing = StandingPattern(config.standing)
         self._bonnet = Bonnet(config.bonnet)
-        self._kept: list[_Kept] = []
+        self._kept = KeptImages(config.kept_images)
         self._confirmed = 0
         self._refused = 0.0  # comparisons in a row, each counted by what of it is new: those of one view err together
         self._tries = 0  # and by number
@@ -98,7 +85,9 @@ class RoadScale:
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
         """The odometry begins anew with this image; its unit of length is known to `sigma_rel`."""
         image = self._aligner.image(grey)
-        self._kept = [_Kept(image, image, pose)] if not self._standing.present else []
+        self._kept.clear()
+        if not self._standing.present:
+            self._kept.keep(Seen(image, image), pose, 0.0)
         if not self._confirmed:
             sigma_rel = 1.0
         self._filter.forget_scale(sigma_rel)
@@ -135,7 +124,7 @@ class RoadScale:
         by_car = self._car.follow(*view.interval_ns, forward_m, travelled_m, self._known())
         if by_car != 1.0:
             self._car.rescale(by_car)
-            self._rescale(view.pose.p, by_car)
+            self._kept.rescale(view.pose.p, by_car)
         return by_road * by_car
 
     def _measure_road(self, step: Pose, view: RoadView) -> float:
@@ -165,7 +154,7 @@ class RoadScale:
                 baseline_m = float(np.linalg.norm(T.p)) * (unit or factor)
                 driven_m = baseline_m if view.near_px < _DRIVEN_PX else np.inf
                 if self._standing.judge(past.plain, image.plain, px, driven_m):
-                    self._kept = []  # they are of the other kind
+                    self._kept.clear()  # they are of the other kind
                     return factor
                 borne_out = None if unit is None else unit / factor
                 if self._car.length is not None:
@@ -176,12 +165,12 @@ class RoadScale:
         self._keep(image, pose, factor)
         return factor
 
-    def _image(self, grey: NDArray[np.uint8]) -> _Seen:
+    def _image(self, grey: NDArray[np.uint8]) -> Seen:
         plain, standing, top_px = self._aligner.image(grey), self._standing, self._aligner.top_px
         standing.learn(grey, top_px)
         if not standing.present:
-            return _Seen(plain, plain)
-        return _Seen(plain, RoadImage.of(standing.without(grey, top_px), top_px))
+            return Seen(plain, plain)
+        return Seen(plain, RoadImage.of(standing.without(grey, top_px), top_px))
 
     def _learn_bonnet(self, view: RoadView, travelled_m: float) -> None:
         """Where a bonnet turns out to have been taken for road, all that it said is forgotten."""
@@ -203,23 +192,15 @@ class RoadScale:
             return None
         return length_unit(self.camera, self._tilt, window)
 
-    def _keep(self, seen: _Seen, pose: Pose, factor: float) -> None:
+    def _keep(self, seen: Seen, pose: Pose, factor: float) -> None:
         """Remembers the image for later comparisons, where it is far enough from the last one kept."""
         cfg = self.config
         if factor != 1.0:
-            self._rescale(pose.p, factor)
-        newest = self._kept[-1] if self._kept else None
-        away_m = np.inf if newest is None else float(np.linalg.norm(newest.pose.p - pose.p))
+            self._kept.rescale(pose.p, factor)
         if self._held:  # the earlier ones show no road, or from too vague a distance
-            if away_m > cfg.min_baseline_m:
-                self._kept = [_Kept(seen.plain, seen.image, pose)]
-        elif away_m > 0.5 * cfg.min_baseline_m:
-            self._kept = [*self._kept[1 - cfg.kept_images :], _Kept(seen.plain, seen.image, pose)]
-
-    def _rescale(self, centre: Floats, factor: float) -> None:
-        """Multiplies the distances of all kept images from a point."""
-        moved = [Pose(k.pose.R, centre + factor * (k.pose.p - centre)) for k in self._kept]
-        self._kept = [_Kept(k.plain, k.image, T) for k, T in zip(self._kept, moved, strict=True)]
+            self._kept.keep(seen, pose, cfg.min_baseline_m, alone=True)
+        else:
+            self._kept.keep(seen, pose, 0.5 * cfg.min_baseline_m)
 
     @property
     def sources(self) -> tuple[SpeedSource, ...]:
@@ -262,19 +243,12 @@ class RoadScale:
     def _in_doubt(self) -> bool:
         return self.sigma_rel > self.config.doubt_sigma_rel or self._refused >= self.config.doubt_after
 
-    def _past(self, pose: Pose) -> _Kept | None:
+    def _past(self, pose: Pose) -> Kept | None:
         """The earlier image to compare with: the one whose baseline is nearest to the target."""
-        cfg = self.config
-        if not self._kept:
-            return None
         if self._in_doubt():
             # Lengths are not known: the longest there is, or, where that looked like nothing, the shortest, and so on.
-            return self._kept[-self._tries % len(self._kept)]
-        distance = np.array([np.linalg.norm(k.pose.p - pose.p) for k in self._kept])
-        usable = np.flatnonzero(distance > cfg.min_baseline_m)
-        if not len(usable):
-            return None
-        return self._kept[int(usable[np.argmin(np.abs(np.log(distance[usable] / cfg.target_baseline_m)))])]
+            return self._kept.in_turn(self._tries)
+        return self._kept.nearest_to(pose, self.config.target_baseline_m, self.config.min_baseline_m)
 
     def _compare(
         self,
