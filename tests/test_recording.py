@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from msgspec.structs import replace
 
 from birdslam.datasets.camera_file import load_camera
 from birdslam.datasets.recording import DatasetError
@@ -37,7 +38,7 @@ from birdslam.runtime.recording.recording import (
 from birdslam.runtime.replay.replay import compare
 from birdslam.runtime.supervision.recording_files import choose_file
 from birdslam.runtime.wire import Health, decode, encode
-from birdslam.types import Estimate, Measurements
+from birdslam.types import Estimate, Measurements, Status
 from tests.taped_drive import CAMERA, Tape, measured
 from tests.test_bus import until
 from tests.test_pipeline import F_PX, HEIGHT, LIMIT_S, UNHURRIED, WIDTH, Run, call, road_image
@@ -59,6 +60,17 @@ def tape(tmp_path: Path) -> Tape:
     tape.writer.draw("/estimate", tape.estimates[-1], 40)
     tape.close()
     return tape
+
+
+def test_between_two_looks_of_the_detector_its_boxes_stay() -> None:
+    seen = next(m for m in measured(40) if m.cv)
+    later = replace(seen, cv=(), status=(Status.DETECTIONS_CARRIED,), ages={"detector": 1})
+    long_after = replace(later, ages={"detector": 60})
+    nothing_there = replace(seen, cv=())
+    drawn = [
+        {channel for channel, _ in scene.from_measurements(m, 0)} for m in (seen, later, long_after, nothing_there)
+    ]
+    assert ["/camera/boxes" in channels for channels in drawn] == [True, False, True, True]
 
 
 def messages(path: Path) -> list[Recorded]:

@@ -32,7 +32,7 @@ from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.latency import stages
 from birdslam.runtime.recording.foxglove import CompressedImage
 from birdslam.runtime.recording.recording import Latency, Recording
-from birdslam.runtime.recording.scene import VEHICLE_HEIGHT_M, ellipse
+from birdslam.runtime.recording.scene import VEHICLE_HEIGHT_M, between_looks, ellipse
 from birdslam.runtime.transport.bus import Bus, BusError
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameReader
@@ -90,10 +90,11 @@ class Viewer:
         if Status.END_OF_SOURCE in measurements.status:
             return
         self.at(measurements.frame_id, measurements.t_source_ns)
-        boxes = np.array([edge.box_px for edge in measurements.cv]).reshape(-1, 4)
-        labels = [f"{edge.label} {edge.vehicle}" for edge in measurements.cv]
-        shown = rr.Boxes2D(array=boxes, array_format=rr.Box2DFormat.XYXY, labels=labels, colors=SEEN)
-        self._stream.log("camera/boxes", shown)
+        if not between_looks(measurements):
+            boxes = np.array([edge.box_px for edge in measurements.cv]).reshape(-1, 4)
+            labels = [f"{edge.label} {edge.vehicle}" for edge in measurements.cv]
+            shown = rr.Boxes2D(array=boxes, array_format=rr.Box2DFormat.XYXY, labels=labels, colors=SEEN)
+            self._stream.log("camera/boxes", shown)
         lanes = np.array([(p.x_m, p.y_m) for p in measurements.lanes]).reshape(-1, 2)
         self._stream.log("bev/lanes", rr.Points2D(_above(lanes), radii=0.15, colors=ROAD))
 

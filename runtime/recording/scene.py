@@ -42,10 +42,11 @@ from birdslam.runtime.recording.foxglove import (
     Vector3,
 )
 from birdslam.trajectory import Transform, ego_pose, mount_pose
-from birdslam.types import NS_PER_S, Attitude, Estimate, MapUpdate, Measurements, VehicleEstimate
+from birdslam.types import NS_PER_S, Attitude, Estimate, MapUpdate, Measurements, Status, VehicleEstimate
 
 VEHICLE_HEIGHT_M = 1.5  # drawn; no height is estimated
 ELLIPSE_POINTS = 24
+_BOXES_STAY_FRAMES = 8  # after the last look: a quarter of a second at 33 Hz
 EGO, VEHICLE, UNSEEN = Color(0.1, 0.4, 0.9), Color(0.9, 0.4, 0.1), Color(0.6, 0.6, 0.6)
 
 CHANNELS: dict[str, type[msgspec.Struct]] = {
@@ -87,9 +88,23 @@ def from_estimate(estimate: Estimate, t_ns: int) -> Iterator[Drawn]:
     yield "/scene", SceneUpdate(deletions=(gone,), entities=tuple(entities))
 
 
+def between_looks(measurements: Measurements) -> bool:
+    """Whether the boxes of the last look are still worth showing: the detector has not run on this frame."""
+    carried = Status.DETECTIONS_CARRIED in measurements.status and not measurements.cv
+    return carried and measurements.ages.get("detector", _BOXES_STAY_FRAMES + 1) <= _BOXES_STAY_FRAMES
+
+
 def from_measurements(measurements: Measurements, t_ns: int) -> Iterator[Drawn]:
-    """The boxes in the image, and what was seen of the road in this frame, in ego."""
+    """The boxes in the image, and what was seen of the road in this frame, in ego. Between two looks boxes stay."""
     t = timestamp(t_ns)
+    if not between_looks(measurements):
+        yield "/camera/boxes", _boxes(measurements, t)
+    seen = [(point.x_m, point.y_m) for point in measurements.lanes]
+    seen += [(edge.x_m, edge.y_m) for edge in measurements.cp]
+    yield "/road", PointCloud(timestamp=t, frame_id="ego", data=_packed(seen))
+
+
+def _boxes(measurements: Measurements, t: Time) -> ImageAnnotations:
     boxes, texts = [], []
     for edge in measurements.cv:
         x1, y1, x2, y2 = edge.box_px
@@ -97,10 +112,7 @@ def from_measurements(measurements: Measurements, t_ns: int) -> Iterator[Drawn]:
         boxes.append(PointsAnnotation(timestamp=t, points=corners, outline_color=VEHICLE))
         text = f"{edge.label} {edge.vehicle}  {math.hypot(edge.T_ego_vehicle.x_m, edge.T_ego_vehicle.y_m):.1f} m"
         texts.append(TextAnnotation(timestamp=t, position=Point2(x1, y1), text=text))
-    yield "/camera/boxes", ImageAnnotations(points=tuple(boxes), texts=tuple(texts))
-    seen = [(point.x_m, point.y_m) for point in measurements.lanes]
-    seen += [(edge.x_m, edge.y_m) for edge in measurements.cp]
-    yield "/road", PointCloud(timestamp=t, frame_id="ego", data=_packed(seen))
+    return ImageAnnotations(points=tuple(boxes), texts=tuple(texts))
 
 
 def from_map(update: MapUpdate, t_ns: int) -> Iterator[Drawn]:
