@@ -194,3 +194,23 @@ def test_dead_reckoning_is_the_chain(world: Drive) -> None:
     ego_m, car_m = worst_m(world, dead_reckoned(world.measurements))
     assert ego_m < 1e-6
     assert car_m < 1e-6
+
+
+def test_cp_of_vehicles_holds_them_in_the_batch_where_they_were_seen(world: Drive) -> None:
+    """Eq. 7 with A a vehicle: of an exact log nothing moves, and one sight that is off counts by CP's weight too."""
+    plain = msgspec.structs.replace(nair.CONFIG, landmarks=True)
+    more = msgspec.structs.replace(plain, weights=msgspec.structs.replace(plain.weights, cp_vehicles=10_000.0))
+    assert max(worst_m(world, solve_batch(world.measurements, more)[0])) < 0.05
+    log, middle = list(world.measurements), QUIET.frames // 2
+    edge = max(log[middle].cv, key=lambda e: e.T_ego_vehicle.x_m)
+    off = msgspec.structs.replace(edge, T_ego_vehicle=SE2(1.0) @ edge.T_ego_vehicle)
+    log[middle] = msgspec.structs.replace(
+        log[middle], cv=tuple(off if e.vehicle == edge.vehicle else e for e in log[middle].cv)
+    )
+    left_m = []
+    for config in (plain, more):
+        result = solve_batch(log, config)[0]
+        told = result.ego[middle] @ off.T_ego_vehicle
+        found = result.vehicles[edge.vehicle][middle]
+        left_m.append(math.hypot(found.x_m - told.x_m, found.y_m - told.y_m))
+    assert left_m[1] < 0.1 * left_m[0]

@@ -1,8 +1,8 @@
 """The reference of the paper's incremental SE(2) graph: Eq. 8 over all frames of a log at once, by gtsam.
 
 It has the same CC, CV and VV edges with the same covariances as the incremental graph, the same constant-velocity
-factor where that has one, and CP edges with a node for each landmark. It has no gate: an outlier counts like any other
-edge. Nothing is marginalised and every edge is linearised at the optimum, future frames included.
+factor where that has one, and CP edges of the ego with a node for each landmark. It has no gate: an outlier counts like
+any other edge. Nothing is marginalised and every edge is linearised at the optimum, future frames included.
 """
 
 from __future__ import annotations

@@ -91,6 +91,7 @@ class _Builder:
         self.poses: dict[int, Floats] = {}  # where the optimisation starts
         self._attitudes: dict[int, Attitude] = {}
         self._seen: dict[int, set[int]] = {}  # vehicle -> frames
+        self._sights: dict[int, dict[int, SE2]] = {}  # frame -> vehicle -> T_ego_vehicle
         self._last: int | None = None
         if not config.metric:
             self.values.insert(_SCALE, np.array([1.0]))
@@ -128,6 +129,7 @@ class _Builder:
             noise = _noise6(np.array(cv.cov).reshape(3, 3), level)
             self.graph.add(gtsam.BetweenFactorPose3(key, node, gtsam.Pose3(edge), noise))
             self._seen.setdefault(cv.vehicle, set()).add(cv.frame)
+            self._sights.setdefault(cv.frame, {})[cv.vehicle] = cv.T_ego_vehicle
         for vv in m.vv if self.config.steady_motion is None else ():
             if {vv.from_frame, vv.to_frame} <= self._seen.get(vv.vehicle, set()):
                 start, end = (_vehicle_key(vv.vehicle, frame) for frame in (vv.from_frame, vv.to_frame))
@@ -152,6 +154,20 @@ class _Builder:
                 noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_m / range_m, sigma_m / range_m, sigma_m]))
                 key = gtsam.symbol("x", edge.frame)
                 self.graph.add(gtsam.BearingRangeFactor3D(key, node, gtsam.Unit3(at), range_m, noise))
+                if self.config.weights.cp_vehicles is not None:
+                    self._add_landmark_of_vehicles(node, edge, self.config.weights.cp_vehicles)
+
+    def _add_landmark_of_vehicles(self, node: int, edge: LandmarkEdge, weight: float) -> None:
+        """The CP edges of the vehicles that the frame sees (Eq. 7), by the difference of its two sights.
+
+        gtsam has no such edge that leaves the vehicle's yaw alone, as Eq. 3 does: this one bears on it too.
+        """
+        for vehicle, T_ego_vehicle in self._sights.get(edge.frame, {}).items():
+            at = np.append(T_ego_vehicle.inverse() @ np.array([edge.x_m, edge.y_m]), 0.0)
+            range_m, sigma_m = max(float(np.linalg.norm(at)), 1e-3), weight**-0.5
+            noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_m / range_m, sigma_m / range_m, sigma_m]))
+            key = _vehicle_key(vehicle, edge.frame)
+            self.graph.add(gtsam.BearingRangeFactor3D(key, node, gtsam.Unit3(at), range_m, noise))
 
     def add_steady_motion(self, sigmas: Floats) -> None:
         """Ties each three poses of a vehicle at frames in a row."""
