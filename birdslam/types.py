@@ -140,7 +140,7 @@ class FrameRef(msgspec.Struct, frozen=True, kw_only=True):
     speeds: tuple[SpeedReading, ...] = ()  # as in `Frame`; a frame that is dropped loses none, the next has them too
 
 
-class EgoEdge(msgspec.Struct, frozen=True, kw_only=True):
+class EgoEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """CC: the ego's motion between two frames (camera-camera edge, Eq. 2)."""
 
     from_frame: FrameId
@@ -152,7 +152,7 @@ class EgoEdge(msgspec.Struct, frozen=True, kw_only=True):
         _check_cov(self, "cov")
 
 
-class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True):
+class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """CV: a vehicle seen from the ego in one frame (camera-vehicle edge, Eq. 2).
 
     `T_ego_vehicle` is the centre of the footprint; where only the nearest face was seen, it is that face moved back by
@@ -181,7 +181,7 @@ class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True):
         _check_cov(self, "cov")
 
 
-class MotionEdge(msgspec.Struct, frozen=True, kw_only=True):
+class MotionEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """VV: a vehicle's own motion between two frames as the tracker predicts it (vehicle-vehicle edge, Eq. 2)."""
 
     vehicle: BodyId
@@ -204,7 +204,7 @@ class LandmarkKind(enum.IntEnum):
 _STATION_IDS = 1 << 48  # stations' ids began here in records that had no `kind` yet
 
 
-class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
     """CP: a landmark of the static map seen from the ego (camera-point edge, Eq. 3), back-projected by Eq. 1.
 
     It is known by `kind` and `landmark` together: each kind numbers its own.
@@ -225,7 +225,7 @@ class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
             msgspec.structs.force_setattr(self, "landmark", self.landmark - _STATION_IDS)
 
 
-class LanePoint(msgspec.Struct, frozen=True, array_like=True):
+class LanePoint(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """A point of a lane line on the road, in ego; it only feeds the map."""
 
     x_m: float
@@ -287,7 +287,7 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
         check_finite(self, "scale_sigma_rel")
 
 
-class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True):
+class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """One vehicle in an `Estimate`: pose and velocity over the ground, in world."""
 
     vehicle: BodyId  # its number, for as long as it is followed

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from birdslam.baselines.batch_se2 import ego_key, solve, vehicle_key
 from birdslam.evaluation.tracking import PAPER
 from birdslam.geometry.se2 import SE2
-from birdslam.graph import vehicle_places
-from birdslam.graph.factors import CpEdge, CvEdges, VvEdges
+from birdslam.graph import pose_graph, vehicle_places
+from birdslam.graph.factors import CpEdge, CvEdge, VvEdge
 from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.graph.window import Window
@@ -42,23 +42,29 @@ def run(log: list[Measurements]) -> list[Estimate]:
     return [graph.optimise(m) for m in log]
 
 
-def added(log: list[Measurements], monkeypatch: pytest.MonkeyPatch) -> list[tuple[Window, CvEdges, Floats]]:
+def added(log: list[Measurements], monkeypatch: pytest.MonkeyPatch) -> list[tuple[Window, list[CvEdge], Floats]]:
     """What the edges of each frame add to the information about the state: the window, its CV edges, (n, n)."""
     out = []
-    minimise = Window.minimise
+    minimise = pose_graph.minimise
 
     def seen(
-        self: Window, cv: CvEdges, vv: VvEdges, cp: CpEdge | None, gate: float, hold: bool, ends_alike: bool
+        window: Window,
+        cv: list[CvEdge],
+        vv: list[VvEdge],
+        cp: CpEdge | None,
+        gate: float,
+        hold: bool,
+        ends_alike: bool,
     ) -> list[int]:
-        before = self.P.copy()
-        outliers = minimise(self, cv, vv, cp, gate, hold, ends_alike)
+        before = window.P.copy()
+        outliers = minimise(window, cv, vv, cp, gate, hold, ends_alike)
         more = np.zeros_like(before)
-        if self.frame in FRAMES:
-            more = np.linalg.inv(self.P) - np.linalg.inv(before)
-        out.append((self, cv, more))
+        if window.frame in FRAMES:
+            more = np.linalg.inv(window.P) - np.linalg.inv(before)
+        out.append((window, cv, more))
         return outliers
 
-    monkeypatch.setattr(Window, "minimise", seen)
+    monkeypatch.setattr(pose_graph, "minimise", seen)
     run(log)
     return out
 
@@ -76,8 +82,8 @@ def test_each_edge_adds_its_lambda_and_nothing_adds_more(monkeypatch: pytest.Mon
         )  # those that the world has, from their first sight
         summed += known
         expected[[0, 1], [0, 1]] = LAMBDA_CP * known  # of the ego's place in the world: not its yaw, no other pose
-        assert len(cv.rows) == len(m.cv) == 3
-        far_to_near = sorted(zip((-e.T_ego_vehicle.x_m for e in m.cv), cv.rows.tolist(), strict=True))
+        assert len(cv) == len(m.cv) == 3
+        far_to_near = sorted((-e.at.real, e.row) for e in cv)
         weights = []
         for _, row in far_to_near:
             rows = window.layout.poses[row]

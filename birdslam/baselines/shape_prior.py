@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from birdslam.baselines.trajectories import Trajectories
 from birdslam.geometry.camera import Camera
-from birdslam.geometry.planar import unit
 from birdslam.geometry.se2 import SE2
 from birdslam.types import Measurements, VehicleEdge
 
@@ -85,7 +84,7 @@ def project(unknowns: Floats, camera: Camera) -> Floats:
     `unknowns` (N, 6): x, y (m) and yaw (rad) in ego, and the logarithms of length, width and height (m).
     """
     points = WIREFRAME * np.exp(unknowns[:, None, 3:])
-    at = (points[..., 0] + 1j * points[..., 1]) * unit(unknowns[:, 2])[:, None]
+    at = (points[..., 0] + 1j * points[..., 1]) * np.exp(1j * unknowns[:, 2])[:, None]
     ahead = np.maximum(at.real + unknowns[:, :1], 0.5)
     u = camera.cx_px - camera.fx_px * (at.imag + unknowns[:, 1:2]) / ahead
     v = camera.fy_px * (camera.height_m - points[..., 2]) / ahead

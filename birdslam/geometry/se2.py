@@ -21,7 +21,7 @@ def wrap(angle_rad: float) -> float:
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
-class SE2(msgspec.Struct, frozen=True, array_like=True):
+class SE2(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """A pose or motion on the road plane; on the wire `[x_m, y_m, yaw_rad]`.
 
     Raises ValueError (on decoding: msgspec.ValidationError) where a number is not finite.

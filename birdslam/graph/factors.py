@@ -1,67 +1,72 @@
 """Eqs. 2-8 of the paper, in its order: what the edges measure, what they weigh, and the cost that is minimised.
 
 What one frame adds to the cost F of Eq. 8 is collected here as a `Cost`, linear in the state of the window (window.py),
-which minimises it. Three things are written otherwise than in the paper and mean the same:
+which minimum.py minimises. Three things are written otherwise than in the paper and mean the same:
 
 - An information matrix Omega is given by its inverse, the covariance.
 - The poses of the window are relative to the newest ego pose, so that (T_S^W)^-1 T_D^W of Eq. 2 is one of them. A
   residual is the measurement minus the state, in the axes of the source node S; covariances are turned to these axes.
-- Poses are complex: a position x + iy and a heading e^(i yaw) (geometry/planar.py). A point's covariance
-  [[m + a, b], [b, m - a]] is its mean m and its deviator d = a + ib: turning by an angle multiplies d by
-  e^(2i angle), and the inverse is (m, -d) / (m^2 - |d|^2). That halves the numpy calls of a frame.
+- Poses are complex: a position x + iy and a heading e^(i yaw). A point's covariance [[m + a, b], [b, m - a]] is its
+  mean m and its deviator d = a + ib: turning by an angle multiplies d by e^(2i angle), and the inverse is
+  (m, -d) / (m^2 - |d|^2).
+
+Edges of vehicles are a dozen a frame, taken one by one in Python's own numbers; landmarks are hundreds, and arrays.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import cmath
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.planar import Complexes, Floats, advance, pairs, turned, unit
+from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
 
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
 Rows = NDArray[np.int64]
+Triple = tuple[float, float, float]
+Cov = tuple[float, ...]  # row-major, of (x_m, y_m, yaw_rad)
 
 
-@dataclass(slots=True)
-class CvEdges:
-    """The CV edges of the newest frame to vehicles that the window has."""
+class CvEdge(NamedTuple):
+    """A CV edge of the newest frame to a vehicle that the window has."""
 
-    rows: Rows  # (k,) the vehicles, by their row in the window
-    poses: Floats  # (k, 3) T_ego_vehicle
-    covs: Floats  # (k, 3, 3) in the axes of the measured pose
-
-
-@dataclass(slots=True)
-class VvEdges:
-    """The VV edges from the newest poses of vehicles in the window to the newest frame."""
-
-    rows: Rows  # (v,) the vehicles, by their row in the window
-    dt_s: Floats  # (v,) the interval that the edge spans
-    motions: Floats  # (v, 3) T_from_to
-    covs: Floats  # (v, 3, 3) in the axes of the measured pose
+    row: int  # of the vehicle in the window
+    at: complex  # the measured place, in ego
+    heading: complex
+    cov: Cov  # in ego
 
 
-NO_VV = VvEdges(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+class VvEdge(NamedTuple):
+    """A VV edge from the newest pose of a vehicle in the window to the newest frame."""
+
+    row: int  # of the vehicle in the window
+    dt_s: float  # the interval that the edge spans
+    motion: SE2  # T_from_to
+    cov: Cov  # in the axes of the measured pose
 
 
 @dataclass(slots=True)
 class CpEdge:
     """All CP edges of a frame as one (Eq. 7)."""
 
-    residual: Floats  # (2,) metres in ego: by how much the ego node lies further on than the window has it
+    residual: tuple[float, float]  # metres in ego: by how much the ego node lies further on than the window has it
     cov: Floats  # (2, 2)
-    place: Rows  # (2,) which numbers of the state are the place of that node
+    place: list[int]  # (2,) which numbers of the state are the place of that node
 
 
 @dataclass(slots=True)
 class Cost:
     """A sum of F^s (Eq. 5) over edges that each measure numbers of the state: residual = measured - state[index]."""
 
-    index: Rows  # (n,) which numbers of the state
-    residual: Floats  # (n,)
-    covs: Floats  # (n / 3, 3, 3), the inverses of the edges' information matrices
+    index: list[int] = field(default_factory=list)  # (n,) which numbers of the state
+    residual: list[float] = field(default_factory=list)  # (n,)
+    covs: list[float] = field(default_factory=list)  # (3 n,), row-major: inverses of the edges' information matrices
     cp_cov: Floats | None = None  # (2, 2) of the last two rows, where CP edges are in the sum
 
 
@@ -73,19 +78,22 @@ def chained(T_world_from: SE2, T_from_to: SE2) -> SE2:
     return T_world_from @ T_from_to  # Eq. 2
 
 
-def binary_residual(measured: Floats, headings: Complexes, at: Complexes, heading: Complexes) -> Floats:
-    """(3N,) residuals (x_m, y_m, yaw_rad) of N CV or VV edges, in the axes of the source node.
+def binary_residual(measured_at: complex, measured_heading: complex, at: complex, heading: complex) -> Triple:
+    """(x_m, y_m, yaw_rad) of a CV or VV edge, in the axes of the source node.
 
-    `measured` (N, 3) are the measurements T_S_D and `headings` (N,) their headings; `at` and `heading` (N,) are the
-    poses of D in S that the window has.
+    The measurement T_S_D, and the pose of D in S that the window has, each as place and heading.
     """
-    out = np.empty(3 * len(at))
-    gap = measured[:, 0] + 1j * measured[:, 1] - at  # Eq. 2: its translation
-    out[0::3] = gap.real
-    out[1::3] = gap.imag
-    turn = headings * heading.conj()  # Eq. 2: its rotation
-    np.arctan2(turn.imag, turn.real, out=out[2::3])
-    return out
+    gap = measured_at - at  # Eq. 2: its translation
+    return gap.real, gap.imag, cmath.phase(measured_heading * heading.conjugate())  # Eq. 2: its rotation
+
+
+def turned(cov: Cov, heading: complex) -> Cov:
+    """A covariance in axes that point to `heading`, told outside."""
+    xx, xy, xt, _, yy, yt, _, _, tt = cov
+    mean = 0.5 * (xx + yy)
+    d = complex(0.5 * (xx - yy), xy) * heading * heading
+    t = complex(xt, yt) * heading
+    return mean + d.real, d.imag, t.real, d.imag, mean - d.real, t.imag, t.real, t.imag, tt
 
 
 # --- Eq. 3: unary edges (CP) ---
@@ -120,11 +128,27 @@ def inflation(costs: Floats, gate: float) -> Floats:
 # --- Eq. 5: the cost of an edge ---
 
 
-def pose_costs(residuals: Floats, covs: Floats) -> Floats:
-    """(N,) squared Mahalanobis distances of residuals (3N,) with covariances (N, 3, 3)."""
-    e = residuals.reshape(-1, 3, 1)
-    out: Floats = (e * np.linalg.solve(covs, e)).reshape(-1, 3).sum(axis=1)  # Eq. 5
-    return out
+def pose_cost(residual: Sequence[float], cov: Sequence[Sequence[float]]) -> float:
+    """The squared Mahalanobis distance of a residual (3,) with covariance (3, 3), by its Cholesky factors LDL'.
+
+    0 where the matrix is no covariance.
+    """
+    (xx, _, _), (yx, yy, _), (tx, ty, tt) = cov
+    x, y, t = residual
+    if xx <= 0.0:
+        return 0.0
+    to_y, to_t = yx / xx, tx / xx
+    yy -= to_y * yx
+    ty -= to_t * yx
+    if yy <= 0.0:
+        return 0.0
+    y_to_t = ty / yy
+    tt -= to_t * tx + y_to_t * ty
+    if tt <= 0.0:
+        return 0.0
+    y -= to_y * x
+    t -= to_t * x + y_to_t * y
+    return x * x / xx + y * y / yy + t * t / tt  # Eq. 5
 
 
 def point_costs(residuals: Complexes, means: Floats, deviators: Complexes) -> Floats:
@@ -137,39 +161,39 @@ def point_costs(residuals: Complexes, means: Floats, deviators: Complexes) -> Fl
 # --- Eq. 6: the cost of what moves ---
 
 
-def cv_cost(edges: CvEdges, headings: Complexes, states: Rows, at: Complexes, heading: Complexes) -> Cost:
-    """CV, with the measured `headings` (k,), of vehicles that stand `at` with `heading` (k,).
-
-    Their poses are the numbers `states` (k, 3) of the state.
-    """
-    residual = binary_residual(edges.poses, headings, at, heading)
-    return Cost(states.ravel(), residual, turned(edges.covs, headings))
-
-
-def vv_cost(edges: VvEdges, states: Rows, velocity: Complexes, turn_radps: Floats) -> Cost:
-    """VV, of vehicles whose twists (v,) are the numbers `states` (v, 3) of the state."""
-    v = len(edges.rows)
-    way, heading, partial = advance(np.ones(v, np.complex128), velocity, turn_radps, edges.dt_s)
-    headings = unit(edges.motions[:, 2])
-    H = np.zeros((v, 3, 3))  # how an error of the twist moves the end of the way
-    H[:, :2] = pairs(partial)[:, :, 3:]
-    H[:, 2, 2] = edges.dt_s
-    back = np.linalg.inv(H)
-    residual = back @ binary_residual(edges.motions, headings, way, heading).reshape(v, 3, 1)
-    covs = back @ turned(edges.covs, headings) @ back.transpose(0, 2, 1)
-    return Cost(states.ravel(), residual.ravel(), covs)
-
-
-def dynamic_cost(cv: Cost, vv: Cost | None) -> Cost:
+def dynamic_cost(
+    cv: Iterable[tuple[CvEdge, int, complex, complex]], vv: Iterable[tuple[VvEdge, int, complex, float]]
+) -> Cost:
     """F_D of this frame: its CV and VV edges.
 
-    Of the other terms of Eq. 6, CC has moved the window on to this frame (`chained`), and the CV edges of earlier
-    frames are in what the window knows.
+    With each CV edge come the first of the three numbers of the state that are the vehicle's pose, its place and its
+    heading; with each VV edge the first of the three that are its twist, its velocity and its yaw rate. Of the other
+    terms of Eq. 6, CC has moved the window on to this frame (`chained`), and the CV edges of earlier frames are in what
+    the window knows.
     """
-    if vv is None:
-        return cv
-    index, residual = np.concatenate([cv.index, vv.index]), np.concatenate([cv.residual, vv.residual])
-    return Cost(index, residual, np.concatenate([cv.covs, vv.covs]))  # Eq. 6
+    cost = Cost()
+    for seen, first, at, heading in cv:
+        cost.index += (first, first + 1, first + 2)
+        cost.residual += binary_residual(seen.at, seen.heading, at, heading)
+        cost.covs += seen.cov
+    for moved, first, velocity, turn_radps in vv:
+        residual, cov = _as_twist(moved, velocity, turn_radps)
+        cost.index += (first, first + 1, first + 2)
+        cost.residual += residual
+        cost.covs += cov
+    return cost  # Eq. 6
+
+
+def _as_twist(edge: VvEdge, velocity: complex, turn_radps: float) -> tuple[list[float], list[float]]:
+    """What a VV edge says of the twist that the window has: residual (3,) and covariance (9,)."""
+    way, heading, by_velocity, by_turn = advance(1.0 + 0.0j, velocity, turn_radps, edge.dt_s)
+    T = edge.motion
+    measured = cmath.rect(1.0, T.yaw_rad)
+    g, d = by_velocity, by_turn
+    back = np.linalg.inv([[g.real, -g.imag, d.real], [g.imag, g.real, d.imag], [0.0, 0.0, edge.dt_s]])
+    residual = back @ binary_residual(complex(T.x_m, T.y_m), measured, way, heading)
+    cov = back @ np.reshape(turned(edge.cov, measured), (3, 3)) @ back.T
+    return residual.tolist(), cov.ravel().tolist()
 
 
 # --- Eq. 7: the cost of what stands ---
@@ -192,8 +216,9 @@ def sum_of_points(residuals: Complexes, means: Floats, deviators: Complexes) -> 
 
 
 def collective_cost(dynamic: Cost, static: CpEdge | None) -> Cost:
-    """F = F_D + F_S."""
-    if static is None:
-        return dynamic
-    index, residual = np.concatenate([dynamic.index, static.place]), np.concatenate([dynamic.residual, static.residual])
-    return Cost(index, residual, dynamic.covs, static.cov)  # Eq. 8
+    """F = F_D + F_S, in place of F_D."""
+    if static is not None:
+        dynamic.index += static.place
+        dynamic.residual += static.residual
+        dynamic.cp_cov = static.cov
+    return dynamic  # Eq. 8

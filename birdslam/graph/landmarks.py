@@ -19,18 +19,25 @@ Where X_p of Eq. 3 is, is a choice (`LandmarkAnchor`):
 from __future__ import annotations
 
 import cmath
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.planar import Complexes, Floats
 from birdslam.graph.edges import LARGEST_M
-from birdslam.graph.factors import CpEdge, Rows, inflation, landmark_residual, point_costs, sum_of_points
+from birdslam.graph.factors import (
+    Complexes,
+    CpEdge,
+    Floats,
+    Rows,
+    inflation,
+    landmark_residual,
+    point_costs,
+    sum_of_points,
+)
 from birdslam.graph.window import EGO_PLACE, KEY_PLACE, Window
 from birdslam.types import LandmarkEdge, LandmarkKind
 
@@ -133,10 +140,10 @@ class Landmarks:
         `common_variance` in m^2 is of what all landmarks of a frame share, which their sum does not average away.
         """
         rows = self._rows(seen)
-        now = np.flatnonzero(rows >= 0)
-        if not len(now):
+        now = [i for i, row in enumerate(rows) if row >= 0]
+        if not now:
             return None
-        then = rows[now]
+        then = [rows[i] for i in now]
         points, means, deviators = seen.points[now], seen.means[now], seen.deviators[now]
         if self._fixed:  # known, where the world has it
             place, node_cov = EGO_PLACE, window.ego_cov[:2, :2]
@@ -156,10 +163,10 @@ class Landmarks:
             means, deviators = means * excess, deviators * excess
         gap, m, d = sum_of_points(residuals, means, deviators)  # Eq. 7
         m += common_variance
-        return CpEdge(np.array([gap.real, gap.imag]), np.array([[m + d.real, d.imag], [d.imag, m - d.real]]), place)
+        return CpEdge((gap.real, gap.imag), np.array([[m + d.real, d.imag], [d.imag, m - d.real]]), place)
 
     def vehicle_residuals(
-        self, seen: Sightings, window: Window, rows: Rows, places: Complexes
+        self, seen: Sightings, window: Window, rows: Sequence[int], places: Sequence[complex]
     ) -> tuple[Complexes, int]:
         """The CP edges of vehicles (Eq. 7) that a frame sees at `places` (k,) in ego, those of each summed.
 
@@ -167,14 +174,15 @@ class Landmarks:
         0 where no landmark is known. All landmarks weigh alike. They must be anchored at their first sight.
         """
         known = self._rows(seen)
-        now = np.flatnonzero(known >= 0)
-        if not len(now):
+        now = [i for i, row in enumerate(known) if row >= 0]
+        if not now:
             return np.zeros(len(rows), np.complex128), 0
-        there, off = self._in_ego(known[now], window)
+        there, off = self._in_ego([known[i] for i in now], window)
         ego = complex(landmark_residual(there, 0.0, off, seen.points[now]).mean())  # Eq. 7
-        return ego + off * places - window.at[window.nodes + rows], len(now)  # Eq. 3, of the vehicle
+        at = np.array([window.at[window.nodes + row] for row in rows])
+        return ego + off * np.array(places) - at, len(now)  # Eq. 3, of the vehicle
 
-    def _in_ego(self, rows: Rows, window: Window) -> tuple[Complexes, complex]:
+    def _in_ego(self, rows: Sequence[int], window: Window) -> tuple[Complexes, complex]:
         """Known landmarks in ego, and the heading there of what a frame sees: that of the CC edges alone."""
         T = window.world
         there = (self._tied.points[rows] - complex(T.x_m, T.y_m)) * cmath.exp(-1j * T.yaw_rad)
@@ -188,32 +196,33 @@ class Landmarks:
         """
         seen = seen[: self._capacity]
         rows = self._rows(seen)
-        gone = np.ones(len(self._row), dtype=np.bool_)
-        gone[rows[rows >= 0]] = False
-        gone &= (self._frames >= least_frames) & _are_road_points(self._row)
-        settled = [(p.real, p.imag) for p in (self._moment[gone] / self._information[gone]).tolist()]
+        seen_now, frames_before = {*rows}, self._frames.tolist()
+        gone = [
+            row
+            for (kind, _), row in self._row.items()
+            if kind is LandmarkKind.ROAD_POINT and frames_before[row] >= least_frames and row not in seen_now
+        ]
+        settled = [(p.real, p.imag) for p in (self._moment[gone] / self._information[gone]).tolist()] if gone else []
 
         T = window.world
         information = 1.0 / seen.means
         at = complex(T.x_m, T.y_m)
         moment = information * (at + seen.points * cmath.exp(1j * T.yaw_rad))
-        old = np.flatnonzero(rows >= 0)
+        old = [i for i, row in enumerate(rows) if row >= 0]
+        before = [rows[i] for i in old]
         if self._fixed:
             fixed = at + seen.points * cmath.exp(1j * self._yaw_rad)
-            fixed[old] = self._tied.points[rows[old]]
+            fixed[old] = self._tied.points[before]
             seen = Sightings(seen.keys, fixed, seen.means, seen.deviators)
         frames = np.ones(len(rows), dtype=np.int64)
-        for sums, before in ((information, self._information), (moment, self._moment), (frames, self._frames)):
-            sums[old] += before[rows[old]]
+        for sums, kept in ((information, self._information), (moment, self._moment), (frames, self._frames)):
+            sums[old] += kept[before]
         self._information, self._moment, self._frames = information, moment, frames
         self._row = {key: row for row, key in enumerate(seen.keys)}
         self._tied = seen
         return settled
 
-    def _rows(self, seen: Sightings) -> Rows:
-        """(N,) where each landmark is kept; -1: nowhere yet."""
-        return np.array([self._row.get(key, -1) for key in seen.keys], dtype=np.int64)
-
-
-def _are_road_points(keys: Iterable[LandmarkKey]) -> NDArray[np.bool_]:
-    return np.array([kind is LandmarkKind.ROAD_POINT for kind, _ in keys], dtype=np.bool_)
+    def _rows(self, seen: Sightings) -> list[int]:
+        """Where each landmark is kept; -1: nowhere yet."""
+        row = self._row
+        return [row.get(key, -1) for key in seen.keys]

@@ -2,10 +2,10 @@
 
 `PoseGraph.optimise` takes these steps, each in the module of its part of the graph:
 
-1. weights.py weighs the edges by Eq. 4, edges.py makes arrays of them, vehicles.py finds those that tie vehicles of the
-   graph to this frame;
+1. weights.py weighs the edges by Eq. 4, edges.py leaves out what is none, vehicles.py finds those that tie vehicles of
+   the graph to this frame;
 2. window.py moves the graph on to the frame: the ego by the CC edge, vehicles with constant velocity;
-3. landmarks.py sums the CP edges (Eq. 7), window.py finds the minimum of Eq. 8 over CV, VV and CP edges;
+3. landmarks.py sums the CP edges (Eq. 7), minimum.py finds the minimum of Eq. 8 over CV, VV and CP edges;
 4. vehicles.py, landmarks.py and pending_map.py begin and end vehicles and landmarks;
 5. marginals.py gives poses, velocities and marginal covariances of the frame.
 
@@ -24,18 +24,19 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from birdslam.geometry.planar import Floats, rates
+from birdslam.geometry.constant_twist import rate
 from birdslam.geometry.se2 import SE2
 from birdslam.graph import vehicle_places
 from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, plain, unpack
 from birdslam.graph.edges import PoseEdges, pose_edges
-from birdslam.graph.factors import NO_VV
+from birdslam.graph.factors import Floats, VvEdge
 from birdslam.graph.landmarks import LandmarkAnchor, Landmarks, Sightings, sightings
 from birdslam.graph.marginals import vehicle_estimates
+from birdslam.graph.minimum import minimise, solver
 from birdslam.graph.pending_map import PendingMap
-from birdslam.graph.vehicles import SHORTEST_S, Ties, VehicleNodes
+from birdslam.graph.vehicles import SHORTEST_S, Ties, VehicleNodes, cv_edge
 from birdslam.graph.weights import WeightsConfig, weighted
-from birdslam.graph.window import Window, solver
+from birdslam.graph.window import Window
 from birdslam.types import INVALIDATING, BodyId, Estimate, MapUpdate, Measurements, SpeedSource, Status, VehicleEstimate
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -102,7 +103,7 @@ class PoseGraph:
         self.epoch = epoch
         check_together(config, weights)
         self._map = PendingMap(config.max_pending_landmarks, config.max_pending_frames)
-        self._changes = np.square([config.change_forward_mps, config.change_sideways_mps, config.change_turn_radps])
+        self._changes = config.change_forward_mps**2, config.change_sideways_mps**2, config.change_turn_radps**2
         self._birth = np.diag(np.square([config.birth_forward_mps, config.birth_sideways_mps, config.birth_turn_radps]))
         # Whether a vehicle stands is judged by its velocity's covariance: Eq. 6 alone has none that was measured
         self._birth_det = float(self._birth[0, 0] * self._birth[1, 1]) if config.constant_velocity else None
@@ -148,8 +149,8 @@ class PoseGraph:
         for row, v in enumerate(self._vehicles.nodes):
             if v.seen_ns == self._t_ns:
                 k, states = window.nodes + row, window.layout.poses[row]
-                at, yaw_rad = window.at[k], cmath.phase(complex(window.heading[k]))
-                out[v.vehicle] = SE2(float(at.real), float(at.imag), yaw_rad), window.P[np.ix_(states, states)]
+                at, yaw_rad = window.at[k], cmath.phase(window.heading[k])
+                out[v.vehicle] = SE2(at.real, at.imag, yaw_rad), window.P[np.ix_(states, states)]
         return out
 
     def map_update(self) -> MapUpdate | None:
@@ -229,18 +230,26 @@ class PoseGraph:
         """
         cc, vv = edges.cc, ties.vv
         assert cc is not None  # the frame follows
-        growth = np.zeros((len(ties.dt_s), 3))
-        if self.config.constant_velocity:
-            growth = ties.dt_s[:, None] * self._changes
-        elif len(vv.rows):
-            window.retwist(vv.rows, *rates(vv.motions, vv.dt_s), vv.covs / np.square(vv.dt_s)[:, None, None])
+        growth = self._changes
+        if not self.config.constant_velocity:
+            growth = (0.0, 0.0, 0.0)
+            if vv:
+                self._retwist(window, vv)
         stands = self._stands(m)
-        cov = np.zeros((3, 3)) if stands else edges.covs[0]
+        cov = np.zeros((3, 3)) if stands else np.reshape(cc.cov, (3, 3))
         self._motion = window.propagate(cc.T_from_to, cov, cc.from_frame, m.frame_id, ties.dt_s, growth)
         self._landmarks.turn(self._motion.yaw_rad)
         self._t_before_ns, self._t_ns = self._t_ns, m.t_source_ns
         if not stands:
             self._drift(window, m.scale_sigma_rel)
+
+    def _retwist(self, window: Window, edges: list[VvEdge]) -> None:
+        """The twists of the interval that led to this frame are what the VV edges say of it."""
+        covs = np.array([e.cov for e in edges]).reshape(-1, 3, 3)
+        for e, cov in zip(edges, covs, strict=True):
+            T, dt_s = e.motion, e.dt_s
+            cov /= dt_s * dt_s
+            window.retwist(e.row, *rate(complex(T.x_m, T.y_m), T.yaw_rad, dt_s), cov)
 
     def _drift(self, window: Window, scale_sigma_rel: float) -> None:
         """The error of the metric scale lasts, so that of a step is the same as that of the way before it.
@@ -271,9 +280,9 @@ class PoseGraph:
                 config.landmark_gate_sigma**2,
                 config.landmark_common_m**2,
             )
-        vv = ties.vv if config.constant_velocity else NO_VV  # else they have set the twists
+        vv = ties.vv if config.constant_velocity else []  # else they have set the twists
         gate = config.detection_gate_sigma**2
-        return window.minimise(ties.cv, vv, cp, gate, self._stands(m), config.ends_alike)
+        return minimise(window, ties.cv, vv, cp, gate, self._stands(m), config.ends_alike)
 
     def _stands(self, m: Measurements) -> bool:
         """Whether the ego holds its pose."""
@@ -285,28 +294,29 @@ class PoseGraph:
         """Forgets who is long out of sight, and begins who is new or was an outlier too often."""
         rows, begun = self._vehicles.book(edges.cv, ties.known, [ties.known[i] for i in outliers], m.t_source_ns)
         if rows is not None:
-            window.select(np.array(rows, dtype=np.int64))
-        if begun:
-            at = [self._vehicles.begin(edges.cv[k].vehicle, m.frame_id, m.t_source_ns) for k in begun]
-            poses, covs = edges.poses[edges.cv_at][begun], edges.covs[edges.cv_at][begun]
-            window.place(np.array(at, dtype=np.int64), poses, covs, self._birth_covs(covs))
+            window.select(rows)
+        for k in begun:
+            row = self._vehicles.begin(edges.cv[k].vehicle, m.frame_id, m.t_source_ns)
+            seen = cv_edge(row, edges.cv[k])
+            window.place(row, seen.at, seen.heading, seen.cov, self._birth_cov(seen.cov[-1]))
 
     def _tie_vehicles(self, m: Measurements, window: Window, edges: PoseEdges, seen: Sightings, weight: float) -> None:
         """The CP edges of the vehicles that the frame sees, each of information `weight` (Eqs. 4 and 7)."""
-        every = np.array([self._vehicles.row(edge.vehicle) for edge in edges.cv])
-        rows, poses = every[every >= 0], edges.poses[edges.cv_at][every >= 0]
-        residuals, count = self._landmarks.vehicle_residuals(seen, window, rows, poses[:, 0] + 1j * poses[:, 1])
-        if count:
-            vehicle_places.correct(window, rows, residuals, 1.0 / (weight * count), self._stands(m))
+        of = {self._vehicles.row(edge.vehicle): edge.T_ego_vehicle for edge in edges.cv}
+        of.pop(-1, None)
+        places = [complex(T.x_m, T.y_m) for T in of.values()]
+        residuals, count = self._landmarks.vehicle_residuals(seen, window, [*of], places)
+        if of and count:
+            vehicle_places.correct(window, [*of], residuals, 1.0 / (weight * count), self._stands(m))
 
-    def _birth_covs(self, covs: Floats) -> Floats:
-        """(k, 3, 3) of the twists of vehicles first seen with `covs` (k, 3, 3), at rest for all that is known.
+    def _birth_cov(self, yaw_variance: float) -> Floats:
+        """(3, 3) of the twist of a vehicle seen for the first time, at rest for all that is known.
 
         A yaw that is off turns the velocity: the twist is in axes that are off by it, so its variances grow by that.
         """
-        out = np.tile(self._birth, (len(covs), 1, 1))
-        out[:, 0, 0] += covs[:, 2, 2] * self._birth[1, 1]
-        out[:, 1, 1] += covs[:, 2, 2] * self._birth[0, 0]
+        out = self._birth.copy()
+        out[0, 0] += yaw_variance * self._birth[1, 1]
+        out[1, 1] += yaw_variance * self._birth[0, 0]
         return out
 
     def _renew_map(self, m: Measurements, window: Window, seen: Sightings | None) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from birdslam.geometry.planar import Floats
+from birdslam.graph.factors import Floats
 
 EGO = slice(0, 3)
 
@@ -19,17 +19,30 @@ class StateLayout:
         first = 3 + 3 * nodes  # of the vehicles
         self.size = first + 6 * vehicles
         self.ego_poses = slice(0, first)  # the newest and the nodes
-        self.nodes = slice(3, first)
         self.vehicles = slice(first, self.size)
-        self.of_vehicles = first + np.arange(6 * vehicles, dtype=np.int64).reshape(vehicles, 6)  # (M, 6)
-        self.poses, self.twists = self.of_vehicles[:, :3], self.of_vehicles[:, 3:]  # (M, 3) each
-        self.twist_rows = self.twists.ravel()
-        # (nodes + M, 3) of all poses but the newest ego's
-        self.moved = np.concatenate([3 + np.arange(3 * nodes, dtype=np.int64).reshape(nodes, 3), self.poses])
+        self.firsts = range(first, self.size, 6)  # rows of the vehicles: three of the pose, three of the twist
+        of_vehicles = first + np.arange(6 * vehicles, dtype=np.int64).reshape(vehicles, 6)
+        self.poses, self.twists = of_vehicles[:, :3], of_vehicles[:, 3:]  # (M, 3) each
+        self.of_vehicles = of_vehicles  # (M, 6)
+        # Of all poses but the newest ego's, nodes and then vehicles: the rows of their places, and (n, 3) how they move
+        # when the ego does that they are told from, but for the lever of its turn
+        moved = np.concatenate([3 + np.arange(3 * nodes, dtype=np.int64).reshape(nodes, 3), self.poses])
+        self.x_rows, self.y_rows = moved[:, 0], moved[:, 1]
+        self.against = np.zeros((self.size, 3))
+        self.against[EGO] = np.eye(3)
+        for axis in range(3):
+            self.against[moved[:, axis], axis] = -1.0
+        # When the newest ego pose moves: where each entry of the Jacobian of the ego poses, its own adjoint and the
+        # nodes' turn, stands in (0, 1, cos, sin, -sin, and the lever of the turn, y and -x)
+        self.ego_moves = np.zeros((first, first), dtype=np.int64)
+        for i in range(0, first, 3):
+            self.ego_moves[i : i + 3, i : i + 3] = (2, 4, 0), (3, 2, 0), (0, 0, 1)
+        self.ego_moves[:2, 2] = 5, 6
         own = np.empty((vehicles, 9), dtype=np.int64)
         own[:, :3] = np.arange(3)
-        own[:, 3:] = self.of_vehicles
-        self.own = own[:, :, None], own[:, None, :]  # of (M, 9, 9): the ego's and each vehicle's own part of P
+        own[:, 3:] = of_vehicles
+        # (M, 9, 9) of the numbers of P in a row: the ego's and each vehicle's own part
+        self.own = own[:, :, None] * self.size + own[:, None, :]
 
     @staticmethod
     def node(k: int) -> slice:
@@ -42,10 +55,10 @@ def diagonal(P: Floats) -> Floats:
     return P.reshape(-1)[:: len(P) + 1]
 
 
-def diagonal_blocks(A: Floats, first: int, count: int, size: int) -> Floats:
-    """(count, size, size) view of the blocks on the diagonal of `A` that begin at `first` and every third row after it.
+def diagonal_blocks(A: Floats, count: int) -> Floats:
+    """(count, 3, 3) view of the first blocks on the diagonal of `A`.
 
     numpy's as_strided makes the same view, but takes several microseconds for it, this less than one.
     """
     row, column = A.strides
-    return np.ndarray((count, size, size), np.float64, A, first * (row + column), (3 * (row + column), row, column))
+    return np.ndarray((count, 3, 3), np.float64, A, 0, (3 * (row + column), row, column))

@@ -8,20 +8,22 @@ which the window has as the ego's pose and the vehicle's place in ego: both are 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from birdslam.geometry.planar import Complexes
-from birdslam.graph.factors import Rows
+from birdslam.graph.factors import Complexes
 from birdslam.graph.state_layout import EGO
 from birdslam.graph.window import Window
 
 
-def correct(window: Window, rows: Rows, residuals: Complexes, variance_m2: float, hold: bool) -> None:
+def correct(window: Window, rows: Sequence[int], residuals: Complexes, variance_m2: float, hold: bool) -> None:
     """Adds edges that each say how much further on, in ego, a vehicle of `rows` (k,) stands: `residuals` (k,), metres.
 
     `variance_m2` is each edge's, in either axis; `hold` keeps the ego where it is.
     """
-    k, at, states = len(rows), window.at[window.nodes + rows], window.layout.poses[rows]
+    k, states = len(rows), window.layout.poses[rows]
+    at = np.array([window.at[window.nodes + row] for row in rows])
     H = np.zeros((2 * k, len(window.P)))  # how the place in the world goes with the state
     H[0::2, EGO.start] = H[1::2, EGO.start + 1] = 1.0
     H[0::2, EGO.start + 2], H[1::2, EGO.start + 2] = -at.imag, at.real
@@ -35,4 +37,4 @@ def correct(window: Window, rows: Rows, residuals: Complexes, variance_m2: float
     if hold:
         dx[EGO] = 0.0
         window.P[EGO, EGO] = held
-    window.shift(dx)
+    window.shift(dx.tolist())

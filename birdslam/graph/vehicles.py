@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+import cmath
 from dataclasses import dataclass
 
-import numpy as np
-
-from birdslam.geometry.planar import Floats
 from birdslam.graph.edges import PoseEdges
-from birdslam.graph.factors import CvEdges, VvEdges
+from birdslam.graph.factors import CvEdge, VvEdge, turned
 from birdslam.types import Moves, VehicleEdge
 
 PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/parallax.py
@@ -41,9 +39,16 @@ class Ties:
     """The edges of a frame that tie vehicles of the window to it, and for how long each vehicle drives on."""
 
     known: list[int]  # which of the frame's CV edges `cv` has
-    cv: CvEdges
-    vv: VvEdges
-    dt_s: Floats  # (M,) since each vehicle's newest pose; 0: it gets no pose in this frame
+    cv: list[CvEdge]
+    vv: list[VvEdge]
+    dt_s: list[float]  # (M,) since each vehicle's newest pose; 0: it gets no pose in this frame
+
+
+def cv_edge(row: int, edge: VehicleEdge) -> CvEdge:
+    """The edge to the vehicle in this row of the window, all in ego."""
+    T = edge.T_ego_vehicle
+    heading = cmath.rect(1.0, T.yaw_rad)
+    return CvEdge(row, complex(T.x_m, T.y_m), heading, turned(edge.cov, heading))
 
 
 class VehicleNodes:
@@ -69,33 +74,27 @@ class VehicleNodes:
         """
         rows = [self._row.get(e.vehicle, -1) for e in edges.cv]
         known = [k for k, row in enumerate(rows) if row >= 0]
-        linked = [k for k, e in enumerate(edges.vv) if self._starts_at_newest(e.vehicle, e.from_frame)]
-        linked_rows = [self._row[edges.vv[k].vehicle] for k in linked]
-        tied = set(linked_rows)
+        linked = []
+        for e in edges.vv:
+            row = self._row.get(e.vehicle)
+            if row is not None and self.nodes[row].node_frame == e.from_frame:
+                linked.append((row, e))
+        tied = {row for row, _ in linked}
         if constant_velocity:
             tied.update([rows[k] for k in known])
         else:
             known = [k for k in known if rows[k] in tied]
-        passed_s = [0.0] * len(self.nodes)
+        dt_s = [0.0] * len(self.nodes)
         for row in tied:
             v = self.nodes[row]
-            passed_s[row] = max((t_ns - v.node_ns) * 1e-9, SHORTEST_S)
+            dt_s[row] = max((t_ns - v.node_ns) * 1e-9, SHORTEST_S)
             v.node_frame, v.node_ns = frame, t_ns
-        dt_s, vv_rows = np.array(passed_s), np.array(linked_rows, dtype=np.int64)
-        return Ties(
-            known,
-            CvEdges(np.array([rows[k] for k in known], dtype=np.int64), *edges.some(edges.cv_at, known)),
-            VvEdges(vv_rows, dt_s[vv_rows], *edges.some(edges.vv_at, linked)),
-            dt_s,
-        )
+        cv = [cv_edge(rows[k], edges.cv[k]) for k in known]
+        return Ties(known, cv, [VvEdge(row, dt_s[row], e.T_from_to, e.cov) for row, e in linked], dt_s)
 
     def row(self, vehicle: int) -> int:
         """Of a vehicle in the window; -1: it is not there."""
         return self._row.get(vehicle, -1)
-
-    def _starts_at_newest(self, vehicle: int, from_frame: int) -> bool:
-        row = self._row.get(vehicle)
-        return row is not None and self.nodes[row].node_frame == from_frame
 
     def book(
         self, edges: list[VehicleEdge], known: list[int], outliers: list[int], t_ns: int

@@ -16,7 +16,7 @@ import msgspec
 
 from birdslam.frontend import FrontEnd
 from birdslam.geometry.camera import Camera
-from birdslam.graph.window import solver
+from birdslam.graph.minimum import solver
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.capture import CaptureNode, stamps
 from birdslam.runtime.nodes.degradation import STATUS, Degradation, Mode
