@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import resource
 import shutil
 import subprocess
 import sys
@@ -170,6 +171,33 @@ def test_who_computes_little_goes_before_networks(monkeypatch: pytest.MonkeyPatc
     assert max(asked) < 0
     monkeypatch.setattr(os, "setpriority", refused)  # of whoever may not
     assert list(realtime.apply("optimize", scheduled())) == []
+
+
+def test_a_spare_loads_below_all_others_and_comes_back() -> None:
+    policy = os.sched_getscheduler(0)
+    with subprocess.Popen(["sleep", "600"], start_new_session=True) as process:
+        group = Path(f"/proc/{process.pid}/autogroup")
+        try:
+            realtime.stand_by(process.pid)
+            if group.exists():
+                assert group.read_text().split()[-1] == "19"
+            assert os.sched_getscheduler(process.pid) in (os.SCHED_IDLE, policy)  # who may not come back is not sent
+            realtime.to_work(process.pid)
+            assert os.sched_getscheduler(process.pid) == policy
+            if group.exists():
+                assert group.read_text().split()[-1] == "0"
+        finally:
+            process.kill()
+    realtime.to_work(process.pid)  # it has ended: nothing to do
+
+
+def test_who_may_not_come_back_is_not_sent_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda which: (0, 0))
+    monkeypatch.setattr(realtime, "_has", lambda bit: False)
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *of: pytest.fail("it was"))
+    with subprocess.Popen(["sleep", "600"], start_new_session=True) as process:
+        realtime.stand_by(process.pid)
+        process.kill()
 
 
 def test_the_doctor_has_a_row_for_everything(tmp_path: Path) -> None:

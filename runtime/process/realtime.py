@@ -12,12 +12,13 @@ import gc
 import os
 import resource
 import threading
+import time
 from collections.abc import Iterator
 
 from birdslam.runtime.configuration import Configuration
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
-_CAP_IPC_LOCK = 14
+_CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of mallopt(3)
 _OBJECT_BYTES, _ANCHORED = 400, 256  # of Python's small objects, and how many in a row have one that stays
 _MIB = 1 << 20
@@ -57,6 +58,7 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
         with contextlib.suppress(PermissionError):  # who may not: these wait for a core like the others
             for thread in _threads():
                 os.setpriority(os.PRIO_PROCESS, thread, _GOES_FIRST)
+            _weigh_session("self", _GOES_FIRST)
     if realtime.lock_memory == "on" or (realtime.lock_memory == "auto" and live):
         if not may_lock_memory():
             yield "realtime.lock_memory: locking memory is not permitted (LimitMEMLOCK=infinity): it may be paged out"
@@ -73,6 +75,51 @@ def give_way() -> None:
         thread = threading.get_native_id()
         nice = min(os.getpriority(os.PRIO_PROCESS, thread) + _GIVES_WAY, _NICEST)
         os.setpriority(os.PRIO_PROCESS, thread, nice)
+
+
+def stand_by(pid: int) -> None:
+    """The process `pid`, just started as a session of its own, loads where nobody else wants a core: loading a spare
+    must not cost frames.
+
+    What it could not come back from (RLIMIT_NICE, CAP_SYS_NICE) is left out. A session's nice value anybody may raise
+    to 0 again; but it counts only outside of control groups (a desktop, not a service).
+    """
+    _weigh_session(pid, _NICEST)
+    limit = resource.getrlimit(resource.RLIMIT_NICE)[0]
+    enough = 20 - os.getpriority(os.PRIO_PROCESS, 0)
+    if limit >= enough or limit == resource.RLIM_INFINITY or _has(_CAP_SYS_NICE):
+        with contextlib.suppress(PermissionError, ProcessLookupError):
+            os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
+
+
+def to_work(pid: int) -> None:
+    """Ends `stand_by`: all its threads, and those that they begin meanwhile, compute like this process does."""
+    _weigh_session(pid, 0)
+    policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
+    done: set[int] = set()
+    while new := {*_threads(pid)} - done:
+        for thread in new:
+            with contextlib.suppress(ProcessLookupError):  # it has ended
+                if os.sched_getscheduler(thread) == os.SCHED_IDLE:
+                    os.sched_setscheduler(thread, policy, param)
+        done |= new
+
+
+def _weigh_session(pid: int | str, nice: int) -> None:
+    """Gives a process's session a nice value, where the kernel weighs sessions against each other (autogroup(7)).
+
+    There a thread's own nice value and SCHED_IDLE count inside of its session alone.
+    """
+    for last in (False, True):
+        try:
+            with open(f"/proc/{pid}/autogroup", "w") as group:
+                group.write(str(nice))
+            return
+        except BlockingIOError:  # the kernel lets users do this ten times a second
+            if not last:
+                time.sleep(0.1)
+        except OSError:  # no such kernel, not permitted, or it has ended: it computes like the others
+            return
 
 
 def reserve_for(node: str, configuration: Configuration) -> None:
@@ -121,8 +168,10 @@ def settle() -> None:
     del tuples
 
 
-def _threads() -> list[int]:
-    return [int(name) for name in os.listdir("/proc/self/task")]
+def _threads(pid: int | str = "self") -> list[int]:
+    with contextlib.suppress(FileNotFoundError):  # another one, which has ended
+        return [int(name) for name in os.listdir(f"/proc/{pid}/task")]
+    return []
 
 
 def may_lock_memory() -> bool:

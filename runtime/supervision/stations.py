@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.process import realtime
 from birdslam.runtime.process.restarts import Assignment, Restarts
 from birdslam.runtime.supervision.processes import NodeLog, NodeProcess
 from birdslam.runtime.transport.presence import remove_socket, runtime_dir_of
@@ -132,6 +133,8 @@ class Station:
         if spare is not None and spare.exit_status is not None:
             spare.close()
             spare = None
+        if spare is not None:
+            realtime.to_work(spare.pid)  # before it is told to begin: it may still be loading
         self.process = spare or self._started()
         self._begin()
 
@@ -144,6 +147,7 @@ class Station:
             self._spare_due_s = now_s + self._config.runtime.restart_backoff_max_ms / 1e3
         if self._spare is None and now_s >= self._spare_due_s:
             self._spare = self._started()
+            realtime.stand_by(self._spare.pid)
         return self._spare is not None and bool(self._spare.vitals["prepared"])
 
     # --- watchdog ---
