@@ -92,6 +92,7 @@ def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
         "dropped": summary["frames_dropped"],
         "dropped_by": summary["dropped_by"],
         "missed_by_planner": summary["frames_processed"] - received,
+        "predicted": sum(_overtaken(message.record.status) for message in result.messages),
         "coasted": sum(Status.PERCEPTION_LATE in message.record.status for message in result.messages),
         "cpu_cores": round(float(sum(np.mean(values) for values in cpu.values() if len(values))), 3),
         "cpu_cores_by": {name: round(float(np.mean(values)), 3) for name, values in cpu.items() if len(values)},
@@ -116,6 +117,11 @@ def figures(result: Run, warm_up_s: float = 0.0) -> dict[str, Any]:
         "networks": summary["models"],
         "noise": noise("age_ms", age_ms) | noise("period_ms", periods_ms) | _noise_of_cpu(cpu),
     }
+
+
+def _overtaken(status: Sequence[Status]) -> bool:
+    """Whether perceive had no time to look at this frame, and said so in time."""
+    return Status.COASTING in status and Status.PERCEPTION_LATE not in status
 
 
 def age_of(message: Message) -> float:
@@ -213,7 +219,8 @@ def table(content: dict[str, Any]) -> str:
     cpu = ", ".join(f"{name} {cores:.2f}" for name, cores in content["cpu_cores_by"].items())
     lines = [
         f"{'rate':32}{content['rate_hz']:.2f} Hz",
-        f"{'dropped':32}{content['dropped']} of {content['frames']} frames, {content['coasted']} coasted",
+        f"{'dropped':32}{content['dropped']} of {content['frames']} frames, "
+        f"{content['predicted']} predicted and not looked at, {content['coasted']} coasted",
         f"{'cores':32}{content['cpu_cores']:.2f} ({cpu})",
         f"{'memory':32}{content['rss_mb']:.0f} MB, {content['pss_mb'] or 0:.0f} MB with shared pages counted once",
         *(

@@ -19,6 +19,8 @@ from birdslam.runtime.nodes.degradation import Degradation, Mode, modes
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.nodes import PerceiveNode
 from birdslam.runtime.process.restarts import FIRST
+from birdslam.runtime.transport.bus import Message
+from birdslam.runtime.wire import Trace
 from birdslam.types import INVALIDATING, Frame, FrameRef, Measurements, Status
 
 CONFIG = DegradationConfig(window_frames=4, late_share=0.5, calm_frames=6, calm_share=0.5)
@@ -101,8 +103,16 @@ def test_what_runs_in_each_mode(monkeypatch: pytest.MonkeyPatch, mode: Mode, run
 
 
 class Bus:
-    def subscriber(self, topic: str) -> Any:
-        return None
+    """`frames` wait to be received."""
+
+    def __init__(self, *frames: FrameRef) -> None:
+        self.frames = list(frames)
+
+    def subscriber(self, topic: str, depth: int | None = None) -> Any:
+        return self
+
+    def recv(self, timeout_s: float) -> Message | None:
+        return Message(self.frames.pop(0), Trace(), 0) if self.frames else None
 
 
 class Blind(FrontEnd):
@@ -144,6 +154,26 @@ def test_coasting_looks_at_few_frames_and_says_so() -> None:
     assert all(r.cc is None for r in coasted)
     assert Status.DEGRADED_ODOMETRY in records[5].status
     assert all(Status.INPUT_STALE in r.status for r in records if r.frame_id in frontend.shown)
+
+
+def test_a_frame_that_a_newer_one_overtakes_is_predicted() -> None:
+    configuration = Configuration(vehicle="test", models=ModelsConfig(shipped=False))
+    stamps = {"t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0}
+    came = [FrameRef(frame_id=number, slot=0, **stamps) for number in range(3)]
+    end = FrameRef(frame_id=5, slot=-1, **stamps, status=(Status.END_OF_SOURCE,))
+    bus, frontend = Bus(*came), Blind()
+    records: list[Measurements] = []
+    with Inference(configuration) as networks:
+        node = PerceiveNode(configuration, networks, frontend, bus, FIRST)  # type: ignore[arg-type]
+        node._ring = Ring()  # type: ignore[assignment]
+        while (message := node.receive(0.0)) is not None:
+            records += node.step(message.record)
+            if message.record.frame_id == 2:
+                bus.frames += [FrameRef(frame_id=3, slot=0, **stamps), FrameRef(frame_id=4, slot=0, **stamps), end]
+    assert [record.frame_id for record in records] == [0, 1, 2, 3, 4, 5]  # none is left out
+    assert [record.frame_id for record in records if Status.COASTING in record.status] == [0, 1, 3]
+    assert frontend.shown == [2, 4]  # the newest, and the last: the end overtakes nothing
+    assert node.ended
 
 
 def test_what_runs_aside_runs_where_nothing_is_to_be_left_out() -> None:

@@ -1,9 +1,9 @@
 """How often the networks look: what this computer carries, measured at the start, and less of it under load.
 
-A frame that comes while perceive is still at the one before waits, and the next one after it pushes it out. So before
+A frame that comes while perceive is still at the one before waits, and is only predicted if a next one comes. So before
 frames are late, the networks look at fewer of them: vehicles are followed and predicted between two looks, and the
 ego's motion is measured in every frame. This goes before the modes of degradation.py, which judge the age of what goes
-out: dropped frames keep that low.
+out: frames that are left out keep that low.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
@@ -29,6 +30,7 @@ from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameReader
 from birdslam.types import INVALIDATING, Frame, FrameRef, Measurements, Status
 
+WAITING_FRAMES = 8  # that come while perceive is at one are predicted, all but the newest; more are dropped
 STALE_BUDGETS = 3.0  # a frame that comes to perceive this many times later than budgeted bears INPUT_STALE
 
 log = logging.getLogger(__name__)
@@ -70,13 +72,15 @@ class PerceiveNode:
         self, configuration: Configuration, inference: Inference, frontend: FrontEnd, bus: Bus, assignment: Assignment
     ) -> None:
         self.ended = False
-        self._frames = bus.subscriber("frame")
+        degrades = configuration.degradation.enabled and not configuration.lossless
+        self._frames = bus.subscriber("frame", WAITING_FRAMES if degrades else None)
+        self._waiting: deque[Message] = deque()  # frames that have come, behind the one at hand
         self._ring = FrameReader(ring_path(configuration.vehicle, configuration.runtime_dir))
         self._inference = inference
         self._frontend = frontend
         self._torn = 0
         self._degradation: Degradation | None = None
-        if configuration.degradation.enabled and not configuration.lossless:
+        if degrades:
             budget_ms = configuration.budgets.perceived_ms
             self._degradation = Degradation(configuration.degradation, inference.roles, budget_ms)
         perceive = configuration.perceive
@@ -96,13 +100,26 @@ class PerceiveNode:
         return Mode.FULL if self._degradation is None else self._degradation.mode
 
     def receive(self, timeout_s: float) -> Message | None:
-        return self._frames.recv(timeout_s)
+        """The next frame, while `_waiting` has those that came after it."""
+        message = self._frames.recv(0.0 if self._waiting else timeout_s)
+        while message is not None:
+            self._waiting.append(message)
+            message = self._frames.recv(0.0) if self._degradation is not None else None
+        return self._waiting.popleft() if self._waiting else None
+
+    @property
+    def _overtaken(self) -> bool:
+        """Whether a newer frame waits already: the one at hand is predicted, since there is time for one of them."""
+        return any(Status.END_OF_SOURCE not in message.record.status for message in self._waiting)
 
     def step(self, ref: FrameRef) -> Iterator[Measurements]:
         begun_ns = time.monotonic_ns()
         if Status.END_OF_SOURCE in ref.status:
             self.ended = True
             yield Measurements(**stamps(ref), status=ref.status)
+            return
+        if self._overtaken:
+            yield self._coast(ref)
             return
         image = None
         if ref.slot >= 0:
@@ -123,7 +140,7 @@ class PerceiveNode:
             log.warning("frame %d: mode %s after %s", ref.frame_id, self._degradation.mode, mode)
 
     def _keep_pace(self, frame_id: int, step_ms: float) -> None:
-        """Networks that look less often before frames are dropped, and more often once there is time."""
+        """Networks that look less often where frames were left out, and more often once there is time."""
         dropped = self._last_frame is not None and frame_id > self._last_frame + 1
         self._last_frame = frame_id
         if self._look_rate is not None and self._look_rate.judge(step_ms, dropped):
