@@ -144,7 +144,7 @@ def test_vehicles_get_edges_when_confirmed_and_only_from_this_frames_boxes() -> 
     box = [550.0, 180.0, 650.0, 260.0]
     script = {k: motion(k, SE2(0.0, 0.0, 0.0)) for k in range(1, 6)}
     out = run(script, [seeing(box), seeing(box), seeing(box), seeing(box, age=1), seeing(box), seeing(box)])
-    assert [len(m.cv) for m in out] == [0, 0, 1, 0, 1, 1]
+    assert [len(m.cv) for m in out] == [0, 1, 1, 0, 1, 1]
     (edge,) = out[2].cv
     below_horizon_rad = math.atan2(260.0 - CAMERA.cy_px, CAMERA.fy_px) + CAMERA.pitch_rad
     assert edge.T_ego_vehicle.x_m == pytest.approx(1.65 / math.tan(below_horizon_rad) + 2.0, rel=0.08)

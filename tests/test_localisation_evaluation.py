@@ -63,7 +63,7 @@ def test_untruncated_cars_are_compared_and_a_tilted_road_is_found_out() -> None:
         match_cars(sequence, measure(sequence, detections, config)) for config in (FrontEndConfig(), PAPER)
     )
     assert {error.label for error in errors} == {1, 2}  # the first is truncated
-    assert {error.frame for error in errors} == set(range(2, 12))  # a track is confirmed in its third frame
+    assert {error.frame for error in errors} == set(range(1, 12))  # a track is confirmed in its second frame
     assert depth_error(errors, "15-30") < 0.05
     assert depth_error(paper, "15-30") > 0.15
     # Eq. 1 on level ground, on the nearest face
