@@ -43,6 +43,8 @@ class ModelsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     multitask: ModelSpec | None = None  # one network for all of these; the others stand before it, each for its own
     pointnet: ModelSpec | None = None  # Frustum-PointNet: bodies from the depth network's points
     shipped: bool = True  # the package's own network runs where no other finds vehicles or the road
+    # the multi-task network looks beside another detector, whose boxes get the bodies (depth, length, yaw) it finds
+    bodies: bool = False
     completion: bool = True  # the package's own ENet completes the lanes where something hid the road
 
     def given(self) -> dict[str, ModelSpec]:
@@ -53,7 +55,8 @@ class ModelsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     def in_use(self) -> dict[str, ModelSpec]:
         """Role -> network of images that runs, in a fixed order."""
         given = self.given()
-        if self.shipped and "multitask" not in given and not {"detector", "segmenter"} <= set(given):
+        unfilled = not {"detector", "segmenter"} <= set(given)
+        if self.shipped and "multitask" not in given and (unfilled or self.bodies):
             given["multitask"] = ModelSpec(path=str(SHIPPED_NETWORKS / SHIPPED_MULTITASK))
         return given
 

@@ -97,6 +97,9 @@ def test_the_shipped_network_fills_what_is_left() -> None:
     paths = {f"models.{role}.path": "own.onnx" for role in ("detector", "segmenter", "depth")}
     assert list(load(None, paths).models.in_use()) == ["detector", "segmenter", "depth"]
     assert load(None, {"models.multitask.path": "own.onnx"}).models.in_use() == {"multitask": own}
+    both = {"models.detector.path": "own.onnx", "models.segmenter.path": "own.onnx"}
+    assert list(load(None, both).models.in_use()) == ["detector", "segmenter"]
+    assert list(load(None, both | {"models.bodies": True}).models.in_use()) == ["detector", "segmenter", "multitask"]
     assert load(None, {"models.shipped": False}).models.in_use() == {}
 
 

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.perception.body_overlap import with_bodies
 from birdslam.perception.depth import DepthMap
 from birdslam.perception.detection import Detections
 from birdslam.perception.findings import Findings
@@ -93,11 +94,12 @@ class Networks:
 
     A head is due when `every` frames have passed since the one it last started on, so that a dropped frame doesn't
     starve it; while its last run is under way it isn't started again. `sparing` may be set between two frames: then
-    each head is due after so many times as many. A head that fills several roles leaves those to
-    others that have a head of their own. `submit(run, image) -> Future` is the executor's
-    (birdslam has no threads of its own; it needs one for each head). `patience_s` None awaits every head that runs, so
-    that the results depend on the frames alone. Else `result()` waits that long in all, for the heads that started on
-    its frame and are `awaited`; what isn't there is carried and goes on in the background.
+    each head is due after so many times as many. A head that fills several roles leaves those to others that have a
+    head of their own; with `bodies` what it knows of vehicles' bodies counts in the other detector's boxes all the
+    same, where both looked at one image (body_overlap.py). `submit(run, image) -> Future` is the executor's (birdslam
+    has no threads of its own; it needs one for each head). `patience_s` None awaits every head that runs, so that the
+    results depend on the frames alone. Else `result()` waits that long in all, for the heads that started on its frame
+    and are `awaited`; what isn't there is carried and goes on in the background.
     """
 
     def __init__(
@@ -105,6 +107,7 @@ class Networks:
         heads: Sequence[Head],
         submit: Callable[..., Future[Any]],
         patience_s: float | None = None,
+        bodies: bool = False,
     ) -> None:
         for key in ("name", "role"):
             values = [getattr(head, key) for head in heads]
@@ -115,6 +118,7 @@ class Networks:
         self.heads = tuple(heads)
         self._submit = submit
         self._patience_s = patience_s
+        self._bodies = bodies
         own = {head.role for head in heads}
         self._slots = [
             _Slot(
@@ -140,7 +144,8 @@ class Networks:
         for slot in self._slots:
             every = slot.head.schedule.every * self.sparing
             due = slot.started_frame is None or frame_id - slot.started_frame >= every
-            wanted = bool(slot.fills) and (only is None or not set(only).isdisjoint(slot.fills))
+            feeds = {*slot.fills, *(("detector",) if self._bodies and slot.head.role in ROLES else ())}
+            wanted = bool(feeds) and (only is None or not feeds.isdisjoint(only))
             if image is not None and due and wanted and slot.running is None:
                 slot.running = self._submit(slot.head.run, image)
                 slot.started_frame = frame_id
@@ -152,8 +157,17 @@ class Networks:
         self._await(frame_id)
         status = self._take_results(frame_id)
         found = {FIELDS[role]: getattr(s.findings, FIELDS[role]) for s in self._slots for role in s.fills}
+        found["detections"] = self._with_bodies(found.get("detections"))
         ages = {name: frame_id - s.found_frame for s in self._slots if s.found_frame is not None for name in s.names}
         return Perception(**found, ages=ages, status=tuple(dict.fromkeys(status)))
+
+    def _with_bodies(self, detections: Detections | None) -> Detections | None:
+        """The detector's boxes with the bodies that a head of several roles found in the same image."""
+        own = next((s for s in self._slots if s.head.role == "detector"), None)
+        many = next((s for s in self._slots if s.head.role in ROLES), None)
+        if not self._bodies or detections is None or own is None or many is None:
+            return detections
+        return with_bodies(detections, many.findings.detections) if own.found_frame == many.found_frame else detections
 
     def _await(self, frame_id: int) -> None:
         """Until the heads that the frame waits for are done, or its patience is over."""

@@ -110,7 +110,7 @@ def _with_length(of_class: Dimensions, length_m: float, sigma_m: float) -> Dimen
     share = sigma_class_m**2 / (sigma_class_m**2 + sigma_m**2)
     together_m = of_class.length_m + share * (length_m - of_class.length_m)
     return msgspec.structs.replace(
-        of_class, length_m=together_m, sigma_length_rel=math.sqrt(share) * sigma_m / together_m
+        of_class, length_m=together_m, sigma_length_rel=math.sqrt(1.0 - share) * sigma_class_m / together_m
     )
 
 

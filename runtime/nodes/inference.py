@@ -73,7 +73,8 @@ class Inference(Closing):
         self._behind = ThreadPoolExecutor(max(1, len(heads)), "network-behind", initializer=realtime.give_way)
         self._beside = ThreadPoolExecutor(1, "beside", initializer=realtime.give_way)
         self._frame_over = threading.Event()
-        self.networks = Networks(heads, self._submit, None if self._deadline_ns is None else 0.0)
+        patience_s = None if self._deadline_ns is None else 0.0
+        self.networks = Networks(heads, self._submit, patience_s, bodies=configuration.models.bodies)
 
     def _submit(self, run: Run, *arguments: Any) -> Future[Any]:
         if run not in self._awaited and self._deadline_ns is not None:
