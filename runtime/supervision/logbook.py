@@ -47,6 +47,7 @@ class Logbook:
         self.age = Distribution()
         self.stages: dict[str, Distribution] = {}
         self.statuses: Counter[str] = Counter()
+        self.predicted = 0  # frames that perceive answered without looking at them
         self.speed_sources: Counter[str] = Counter()
         self._results = results
         self._listeners = tuple(listeners)
@@ -84,6 +85,7 @@ class Logbook:
         self._latest = estimate
         if Status.PERCEPTION_LATE in estimate.status:  # nothing was measured: no row, and no frame that was processed
             return
+        self.predicted += Status.COASTING in estimate.status
         for listener in self._listeners:
             listener.add(estimate)
         self._write(self._results.add, estimate)

@@ -37,6 +37,7 @@ def summarise(
         "source": configuration.source.uri,
         "frames_in": sent["capture"] + by["capture"],
         "frames_processed": logbook.recorded,
+        "frames_predicted": logbook.predicted,  # of those: perceive had no time to look at them
         "frames_dropped": sum(by.values()),
         "dropped_by": by,
         "looks": stations["perceive"].total("looks"),  # frames on which networks were begun
@@ -79,11 +80,13 @@ def table(summary: dict[str, Any], output: Path) -> str:
     budget = f"p{whole['percentile']:g} within {whole['end_to_end_ms']:g} ms: {'kept' if whole['kept'] else 'NOT KEPT'}"
     dropped = {name: n for name, n in summary["dropped_by"].items() if n}
     by = f" ({', '.join(f'{n} by {name}' for name, n in dropped.items())})" if dropped else ""
+    unseen = summary["frames_predicted"]
+    predicted = f" ({unseen} of them predicted, not looked at)" if unseen else ""
     rows = [
         ("ended", summary["ended"]),
         (
             "frames",
-            f"{summary['frames_in']} in, {summary['frames_processed']} processed, "
+            f"{summary['frames_in']} in, {summary['frames_processed']} processed{predicted}, "
             f"{summary['frames_dropped']} dropped{by}",
         ),
         ("rate", f"{summary['rate_hz']:.2f} Hz"),
