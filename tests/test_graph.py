@@ -290,6 +290,21 @@ def test_a_frame_without_a_picture_repeats_the_pose_and_knows_it_less_well(statu
     assert after.epoch == 0
 
 
+def test_a_frame_that_nobody_looked_at_is_told_by_the_last_motion() -> None:
+    world = drive(DriveConfig(frames=30), seed=6)
+    last, ahead = world.measurements[19], world.measurements[23]
+    coasts = Measurements(
+        frame_id=23, t_source_ns=ahead.t_source_ns, t_capture_ns=1, t_utc_ns=2, status=(Status.COASTING,)
+    )
+    before, told = run([*world.measurements[:20], coasts], GraphConfig())[19:]
+    truth = [SE2(*world.ego[k]) for k in (19, 23)]
+    moved, told_m = truth[0].between(truth[1]), before.T_world_ego.between(told.T_world_ego)
+    assert told.valid
+    assert last.t_source_ns < told.t_source_ns
+    assert abs(told_m.between(moved).x_m) < 0.1 * moved.x_m
+    assert all(t > b for t, b in zip(told.cov[::4], before.cov[::4], strict=True))
+
+
 def test_nothing_is_known_before_the_first_picture() -> None:
     blind = Measurements(frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, status=(Status.FRAME_UNREADABLE,))
     world = drive(DriveConfig(frames=5), seed=6)

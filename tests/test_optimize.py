@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.runtime.configuration import (
     BudgetsConfig,
@@ -175,7 +176,10 @@ def test_late_measurements_correct_what_was_told(tmp_path: Path) -> None:
     (better,) = estimates(node, DRIVE[10])  # two frames behind: of the newest that was told, from where this one is
     assert (guessed.frame_id, better.frame_id) == (12, 12)
     assert Status.PERCEPTION_LATE in better.status
-    assert better.T_world_ego == goal[10].T_world_ego != guessed.T_world_ego
+    step, passed_ns = DRIVE[10].cc, DRIVE[10].t_source_ns - DRIVE[9].t_source_ns
+    assert step is not None
+    way = SE2.exp(step.T_from_to.log() * (better.t_source_ns - goal[10].t_source_ns) / passed_ns)
+    assert better.T_world_ego == (goal[10].T_world_ego @ way) != guessed.T_world_ego
     assert node.counters()["outrun"] == 1
     assert estimates(node, DRIVE[11])[0].frame_id == 12
     assert estimates(node, DRIVE[12]) == [goal[12]]  # the same frame again, and now measured

@@ -327,16 +327,26 @@ class PoseGraph:
     # --- the newest frame's estimates ---
 
     def _coast(self, m: Measurements) -> Estimate:
-        """A frame without a picture: the last pose, as uncertain as the time since then makes it."""
+        """A frame without a picture: the last pose, as uncertain as the time since then makes it.
+
+        One that nobody looked at is told by the last motion, which may have changed meanwhile.
+        """
         window, config = self._window, self.config
         if window is None:
             return self._estimate(m, (*m.status, Status.NOT_INITIALISED), np.zeros((3, 3)), ())
         m = msgspec.structs.replace(m, speed_sources=m.speed_sources or (SpeedSource.CARRIED,))
         since_s = max((m.t_source_ns - self._t_ns) * 1e-9, 0.0)
-        rate = np.abs(self._motion.log()) / max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
-        rate += np.array([config.blind_mps, config.blind_mps, config.blind_radps])
-        cov = window.ego_cov + np.diag(np.square(rate * since_s))
-        return self._estimate(m, m.status, cov, self._vehicle_estimates(m, window))
+        twist = self._motion.log() / max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
+        change = np.array([config.blind_mps, config.blind_mps, config.blind_radps])
+        way = SE2()
+        if Status.COASTING in m.status:
+            way = SE2.exp(twist * since_s)
+        else:
+            change += np.abs(twist)
+        back = way.inverse().adjoint()
+        cov = back @ window.ego_cov @ back.T + np.diag(np.square(change * since_s))
+        estimate = self._estimate(m, m.status, cov, self._vehicle_estimates(m, window))
+        return msgspec.structs.replace(estimate, T_world_ego=window.world @ way)
 
     def _vehicle_estimates(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
         return vehicle_estimates(window, self._vehicles.nodes, m.t_source_ns, self._changes, self._birth_det)

@@ -1,4 +1,4 @@
-"""What the optimizer says of frames that perceive does not answer in time: the last pose with a growing covariance.
+"""What the optimizer says of frames that perceive does not answer in time: a prediction with a growing covariance.
 
 A planner is told at each frame, by its budget, whether perceive is dead, stalled or merely slow. Nothing of it enters
 the graph: when the measurements come after all, it goes on as if they had come in time.

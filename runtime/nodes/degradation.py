@@ -2,7 +2,7 @@
 
     full -> rate (networks on fewer frames) -> boxes (the detector alone) -> odometry (no network) -> coasting
 
-In `coasting` most frames are not looked at: the last pose with a growing covariance, invalid after a while. Each mode
+In `coasting` most frames are not looked at: predicted, with a growing covariance, invalid after a while. Each mode
 but the first is a status in the measurements, and so in the estimate.
 """
 
