@@ -35,9 +35,7 @@ class Status(enum.StrEnum):
     DEGRADED_RATE = "degraded_rate"  # short of time: the networks run on fewer frames
     DEGRADED_BOXES = "degraded_boxes"  # short of time: the detector alone runs, no road and no lanes
     DEGRADED_ODOMETRY = "degraded_odometry"  # short of time: no network runs, the ego alone is followed
-    COASTING = (
-        "coasting"  # short of time: nobody looked at this frame; predicted by the last motion, the covariance grown
-    )
+    COASTING = "coasting"  # short of time: nobody looked at this frame; told by the last motion, less surely
     COASTED_TOO_LONG = "coasted_too_long"  # no frame has been looked at for too long
     PERCEPTION_LATE = "perception_late"  # perceive has not answered in time: the optimizer coasts from the last answer
     GRAPH_RESET = "graph_reset"  # the optimizer began a new epoch on this frame
