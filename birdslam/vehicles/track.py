@@ -23,7 +23,7 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_iou: float = 0.15  # of a box with the one predicted from bird's-eye view
     gate_sigma: float = 3.0  # Mahalanobis distance in bird's-eye view past which boxes are never the same vehicle
     birth_score: float = 0.5  # a detection must reach it to begin a track
-    confirm_hits: int = 2  # a track gets its id when it has been seen so often
+    confirm_hits: int = 2  # a track gets its id when it has been seen so often; KITTI tracking chose between 2 and 3
     forget_unconfirmed_s: float = 0.25  # without a detection, of a track without an id
     forget_s: float = 1.0  # without a detection, of a track with an id
     sigma_accel_mps2: float = 3.0  # 1-sigma of a vehicle's acceleration
