@@ -13,11 +13,12 @@ from birdslam.runtime.process.workers import workers
 
 LIMIT_S = 60.0
 BUSY = """
+import os
 import signal
 from birdslam.runtime.process.workers import workers
 
 def work(number):
-    print(f"task {number} begun", flush=True)
+    os.write(1, f"task {number} begun\n".encode())  # at once: two print to one pipe
     signal.pause()
 
 if __name__ == "__main__":
