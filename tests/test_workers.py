@@ -18,7 +18,7 @@ import signal
 from birdslam.runtime.process.workers import workers
 
 def work(number):
-    os.write(1, f"task {number} begun\n".encode())  # at once: two print to one pipe
+    os.write(1, f"task {number} begun\\n".encode())  # at once: two print to one pipe
     signal.pause()
 
 if __name__ == "__main__":
@@ -33,13 +33,16 @@ def test_workers_end_with_a_process_that_is_killed(how: signal.Signals, tmp_path
     script = tmp_path / "busy.py"
     script.write_text(BUSY)
     process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    begun = {process.stdout.readline() for _ in range(2)}
-    assert begun == {"task 0 begun\n", "task 1 begun\n"}
-    process.send_signal(how)
-    out, _ = process.communicate(timeout=LIMIT_S)  # returns once nobody holds the workers' standard output any more
-    assert process.returncode == -how
-    assert out == ""  # the tasks that waited were not begun
+    try:
+        assert process.stdout is not None
+        begun = {process.stdout.readline() for _ in range(2)}
+        assert begun == {"task 0 begun\n", "task 1 begun\n"}
+        process.send_signal(how)
+        out, _ = process.communicate(timeout=LIMIT_S)  # returns once nobody holds the workers' standard output any more
+        assert process.returncode == -how
+        assert out == ""  # the tasks that waited were not begun
+    finally:
+        process.kill()
 
 
 @pytest.mark.processes
