@@ -14,13 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.baselines.trajectories import Trajectories
+from birdslam.baselines.trajectories import Method, Trajectories
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.types import Measurements, VehicleEdge
@@ -50,19 +49,12 @@ class ShapePriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cut_margin_px: float = 4.0  # an edge so near to the image's border is none of the vehicle's
 
 
-class _Method(Protocol):
-    @property
-    def label(self) -> str: ...
-
-    def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories: ...
-
-
 @dataclass(frozen=True)
 class Initialised:
     """A baseline on the log's vehicles as the shape prior places them."""
 
     label: str
-    method: _Method
+    method: Method
 
     def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
         """Trajectories of the whole log at once."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
+from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.types import Estimate, Measurements
 
@@ -18,6 +20,15 @@ class Trajectories:
 
     def put_vehicle(self, vehicle: int, frame: int, pose: SE2) -> None:
         self.vehicles.setdefault(vehicle, {})[frame] = pose
+
+
+class Method(Protocol):
+    """Whatever makes trajectories of a log: a module of this package, or a back end of ours."""
+
+    @property
+    def label(self) -> str: ...
+
+    def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories: ...
 
 
 class LiveTrajectories:

@@ -14,9 +14,9 @@ from types import MappingProxyType
 import msgspec
 
 from birdslam.baselines import batch_se3
-from birdslam.baselines.trajectories import Trajectories
+from birdslam.baselines.trajectories import Method, Trajectories
 from birdslam.evaluation.completed_lanes import of_kind, with_completed_lanes
-from birdslam.evaluation.tracking import PAPER, Final, Live, Method
+from birdslam.evaluation.tracking import PAPER, Final, Live
 from birdslam.geometry.camera import Camera
 from birdslam.graph.pose_graph import GraphConfig
 from birdslam.graph.weights import NO_WEIGHT, EdgeType, WeightsConfig

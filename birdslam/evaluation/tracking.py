@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from birdslam.baselines import batch_se3, cubeslam, nair, namdev
 from birdslam.baselines.shape_prior import Initialised
-from birdslam.baselines.trajectories import LiveTrajectories, Trajectories
+from birdslam.baselines.trajectories import LiveTrajectories, Method, Trajectories
 from birdslam.datasets.kitti import KITTI_RATE_HZ
 from birdslam.datasets.kitti_tracking import VEHICLE_KINDS, TrackingSequence
 from birdslam.datasets.speed_log import SpeedLog
@@ -44,15 +43,6 @@ EGO = "ego"
 LEAST_FRAMES = 5  # a vehicle matched in fewer is left out of the report, unless the paper names it
 
 NO_IMAGE = np.zeros((1, 1), dtype=np.uint8)  # for an odometry that needs none
-
-
-class Method(Protocol):
-    """A module of baselines/, `Live` or `Final`."""
-
-    @property
-    def label(self) -> str: ...
-
-    def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories: ...
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from birdslam.baselines import batch_se3, nair
 from birdslam.baselines.posegraph3 import solve_batch
+from birdslam.baselines.trajectories import Method
 from birdslam.datasets.kitti import find_images, read_image
 from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.datasets.recording import DatasetError
@@ -27,7 +28,6 @@ from birdslam.evaluation.tables import Published
 from birdslam.evaluation.told import motion_row, range_rows, sights
 from birdslam.evaluation.tracking import (
     PAPER,
-    Method,
     Row,
     Trial,
     Truth,
