@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace as with_
 
+import msgspec
 import numpy as np
 import pytest
 import tracking_world
@@ -15,7 +16,7 @@ from test_tracking_evaluation import log_of
 
 from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking
 from birdslam.evaluation.motion_consistency import _of_length
-from birdslam.evaluation.relative_nees import NeesRow, nees_rows
+from birdslam.evaluation.relative_nees import NeesRow, nees_rows, over_seeds
 from birdslam.evaluation.tables import nees_table
 from birdslam.evaluation.tracking import ours
 from birdslam.geometry.se2 import SE2
@@ -88,3 +89,12 @@ def test_without_vehicles_there_is_nothing_to_judge(world: tuple[TrackingSequenc
     sequence, log = world
     bare = rows_of(with_(sequence, labels=()), log)
     assert (bare["vehicles", "frame"].n, bare["vehicles", "frame"].nees) == (0, None)
+
+
+def test_seeds_count_by_what_each_of_them_judged() -> None:
+    row = NeesRow(sequence="0002", odometry="simulate", of="ego", per="frame", n=30, nees=1.0, nees_median=0.5)
+    seeds = [[row], [msgspec.structs.replace(row, n=10, nees=2.0)], [msgspec.structs.replace(row, n=0, nees=None)]]
+    (both,) = over_seeds(seeds)
+    assert (both.n, both.nees, both.nees_median) == (40, 1.25, 0.5)
+    (none,) = over_seeds([[msgspec.structs.replace(row, n=0, nees=None, nees_median=None)]] * 2)
+    assert (none.n, none.nees, none.nees_median) == (0, None, None)

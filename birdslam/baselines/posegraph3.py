@@ -183,10 +183,11 @@ class _Builder:
         out = Trajectories()
         if not self.poses:
             return out, Convergence(0, False, 0.0)
-        params = gtsam.LevenbergMarquardtParams()
+        # Not Levenberg-Marquardt: a change of the scale moves every node, which its damping forbids to each
+        params = gtsam.DoglegParams()
         params.setMaxIterations(self.config.iterations)
         params.setRelativeErrorTol(1e-8)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, self.values, params)
+        optimizer = gtsam.DoglegOptimizer(self.graph, self.values, params)
         solution = optimizer.optimize()
         step = math.nan
         if check:

@@ -92,6 +92,25 @@ def nees_rows(sequence: TrackingSequence, log: Sequence[Measurements], live: Liv
     return rows
 
 
+def over_seeds(rows: Sequence[Sequence[NeesRow]]) -> list[NeesRow]:
+    """One row each of what seeds have one of: all that they judged, and the means over it."""
+    return [
+        msgspec.structs.replace(
+            same[0],
+            n=sum(row.n for row in same),
+            nees=_mean([(row.nees, row.n) for row in same]),
+            nees_median=_mean([(row.nees_median, row.n) for row in same]),
+        )
+        for same in zip(*rows, strict=True)
+    ]
+
+
+def _mean(values: Sequence[tuple[float | None, int]]) -> float | None:
+    """Of values with their weights; None where there is none."""
+    known = [(value, weight) for value, weight in values if value is not None and weight]
+    return sum(value * weight for value, weight in known) / sum(weight for _, weight in known) if known else None
+
+
 def _ego_rows(sequence: str, odometry: str, per: str, found: MotionConsistency) -> list[NeesRow]:
     ego = NeesRow(
         sequence=sequence,

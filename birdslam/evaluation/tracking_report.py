@@ -32,9 +32,9 @@ ABOUT_NEES = (
     "Squared errors over what was stated, a degree of freedom: 1 is honest, more is too sure. *Median* is the median "
     "over that of an honest error, which a few wild errors do not move. The ego's are those of each frame's motion and "
     "of 10 m of motions, the scale's the part of these along the way. Truth's own noise is added, but not to simulated "
-    "odometry, which errs from the true poses themselves. Its rows say how well the simulation knows itself: over 10 m "
-    "its scale errs less than the graph takes for granted, which is told of odometry whose error lasts. Rows of images "
-    "alone are of our odometry. "
+    "odometry, which errs from the true poses themselves. Its rows say how well the simulation knows itself, over all "
+    "seeds: over 10 m its scale errs less than the graph takes for granted, whose memory of it is that of our own "
+    "odometry and longer than the simulation's. Rows of images alone are of our odometry. "
     "A vehicle's are of its place in the ego's frame as the live graph has it, in the frames that see it, and in the "
     "frame that the ego had 10 m before. Vehicles' errors last: a few vehicles are few samples, however many frames."
 )
@@ -179,10 +179,10 @@ def _runtime(outcomes: Sequence[Outcome], published: Published) -> str:
         "## Runtime of the optimisation",
         "",
         "Seconds for so many first frames of a sequence on this computer, other processes beside it: all updates of "
-        "our live graph (the median of three runs), and one solve of the batch in SE(3), of odometry of unknown scale "
-        "(as the paper's) and of metric odometry. A batch has its iterations in brackets; one that has not converged "
-        "has no ratio. The factors of the unknown scale are Python in gtsam's solver, the others are its own. "
-        "`runtime.png` shows each update.",
+        "our live graph, and one solve of the batch in SE(3), of odometry of unknown scale (as the paper's) and of "
+        "metric odometry, each the median of three runs. A batch has its iterations in brackets; one that has not "
+        "converged has no ratio. The factors of the unknown scale are Python in gtsam's solver, the others are its "
+        "own. `runtime.png` shows each update.",
         "",
         "| Seq | frames | incremental | batch, unscaled | ratio | batch, metric | ratio |",
         "| --- | --- | --- | --- | --- | --- | --- |",
