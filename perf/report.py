@@ -8,6 +8,7 @@ from typing import Any
 
 from birdslam.perf import plots
 from birdslam.perf.machine import ROOT
+from birdslam.runtime.latency import key_of
 
 FEW = 1000
 Benchmarks = Mapping[str, Mapping[str, Any]]
@@ -125,7 +126,7 @@ def _system(benchmarks: Benchmarks) -> Iterator[str]:
         budgets = {row["budget"]: row for row in run["budgets"]}
         rows = []
         for stage, figures in [*run["stages"].items(), ("whole", run["age_ms"])]:
-            key = "end_to_end_ms" if stage == "whole" else f"{stage.replace(' -> ', '_to_')}_ms"
+            key = "end_to_end_ms" if stage == "whole" else f"{key_of(stage)}_ms"
             budget = budgets.get(key, {})
             limit = f"p{budget['percentile']:g} {budget['limit_ms']:g}" if budget else None
             figured = (figures["mean"], figures.get("mean_in_tail"), *_percentiles(figures, ("p50", "p99", "max")))

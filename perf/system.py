@@ -23,7 +23,7 @@ from birdslam.perf.figures import BLOCKS, Ledger, curve, noise, numbers, shown, 
 from birdslam.perf.live import Ask, Run, add_run_options, drive
 from birdslam.perf.machine import Steal, loaded
 from birdslam.runtime.configuration import BudgetsConfig
-from birdslam.runtime.latency import stages
+from birdslam.runtime.latency import key_of, queue_of, stages
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Message
 from birdslam.types import Status
@@ -200,7 +200,8 @@ def budgets(
     limits = msgspec.convert(configured, BudgetsConfig)
     measured = {"end_to_end_ms": age_ms}
     for name, values in parts_ms.items():
-        measured[f"{name.replace(' -> ', '_to_')}_ms"] = gone(values)
+        waited_ms = np.nan_to_num(parts_ms.get(queue_of(name), np.zeros(1)))
+        measured[f"{key_of(name)}_ms"] = gone(values + waited_ms)
     for key in BudgetsConfig.__struct_fields__:
         if key != "percentile" and measured.get(key, np.zeros(0)).size:
             value = float(np.percentile(measured[key], limits.percentile))

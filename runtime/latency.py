@@ -79,8 +79,21 @@ class Recent:
 
 
 def stages(trace: Trace, t_received_ns: int) -> Iterator[tuple[str, float]]:
-    """(name, ms) of each step, of each hop between nodes, and of the last hop to whoever received the message."""
-    arrivals = [(after.node, after.received_ns) for after in trace.stages[1:]] + [("planner", t_received_ns)]
+    """(name, ms) of each wait in a node's queue, of each step, of each hop between nodes, the last to the receiver."""
+    arrivals = [(after.node, after.arrived_ns or after.received_ns) for after in trace.stages[1:]]
+    arrivals.append(("planner", t_received_ns))
     for stage, (receiver, arrival_ns) in zip(trace.stages, arrivals, strict=False):
+        if stage.arrived_ns:
+            yield queue_of(stage.node), (stage.received_ns - stage.arrived_ns) / 1e6
         yield stage.node, (stage.done_ns - stage.received_ns) / 1e6
         yield f"{stage.node} -> {receiver}", (arrival_ns - stage.done_ns) / 1e6
+
+
+def queue_of(node: str) -> str:
+    """The name of the stage in which a record waits for the node, which is at another one."""
+    return f"{node} queue"
+
+
+def key_of(stage: str) -> str:
+    """A stage's name as a plain word, as in `budgets.capture_to_perceive_ms`."""
+    return stage.replace(" -> ", "_to_").replace(" ", "_")

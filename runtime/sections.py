@@ -164,16 +164,17 @@ class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 class BudgetsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How long each node, each hop and the whole may take, from a frame's capture on, at `percentile` of the frames.
 
+    What waits in a node's queue waits because that node is at another record: the node's budget holds both together.
     Raises ValueError where the parts exceed the whole.
     """
 
     # of the frames must keep each limit, in percent
     percentile: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)] = 99.0
     capture_ms: Positive = 10.0  # capture's step
-    capture_to_perceive_ms: Positive = 10.0  # the hop, with its wait in a queue
-    perceive_ms: Positive = 100.0  # perceive's step
-    perceive_to_optimize_ms: Positive = 10.0  # the hop, with its wait in a queue
-    optimize_ms: Positive = 10.0  # optimize's step
+    capture_to_perceive_ms: Positive = 10.0  # the hop, until the frame has arrived there
+    perceive_ms: Positive = 100.0  # perceive's step, with the frame's wait in its queue
+    perceive_to_optimize_ms: Positive = 10.0  # the hop, until the measurements have arrived there
+    optimize_ms: Positive = 10.0  # optimize's step, with the measurements' wait in its queue
     optimize_to_planner_ms: Positive = 10.0  # the hop, with its wait in a queue
     end_to_end_ms: Positive = 150.0  # the whole, from the frame's capture to the planner
 
@@ -184,7 +185,7 @@ class BudgetsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
             raise ValueError(f"{' + '.join(parts)} = {total_ms:g} is over end_to_end_ms = {self.end_to_end_ms:g}")
 
     def step_ms(self, node: str) -> float:
-        """What one node may take for a frame."""
+        """What one node may take for a frame, its wait in the queue included."""
         limit_ms: float = getattr(self, f"{node}_ms")
         return limit_ms
 

@@ -41,9 +41,10 @@ class Stage(msgspec.Struct, frozen=True, array_like=True):
     """What one node did with a message, on CLOCK_MONOTONIC: received it, finished its step, sent the result."""
 
     node: _NodeName
-    received_ns: int  # taken up: what it waited in the node's queue belongs to the hop
+    received_ns: int  # taken up
     done_ns: int
     sent_ns: int = 0  # stamped by Publisher.put
+    arrived_ns: int = 0  # in the node's process: until it was taken up it waited in the queue; 0: nobody said
 
 
 class Trace(msgspec.Struct, frozen=True):
@@ -53,14 +54,14 @@ class Trace(msgspec.Struct, frozen=True):
     left_ns: int | None = None  # of the budget end to end when an estimate was done; negative: it is late
     number: _Count = 0  # of this message among its publisher's, from 1 on: a gap tells that some were lost
 
-    def after(self, node: str, received_ns: int, done_ns: int) -> Trace:
+    def after(self, node: str, received_ns: int, done_ns: int, arrived_ns: int = 0) -> Trace:
         """The trace of what `node` made of this message: one stage more."""
-        return Trace((*self.stages, Stage(node, received_ns, done_ns)))
+        return Trace((*self.stages, Stage(node, received_ns, done_ns, arrived_ns=arrived_ns)))
 
     def sent(self, sent_ns: int, number: int) -> Trace:
         """The trace with the sending of its last stage stamped, as its publisher's message of this number."""
         *earlier, last = self.stages
-        return Trace((*earlier, Stage(last.node, last.received_ns, last.done_ns, sent_ns)), self.left_ns, number)
+        return Trace((*earlier, msgspec.structs.replace(last, sent_ns=sent_ns)), self.left_ns, number)
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True):
@@ -92,8 +93,8 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     wait: Spread = Spread()  # from sent to taken up; capture: from its due time
     step: Spread = Spread()  # from taken up to done
     age: Spread = Spread()  # from the frame's capture to done
-    overruns: _Count = 0  # steps over this node's budget
-    late: _Count = 0  # records that took longer than the budget of their hop to come here
+    overruns: _Count = 0  # steps over this node's budget, with the record's wait in the queue
+    late: _Count = 0  # records that took longer than the budget of their hop to arrive here
     rss_bytes: _Count = 0
     cpu_percent: float = 0.0  # of one core, since the last Health
     mode: str = "full"  # of perceive: full, rate, boxes, odometry or coasting

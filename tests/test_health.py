@@ -101,14 +101,16 @@ def test_a_node_s_health() -> None:
     begun_ns = time.monotonic_ns()
     for number in range(20):
         taken_ns = begun_ns + number * 50 * MS
-        trace = Trace((Stage("capture", 0, 0, 0), Stage("perceive", 0, 0, taken_ns - 3 * MS)))
+        done_ns = taken_ns + (7 if number % 4 == 0 else 2) * MS
+        waited_ns = 4 * MS if number in (1, 2) else 0  # in the queue: this node's time, not the hop's
+        trace = Trace((Stage("capture", 0, 0, 0), Stage("perceive", 0, 0, taken_ns - waited_ns - 3 * MS)))
         meter.heard(taken_ns)
-        meter.frame(taken_ns - 40 * MS, trace, taken_ns, taken_ns + (7 if number % 4 == 0 else 2) * MS)
+        meter.frame(taken_ns - 40 * MS, trace.after("optimize", taken_ns, done_ns, taken_ns - waited_ns))
     assert not meter.due(begun_ns)
     now_ns = begun_ns + PERIOD_NS + 50 * MS
     assert meter.due(now_ns)
     health = meter.health(now_ns, "full", {"dropped": 1, "malformed": 2, "torn": 3})
-    assert (health.frames, health.overruns, health.late, health.restarts) == (20, 5, 0, 2)
+    assert (health.frames, health.overruns, health.late, health.restarts) == (20, 7, 0, 2)
     assert health.rate_hz == pytest.approx(20.0, rel=0.1)
     assert health.wait.p50_ms == pytest.approx(3.0, rel=0.02)
     assert (health.step.p50_ms, health.step.max_ms) == (pytest.approx(2.0, rel=0.02), pytest.approx(7.0))

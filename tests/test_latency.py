@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.runtime.latency import Distribution, stages
+from birdslam.runtime.latency import Distribution, key_of, stages
 from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.wire import Trace
@@ -43,7 +43,7 @@ def test_the_stages_add_up_to_the_age() -> None:
         Trace()
         .after("capture", 10 * MS, 11 * MS)
         .after("perceive", 13 * MS, 40 * MS)
-        .after("optimize", 41 * MS, 42 * MS)
+        .after("optimize", 43 * MS, 44 * MS, arrived_ns=41 * MS)
     )
     parts = dict(stages(trace, 50 * MS))
     assert parts == {
@@ -51,11 +51,18 @@ def test_the_stages_add_up_to_the_age() -> None:
         "capture -> perceive": 2.0,
         "perceive": 27.0,
         "perceive -> optimize": 1.0,
+        "optimize queue": 2.0,
         "optimize": 1.0,
-        "optimize -> planner": 8.0,
+        "optimize -> planner": 6.0,
     }
     assert sum(parts.values()) == 40.0
     assert list(stages(Trace(), 5)) == []
+    assert [key_of(part) for part in parts][1:5] == [
+        "capture_to_perceive",
+        "perceive",
+        "perceive_to_optimize",
+        "optimize_queue",
+    ]
 
 
 def test_vitals_are_shared_through_their_descriptor() -> None:

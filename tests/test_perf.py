@@ -172,6 +172,24 @@ def test_budgets_are_those_of_the_configuration() -> None:
     assert broken == {"perceive_ms"}
 
 
+def test_what_waits_for_a_node_is_in_that_node_s_budget_and_not_in_the_hop_s() -> None:
+    run = _run(40.0)
+    for number in range(100, 110):
+        was = run.messages[number]
+        first, second, last = was.trace.stages
+        arrived_ns, by_ns = second.received_ns, 30 * MS
+        moved = [Stage(s.node, s.received_ns + by_ns, s.done_ns + by_ns, s.sent_ns + by_ns) for s in (second, last)]
+        waited = msgspec.structs.replace(moved[0], arrived_ns=arrived_ns)
+        run.messages[number] = Message(was.record, Trace((first, waited, moved[1])), was.t_received_ns + by_ns)
+    found = system.figures(run)
+    assert found["stages"]["perceive queue"]["n"] == 10
+    assert found["stages"]["capture -> perceive"]["max"] == pytest.approx(1.0)
+    held = {row["budget"]: row for row in found["budgets"]}
+    assert not held["perceive_ms"]["met"]
+    assert {name for name, row in held.items() if not row["met"]} == {"perceive_ms"}
+    assert sum(stage["mean"] for stage in found["stages"].values()) == pytest.approx(found["age_ms"]["mean"], abs=1e-2)
+
+
 def test_a_warm_up_is_left_out() -> None:
     run = _run(100.0).after(3.0)
     assert len(run.messages) == 200
@@ -231,7 +249,7 @@ def test_the_optimize_process_is_driven_with_vehicles_at_the_rate() -> None:
     assert row["vehicles"] == 4
     assert row["tracked"] > 3.0
     assert row["step_ms"]["n"] + row["dropped"] == row["frames"] == 20
-    assert set(row["stages"]) == {"perceive -> optimize", "optimize", "optimize -> planner"}
+    assert set(row["stages"]) == {"perceive -> optimize", "optimize queue", "optimize", "optimize -> planner"}
 
 
 def test_what_is_missing_is_a_row_of_accuracy(tmp_path: Path) -> None:

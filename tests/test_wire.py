@@ -199,7 +199,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
             ),
         ),
     ),
-    Trace((Stage("capture", 1000, 2000, 2500), Stage("perceive", 3000, 25_000, 26_000)), 42_000_000, 5),
+    Trace((Stage("capture", 1000, 2000, 2500, 900), Stage("perceive", 3000, 25_000, 26_000, 2700)), 42_000_000, 5),
 )
 BY_NAME = {type(example).__name__: example for example in EXAMPLES}
 by_name = pytest.mark.parametrize("name", BY_NAME)
@@ -364,7 +364,7 @@ def test_a_message_that_is_too_large_is_never_sent() -> None:
 
 
 def test_numpy_numbers_are_numbers_and_other_things_are_refused() -> None:
-    trace = Trace((Stage("capture", np.int64(1000), 2000, 2500), *BY_NAME["Trace"].stages[1:]), 42_000_000, 5)
+    trace = Trace((Stage("capture", np.int64(1000), 2000, 2500, 900), *BY_NAME["Trace"].stages[1:]), 42_000_000, 5)
     assert encode(trace) == golden("Trace")
     score = Ground(height_m=np.float64(1.65), pitch_rad=np.float32(0.5))
     assert decode(encode(score), Ground) == Ground(height_m=1.65, pitch_rad=0.5)
@@ -375,9 +375,9 @@ def test_numpy_numbers_are_numbers_and_other_things_are_refused() -> None:
 
 
 def test_the_trace_grows_by_a_stage() -> None:
-    trace = Trace().after("capture", 1, 2).sent(3, 1).after("perceive", 4, 5)
-    assert trace == Trace((Stage("capture", 1, 2, 3), Stage("perceive", 4, 5, 0)))
-    assert len(encode(Trace((Stage("n" * 32, 1 << 62, 1 << 62, 1 << 62),) * 8))) <= MAX_TRACE_BYTES
+    trace = Trace().after("capture", 1, 2).sent(3, 1).after("perceive", 5, 6, arrived_ns=4).sent(7, 2)
+    assert trace == Trace((Stage("capture", 1, 2, 3), Stage("perceive", 5, 6, 7, 4)), number=2)
+    assert len(encode(Trace((Stage("n" * 32, 1 << 62, 1 << 62, 1 << 62, 1 << 62),) * 8))) <= MAX_TRACE_BYTES
     with pytest.raises(WireError, match="length <= 8"):
         decode(encode(Trace((Stage("n", 1, 2, 3),) * 9)), Trace)
 

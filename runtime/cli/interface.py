@@ -92,7 +92,8 @@ with a growing covariance, then as invalid; the last of them is told again when 
 
 Every message of a topic carries a {trace}: what each node did with the frame, and with an estimate also what was left
 of the budget end to end when it was done. A stage's `done_ns - received_ns` is that node's step; from its `sent_ns`
-to the next stage's `received_ns` is the hop between them. Of a coasted frame perceive's stage is missing.
+to the next stage's `arrived_ns` is the hop between them, and from there to its `received_ns` the record waits in the
+node's queue. Of a coasted frame perceive's stage is missing.
 
 ## Records
 

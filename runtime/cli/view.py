@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.runtime.configuration import ConfigurationError
-from birdslam.runtime.latency import stages
+from birdslam.runtime.latency import key_of, stages
 from birdslam.runtime.recording.foxglove import CompressedImage
 from birdslam.runtime.recording.recording import Latency, Recording
 from birdslam.runtime.recording.scene import VEHICLE_HEIGHT_M, between_looks, ellipse
@@ -122,7 +122,7 @@ class Viewer:
         self._stream.set_time("frame", sequence=latency.frame_id)
         for name, ms in (("age", latency.age_ms), ("left", latency.left_ms), *latency.stages_ms.items()):
             if ms is not None:
-                self._stream.log(f"latency/{name.replace(' -> ', '_to_')}", rr.Scalars(ms))
+                self._stream.log(f"latency/{key_of(name)}", rr.Scalars(ms))
 
     def map(self, update: MapUpdate) -> None:
         """What the map gained."""

@@ -35,17 +35,20 @@ class Meter:
         """Something came in."""
         self._heard_ns = now_ns
 
-    def frame(self, t_capture_ns: int, trace: Trace, taken_ns: int, done_ns: int) -> None:
-        """A frame is done; `trace` is that of the message that brought it."""
+    def frame(self, t_capture_ns: int, trace: Trace) -> None:
+        """A frame is done; `trace` is what brought it, and this node's own stage.
+
+        That it waited in the queue is this node's doing, which was at another frame: its own budget bears it.
+        """
         self.frames += 1
-        sent_ns = trace.stages[-1].sent_ns if trace.stages else t_capture_ns
-        wait_ms = max(0.0, (taken_ns - sent_ns) / 1e6)
-        self._wait.add(wait_ms, done_ns)
-        self._late += self._hop_ms is not None and wait_ms > self._hop_ms
-        step_ms = (done_ns - taken_ns) / 1e6
-        self._step.add(step_ms, done_ns)
+        own = trace.stages[-1]
+        done_ns, arrived_ns = own.done_ns, own.arrived_ns or own.received_ns
+        sent_ns = trace.stages[-2].sent_ns if len(trace.stages) > 1 else t_capture_ns
+        self._wait.add(max(0.0, (own.received_ns - sent_ns) / 1e6), done_ns)
+        self._late += self._hop_ms is not None and (arrived_ns - sent_ns) / 1e6 > self._hop_ms
+        self._step.add((done_ns - own.received_ns) / 1e6, done_ns)
         self._age.add(max(0.0, (done_ns - t_capture_ns) / 1e6), done_ns)
-        self._overruns += step_ms > self._budget_ms
+        self._overruns += (done_ns - arrived_ns) / 1e6 > self._budget_ms
 
     def due(self, now_ns: int) -> bool:
         """Whether a second has passed."""

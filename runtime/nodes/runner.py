@@ -131,12 +131,15 @@ def _loop(
         message = node.receive(beat_s)
         now_ns = time.monotonic_ns()
         if message is not None:
-            taken_ns = now_ns  # waiting in the queue belongs to the hop, not to the step
-            if not isinstance(message.record, Overdue):
+            taken_ns = now_ns
+            overdue = isinstance(message.record, Overdue)
+            if not overdue:
                 meter.heard(taken_ns)
+            waits = message.trace.stages and not overdue  # in the queue of this node, which was at another record
+            arrived_ns = message.t_received_ns if waits else 0
             for record in node.step(message.record):
                 now_ns = time.monotonic_ns()
-                trace = message.trace.after(name, taken_ns, now_ns)
+                trace = message.trace.after(name, taken_ns, now_ns, arrived_ns)
                 if _is_frame(record):
                     vitals.count(
                         next_frame=record.frame_id + 1,
@@ -144,7 +147,7 @@ def _loop(
                         t_capture_ns=record.t_capture_ns,
                     )
                     if Status.PERCEPTION_LATE not in record.status:
-                        meter.frame(record.t_capture_ns, message.trace, taken_ns, now_ns)
+                        meter.frame(record.t_capture_ns, trace)
                     if isinstance(record, Estimate):
                         trace = msgspec.structs.replace(trace, left_ns=record.t_capture_ns + budget_ns - now_ns)
                 publishers[type(record)].put(record, trace)
