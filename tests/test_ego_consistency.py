@@ -50,19 +50,21 @@ def camera_poses(egos: list[SE2]) -> NDArray[np.float64]:
     return out
 
 
+EGOS = way(2000)
+TRUTH = camera_poses(EGOS)
+
+
 @given(told=st.floats(0.3, 3.0), seed=st.integers(0, 2**32 - 1))
 @example(told=1.0, seed=0)
 @settings(max_examples=20)
 def test_an_honest_covariance_has_a_nees_of_one_and_a_narrower_one_more(told: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    egos = way(2000)
-    truth = camera_poses(egos)
     consistency = Consistency(MOUNT)
     L = np.array([[0.5, 0.0, 0.0], [0.1, 0.3, 0.0], [0.004, 0.01, 0.02]])
-    for index, ego in enumerate(egos):
+    for index, ego in enumerate(EGOS):
         error = SE2.exp(L @ rng.standard_normal(3)) if index else SE2()
         consistency.add(estimate(index, START @ ego @ error, told**2 * L @ L.T))
-    report = consistency.report(truth)
+    report = consistency.report(TRUTH)
     assert report.frames == 2000
     assert report.nees == pytest.approx(1.0 / told**2, rel=0.12)
     if told == 1.0:

@@ -182,9 +182,9 @@ def test_nothing_seen_is_nothing_learned() -> None:
 
 
 def test_parked_cars_are_seen_from_a_passing_ego_without_drift() -> None:
-    """The filter's covariance stays positive over thousands of frames and vehicles that come and go."""
+    """The filter's covariance stays positive over hundreds of frames and vehicles that come and go."""
     road = Road(0.005)
-    for k in range(1500):
+    for k in range(700):
         first = k // 10
         boxes = {i: road.box(*(15.0 + 7.0 * (i - k / 10.0), 3.5), 1.5) for i in range(first, first + 5)}
         road.see(boxes)
