@@ -130,8 +130,7 @@ class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     # The same in periods of the source's frames: the rest of a period is for what comes after the networks
     deadline_periods: Positive = 0.75
     period_ms: Positive | None = None  # from one frame of the source to the next; None: by the frame rate
-    # Of OpenCV in perceive: with a second one the same frames take a tenth more processor time, and no less time
-    opencv_threads: PositiveInt = 1
+    opencv_threads: PositiveInt = 2  # of OpenCV in perceive
     schedule: ScheduleConfig = ScheduleConfig()
     looks: LooksConfig = LooksConfig()
 
