@@ -30,7 +30,8 @@ from birdslam.vehicles.localisation import (
     extent_m,
     place,
 )
-from birdslam.vehicles.parallax import LearnedSize, Parallax, ParallaxConfig, measure_boxes
+from birdslam.vehicles.parallax import LearnedSize, Parallax, ParallaxConfig
+from birdslam.vehicles.parallax_measurements import measure_boxes
 from birdslam.vehicles.track import Track
 
 Floats = NDArray[np.float64]
@@ -144,17 +145,19 @@ class Placing:
         self, assignments: Sequence[Assignment], expected: _Expected, T_world_ego: SE2, ground_size: GroundSizeFilter
     ) -> LearnedSize:
         """What the vehicles' growth in the image says of their heights."""
-        for assignment, centre_m in zip(assignments, expected.centre_m, strict=True):
+        for assignment, centre_m, yaw_rad in zip(assignments, expected.centre_m, expected.yaw_rad, strict=True):
             if assignment.track is None:
                 d = assignment.observation.dimensions
                 sigmas = d.sigma_height_rel, d.sigma_width_rel
-                self.parallax.begin(assignment.serial, centre_m, T_world_ego, math.log(d.height_m), sigmas)
+                self.parallax.begin(assignment.serial, centre_m, yaw_rad, T_world_ego, math.log(d.height_m), sigmas)
         seen, height_m = [a.observation for a in assignments], ground_size.ground.height_m
         over_roof_m = np.array([max(0.0, height_m - o.dimensions.height_m) for o in seen])
         roof_m2 = over_roof_m * expected.extent_m[:, 0] * ground_size.config.roof_reach_rel
-        boxes = measure_boxes(seen, expected.centre_m, expected.extent_m, expected.turned_rad, roof_m2)
+        boxes = measure_boxes(
+            seen, expected.centre_m, expected.extent_m, expected.turned_rad, np.array(expected.yaw_rad), roof_m2
+        )
         serials = [a.serial for a in assignments]
-        return self.parallax.learn_sizes(serials, boxes, T_world_ego, height_m, ground_size.sigma_pitch_rad)
+        return self.parallax.learn_sizes(serials, boxes, T_world_ego, height_m)
 
     def _places_at(self, depths: Depths, assignments: Sequence[Assignment], yaws_rad: Sequence[float]) -> list[Place]:
         """The places at these depths, with the uncertainty of the depths and of the yaws."""
