@@ -110,9 +110,9 @@ class LooksConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     adaptive: bool = True  # False: as each network's manifest says, whatever the computer
     measured_s: Positive = 1.0  # all networks together are measured for so long before the first frame
     least_hz: Positive = 3.0  # not fewer looks a second than this
-    slight_load: Positive = (
-        0.25  # cores: networks that keep no more busy look no less often, since it would gain nothing
-    )
+    # Cores: networks that keep no more busy look no less often. Less than pays by itself, since each look also has its
+    # vehicles placed and tracked; on the shipped drive with two slow cores, where every 3rd frame was too often
+    slight_load: Positive = 0.16
     awaited_share: Share = 0.45  # of a frame's period: a network that takes longer is not awaited
     room_share: Share = 0.6  # of the cores that the front end leaves, the networks begin with so much
     busy_share: Share = 0.92  # of the period: perceive's mean step takes longer, and the networks look less often

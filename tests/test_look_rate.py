@@ -34,7 +34,7 @@ def settle(rate: LookRate, work_ms: float, look_ms: float, frames: int) -> list[
     return [rate.sparing for _ in range(frames) if rate.judge(work_ms + look_ms / rate.sparing, dropped=False) or True]
 
 
-@pytest.mark.parametrize(("cores", "ms", "sparing"), [(2.0, 22.0, 2), (4.0, 22.0, 1), (2.0, 6.0, 1), (1.0, 22.0, 3)])
+@pytest.mark.parametrize(("cores", "ms", "sparing"), [(2.0, 22.0, 2), (4.0, 22.0, 1), (2.0, 6.0, 1), (1.0, 22.0, 5)])
 def test_it_begins_with_what_the_cores_carry(cores: float, ms: float, sparing: int) -> None:
     costs = {"multitask": Cost(ms, threads=min(2, threads_of_a_network(cores)), every=1)}
     config = LooksConfig()
@@ -44,11 +44,21 @@ def test_it_begins_with_what_the_cores_carry(cores: float, ms: float, sparing: i
     assert rate.sparing == rate.most or load(costs, PERIOD_MS, rate.sparing) <= room
 
 
-@pytest.mark.parametrize(("ms", "most"), [(22.0, 3), (6.0, 1), (400.0, 11)])
+@pytest.mark.parametrize(("ms", "most"), [(22.0, 5), (4.0, 1), (400.0, 11)])
 def test_looks_that_cost_little_are_left_as_they_are(ms: float, most: int) -> None:
     rate = look_rate(costs={"multitask": Cost(ms, threads=1, every=1)})
     assert rate.most == most
     assert most == 11 or load({"multitask": Cost(ms, 1, 1)}, PERIOD_MS, most) <= CONFIG.slight_load
+
+
+def test_looks_that_are_spared_are_for_boxes_and_cost_less() -> None:
+    cost = Cost(ms=22.0, threads=1, every=1, boxes_ms=16.0)
+    rate = look_rate(costs={"multitask": cost})
+    assert (rate.sparing, rate.masks_every) == (2, 2)
+    assert load({"multitask": cost}, PERIOD_MS, 2) == pytest.approx((22.0 + 16.0) / 2.0 / 60.0)
+    assert load({"multitask": cost}, PERIOD_MS, 1) == pytest.approx(22.0 / 30.0)
+    settle(rate, work_ms=2.0, look_ms=2.0, frames=100)
+    assert (rate.sparing, rate.masks_every) == (1, 1)
 
 
 @given(st.floats(0.5, 64.0), st.floats(0.1, 500.0), st.integers(1, 9), st.floats(10.0, 200.0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from birdslam.perception import (
     load_network,
 )
 from birdslam.perception.detection import MOST_CANDIDATES, YoloxDecoder, intersections, suppress
-from birdslam.perception.manifest import FitPad, Input, Schedule, Stretch, Tiles, Yolox
+from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, Schedule, Stretch, Tiles, Yolox
 from birdslam.perception.views import Preparation, View, make_views
 from birdslam.types import Status
 
@@ -507,6 +507,48 @@ def test_a_source_that_begins_anew_forgets_the_old_frames() -> None:
     executor.finish(some(0.8))
     assert networks.start(1, IMAGE).result().ages == {}  # the old run is thrown away
     assert step(networks, executor, 2).ages == {"detector": 0}
+
+
+@given(st.integers(1, 3), st.integers(1, 4), st.lists(st.integers(1, 3), min_size=1, max_size=20))
+def test_masks_come_with_one_run_in_so_many_and_are_carried_between(sparing: int, masks: int, gaps: list[int]) -> None:
+    executor, alone = Executor(), object()
+    head = FakeHead("multitask", "multitask")
+    networks = Networks([head], executor.submit, boxes_alone=alone)  # type: ignore[arg-type]
+    networks.sparing, networks.masks_every = sparing, masks
+    looks: list[int] = []
+    for frame_id in np.cumsum([0, *gaps]).tolist():
+        pending = networks.start(frame_id, IMAGE)
+        if len(executor.runs) > len(looks):
+            whole = len(looks) % masks == 0
+            assert (executor.runs[-1][0] == head.run) == whole
+            assert (executor.runs[-1][0] is alone) != whole
+            mask = np.full((2, 2), frame_id, np.int64)
+            found = some(frame_id / 1000)
+            executor.finish(replace(found, segmentation=Segmentation(mask, mask)) if whole else found)  # type: ignore[arg-type]
+            looks.append(frame_id)
+        perception = pending.result()
+        with_masks = looks[(len(looks) - 1) // masks * masks]
+        assert perception.ages["detector"] == frame_id - looks[-1]
+        assert perception.ages["segmenter"] == frame_id - with_masks
+        assert perception.segmentation is not None
+        assert perception.segmentation.road[0, 0] == with_masks
+        assert (Status.SEGMENTATION_CARRIED in perception.status) == (with_masks != frame_id)
+        assert (Status.DETECTIONS_CARRIED in perception.status) == (looks[-1] != frame_id)
+
+
+def test_the_shipped_network_says_the_same_of_boxes_without_its_masks() -> None:
+    spec = ModelSpec(str(SHIPPED_NETWORKS / "multitask_int8.onnx"))
+    network = load_network("multitask", spec, 1, ("depth",), ("segmentation",))
+    image = np.random.default_rng(3).integers(0, 255, (96, 320, 3), np.uint8)
+    whole, boxes = network.run(image), network.run_without(image)
+    assert whole is not None
+    assert boxes is not None
+    assert whole.segmentation is not None
+    assert (boxes.segmentation, boxes.depth, whole.depth) == (None, None, None)
+    assert whole.detections is not None
+    assert boxes.detections is not None
+    np.testing.assert_array_equal(whole.detections.boxes_px, boxes.detections.boxes_px)
+    np.testing.assert_array_equal(whole.detections.scores, boxes.detections.scores)
 
 
 def test_two_heads_of_one_role_are_refused() -> None:

@@ -80,7 +80,7 @@ class MultiTaskDecoder:
         focal_rel = CANONICAL_FOCAL * self.input.width_px / float(view.width_px)
         return Findings(
             detections=self._detections(tensors["heat"][0], tensors["body"][0], view, focal_rel),
-            segmentation=self._segmentation(tensors["segmentation"][0], view),
+            segmentation=self._segmentation(tensors["segmentation"][0], view) if "segmentation" in tensors else None,
             depth=self._depth(tensors["depth"][0, 0], view, focal_rel) if "depth" in tensors else None,
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Protocol, cast, get_args
@@ -79,6 +79,25 @@ DECODINGS: dict[type, tuple[Callable[..., Decoder], str, Callable[[Any], tuple[s
 }
 
 
+class _Bound:
+    """A session whose input is `image` and whose outputs are buffers of its own, made once."""
+
+    def __init__(self, session: Any, name: str, image: NDArray[np.float32], outputs: Sequence[str]) -> None:
+        self._session = session
+        first = session.run(outputs, {name: image})  # the first run: what is really there
+        self.tensors = {output: np.empty(out.shape, np.float32) for output, out in zip(outputs, first, strict=True)}
+        self._binding = session.io_binding()
+        self._binding.bind_input(name, "cpu", 0, np.float32, image.shape, image.ctypes.data)
+        for output, buffer in self.tensors.items():
+            self._binding.bind_output(output, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
+        self.infer()  # warm-up of this path
+
+    def infer(self) -> bool:
+        """Runs on what is in the input; False where an output holds a number that is not finite."""
+        self._session.run_with_iobinding(self._binding)
+        return all(np.isfinite(tensor).all() for tensor in self.tensors.values())
+
+
 class Network:
     """A loaded and warmed-up network. One run at a time: the buffers are its own and made once.
 
@@ -94,8 +113,9 @@ class Network:
         content: bytes,
         schedule: Schedule,
         unread: Collection[str] = (),
+        apart: Collection[str] = (),
     ) -> None:
-        """`unread` are outputs that are not to be computed.
+        """`unread` are outputs that are not to be computed, `apart` those that `run_without` leaves out too.
 
         Raises Misfit where manifest and network contradict each other, an onnxruntime error where it can't run."""
         self.name = name
@@ -110,21 +130,17 @@ class Network:
         self._preparation = Preparation(manifest.input)
         from birdslam.perception.session import open_session  # here: only who runs networks holds onnxruntime's 18 MB
 
-        content = without_outputs(content, unread) if unread else content
-        self._session = open_session(content, manifest.input, self._outputs, schedule.threads)
-        tensor = self._preparation.tensor
-        shapes = dict(zip(self._outputs, self._shapes(tensor), strict=True))  # the first run: what is really there
-        self._tensors = {output: np.empty(shape, dtype=np.float32) for output, shape in shapes.items()}
-        self._binding = self._session.io_binding()
-        self._binding.bind_input(manifest.input.name, "cpu", 0, np.float32, tensor.shape, tensor.ctypes.data)
-        for output, buffer in self._tensors.items():
-            self._binding.bind_output(output, "cpu", 0, np.float32, buffer.shape, buffer.ctypes.data)
+        def bound(left_out: Collection[str]) -> _Bound:
+            outputs = tuple(output for output in self._outputs if output not in left_out)
+            part = without_outputs(content, {*unread, *left_out}) if unread or left_out else content
+            session = open_session(part, manifest.input, outputs, schedule.threads)
+            return _Bound(session, manifest.input.name, self._preparation.tensor, outputs)
+
+        self._whole = bound(())
+        self._part = bound(apart) if apart else self._whole
+        shapes = {output: tensor.shape for output, tensor in self._whole.tensors.items()}
         self.decoder = make_decoder(table, manifest.input, shapes)
         self._views: dict[tuple[int, int], tuple[View, ...]] = {}
-        self.infer()  # warm-up of the path that run() takes
-
-    def _shapes(self, tensor: NDArray[np.float32]) -> list[tuple[int, ...]]:
-        return [out.shape for out in self._session.run(self._outputs, {self.manifest.input.name: tensor})]
 
     def views(self, image: NDArray[np.uint8]) -> tuple[View, ...]:
         """The views in which an image is run, each a run of its own. Raises ValueError where it is no image."""
@@ -145,21 +161,27 @@ class Network:
 
     def infer(self) -> bool:
         """Runs the network on its input; False where an output holds a number that is not finite."""
-        self._session.run_with_iobinding(self._binding)
-        return all(np.isfinite(tensor).all() for tensor in self._tensors.values())
+        return self._whole.infer()
 
     def read(self, view: View) -> Any:
         """The outputs of the last run decoded, for `merge`."""
-        return self.decoder.read(self._tensors, view)
+        return self.decoder.read(self._whole.tensors, view)
 
     def run(self, image: NDArray[np.uint8]) -> Findings | None:
         """The findings in a grey (H, W) or BGR (H, W, 3) image of any size; None where the network gave no numbers."""
+        return self._run(self._whole, image)
+
+    def run_without(self, image: NDArray[np.uint8]) -> Findings | None:
+        """As `run`, and the same to a bit, without the outputs that stand `apart` and what only they need."""
+        return self._run(self._part, image)
+
+    def _run(self, bound: _Bound, image: NDArray[np.uint8]) -> Findings | None:
         views, parts = self.views(image), []
         for view in views:
             self.prepare(image, view)
-            if not self.infer():
+            if not bound.infer():
                 return None
-            parts.append(self.read(view))
+            parts.append(self.decoder.read(bound.tensors, view))
         found = self.decoder.merge(parts, views)
         return Findings(**{self._finding: found}) if self._finding else cast(Findings, found)
 
@@ -167,12 +189,12 @@ class Network:
         """The outputs as they are for an image's first view."""
         self.prepare(image, self.views(image)[0])
         self.infer()
-        return {name: tensor.copy() for name, tensor in self._tensors.items()}
+        return {name: tensor.copy() for name, tensor in self._whole.tensors.items()}
 
     @property
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
         """Of the outputs that the manifest names."""
-        return {name: tensor.shape for name, tensor in self._tensors.items()}
+        return {name: tensor.shape for name, tensor in self._whole.tensors.items()}
 
     def describe(self) -> dict[str, Any]:
         """What ran, for a summary: plain values."""
@@ -191,13 +213,19 @@ class Network:
         }
 
 
-def load_network(name: str, spec: ModelSpec, most_threads: int | None = None, unread: Collection[str] = ()) -> Network:
+def load_network(
+    name: str,
+    spec: ModelSpec,
+    most_threads: int | None = None,
+    unread: Collection[str] = (),
+    apart: Collection[str] = (),
+) -> Network:
     """Opens a network, checks its manifest against its real inputs and outputs, and warms it up.
 
     Where the `spec` does not say how many threads it has, these are its manifest's, but no more than `most_threads`.
-    Of a multi-task network the outputs `unread` are not computed, which "depth" alone may be. A `name` that is a role's
-    must be the manifest's. Raises ModelError naming the file, the key, what the manifest says
-    and what the network has.
+    Of a multi-task network the outputs `unread` are not computed, which "depth" alone may be, and `run_without` leaves
+    out `apart` too, which "segmentation" alone may be. A `name` that is a role's must be the manifest's. Raises
+    ModelError naming the file, the key, what the manifest says and what the network has.
     """
     path = Path(spec.path)
     try:
@@ -216,7 +244,8 @@ def load_network(name: str, spec: ModelSpec, most_threads: int | None = None, un
     from birdslam.perception.session import SESSION_ERRORS
 
     try:
-        return Network(name, path, manifest, sha256, content, schedule, unread if manifest.role == "multitask" else ())
+        outputs = (unread, apart) if manifest.role == "multitask" else ((), ())
+        return Network(name, path, manifest, sha256, content, schedule, *outputs)
     except Misfit as error:
         raise ModelError(f"{path}: {error} (manifest {origin})") from error
     except SESSION_ERRORS as error:

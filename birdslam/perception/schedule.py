@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -73,20 +73,37 @@ class Head(Protocol):
 
 @dataclass
 class _Slot:
-    """One head's run and its last result."""
+    """One head's run and its last results."""
 
     head: Head
     fills: tuple[Role, ...]  # what its findings are used for
     running: Future[Findings | None] | None = None
     started_frame: int | None = None
+    masks: bool = True  # the last run that was started makes masks too
+    without_masks: int = 0  # runs since the last one that made them
     outdated: bool = False  # the run under way belongs to frames of before a restart of the source
     findings: Findings = field(default_factory=Findings)
-    found_frame: int | None = None
+    found: dict[Role, int] = field(default_factory=dict)  # the frame that each result was computed on
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The keys of its age in `Perception.ages`."""
-        return self.fills if self.head.role in ROLES else (self.head.name,)
+    def begin(self, frame_id: int, masks: bool) -> None:
+        """A run on this frame."""
+        self.started_frame, self.masks = frame_id, masks
+        self.without_masks = 0 if masks else self.without_masks + 1
+
+    def take(self, findings: Findings) -> None:
+        """The result of the last run that was started."""
+        assert self.started_frame is not None
+        roles = ROLES.get(self.head.role, (self.head.role,))
+        if not self.masks:
+            findings = replace(findings, segmentation=self.findings.segmentation)
+            roles = tuple(role for role in roles if role != "segmenter")
+        self.findings = findings
+        self.found |= dict.fromkeys(roles, self.started_frame)
+
+    def ages(self, frame_id: int) -> dict[str, int]:
+        """As in `Perception.ages`."""
+        names = {role: role if self.head.role in ROLES else self.head.name for role in self.fills}
+        return {names[role]: frame_id - self.found[role] for role in self.fills if role in self.found}
 
 
 class Networks:
@@ -96,10 +113,11 @@ class Networks:
     starve it; while its last run is under way it isn't started again. `sparing` may be set between two frames: then
     each head is due after so many times as many. A head that fills several roles leaves those to others that have a
     head of their own; with `bodies` what it knows of vehicles' bodies counts in the other detector's boxes all the
-    same, where both looked at one image (body_overlap.py). `submit(run, image) -> Future` is the executor's (birdslam
-    has no threads of its own; it needs one for each head). `patience_s` None awaits every head that runs, so that the
-    results depend on the frames alone. Else `result()` waits that long in all, for the heads that started on its frame
-    and are `awaited`; what isn't there is carried and goes on in the background.
+    same, where both looked at one image (body_overlap.py). `boxes_alone` runs such a head without its masks: where
+    `masks_every` is set too, its masks come with one run in so many. `submit(run, image) -> Future` is the executor's
+    (birdslam has no threads of its own; it needs one for each head). `patience_s` None awaits every head that runs, so
+    that the results depend on the frames alone. Else `result()` waits that long in all, for the heads that started on
+    its frame and are `awaited`; what isn't there is carried and goes on in the background.
     """
 
     def __init__(
@@ -108,6 +126,7 @@ class Networks:
         submit: Callable[..., Future[Any]],
         patience_s: float | None = None,
         bodies: bool = False,
+        boxes_alone: Callable[[NDArray[np.uint8]], Findings | None] | None = None,
     ) -> None:
         for key in ("name", "role"):
             values = [getattr(head, key) for head in heads]
@@ -119,6 +138,7 @@ class Networks:
         self._submit = submit
         self._patience_s = patience_s
         self._bodies = bodies
+        self._boxes_alone = boxes_alone
         own = {head.role for head in heads}
         self._slots = [
             _Slot(
@@ -127,7 +147,7 @@ class Networks:
             for head in heads
         ]
         self._last_frame = -1
-        self.sparing = 1
+        self.sparing = self.masks_every = 1
         self.looks = 0  # frames on which a head was begun
 
     def start(self, frame_id: int, image: NDArray[np.uint8] | None, only: Collection[Role] | None = None) -> Pending:
@@ -147,18 +167,23 @@ class Networks:
             feeds = {*slot.fills, *(("detector",) if self._bodies and slot.head.role in ROLES else ())}
             wanted = bool(feeds) and (only is None or not feeds.isdisjoint(only))
             if image is not None and due and wanted and slot.running is None:
-                slot.running = self._submit(slot.head.run, image)
-                slot.started_frame = frame_id
+                slot.running = self._submit(self._begin(slot, frame_id), image)
                 begun = True
         self.looks += begun
         return _Started(self, frame_id)
+
+    def _begin(self, slot: _Slot, frame_id: int) -> Callable[[NDArray[np.uint8]], Findings | None]:
+        """What is to run for a slot."""
+        boxes = self._boxes_alone if slot.head.role in ROLES and "segmenter" in slot.found else None
+        slot.begin(frame_id, masks=boxes is None or slot.without_masks + 1 >= self.masks_every)
+        return slot.head.run if slot.masks or boxes is None else boxes
 
     def _collect(self, frame_id: int) -> Perception:
         self._await(frame_id)
         status = self._take_results(frame_id)
         found = {FIELDS[role]: getattr(s.findings, FIELDS[role]) for s in self._slots for role in s.fills}
         found["detections"] = self._with_bodies(found.get("detections"))
-        ages = {name: frame_id - s.found_frame for s in self._slots if s.found_frame is not None for name in s.names}
+        ages = {name: age for slot in self._slots for name, age in slot.ages(frame_id).items()}
         return Perception(**found, ages=ages, status=tuple(dict.fromkeys(status)))
 
     def _with_bodies(self, detections: Detections | None) -> Detections | None:
@@ -167,7 +192,8 @@ class Networks:
         many = next((s for s in self._slots if s.head.role in ROLES), None)
         if not self._bodies or detections is None or own is None or many is None:
             return detections
-        return with_bodies(detections, many.findings.detections) if own.found_frame == many.found_frame else detections
+        same_image = own.found.get("detector") == many.found.get("detector")
+        return with_bodies(detections, many.findings.detections) if same_image else detections
 
     def _await(self, frame_id: int) -> None:
         """Until the heads that the frame waits for are done, or its patience is over."""
@@ -195,9 +221,8 @@ class Networks:
                 elif findings is None:
                     status.append(Status.NETWORK_FAILED)
                 else:
-                    slot.findings, slot.found_frame = findings, slot.started_frame
-            if slot.found_frame != frame_id:
-                status.extend(CARRIED[role] for role in slot.fills)
+                    slot.take(findings)
+            status.extend(CARRIED[role] for role in slot.fills if slot.found.get(role) != frame_id)
         return status
 
 

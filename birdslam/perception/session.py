@@ -24,6 +24,7 @@ def session_options(threads: int) -> ort.SessionOptions:
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
+    options.enable_mem_pattern = False  # as fast without, and 10 of 29 MB less for the shipped network
     options.log_severity_level = 4  # what goes wrong is raised; its logger would write it to the terminal too
     return options
 

@@ -32,6 +32,8 @@ Run = Callable[..., Any]
 
 # Of a multi-task network: vehicles that come with bodies are placed by these, and no map is asked (pseudolidar.py)
 UNREAD_WITH_BODIES = ("depth",)
+APART = ("segmentation",)  # of a multi-task network, what not every look needs
+BOXES = "boxes alone"  # such a look, among what is measured
 LANES_SPARING = 2  # lanes are found half as often at the least: a run takes the interpreter 20 ms from the frames
 
 log = logging.getLogger(__name__)
@@ -53,7 +55,9 @@ class Inference(Closing):
         most_threads = threads_of_a_network(usable_cores()) if self._adapts else None
         pointnet = configuration.models.pointnet
         unread = UNREAD_WITH_BODIES if pointnet is None else ()
-        heads = [load_network(role, spec, most_threads, unread) for role, spec in specs.items()]
+        chosen = any(spec.every is not None for spec in specs.values())  # by the user: nothing is to be adapted
+        apart = APART if self._adapts and not chosen and not {"detector", "segmenter"} & specs.keys() else ()
+        heads = [load_network(role, spec, most_threads, unread, apart) for role, spec in specs.items()]
         self._specs = specs
         self._lanes_every = schedule.lanes.every or 1
         self.frustum_network: PointNet | None = None if pointnet is None else load_pointnet(pointnet)
@@ -66,6 +70,10 @@ class Inference(Closing):
         self._after_ns: deque[int] = deque(maxlen=looks.window_frames)  # what frames took when they had waited
         self._resumed_ns: int | None = None
         self._awaited: set[Run] = {head.run for head in heads if head.schedule.awaited}
+        many = next((head for head in heads if head.role in ROLES), None)
+        self._boxes_alone: Run | None = many.run_without if many is not None and apart else None
+        if many is not None and self._boxes_alone is not None and many.schedule.awaited:
+            self._awaited.add(self._boxes_alone)
         self._rate_divisor = configuration.degradation.rate_divisor
         self._ran_frame = -self._rate_divisor  # the last frame that networks were offered
         self._started: list[Future[Any]] = []  # for the frame at hand, and awaited
@@ -74,7 +82,9 @@ class Inference(Closing):
         self._beside = ThreadPoolExecutor(1, "beside", initializer=realtime.give_way)
         self._frame_over = threading.Event()
         patience_s = None if self._deadline_ns is None else 0.0
-        self.networks = Networks(heads, self._submit, patience_s, bodies=configuration.models.bodies)
+        self.networks = Networks(
+            heads, self._submit, patience_s, bodies=configuration.models.bodies, boxes_alone=self._boxes_alone
+        )
 
     def _submit(self, run: Run, *arguments: Any) -> Future[Any]:
         if run not in self._awaited and self._deadline_ns is not None:
@@ -93,15 +103,30 @@ class Inference(Closing):
             return None
         if camera is None or period_ms is None:  # nobody knows the frames yet
             return None
-        took_ms = measure({head.role: head.run for head in heads}, camera, measured_s)
-        costs: dict[str, Cost] = {h.role: Cost(took_ms[h.role], h.schedule.threads, h.schedule.every) for h in heads}
+        runs: dict[str, Run] = {head.role: head.run for head in heads}
+        if self._boxes_alone is not None:
+            runs[BOXES] = self._boxes_alone
+        took_ms = measure(runs, camera, measured_s)
+        costs: dict[str, Cost] = {
+            h.role: Cost(
+                took_ms[h.role],
+                h.schedule.threads,
+                h.schedule.every,
+                took_ms.get(BOXES) if h.role in ROLES else None,
+            )
+            for h in heads
+        }
         for head in heads:
             if self._specs[head.role].awaited is None and took_ms[head.role] > perceive.looks.awaited_share * period_ms:
-                self._awaited.discard(head.run)
+                self._awaited -= {head.run, *((self._boxes_alone,) if head.role in ROLES and self._boxes_alone else ())}
         rate = LookRate(perceive.looks, costs, usable_cores(), period_ms)
-        self.networks.sparing = rate.sparing
+        self.look_as(rate)
         log.info("%s", rate.describe(costs, {head.role for head in heads if head.run in self._awaited}))
         return rate
+
+    def look_as(self, rate: LookRate) -> None:
+        """From now on the networks look as often as this says."""
+        self.networks.sparing, self.networks.masks_every = rate.sparing, rate.masks_every
 
     @property
     def aside(self) -> Run | None:

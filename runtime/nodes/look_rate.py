@@ -21,6 +21,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.runtime.configuration import LooksConfig
 
 LEAST_RUNS = 3  # of a network that is measured; its first is not counted
+MASKS_SPARING = 2  # looks that are spared are for boxes; masks, which change more slowly, come with one in so many
 FRONT_END_CORES = 1.25  # what the frames themselves keep busy: one core in perceive, a part of another elsewhere
 
 
@@ -31,6 +32,13 @@ class Cost:
     ms: float
     threads: int
     every: int  # as its schedule has it
+    boxes_ms: float | None = None  # of a run without masks; None: it has none
+
+    def look_ms(self, sparing: int) -> float:
+        """Of a run, the mean of those with masks and of those without."""
+        if self.boxes_ms is None or sparing == 1:
+            return self.ms
+        return self.boxes_ms + (self.ms - self.boxes_ms) / MASKS_SPARING
 
 
 def measure(
@@ -58,7 +66,7 @@ def threads_of_a_network(cores: float) -> int:
 
 def load(costs: Mapping[str, Cost], period_ms: float, sparing: int) -> float:
     """Cores that networks keep busy which look `sparing` times less often than their schedules say."""
-    return sum(cost.ms * cost.threads / (cost.every * sparing * period_ms) for cost in costs.values())
+    return sum(cost.look_ms(sparing) * cost.threads / (cost.every * sparing * period_ms) for cost in costs.values())
 
 
 class LookRate:
@@ -82,11 +90,17 @@ class LookRate:
     def describe(self, costs: Mapping[str, Cost], awaited: Collection[str]) -> str:
         """One line for the log: what was measured and chosen."""
         parts = [
-            f"{name} {cost.ms:.0f} ms on {cost.threads} threads, every {cost.every * self.sparing} frames, "
+            f"{name} {cost.look_ms(self.sparing):.0f} ms on {cost.threads} threads, "
+            f"every {cost.every * self.sparing} frames, "
             f"{'awaited' if name in awaited else 'not awaited'}"
             for name, cost in costs.items()
         ]
         return f"{self._cores:g} cores, {1e3 / self._period_ms:.3g} Hz: {'; '.join(parts)}"
+
+    @property
+    def masks_every(self) -> int:
+        """Of so many looks of a network that can do without its masks one makes them."""
+        return 1 if self.sparing == 1 else MASKS_SPARING
 
     def judge(self, step_ms: float, dropped: bool) -> bool:
         """One frame more, which took perceive `step_ms`; `dropped`: some before it were. Whether `sparing` changed."""

@@ -144,7 +144,7 @@ class PerceiveNode:
         dropped = self._last_frame is not None and frame_id > self._last_frame + 1
         self._last_frame = frame_id
         if self._look_rate is not None and self._look_rate.judge(step_ms, dropped):
-            self._inference.networks.sparing = self._look_rate.sparing
+            self._inference.look_as(self._look_rate)
             log.info("frame %d: networks look %d times less often than they would", frame_id, self._look_rate.sparing)
 
     def _look(self, frame: Frame, mode: Mode) -> Measurements:
