@@ -24,7 +24,19 @@ from birdslam.perf.system import figures
 
 label = "rate, drops, age, vehicles found and the ego's error on 1, 2 and 4 cores, by affinity"
 
-KEPT = ("rate_hz", "frames", "dropped", "cpu_cores", "rss_mb", "pss_mb", "age_ms", "stages", "noise")
+KEPT = (
+    "rate_hz",
+    "frames",
+    "dropped",
+    "predicted",
+    "coasted",
+    "cpu_cores",
+    "rss_mb",
+    "pss_mb",
+    "age_ms",
+    "stages",
+    "noise",
+)
 
 
 def run(arguments: list[str]) -> None:
@@ -86,13 +98,13 @@ def summary(row: dict[str, Any]) -> str:
     age = row["age_ms"]
     parts = [
         f"{row['rate_hz']:.1f} Hz",
-        f"dropped {row['dropped']} of {row['frames']}",
+        f"dropped {row['dropped']} of {row['frames']}, predicted {row['predicted']}, coasted {row['coasted']}",
         f"age p50 {age['p50']:.1f} p99 {age['p99']:.1f} ms",
         f"{row['cpu_cores']:.2f} cores",
         f"{row['rss_mb']:.0f} MB, shared once {row['pss_mb'] or 0:.0f}",
     ]
     if "found" in row:
-        parts.append(f"vehicles found {row['found']:.0%}")
+        parts.append(f"vehicles seen in the very frame {row['found']:.0%}, told of {row['told']:.0%}")
     if "ate_m" in row:
         parts.append(f"ATE {row['ate_m']:.2f} m")
     return "  ".join(parts)

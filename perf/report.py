@@ -147,7 +147,20 @@ def _cores(benchmarks: Benchmarks) -> Iterator[str]:
     rows = benchmarks.get("cores", {}).get("rows", [])
     if rows:
         yield "The source once, on the first so many cores by affinity:\n"
-        titles = ("on", "rate Hz", "dropped", "age p50", "p99", "cores", "MB", "MB shared once", "found", "ego ATE m")
+        titles = (
+            "on",
+            "rate Hz",
+            "dropped",
+            "predicted",
+            "age p50",
+            "p99",
+            "cores",
+            "MB",
+            "MB shared once",
+            "seen in the frame",
+            "told",
+            "ego ATE m",
+        )
         there = [row for row in rows if "missing" not in row]
         yield from table(
             titles,
@@ -156,8 +169,9 @@ def _cores(benchmarks: Benchmarks) -> Iterator[str]:
                     row["name"],
                     row["rate_hz"],
                     f"{row['dropped']} of {row['frames']}",
+                    row.get("predicted"),
                     *_percentiles(row["age_ms"], ("p50", "p99")),
-                    *(row.get(name) for name in ("cpu_cores", "rss_mb", "pss_mb", "found", "ate_m")),
+                    *(row.get(name) for name in ("cpu_cores", "rss_mb", "pss_mb", "found", "told", "ate_m")),
                 ]
                 for row in there
             ),
@@ -193,7 +207,12 @@ def _accuracy(benchmarks: Benchmarks) -> Iterator[str]:
         titles = {
             **{"frames": "frames", "dropped": "dropped", "ate_m": "ego ATE m", "ate_se3_m": "aligned"},
             **{"scale_error": "scale error", "rpe_t_m": "RPE m", "rpe_r_deg": "RPE deg"},
-            **{"vehicle_ate_m": "vehicles' ATE m", "vehicle_centre_rel": "place, of the range", "found": "found"},
+            **{
+                "vehicle_ate_m": "vehicles' ATE m",
+                "vehicle_centre_rel": "place, of the range",
+                "found": "found",
+                "told": "told",
+            },
         }
         there = [row for row in rows if "missing" not in row]
         ages = (_percentiles(row.get("age_ms", {}), ("p50", "p99")) for row in there)

@@ -57,7 +57,7 @@ def _figures(benchmarks: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
                 yield f"{row['contender']}, {row['vehicles']} vehicles: {level} us", row[f"{level}_us"]
     for name in ("accuracy", "accuracy-data"):
         for row in benchmarks.get(name, {}).get("rows", []):
-            keys = ("ate_m", "scale_error", "vehicle_centre_rel", "found")
+            keys = ("ate_m", "scale_error", "vehicle_centre_rel", "found", "told")
             yield from ((f"{row['name']}: {key}", row[key]) for key in keys if row.get(key) is not None)
     for row in benchmarks.get("inference", {}).get("rows", []):
         yield f"{row['name']}: p50 ms", row["total_ms"]["p50"]
@@ -66,6 +66,8 @@ def _figures(benchmarks: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
 def _of_run(name: str, run: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
     yield f"{name}: rate Hz", run["rate_hz"]
     yield f"{name}: dropped %", 100.0 * run["dropped"] / run["frames"]
+    if run.get("predicted") is not None:
+        yield f"{name}: predicted %", 100.0 * run["predicted"] / run["frames"]
     yield f"{name}: age p50 ms", run["age_ms"]["p50"]
     yield f"{name}: age p99 ms", run["age_ms"]["p99"]
     yield f"{name}: cores", run["cpu_cores"]
@@ -79,7 +81,7 @@ def better_when(figure: str) -> Better:
     what = figure.rpartition(": ")[2]
     if what == "scale_error":
         return "nearer to 0"
-    return "more" if what in ("found", "rate Hz") else "less"
+    return "more" if what in ("found", "told", "rate Hz") else "less"
 
 
 def keep(new: Card, folder: Path = RESULTS) -> Path:

@@ -395,6 +395,7 @@ def _measured(age_p99_ms: float, dropped: int = 0, version: str = "0.2.0", found
         machine = {**ledger.content["machine"], "versions": {"birdslam": version}}
     run = {
         **{"rate_hz": 33.0, "dropped": dropped, "frames": 1000, "cpu_cores": 1.3, "rss_mb": 900.0, "pss_mb": 500.0},
+        "predicted": 7,
         "age_ms": {"p50": 20.0, "p99": age_p99_ms, "max": 50.0, "n": 1000},
     }
     cores = [{"name": "1 core", "cores": 1, **run, "found": found}, {"name": "4 cores", "missing": "2 are at hand"}]
@@ -431,5 +432,5 @@ def test_the_last_release_is_kept_and_a_report_is_compared_with_it(
 
 def test_the_report_has_a_table_of_cores() -> None:
     text = report.markdown(_content(_measured(30.0)["benchmarks"] | {"system": {}}))
-    assert "| 1 core | 33 | 0 of 1000 | 20 | 30 |" in text
+    assert "| 1 core | 33 | 0 of 1000 | 7 | 20 | 30 |" in text
     assert "**4 cores is missing**: 2 are at hand" in text
