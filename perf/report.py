@@ -210,7 +210,7 @@ def _accuracy(benchmarks: Benchmarks) -> Iterator[str]:
             **{
                 "vehicle_ate_m": "vehicles' ATE m",
                 "vehicle_centre_rel": "place, of the range",
-                "found": "found",
+                "found": "seen in the frame",
                 "told": "told",
             },
         }
