@@ -241,12 +241,14 @@ class Parallax:
         PJt = P @ J.swapaxes(-1, -2)
         S = J @ PJt
         S = S + self._noise(boxes, innovation, S, of_box, of_face * of_view)
-        gain = PJt @ np.linalg.inv(S)
+        information = np.linalg.inv(S)
+        gain = PJt @ information
         self._x[rows] = x + (gain @ innovation[..., None])[..., 0]
         posterior = P - gain @ PJt.swapaxes(-1, -2)
         self._P[rows] = (posterior + posterior.swapaxes(-1, -2)) / 2.0
 
-        log_likelihood = -0.5 * (_squared(innovation, S) + np.log(np.linalg.det(S)))[:, : len(WAYS)]
+        squared = np.einsum("...a,...ab,...b->...", innovation, information, innovation)
+        log_likelihood = -0.5 * (squared + np.log(np.linalg.det(S)))[:, : len(WAYS)]
         weight = self._weight[rows] * np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
         self._weight[rows] = np.maximum(weight / weight.sum(axis=1, keepdims=True), LEAST_WEIGHT)
         self._unseen_s[rows] = 0.0
@@ -306,9 +308,11 @@ class Parallax:
     def _mixed(self, share: Floats, x: Floats, P: Floats) -> tuple[Floats, Floats]:
         """The moments of filters (N, 6) mixed by `share` (N, 6, K); of the six and of the K the first two stand."""
         P[:, STILL, [[VX], [VY]], [[VX], [VY]]] = self.config.sigma_creep_mps**2  # it starts
-        mean = np.einsum("nij,nia->nja", share, x)
-        gap = x[:, :, None] - mean[:, None]  # (N, from, to, 8)
-        cov = np.einsum("nij,niab->njab", share, P) + np.einsum("nij,nija,nijb->njab", share, gap, gap)
+        to = share.swapaxes(1, 2)  # (N, to, from)
+        mean = to @ x
+        gap = x[:, None] - mean[:, :, None]  # (N, to, from, 8)
+        cov = (to @ P.reshape(*P.shape[:2], -1)).reshape(*mean.shape, P.shape[-1])
+        cov += (to[..., None] * gap).swapaxes(-1, -2) @ gap
         speed = slice(VX, VY + 1)
         mean[:, STILL, speed] = 0.0
         cov[:, STILL, speed] = 0.0
