@@ -273,14 +273,15 @@ def ranges_table(rows: Sequence[RangeRow]) -> str:
 
 def motion_table(rows: Sequence[MotionRow]) -> str:
     """Of the found cars: their velocities, and how many standing and driving ones were told as the other."""
-    head = ["Seq", "sights", "velocity error m/s", "standing", "false movers", "sure of it", "driving"]
-    head.append("missed movers")
+    head = ["Seq", "sights", "velocity error m/s", "standing", "false movers", "sure of it"]
+    head += ["driving", "missed movers", "sure of it"]
     lines = [
         [
             row.sequence,
             str(row.asked),
             _number(row.velocity_error_median_mps),
-            *(str(n) for n in (row.standing, row.false_movers, row.false_movers_sure, row.driving, row.missed_movers)),
+            *map(str, (row.standing, row.false_movers, row.false_movers_sure)),
+            *map(str, (row.driving, row.missed_movers, row.missed_movers_sure)),
         ]
         for row in rows
     ]

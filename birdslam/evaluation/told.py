@@ -58,8 +58,8 @@ class RangeRow(msgspec.Struct, frozen=True, kw_only=True):
 class MotionRow(msgspec.Struct, frozen=True, kw_only=True):
     """Velocities of the found cars, and how many sights of standing (driving) ones were told as driving (standing).
 
-    `false_movers_sure`: those whose speed is over the bar by twice its own sigma too. Of a vehicle just come into sight
-    the covariance says that nothing is known of its speed yet.
+    `false_movers_sure` and `missed_movers_sure`: those whose speed is over or under the bar by twice its own sigma too.
+    Of a vehicle just come into sight the covariance says that nothing is known of its speed yet.
     """
 
     sequence: str
@@ -70,6 +70,7 @@ class MotionRow(msgspec.Struct, frozen=True, kw_only=True):
     false_movers_sure: int
     driving: int
     missed_movers: int
+    missed_movers_sure: int
 
 
 def sights(sequence: TrackingSequence, estimates: Sequence[Estimate]) -> list[Sight]:
@@ -178,7 +179,7 @@ def motion_row(sequence: str, seen: Sequence[Sight]) -> MotionRow:
     pairs = [(truth, told, sigma) for truth, told, sigma in known if truth is not None and told is not None]
     errors = [math.dist(truth, told) for truth, told, _ in pairs]
     standing = [(math.hypot(*told), sigma) for truth, told, sigma in pairs if math.hypot(*truth) < STANDS_MPS]
-    driving = [math.hypot(*told) for truth, told, _ in pairs if math.hypot(*truth) > DRIVES_MPS]
+    driving = [(math.hypot(*told), sigma) for truth, told, sigma in pairs if math.hypot(*truth) > DRIVES_MPS]
     return MotionRow(
         sequence=sequence,
         asked=len(pairs),
@@ -187,5 +188,6 @@ def motion_row(sequence: str, seen: Sequence[Sight]) -> MotionRow:
         false_movers=sum(speed > TOLD_DRIVING_MPS for speed, _ in standing),
         false_movers_sure=sum(speed - 2.0 * sigma > TOLD_DRIVING_MPS for speed, sigma in standing),
         driving=len(driving),
-        missed_movers=sum(speed <= TOLD_DRIVING_MPS for speed in driving),
+        missed_movers=sum(speed <= TOLD_DRIVING_MPS for speed, _ in driving),
+        missed_movers_sure=sum(speed + 2.0 * sigma <= TOLD_DRIVING_MPS for speed, sigma in driving),
     )

@@ -17,7 +17,7 @@ from birdslam.evaluation.tracking import Row
 ABOUT_TOLD = (
     "Live, in the ego's frame: cars labelled 25 px or more high, hardly occluded and not truncated; found is an "
     "estimate within 20 % of the distance ahead and 1.5 m across. A car stands under 0.5 m/s and drives over 2 m/s by "
-    "its labels; it is told as driving over 1.5 m/s, surely where it is over that by twice its own sigma."
+    "its labels; it is told as driving over 1.5 m/s, surely where it is over or under that by twice its own sigma."
 )
 
 ABOUT_LANES = (
@@ -157,8 +157,8 @@ def _preface(setting: Setting, outcomes: Sequence[Outcome]) -> str:
         "each box and the log's distance, as no network for keypoints is at hand (birdslam/baselines/shape_prior.py).",
         "The placing's constants were chosen on 0000-0006 and 0008, the simulated odometry is fitted to other clips; "
         "0010 and 0018 chose nothing but `confirm_hits`, 0020 beside it what tells standing from creeping "
-        "(docs/constants.md). The true poses of 0018 and 0020 are of a stereo SLAM, whose scale is within 3 %; those of "
-        "the others are of GPS and IMU.",
+        "(docs/constants.md). The true poses of 0018 and 0020 are of a stereo SLAM, whose scale is within 3 %; those "
+        "of the others are of GPS and IMU.",
     ]
     if setting.frames == "paper":
         lines.append(
