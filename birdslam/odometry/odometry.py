@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.se2 import SE2
+from birdslam.odometry.beyond_road import BeyondRoad, BeyondRoadConfig
 from birdslam.odometry.car_reckoning import DRIVES_M, moves_sideways, reckoned
 from birdslam.odometry.car_scale import CarStep
 from birdslam.odometry.corner_pose import Corners, Fitting, Located, pose_beside_glass
@@ -43,7 +44,7 @@ from birdslam.odometry.motion import (
 from birdslam.odometry.moving_median import MedianScale
 from birdslam.odometry.road_alignment import RoadAligner, RoadFit
 from birdslam.odometry.road_filter import RoadScaleConfig
-from birdslam.odometry.road_points import on_road, outside
+from birdslam.odometry.road_points import is_night, on_road, outside
 from birdslam.odometry.road_scale import RoadScale
 from birdslam.odometry.sliding_window import common
 from birdslam.odometry.standing_corners import StandingCorners, StandingCornersConfig
@@ -83,6 +84,7 @@ class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
     standstill: StandstillConfig = StandstillConfig()
     standing_corners: StandingCornersConfig = StandingCornersConfig()
     held_speed: HeldSpeedConfig = HeldSpeedConfig()
+    beyond_road: BeyondRoadConfig = BeyondRoadConfig()
 
 
 class Odometry:
@@ -112,6 +114,7 @@ class Odometry:
         self._last = LastMotion()
         self._held = HeldSpeed(self.config.held_speed)
         self._glass = StandingCorners(self.camera, self.config.standing_corners)
+        self._beyond = BeyondRoad(self.camera, self.config.beyond_road)
         self._obstructed = False  # corners on the glass were left out of the newest motion
         self._guess: Pose | None = None  # of the step to the present image, where it had to be searched for
         self._road_tracks: tuple[Ints, Floats] = _NO_TRACKS
@@ -215,6 +218,8 @@ class Odometry:
         else:
             pose, info, held_m = self._hold_speed(pose, info, dt_s)
             pose = self._window.extend(frame_id, pose, corners.ids, corners.xy, held_m)  # bundle adjustment
+            if not self._scale.unknown and not self._glass.present:
+                self._beyond.judge(self._window, pose, self._scale.ground)
             if np.isfinite(held_m):
                 self._scale.length_held(held_m / max(float(np.linalg.norm(pose.p - self._pose.p)), held_m))
             interval_ns = (t_source_ns - round(dt_s * 1e9), t_source_ns)
@@ -231,7 +236,7 @@ class Odometry:
         self._tracker.accept(tracks)
         self._window = self._new_window()
         self._pose = STILL
-        static = outside(tracks.px, boxes_px)
+        static = outside(tracks.px, boxes_px, is_night(tracks.image))
         self._window.append(frame_id, self._pose, tracks.ids[static], self.camera.to_xy(tracks.px[static]))
         self._base_frame, self._base_t_ns, self._base_seen = frame_id, t_source_ns, True
         self._scale.restart(tracks.image, self._pose, 0.3)
@@ -259,9 +264,11 @@ class Odometry:
 
     def _static_corners(self, tracks: Tracks, boxes_px: Floats, dt_s: float) -> Corners:
         driven_m = self._last.speed_mps * dt_s if self._scale.sigma_rel < _WAY_SIGMA_REL else 0.0
-        static, base = outside(tracks.px, boxes_px), self._tracker.base
+        static, base = outside(tracks.px, boxes_px, is_night(tracks.image)), self._tracker.base
         ids, px = tracks.ids[static], tracks.px[static]
         stands = self._glass.see(ids, px, self._scale.ground, driven_m)
+        good = self._beyond.without(ids)
+        ids, px, stands = ids[good], px[good], stands[good]
         a, b = common(base.ids, ids)
         displacement: Floats = np.sqrt(((px[b] - base.px[a]) ** 2).sum(axis=1))
         return Corners(ids, self.camera.to_xy(px), displacement, stands & self._glass.present)
