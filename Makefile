@@ -13,13 +13,12 @@ ON_EACH_CHANGE := not slow and not faults and not onroad
 
 setup: $(VENV)/.ready
 
-# Modules are compiled when they are first used: to compile them all takes half a minute
 $(VENV)/.ready: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "birdslam needs Python 3.11 or newer; set PYTHON=..."; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { test "$$(id -u)" = 0 && apt-get update -q && apt-get install -qy python3-venv; } \
 		|| { echo "Python's venv module is missing; as root: apt-get install python3-venv"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	@touch $@
 
 # First the tests that compute, one on each core; then those that start processes and wait for them, two at a time
