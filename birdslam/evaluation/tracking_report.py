@@ -182,8 +182,8 @@ def _runtime(outcomes: Sequence[Outcome], published: Published) -> str:
         "Seconds for so many first frames of a sequence on this computer, other processes beside it: all updates of "
         "our live graph, and one solve of the batch in SE(3), of odometry of unknown scale (as the paper's) and of "
         "metric odometry, each the median of three runs. A batch has its iterations in brackets; one that has not "
-        "converged has no ratio. The factors of the unknown scale are Python in gtsam's solver, the others are its "
-        "own. `runtime.png` shows each update.",
+        "converged ran once and has no ratio. The factors of the unknown scale are Python in gtsam's solver, the "
+        "others are its own. `runtime.png` shows each update.",
         "",
         "| Seq | frames | incremental | batch, unscaled | ratio | batch, metric | ratio |",
         "| --- | --- | --- | --- | --- | --- | --- |",
