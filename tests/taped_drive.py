@@ -53,6 +53,11 @@ class Perceive:
     def wait_alive(self, nodes: Any, timeout_s: float) -> set[str]:
         return set()
 
+    def forget(self, but_last: int) -> None:
+        """As after a longer drive than it keeps measurements of."""
+        while len(self.sent) > but_last:
+            self.sent.popleft()
+
     def kept(self, topic: str, timeout_s: float = 0.0) -> list[Message]:
         return list(self.sent)
 

@@ -120,6 +120,28 @@ def test_restarts_of_the_optimizer(tmp_path: Path, with_checkpoint: bool) -> Non
     assert verdict.epochs == (1 if with_checkpoint else 2)
 
 
+def test_a_restart_that_took_longer_than_perceive_keeps_measurements(tmp_path: Path) -> None:
+    """The checkpoint is whole, but nothing ties it to the oldest of them: a new world, and nothing was restored."""
+    tape, frames = Tape(tmp_path), measured(60)
+    for measurements in frames[:20]:
+        tape.step(measurements)
+    for measurements in frames[20:45]:
+        tape.frame(measurements)
+        tape.send(measurements)
+    tape.perceive.forget(10)
+    tape.restart(with_checkpoint=True)
+    for measurements in frames[45:]:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    told_of = {status for estimate in tape.estimates for status in estimate.status}
+    assert Status.GRAPH_RESET in told_of
+    assert Status.GRAPH_RESTORED not in told_of
+    verdict = verdict_of(tape)
+    assert verdict.same, verdict.difference
+    assert (verdict.restarts, verdict.epochs) == (1, 2)
+    assert verdict.equal == len(tape.estimates)
+
+
 def test_a_new_world_without_a_restart_that_anybody_saw_is_a_difference(tmp_path: Path) -> None:
     tape, frames = Tape(tmp_path), measured(20)
     for measurements in frames[:10]:

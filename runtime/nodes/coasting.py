@@ -78,3 +78,11 @@ def unmeasured(ref: FrameRef, last: Estimate | None, max_ns: int) -> Measurement
         if ref.t_source_ns - last.t_source_ns > max_ns:
             status.append(Status.COASTED_TOO_LONG)
     return Measurements(**stamps(ref), status=tuple(dict.fromkeys(status)))
+
+
+def with_untold(estimate: Estimate, untold: tuple[Status, ...]) -> Estimate:
+    """The estimate with what planners have yet to hear; in a world that begins with it nothing is restored."""
+    status = tuple(dict.fromkeys((*estimate.status, *untold)))
+    if Status.GRAPH_RESET in status:
+        status = tuple(said for said in status if said != Status.GRAPH_RESTORED)
+    return estimate if status == estimate.status else msgspec.structs.replace(estimate, status=status)

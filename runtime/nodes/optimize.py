@@ -15,7 +15,15 @@ from birdslam.graph.pose_graph import PoseGraph
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.nodes.capture import stamps
 from birdslam.runtime.nodes.checkpoints import CheckpointFile, checkpoint_path
-from birdslam.runtime.nodes.coasting import ANNOUNCED_FRAMES, TOLD_AGAIN, Announced, Overdue, deadline_ns, unmeasured
+from birdslam.runtime.nodes.coasting import (
+    ANNOUNCED_FRAMES,
+    TOLD_AGAIN,
+    Announced,
+    Overdue,
+    deadline_ns,
+    unmeasured,
+    with_untold,
+)
 from birdslam.runtime.nodes.degradation import Mode
 from birdslam.runtime.process.restarts import FIRST, Assignment, EpochFile
 from birdslam.runtime.transport.bus import Bus, Message
@@ -30,7 +38,8 @@ class OptimizeNode:
 
     Frame numbers never fall: measurements that come after their frame was given up correct the graph, and the newest
     frame that was told of is told of again. After a restart the graph goes on from its last checkpoint, with what
-    perceive still has of the measurements since (GRAPH_RESTORED), or in a new epoch (GRAPH_RESET).
+    perceive still has of the measurements since (GRAPH_RESTORED); or, where these do not reach back to it, in a new
+    epoch (GRAPH_RESET).
     """
 
     def __init__(self, configuration: Configuration, bus: Bus, assignment: Assignment = FIRST) -> None:
@@ -150,9 +159,7 @@ class OptimizeNode:
 
     def _told(self, estimate: Estimate) -> Estimate:
         """What goes out, with what planners have yet to hear."""
-        if self._untold:
-            status = tuple(dict.fromkeys((*estimate.status, *self._untold)))
-            estimate, self._untold = msgspec.structs.replace(estimate, status=status), ()
+        estimate, self._untold = with_untold(estimate, self._untold), ()
         self._told_frame = estimate.frame_id
         if self._epochs is not None:
             self._epochs.store(estimate.epoch)

@@ -6,7 +6,7 @@ from the clock. What a recording can leave open, it is held to one by one, and t
 
 - measurements that no estimate answers: the optimizer never had them, or its estimate was lost on its way here;
 - a restart of the optimizer (the recording has it come alive again): in a new epoch, or from its last checkpoint, from
-  which on it was given all measurements.
+  which on it was given all measurements, or none before those that begin a new epoch.
 
 Where measurements are missing that the optimizer had, its graph is not known any more: nothing is compared until a new
 epoch begins, and that is counted. A file that begins in the middle of a drive, since the recorder died, has in it the
@@ -26,7 +26,7 @@ from birdslam.graph.checkpoint import CheckpointError
 from birdslam.graph.pose_graph import GraphConfig, PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.runtime.configuration import DegradationConfig
-from birdslam.runtime.nodes.coasting import TOLD_AGAIN, unmeasured
+from birdslam.runtime.nodes.coasting import TOLD_AGAIN, unmeasured, with_untold
 from birdslam.runtime.nodes.optimize import farewell
 from birdslam.runtime.recording.recording import CHECKPOINT, Alive, GraphCheckpoint, Recording, RecordingError
 from birdslam.runtime.replay.verdict import Difference, Verdict, differing
@@ -67,11 +67,8 @@ class _State:
 
     def tell(self, estimate: Estimate) -> Estimate:
         """With what had yet to be told."""
-        if not self.untold:
-            return estimate
-        status = tuple(dict.fromkeys((*estimate.status, *self.untold)))
-        self.untold = ()
-        return msgspec.structs.replace(estimate, status=status)
+        told, self.untold = with_untold(estimate, self.untold), ()
+        return told
 
 
 class Comparison:
@@ -196,6 +193,7 @@ class Comparison:
         came_again = self._alive - 1 > self.verdict.restarts
         if came_again and new_world:
             yield self._fresh(estimate), now, True
+            yield self._copy(), now, True  # from its checkpoint, which nothing ties to what perceive still had
         if came_again and Status.GRAPH_RESTORED in estimate.status:
             for last in (self._state.last, None):
                 restored = self._copy()
