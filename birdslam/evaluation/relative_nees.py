@@ -108,7 +108,10 @@ def over_seeds(rows: Sequence[Sequence[NeesRow]]) -> list[NeesRow]:
 def _mean(values: Sequence[tuple[float | None, int]]) -> float | None:
     """Of values with their weights; None where there is none."""
     known = [(value, weight) for value, weight in values if value is not None and weight]
-    return sum(value * weight for value, weight in known) / sum(weight for _, weight in known) if known else None
+    if not known:
+        return None
+    means, weights = np.transpose(known)
+    return float(np.average(means, weights=weights))
 
 
 def _ego_rows(sequence: str, odometry: str, per: str, found: MotionConsistency) -> list[NeesRow]:
