@@ -178,7 +178,9 @@ class FrontEnd:
         depth = perception.depth if perception.ages.get("depth", 0) == age else None
         segmentation = perception.segmentation if perception.ages.get("segmenter", 0) == age else None
         road = None if segmentation is None else segmentation.road
-        seen = self.vehicles.ingest_detections(perception.detections, frame.frame_id - age, depth, road)
+        seen = self.vehicles.ingest_detections(
+            perception.detections, frame.frame_id - age, depth, road, perception.awaited_from
+        )
         return vehicle_edges(seen, opened.ego, self.vehicles.road.ground, self.camera, self.config.tracking)
 
     def _open_frame(self, frame: Frame, motion: Motion | None) -> OpenFrame:

@@ -100,6 +100,40 @@ def test_vehicles_are_as_if_detections_had_come_in_time(delays: list[int]) -> No
     assert [roads[k] for k in whole] == [punctual_roads[k] for k in whole]
 
 
+@pytest.mark.parametrize(("every", "delay"), [(3, 2), (4, 1), (2, 1), (5, 0)])
+def test_frames_that_nobody_looks_at_are_settled_before_the_next_detections_come(every: int, delay: int) -> None:
+    """Where they settle changes nothing but when the work is done: the tracks and the road are those of before."""
+
+    def drive(told: bool) -> tuple[list[list[float]], list[GroundPlane], list[int]]:
+        vehicles, seen, roads, settled = out_of_sequence(), [], [], []
+        localise, work = vehicles.tracker.localise_vehicles, []
+        vehicles.tracker.localise_vehicles = lambda *a: work.append(a) or localise(*a)  # type: ignore[method-assign]
+        for k in range(FRAMES):
+            look = k // every * every
+            known = look if k - look >= delay else look - every
+            work.clear()
+            vehicles.open_frame(open_frame(k))
+            found = detections(known) if known >= 0 else None
+            tracks = vehicles.ingest_detections(
+                found, known, awaited_from=(look if known < look else k + 1) if told else 0
+            )
+            seen += [[t.seen_frame, t.vehicle, *t.state.tolist(), *t.cov.ravel().tolist()] for t in tracks]
+            roads.append(vehicles.road.ground)
+            settled.append(len(work))
+        return seen, roads, settled
+
+    told, kept_open = drive(True), drive(False)
+    assert told[0] == kept_open[0]
+    assert told[0]
+    for one, other in zip(told[1], kept_open[1], strict=True):
+        assert (one.height_m, one.pitch_rad, one.roll_rad) == pytest.approx(
+            (other.height_m, other.pitch_rad, other.roll_rad), rel=0, abs=1e-15
+        )
+    assert sum(told[2]) >= sum(kept_open[2])
+    arrives = range(every + delay, FRAMES, every)
+    assert max(told[2][k] for k in arrives) < max(kept_open[2][k] for k in arrives)
+
+
 def test_a_result_is_used_once_and_none_after_the_latest() -> None:
     seen, _ = follow([0, 1, 2, 2, 2, 2, 6])
     assert sorted({row[0] for row in seen}) == [1, 2, 6]

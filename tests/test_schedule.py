@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from birdslam.geometry.camera import Camera
-from birdslam.perception import Detections, Findings, ModelSpec, Perception, Segmentation
+from birdslam.perception import Detections, Findings, ModelSpec, Networks, Perception, Segmentation
 from birdslam.perception.manifest import Schedule
 from birdslam.runtime.configuration import (
     Configuration,
@@ -91,6 +92,19 @@ class Head:
         if self.role == "detector":
             return Findings(detections=Detections(np.zeros((0, 4)), np.zeros(0), ()))
         return Findings(segmentation=Segmentation(image > 0, image > 0))
+
+
+def test_of_frames_before_the_one_that_is_looked_at_no_more_detections_come() -> None:
+    head = Head("detector", ModelSpec("none.onnx", every=2, awaited=False))
+    with ThreadPoolExecutor(1) as threads:
+        networks = Networks([head], threads.submit, patience_s=0.0)
+        networks.start(4, IMAGE)
+        assert networks.start(5, IMAGE).result().awaited_from == 4
+        head.go.set()
+        head.done.wait()
+        threads.submit(int).result()  # the one before has ended too
+        pending = networks.start(6, None)
+        assert pending.result().awaited_from == 7
 
 
 def test_each_head_runs_on_its_frames_and_a_late_one_is_skipped_and_said_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,7 +33,8 @@ class Perception:
 
     `ages`: head name -> frames since the frame that its result in use was computed on, 0 is this one; a head without
     any result yet is absent. A head that fills several roles stands there with these roles, not with its name. Each
-    head whose result is of an earlier frame has its status in `status`.
+    head whose result is of an earlier frame has its status in `status`. `awaited_from`: of frames before it no
+    detections will come after these.
     """
 
     detections: Detections | None = None
@@ -41,6 +42,7 @@ class Perception:
     ages: dict[str, int] = field(default_factory=dict)
     status: tuple[Status, ...] = ()
     depth: DepthMap | None = None
+    awaited_from: int = 0
 
 
 class Pending(Protocol):
@@ -184,7 +186,14 @@ class Networks:
         found = {FIELDS[role]: getattr(s.findings, FIELDS[role]) for s in self._slots for role in s.fills}
         found["detections"] = self._with_bodies(found.get("detections"))
         ages = {name: age for slot in self._slots for name, age in slot.ages(frame_id).items()}
-        return Perception(**found, ages=ages, status=tuple(dict.fromkeys(status)))
+        return Perception(
+            **found, ages=ages, status=tuple(dict.fromkeys(status)), awaited_from=self._awaited_from(frame_id)
+        )
+
+    def _awaited_from(self, frame_id: int) -> int:
+        """The frame of the detections under way; the next one where there are none."""
+        under_way = (s.started_frame for s in self._slots if s.running is not None and "detector" in s.fills)
+        return min((frame for frame in under_way if frame is not None), default=frame_id + 1)
 
     def _with_bodies(self, detections: Detections | None) -> Detections | None:
         """The detector's boxes with the bodies that a head of several roles found in the same image."""

@@ -2,8 +2,9 @@
 
 The tracks and the ground and size filter stand at the last *settled* frame, whose detections are in or are no longer
 awaited. The frames after it are open: what is known of each (pose, time, how the camera pitched) is kept. Once the
-detections of one of them arrive, the open frames up to it are settled in their order. The road under the camera in the
-newest frame is predicted over the open ones.
+detections of one of them arrive, the open frames up to it are settled in their order. Frames of which none can come any
+more are settled before that, in a frame without detections: where few frames are looked at, the one whose detections
+arrive would bear the work of all. The road under the camera in the newest frame is predicted over the open ones.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class OpenFrame:
 
 
 class OutOfSequenceTracker:
-    """open_frame(), then ingest_detections(), once a frame; `road` is the road under the camera in the newest one."""
+    """open_frame(), then ingest_detections(), once a frame; after both `road` is the one under the camera in it."""
 
     def __init__(self, tracker: Tracker, ground_size: GroundSizeFilter, config: OutOfSequenceConfig) -> None:
         self.tracker = tracker
@@ -58,9 +59,8 @@ class OutOfSequenceTracker:
             self._used_frame = -1
         self._newest_frame = frame.ego.frame_id
         self._open.append(frame)
-        if self.road is self.ground_size:
-            self.road = self.ground_size.ground_alone()
-        _predict(self.road, frame)
+        if self.road is not self.ground_size:
+            _predict(self.road, frame)
         while (frame.ego.t_source_ns - self._open[0].ego.t_source_ns) * 1e-6 > self.config.latest_ms:
             self._settle_oldest(None)
 
@@ -70,11 +70,13 @@ class OutOfSequenceTracker:
         detected_frame: int,
         depth: DepthMap | None = None,
         road: NDArray[np.bool_] | None = None,
+        awaited_from: int = 0,
     ) -> list[Track]:
         """The confirmed tracks that detections of `detected_frame` show, as they were in it, ordered by id.
 
         Each detections are used once. A detector works on one image at a time, so that none come after later ones.
-        `depth` and `road`, a mask (H, W), are of the same frame, None where they are not.
+        `depth` and `road`, a mask (H, W), are of the same frame, None where they are not. Of frames before
+        `awaited_from` none come after these.
         """
         tracks: list[Track] = []
         awaited = any(frame.ego.frame_id == detected_frame for frame in self._open)
@@ -82,7 +84,10 @@ class OutOfSequenceTracker:
             self._used_frame = detected_frame
             self._settle_before(detected_frame)
             tracks = self._settle_oldest(detections, depth, road)
-            self.road = self.ground_size if not self._open else self.ground_size.ground_alone()
+        else:
+            self._settle_before(awaited_from)
+        if self._open and self.road is self.ground_size:
+            self.road = self.ground_size.ground_alone()
             for frame in self._open:
                 _predict(self.road, frame)
         return tracks
@@ -97,8 +102,9 @@ class OutOfSequenceTracker:
         depth: DepthMap | None = None,
         road: NDArray[np.bool_] | None = None,
     ) -> list[Track]:
-        """The oldest open frame, with its detections or without any."""
+        """The oldest open frame, with its detections or without any; `road` is to be predicted anew after it."""
         frame = self._open.popleft()
+        self.road = self.ground_size
         _predict(self.ground_size, frame)
         return self.tracker.localise_vehicles(frame.ego, detections, self.ground_size, depth, road)
 
