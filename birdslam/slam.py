@@ -6,7 +6,8 @@ import msgspec
 
 from birdslam.frontend import EgoMotion, FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph, check_together
+from birdslam.graph.graph_config import GraphConfig, check_together
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.mapping.lane_mapper import LaneHead
 from birdslam.perception import Networks, shipped_networks

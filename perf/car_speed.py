@@ -35,7 +35,8 @@ from birdslam.evaluation.odometry import ate_m, from_first, path_length_m
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import ModelError, Perception
 from birdslam.perf.errors import PerfError

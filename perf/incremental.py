@@ -33,7 +33,8 @@ from birdslam.baselines.batch_se2 import Solution
 from birdslam.baselines.posegraph3 import Convergence, solve_batch
 from birdslam.evaluation.tracking import PAPER, ours
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.simulation.drive import Drive, DriveConfig, drive
 from birdslam.slam import SlamConfig

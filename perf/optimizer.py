@@ -37,7 +37,8 @@ import psutil
 from msgspec.structs import replace
 
 from birdslam.baselines.smoothers import Smoother
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perf.figures import curve, noise, spread, write_json
 from birdslam.perf.machine import Steal

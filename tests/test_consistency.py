@@ -15,7 +15,8 @@ from birdslam.baselines.batch_se2 import Solution, ego_key, solve, vehicle_key
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.road_alignment import RoadFit
 from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig

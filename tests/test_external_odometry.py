@@ -17,7 +17,8 @@ from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.geometry.timed_poses import TimedPoses
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.external import ExternalConfig, ExternalOdometry
 from birdslam.odometry.motion import Motion

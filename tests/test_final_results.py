@@ -18,7 +18,8 @@ from birdslam.evaluation.results import Recorder, ResultsError
 from birdslam.evaluation.tracking import Final, ours
 from birdslam.evaluation.video import DriveVideo, SideBySide, check_video
 from birdslam.geometry.camera import Camera
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.runtime.cli import replay
 from birdslam.runtime.cli.main import main

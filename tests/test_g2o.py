@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from birdslam.baselines.batch_se2 import ego_key, solve
 from birdslam.graph.g2o import g2o_lines
-from birdslam.graph.pose_graph import GraphConfig
+from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.weights import WeightsConfig
 from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.types import Measurements

@@ -22,7 +22,8 @@ from birdslam.baselines.posegraph3 import BatchConfig
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.factors import sum_of_points
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perf import incremental, optimizer
 from birdslam.perf.__main__ import main as perf_main
@@ -502,7 +503,8 @@ def test_no_more_vehicles_than_configured_the_freshest_stay() -> None:
 
 REPLAY = """
 import hashlib, msgspec
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.graph.weights import WeightsConfig
 graph = PoseGraph(GraphConfig(), WeightsConfig(leave_out=()))

@@ -13,7 +13,8 @@ from birdslam.evaluation.tracking import PAPER
 from birdslam.geometry.se2 import SE2
 from birdslam.graph import pose_graph, vehicle_places
 from birdslam.graph.factors import CpEdge, CvEdge, VvEdge
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.graph.window import Window
 from birdslam.simulation.drive import Drive, DriveConfig, drive

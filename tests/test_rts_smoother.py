@@ -13,7 +13,8 @@ from birdslam.evaluation.odometry import rms
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections, Perception, Ready
 from birdslam.types import Measurements, Status, VehicleEdge

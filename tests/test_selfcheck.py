@@ -19,7 +19,8 @@ from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import rotation_exp
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.plausibility import PlausibilityConfig

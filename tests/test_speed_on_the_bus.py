@@ -23,7 +23,8 @@ from birdslam.datasets.recording import RecordedFrame
 from birdslam.datasets.speed_log import KEPT_READINGS, added
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.runtime.configuration import Configuration, RecordingConfig, RuntimeConfig, SourceConfig
 from birdslam.runtime.nodes import capture

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.standing import DECIDED, GIVEN_UP, STANDING_MPS, decide, judge, told_velocity
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.weights import WeightsConfig

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Perception, Ready
 from birdslam.perf import street

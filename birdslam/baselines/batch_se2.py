@@ -19,7 +19,7 @@ from birdslam.baselines.trajectories import Trajectories, dead_reckoned
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.planar import between, compose, log
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.pose_graph import GraphConfig
+from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.types import LandmarkEdge, LandmarkKind, Measurements, VehicleEdge
 

@@ -18,7 +18,7 @@ from birdslam.baselines.trajectories import Method, Trajectories
 from birdslam.evaluation.completed_lanes import of_kind, with_completed_lanes
 from birdslam.evaluation.tracking import PAPER, Final, Live
 from birdslam.geometry.camera import Camera
-from birdslam.graph.pose_graph import GraphConfig
+from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.weights import NO_WEIGHT, EdgeType, WeightsConfig
 from birdslam.types import LandmarkKind, Measurements
 from birdslam.vehicles.rts_smoother import SmootherConfig

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from birdslam.evaluation import truth_quality
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
 from birdslam.types import INVALIDATING, EgoEdge, Estimate, Measurements, Status

@@ -32,7 +32,8 @@ from birdslam.evaluation.tracking_metrics import (
 from birdslam.frontend import EgoMotion, FrontEnd, FrontEndConfig, Pending
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.simulation.odometry import SimulatedOdometry
 from birdslam.slam import SlamConfig

@@ -23,7 +23,8 @@ from typing import Any
 import msgspec
 
 from birdslam.graph.checkpoint import CheckpointError
-from birdslam.graph.pose_graph import GraphConfig, PoseGraph
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.runtime.configuration import DegradationConfig
 from birdslam.runtime.nodes.coasting import TOLD_AGAIN, unmeasured, with_untold

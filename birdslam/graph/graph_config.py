@@ -1,0 +1,61 @@
+"""The back end's own numbers: what they are, their defaults, and what they ask of the weights."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from birdslam.graph.landmarks import LandmarkAnchor
+from birdslam.graph.weights import WeightsConfig
+
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The back end's own numbers."""
+
+    # Ego poses kept beside the newest. One frame in so many is a key frame: landmarks tie it to the key frame before
+    ego_nodes: Annotated[int, msgspec.Meta(ge=1, le=64)] = 4
+    # Vehicles
+    constant_velocity: bool = True  # False: only VV edges tie the poses of a vehicle, as in Eq. 6
+    change_forward_mps: Positive = 2.0  # 1-sigma by which a vehicle's velocity changes within a second
+    change_sideways_mps: Positive = 0.5  # the same across
+    change_turn_radps: Positive = 0.3  # and of its yaw rate
+    birth_forward_mps: Positive = 12.0  # 1-sigma of the velocity of a vehicle seen for the first time
+    birth_sideways_mps: Positive = 2.0  # the same across
+    birth_turn_radps: Positive = 0.5  # and of its yaw rate
+    forget_s: Positive = 1.0  # a vehicle out of sight is predicted on for so long
+    max_vehicles: Count = 32  # the longest out of sight go first
+    detection_gate_sigma: Positive = 4.0  # Mahalanobis distance past which a detection weighs less; twice it: nothing
+    detection_contradictions: Count = 5  # so many left out in a row begin the vehicle anew
+    ends_alike: bool = True  # a CV edge may take a vehicle's front for its back; False: its yaw counts as it is
+    # Static map
+    landmark_gate_sigma: Positive = 3.0  # Mahalanobis distance past which a landmark weighs less
+    landmark_common_m: NotNegative = 0.15  # 1-sigma of what is common to all landmarks of a frame (scale, pitch)
+    # Where X_p of Eq. 3 is. key_frame: where the last key frame saw it, as uncertain as that sight and that pose;
+    # first_sight: in the world, put there once by the frame that saw it first and known from then on, as in the paper
+    landmark_anchor: LandmarkAnchor = "key_frame"
+    landmark_least_frames: Count = 2  # frames with CP edges that a landmark was seen in, to be put on the map
+    max_landmarks: Count = 512  # of a frame
+    max_pending_landmarks: Count = 10_000  # waiting for `map_update`
+    max_pending_frames: Count = 1_000  # whose lane points wait for `map_update`
+    # What is common to many CC edges in a row, and so moves all that is in sight against the world's origin alone
+    # The way over which the errors of the metric scale, direction and turn last; 0: they do not
+    scale_memory_m: NotNegative = 20.0
+    # The part of a camera's motion that lasts so: over 10 m the direction is off by 0.0033 to 0.0070 rad on KITTI 00,
+    # 01, 06, 0005 and the shipped drive, and a turn by 0.8 % (01) and 1.8 % (00)
+    lasting_direction_rad: NotNegative = 0.005  # 1-sigma of the direction of travel
+    lasting_turn_rel: NotNegative = 0.01  # 1-sigma of a turn, as a fraction
+    hold_at_standstill: bool = True  # False: a car that stands has the CC edge of one that drives
+    # Frames without a picture
+    blind_mps: Positive = 1.0  # 1-sigma by which the ego's velocity may differ from the last one measured
+    blind_radps: Positive = 0.1  # the same of its yaw rate
+
+
+def check_together(graph: GraphConfig, weights: WeightsConfig) -> None:
+    """Raises ValueError where the weights ask for edges that the graph does not have."""
+    if weights.cp_vehicles is not None and graph.landmark_anchor != "first_sight":
+        raise ValueError('weights.cp_vehicles needs graph.landmark_anchor = "first_sight": X_p in the world')
