@@ -556,7 +556,7 @@ def test_two_heads_of_one_role_are_refused() -> None:
         Networks([FakeHead("a"), FakeHead("b")], Executor().submit)
     with pytest.raises(ValueError, match="patience_s"):
         Networks([], Executor().submit, patience_s=-1.0)
-    assert Networks([], Executor().submit).start(0, IMAGE).result() == Perception()
+    assert Networks([], Executor().submit).start(0, IMAGE).result() == Perception(awaited_from=1)
     assert Ready(Perception()).result() == Perception()
 
 

@@ -28,8 +28,8 @@ def vehicle_edges(
     Edges end in `present`, over whose road `ground` the camera stands.
     """
     cv, vv = [], []
-    for seen in tracks:
-        track = seen if seen.seen_frame == present.frame_id else _moved_on(seen, present, ground, camera, config)
+    late = bool(tracks) and tracks[0].seen_frame != present.frame_id
+    for seen, track in zip(tracks, _moved_on(tracks, present, ground, camera, config) if late else tracks, strict=True):
         if track is None:
             continue
         cv.append(_vehicle_edge(track, present.t_source_ns - seen.seen_ns, config))
@@ -61,37 +61,34 @@ def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> Vehicl
 
 
 def _moved_on(
-    track: Track, present: EgoFrame, ground: GroundPlane, camera: Camera, config: TrackingConfig
-) -> Track | None:
-    """The track as it would be had it been seen now where its velocity puts it.
+    tracks: list[Track], present: EgoFrame, ground: GroundPlane, camera: Camera, config: TrackingConfig
+) -> list[Track | None]:
+    """Tracks, all seen in one frame, as they would be had they been seen now where their velocities put them.
 
-    None where it has left the view, or its velocity is not known well enough to say where it is.
+    None where one has left the view, or its velocity is not known well enough to say where it is.
     """
-    dt_s = (present.t_source_ns - track.seen_ns) * 1e-9
-    velocity, drift = track.state[2:], _drift(track, dt_s, config)
-    if float(np.linalg.eigvalsh(drift)[-1]) > config.late_sigma_m**2:
-        return None
-    moved = replace(track, state=np.concatenate([track.state[:2] + velocity * dt_s, velocity]))
-    (box,) = predicted_boxes_px([moved], camera, present.T_world_ego, ground)
-    if not np.isfinite(box).all():
-        return None
-    R_world_then, R_now_world = track.T_world_ego.rotation(), present.T_world_ego.rotation().T
+    dt_s, T_world_then = (present.t_source_ns - tracks[0].seen_ns) * 1e-9, tracks[0].T_world_ego
+    state, cov = np.array([track.state for track in tracks]), np.array([track.cov for track in tracks])
+    steps = state[:, 2:] * dt_s
+    drift = cov[:, 2:, 2:] * dt_s**2 + np.eye(2) * (config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
+    state[:, :2] += steps
+    moved = [replace(track, state=moved_to) for track, moved_to in zip(tracks, state, strict=True)]
+    boxes = predicted_boxes_px(moved, camera, present.T_world_ego, ground)
+    known = (np.linalg.eigvalsh(drift)[:, -1] <= config.late_sigma_m**2) & np.isfinite(boxes).all(axis=1)
+    R_world_then, R_now_world = T_world_then.rotation(), present.T_world_ego.rotation().T
     # The velocity errs with the place that it was corrected by: K R of a Kalman filter is the posterior's block
-    cov_world = R_world_then @ track.place.cov @ R_world_then.T + drift
-    cov_world += dt_s * (track.cov[2:, :2] + track.cov[:2, 2:])
-    centre = present.T_world_ego.inverse() @ (track.T_world_ego @ track.place.centre_m + velocity * dt_s)
-    moved.place = msgspec.structs.replace(track.place, centre_m=centre, cov=R_now_world @ cov_world @ R_now_world.T)
-    moved.observation = msgspec.structs.replace(track.observation, box_px=tuple(box.tolist()))
-    moved.seen_frame, moved.seen_ns, moved.T_world_ego = present.frame_id, present.t_source_ns, present.T_world_ego
-    if track.motion is not None:
-        moved.motion = _motion_on(track.motion, track, present.frame_id, velocity * dt_s, drift, config, dt_s)
-    return moved
-
-
-def _drift(track: Track, dt_s: float, config: TrackingConfig) -> NDArray[np.float64]:
-    """(2, 2) in world: how far off its velocity puts it after `dt_s`."""
-    out: NDArray[np.float64] = track.cov[2:, 2:] * dt_s**2 + np.eye(2) * (config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
-    return out
+    places_cov = R_world_then @ np.array([track.place.cov for track in tracks]) @ R_world_then.T + drift
+    places_cov += dt_s * (cov[:, 2:, :2] + cov[:, :2, 2:])
+    places_cov = R_now_world @ places_cov @ R_now_world.T
+    centres = np.array([track.place.centre_m for track in tracks])
+    centres = present.T_world_ego.inverse() @ (T_world_then @ centres + steps)
+    for k, (track, box) in enumerate(zip(moved, boxes.tolist(), strict=True)):
+        track.place = msgspec.structs.replace(track.place, centre_m=centres[k], cov=places_cov[k])
+        track.observation = msgspec.structs.replace(track.observation, box_px=tuple(box))
+        track.seen_frame, track.seen_ns, track.T_world_ego = present.frame_id, present.t_source_ns, present.T_world_ego
+        if track.motion is not None:
+            track.motion = _motion_on(track.motion, track, present.frame_id, steps[k], drift[k], config, dt_s)
+    return [track if shown else None for track, shown in zip(moved, known.tolist(), strict=True)]
 
 
 def _motion_on(
