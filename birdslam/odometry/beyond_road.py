@@ -45,9 +45,9 @@ class BeyondRoad:
         """Looks at the landmarks as a camera at `pose` sees them, in metres; those that are wrong leave the window."""
         cfg = self.config
         with np.errstate(invalid="ignore"):
-            rays = np.column_stack([window.predict_xy(pose), np.ones(len(window.ids))])
-            on_road = -(rays @ plane_normal(ground.pitch_rad, ground.roll_rad)[0]) / self.camera.height_m
-            most = window.inverse_depths(pose) + cfg.sigmas * window.rho_sigma
+            seen, inverse_depths = window.seen_from(pose)
+            on_road = -(plane_normal(ground.pitch_rad, ground.roll_rad)[0] @ seen) / self.camera.height_m
+            most = inverse_depths + cfg.sigmas * window.rho_sigma
             wrong = (on_road > 1.0 / cfg.far_m) & (most < on_road / cfg.depth_ratio)
         window.rho[wrong] = np.nan
         self._ids = np.union1d(self._ids, window.ids[wrong])

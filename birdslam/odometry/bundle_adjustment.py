@@ -104,13 +104,13 @@ def _choose(window: SlidingWindow, max_landmarks: int) -> _Problem | None:
     if len(chosen) > max_landmarks:
         chosen = np.sort(chosen[np.argsort(-count[chosen], kind="stable")][:max_landmarks])
     chosen = chosen[np.argsort(anchor[chosen], kind="stable")]
-    anchor, xy = anchor[chosen], window.obs[:, chosen]
+    anchor, xy = anchor[chosen], window.obs.take(chosen, axis=1)
     observed = np.isfinite(xy[..., 0]) & (np.arange(F)[:, None] != anchor[None])
     return _Problem(
         landmarks=chosen,
         anchor=anchor,
         groups=[slice(*np.searchsorted(anchor, [i, i + 1])) for i in range(F)],
-        rays=np.concatenate([xy[anchor, np.arange(len(chosen))].T, np.ones((1, len(chosen)))]),
+        rays=np.concatenate([window.xy_of(anchor, chosen).T, np.ones((1, len(chosen)))]),
         observed=observed,
         target=np.where(observed[:, None], xy.transpose(0, 2, 1), 0.0),
         J_anchor=np.empty((F, 6, 2, len(chosen))),
@@ -122,7 +122,7 @@ def _reproject(window: SlidingWindow, problem: _Problem, rho: Floats, outlier_fa
     R, p = window.stacked()
     f, sigma_px = window.focal_px, window.sigma_px
     base = np.concatenate([R[i] @ problem.rays[:, of] for i, of in enumerate(problem.groups)], axis=1)
-    between = p[problem.anchor].T - p[:, :, None]
+    between = (p.T - p[:, :, None]).take(problem.anchor, axis=2)
     c = base + rho * between
     q = R.transpose(0, 2, 1) @ c
     ahead = q[:, 2] > MIN_DEPTH

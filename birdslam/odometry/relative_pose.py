@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.median import upper_median
-from birdslam.odometry.sliding_window import MIN_DEPTH, SlidingWindow
+from birdslam.odometry.sliding_window import MIN_DEPTH, SlidingWindow, turned
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -78,10 +78,9 @@ def _known(window: SlidingWindow, ids: Ints) -> tuple[Ints, Bools]:
 def _landmarks(window: SlidingWindow, m: Ints, xy: Floats) -> _Landmarks:
     anchor = window.anchors()[m]
     R, p = window.stacked()
-    rays = np.column_stack([window.obs[anchor, m], np.ones(len(m))])
-    rho, p_anchor = window.rho[m], np.ascontiguousarray(p[anchor].T)
+    rho, p_anchor = window.rho[m], p.T.take(anchor, axis=1)
     return _Landmarks(
-        scaled=(R[anchor] @ rays[:, :, None])[:, :, 0].T + rho * p_anchor,
+        scaled=turned(R, anchor, window.xy_of(anchor, m)) + rho * p_anchor,
         rho=rho,
         rho_sigma=np.where(np.isfinite(window.rho_sigma[m]), window.rho_sigma[m], 0.0),
         p_anchor=p_anchor,

@@ -218,7 +218,8 @@ class RoadAligner:
         if len(px) < cfg.min_samples:
             return None
         fine = self._view(present, px, T_past_present)
-        coarse = _View(*(part[..., :: cfg.coarse_step] for part in (fine.rays, fine.turned, fine.grey)))
+        parts = fine.rays, fine.turned, fine.grey
+        coarse = _View(*(np.ascontiguousarray(part[..., :: cfg.coarse_step]) for part in parts))
         x = np.concatenate([prior, np.zeros(MOTION)])
         mean, weight_prior = x.copy(), np.zeros((ROAD + MOTION, ROAD + MOTION))
         weight_prior[:ROAD, :ROAD] = np.linalg.inv(prior_cov)
