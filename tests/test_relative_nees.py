@@ -48,7 +48,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> tuple[TrackingSequence, l
 
 
 def noisy(sequence: TrackingSequence, log: list[Measurements], times: float) -> list[Measurements]:
-    """Vehicles' edges at the truth but for `times` the noise that they state."""
+    """Vehicles' edges at the truth but for `times` the noise that they state, anew in each frame; sizes are known."""
     rng = np.random.default_rng(1)
     cov = tuple(np.diag(SIGMA**2).ravel().tolist())
     first, out = log[0].frame_id, []
@@ -61,7 +61,7 @@ def noisy(sequence: TrackingSequence, log: list[Measurements], times: float) -> 
             gaps = [math.hypot(place.x_m - seen.x_m, place.y_m - seen.y_m) for place in places]
             near = places[int(np.argmin(gaps))]
             noise = SE2.exp(times * SIGMA * rng.standard_normal(3))
-            cv.append(replace(edge, T_ego_vehicle=near @ noise, cov=cov))
+            cv.append(replace(edge, T_ego_vehicle=near @ noise, cov=cov, sigma_log_height=0.0))
         out.append(replace(m, cv=tuple(cv), vv=()))
     return out
 

@@ -126,3 +126,41 @@ def test_planners_are_told() -> None:
     assert {(v.moves, v.standing) for v in nobody_says} == {(Moves.UNDECIDED, 0.5)}
     as_published = driven_past(0.0, 0.97, GraphConfig(constant_velocity=False), WeightsConfig(mode="paper"))
     assert {v.moves for v in as_published} == {Moves.UNDECIDED}
+
+
+def test_an_error_of_the_size_is_not_averaged_away() -> None:
+    """Vehicles that are all off by their sizes' errors, in each frame alike, and the velocities that come of it."""
+    rng, sigma, frames = np.random.default_rng(3), 0.06, 25
+    off = sigma * rng.standard_normal(30)
+    at = np.column_stack([rng.uniform(50.0, 70.0, 30), rng.choice([-6.0, -3.0, 3.0, 6.0], 30)])
+    nees = {}
+    for stated in (sigma, 0.0):
+        graph = PoseGraph(GraphConfig(), WeightsConfig())
+        for k in range(frames):
+            step = EgoEdge(from_frame=k - 1, to_frame=k, T_from_to=SE2(1.0), cov=tuple((1e-6 * np.eye(3)).ravel()))
+            places = (at - [k, 0.0]) * np.exp(off)[:, None]
+            cov = tuple(np.diag([4.0, 0.04, 0.01]).ravel())
+            cv = tuple(
+                VehicleEdge(
+                    vehicle=v,
+                    frame=k,
+                    T_ego_vehicle=SE2(*place),
+                    cov=cov,
+                    depth_per_height=1.0,
+                    sigma_log_height=stated,
+                )
+                for v, place in enumerate(places.tolist())
+            )
+            times = dict.fromkeys(("t_source_ns", "t_capture_ns", "t_utc_ns"), k * 100_000_000)
+            m = Measurements(frame_id=k, **times, cc=step if k else None, cv=cv, vv=(), cp=())
+            estimate = graph.optimise(m)
+        in_ego = graph.vehicles_in_ego()
+        errors = [np.array([T.x_m, T.y_m]) - at[v] + [frames - 1, 0.0] for v, (T, _) in in_ego.items()]
+        pairs = zip(errors, in_ego.values(), strict=True)
+        of_place = np.mean([e @ np.linalg.solve(P[:2, :2], e) for e, (_, P) in pairs]) / 2.0
+        of_velocity = np.mean([v.velocity_mps[0] ** 2 / v.velocity_cov[0] for v in estimate.vehicles])
+        nees[stated] = of_place, of_velocity
+    assert 0.2 < nees[sigma][0] < 1.2  # along the line of sight alone something is off
+    assert nees[0.0][0] > 3.0 * nees[sigma][0]
+    assert 0.1 < nees[sigma][1] < 1.5
+    assert nees[0.0][1] > nees[sigma][1]

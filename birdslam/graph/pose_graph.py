@@ -99,7 +99,9 @@ class PoseGraph:
             if v.seen_ns == self._t_ns:
                 k, states = window.nodes + row, window.layout.poses[row]
                 at, yaw_rad = window.at[k], cmath.phase(window.heading[k])
-                out[v.vehicle] = SE2(at.real, at.imag, yaw_rad), window.P[np.ix_(states, states)]
+                by_size = v.lasting_rel * np.array([at.real, at.imag, 0.0])  # see marginals.py
+                cov = window.P[np.ix_(states, states)] + np.outer(by_size, by_size)
+                out[v.vehicle] = SE2(at.real, at.imag, yaw_rad), cov
         return out
 
     def map_update(self) -> MapUpdate | None:
@@ -298,7 +300,9 @@ class PoseGraph:
         return msgspec.structs.replace(estimate, T_world_ego=window.world @ way)
 
     def _vehicle_estimates(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
-        return vehicle_estimates(window, self._vehicles.nodes, m.t_source_ns, self._changes, self._birth_det)
+        since_s = (self._t_ns - self._t_before_ns) * 1e-9
+        ego_mps = complex(self._motion.x_m, self._motion.y_m) / max(since_s, SHORTEST_S)
+        return vehicle_estimates(window, self._vehicles.nodes, m.t_source_ns, self._changes, ego_mps, self._birth_det)
 
     def _estimate(
         self, m: Measurements, status: tuple[Status, ...], cov: Floats, vehicles: tuple[VehicleEstimate, ...]

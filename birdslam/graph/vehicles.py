@@ -30,6 +30,7 @@ class VehicleNode:
     delay_ns: int = 0  # of the detection at seen_ns
     standing_seen: float | None = None  # the probability that it stands, by its last edge; None: that did not say
     in_path: bool = False  # of the ego, by its last edge
+    lasting_rel: float = 0.0  # 1-sigma of its distance by what its size is off, as a fraction: more frames don't help
     standing: float | None = None  # the probability by all that is known; None: of that nothing
     moves: Moves = Moves.UNDECIDED
 
@@ -124,6 +125,7 @@ class VehicleNodes:
             v.seen_ns, v.frames, v.label = t_ns, v.frames + 1, edge.label
             v.length_m, v.width_m, v.delay_ns = edge.length_m, edge.width_m, edge.delay_ns
             v.standing_seen = edge.standing or None  # 0: nobody said
+            v.lasting_rel = abs(edge.depth_per_height) * edge.sigma_log_height
             v.in_path = abs(edge.T_ego_vehicle.y_m) < PATH_HALF_WIDTH_M
         before = len(self.nodes)
         alive = [row for row, v in enumerate(self.nodes) if (t_ns - v.seen_ns) * 1e-9 <= self._forget_s]
