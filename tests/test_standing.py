@@ -71,6 +71,16 @@ def test_both_have_to_agree() -> None:
     assert judged(node(0.005), (0.0, 0.0), 0.5).moves is Moves.UNDECIDED
 
 
+def test_who_is_first_seen_far_beside_the_road_needs_more_to_be_told_to_drive() -> None:
+    for standing_seen, v_mps in ((0.2, 2.5), (0.4, 1.5)):
+        on_road = judged(node(standing_seen), (v_mps, 0.0), 1.0)
+        beside = judged(node(standing_seen, beside=True), (v_mps, 0.0), 1.0)
+        assert on_road.standing is not None
+        assert beside.standing is not None
+        assert beside.standing > on_road.standing
+    assert judged(node(0.005, beside=True), (9.0, 0.0), 0.5).moves is Moves.DRIVING
+
+
 def test_in_the_egos_path_a_decision_is_kept_until_the_velocity_contradicts_it() -> None:
     creeps = judged(node(0.999, in_path=True), (1.0, 0.0), 0.5)
     assert creeps.moves is Moves.UNDECIDED

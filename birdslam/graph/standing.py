@@ -6,10 +6,11 @@ was seen (the density ratio of Savage and Dickey):
 
     log N(0; v, P) - log N(0; 0, P_birth) = log sqrt(|P_birth| / |P|) - v' P^-1 v / 2
 
-They are pooled by the mean of their log odds, as opinions are that share their evidence (Genest and Zidek 1986). From
-this comes a decision that lasts: taken on strong evidence, given up only where the evidence turns. In the ego's path
-growth says nothing (parallax.py tells why), and a car there that creeps must not be told to stand: what was decided
-before is kept there, until the velocity alone contradicts it, and nothing new is decided.
+They are pooled by the mean of their log odds, as opinions are that share their evidence (Genest and Zidek 1986). Both
+begin with the odds of vehicles on the ego's road; who is first seen far beside it more often stands, and gets the odds
+of those. From this comes a decision that lasts: taken on strong evidence, given up only where the evidence turns. In the
+ego's path growth says nothing (parallax.py tells why), and a car there that creeps must not be told to stand: what was
+decided before is kept there, until the velocity alone contradicts it, and nothing new is decided.
 
 The graph's velocity is that of a vehicle that moves. What is told is of both, with the covariance that a mixture has:
 
@@ -31,6 +32,9 @@ Pair = tuple[float, float]
 Quad = tuple[float, float, float, float]
 
 PRIOR = 1.0 / 3.0  # of the vehicles stand when first seen, as parallax.py has it
+# Of those first seen more than 15 m aside, on another road or on none. By the labels of KITTI tracking 0000 to 0020: 48
+# of 62 cars that do either, at their first sight of 25 px; nearer, but for the ego's own lane, it is 103 of 212
+PRIOR_BESIDE = 0.75
 SUREST = 0.99  # and 1 less it: neither of the two is believed to be surer
 # To decide, and below it to give a decision up. By judgement; from 0.5 to 0.7 and from 0.9 to 0.95 the cars of KITTI
 # tracking 0000-0018 by RRC's boxes, and of 0005 by two networks', are told alike but for some 10 sights of 5,600
@@ -53,7 +57,8 @@ def judge(v: VehicleNode, velocity: Pair, cov: Quad, birth_det: float, t_ns: int
     z2 = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / det
     by_velocity = _clipped(_logit(PRIOR) + 0.5 * (math.log(birth_det / det) - z2))
     if not v.in_path:
-        v.standing = _probability((by_velocity + _clipped(_logit(v.standing_seen))) / 2.0)
+        beside = _logit(PRIOR_BESIDE) - _logit(PRIOR) if v.beside else 0.0  # both have the prior of those on its road
+        v.standing = _probability((by_velocity + _clipped(_logit(v.standing_seen))) / 2.0 + beside)
         v.moves = decide(v.moves, v.standing)
     elif v.moves is not Moves.DRIVING and _probability(by_velocity) <= 1.0 - DECIDED:
         v.standing, v.moves = None, Moves.UNDECIDED

@@ -10,6 +10,7 @@ from birdslam.graph.factors import CvEdge, VvEdge, turned
 from birdslam.types import Moves, VehicleEdge
 
 PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/parallax.py
+BESIDE_M = 15.0  # farther aside is another road, or none: see standing.py
 SHORTEST_S = 1e-3  # source clocks that stand still or run backwards
 
 
@@ -30,6 +31,7 @@ class VehicleNode:
     delay_ns: int = 0  # of the detection at seen_ns
     standing_seen: float | None = None  # the probability that it stands, by its last edge; None: that did not say
     in_path: bool = False  # of the ego, by its last edge
+    beside: bool = False  # on another road, or on none, by its first edge
     lasting_rel: float = 0.0  # 1-sigma of its distance by what its size is off, as a fraction: more frames don't help
     standing: float | None = None  # the probability by all that is known; None: of that nothing
     moves: Moves = Moves.UNDECIDED
@@ -113,7 +115,7 @@ class VehicleNodes:
         for k, edge in enumerate(edges):
             row = self._row.get(edge.vehicle)
             if row is None:
-                born.append(v := VehicleNode(edge.vehicle))
+                born.append(v := VehicleNode(edge.vehicle, beside=abs(edge.T_ego_vehicle.y_m) > BESIDE_M))
             else:
                 v = self.nodes[row]
             if k not in outliers:
