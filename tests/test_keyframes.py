@@ -47,7 +47,8 @@ def unit_of_length(seed: int, way_m: float, sigma_px: float) -> Floats:
         pose = poses[-1] @ step
         if frame > 1:
             pose, _, _ = locate(window, poses[-1] @ poses[-2].between(poses[-1]), ids, xy)
-        poses.append(window.extend(frame, pose, ids, xy))
+        window.extend(frame, pose, ids, xy)
+        poses.append(window.refine())
     ways_m = [float(np.linalg.norm(b.p - a.p)) for a, b in zip(poses[9::3], poses[12::3], strict=False)]
     return np.array(ways_m) / (3 * STEP_M)
 

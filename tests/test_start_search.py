@@ -10,7 +10,7 @@ import pytest
 from birdslam.datasets.opening import open_recording
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.geometry.pose import Pose, rotation_exp
-from birdslam.odometry.guided_two_view import guided_two_view
+from birdslam.odometry.guided_two_view import first_pose, guided_two_view
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road_alignment import RoadAlignConfig, RoadAligner, plane_normal
@@ -105,6 +105,24 @@ def test_a_guided_two_view_holds_where_most_matches_are_far_or_wrong() -> None:
     assert np.degrees(np.arccos((np.trace(pose.R.T @ step.R) - 1.0) / 2.0)) < 0.1
     assert fits[30:150].mean() > 0.95
     assert guided_two_view(xy, xy_b, Pose(np.eye(3), np.zeros(3)), 700.0, 0.7) is None  # a guess without a direction
+
+
+def test_corners_that_move_backwards_along_their_lines_say_nothing_of_the_first_pose() -> None:
+    """They lie on the lines of the true motion, and no line tells them from the good: only the way along it does."""
+    rng = np.random.default_rng(2)
+    step = _step(0.4, 1.3)
+    depth = np.concatenate([rng.uniform(6.0, 60.0, 90), rng.uniform(-30.0, -12.0, 60)])  # the last behind the camera
+    xy = np.column_stack([rng.uniform(-0.8, 0.8, 150), rng.uniform(-0.2, 0.25, 150)])
+    there = (np.column_stack([xy, np.ones(150)]) - step.p / depth[:, None]) @ step.R
+    xy_b = there[:, :2] / there[:, 2:] + rng.normal(0.0, 0.2 / 700.0, xy.shape)
+    backwards = (depth < 0.0) & (np.linalg.norm(there[:, :2] / there[:, 2:] - xy @ step.R[:2, :2], axis=1) > 0.01)
+    for found in (first_pose(xy, xy_b, step, 700.0, 0.7), guided_two_view(xy, xy_b, step, 700.0, 0.7)):
+        assert found is not None
+        pose, fits = found
+        assert np.degrees(np.arccos(min(pose.p @ step.p / np.linalg.norm(step.p), 1.0))) < 0.5
+        assert fits[:90].mean() > 0.95
+        assert backwards.sum() > 20
+        assert fits[backwards].sum() == 0
 
 
 # --- on recorded drives ---

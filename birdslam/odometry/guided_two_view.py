@@ -2,7 +2,9 @@
 
 Five points determine the pose of two images, but where most corners are far away a turn looks like a move to the side,
 and among wrong matches or along a moving car RANSAC finds many corners that agree on one that no car makes. From a
-guess near the truth the same residuals, weighted robustly, have one minimum.
+guess near the truth the same residuals, weighted robustly, have one minimum. A residual says only how far a corner is
+from its epipolar line; along it a corner moves away from where it would be at infinity, and one that has moved the
+other way is a wrong match, or on something that moves along with the car.
 """
 
 from __future__ import annotations
@@ -37,6 +39,9 @@ def first_pose(
     """
     guided = guided_two_view(xy_a, xy_b, guess, focal_px, threshold_px)
     free = two_view(xy_a, xy_b, focal_px, threshold_px)
+    if free is not None:
+        rays_a, rays_b = _rays(xy_a), _rays(xy_b)
+        free = free[0], free[1] & (_nearer_px(free[0], rays_a, rays_b, focal_px) > -threshold_px)
     if guided is None or free is None:
         return free if guided is None else guided
     no_car = abs(float(free[0].p[2])) < _LEAST_FORWARD
@@ -53,23 +58,31 @@ def guided_two_view(
     length = float(np.linalg.norm(guess.p))
     if len(xy_a) < 12 or length < 1e-6:
         return None
-    rays_a, rays_b = (np.column_stack([xy, np.ones(len(xy))]) for xy in (xy_a, xy_b))
+    rays_a, rays_b = _rays(xy_a), _rays(xy_b)
     axes = _across(guess.p / length)
     prior = np.array([_SIGMA_ROTATION_RAD**-2] * 3 + [_SIGMA_DIRECTION_RAD**-2] * 2)
     x = np.zeros(5)
     for width_px in _WIDTHS_PX:
-        r = _residuals(x, guess, axes, rays_a, rays_b, focal_px)
+        T = _pose(x, guess, axes)
+        r = _residuals(T, rays_a, rays_b, focal_px)
         J = np.empty((5, len(r)))
         for k in range(5):
             moved = x.copy()
             moved[k] += _STEP_RAD
-            J[k] = (_residuals(moved, guess, axes, rays_a, rays_b, focal_px) - r) / _STEP_RAD
+            J[k] = (_residuals(_pose(moved, guess, axes), rays_a, rays_b, focal_px) - r) / _STEP_RAD
         w = 1.0 / np.square(1.0 + np.square(r / width_px)) / threshold_px**2  # Geman-McClure
+        w *= _nearer_px(T, rays_a, rays_b, focal_px) > -width_px
         x = x - np.linalg.solve((J * w) @ J.T + np.diag(prior), (J * w) @ r + prior * x)
-    fits = np.abs(_residuals(x, guess, axes, rays_a, rays_b, focal_px)) < threshold_px
-    if not fits.any() or not np.isfinite(x).all():
+    if not np.isfinite(x).all():
         return None
-    return _pose(x, guess, axes), fits
+    T = _pose(x, guess, axes)
+    fits = np.abs(_residuals(T, rays_a, rays_b, focal_px)) < threshold_px
+    fits &= _nearer_px(T, rays_a, rays_b, focal_px) > -threshold_px
+    return (T, fits) if fits.any() else None
+
+
+def _rays(xy: Floats) -> Floats:
+    return np.column_stack([xy, np.ones(len(xy))])
 
 
 def _across(direction: Floats) -> Floats:
@@ -84,12 +97,22 @@ def _pose(x: Floats, guess: Pose, axes: Floats) -> Pose:
     return Pose(rotation_exp(x[:3]) @ guess.R, direction / np.linalg.norm(direction))
 
 
-def _residuals(x: Floats, guess: Pose, axes: Floats, rays_a: Floats, rays_b: Floats, focal_px: float) -> Floats:
+def _residuals(T_a_b: Pose, rays_a: Floats, rays_b: Floats, focal_px: float) -> Floats:
     """(N,) px: Sampson's distance of each pair from the epipolar geometry."""
-    T = _pose(x, guess, axes)
-    tx, ty, tz = T.p
-    E = np.array([[0.0, -tz, ty], [tz, 0.0, -tx], [-ty, tx, 0.0]]) @ T.R
+    tx, ty, tz = T_a_b.p
+    E = np.array([[0.0, -tz, ty], [tz, 0.0, -tx], [-ty, tx, 0.0]]) @ T_a_b.R
     along_a, along_b = rays_b @ E.T, rays_a @ E
     norm2 = (along_a[:, :2] ** 2).sum(axis=1) + (along_b[:, :2] ** 2).sum(axis=1)
     out: Floats = focal_px * (rays_a * along_a).sum(axis=1) / np.sqrt(np.maximum(norm2, 1e-12))
+    return out
+
+
+def _nearer_px(T_a_b: Pose, rays_a: Floats, rays_b: Floats, focal_px: float) -> Floats:
+    """(N,) px: how far each corner of b is from where it would be at infinity, the way that nearer ones go."""
+    turned = rays_a @ T_a_b.R
+    at_infinity = turned[:, :2] / np.maximum(turned[:, 2:], 1e-3)
+    p_b_a = -(T_a_b.R.T @ T_a_b.p)
+    way = p_b_a[:2] - at_infinity * p_b_a[2]
+    length = np.maximum(np.linalg.norm(way, axis=1), 1e-6)
+    out: Floats = focal_px * ((rays_b[:, :2] - at_infinity) * way).sum(axis=1) / length
     return out

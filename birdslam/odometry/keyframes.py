@@ -43,8 +43,8 @@ class KeyframeWindow(SlidingWindow):
         self.config = config
         self._provisional = False  # the newest image is no keyframe yet
 
-    def extend(self, frame_id: int, pose: Pose, ids: Ints, xy: Floats, held_m: float = np.inf) -> Pose:
-        """Puts the present image into the window, triangulates and adjusts it; gives its pose after that.
+    def extend(self, frame_id: int, pose: Pose, ids: Ints, xy: Floats, held_m: float = np.inf) -> None:
+        """Puts the present image into the window and triangulates its corners.
 
         `pose` is its relative pose, ids (N,) ascending and xy (N, 2) its corners in normalised coordinates; `held_m` is
         1-sigma of its place where a held speed gave it.
@@ -57,9 +57,13 @@ class KeyframeWindow(SlidingWindow):
         while len(self.poses) > cfg.keyframes + 1:
             self.drop(0)
         self.triangulate()
+
+    def refine(self) -> Pose:
+        """Adjusts poses and landmarks; gives the pose of the present image after that."""
+        cfg, before = self.config, self.poses[-1]
         adjust(self, cfg.adjust_iterations, cfg.adjusted_landmarks, _STEP_PRIOR)
         if not np.isfinite(self.poses[-1].p).all():
-            self.poses[-1] = pose
+            self.poses[-1] = before
         return self.poses[-1]
 
     def _becomes_keyframe(self, pose: Pose, ids: Ints, xy: Floats) -> bool:

@@ -217,9 +217,10 @@ class Odometry:
             motion = self._stand(frame_id)
         else:
             pose, info, held_m = self._hold_speed(pose, info, dt_s)
-            pose = self._window.extend(frame_id, pose, corners.ids, corners.xy, held_m)  # bundle adjustment
+            self._window.extend(frame_id, pose, corners.ids, corners.xy, held_m)
             if not self._scale.unknown and not self._glass.present:
                 self._beyond.judge(self._window, pose, self._scale.ground)
+            pose = self._window.refine()
             if np.isfinite(held_m):
                 self._scale.length_held(held_m / max(float(np.linalg.norm(pose.p - self._pose.p)), held_m))
             interval_ns = (t_source_ns - round(dt_s * 1e9), t_source_ns)
