@@ -18,7 +18,7 @@ from birdslam.graph.pending_map import PendingState
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import WindowState
 
-VERSION = 5
+VERSION = 6
 _MAGIC = b"BirdSLAM graph\n"
 _SUM_BYTES = 16
 _KINDS = {"<f8": np.float64, "<c16": np.complex128, "<i8": np.int64}

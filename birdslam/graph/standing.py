@@ -8,9 +8,9 @@ was seen (the density ratio of Savage and Dickey):
 
 They are pooled by the mean of their log odds, as opinions are that share their evidence (Genest and Zidek 1986). Both
 begin with the odds of vehicles on the ego's road; who is first seen far beside it more often stands, and gets the odds
-of those. From this comes a decision that lasts: taken on strong evidence, given up only where the evidence turns. In the
-ego's path growth says nothing (parallax.py tells why), and a car there that creeps must not be told to stand: what was
-decided before is kept there, until the velocity alone contradicts it, and nothing new is decided.
+of those. From this comes a decision that lasts: taken on strong evidence, given up only where the evidence turns. In
+the ego's path growth says nothing (parallax.py tells why), and a car there that creeps must not be told to stand: what
+was decided before is kept there, until the velocity alone contradicts it, and nothing new is decided.
 
 The graph's velocity is that of a vehicle that moves. What is told is of both, with the covariance that a mixture has:
 
