@@ -196,11 +196,10 @@ class PoseGraph:
 
     def _retwist(self, window: Window, edges: list[VvEdge]) -> None:
         """The twists of the interval that led to this frame are what the VV edges say of it."""
-        covs = np.array([e.cov for e in edges]).reshape(-1, 3, 3)
-        for e, cov in zip(edges, covs, strict=True):
-            T, dt_s = e.motion, e.dt_s
-            cov /= dt_s * dt_s
-            window.retwist(e.row, *rate(complex(T.x_m, T.y_m), T.yaw_rad, dt_s), cov)
+        twists = [rate(complex(e.motion.x_m, e.motion.y_m), e.motion.yaw_rad, e.dt_s) for e in edges]
+        intervals_s = np.array([e.dt_s for e in edges])
+        covs = np.array([e.cov for e in edges]).reshape(-1, 3, 3) / np.square(intervals_s)[:, None, None]
+        window.retwist([e.row for e in edges], twists, covs)
 
     def _drift(self, window: Window, scale_sigma_rel: float) -> None:
         """The error of the metric scale lasts, so that of a step is the same as that of the way before it.

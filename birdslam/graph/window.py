@@ -35,7 +35,7 @@ import numpy as np
 
 from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.factors import Complexes, Cov, Floats, chained
+from birdslam.graph.factors import Complexes, Cov, Floats, Rows, chained
 from birdslam.graph.state_layout import EGO, StateLayout, diagonal
 
 KEY_NODE = 0  # the ego node that landmarks are tied to; it is renewed once in every round of the nodes
@@ -260,20 +260,21 @@ class Window:
         """The vehicle `row` begins anew in ego, with `cov` in the ego's axes, at rest give or take, independent of all
         else."""
         self.at[self.nodes + row], self.heading[self.nodes + row] = at, heading
-        self._renew(self.layout.firsts[row], np.reshape(cov, (3, 3)))
-        self.retwist(row, 0j, 0.0, twist_cov)
+        self._renew(self.layout.poses[[row]], np.reshape(cov, (3, 3)))
+        self.retwist([row], [(0j, 0.0)], twist_cov)
 
-    def retwist(self, row: int, velocity: complex, turn_radps: float, cov: Floats) -> None:
-        """The vehicle `row` gets a new twist with `cov` (3, 3), independent of all else; its pose stays."""
-        self.velocity[row], self.turn_radps[row] = velocity, turn_radps
-        self._renew(self.layout.firsts[row] + 3, cov)
+    def retwist(self, rows: Sequence[int], twists: Sequence[tuple[complex, float]], covs: Floats) -> None:
+        """Vehicles `rows` (k,) get new twists with `covs` (k, 3, 3), independent of all else; their poses stay."""
+        for row, (velocity, turn_radps) in zip(rows, twists, strict=True):
+            self.velocity[row], self.turn_radps[row] = velocity, turn_radps
+        self._renew(self.layout.twists[rows], covs)
 
-    def _renew(self, first: int, cov: Floats) -> None:
-        """Three numbers of the state get the covariance `cov` (3, 3), and no correlation with others."""
-        P, rows = self.P, slice(first, first + 3)
-        P[rows] = 0.0
-        P[:, rows] = 0.0
-        P[rows, rows] = cov
+    def _renew(self, numbers: Rows, covs: Floats) -> None:
+        """Each three numbers (k, 3) of the state get their covariance (k, 3, 3), and no correlation with others."""
+        P, all_of_them = self.P, numbers.reshape(-1)
+        P[all_of_them] = 0.0
+        P[:, all_of_them] = 0.0
+        P[numbers[:, :, None], numbers[:, None]] = covs
 
     def select(self, rows: Sequence[int]) -> None:
         """Keeps the vehicles `rows` in that order; -1 makes room for a new one, to be placed next."""
