@@ -30,6 +30,7 @@ from birdslam.perception.pointnet import PointNet, load_pointnet
 from birdslam.perf.errors import PerfError
 from birdslam.perf.figures import Ledger
 from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
+from birdslam.vehicles.heading import HeadingConfig
 from birdslam.vehicles.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes, place
 from birdslam.vehicles.placing import Assignment
 from birdslam.vehicles.pseudolidar import localise_by_depth, places_of
@@ -128,7 +129,7 @@ def measured(samples: Iterator[Sample], pointnet: PointNet) -> dict[tuple[str, f
         ground = GroundPlane(true.height_m, pitch_rad, true.roll_rad)
         by_box = [by_bottom(o, ground, LOCALISATION) for o in sample.seen]
         headed = [
-            by_bottom(o, ground, LOCALISATION, Assignment(0, None, o, body).yaw_rad(SE2()))
+            by_bottom(o, ground, LOCALISATION, Assignment(0, None, o, body).yaw_rad(SE2(), HeadingConfig()))
             for o, body in zip(sample.seen, sample.bodies, strict=True)
         ]
         by_net = localise_by_depth(sample.seen, sample.depth, camera, ground, config, network=pointnet)

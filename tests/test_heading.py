@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from birdslam.evaluation.localisation import INSIDE_2_SIGMA
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera
-from birdslam.vehicles.heading import HeadingConfig, Headings, marginalise_yaw
+from birdslam.vehicles.heading import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
 from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes, place
 
 Floats = NDArray[np.float64]
@@ -91,3 +91,22 @@ def test_the_covariance_holds_cars_that_stand_as_they_like() -> None:
     assert np.mean(sharp) > 2.5  # two degrees of freedom
     assert 1.0 < np.mean(told) < 2.0
     assert np.mean(told <= INSIDE_2_SIGMA) > 0.95
+
+
+@pytest.mark.parametrize(
+    ("yaw_rad", "first"), [(0.0, 0.0), (math.pi, 0.0), (math.pi / 2, math.pi / 2), (-1.5, math.pi / 2)]
+)
+@pytest.mark.parametrize("x_m", [12.0, 25.0, 45.0])
+@pytest.mark.parametrize("y_m", [-5.0, 0.0, 5.0])
+def test_a_box_shows_who_stands_across_the_road(yaw_rad: float, first: float, x_m: float, y_m: float) -> None:
+    seen, _ = car_at(np.array([x_m, y_m]), yaw_rad, np.zeros(4))
+    assert first_yaw_rad(seen, CONFIG) == first
+    assert first_yaw_rad(seen, HeadingConfig(across=0.0)) == 0.0
+
+
+def test_a_wide_box_that_the_border_cuts_shows_nothing_of_the_yaw() -> None:
+    box = np.array([[2.0, 150.0, 402.0, 300.0]])
+    (cut,) = observe_boxes(box, np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION)
+    (whole,) = observe_boxes(box + [400.0, 0.0] * 2, np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION)
+    assert first_yaw_rad(cut, CONFIG) == 0.0
+    assert first_yaw_rad(whole, CONFIG) == math.pi / 2.0

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.vehicles.localisation import CENTRE_STEPS, LocalisationConfig, Observation
+from birdslam.vehicles.localisation import CENTRE_STEPS, LocalisationConfig, Observation, extent_m
 
 Floats = NDArray[np.float64]
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
@@ -36,6 +36,9 @@ class HeadingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     outlier_known: Share = 0.1  # of those whose motion or body seemed to show it
     sigma_along_road_rad: float = 0.05  # of the others of the first kind: they are headed like the ego
     sigma_width_rel: float = 0.09  # of the outline of a footprint, among vehicles of a class
+    # Of the vehicles, when first seen: they stand or drive across the ego's road. By the labels of KITTI tracking 0000
+    # to 0020 43 of 343 do
+    across: Share = 0.1
     fan: Annotated[int, msgspec.Meta(ge=4, le=90)] = 12  # yaws over half a turn: a heading and its opposite look alike
 
 
@@ -49,6 +52,30 @@ class Headings:
     yaw_rad: Floats
     sigma_rad: Floats
     outlier: Floats
+
+
+def first_yaw_rad(seen: Observation, config: HeadingConfig) -> float:
+    """Against the ego, of a vehicle whose body and motion show nothing: along the road or, if it looks it, across.
+
+    A car from the side is 2.5 times as wide as high, one from behind as wide as high: the shape of its box needs no
+    depth. One that the image's border cuts is taken to stand along the road.
+    """
+    if seen.cut_side or seen.sigma_cut is not None:
+        return 0.0
+    d, tan_height, across_rad = seen.dimensions, max(seen.tan_height, 1e-3), math.pi / 2.0
+    sigmas = (
+        math.hypot(seen.sigma_left, seen.sigma_right) / seen.tan_width,
+        math.hypot(seen.sigma_bottom, seen.sigma_top) / tan_height,
+        config.sigma_width_rel,
+        d.sigma_height_rel,
+    )
+    along, across = (
+        math.log(extent_m(d, yaw_rad, seen.depth_by_height_m, seen.bearing)[1] / d.height_m)
+        for yaw_rad in (0.0, across_rad)
+    )
+    shape = math.log(seen.tan_width / tan_height)
+    more_likely = 0.5 * ((shape - along) ** 2 - (shape - across) ** 2) / sum(sigma**2 for sigma in sigmas)
+    return across_rad if config.across > 0.0 and more_likely > math.log(1.0 / config.across - 1.0) else 0.0
 
 
 def marginalise_yaw(

@@ -20,7 +20,7 @@ from birdslam.geometry.se2 import SE2, wrap
 from birdslam.vehicles.association import NEAREST_M, in_ego
 from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
 from birdslam.vehicles.ground_size_filter import Depths, GroundSizeFilter
-from birdslam.vehicles.heading import HeadingConfig, Headings, marginalise_yaw
+from birdslam.vehicles.heading import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
 from birdslam.vehicles.localisation import (
     AssumedSize,
     LocalisationConfig,
@@ -46,10 +46,11 @@ class Assignment:
     observation: Observation
     by_depth: DepthPlace | None = None
 
-    def yaw_rad(self, T_world_ego: SE2) -> float:
-        """In ego; a new vehicle is headed as it looks, or like the ego where its front was not seen."""
+    def yaw_rad(self, T_world_ego: SE2, config: HeadingConfig) -> float:
+        """In ego; a new vehicle is headed as it looks, or as its box looks where its front was not seen."""
         if self.track is None:
-            return self.by_depth.yaw_rad if self.by_depth is not None and self.by_depth.front_seen else 0.0
+            seen = self.by_depth is not None and self.by_depth.front_seen
+            return self.by_depth.yaw_rad if seen else first_yaw_rad(self.observation, config)
         return wrap(self.track.yaw_rad - T_world_ego.yaw_rad)
 
     def yaw_uncertainty(self, config: HeadingConfig) -> tuple[float, float]:
@@ -131,7 +132,7 @@ class Placing:
         ]
 
     def _expected(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> _Expected:
-        yaws = [a.yaw_rad(T_world_ego) for a in assignments]
+        yaws = [a.yaw_rad(T_world_ego, self.heading) for a in assignments]
         depths = [a.expected_depth_m(T_world_ego) for a in assignments]
         turned = [a.turned_rad(T_world_ego) for a in assignments]
         each = [(a.observation, yaw, depth) for a, yaw, depth in zip(assignments, yaws, depths, strict=True)]

@@ -228,7 +228,7 @@ class Tracker:
         )
 
     def _begin(self, assignment: Assignment, seen: Place, frame: EgoFrame) -> Track:
-        # Most traffic runs along the road: until it is seen to face or to move otherwise, it is headed like the ego.
+        # Most traffic runs along the road: until it is seen to face or to move otherwise, it is headed as its box looks
         observation, by_depth = assignment.observation, assignment.by_depth
         if by_depth is not None and not by_depth.front_seen:
             by_depth = None
@@ -240,7 +240,7 @@ class Tracker:
         return Track(
             state=np.concatenate([T_world_ego @ seen.centre_m, np.zeros(2)]),
             cov=cov,
-            yaw_rad=wrap(T_world_ego.yaw_rad + assignment.yaw_rad(T_world_ego)),
+            yaw_rad=wrap(T_world_ego.yaw_rad + assignment.yaw_rad(T_world_ego, self.config.heading)),
             observation=observation,
             place=seen,
             serial=assignment.serial,
