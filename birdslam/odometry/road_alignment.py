@@ -265,6 +265,15 @@ class RoadAligner:
         measured: Floats = x[:ROAD] + cov @ weight_prior[:ROAD, :ROAD] @ (x[:ROAD] - prior)
         return RoadFit(measured, cov, correlation, int(seen.sum()))
 
+    def driven(self, past: RoadImage, T_past_present: Pose, px: Ints, road: Floats) -> tuple[Floats, Bools]:
+        """(N,) what the past image has where a motion and a road (4,) put the present pixels (N, 2), and if it has it.
+
+        Nothing is fitted.
+        """
+        view = self._view(past, px, T_past_present)
+        seen, (grey, *_) = self._look(view, past, T_past_present, np.append(road, np.zeros(MOTION)))
+        return grey, seen
+
     def _view(self, present: RoadImage, px: Ints, T_past_present: Pose) -> _View:
         cam = self.camera
         rays = np.stack(

@@ -8,6 +8,7 @@ only some combination of scale, pitch, roll and curvature, and the filter knows 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,7 +154,10 @@ class RoadScale:
                 unit = self._unit_of_landmarks(view.window)
                 baseline_m = float(np.linalg.norm(T.p)) * (unit or factor)
                 driven_m = baseline_m if view.near_px < _DRIVEN_PX else np.inf
-                if self._standing.judge(past.plain, image.plain, px, driven_m):
+                moved, (road, _) = Pose(T.R, T.p * (unit or factor)), self._filter.expected
+                road[0] = 0.0
+                driven = partial(self._aligner.driven, past.plain, moved, px, road)
+                if self._standing.judge(past.plain, image.plain, px, driven_m, driven):
                     self._kept.clear()  # they are of the other kind
                     return factor
                 borne_out = None if unit is None else unit / factor
