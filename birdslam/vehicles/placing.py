@@ -49,8 +49,9 @@ class Assignment:
     def yaw_rad(self, T_world_ego: SE2, config: HeadingConfig) -> float:
         """In ego; a new vehicle is headed as it looks, or as its box looks where its front was not seen."""
         if self.track is None:
-            seen = self.by_depth is not None and self.by_depth.front_seen
-            return self.by_depth.yaw_rad if seen else first_yaw_rad(self.observation, config)
+            if self.by_depth is not None and self.by_depth.front_seen:
+                return self.by_depth.yaw_rad
+            return first_yaw_rad(self.observation, config)
         return wrap(self.track.yaw_rad - T_world_ego.yaw_rad)
 
     def yaw_uncertainty(self, config: HeadingConfig) -> tuple[float, float]:
