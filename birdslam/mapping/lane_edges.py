@@ -76,8 +76,10 @@ def stations(points_m: Floats, lanes: Ids, config: LaneEdgesConfig) -> list[tupl
             middle_m = (cell + 0.5) * config.station_m
             if len(along) < config.least_points or np.ptp(along) < _FULL * config.station_m:
                 continue
-            slope, at_m = np.polyfit(along - middle_m, across, 1)
-            if np.std(across - at_m - slope * (along - middle_m)) > config.bend_m:
+            gap_m = along - along.mean()
+            slope = float(gap_m @ across) / float(gap_m @ gap_m)  # numpy.polyfit takes ten times as long
+            at_m = float(across.mean()) + slope * (middle_m - float(along.mean()))
+            if np.std(across - slope * gap_m) > config.bend_m:
                 continue
             point, direction = np.array([middle_m, at_m]), np.array([1.0, slope]) / np.hypot(1.0, slope)
             landmark = (2 * int(lane) + axis) * _CELLS + cell % _CELLS

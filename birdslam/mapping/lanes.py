@@ -21,7 +21,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.lane_ids import LaneCloud, LaneIds
@@ -146,12 +145,20 @@ def points_of(
     Each point of a lattice on the road is looked up in the masks (the inverse of Eq. 1), so that near and far road has
     as many points. What `boxes_px` (B, 4) cover is left out: a vehicle hides the road there.
     """
-    lattice = _lattice(config)
-    with np.errstate(invalid="ignore"):
-        u, v = np.floor(bev.ego_to_pixel(camera, ground, lattice)).T
-        seen = np.flatnonzero((u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px))
-    at = v[seen].astype(np.int64), u[seen].astype(np.int64)
-    road, lane = (lattice[seen[without_boxes(mask, boxes_px)[at]]] for mask in (segmentation.road, segmentation.lane))
+    x_m, y_m = _lattice(config)
+    # As bev.ego_to_pixel, but that of a lattice each coordinate in the camera is a sum over its rows and columns
+    ahead, aside, up = ground.R_ego_cam
+    right, down, depth = (
+        (a * x_m - c * ground.height_m)[:, None] + b * y_m for a, b, c in zip(ahead, aside, up, strict=True)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = camera.fx_px * (right / depth) + camera.cx_px
+        v = camera.fy_px * (down / depth) + camera.cy_px
+    inside = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px) & (depth > 0.0)
+    row, column = inside.nonzero()
+    at = v[inside].astype(np.int64), u[inside].astype(np.int64)
+    points = np.stack([x_m[row], y_m[column]], axis=-1)
+    road, lane = (points[without_boxes(mask, boxes_px)[at]] for mask in (segmentation.road, segmentation.lane))
     return road, lane
 
 
@@ -166,11 +173,11 @@ def without_boxes(mask: Bools, boxes_px: Floats) -> Bools:
 
 
 @functools.lru_cache(maxsize=4)
-def _lattice(config: LanesConfig) -> Floats:
-    """(N, 2) the points of the road that are looked up."""
+def _lattice(config: LanesConfig) -> tuple[Floats, Floats]:
+    """The rows' x (N,) and the columns' y (M,) of the points of the road that are looked up."""
     x_m = np.arange(0.5 * config.cell_m, config.depth_m, config.cell_m)
     y_m = np.arange(-config.half_width_m, config.half_width_m, config.lattice_m)
-    return np.stack(np.meshgrid(x_m, y_m, indexing="ij"), axis=-1).reshape(-1, 2)
+    return x_m, y_m
 
 
 def count_cells(points_m: Complexes, config: LanesConfig) -> NDArray[np.float32]:
