@@ -163,14 +163,14 @@ class HeightWatch:
         b = np.array([known.right for known in vehicles]) / alike[:, None]
         own = np.square(height_m * np.array([known.class_rel for known in vehicles])) + cfg.sigma_kerb_m**2
         share = own / (1.0 + own * A[:, 0, 0])  # Sherman-Morrison
-        information = A - share[:, None, None] * A[:, :, None, 0] * A[:, None, 0, :]
+        information = (A - share[:, None, None] * A[:, :, None, 0] * A[:, None, 0, :]).reshape(-1, 9)
         right = b - (share * b[:, 0])[:, None] * A[:, 0]
         spread = np.sqrt(A[:, 0, 0] * (1.0 + own * A[:, 0, 0]))
         prior = np.diag(1.0 / np.square([cfg.sigma_height_rel * height_m, cfg.sigma_pitch_rad, cfg.sigma_roll_rad]))
         expected = np.array([height_m, 0.0, 0.0])
         weight, x, cov = np.ones(len(vehicles)), expected, prior
         for _ in range(ITERATIONS):
-            cov = np.asarray(np.linalg.inv(prior + np.tensordot(weight, information, 1)), dtype=np.float64)
+            cov = np.asarray(np.linalg.inv(prior + (weight @ information).reshape(3, 3)), dtype=np.float64)
             x = cov @ (prior @ expected + weight @ right)
             misfit = np.abs(b[:, 0] - A[:, 0] @ x) / spread
             weight = 1.0 / np.maximum(1.0, misfit / cfg.gate_sigma)

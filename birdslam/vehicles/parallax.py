@@ -141,7 +141,8 @@ class Parallax:
 
     def standing(self, vehicle: int) -> float:
         """The probability that a vehicle stands."""
-        return float(self._weight[self._vehicles.index(vehicle), STILL].sum())
+        weight = self._weight[self._vehicles.index(vehicle)]
+        return float(weight[STANDING] + weight[UNUSUAL])
 
     def begin(
         self,
