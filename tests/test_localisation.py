@@ -82,6 +82,18 @@ def test_edges_behind_a_nearer_box_are_doubted() -> None:
     assert (covered.sigma_left, covered.sigma_top) == (alone.sigma_left, alone.sigma_top)
 
 
+@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_edges_of_a_doubtful_box_are_doubted(score: float, other: float) -> None:
+    box = box_of_car(20.0, 2.0)[None]
+    edges = {}
+    for each in (score, other):
+        (seen,) = observe_boxes(box, np.array([each]), ("car",), CAMERA, GROUND, CONFIG)
+        edges[each] = np.array([seen.sigma_left, seen.sigma_right, seen.sigma_top, seen.sigma_bottom])
+    assert (edges[min(score, other)] >= edges[max(score, other)]).all()
+    (sure,) = observe_boxes(box, np.ones(1), ("car",), CAMERA, GROUND, CONFIG)
+    assert edges[score][3] / sure.sigma_bottom == pytest.approx(1.0 + 2.0 * max(0.0, 0.9 - score))
+
+
 def test_farther_is_less_certain() -> None:
     assert locate(box_of_car(35.0, 3.0), 33.0).cov[0, 0] > 4.0 * locate(box_of_car(10.0, 0.0), 8.0).cov[0, 0]
 
