@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose
-from birdslam.geometry.se2 import SE2
 from birdslam.odometry.beyond_road import BeyondRoad, BeyondRoadConfig
-from birdslam.odometry.car_reckoning import DRIVES_M, moves_sideways, reckoned
+from birdslam.odometry.car_reckoning import DRIVES_M, moves_sideways
 from birdslam.odometry.car_scale import CarStep
 from birdslam.odometry.corner_pose import Corners, Fitting, Located, pose_beside_glass
 from birdslam.odometry.corner_prediction import corners_of_unknown_depth_px
@@ -31,16 +30,8 @@ from birdslam.odometry.held_speed import HeldSpeed, HeldSpeedConfig, worst_sigma
 from birdslam.odometry.keyframes import KeyframeConfig, KeyframeWindow
 from birdslam.odometry.last_motion import STILL, LastMotion
 from birdslam.odometry.metric_scale import MetricScale, RoadView
-from birdslam.odometry.motion import (
-    Motion,
-    MotionConfig,
-    coasting_cov,
-    measured_cov,
-    on_plane,
-    planar,
-    standing_cov,
-    step_cov,
-)
+from birdslam.odometry.motion import Motion, MotionConfig, planar, step_cov
+from birdslam.odometry.motion_records import MotionRecords
 from birdslam.odometry.moving_median import MedianScale
 from birdslam.odometry.road_alignment import RoadAligner, RoadFit
 from birdslam.odometry.road_filter import RoadScaleConfig
@@ -50,7 +41,7 @@ from birdslam.odometry.sliding_window import common
 from birdslam.odometry.standing_corners import StandingCorners, StandingCornersConfig
 from birdslam.odometry.standstill import StandstillConfig, near_displacement_px, stands
 from birdslam.odometry.start_search import StartSearch, StartSearchConfig
-from birdslam.types import SpeedReading, SpeedSource, Status
+from birdslam.types import SpeedReading, Status
 
 __all__ = ["Motion", "Odometry", "OdometryConfig", "Tracks"]
 
@@ -112,6 +103,7 @@ class Odometry:
         self._base_t_ns = 0
         self._base_seen = True  # False: no image shows where the base was, the car's own speed alone led there
         self._last = LastMotion()
+        self._records = MotionRecords(self.config.motion, self.config.start.camera_ahead_m, self._scale, self._last)
         self._held = HeldSpeed(self.config.held_speed)
         self._glass = StandingCorners(self.camera, self.config.standing_corners)
         self._beyond = BeyondRoad(self.camera, self.config.beyond_road)
@@ -376,69 +368,21 @@ class Odometry:
 
     def _move(self, frame_id: int, step: Pose, cov6: Floats, dt_s: float) -> Motion:
         self._last.measured(step, dt_s)
-        T_prev_curr = planar(step, self._scale.ground)
-        cov = measured_cov(self.config.motion, cov6, T_prev_curr, self._scale.ground, self._scale.sigma_rel)
-        status = self._scale.status()
-        if self._obstructed and Status.VIEW_OBSTRUCTED not in status:
-            status.append(Status.VIEW_OBSTRUCTED)
-        return self._motion(frame_id, step, T_prev_curr, cov, status)
+        return self._records.measured(self._frames(frame_id), step, cov6, self._obstructed)
 
     def _stand(self, frame_id: int) -> Motion:
         self._last.stood()
         self._held.settle(0.0, 1.0)
-        return self._motion(frame_id, STILL, SE2(), standing_cov(self.config.motion), [Status.STANDSTILL])
+        return self._records.standing(self._frames(frame_id))
 
-    def _coast(self, frame_id: int, dt_s: float, status: list[Status], car: CarStep | None = None) -> Motion:
-        """The last velocity goes on, or what the car itself says of its motion; the base image stays."""
+    def _coast(self, frame_id: int, dt_s: float, status: list[Status], car: CarStep | None) -> Motion:
+        """The base image stays."""
         self._road_tracks = _NO_TRACKS  # those of the last measured image would say that the car has not moved since
-        if car is not None:
-            return self._reckon(frame_id, dt_s, status, car)
-        step = self._last.over(dt_s)
-        T_prev_curr = planar(step, self._scale.ground)
-        cov = coasting_cov(self.config.motion, T_prev_curr, dt_s, self._last.known, self._scale.sigma_rel)
-        return self._motion(frame_id, step, T_prev_curr, cov, [*status, Status.ODOMETRY_COASTING])
+        return self._records.coasted(self._frames(frame_id), dt_s, status, car)
 
-    def _reckon(self, frame_id: int, dt_s: float, status: list[Status], car: CarStep) -> Motion:
-        """The motion by the car's own readings; without its yaw rate the last turn fades out."""
-        if car.yaw_rad is None:
-            status = [*status, Status.ODOMETRY_COASTING]
-        last_radps = planar(self._last.over(1.0), self._scale.ground).yaw_rad
-        ahead_m = self.config.start.camera_ahead_m
-        T_prev_curr, cov = reckoned(self.config.motion, car, last_radps, dt_s, ahead_m)
-        step = on_plane(T_prev_curr, self._scale.ground)
-        return self._motion(frame_id, step, T_prev_curr, cov, status, car.sigma_rel)
-
-    def _motion(
-        self,
-        frame_id: int,
-        step: Pose,
-        T_prev_curr: SE2,
-        cov: Floats,
-        status: list[Status],
-        car_sigma_rel: float | None = None,
-    ) -> Motion:
-        """`car_sigma_rel` is of the metres where they are the car's alone."""
-        sources = self._scale.sources
-        if car_sigma_rel is not None:
-            sources = (SpeedSource.CAR,)
-        elif Status.ODOMETRY_COASTING in status:
-            sources = (SpeedSource.CARRIED,)
-        if car_sigma_rel is None and self._scale.unknown and Status.SCALE_INVALID not in status:
-            status = [*status, Status.SCALE_INVALID]  # standing or coasting, in metres that nobody knows
-        return Motion(
-            from_frame=self._base_frame if self._base_frame is not None else frame_id,
-            to_frame=frame_id,
-            R_prev_curr=step.R,
-            t_prev_curr_m=step.p,
-            T_prev_curr=T_prev_curr,
-            cov=cov,
-            scale_sigma_rel=self._scale.sigma_rel if car_sigma_rel is None else car_sigma_rel,
-            ground=self._scale.ground,
-            pitch_sigma_rad=self._scale.pitch_sigma_rad,
-            standstill=Status.STANDSTILL in status,
-            status=(*status, *self._scale.car_status()),
-            speed_sources=sources,
-        )
+    def _frames(self, frame_id: int) -> tuple[int, int]:
+        """From which image to which a motion leads."""
+        return self._base_frame if self._base_frame is not None else frame_id, frame_id
 
     def _tracks_on_road(self, tracks: Tracks, boxes_px: Floats, road_mask: Bools | None) -> tuple[Ints, Floats]:
         """The corners followed into this image that lie on the road: the paper's static map points."""
