@@ -68,6 +68,24 @@ def test_parked_cars_keep_their_ids_and_places_as_the_ego_passes() -> None:
         assert abs(wrap(poses[-1].yaw_rad)) < 0.2  # it stands, so it keeps the road's direction
 
 
+def test_what_stands_is_looked_for_where_it_stood_and_what_drives_where_it_drives() -> None:
+    """(places' 1-sigma, speed) of a parked car and of one that drives, without and with what standing says."""
+    found = {}
+    for sigma_mps in (1e3, TrackingConfig().sigma_standing_mps):
+        drive = Drive(TrackingConfig(sigma_standing_mps=sigma_mps), noise_px=0.5)
+        for k in range(30):
+            parked, drives = SE2(45.0, -5.0), SE2(20.0 + 1.4 * k, 4.0)
+            seen = drive.step(SE2(0.8 * k, 0.0, 0.0), [parked, drives])
+        by_side = sorted(seen, key=lambda track: float(track.state[1]))
+        assert [track.stands for track in by_side] == [True, False]
+        found[sigma_mps] = [(math.sqrt(track.cov[2, 2]), float(track.state[2])) for track in by_side]
+    (parked_before, drives_before), (parked_now, drives_now) = found.values()
+    assert parked_now[0] < 0.9 * parked_before[0]
+    assert abs(parked_now[1]) < 1.0
+    assert drives_now == pytest.approx(drives_before, abs=0.01)  # they share a road
+    assert drives_now[1] == pytest.approx(14.0, abs=2.0)
+
+
 def test_a_gap_shorter_than_forget_s_keeps_the_id() -> None:
     drive = Drive(noise_px=0.3)
     ids = set()

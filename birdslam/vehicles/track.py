@@ -41,6 +41,7 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     parallax: ParallaxConfig = ParallaxConfig()
     heading: HeadingConfig = HeadingConfig()
     stands: float = 0.5  # the probability from which on a vehicle does, by its parallax: its yaw is kept
+    sigma_standing_mps: float = 2.0  # 1-sigma of the velocity of one that does: it is not sure, and may start
     late_sigma_m: float = 3.0  # a late detection that the velocity puts so far off is not shown in the present frame
 
 

@@ -203,6 +203,11 @@ class Tracker:
                 track.cov[:2, :2] = R_seen[k]
             else:
                 track.state, track.cov = corrected[k], corrected_cov[k]
+                if track.stands:  # so that it is looked for where it stood, and takes no neighbour's box
+                    of_velocity = track.cov[2:, 2:] + np.eye(2) * self.config.sigma_standing_mps**2
+                    to_rest = track.cov[:, 2:] @ np.linalg.inv(of_velocity)
+                    track.state = track.state - to_rest @ track.state[2:]
+                    track.cov = track.cov - to_rest @ track.cov[2:]
             track.observation, track.place = assignment.observation, seen
             track.seen_frame, track.seen_ns, track.T_world_ego = frame.frame_id, frame.t_source_ns, frame.T_world_ego
             track.hits += 1
