@@ -26,6 +26,8 @@ from birdslam.vehicles.pseudolidar import FrustumNetwork, locate_by_depth
 from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig, turned_back
 from birdslam.vehicles.yaw_filter import YawFilter
 
+Floats = NDArray[np.float64]
+
 
 class Tracker:
     """A Kalman filter of constant velocity for each vehicle.
@@ -192,9 +194,11 @@ class Tracker:
         gain = cov[:, :, :2] @ information
         corrected = state + (gain @ innovation[..., None])[..., 0]
         corrected_cov = cov - gain @ S @ gain.swapaxes(1, 2)
+        stands = np.array([self.placing.parallax.standing(track.serial) > self.config.stands for track, *_ in known])
+        self._bring_to_rest(corrected, corrected_cov, stands)
         for k, (track, assignment, seen) in enumerate(known):
             track.motion = self._predicted_motion(track, frame)
-            track.stands = self.placing.parallax.standing(track.serial) > self.config.stands
+            track.stands = bool(stands[k])
             if track.stands and misfit[k] > self.config.gate_sigma**2:
                 # Its size was estimated anew, which moves its place: that is no motion
                 track.state[:2] += innovation[k]
@@ -203,11 +207,6 @@ class Tracker:
                 track.cov[:2, :2] = R_seen[k]
             else:
                 track.state, track.cov = corrected[k], corrected_cov[k]
-                if track.stands:  # so that it is looked for where it stood, and takes no neighbour's box
-                    of_velocity = track.cov[2:, 2:] + np.eye(2) * self.config.sigma_standing_mps**2
-                    to_rest = track.cov[:, 2:] @ np.linalg.inv(of_velocity)
-                    track.state = track.state - to_rest @ track.state[2:]
-                    track.cov = track.cov - to_rest @ track.cov[2:]
             track.observation, track.place = assignment.observation, seen
             track.seen_frame, track.seen_ns, track.T_world_ego = frame.frame_id, frame.t_source_ns, frame.T_world_ego
             track.hits += 1
@@ -215,6 +214,13 @@ class Tracker:
             track.votes[assignment.observation.label] += 1
             self.yaw.turn_to_motion(track, frame.T_world_ego, ground_size)
             self.yaw.turn_to_body(track, assignment.by_depth, frame.T_world_ego, ground_size)
+
+    def _bring_to_rest(self, states: Floats, covs: Floats, which: NDArray[np.bool_]) -> None:
+        """Those of the states (N, 4) that stand, in place: looked for there, they take no neighbour's box."""
+        of_velocity = covs[which, 2:, 2:] + np.eye(2) * self.config.sigma_standing_mps**2
+        gain = covs[which, :, 2:] @ np.linalg.inv(of_velocity)
+        states[which] -= (gain @ states[which, 2:, None])[..., 0]
+        covs[which] -= gain @ covs[which, 2:]
 
     def _predicted_motion(self, track: Track, frame: EgoFrame) -> MotionEdge | None:
         """VV by constant velocity; None for a track that no edge has shown yet."""
