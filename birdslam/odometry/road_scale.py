@@ -154,9 +154,11 @@ class RoadScale:
                 unit = self._unit_of_landmarks(view.window)
                 baseline_m = float(np.linalg.norm(T.p)) * (unit or factor)
                 driven_m = baseline_m if view.near_px < _DRIVEN_PX else np.inf
-                moved, (road, _) = Pose(T.R, T.p * (unit or factor)), self._filter.expected
-                road[0] = 0.0
-                driven = partial(self._aligner.driven, past.plain, moved, px, road)
+                driven = None
+                if baseline_m >= self.config.standing.min_baseline_m:  # else it would be the standing image again
+                    road = np.append(0.0, self._filter.expected[0][1:])
+                    moved = Pose(T.R, T.p * (unit or factor))
+                    driven = partial(self._aligner.driven, past.plain, moved, px, road)
                 if self._standing.judge(past.plain, image.plain, px, driven_m, driven):
                     self._kept.clear()  # they are of the other kind
                     return factor

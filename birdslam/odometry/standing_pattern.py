@@ -65,18 +65,19 @@ class StandingPattern:
         present: RoadImage,
         px: NDArray[np.int64],
         baseline_m: float,
-        driven: Callable[[], tuple[NDArray[np.float64], NDArray[np.bool_]]],
+        driven: Callable[[], tuple[NDArray[np.float64], NDArray[np.bool_]]] | None = None,
     ) -> bool:
         """Looks at the same pixels (N, 2) of two images; whether `present` has changed.
 
-        `driven` gives (N,) what the past image has where the car's motion puts these pixels, and whether it has it.
+        `driven` gives (N,) what the past image has where the car's motion puts these pixels, and whether it has it;
+        None where the length of that motion is not known.
         """
         cfg = self.config
         if baseline_m < cfg.min_baseline_m or len(px) < 2:
             return False
         a, b = (image.grey[px[:, 1] - image.top_px, px[:, 0]].astype(np.float64) for image in (past, present))
         alike = _correlation(a, b)
-        if alike > cfg.ends_at:
+        if driven is not None and alike > cfg.ends_at:
             there, seen = driven()
             alike = _correlation(_without(a[seen], there[seen]), b[seen]) if seen.sum() > 1 else 0.0
         self._correlation += (alike - self._correlation) / cfg.judged_images
