@@ -73,6 +73,11 @@ class Bonnet:
         return (before is None) != (self.rows is None)
 
     @property
+    def begun(self) -> bool:
+        """Whether an image was ever learned."""
+        return self._images > 0
+
+    @property
     def present(self) -> bool:
         """Whether there is one."""
         return self.rows is not None

@@ -86,6 +86,8 @@ class RoadScale:
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
         """The odometry begins anew with this image; its unit of length is known to `sigma_rel`."""
         image = self._aligner.image(grey)
+        if not self._bonnet.begun:
+            self._bonnet.learn(grey, self._aligner.top_px, np.inf)
         self._kept.clear()
         if not self._standing.present:
             self._kept.keep(Seen(image, image), pose, 0.0)
