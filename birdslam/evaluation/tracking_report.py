@@ -134,7 +134,8 @@ def render_report(setting: Setting, published: Published, outcomes: Sequence[Out
     nees = [row for outcome in outcomes for row in outcome.nees]
     if nees:
         parts.append(f"## Whether stated sigmas are honest\n\n{ABOUT_NEES}\n\n{tables.nees_table(nees)}")
-    parts.append(_runtime(outcomes, published))
+    if any(outcome.timings for outcome in outcomes):
+        parts.append(_runtime(outcomes, published))
     return "\n".join(parts)
 
 

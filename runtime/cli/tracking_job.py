@@ -52,6 +52,7 @@ from birdslam.types import Estimate, Measurements
 # Methods whose log is that of the paper's placing of vehicles, by the ideas that they are
 EQ_1 = {"paper_eq1": "ideas/nothing (the paper)", "paper_eq1_final": "ideas/the smoother"}
 FIGURE_FRAMES = (50, 100, 200, 414)  # of the paper's figure of times
+BATCHES = frozenset({"batch_se3", "nair"})  # the methods that the figure of times is about
 REPEATS = 3  # of each time: the median counts
 
 
@@ -176,7 +177,12 @@ def _ideas(job: Job) -> dict[str, Method]:
 
 
 def _lengths(log: Sequence[Measurements], job: Job) -> list[int]:
-    """Of the sequence that the paper states its times for, the frames of its figure; of the others all."""
+    """Of the sequence that the paper states its times for, the frames of its figure; of the others all.
+
+    None where methods are named and no batch is among them.
+    """
+    if job.methods and BATCHES.isdisjoint(job.methods):
+        return []
     if job.sequence != job.published.runtime.sequence:
         return [len(log)]
     return sorted({*(n for n in FIGURE_FRAMES if n < len(log)), len(log)})
