@@ -28,7 +28,7 @@ from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
 from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.wire import Trace
 from birdslam.simulation.drive import DriveConfig, drive
-from birdslam.types import INVALIDATING, Estimate, FrameRef, Measurements, Status
+from birdslam.types import INVALIDATING, Attitude, Estimate, FrameRef, Measurements, Status
 
 MS = 1_000_000
 DRIVE = drive(DriveConfig(frames=60, vehicles=3, traffic="convoy"), 1).measurements
@@ -158,6 +158,8 @@ def test_what_was_invalid_stays_so_while_nobody_looks() -> None:
     told = unmeasured(ref(2), last, 10**12)
     assert told.status == (Status.COASTING, Status.PERCEPTION_LATE, Status.SCALE_INVALID)
     assert Status.NOT_INITIALISED in unmeasured(ref(2), None, 10**12).status
+    uphill = msgspec.structs.replace(last, attitude=Attitude(z_m=5.0, pitch_rad=-0.03))
+    assert unmeasured(ref(2), uphill, 10**12).attitude == uphill.attitude  # no jump in 6-DoF trajectories
     assert Status.FRAME_UNREADABLE in unmeasured(ref(2, 0, (Status.FRAME_UNREADABLE,)), last, 10**12).status
 
 

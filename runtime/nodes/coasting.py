@@ -13,7 +13,7 @@ import msgspec
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.nodes.capture import stamps
 from birdslam.runtime.transport.bus import Message
-from birdslam.types import INVALIDATING, Estimate, FrameRef, Measurements, Status
+from birdslam.types import INVALIDATING, Attitude, Estimate, FrameRef, Measurements, Status
 
 ANNOUNCED_FRAMES = 64  # more than are captured within any deadline
 # What a planner must hear with the next frame, where its own was late
@@ -68,7 +68,8 @@ def deadline_ns(configuration: Configuration) -> int:
 def unmeasured(ref: FrameRef, last: Estimate | None, max_ns: int) -> Measurements:
     """What stands for a frame's measurements meanwhile; `last` is the last estimate that rests on some.
 
-    What made that one invalid still holds, and after `max_ns` of source time without measurements all is.
+    What made that one invalid still holds, and after `max_ns` of source time without measurements all is. The ego's
+    height and tilt are those of that one.
     """
     status = [*ref.status, Status.COASTING, Status.PERCEPTION_LATE]
     if last is None:
@@ -77,7 +78,8 @@ def unmeasured(ref: FrameRef, last: Estimate | None, max_ns: int) -> Measurement
         status += [s for s in last.status if s in INVALIDATING]
         if ref.t_source_ns - last.t_source_ns > max_ns:
             status.append(Status.COASTED_TOO_LONG)
-    return Measurements(**stamps(ref), status=tuple(dict.fromkeys(status)))
+    attitude = Attitude() if last is None else last.attitude
+    return Measurements(**stamps(ref), status=tuple(dict.fromkeys(status)), attitude=attitude)
 
 
 def with_untold(estimate: Estimate, untold: tuple[Status, ...]) -> Estimate:

@@ -28,7 +28,7 @@ from birdslam.runtime.process.restarts import Assignment
 from birdslam.runtime.transport.bus import Bus, Message
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameReader
-from birdslam.types import INVALIDATING, Frame, FrameRef, Measurements, Status
+from birdslam.types import INVALIDATING, Attitude, Frame, FrameRef, Measurements, Status
 
 WAITING_FRAMES = 8  # that come while perceive is at one are predicted, all but the newest; more are dropped
 STALE_BUDGETS = 3.0  # a frame that comes to perceive this many times later than budgeted bears INPUT_STALE
@@ -94,6 +94,7 @@ class PerceiveNode:
         self._looked_frame = -1  # the last frame with pixels that was looked at
         self._measured_ns: int | None = None  # the source time of the last one whose motion was measured
         self._looked_invalid: tuple[Status, ...] = ()  # what made it one that nobody may drive by
+        self._looked_attitude = Attitude()
 
     @property
     def mode(self) -> str:
@@ -155,6 +156,7 @@ class PerceiveNode:
             if Status.ODOMETRY_COASTING not in measurements.status:
                 self._measured_ns = frame.t_source_ns
         late = self._too_long(frame.t_source_ns)
+        self._looked_attitude = measurements.attitude
         self._looked_invalid = tuple(s for s in measurements.status if s in INVALIDATING)
         status = (*measurements.status, *late, *STATUS[mode], *((Status.INPUT_STALE,) if stale else ()))
         return msgspec.structs.replace(measurements, status=tuple(dict.fromkeys(status)))
@@ -165,7 +167,7 @@ class PerceiveNode:
 
     def _coast(self, ref: FrameRef) -> Measurements:
         status = (*ref.status, Status.COASTING, *self._looked_invalid, *self._too_long(ref.t_source_ns))
-        return Measurements(**stamps(ref), status=tuple(dict.fromkeys(status)))
+        return Measurements(**stamps(ref), status=tuple(dict.fromkeys(status)), attitude=self._looked_attitude)
 
     def _too_long(self, t_source_ns: int) -> tuple[Status, ...]:
         """Whether the motion has only been predicted for longer than anybody should drive by."""
