@@ -45,12 +45,13 @@ class LaneIds:
         """Forgets where the lanes were."""
         self._points = np.zeros((0, 2))  # remembered, in world
         self._lanes = np.zeros(0, dtype=np.int64)
+        self._near = self._tree(self._points)
 
     def of(self, points_m: Floats) -> Ids:
         """(N,) the lanes that points (N, 2) in world lie on, NO_LANE where none is known to be."""
         out: Ids = np.full(len(points_m), NO_LANE)
         if len(self._points) and len(points_m):
-            distance, at = self._tree(self._points).query(points_m, distance_upper_bound=self._same_lane_m)
+            distance, at = self._near.query(points_m, distance_upper_bound=self._same_lane_m)
             near = np.isfinite(distance)
             out[near] = self._lanes[at[near]]
         return out
@@ -60,9 +61,8 @@ class LaneIds:
         in_world = [T_world_ego @ cloud for cloud in clouds]
         votes: list[tuple[int, int, int]] = []  # (how many points, the cloud, the lane)
         if len(self._points):
-            tree = self._tree(self._points)
             for k, points in enumerate(in_world):
-                distance, at = tree.query(points, distance_upper_bound=self._same_lane_m)
+                distance, at = self._near.query(points, distance_upper_bound=self._same_lane_m)
                 seen, counts = np.unique(self._lanes[at[np.isfinite(distance)]], return_counts=True)
                 votes += [(int(n), k, int(lane)) for n, lane in zip(counts, seen, strict=True)]
         lane_of: dict[int, int] = {}
@@ -83,3 +83,4 @@ class LaneIds:
         points, ids = points[near], ids[near]
         _, first = np.unique(cell_keys(points, self._cell_m), return_index=True)
         self._points, self._lanes = points[first], ids[first].astype(np.int64)
+        self._near = self._tree(self._points)

@@ -12,6 +12,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -249,8 +250,10 @@ class LaneMapper:
         lane = segmentation.lane.copy()
         for x1, y1, x2, y2 in boxes_px:
             lane[max(0, math.floor(y1)) : math.ceil(y2), max(0, math.floor(x1)) : math.ceil(x2)] = False
-        rows, columns = np.nonzero(lane)
-        points = bev.pixel_to_ego(self.camera, ground, np.column_stack([columns, rows]).astype(np.float64))
+        if not lane.any():
+            return np.zeros((0, 2))
+        px = cv2.findNonZero(lane.view(np.uint8)).reshape(-1, 2)  # columns and rows
+        points = bev.pixel_to_ego(self.camera, ground, px.astype(np.float64))
         with np.errstate(invalid="ignore"):
             points = points[points[:, 0] < config.lane_range_m]
         _, first = np.unique(cell_keys(points, config.lane_cell_m), return_index=True)

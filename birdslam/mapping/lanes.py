@@ -10,10 +10,10 @@ A grid is (rows, columns) over x (row 0 is `behind_m` behind the ego) and y (col
 
 from __future__ import annotations
 
-import cmath
 import functools
 import math
 from collections import deque
+from collections.abc import Sequence
 from typing import Protocol
 
 import cv2
@@ -27,7 +27,7 @@ from birdslam.mapping.lane_ids import LaneCloud, LaneIds
 from birdslam.perception import Segmentation
 
 Floats = NDArray[np.float64]
-Complexes = NDArray[np.complex128]  # points x + iy
+Points = NDArray[np.float32]  # (N, 1, 2), as OpenCV takes them: x and y
 Grids = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
@@ -82,7 +82,7 @@ class AmodalLanes:
         self.config = config
         self.complete = complete
         self.completion_failed = False  # the last time: its output was not finite, and the grids stayed as seen
-        self._frames: deque[tuple[SE2, tuple[Complexes, Complexes]]] = deque(maxlen=config.window_frames)
+        self._frames: deque[tuple[SE2, tuple[Points, Points]]] = deque(maxlen=config.window_frames)
         self.ids = LaneIds(config.same_lane_m, config.cell_m, config.remembered_m)
 
     def is_news(self, T_world_ego: SE2) -> bool:
@@ -94,8 +94,8 @@ class AmodalLanes:
 
     def add(self, T_world_ego: SE2, road_m: Floats, boundary_m: Floats) -> None:
         """What one frame saw: points of the road (N, 2) and of lane boundaries (M, 2) in its ego."""
-        near = [points[points[:, 0] < self.config.depth_m] for points in (road_m, boundary_m)]
-        road, boundary = (points[:, 0] + 1j * points[:, 1] for points in near)
+        near = (points[points[:, 0] < self.config.depth_m] for points in (road_m, boundary_m))
+        road, boundary = (points.astype(np.float32)[:, None] for points in near)
         self._frames.append((T_world_ego, (road, boundary)))
 
     def clear(self) -> None:
@@ -118,23 +118,17 @@ class AmodalLanes:
     def grids(self, T_world_ego: SE2) -> Grids:
         """(2, rows, columns) occupancy of 0..1 of road and lane boundary, gathered and filtered."""
         config = self.config
-        counts = np.stack([count_cells(self._gathered(T_world_ego, channel), config) for channel in (ROAD, BOUNDARY)])
+        counts = np.stack([self._counts(T_world_ego, channel) for channel in (ROAD, BOUNDARY)])
         occupancy = np.minimum(counts / config.full_count, 1.0).astype(np.float32)
         for channel in (ROAD, BOUNDARY):
             occupancy[channel] *= dense(counts[channel] > 0, config)
         return occupancy
 
-    def _gathered(self, T_world_ego: SE2, channel: int) -> Complexes:
-        """(N,) the points x + iy of a channel that the frames saw, in the ego at `T_world_ego`."""
-        out = np.empty(sum(len(seen[channel]) for _, seen in self._frames), dtype=np.complex128)
-        end = 0
-        for T_world_then, seen in self._frames:
-            T_ego_then, points = T_world_ego.between(T_world_then), seen[channel]
-            here = out[end : end + len(points)]
-            np.multiply(points, cmath.exp(1j * T_ego_then.yaw_rad), out=here)
-            here += complex(T_ego_then.x_m, T_ego_then.y_m)
-            end += len(points)
-        return out
+    def _counts(self, T_world_ego: SE2, channel: int) -> Grids:
+        """(rows, columns) how often the frames saw a channel in each cell around the ego at `T_world_ego`."""
+        T_ego_world = T_world_ego.inverse()
+        clouds = [in_cells(seen[channel], T_ego_world @ T, self.config) for T, seen in self._frames]
+        return count_cells(clouds, self.config)
 
 
 def points_of(
@@ -180,17 +174,22 @@ def _lattice(config: LanesConfig) -> tuple[Floats, Floats]:
     return x_m, y_m
 
 
-def count_cells(points_m: Complexes, config: LanesConfig) -> NDArray[np.float32]:
-    """How many of the points x + iy (N,) in ego fall into each cell."""
+def in_cells(points_m: Points, T_ego_then: SE2, config: LanesConfig) -> Points:
+    """Points of an earlier frame's ego in cells of the grid: (row, column) of each, with its fraction."""
+    if not len(points_m):  # OpenCV transforms at least one
+        return points_m
+    origin_m = _origin_m(config) + np.array([T_ego_then.x_m, T_ego_then.y_m])
+    to_cells = np.column_stack([T_ego_then.rotation(), origin_m]) / config.cell_m
+    return np.asarray(cv2.transform(points_m, to_cells), np.float32)
+
+
+def count_cells(clouds: Sequence[Points], config: LanesConfig) -> Grids:
+    """(rows, columns) how many points of all clouds, as `in_cells` gives them, lie in each cell."""
     rows, columns = config.shape
-    origin = complex(config.behind_m + config.cell_m, config.half_width_m + config.cell_m)  # a rim for the rest
-    cells = (points_m + origin) / config.cell_m
-    row = cells.real.clip(0.0, rows + 1.0).astype(np.int32)
-    column = cells.imag.clip(0.0, columns + 1.0).astype(np.int32)
-    row *= np.int32(columns + 2)
-    row += column
-    counts = np.bincount(row, minlength=(rows + 2) * (columns + 2))
-    return counts.reshape(rows + 2, columns + 2)[1:-1, 1:-1].astype(np.float32)
+    points = np.concatenate([np.zeros((0, 1, 2), np.float32), *clouds])
+    if not len(points):
+        return np.zeros((rows, columns), np.float32)
+    return np.asarray(cv2.calcHist([points], [0, 1], None, [rows, columns], [0, rows, 0, columns]), np.float32)
 
 
 def _cells_of(centres_m: Floats, config: LanesConfig) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
