@@ -273,7 +273,8 @@ class NodeScheduling(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 class RealtimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The scheduling of the nodes, where the system permits it (process/realtime.py); a line in the log where not."""
 
-    fifo: Literal["auto", "on", "off"] = "auto"  # SCHED_FIFO; "auto": with a live camera
+    # SCHED_FIFO; "auto": all nodes with a live camera, else capture and optimize, which compute for 2 ms of a frame
+    fifo: Literal["auto", "on", "off"] = "auto"
     lock_memory: Literal["auto", "on", "off"] = "auto"  # nothing is paged out; "auto": with a live camera
     capture: NodeScheduling = NodeScheduling(priority=30)
     perceive: NodeScheduling = NodeScheduling(priority=10)

@@ -158,21 +158,50 @@ def test_what_is_not_permitted_is_a_line(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_node_runs_where_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, tuple[int, ...]]] = []
     monkeypatch.setattr(os, "sched_setaffinity", lambda thread, cpus: asked.append((thread, cpus)))
-    monkeypatch.setattr(os, "setpriority", lambda *of: None)
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *of: None)
     assert list(realtime.apply("capture", scheduled(capture=NodeScheduling(cpus=(1, 2))))) == []
     assert (os.getpid(), (1, 2)) in asked
 
 
+def at_rate(hz: float) -> Configuration:
+    return msgspec.structs.replace(scheduled(), perceive=PerceiveConfig(period_ms=1e3 / hz))
+
+
 def test_who_computes_little_goes_before_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
-    monkeypatch.setattr(os, "setpriority", lambda which, thread, nice: asked.append(nice))
-    assert list(realtime.apply("perceive", scheduled())) == []
+    by_fifo: list[int] = []
+    nice: list[int] = []
+    monkeypatch.setattr(os, "sched_setscheduler", lambda thread, policy, param: by_fifo.append(param.sched_priority))
+    monkeypatch.setattr(os, "setpriority", lambda which, thread, value: nice.append(value))
+    assert list(realtime.apply("perceive", at_rate(33.0))) == []
+    assert (by_fifo, nice) == ([], [])
+    assert list(realtime.apply("optimize", at_rate(33.0))) == []
+    assert ({*by_fifo}, nice) == ({scheduled().realtime.optimize.priority}, [])
+    monkeypatch.setattr(os, "sched_setscheduler", refused)  # of whoever may not
+    assert list(realtime.apply("optimize", at_rate(33.0))) == []
+    assert nice
+    assert max(nice) < 0
+    monkeypatch.setattr(os, "setpriority", refused)  # nor that
+    assert list(realtime.apply("optimize", at_rate(33.0))) == []
+
+
+@pytest.mark.parametrize("configuration", [scheduled(), at_rate(1000.0)])
+def test_a_flood_of_frames_takes_no_core_for_good(
+    configuration: Configuration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nice: list[int] = []
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *of: pytest.fail("SCHED_FIFO at a rate without a bound"))
+    monkeypatch.setattr(os, "setpriority", lambda which, thread, value: nice.append(value))
+    assert list(realtime.apply("capture", configuration)) == []
+    assert nice
+
+
+def test_at_rate_max_nobody_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *of: asked.append(of))
+    monkeypatch.setattr(os, "setpriority", lambda *of: asked.append(of))
+    lossless = msgspec.structs.replace(at_rate(33.0), source=SourceConfig(uri="kitti:x", rate="max"))
+    assert list(realtime.apply("optimize", lossless)) == []
     assert asked == []
-    assert list(realtime.apply("optimize", scheduled())) == []
-    assert asked
-    assert max(asked) < 0
-    monkeypatch.setattr(os, "setpriority", refused)  # of whoever may not
-    assert list(realtime.apply("optimize", scheduled())) == []
 
 
 def test_a_spare_loads_below_all_others_and_comes_back() -> None:

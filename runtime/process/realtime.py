@@ -23,9 +23,10 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of mallopt(3)
 _OBJECT_BYTES, _ANCHORED = 400, 256  # of Python's small objects, and how many in a row have one that stays
 _MIB = 1 << 20
 
-# Nodes that compute for 2 ms of a frame and then wait: they take a core from networks, not networks from them. With two
-# cores that others wanted too, an optimizer's step took up to 6 ms, of which 1 was its own
+# Nodes that compute for 2 ms of a frame and then wait: they take a core from networks, not networks from them. On two
+# cores, beside perceive alone, a step of the optimizer took p99 2.3 to 4.6 ms at SCHED_FIFO, 4.5 to 11.8 at nice -5
 _FIRST, _GOES_FIRST = ("capture", "optimize"), -5
+_LEAST_PERIOD_MS = 10.0  # of frames, for SCHED_FIFO: at more than 100 Hz they would leave no core to the others
 _GIVES_WAY = 5  # nicer: a third of the time that one gets that wants the same core and is not
 _NICEST = 19
 
@@ -48,13 +49,13 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
         except OSError as error:
             cpus = ", ".join(map(str, scheduling.cpus))
             yield f"realtime.{node}.cpus: can't run on cores {cpus} ({error.strerror}): runs on any"
-    if realtime.fifo == "on" or (realtime.fifo == "auto" and live):
-        try:
-            for thread in _threads():
-                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(scheduling.priority))
-        except PermissionError:
-            yield "realtime.fifo: SCHED_FIFO is not permitted (LimitRTPRIO=, CAP_SYS_NICE): runs at normal priority"
-    elif node in _FIRST and not configuration.lossless:
+    every = realtime.fifo == "on" or (realtime.fifo == "auto" and live)
+    first = node in _FIRST and not configuration.lossless
+    seldom = (configuration.perceive.period_ms or 0.0) >= _LEAST_PERIOD_MS
+    by_fifo = (every or (first and seldom and realtime.fifo == "auto")) and _by_fifo(scheduling.priority)
+    if every and not by_fifo:
+        yield "realtime.fifo: SCHED_FIFO is not permitted (LimitRTPRIO=, CAP_SYS_NICE): runs at normal priority"
+    if first and not by_fifo:
         with contextlib.suppress(PermissionError):  # who may not: these wait for a core like the others
             for thread in _threads():
                 os.setpriority(os.PRIO_PROCESS, thread, _GOES_FIRST)
@@ -64,6 +65,16 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
             yield "realtime.lock_memory: locking memory is not permitted (LimitMEMLOCK=infinity): it may be paged out"
         elif ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
             yield f"realtime.lock_memory: {os.strerror(ctypes.get_errno())}: memory may be paged out"
+
+
+def _by_fifo(priority: int) -> bool:
+    """Runs this process at SCHED_FIFO; False where that is not permitted."""
+    try:
+        for thread in _threads():
+            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        return False
+    return True
 
 
 def give_way() -> None:
