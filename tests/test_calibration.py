@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.calibration.calibration import CalibrationConfig, CalibrationError, calibrate
+from birdslam.calibration.calibration import CalibrationConfig, CalibrationError, _by_road, _Seen, calibrate
 from birdslam.calibration.height_check import VehicleHeightConfig, solve_mounting
 from birdslam.calibration.intrinsics import from_chessboard, read_intrinsics
 from birdslam.datasets.camera_file import camera_text, load_camera
@@ -23,6 +23,7 @@ from birdslam.datasets.recording import DatasetError
 from birdslam.datasets.speed_file import read_speed_curve
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
+from birdslam.odometry.road_alignment import RoadFit
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.main import main
 from birdslam.types import Frame
@@ -210,6 +211,22 @@ def test_the_stand_by_vehicles_is_within_its_sigma(seed: int) -> None:
     assert np.sqrt(np.diag(mounting.cov)) == pytest.approx([0.08, 0.004, 0.015], rel=0.4)
     assert (np.abs(mounting.state - truth) < 2.5 * np.sqrt(np.diag(mounting.cov))).all()
     assert solve_mounting(boxes[:16], np.array([1.65, 0.0, 0.0]), wide, VehicleHeightConfig()) is None
+
+
+def test_an_error_of_the_running_scale_is_in_what_the_road_says_however_many_comparisons_there_are() -> None:
+    """Each knows a combination of length and pitch exactly: at a scale 2 % too long all of them tilt alike."""
+    by_pitch, off_log = 5.0, 0.02  # of the log length; and by how much the running scale is off
+    exact = np.outer([1.0, by_pitch, 0.0, 0.0], [1.0, by_pitch, 0.0, 0.0]) / 0.005**2
+    cov = np.linalg.inv(exact + np.diag([1.0, 1.0, 1.0 / 0.01**2, 1.0 / 0.0001**2]))
+    pitch_rad = 0.01 + off_log / by_pitch
+    sigmas = []
+    for count in (40, 400):
+        seen = _Seen(fits=[(RoadFit(np.array([0.0, pitch_rad, 0.0, 0.0]), cov, 0.9, 1000), 3.0)] * count)
+        road = _by_road(seen, CalibrationConfig())
+        assert road is not None
+        sigmas.append(math.sqrt(road.cov[0]))
+        assert abs(road.pitch_rad - 0.01) < 1.5 * sigmas[-1]
+    assert sigmas[1] > 0.9 * sigmas[0]
 
 
 # --- a drive ---

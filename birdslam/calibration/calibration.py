@@ -216,6 +216,7 @@ def _by_road(seen: _Seen, config: CalibrationConfig) -> Witness | None:
     own = np.linalg.inv([fit.cov for fit, _ in seen.fits])
     cov = np.linalg.inv(own + known)
     tilt = np.einsum("nij,njk,nk->ni", cov, own, [fit.state for fit, _ in seen.fits])[:, 1:3]
+    by_length = cov[:, 1:3, 0] * config.sigma_length_rel**-2  # of the tilt, by the log of the running scale
     noise = cov[:, 1:3, 1:3]
     noise = noise + np.eye(2) * (config.sigma_fit_rad**2 + config.sigma_bounce_rad**2)
     share = np.array([min(1.0, way_m / config.bounce_m) for _, way_m in seen.fits])
@@ -227,7 +228,9 @@ def _by_road(seen: _Seen, config: CalibrationConfig) -> Witness | None:
         mean = np.linalg.solve(total, np.einsum("n,nij,nj->i", weights, info, tilt))
         away = np.sqrt(np.einsum("ni,nij,nj->n", tilt - mean, np.linalg.inv(noise), tilt - mean))
         weights = 1.0 / np.maximum(1.0, away / 1.5)  # Huber
-    of_mean = np.linalg.inv(total) + np.eye(2) * config.sigma_road_rad**2
+    # An error of the running scale lasts: it tilts all comparisons alike, and no mean of many makes it less
+    lasting = np.linalg.solve(total, np.einsum("n,nij,nj->i", weights, info, by_length)) * config.sigma_length_rel
+    of_mean = np.linalg.inv(total) + np.outer(lasting, lasting) + np.eye(2) * config.sigma_road_rad**2
     return _witness("road", mean, of_mean, len(tilt))
 
 
