@@ -38,7 +38,6 @@ NOT_YET = {  # what fails, by how much; strict, so that whoever mends it must st
     "street+reflection": "one valid frame off by 13 %",
     "street+bonnet": "way -5.3 %, two valid frames off by 11 %: the near road is hidden",
     "street+compression": "one valid frame off by 10 %, way -4.7 %",
-    "motorway+bonnet": "way -5.8 %, 4 of it in the first step: the bonnet seems to stand until it is found",
 }
 FRAMES = 26
 QUALITY = 70  # of the clips' WebP images
@@ -97,13 +96,14 @@ def test_what_is_on_the_glass_of_a_motorway_is_told(effect: str) -> None:
     assert sum(told) >= 0.3 * len(told)
 
 
-def test_a_bonnet_that_makes_the_car_seem_to_stand_is_seen_through() -> None:
-    """From the second image on its edge is not found in time: a motion that seems to be none explains nothing."""
+@pytest.mark.parametrize("first", [0, 1, 6])  # of the images
+def test_a_bonnet_that_makes_the_car_seem_to_stand_is_seen_through(first: int) -> None:
+    """Two images do not show its edge yet, and on the near road it stands: the farther road moves."""
     drive = read(DemoRecording(directory=CLIPS / "motorway_20"), EFFECTS["bonnet"]())
-    whole = errors(drive, range(1, FRAMES), *follow(drive, range(1, FRAMES)))
+    whole = errors(drive, range(first, FRAMES), *follow(drive, range(first, FRAMES)))
     assert whole is not None
-    assert whole["valid"] > 8
-    assert whole["scale_error"][-1] > -0.5
+    assert whole["scale_error"][0] > -0.3  # of the first step
+    assert abs(whole["scale_error"][-1]) < SCALE_LIMIT
 
 
 # --- how much a comparison of the road is believed ---

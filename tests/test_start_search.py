@@ -14,6 +14,7 @@ from birdslam.odometry.guided_two_view import first_pose, guided_two_view
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road_alignment import RoadAlignConfig, RoadAligner, plane_normal
+from birdslam.odometry.road_search import most_alike
 from birdslam.odometry.start_search import StartSearch, StartSearchConfig
 from birdslam.perf.overlays import measure
 from birdslam.perf.starts import Task, mirrored_camera, read
@@ -123,6 +124,33 @@ def test_corners_that_move_backwards_along_their_lines_say_nothing_of_the_first_
         assert fits[:90].mean() > 0.95
         assert backwards.sum() > 20
         assert fits[backwards].sum() == 0
+
+
+@pytest.mark.parametrize(
+    ("far", "found_m"),
+    [
+        ([[0.2, 0.1, 0.1], [0.2, 0.1, 0.7]], 2.0),  # a bonnet on the near road
+        ([[0.9, 0.5, 0.1], [0.9, 0.4, 0.1]], 0.05),  # a car that stands
+        ([[0.2, 0.1, 0.1], [0.2, 0.1, 0.25]], 0.05),  # what may be chance
+    ],
+)
+def test_what_stands_is_a_bonnet_where_the_farther_road_moves(far: list[list[float]], found_m: float) -> None:
+    lengths = np.array([0.05, 1.0, 2.0])
+    whole = [[0.6, 0.2, 0.3], [0.8, 0.2, 0.3]]
+    pitch, length = most_alike(lambda farther: np.array(far if farther else whole), lengths)
+    assert lengths[length] == found_m
+    assert pitch == 1
+
+
+def test_the_farther_road_is_not_asked_where_the_whole_road_moves() -> None:
+    asked: list[bool] = []
+
+    def alike(farther: bool) -> np.ndarray:
+        asked.append(farther)
+        return np.array([[0.2, 0.8]])
+
+    assert most_alike(alike, np.array([0.05, 2.0])) == (0, 1)
+    assert asked == [False]
 
 
 # --- on recorded drives ---

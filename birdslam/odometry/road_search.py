@@ -6,6 +6,8 @@ the length, this search gives it a start that is near enough.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,9 @@ from birdslam.geometry.pose import Pose
 from birdslam.odometry.road_alignment import RoadImage, plane_normal
 
 Floats = NDArray[np.float64]
+
+_STANDS_M = 0.1  # a car that drives so little at a start stands as well as not
+_LEAD = 0.1  # of the correlation of the farther road as it moves over that as it stands
 
 
 def search_length(
@@ -30,8 +35,48 @@ def search_length(
 
     `px` (N, 2) are pixels of the present image that show road, `tilt` its (pitch, roll) in rad; only the direction of
     `T_past_present`'s translation counts."""
-    f32 = np.float32
     px = px[:: max(1, len(px) // 900)]
+    tilts = [(pitch_rad, tilt[1]) for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01)]
+
+    def alike(far: bool) -> Floats:
+        shown = farther_half(px) if far else px
+        return np.array([_alike(camera, past, present, T_past_present, shown, each, lengths) for each in tilts])
+
+    return float(lengths[most_alike(alike, lengths)[1]])
+
+
+def most_alike(alike: Callable[[bool], Floats], lengths: Floats) -> tuple[int, int]:
+    """Which pitch and which of `lengths` (L,) ascending, in metres, make two images of the road most alike.
+
+    `alike` gives correlations (pitches, L), of the whole road, or where it is told so of the farther half alone: of a
+    car that stands that stands as well. Where it moves, what stands is the car's own bonnet on the near road.
+    """
+    whole = alike(False)
+    pitch, length = np.unravel_index(int(whole.argmax()), whole.shape)
+    if lengths[length] < _STANDS_M:
+        far = alike(True)
+        far_pitch, far_length = np.unravel_index(int(far.argmax()), far.shape)
+        if far[far_pitch, far_length] > far[:, lengths < _STANDS_M].max() + _LEAD:
+            pitch, length = far_pitch, far_length
+    return int(pitch), int(length)
+
+
+def farther_half(px: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Those of the pixels (N, 2) of the road that lie above their median row."""
+    return px[px[:, 1] < np.median(px[:, 1])]
+
+
+def _alike(
+    camera: Camera,
+    past: RoadImage,
+    present: RoadImage,
+    T_past_present: Pose,
+    px: NDArray[np.int64],
+    tilt: tuple[float, float],
+    lengths: Floats,
+) -> Floats:
+    """(L,) correlation of the road's samples with the past image, for each length."""
+    f32 = np.float32
     rays = np.stack(
         [(px[:, 0] - camera.cx_px) / camera.fx_px, (px[:, 1] - camera.cy_px) / camera.fy_px, np.ones(len(px))]
     ).astype(f32)  # fmt: skip
@@ -39,23 +84,18 @@ def search_length(
     direction = (T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9)).astype(f32)
     turned = T_past_present.R.astype(f32) @ rays
     rows, cols = past.grey.shape
-    best = (float(lengths[0]), -1.0)
-    for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01):
-        rho = (plane_normal(pitch_rad, tilt[1])[0].astype(f32) @ rays) * f32(-1.0 / camera.height_m)
-        way = lengths.astype(f32)[:, None] * rho  # (L, N) displacement over depth
-        by_z = f32(1.0) / np.maximum(turned[2] + way * direction[2], f32(1e-3))
-        u = (turned[0] + way * direction[0]) * by_z * f32(camera.fx_px) + f32(camera.cx_px)
-        v = (turned[1] + way * direction[1]) * by_z * f32(camera.fy_px) + f32(camera.cy_px - past.top_px)
-        there = cv2.remap(past.grey, u, v, cv2.INTER_LINEAR)
-        inside = ((u > 0) & (u < cols - 1) & (v > 0) & (v < rows - 1)).astype(f32)
-        count = np.maximum(inside.sum(axis=1), 1.0)
-        a, b = there * inside, here * inside
-        mean_a, mean_b = a.sum(axis=1) / count, b.sum(axis=1) / count
-        ab, aa, bb = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (a, a), (b, b)))
-        variances = (aa - count * mean_a**2) * (bb - count * mean_b**2)
-        correlation = (ab - count * mean_a * mean_b) / np.sqrt(np.maximum(variances, 1e-9))
-        correlation[count < 0.5 * len(px)] = -1.0
-        k = int(correlation.argmax())
-        if correlation[k] > best[1]:
-            best = (float(lengths[k]), float(correlation[k]))
-    return best[0]
+    rho = (plane_normal(*tilt)[0].astype(f32) @ rays) * f32(-1.0 / camera.height_m)
+    way = lengths.astype(f32)[:, None] * rho  # (L, N) displacement over depth
+    by_z = f32(1.0) / np.maximum(turned[2] + way * direction[2], f32(1e-3))
+    u = (turned[0] + way * direction[0]) * by_z * f32(camera.fx_px) + f32(camera.cx_px)
+    v = (turned[1] + way * direction[1]) * by_z * f32(camera.fy_px) + f32(camera.cy_px - past.top_px)
+    there = cv2.remap(past.grey, u, v, cv2.INTER_LINEAR)
+    inside = ((u > 0) & (u < cols - 1) & (v > 0) & (v < rows - 1)).astype(f32)
+    count = np.maximum(inside.sum(axis=1), 1.0)
+    a, b = there * inside, here * inside
+    mean_a, mean_b = a.sum(axis=1) / count, b.sum(axis=1) / count
+    ab, aa, bb = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (a, a), (b, b)))
+    variances = (aa - count * mean_a**2) * (bb - count * mean_b**2)
+    out: Floats = (ab - count * mean_a * mean_b) / np.sqrt(np.maximum(variances, 1e-9))
+    out[count < 0.5 * len(px)] = -1.0  # what leaves the image says nothing
+    return out

@@ -9,6 +9,7 @@ next image's guess. So, at the start and after a loss:
   so that neither the exposure nor another car nor one near tree decides);
 - length: with that rotation the road's image is compared over forward travel and pitch together. A car rolls on its
   rear axle, so the direction of travel follows from the rotation and the length.
+  Where the near road seems to stand, the farther one is asked too: a bonnet stands.
 
 These are guesses for the flow, which says by its residuals which of them is right for each corner.
 """
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.road_alignment import RoadAligner, RoadImage, plane_normal
+from birdslam.odometry.road_search import farther_half, most_alike
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.float32]
@@ -112,18 +114,24 @@ class StartSearch:
     def driven(self, R_past_present: Floats, past: RoadImage, present: RoadImage) -> Pose:
         """T_past_present of this rotation and of the length at which the road is most alike."""
         yaw_rad = float(np.arctan2(R_past_present[0, 2], R_past_present[2, 2]))
-        best = (-1.0, np.zeros(3))
+        views = []
         for pitch_rad in self._pitches_rad:
             px = self._aligner.samples((float(pitch_rad), self.camera.roll_rad), _NO_BOXES, None)
             px = px[:: max(1, len(px) // self.config.samples)]
-            if len(px) < 50:
-                continue
-            ways = self._ways(yaw_rad, float(pitch_rad))
-            alike = self._alike(R_past_present, ways, float(pitch_rad), px, past, present)
-            k = int(alike.argmax())
-            if alike[k] > best[0]:
-                best = (float(alike[k]), ways[k])
-        return Pose(R_past_present, best[1])
+            if len(px) >= 50:
+                views.append((float(pitch_rad), self._ways(yaw_rad, float(pitch_rad)), px))
+
+        def alike(far: bool) -> Floats:
+            rows = [
+                self._alike(R_past_present, ways, pitch_rad, farther_half(px) if far else px, past, present)
+                for pitch_rad, ways, px in views
+            ]
+            return np.array(rows)
+
+        if not views:
+            return Pose(R_past_present, np.zeros(3))
+        pitch, length = most_alike(alike, self._lengths_m)
+        return Pose(R_past_present, views[pitch][1][length])
 
     def _ways(self, yaw_rad: float, pitch_rad: float) -> Floats:
         """(L, 3) translations of a camera in front of the rear axle that rolls on an arc, along the road."""
