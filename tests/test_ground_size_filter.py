@@ -201,7 +201,8 @@ def test_a_size_that_is_learned_elsewhere_counts_in_the_depth_and_is_not_kept() 
     extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
 
     def again(weights: list[float], heights_m: list[float], sigma: float) -> tuple[float, float]:
-        learned = LearnedSize(np.array([weights]), np.log([heights_m]), np.full((1, len(weights)), sigma**2))
+        variances = np.full((1, len(weights)), sigma**2)
+        learned = LearnedSize(np.array([weights]), np.log([heights_m]), variances, np.zeros(1))
         ground_size = copy.deepcopy(road.ground_size)
         found = ground_size.estimate_depths([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), learned)
         assert ground_size.size(0)[0] < 1.62
@@ -221,3 +222,20 @@ def test_a_size_that_is_learned_elsewhere_counts_in_the_depth_and_is_not_kept() 
     assert abs(vague_m - prior_m) < 0.1 * abs(told_m - prior_m)
     assert mixed_m < told_m
     assert mixed_sigma > 1.5 * told_sigma
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 15.0])
+def test_a_box_that_widens_is_of_a_car_that_turns_or_of_one_that_comes_nearer(speed_mps: float) -> None:
+    """What stands shows no other side but by the ego's way, so that its width counts; who drives may turn."""
+    road = Road()
+    motion = LearnedSize(np.ones((1, 1)), np.full((1, 1), math.log(1.53)), np.full((1, 1), 1e6), np.full(1, speed_mps))
+    cuboid = road.box(30.0, 0.0, 1.53)
+    for k in range(40):
+        half_px = (cuboid[2] - cuboid[0]) / 2.0 * max(0.0, 0.025 * (k - 10))
+        box = cuboid + np.array([-half_px, 0.0, half_px, 0.0])
+        road.ground_size.predict(0.1, 0.0, None, 0.0)
+        seen = observe_boxes(box[None], np.ones(1), ("car",), CAMERA, road.ground_size.ground, LOCALISATION)
+        extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
+        depths = road.ground_size.estimate_depths([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), motion)
+    nearer_rel = 1.0 - float(np.exp(depths.log_depth[0])) / (30.0 - CAR.length_m / 2.0)
+    assert nearer_rel < 0.04 if speed_mps else nearer_rel > 0.08

@@ -16,8 +16,8 @@ that count downwards from the plane of the road, each box has three measurements
     log width = log w + log(class's outline) - log z
 
 The pitch follows the camera's own rotation between frames, and decays to the calibrated one: where a rotation lasts,
-the road turned too. Between frames a vehicle's size and kerb stay. The update is iterated once about its own result,
-with the noise of outliers raised (robust weights, Huber).
+the road turned too. Between frames a vehicle's size and kerb stay; its outline changes as it or the line of sight
+turns. The update is iterated once about its own result, with the noise of outliers raised (robust weights, Huber).
 """
 
 from __future__ import annotations
@@ -62,6 +62,7 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_crown_rad: float = 0.007  # and the more the farther it stands to the side
     width_drift_rel: float = 0.002  # of the outline, a frame
     width_turn_rel: float = 1.0  # of the outline, a radian that the line of sight turned: the yaw is not known as well
+    bend_per_m: float = 0.01  # 1-sigma of the curvature of a vehicle's own way, by judgement: a bend of 100 m
     width_turned_rel: float = 0.6  # of a change of the outline that comes of a yaw newly learned
     roof_reach_rel: float = 0.6  # of the vehicle's extent along the line of sight, to the edge of its roof
     cues: tuple[Cue, ...] = ("bottom", "top", "width")  # what of a box is believed
@@ -188,7 +189,7 @@ class GroundSizeFilter:
         if not n:
             return Depths(*np.zeros((5, 0)))
         at = np.array([self._at(vehicle) for vehicle in vehicles])
-        self._P[at + 1, at + 1] += self.config.width_drift_rel**2 + (self.config.width_turn_rel * turned_rad) ** 2
+        self._P[at + 1, at + 1] += self._outline_drift(at, turned_rad, learned)
         tops = np.array([o.slope_top for o in seen])
         slopes = np.array([o.slope_bottom for o in seen])
         bearing = np.array([o.bearing for o in seen])
@@ -210,6 +211,18 @@ class GroundSizeFilter:
             *_mixed(learned.weight, log_h[:, None] + of_height * gap, P_h[:, None] - of_height * P_h[:, None]),
             P_zh / P_h,
         )
+
+    def _outline_drift(self, at: NDArray[np.intp], turned_rad: Floats, learned: LearnedSize | None) -> Floats:
+        """(N,): by how much the variance of each log outline grew since it was last seen.
+
+        The line of sight to what stands turns by what the ego drives; who drives turns by itself too, the more the
+        faster. A car that is seen from behind doubles its outline within 30 degrees.
+        """
+        config = self.config
+        own_turn = 0.0 if learned is None else config.bend_per_m * learned.speed_mps  # in a second
+        own_var = np.square(own_turn) * self._unseen_s[(at - COMMON) // OWN]
+        out: Floats = config.width_drift_rel**2 + config.width_turn_rel**2 * (np.square(turned_rad) + own_var)
+        return out
 
     def _frames_alike(self, at: NDArray[np.intp]) -> Floats:
         """(N,): how many frames in a row err alike, by how long ago each vehicle was last seen."""

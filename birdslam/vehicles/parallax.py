@@ -108,11 +108,15 @@ class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class LearnedSize:
-    """Measurements of log h that exclude each other, (N, K): each holds with its weight, and has its variance."""
+    """Measurements of log h that exclude each other, (N, K): each holds with its weight, and has its variance.
+
+    `speed_mps` (N,) is the root mean square of the speeds that the ways to move have, each with its probability.
+    """
 
     weight: Floats
     log_height: Floats
     variance: Floats
+    speed_mps: Floats
 
 
 class Parallax:
@@ -227,7 +231,8 @@ class Parallax:
         """What motion says of each vehicle's size; `height_m` is the camera's."""
         rows = [self._vehicles.index(vehicle) for vehicle in vehicles]
         if not rows:
-            return LearnedSize(*np.zeros((3, 0, len(BLIND) + 1)))
+            nothing = np.zeros((0, len(BLIND) + 1))
+            return LearnedSize(nothing, nothing, nothing, np.zeros(0))
         config = self.config
         x, P = self._x[rows], self._P[rows]
         outline_var = np.square(boxes.turned_rad) + config.outline_drift_rel**2 * self._unseen_s[rows]
@@ -335,10 +340,12 @@ class Parallax:
         log_height = np.where(informed, (mean / var - prior / prior_var) / information, prior)
         variance = 1.0 / information + lasting[:, None]
         weight = self._weight[rows]
+        square = np.square(self._x[rows][:, MOVING, VX:HEIGHT]).sum(axis=-1)
         return LearnedSize(
             np.column_stack([weight[:, STILL], weight[:, MOVING].sum(axis=1)]),
             np.column_stack([log_height, prior]),
             np.column_stack([variance, np.full(len(rows), UNKNOWN)]),
+            np.sqrt((weight[:, MOVING] * square).sum(axis=1)),
         )
 
 
