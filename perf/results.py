@@ -271,11 +271,13 @@ def summary(found: Mapping[str, Kept]) -> str:
         good += f"published, from images, {published[name]:.2f}"
         what = f"trajectories of the paper's {whose}; recorded boxes, simulated odometry"
         rows.append((what, good, "`birdslam evaluate tracking`"))
-    age = re.search(r"^\| system \|(.*)$", (ROOT / "perf" / "results" / "report.md").read_text(), re.MULTILINE)
+    report = (ROOT / "perf" / "results" / "report.md").read_text()
+    age, cores = re.search(r"^\| system \|(.*)$", report, re.MULTILINE), re.search(r", (\d+) cores, ", report)
     assert age is not None
+    assert cores is not None
     rate, dropped, *_, p50, p99, _, worst, _ = (cell.strip() for cell in age[1].strip("|").split("|"))
     good = f"p50 {p50}, p99 {p99}, max {worst} ms; {dropped} frames dropped"
-    rows.append((f"age at the planner, {rate} Hz, 4 cores", good, "`python -m perf system`"))
+    rows.append((f"age at the planner, {rate} Hz, {cores[1]} cores", good, "`python -m perf system`"))
     return table(rows)
 
 
