@@ -149,7 +149,11 @@ def test_the_world_frame_does_not_matter(yaw_rad: float, x_m: float, y_m: float)
     assert np.mean(np.abs(a - b) > 0.6) < 0.02  # points on a cell's edge may fall to either side
 
 
-@given(st.lists(st.tuples(st.floats(-40, 60, width=32), st.floats(-40, 40, width=32)), max_size=50))
+# In 1/64 m, which float32 has exactly, and the cells' edges among them
+METRES = st.integers(-40 * 64, 60 * 64).map(lambda n: n / 64.0)
+
+
+@given(st.lists(st.tuples(METRES, METRES), max_size=50))
 def test_every_point_of_the_grid_is_counted_once(points: list[tuple[float, float]]) -> None:
     cloud = np.array(points).reshape(-1, 2)
     inside = (cloud[:, 0] >= -CONFIG.behind_m) & (cloud[:, 0] < CONFIG.ahead_m)
