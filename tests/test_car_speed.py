@@ -117,7 +117,7 @@ def test_a_jump_is_refused_until_it_lasts() -> None:
 
 
 class World:
-    """Images that see each way exactly, in a unit of their own; a road that says the metres; readings."""
+    """Images that see each way, in a unit of their own; a road that says the metres; readings."""
 
     def __init__(self, unit_m: float = 1.0) -> None:
         self.config = RoadScaleConfig()
@@ -125,7 +125,9 @@ class World:
         self.filter.forget_scale(1.0)
         self.car = CarScale(self.config, self.filter)
         self.unit_m = unit_m  # of the odometry's unit of length
+        self.trembles = np.zeros(1)  # by which one image after the other sees its way too long, as a fraction
         self.error = 0.0  # of the last way, as a fraction
+        self.errors: list[float] = []  # of all of them
 
     def drive(
         self, speed: Speed, readings: Sequence[SpeedReading], span_s: tuple[float, float], road: bool, hz: float = 10.0
@@ -136,13 +138,15 @@ class World:
             now_ns = round(b * NS_PER_S)
             self.car.hear([r for r in readings if now_ns - NS_PER_S < r.t_ns <= now_ns], now_ns)
             true_m = float(np.trapezoid([speed(t) for t in np.linspace(a, b, 21)], dx=(b - a) / 20))
-            way = true_m / self.unit_m
+            way = true_m / self.unit_m * (1.0 + float(self.trembles[k % len(self.trembles)]))
             self.filter.predict(np.eye(3), way)
             if road:
                 off = np.array([math.log(self.unit_m), *self.filter.x[1:4]])
                 way *= self._rescale(self.filter.accept(RoadFit(off, np.diag([1e-6, 1e-4, 1e-4, 1e-6]), 0.9, 1000)))
             factor = self.car.follow(round(a * NS_PER_S), now_ns, way, way, road)
-            self.error = way * self._rescale(factor) / true_m - 1.0 if true_m > 0.0 else self.error
+            metres = way * self._rescale(factor) * self.car.motion_factor
+            self.error = metres / true_m - 1.0 if true_m > 0.0 else self.error
+            self.errors.append(self.error)
             told |= dict.fromkeys(self.car.status())
         return list(told)
 
@@ -194,6 +198,17 @@ def test_what_a_lit_road_taught_holds_in_the_dark() -> None:
     alone = World()
     alone.drive(lambda t: 12.0, [], (1.0, 20.0), road=True)
     assert len(alone.filter.x) == STATES  # nothing changes for a car that never tells
+
+
+def test_a_motion_that_images_see_roughly_is_smoothed_by_readings_that_are_there() -> None:
+    readings, world = [r for r in readings_of(lambda t: 12.0, 12.0, 1.03) if r.t_ns <= 11.0 * NS_PER_S], World()
+    world.trembles = np.random.default_rng(0).normal(0.0, 0.03, 50)
+    world.drive(lambda t: 12.0, readings, (1.0, 6.0), road=True)
+    world.errors = []
+    world.drive(lambda t: 12.0, readings, (6.0, 11.0), road=True)
+    assert np.std(world.errors) < 0.5 * np.std(world.trembles)
+    world.drive(lambda t: 12.0, readings, (11.0, 11.3), road=True)
+    assert world.car.motion_factor == 1.0  # no reading covers the newest motion
 
 
 @pytest.mark.parametrize(

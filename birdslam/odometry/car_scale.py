@@ -6,6 +6,9 @@ lambda, log k and the delay are states of the road's filter, so that each knows 
 seen it teaches the factor, and where it is not the readings carry the metres by the factor learned. The delay shows
 itself where the car brakes or accelerates, and nowhere else.
 
+A way by images is wrong by itself too, from pose to pose, most by night. That share of its misfit changes the
+newest motion alone (`motion_factor`), the landmarks and the unit of length stay as they are.
+
 A way that contradicts what was expected is refused, and the readings are then not trusted until one agrees again. So
 the road stays in the right while it is seen. Where it is not and the contradiction stays one and the same ratio, it is
 the images whose metres are in doubt, and the car's count.
@@ -63,7 +66,7 @@ class CarScale:
     - State: the way by images since the last comparison, image by image; whether the readings are trusted.
     - Measurements: `hear`, the car's readings; `follow`, each motion by images.
     - Readers: `road_scale.RoadScale` for the factor on all lengths, its statuses and sources; `Odometry` through it for
-      `step`, the motion where images show none.
+      `motion_factor`, and for `step`, the motion where images show none.
     """
 
     def __init__(self, config: RoadScaleConfig, filter_: RoadFilter) -> None:
@@ -82,6 +85,7 @@ class CarScale:
         self._begun_m = 0.0  # travelled since the window began
         self._jumps = 0
         self.since_m = math.inf  # travelled since then
+        self.motion_factor = 1.0  # on the newest motion alone, beside that on all lengths
 
     @property
     def config(self) -> CarSpeedConfig:
@@ -144,6 +148,7 @@ class CarScale:
         self.since_m += travelled
         self._begun_m += travelled
         self._refused_m += travelled
+        self.motion_factor = 1.0
         if not self._speed.heard:
             return 1.0
         self._confirmed = confirmed
@@ -178,8 +183,8 @@ class CarScale:
         if way is None:
             return 1.0
         ratio = way.way_m / by_images
-        var = way.var_m2 / max(by_images**2, way.way_m**2)
-        var += cfg.sigma_step_rel**2 / max(abs(by_images), 1.0) + (cfg.sigma_step_m / by_images) ** 2
+        own = cfg.sigma_step_rel**2 / max(abs(by_images), 1.0) + (cfg.sigma_step_m / by_images) ** 2  # the images'
+        var = way.var_m2 / max(by_images**2, way.way_m**2) + own
         walk = self._road.scale_walk_rel_per_sqrt_m if self._settled else cfg.start_walk_rel_per_sqrt_m
         var += walk**2 * abs(lag)
         if ratio <= 0.05:
@@ -198,7 +203,12 @@ class CarScale:
         if self._confirmed and filter_.carried_m < self._road.carried_after_m:
             self._agreements += 1
         if not self._settled:
-            var += (cfg.sigma_start_m / by_images) ** 2
+            start = (cfg.sigma_start_m / by_images) ** 2
+            own, var = own + start, var + start
+        if lag == 0.0:
+            H, beyond, sigmas = filter_.car_innovation(log_ratio, by_delay, var)
+            if sigmas < cfg.max_innovation_sigma:  # else, by night too, it may be the wheels that slip
+                self.motion_factor = math.exp(own / (float((H @ filter_.cov @ H.T)[0, 0]) + var) * beyond)
         return filter_.measure_car(log_ratio, by_delay, var)
 
     def _refuse(self, t_ns: int, log_ratio: float) -> float:

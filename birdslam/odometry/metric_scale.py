@@ -72,6 +72,10 @@ class MetricScale(Protocol):
     def car_step(self, from_ns: int, to_ns: int) -> CarStep | None:
         """The car's motion by its own readings; None where there are none that can be trusted."""
 
+    @property
+    def motion_factor(self) -> float:
+        """The factor on the newest motion alone, after that on all lengths: its own error, by the car's speed."""
+
     def measure_scale(self, step: Pose, view: RoadView) -> float:
         """The factor on all lengths, about the present camera, after a motion T_prev_curr of `step`."""
 

@@ -95,6 +95,11 @@ class MedianScale:
         """The road, or an older scale of it."""
         return (SpeedSource.CARRIED if Status.SCALE_CARRIED in self.status() else SpeedSource.ROAD,)
 
+    @property
+    def motion_factor(self) -> float:
+        """1: the car's own speed is not heard."""
+        return 1.0
+
     def measure_scale(self, step: Pose, view: RoadView) -> float:
         """The factor by which the moving median has changed; 1 where no frame has given a scale yet."""
         self._carried_m += float(np.linalg.norm(step.p))

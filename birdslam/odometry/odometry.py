@@ -315,7 +315,7 @@ class Odometry:
         near_px: float | None,
         interval_ns: tuple[int, int],
     ) -> Pose:
-        """T_base_present in metres; the window is rescaled to metres too."""
+        """T_base_present in metres, as the images and the car's own speed have it; the window is rescaled to metres."""
         step = self._pose.between(pose)
         sigma = np.sqrt(np.diag(cov6))
         view = RoadView(
@@ -332,7 +332,7 @@ class Odometry:
         factor = self._scale.measure_scale(step, view)
         self._window.rescale(factor)
         self._pose = pose
-        return Pose(step.R, step.p * factor)
+        return Pose(step.R, step.p * (factor * self._scale.motion_factor))
 
     # --- moving, standing, coasting ---
 

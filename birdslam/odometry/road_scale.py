@@ -115,6 +115,11 @@ class RoadScale:
         """The car's motion by its own readings; None where there are none that can be trusted."""
         return self._car.step(from_ns, to_ns)
 
+    @property
+    def motion_factor(self) -> float:
+        """The factor on the newest motion alone, after that on all lengths: its own error, by the car's speed."""
+        return self._car.motion_factor
+
     def measure_scale(self, step: Pose, view: RoadView) -> float:
         """The factor on all lengths, by the road of this image against an earlier one's and by the car's own speed.
 
