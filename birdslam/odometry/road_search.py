@@ -37,10 +37,11 @@ def search_length(
     `T_past_present`'s translation counts."""
     px = px[:: max(1, len(px) // 900)]
     tilts = [(pitch_rad, tilt[1]) for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01)]
+    ways = lengths[:, None] * (T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9))
 
     def alike(far: bool) -> Floats:
         shown = farther_half(px) if far else px
-        return np.array([_alike(camera, past, present, T_past_present, shown, each, lengths) for each in tilts])
+        return np.array([correlations(camera, past, present, T_past_present.R, ways, shown, each) for each in tilts])
 
     return float(lengths[most_alike(alike, lengths)[1]])
 
@@ -66,33 +67,29 @@ def farther_half(px: NDArray[np.int64]) -> NDArray[np.int64]:
     return px[px[:, 1] < np.median(px[:, 1])]
 
 
-def _alike(
+def correlations(
     camera: Camera,
     past: RoadImage,
     present: RoadImage,
-    T_past_present: Pose,
+    R_past_present: Floats,
+    ways: Floats,
     px: NDArray[np.int64],
     tilt: tuple[float, float],
-    lengths: Floats,
 ) -> Floats:
-    """(L,) correlation of the road's samples with the past image, for each length."""
+    """(L,) correlation of the road's samples (N, 2) with the past image, for each translation of `ways` (L, 3)."""
     f32 = np.float32
-    rays = np.stack(
-        [(px[:, 0] - camera.cx_px) / camera.fx_px, (px[:, 1] - camera.cy_px) / camera.fy_px, np.ones(len(px))]
-    ).astype(f32)  # fmt: skip
+    focal_px, centre_px = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
+    rays = np.stack([*((px - centre_px) / focal_px).T, np.ones(len(px))]).astype(f32)
     here = present.grey[px[:, 1] - present.top_px, px[:, 0]]
-    direction = (T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9)).astype(f32)
-    turned = T_past_present.R.astype(f32) @ rays
-    rows, cols = past.grey.shape
     rho = (plane_normal(*tilt)[0].astype(f32) @ rays) * f32(-1.0 / camera.height_m)
-    way = lengths.astype(f32)[:, None] * rho  # (L, N) displacement over depth
-    by_z = f32(1.0) / np.maximum(turned[2] + way * direction[2], f32(1e-3))
-    u = (turned[0] + way * direction[0]) * by_z * f32(camera.fx_px) + f32(camera.cx_px)
-    v = (turned[1] + way * direction[1]) * by_z * f32(camera.fy_px) + f32(camera.cy_px - past.top_px)
-    there = cv2.remap(past.grey, u, v, cv2.INTER_LINEAR)
+    q = (R_past_present.astype(f32) @ rays)[:, None, :] + ways.astype(f32).T[:, :, None] * rho
+    by_z = f32(1.0) / np.maximum(q[2], f32(1e-3))
+    u = q[0] * by_z * f32(camera.fx_px) + f32(camera.cx_px)
+    v = q[1] * by_z * f32(camera.fy_px) + f32(camera.cy_px - past.top_px)
+    rows, cols = past.grey.shape
     inside = ((u > 0) & (u < cols - 1) & (v > 0) & (v < rows - 1)).astype(f32)
     count = np.maximum(inside.sum(axis=1), 1.0)
-    a, b = there * inside, here * inside
+    a, b = cv2.remap(past.grey, u, v, cv2.INTER_LINEAR) * inside, here * inside
     mean_a, mean_b = a.sum(axis=1) / count, b.sum(axis=1) / count
     ab, aa, bb = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (a, a), (b, b)))
     variances = (aa - count * mean_a**2) * (bb - count * mean_b**2)

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp
-from birdslam.odometry.road_alignment import RoadAligner, RoadImage, plane_normal
-from birdslam.odometry.road_search import farther_half, most_alike
+from birdslam.odometry.road_alignment import RoadAligner, RoadImage
+from birdslam.odometry.road_search import correlations, farther_half, most_alike
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.float32]
@@ -122,10 +122,10 @@ class StartSearch:
                 views.append((float(pitch_rad), self._ways(yaw_rad, float(pitch_rad)), px))
 
         def alike(far: bool) -> Floats:
-            rows = [
-                self._alike(R_past_present, ways, pitch_rad, farther_half(px) if far else px, past, present)
-                for pitch_rad, ways, px in views
-            ]
+            rows = []
+            for pitch_rad, ways, px in views:
+                shown, tilt = farther_half(px) if far else px, (pitch_rad, self.camera.roll_rad)
+                rows.append(correlations(self.camera, past, present, R_past_present, ways, shown, tilt))
             return np.array(rows)
 
         if not views:
@@ -138,29 +138,6 @@ class StartSearch:
         half, ahead_m = 0.5 * yaw_rad, self.config.camera_ahead_m * np.sin(yaw_rad)
         forward = self._lengths_m * np.cos(half)
         return np.column_stack([self._lengths_m * np.sin(half) + ahead_m, -np.tan(pitch_rad) * forward, forward])
-
-    def _alike(
-        self, R: Floats, ways: Floats, pitch_rad: float, px: NDArray[np.int64], past: RoadImage, present: RoadImage
-    ) -> Floats:
-        """(L,) correlation of the road's samples with the past image, for each way."""
-        cam, f32 = self.camera, np.float32
-        rays = np.stack([*((px - [cam.cx_px, cam.cy_px]) / [cam.fx_px, cam.fy_px]).T, np.ones(len(px))]).astype(f32)
-        here = present.grey[px[:, 1] - present.top_px, px[:, 0]]
-        rho = (plane_normal(pitch_rad, cam.roll_rad)[0].astype(f32) @ rays) * f32(-1.0 / cam.height_m)
-        q = (R.astype(f32) @ rays)[:, None, :] + ways.astype(f32).T[:, :, None] * rho
-        by_z = f32(1.0) / np.maximum(q[2], f32(1e-3))
-        u = q[0] * by_z * f32(cam.fx_px) + f32(cam.cx_px)
-        v = q[1] * by_z * f32(cam.fy_px) + f32(cam.cy_px - past.top_px)
-        rows, cols = past.grey.shape
-        inside = ((u > 0) & (u < cols - 1) & (v > 0) & (v < rows - 1)).astype(f32)
-        count = np.maximum(inside.sum(axis=1), 1.0)
-        a, b = cv2.remap(past.grey, u, v, cv2.INTER_LINEAR) * inside, here * inside
-        mean_a, mean_b = a.sum(axis=1) / count, b.sum(axis=1) / count
-        ab, aa, bb = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (a, a), (b, b)))
-        variances = (aa - count * mean_a**2) * (bb - count * mean_b**2)
-        out: Floats = (ab - count * mean_a * mean_b) / np.sqrt(np.maximum(variances, 1e-9))
-        out[count < 0.5 * len(px)] = -1.0  # what leaves the image says nothing
-        return out
 
 
 def _contrast(image: Grey) -> Grey:
