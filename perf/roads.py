@@ -8,8 +8,9 @@ over two of them. Each road is rendered from its seed (extra `train`), `--keep D
 `--source demo:DIR/NAME` plays it, and `--drives DIR` measures those that lie there instead of rendering them.
 
 The odometry runs without networks; the boxes of everybody of whom something is to be seen are the true ones. Each drive
-is followed from its first image to its last, and from every `--every`-th over `--images` anew. Writes roads.json,
-report.md, and roads.png, the errors of scale and rotation over the way.
+is followed from each image of `--begin-at` to its last (which image is the first decides much on such roads), and from
+every `--every`-th over `--images` anew. Writes roads.json, report.md, and roads.png, the errors of scale and rotation
+over the way.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ EFFECTS: dict[str, Callable[[], Edit]] = {
     "compression": lambda: _compressed(VideoEncoder()),
 }
 SEEN = 0.05  # of a body: whoever is hidden more has no box
-COLUMNS = ("road", "m/s", "Hz", "way", "rotation", "valid", "of them wrong", "standstill", "NEES", "worst start")
+COLUMNS = ("road", "m/s", "Hz", "ways", "rotation", "valid", "of them wrong", "standstill", "NEES", "worst start")
 
 
 def run(arguments: list[str]) -> None:
@@ -72,11 +73,14 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--frames", type=int, help="of each drive; else all that its road has")
     parser.add_argument("--width", type=int, default=640, help="of the images in pixels; KITTI's have 1242")
     parser.add_argument("--quality", type=int, default=92, help="of the WebP images, 1 to 100")
+    parser.add_argument("--begin-at", type=int, nargs="+", default=[0], metavar="IMAGE", help="followed to the end")
     parser.add_argument("--every", type=int, default=20, help="images from one cold start to the next")
     parser.add_argument("--images", type=int, default=25, help="of each cold start")
     options = parser.parse_args(arguments)
     if options.every < 1 or options.images < LEAST_IMAGES or not 1 <= options.quality <= 100:
         raise PerfError(f"--every must be at least 1, --images {LEAST_IMAGES}, --quality 1 to 100")
+    if min(options.begin_at) < 0:
+        raise PerfError(f"--begin-at {min(options.begin_at)}: images are counted from 0")
     if options.frames is not None and options.frames < LEAST_IMAGES:
         raise PerfError(f"--frames must be at least {LEAST_IMAGES}")
     if not 160 <= options.width <= 4096:
@@ -88,7 +92,8 @@ def run(arguments: list[str]) -> None:
             drives = _Drives(options, Path(spare))
             for name in options.names or drives.names:
                 recording, edit = drives.open(name)
-                row = measure(read(recording, edit, drives.most(name)), options.every, options.images)
+                drive = read(recording, edit, drives.most(name))
+                row = measure(drive, options.begin_at, options.every, options.images)
                 ledger.add(name, told(row), hz=recording.rate_hz, **row)
     except DatasetError as error:
         raise PerfError(str(error)) from error
@@ -165,29 +170,39 @@ def read(recording: DemoRecording, edit: Edit | None = None, most: int = 10**6) 
     return Drive(recording.camera, images, t_ns, poses, list(seen))
 
 
-def measure(drive: Drive, every: int | None = None, images: int = 25) -> dict[str, Any]:
-    """The odometry over the whole drive; and, with `every`, from each so many-th image over some `images` anew."""
+def measure(
+    drive: Drive, begin_at: Sequence[int] = (0,), every: int | None = None, images: int = 25
+) -> dict[str, Any]:  # fmt: skip
+    """The odometry from some images on to the drive's last; and, with `every`, from each so many-th over some anew.
+
+    Of the ways "scale_errors" has each one's; all else counts them together.
+    """
     count = len(drive.images)
-    estimated, motions = follow(drive, range(count))
-    whole = errors(drive, range(count), estimated, motions)
-    if whole is None:
-        raise DatasetError("the car of this drive does not move")
+    ways, motions = [], []
+    for first in begin_at:
+        if first > count - LEAST_IMAGES:
+            raise DatasetError(f"begun at image {first} of {count}: {LEAST_IMAGES} are needed")
+        estimated, seen = follow(drive, range(first, count))
+        way = errors(drive, range(first, count), estimated, seen)
+        if way is None:
+            raise DatasetError("the car of this drive does not move")
+        ways.append(way)
+        motions += seen
     firsts = range(0, count - LEAST_IMAGES + 1, every) if every else range(0)
     starts = [cold_start(drive, range(first, min(first + images, count))) for first in firsts]
-    scales = [start["scale_error"][-1] for start in starts if start is not None]
-    driven_s = (drive.t_ns[-1] - drive.t_ns[0]) * 1e-9
+    driven_s = (drive.t_ns[-1] - drive.t_ns[begin_at[0]]) * 1e-9
     return {
-        "speed_mps": round(whole["true_way_m"][-1] / driven_s, 1),
-        "way_m": whole["true_way_m"][-1],
-        "scale_error": whole["scale_error"][-1],
-        "rotation_error_deg": whole["rotation_error_deg"][-1],
+        "speed_mps": round(ways[0]["true_way_m"][-1] / driven_s, 1),
+        "way_m": ways[0]["true_way_m"][-1],
+        "scale_errors": [way["scale_error"][-1] for way in ways],
+        "rotation_error_deg": max(way["rotation_error_deg"][-1] for way in ways),
         "motions": len(motions),
-        "valid": whole["valid"],
-        "wrong_valid": whole["wrong_valid"],
-        "standstill": whole["standstill"],
+        "valid": sum(way["valid"] for way in ways),
+        "wrong_valid": [frame for way in ways for frame in way["wrong_valid"]],
+        "standstill": sum(way["standstill"] for way in ways),
         "nees": _nees(drive, motions),
-        "cold_starts": scales,
-        "starts": [whole],
+        "cold_starts": [start["scale_error"][-1] for start in starts if start is not None],
+        "starts": ways,
     }
 
 
@@ -208,7 +223,7 @@ def told(row: dict[str, Any]) -> str:
 
 
 def _cells(row: dict[str, Any]) -> Iterator[str]:
-    yield f"{row['scale_error']:+.1%}"
+    yield " ".join(f"{error:+.1%}" for error in row["scale_errors"])
     yield f"{row['rotation_error_deg']:.2f} deg"
     yield f"{row['valid'] / max(row['motions'], 1):.0%}"
     yield str(len(row["wrong_valid"]))
@@ -221,8 +236,8 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
     """The table of all roads."""
     lines = [
         "# Hard roads of the built-in world\n",
-        "Way and rotation: the drive's errors at its end. Wrong: valid frames with a speed off by more than "
-        f"{SPEED_LIMIT:.0%}. Standstill: frames called so while the car drove. NEES: of the motion between images: "
+        "Ways and rotation: the errors at the end, from each image that it was begun at, and the worst. Wrong: valid "
+        f"frames with a speed off by more than {SPEED_LIMIT:.0%}. Standstill: frames called so while the car drove. NEES: of the motion between images: "
         f"1 is consistent. Worst start: the way of the worst cold start; {SCALE_LIMIT:.0%} is the limit.\n",
         f"| {' | '.join(COLUMNS)} |",
         "|---" * len(COLUMNS) + "|",

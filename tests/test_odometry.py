@@ -228,20 +228,32 @@ def test_dark_and_frozen_and_missing_frames_cost_those_frames_only() -> None:
     assert np.linalg.norm(chained[24].p) == pytest.approx(path_m(truth), rel=0.04)
 
 
+def nothing_to_see(k: int, image: np.ndarray) -> np.ndarray:
+    """Images 8 to 21 show no corner."""
+    flat = np.tile(np.linspace(60, 120, image.shape[1], dtype=np.uint8), (image.shape[0], 1))
+    return flat if 8 <= k < 22 else image
+
+
 def test_nothing_to_see_coasts_and_begins_anew() -> None:
     truth = street([(0.7, 0.0)] * 30)
-
-    def edit(k: int, image: np.ndarray) -> np.ndarray:
-        return (
-            np.tile(np.linspace(60, 120, image.shape[1], dtype=np.uint8), (image.shape[0], 1)) if 8 <= k < 22 else image
-        )
-
-    chained, motions = drive(truth, edit=edit)
+    chained, motions = drive(truth, edit=nothing_to_see)
     blind = [m for m in motions if 8 <= m.to_frame < 22]
     assert all(Status.ODOMETRY_COASTING in m.status for m in blind)
     assert Status.LOW_TEXTURE in blind[0].status
     assert Status.ODOMETRY_COASTING not in motions[-1].status
     assert np.linalg.norm(chained[30].p) == pytest.approx(path_m(truth), rel=0.1)
+
+
+def test_a_bump_where_the_window_begins_anew_is_not_a_camera_that_is_mounted_otherwise() -> None:
+    """The first direction of a drive may say that the camera file's pitch is wrong; of a later window it may not."""
+    truth = [
+        Pose(pose.R, pose.p - [0.0, 0.04 if k >= 23 else 0.0, 0.0]) for k, pose in enumerate(street([(0.7, 0.0)] * 28))
+    ]
+    _, motions = drive(truth, edit=nothing_to_see)
+    learned_rad = next(m for m in motions if m.to_frame == 7).ground.pitch_rad
+    anew = [m for m in motions if m.to_frame >= 23]
+    assert Status.ODOMETRY_COASTING in next(m for m in motions if m.to_frame == 22).status  # begun anew there
+    assert max(abs(m.ground.pitch_rad - learned_rad) for m in anew) < math.radians(1.0)
 
 
 def test_vehicles_everywhere_leave_nothing_to_measure() -> None:

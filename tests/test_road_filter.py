@@ -76,3 +76,19 @@ def test_the_mount_is_not_what_the_filter_told_itself() -> None:
         filter_.accept(blind)
     assert np.abs(filter_.x[4:]).max() < 1e-3
     assert filter_.cov[4, 4] >= config.sigma_mount_rad**2
+
+
+def test_corners_that_err_alike_for_metres_do_not_make_a_tilt_sure() -> None:
+    """The same landmarks show a direction that is 20 mrad off, and know it to 20 mm: no more than that is learned."""
+    filters = {sigma_m: RoadFilter(CAMERA, RoadScaleConfig()) for sigma_m in (0.0, 0.02)}
+    wrong = np.array([0.0, -0.02, 1.0])
+    before = RoadFilter(CAMERA, RoadScaleConfig()).tilt
+    for sigma_across_m, filter_ in filters.items():
+        for _ in range(3):
+            filter_.predict(np.eye(3), 1.0)
+            filter_.travel(wrong, 1.0, sigma_across_m)
+    off_rad = {sigma_m: abs(float(filter_.tilt[0] - before[0])) for sigma_m, filter_ in filters.items()}
+    assert off_rad[0.0] > 0.01  # corners that are sure are followed
+    assert off_rad[0.02] < 0.7 * off_rad[0.0]
+    filter_ = filters[0.02]
+    assert off_rad[0.02] < float(np.sqrt(filter_.cov[1, 1]))

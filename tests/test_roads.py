@@ -5,9 +5,9 @@ The clips in tests/roads are rendered by
     python -m perf roads motorway_20 motorway_40 ramp_20 ramp_21_glare night_street night_motorway \
         --frames 26 --quality 70 --keep tests/roads
 
-From the first image, without networks: no valid frame has a speed off by more than a tenth, no way is off by more than
-5 %, nothing says standstill while the car drives, four frames in five are valid. What does not hold yet is expected to
-fail, with its figures (NOT_YET).
+From the first, the third and the fifth image, without networks: no valid frame has a speed off by more than a tenth,
+the way is off by 5 % at the most (in the median of the three), nothing says standstill while the car drives, four
+frames in five are valid. What does not hold yet is expected to fail, with its figures (NOT_YET).
 """
 
 from __future__ import annotations
@@ -35,10 +35,12 @@ from birdslam.types import Status
 CLIPS = Path(__file__).parent / "roads"
 NAMES = ("motorway_20", "motorway_40", "ramp_20", "ramp_21_glare", "night_street", "night_motorway")
 NOT_YET = {  # what fails, by how much; strict, so that whoever mends it must strike it out
-    "street+reflection": "one valid frame off by 13 %",
-    "street+bonnet": "way -5.3 %, two valid frames off by 11 %: the near road is hidden",
-    "street+compression": "one valid frame off by 10 %, way -4.7 %",
+    "street+dirt": "two valid frames off by 11 %, of one start",
+    "street+reflection": "one valid frame off by 13 %, of one start",
+    "street+bonnet": "two valid frames off by 10 to 11 %, of one start: the near road is hidden",
+    "motorway+compression": "3 of 4 frames valid: from the third image on a scale is found late",
 }
+BEGIN_AT = (0, 2, 4)  # one start alone is luck: a rounding decides between 4 and 6 %
 FRAMES = 26
 QUALITY = 70  # of the clips' WebP images
 TOWN_STRIDE, TOWN_FRAMES = 3, 44  # of the shipped drive: 44 m of a street; what comes, comes after half of them
@@ -58,25 +60,25 @@ def holds(row: dict[str, Any]) -> None:
     """The four things that are asked of every road."""
     assert row["way_m"] > 20.0
     assert row["standstill"] == 0
-    assert abs(row["scale_error"]) <= SCALE_LIMIT
+    assert np.median(np.abs(row["scale_errors"])) <= SCALE_LIMIT
     assert row["wrong_valid"] == []
     assert row["valid"] >= LEAST_VALID * row["motions"]
 
 
 @pytest.mark.parametrize("name", cases(NAMES))
 def test_a_cold_start(name: str) -> None:
-    holds(measure(read(DemoRecording(directory=CLIPS / name))))
+    holds(measure(read(DemoRecording(directory=CLIPS / name)), BEGIN_AT))
 
 
 @pytest.mark.parametrize("effect", cases(EFFECTS, "street"))
 def test_a_street_behind_a_windscreen(effect: str) -> None:
     town = DemoRecording(stride=TOWN_STRIDE, directory=DIRECTORY)
-    holds(measure(read(town, EFFECTS[effect](), TOWN_FRAMES)))
+    holds(measure(read(town, EFFECTS[effect](), TOWN_FRAMES), BEGIN_AT))
 
 
 @pytest.mark.parametrize("effect", cases(EFFECTS, "motorway"))
 def test_a_motorway_behind_a_windscreen(effect: str) -> None:
-    holds(measure(read(DemoRecording(directory=CLIPS / "motorway_20"), EFFECTS[effect]())))
+    holds(measure(read(DemoRecording(directory=CLIPS / "motorway_20"), EFFECTS[effect]()), BEGIN_AT))
 
 
 def told_obstructed(drive: Drive) -> list[bool]:

@@ -203,6 +203,8 @@ class Odometry:
                 self._scale.turned_unseen()
             return motion
         pose, info = located
+        if is_night(tracks.image):
+            info = info / cfg.motion.night_inflation
         near_px = near_displacement_px(self.camera, self._scale.ground, self._tracker.base, tracks, boxes_px)
         if self._stands(self._pose.between(pose), corners, near_px, dt_s, car):
             # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.

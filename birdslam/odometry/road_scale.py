@@ -55,6 +55,7 @@ class RoadScale:
         self._bonnet = Bonnet(config.bonnet)
         self._kept = KeptImages(config.kept_images)
         self._confirmed = 0
+        self._begun = False  # whether a scale was ever known: then the drive has shown how the camera is mounted
         self._refused = 0.0  # comparisons in a row, each counted by what of it is new: those of one view err together
         self._tries = 0  # and by number
         self._since_m = 0.0  # travelled since the last comparison
@@ -152,7 +153,7 @@ class RoadScale:
         past = self._past(pose)
         if past is not None:
             T = past.pose.between(pose)
-            if not self._confirmed and self.unknown:
+            if not self._begun and not self._confirmed and self.unknown:
                 self._filter.begin_travelling(T.R.T @ T.p)
             bend_per_m = _bend_per_m(step.R, travelled_m)
             px = self._aligner.samples(self._tilt, view.boxes_px, view.road_mask, bend_per_m, self._standing.present)
@@ -299,6 +300,7 @@ class RoadScale:
         if abs(np.log(factor)) > self.config.doubt_sigma_rel:
             self._car.contradict(float(np.log(factor)))
         self._confirmed = 1 if abs(np.log(factor)) > 0.3 else self._confirmed + 1
+        self._begun = self._begun or self._known()
         if not self._known() and not self._car.measures:
             filter_.cov[0, 0] = max(filter_.cov[0, 0], (1.1 * cfg.doubt_sigma_rel) ** 2)
         return factor
