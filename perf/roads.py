@@ -238,7 +238,8 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
         "# Hard roads of the built-in world\n",
         "Ways and rotation: the errors at the end, from each image that it was begun at, and the worst. Wrong: valid "
         f"frames with a speed off by more than {SPEED_LIMIT:.0%}. Standstill: frames called so while the car drove. "
-        f"NEES: of the motion between images: 1 is consistent. Worst start: the way of the worst cold start; {SCALE_LIMIT:.0%} is the limit.\n",
+        "NEES: of the motion between images: 1 is consistent. Worst start: the way of the worst cold start; "
+        f"{SCALE_LIMIT:.0%} is the limit.\n",
         f"| {' | '.join(COLUMNS)} |",
         "|---" * len(COLUMNS) + "|",
     ]
