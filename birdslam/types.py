@@ -59,6 +59,11 @@ def _check_cov(record: msgspec.Struct, *fields: str) -> None:
             raise ValueError(f"{type(record).__name__}.{name} has a negative variance")
 
 
+def _is_sound(total: float, *variances: float) -> bool:
+    """Whether numbers of this sum are finite and the variances not negative: no need then to look at each."""
+    return math.isfinite(total) and min(variances) >= 0.0
+
+
 def check_points(record: msgspec.Struct, *points_m: tuple[float, float]) -> None:
     for x_m, y_m in points_m:
         if not math.isfinite(x_m + y_m):
@@ -176,9 +181,12 @@ class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     delay_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # > 0: seen so long before this frame, and moved on to it
 
     def __post_init__(self) -> None:
-        check_finite(self, "score", "box_px", "length_m", "width_m")
-        check_finite(self, "log_height", "sigma_log_height", "depth_per_height", "standing")
-        _check_cov(self, "cov")
+        cov, sizes = self.cov, self.length_m + self.width_m + self.log_height + self.sigma_log_height
+        total = self.score + sum(self.box_px) + sizes + self.depth_per_height + self.standing + sum(cov)
+        if not _is_sound(total, cov[0], cov[4], cov[8]):
+            check_finite(self, "score", "box_px", "length_m", "width_m")
+            check_finite(self, "log_height", "sigma_log_height", "depth_per_height", "standing")
+            _check_cov(self, "cov")
 
 
 class MotionEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
@@ -191,7 +199,9 @@ class MotionEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     cov: Cov3
 
     def __post_init__(self) -> None:
-        _check_cov(self, "cov")
+        cov = self.cov
+        if not _is_sound(sum(cov), cov[0], cov[4], cov[8]):
+            _check_cov(self, "cov")
 
 
 class LandmarkKind(enum.IntEnum):
@@ -218,8 +228,10 @@ class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True, g
     kind: LandmarkKind = LandmarkKind.ROAD_POINT  # a feature on the road (0) or a station of a lane (1)
 
     def __post_init__(self) -> None:
-        check_finite(self, "x_m", "y_m")
-        _check_cov(self, "cov")
+        cov = self.cov
+        if not _is_sound(self.x_m + self.y_m + sum(cov), cov[0], cov[3]):
+            check_finite(self, "x_m", "y_m")
+            _check_cov(self, "cov")
         if self.landmark >= _STATION_IDS and self.kind is LandmarkKind.ROAD_POINT:  # an older record
             msgspec.structs.force_setattr(self, "kind", LandmarkKind.LANE_STATION)
             msgspec.structs.force_setattr(self, "landmark", self.landmark - _STATION_IDS)
@@ -233,7 +245,8 @@ class LanePoint(msgspec.Struct, frozen=True, array_like=True, gc=False):
     lane: int = -1  # points of one line share it, from frame to frame; -1: of no lane that is known
 
     def __post_init__(self) -> None:
-        check_finite(self, "x_m", "y_m")
+        if not math.isfinite(self.x_m + self.y_m):
+            check_finite(self, "x_m", "y_m")
 
 
 class Attitude(msgspec.Struct, frozen=True, kw_only=True):
@@ -312,7 +325,7 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     def __post_init__(self) -> None:
         cov, u = self.cov, self.velocity_cov
         total = sum(cov) + sum(u) + sum(self.velocity_mps) + self.length_m + self.width_m + self.standing
-        if not (math.isfinite(total) and min(cov[0], cov[4], cov[8], u[0], u[3]) >= 0.0):  # else no need to look closer
+        if not _is_sound(total, cov[0], cov[4], cov[8], u[0], u[3]):
             check_finite(self, "velocity_mps", "length_m", "width_m", "standing")
             _check_cov(self, "cov", "velocity_cov")
 

@@ -1,6 +1,7 @@
 """The records check themselves, and an older reader lives with a newer sender."""
 
 import math
+from collections.abc import Iterator
 
 import msgspec
 import pytest
@@ -12,7 +13,9 @@ from birdslam.types import (
     Estimate,
     LandmarkEdge,
     LandmarkKind,
+    LanePoint,
     MapUpdate,
+    MotionEdge,
     Status,
     VehicleEdge,
 )
@@ -38,6 +41,38 @@ def test_numbers_that_are_none_are_refused(bad: float) -> None:
         MapUpdate(epoch=0, frame_id=0, lanes_m=((0.0, bad),))
     with pytest.raises(ValueError, match="finite"):
         VehicleEdge(vehicle=0, frame=0, T_ego_vehicle=SE2(), cov=EYE3, box_px=(0.0, bad, 1.0, 1.0))
+
+
+SOUND = (
+    LandmarkEdge(landmark=0, frame=0, x_m=1.0, y_m=2.0, cov=(1.0, 0.5, 0.5, 1.0)),
+    LanePoint(1.0, 2.0),
+    MotionEdge(vehicle=0, from_frame=0, to_frame=1, T_from_to=SE2(), cov=EYE3),
+    VehicleEdge(vehicle=0, frame=0, T_ego_vehicle=SE2(), cov=EYE3, box_px=(0.0, 0.0, 1.0, 1.0), sigma_log_height=0.1),
+)
+
+
+def numbers_of(record: msgspec.Struct) -> Iterator[tuple[str, int | None]]:
+    """Every number of a record, as its field and, in a tuple, its place there; a pose checks its own."""
+    for field in record.__struct_fields__:
+        value = getattr(record, field)
+        if isinstance(value, float):
+            yield field, None
+        elif isinstance(value, tuple):
+            yield from ((field, k) for k in range(len(value)))
+
+
+@pytest.mark.parametrize("record", SOUND, ids=lambda record: type(record).__name__)
+def test_each_number_of_a_record_is_checked(record: msgspec.Struct) -> None:
+    for field, k in numbers_of(record):
+        value = getattr(record, field)
+        side = round(math.sqrt(len(value))) if field == "cov" else 0
+        bad = [(math.nan, "finite"), (math.inf, "finite"), (-math.inf, "finite")]
+        if side and k is not None and k % (side + 1) == 0:
+            bad.append((-1.0, "negative variance"))
+        for number, why in bad:
+            changed = number if k is None else (*value[:k], number, *value[k + 1 :])
+            with pytest.raises(ValueError, match=why):
+                msgspec.structs.replace(record, **{field: changed})
 
 
 @pytest.mark.parametrize("lane_ids", [(1,), (1, 2, 3)])
