@@ -45,14 +45,11 @@ def landmark_edges(
     covs = bev.road_point_cov(
         camera, ground, px[near], config.sigma_landmark_px, sigma_pitch_rad, config.sigma_height_rel
     )
+    flat = covs.reshape(-1, 4)
+    known = np.isfinite(flat).all(axis=1)
+    near, flat = near[known], flat[known]
+    numbers = zip(ids[near].tolist(), points[near].tolist(), flat.tolist(), strict=True)
     return tuple(
-        LandmarkEdge(
-            landmark=int(ids[i]),
-            frame=frame_id,
-            x_m=float(points[i, 0]),
-            y_m=float(points[i, 1]),
-            cov=tuple(cov.ravel().tolist()),
-        )
-        for i, cov in zip(near, covs, strict=True)
-        if np.isfinite(cov).all()
+        LandmarkEdge(landmark=landmark, frame=frame_id, x_m=x_m, y_m=y_m, cov=tuple(cov))
+        for landmark, (x_m, y_m), cov in numbers
     )
