@@ -139,11 +139,9 @@ class Landmarks:
         A landmark whose squared Mahalanobis distance is past `gate` weighs less by the square of the excess.
         `common_variance` in m^2 is of what all landmarks of a frame share, which their sum does not average away.
         """
-        rows = self._rows(seen)
-        now = [i for i, row in enumerate(rows) if row >= 0]
-        if not now:
+        now, then = self._known(seen)
+        if not len(now):
             return None
-        then = [rows[i] for i in now]
         points, means, deviators = seen.points[now], seen.means[now], seen.deviators[now]
         if self._fixed:  # known, where the world has it
             place, node_cov = EGO_PLACE, window.ego_cov[:2, :2]
@@ -173,16 +171,15 @@ class Landmarks:
         How much further on, in ego, the vehicles `rows` (k,) of the window stand (k,), and the number of edges of each:
         0 where no landmark is known. All landmarks weigh alike. They must be anchored at their first sight.
         """
-        known = self._rows(seen)
-        now = [i for i, row in enumerate(known) if row >= 0]
-        if not now:
+        now, then = self._known(seen)
+        if not len(now):
             return np.zeros(len(rows), np.complex128), 0
-        there, off = self._in_ego([known[i] for i in now], window)
+        there, off = self._in_ego(then, window)
         ego = complex(landmark_residual(there, 0.0, off, seen.points[now]).mean())  # Eq. 7
         at = np.array([window.at[window.nodes + row] for row in rows])
         return ego + off * np.array(places) - at, len(now)  # Eq. 3, of the vehicle
 
-    def _in_ego(self, rows: Sequence[int], window: Window) -> tuple[Complexes, complex]:
+    def _in_ego(self, rows: Rows, window: Window) -> tuple[Complexes, complex]:
         """Known landmarks in ego, and the heading there of what a frame sees: that of the CC edges alone."""
         T = window.world
         there = (self._tied.points[rows] - complex(T.x_m, T.y_m)) * cmath.exp(-1j * T.yaw_rad)
@@ -195,26 +192,22 @@ class Landmarks:
         mean over them, weighted by information. A lane's stations do not: their lane is on the map.
         """
         seen = seen[: self._capacity]
-        rows = self._rows(seen)
-        seen_now, frames_before = {*rows}, self._frames.tolist()
-        gone = [
-            row
-            for (kind, _), row in self._row.items()
-            if kind is LandmarkKind.ROAD_POINT and frames_before[row] >= least_frames and row not in seen_now
-        ]
+        old, before = self._known(seen)
+        out_of_sight = np.ones(len(self._frames), np.bool_)
+        out_of_sight[before] = False
+        settles = np.flatnonzero(out_of_sight & (self._frames >= least_frames)).tolist()
+        gone = [row for row in settles if self._tied.keys[row][0] is LandmarkKind.ROAD_POINT]
         settled = [(p.real, p.imag) for p in (self._moment[gone] / self._information[gone]).tolist()] if gone else []
 
         T = window.world
         information = 1.0 / seen.means
         at = complex(T.x_m, T.y_m)
         moment = information * (at + seen.points * cmath.exp(1j * T.yaw_rad))
-        old = [i for i, row in enumerate(rows) if row >= 0]
-        before = [rows[i] for i in old]
         if self._fixed:
             fixed = at + seen.points * cmath.exp(1j * self._yaw_rad)
             fixed[old] = self._tied.points[before]
             seen = Sightings(seen.keys, fixed, seen.means, seen.deviators)
-        frames = np.ones(len(rows), dtype=np.int64)
+        frames = np.ones(len(seen.keys), dtype=np.int64)
         for sums, kept in ((information, self._information), (moment, self._moment), (frames, self._frames)):
             sums[old] += kept[before]
         self._information, self._moment, self._frames = information, moment, frames
@@ -222,7 +215,9 @@ class Landmarks:
         self._tied = seen
         return settled
 
-    def _rows(self, seen: Sightings) -> list[int]:
-        """Where each landmark is kept; -1: nowhere yet."""
+    def _known(self, seen: Sightings) -> tuple[Rows, Rows]:
+        """Which of a frame's landmarks are known, and the row where each of these is kept."""
         row = self._row
-        return [row.get(key, -1) for key in seen.keys]
+        rows = np.array([row.get(key, -1) for key in seen.keys], dtype=np.int64)
+        now = np.flatnonzero(rows >= 0)
+        return now, rows[now]
