@@ -164,8 +164,11 @@ class RoadAligner:
         horizon = camera.cy_px + camera.fy_px * (camera.height_m / config.far_m - 0.05)
         self.top_px = int(np.clip(horizon, 0, camera.height_px - 32))
         # Every second row and third column: below it lie rows of one another's blur.
-        v = np.arange(self.top_px + _MARGIN_PX, camera.height_px - _MARGIN_PX, 2)[:, None]
-        u = np.arange(_MARGIN_PX, camera.width_px - _MARGIN_PX, 3)[None, :]
+        self._pixels = (
+            slice(self.top_px + _MARGIN_PX, camera.height_px - _MARGIN_PX, 2),
+            slice(_MARGIN_PX, camera.width_px - _MARGIN_PX, 3),
+        )
+        v, u = np.ogrid[self._pixels]
         self._grid = (u, v, (u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px)
 
     def image(self, grey: NDArray[np.uint8]) -> RoadImage:
@@ -193,12 +196,13 @@ class RoadAligner:
         middle_m = 0.0 if road_mask is not None else 0.5 * bend_per_m / np.where(inside, rho, 1.0)
         keep = (np.abs(x - middle_m) < half_width_m * rho) & inside
         if road_mask is not None:
-            keep &= road_mask[v, u]
-        for x1, y1, x2, y2 in boxes_px:
-            grow_x, grow_y = 4.0 + 0.04 * (x2 - x1), 4.0 + 0.12 * (y2 - y1)  # a box ends above the shadow of its car
-            rows = slice(*np.searchsorted(v[:, 0], [y1 - grow_y, y2 + grow_y]))
-            cols = slice(*np.searchsorted(u[0], [x1 - grow_x, x2 + grow_x]))
-            keep[rows, cols] = False
+            keep &= road_mask[self._pixels]
+        x1, y1, x2, y2 = boxes_px.T
+        grow_x, grow_y = 4.0 + 0.04 * (x2 - x1), 4.0 + 0.12 * (y2 - y1)  # a box ends above the shadow of its car
+        rows = np.searchsorted(v[:, 0], [y1 - grow_y, y2 + grow_y]).T.tolist()
+        cols = np.searchsorted(u[0], [x1 - grow_x, x2 + grow_x]).T.tolist()
+        for (top, bottom), (left, right) in zip(rows, cols, strict=True):
+            keep[top:bottom, left:right] = False
         at = np.flatnonzero(keep.ravel())
         if len(at) > cfg.max_samples:
             at = at[(np.arange(cfg.max_samples) * (len(at) / cfg.max_samples)).astype(np.int64)]

@@ -38,7 +38,7 @@ def predicted_boxes_px(
     ahead = near[:, 0] >= NEAREST_M
     slopes = np.concatenate([bearing[ahead], near[ahead, 1] / near[ahead, 0]])
     horizon = bev.ego_to_pixel(camera, ground, FAR_M * np.column_stack([np.ones(len(slopes)), slopes]))
-    horizon_then, horizon_now = np.split(horizon, 2)
+    horizon_then, horizon_now = horizon.reshape(2, -1, 2)
     last = np.array([track.observation.box_px for track in tracks])[ahead]
     scale = depth[ahead] / near[ahead, 0]
     half_px = (last[:, 2] - last[:, 0]) / 2.0 * scale

@@ -140,7 +140,7 @@ class Place(msgspec.Struct, frozen=True):
 def iou(a_px: NDArray[np.float64], b_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Intersection over union, (A, B), of boxes (A, 4) and (B, 4) given as x1, y1, x2, y2."""
     a, b = np.reshape(a_px, (-1, 1, 4)), np.reshape(b_px, (1, -1, 4))
-    span = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0.0, None)
+    span = np.maximum(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0.0)
     shared = span[..., 0] * span[..., 1]
     area_a = (a[..., 2] - a[..., 0]) * (a[..., 3] - a[..., 1])
     area_b = (b[..., 2] - b[..., 0]) * (b[..., 3] - b[..., 1])
@@ -261,19 +261,19 @@ def hidden_edges(boxes_px: NDArray[np.float64]) -> NDArray[np.bool_]:
     x1, y1, x2, y2 = (boxes_px[:, k, None] for k in range(4))
     n1, m1, n2, m2 = (boxes_px[None, :, k] for k in range(4))
     nearer = m2 > y2
-    rows = np.clip(np.minimum(y2, m2) - np.maximum(y1, m1), 0.0, None) > HIDING_FRACTION * (y2 - y1)
-    columns = np.clip(np.minimum(x2, n2) - np.maximum(x1, n1), 0.0, None) > HIDING_FRACTION * (x2 - x1)
+    rows = np.maximum(np.minimum(y2, m2) - np.maximum(y1, m1), 0.0) > HIDING_FRACTION * (y2 - y1)
+    columns = np.maximum(np.minimum(x2, n2) - np.maximum(x1, n1), 0.0) > HIDING_FRACTION * (x2 - x1)
     left = nearer & rows & (n1 < x1) & (n2 > x1)
     right = nearer & rows & (n1 < x2) & (n2 > x2)
     bottom = nearer & columns & (m1 < y2)
-    out: NDArray[np.bool_] = np.column_stack([edge.any(axis=1) for edge in (left, right, bottom)])
-    return out
+    edges: NDArray[np.bool_] = np.stack([left, right, bottom], axis=1)  # (N, 3, N)
+    return np.asarray(edges.any(axis=2))
 
 
 def _slopes(camera: Camera, ground: GroundPlane, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 4): bearings of the left and right edge at the bottom, slopes of bottom and top (the rays of Eq. 1)."""
     px = np.concatenate([boxes_px[:, [0, 3]], boxes_px[:, [2, 3]], boxes_px[:, [0, 1]]])
-    left, right, top = np.split(bev.bearing_and_slope(camera, ground, px), 3)
+    left, right, top = bev.bearing_and_slope(camera, ground, px).reshape(3, -1, 2)
     return np.column_stack([left[:, 0], right[:, 0], left[:, 1], top[:, 1]])
 
 

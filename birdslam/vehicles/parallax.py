@@ -219,7 +219,8 @@ class Parallax:
         of_velocity = np.stack([along_across] * len(MOVING), axis=1)
         of_velocity[~self._on_road] = of_velocity[:, MOVING.index(CROSSING)] = np.eye(2) * config.change_mps**2
         in_time = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
-        return np.kron(in_time, np.ones((2, 2))) * np.tile(of_velocity, (2, 2))
+        out: Floats = in_time[:, None, :, None] * of_velocity[:, :, None, :, None, :]  # the Kronecker product
+        return out.reshape(*of_velocity.shape[:2], 4, 4)
 
     def learn_sizes(
         self,
@@ -270,12 +271,13 @@ class Parallax:
         Errors that last get in each frame so little weight that they count right over their memory: `of_box` (N,) is by
         how much a box's variance grows for that, `face_var` (N,) the variance of the nearest face, grown already.
         """
-        noise = np.zeros((len(of_box), FILTERS, len(CUES), len(CUES)))
-        noise[..., range(GROUND), range(GROUND)] = (np.square(boxes.sigma) * of_box[:, None])[:, None]
-        noise[..., [BY_HEIGHT, BY_WIDTH], [BY_HEIGHT, BY_WIDTH]] += face_var[:, None, None]
+        variance = np.empty((len(of_box), FILTERS, len(CUES)))
+        variance[..., :GROUND] = (np.square(boxes.sigma) * of_box[:, None])[:, None]
+        variance[..., [BY_HEIGHT, BY_WIDTH]] += face_var[:, None, None]
         sigma_rel = boxes.sigma_bottom / np.maximum(boxes.bottom, LEAST_SLOPE)
-        noise[..., GROUND, GROUND] = (np.square(sigma_rel) * of_box)[:, None]
-        noise[:, BLIND, GROUND, GROUND] = UNKNOWN
+        variance[..., GROUND] = (np.square(sigma_rel) * of_box)[:, None]
+        variance[:, BLIND, GROUND] = UNKNOWN
+        noise = variance[..., None] * np.eye(len(CUES))
         misfit = _squared(innovation, S + noise).min(axis=1)
         noise *= np.maximum(1.0, misfit / self.config.gate_sigma**2)[:, None, None, None]
         return noise
