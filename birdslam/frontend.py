@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
 from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
 from birdslam.mapping.lane_edges import LaneEdgesConfig
 from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneOutput
@@ -108,7 +110,7 @@ class FrontEnd:
         self.height = HeightWatch(camera, config.height, config.localisation)
         self._lanes = LaneMapper(camera, config.static_map, config.lanes, config.lane_edges, lane_head)
         self._last_frame: int | None = None
-        self._last_pitch = (0, 0.0)  # when, and the camera's against the level
+        self._last = 0, 0.0, SE2()  # when, the camera's pitch against the level, and T_world_ego
 
     def measure(self, frame: Frame, pending: Pending) -> Measurements:
         """The edges that one frame gives: CC, CV, VV and CP (Sec. 3.1 and 3.2).
@@ -186,14 +188,17 @@ class FrontEnd:
     def _open_frame(self, frame: Frame, motion: Motion | None) -> OpenFrame:
         """The ego, and the road as this frame's image and the camera's own pitching since the last frame give it."""
         t_source_ns, pitch_rad = frame.t_source_ns, self._reckoning.attitude.pitch_rad
-        (last_ns, last_rad), self._last_pitch = self._last_pitch, (t_source_ns, pitch_rad)
+        T_world_ego = self._reckoning.T_world_ego
+        (last_ns, last_rad, T_world_last), self._last = self._last, (t_source_ns, pitch_rad, T_world_ego)
+        step = T_world_last.between(T_world_ego)
         step_cov = None if motion is None else np.asarray(motion.cov)
         return OpenFrame(
-            EgoFrame(frame.frame_id, t_source_ns, self._reckoning.T_world_ego, step_cov),
+            EgoFrame(frame.frame_id, t_source_ns, T_world_ego, step_cov),
             dt_s=max(0.0, (t_source_ns - last_ns) * 1e-9),
             turn_rad=None if motion is None else pitch_rad - last_rad,
             image_ground=None if motion is None else motion.ground,
             image_sigma_rad=0.0 if motion is None else motion.pitch_sigma_rad,
+            travelled_m=None if motion is None else math.hypot(step.x_m, step.y_m),
         )
 
     def _map_road(self, frame: Frame) -> tuple[LandmarkEdge, ...]:

@@ -15,9 +15,11 @@ that count downwards from the plane of the road, each box has three measurements
     top    = (H + d - h) / (z + r) - pitch + roll y/x     r: to the roof's far edge where the camera looks down on it
     log width = log w + log(class's outline) - log z
 
-The pitch follows the camera's own rotation between frames, and decays to the calibrated one: where a rotation lasts,
-the road turned too. Between frames a vehicle's size and kerb stay; its outline changes as it or the line of sight
-turns. The update is iterated once about its own result, with the noise of outliers raised (robust weights, Huber).
+The pitch follows the camera's own rotation between frames, and decays to the calibrated one as the ego drives: where a
+rotation lasts, the road turned too. Under a car that stands the road stays as it is, and so does what is known of it.
+Of what stands before it, a box says nothing new there: it errs as in the frame before. Between frames a vehicle's size
+and kerb stay; its outline changes as it or the line of sight turns. The update is iterated once about its own result,
+with the noise of outliers raised (robust weights, Huber).
 """
 
 from __future__ import annotations
@@ -47,17 +49,21 @@ DEPTH_UNKNOWN = 2.0  # 1-sigma of log z before a frame is seen
 UNUSED = 1e3  # 1-sigma of a cue that is not to be used
 _LEAST = 1e-12  # variance of a height that its class knows exactly
 _SHORTEST_S = 1e-3
+_LEAST_SHARE = 1e-6  # of a second, that counts as driving
 
 
 class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is known of roads and vehicles before any was measured."""
 
     sigma_pitch_rad: float = 0.010  # of the camera over real roads against its calibration
-    pitch_memory_s: float = 5.0  # how long the pitch's deviation from the calibration lasts
-    sigma_pitch_step_rad: float = 0.0008  # a frame: the road's own change of grade, and the odometry's error
+    pitch_memory_s: float = 5.0  # of driving: how long the pitch's deviation from the calibration lasts
+    sigma_pitch_step_rad: float = 0.0008  # a frame of driving: the road's change of grade, and the odometry's error
     sigma_pitch_blind_rad: float = 0.003  # a frame without odometry
     sigma_roll_rad: float = 0.01  # of the camera over real roads against its calibration
-    roll_memory_s: float = 20.0  # how long the roll's deviation lasts
+    roll_memory_s: float = 20.0  # of driving: how long the roll's deviation lasts
+    # Road and views change with time far above this speed, and with the way far below it: of a second, 1 - exp(-speed /
+    # this) is of driving. KITTI tracking chose between it and 3 m/s
+    driving_mps: float = 1.0
     sigma_kerb_m: float = 0.04  # how far the road under a vehicle in the ego's lane lies off the ego's plane
     sigma_crown_rad: float = 0.007  # and the more the farther it stands to the side
     width_drift_rel: float = 0.002  # of the outline, a frame
@@ -69,7 +75,7 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cues: tuple[Cue, ...] = ("bottom", "top", "width")  # what of a box is believed
     gate_sigma: float = 2.0  # past it a cue is an outlier: its weight falls with its misfit
     image_pitch_frames: float = 5.0  # for how long the error of a pitch from the images lasts
-    box_memory_s: float = 0.5  # a box errs in the next frame as in this: this time counts as one box
+    box_memory_s: float = 0.5  # a box errs in the next frame as in this: this time of driving counts as one box
 
 
 @dataclass(frozen=True)
@@ -97,6 +103,7 @@ class GroundSizeFilter:
         self.config = config
         self._vehicles: list[int] = []
         self._unseen_s = np.zeros(0)  # of each of them
+        self._driven_s = np.zeros(0)  # and how much of that counts as driving of the ego
         self._x = np.array([camera.pitch_rad, camera.roll_rad])
         self._P = np.diag([config.sigma_pitch_rad**2, config.sigma_roll_rad**2])
         self._image_ground = camera.ground
@@ -119,22 +126,30 @@ class GroundSizeFilter:
     def ground_alone(self) -> GroundSizeFilter:
         """A copy without vehicles, to be predicted on while this one stays."""
         ground = copy.copy(self)
-        ground._vehicles, ground._unseen_s = [], np.zeros(0)
+        ground._vehicles, ground._unseen_s, ground._driven_s = [], np.zeros(0), np.zeros(0)
         ground._x, ground._P = self._x[:COMMON].copy(), self._P[:COMMON, :COMMON].copy()
         return ground
 
     def predict(
-        self, dt_s: float, turn_rad: float | None, image_ground: GroundPlane | None, image_sigma_rad: float
+        self,
+        dt_s: float,
+        turn_rad: float | None,
+        image_ground: GroundPlane | None,
+        image_sigma_rad: float,
+        travelled_m: float | None = None,
     ) -> None:
         """To the next frame: `turn_rad` the camera's own pitching (nose down > 0), None where it is not known.
 
-        `image_ground` is the road as the images show it, None where they don't.
+        `image_ground` is the road as the images show it, None where they don't. `travelled_m` is how far the ego went,
+        None where it is not known: it is taken to drive.
         """
         config = self.config
+        share = 1.0 if travelled_m is None else self._driving(travelled_m / max(dt_s, _SHORTEST_S))
         self._unseen_s = self._unseen_s + dt_s
+        self._driven_s = self._driven_s + share * dt_s
         calibrated = np.array([self.camera.pitch_rad, self.camera.roll_rad])
         sigma = np.array([config.sigma_pitch_rad, config.sigma_roll_rad])
-        keep = np.exp(-dt_s / np.array([config.pitch_memory_s, config.roll_memory_s]))
+        keep = np.exp(-share * dt_s / np.array([config.pitch_memory_s, config.roll_memory_s]))
         step = config.sigma_pitch_blind_rad if turn_rad is None else config.sigma_pitch_step_rad
         self._x[0] += turn_rad or 0.0
         self._x[:COMMON] = calibrated + keep * (self._x[:COMMON] - calibrated)
@@ -142,11 +157,14 @@ class GroundSizeFilter:
         self._P *= np.outer(scale, scale)
         noise = np.zeros(len(self._x))
         noise[:COMMON] = (1.0 - keep**2) * sigma**2
-        noise[0] += step**2
+        noise[0] += share * step**2
         self._P[np.diag_indices_from(self._P)] += noise
         if image_ground is not None and image_ground != self._image_ground:
             self._image_ground = image_ground
-            self._correct_pitch(image_ground.pitch_rad, image_sigma_rad * math.sqrt(config.image_pitch_frames))
+            self._correct_pitch(
+                image_ground.pitch_rad,
+                image_sigma_rad * math.sqrt(config.image_pitch_frames / max(share, _LEAST_SHARE)),
+            )
 
     def rescale_outline(self, vehicle: int, log_outline: float) -> None:
         """The vehicle's yaw was corrected, so that its class's outline grows by exp(log_outline); its box does not."""
@@ -163,7 +181,8 @@ class GroundSizeFilter:
         for k, vehicle in enumerate(self._vehicles):
             if vehicle in wanted:
                 rows += range(COMMON + OWN * k, COMMON + OWN * (k + 1))
-        self._unseen_s = self._unseen_s[[vehicle in wanted for vehicle in self._vehicles]]
+        of_wanted = [vehicle in wanted for vehicle in self._vehicles]
+        self._unseen_s, self._driven_s = self._unseen_s[of_wanted], self._driven_s[of_wanted]
         self._vehicles = [vehicle for vehicle in self._vehicles if vehicle in wanted]
         self._x, self._P = self._x[rows], self._P[np.ix_(rows, rows)]
 
@@ -201,7 +220,7 @@ class GroundSizeFilter:
         R0 = np.concatenate([sigma_slope[:, 0] ** 2, sigma_slope[:, 1] ** 2, sigma_width**2])
         R0[np.repeat([cue not in self.config.cues for cue in CUES], n)] = UNUSED**2
         log_z, P_z, log_h, P_h, P_zh = self._iterate(
-            at, bearing, extents_m * self.config.roof_reach_rel, z, R0, self._frames_alike(at)
+            at, bearing, extents_m * self.config.roof_reach_rel, z, R0, self._frames_alike(at, learned)
         )
         if learned is None:
             return Depths(log_z, P_z, log_h, P_h, P_zh / P_h)
@@ -225,11 +244,22 @@ class GroundSizeFilter:
         out: Floats = config.width_drift_rel**2 + config.width_turn_rel**2 * (np.square(turned_rad) + own_var)
         return out
 
-    def _frames_alike(self, at: NDArray[np.intp]) -> Floats:
-        """(N,): how many frames in a row err alike, by how long ago each vehicle was last seen."""
+    def _driving(self, speed_mps: float) -> float:
+        """What of a second counts as one of driving."""
+        return -math.expm1(-speed_mps / self.config.driving_mps)
+
+    def _frames_alike(self, at: NDArray[np.intp], learned: LearnedSize | None) -> Floats:
+        """(N,): how many frames in a row err alike, by how much changed in view since each vehicle was last seen.
+
+        Errors of a box become others as the ego drives or as the vehicle does. Of what stands before an ego that stands
+        all images are the same one, and it was counted.
+        """
         rows = (at - COMMON) // OWN
-        alike: Floats = np.maximum(1.0, self.config.box_memory_s / np.maximum(self._unseen_s[rows], _SHORTEST_S))
-        self._unseen_s[rows] = 0.0
+        speed_mps = np.zeros(len(at)) if learned is None else learned.speed_mps
+        stood_s = (self._unseen_s - self._driven_s)[rows] * np.exp(-speed_mps / self.config.driving_mps)
+        changed_s = np.maximum(self._unseen_s[rows] - stood_s, _LEAST_SHARE)
+        alike: Floats = np.maximum(1.0, self.config.box_memory_s / changed_s)
+        self._unseen_s[rows] = self._driven_s[rows] = 0.0
         return alike
 
     def _iterate(
@@ -297,7 +327,9 @@ class GroundSizeFilter:
 
     def _begin(self, vehicle: int, seen: Observation) -> None:
         self._vehicles.append(vehicle)
-        self._unseen_s = np.append(self._unseen_s, self.config.box_memory_s)
+        self._unseen_s, self._driven_s = (
+            np.append(s, self.config.box_memory_s) for s in (self._unseen_s, self._driven_s)
+        )
         dimensions, config = seen.dimensions, self.config
         sigma_road_m = math.hypot(config.sigma_kerb_m, config.sigma_crown_rad * seen.bearing * seen.depth_by_height_m)
         self._x = np.append(self._x, [math.log(dimensions.height_m), 0.0, 0.0])

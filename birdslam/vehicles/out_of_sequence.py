@@ -38,6 +38,7 @@ class OpenFrame:
     turn_rad: float | None
     image_ground: GroundPlane | None
     image_sigma_rad: float
+    travelled_m: float | None = None
 
 
 class OutOfSequenceTracker:
@@ -110,4 +111,4 @@ class OutOfSequenceTracker:
 
 
 def _predict(ground_size: GroundSizeFilter, frame: OpenFrame) -> None:
-    ground_size.predict(frame.dt_s, frame.turn_rad, frame.image_ground, frame.image_sigma_rad)
+    ground_size.predict(frame.dt_s, frame.turn_rad, frame.image_ground, frame.image_sigma_rad, frame.travelled_m)

@@ -1,0 +1,151 @@
+"""The road under an ego that stands: held as it was, and known no better than the sizes of the cars before it say."""
+
+import math
+
+import numpy as np
+import pytest
+
+from birdslam.datasets.kitti_tracking import TrackingSequence
+from birdslam.evaluation.localisation import measure
+from birdslam.frontend import FrontEndConfig
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.perception import Detections
+from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, extent_m, observe_boxes
+from birdslam.vehicles.parallax import LearnedSize
+
+CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
+CAR = DIMENSIONS["car"]
+LOCALISATION = LocalisationConfig()
+CONFIG = GroundSizeConfig(roof_reach_rel=1.0)  # the world here is made of cuboids
+PERIOD_S = 0.1
+CARS_M = [(14.0, -4.0), (20.0, 0.0), (26.0, 4.0), (32.0, -4.0)]  # (x, y) of their centres
+
+
+def box_px(x_m: float, y_m: float, height_m: float, pitch_rad: float) -> np.ndarray:
+    half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
+    corners = np.array([(x_m + x, y_m + y, z) for x, y in half for z in (0.0, height_m)])
+    px = bev.ego_to_pixel(CAMERA, GroundPlane(CAMERA.height_m, pitch_rad), corners)
+    return np.array([*px.min(axis=0), *px.max(axis=0)])
+
+
+def see(
+    ground_size: GroundSizeFilter, boxes: list[np.ndarray], travelled_m: float, speed_mps: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """A frame with a box of each car, each of which moves at `speed_mps`: depths in metres, sigmas of their logs."""
+    ground_size.predict(PERIOD_S, 0.0, None, 0.0, travelled_m)
+    n, ground = len(boxes), ground_size.ground
+    seen = [observe_boxes(b[None], np.ones(1), ("car",), CAMERA, ground, LOCALISATION)[0] for b in boxes]
+    extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen]).reshape(-1, 2)
+    learned = LearnedSize(np.ones((n, 1)), np.zeros((n, 1)), np.full((n, 1), 1e6), np.full(n, speed_mps))
+    depths = ground_size.estimate_depths(list(range(n)), seen, extents[:, 1], extents[:, 0], np.zeros(n), learned)
+    return np.exp(depths.log_depth), np.sqrt(depths.variance)
+
+
+def test_a_halted_car_keeps_the_road_that_it_halted_on() -> None:
+    """With cars in sight, and for a minute without any."""
+    pitch_rad, ground_size = 0.02, GroundSizeFilter(CAMERA, CONFIG)
+    for k in range(40):
+        see(ground_size, [box_px(x + 8.0 - 0.2 * k, y, 1.53, pitch_rad) for x, y in CARS_M], 0.2)
+    halted_rad, sigma_rad = ground_size.ground.pitch_rad, ground_size.sigma_pitch_rad
+    assert abs(halted_rad - pitch_rad) < sigma_rad < 0.004
+    boxes = [box_px(x, y, 1.53, pitch_rad) for x, y in CARS_M]
+    for _ in range(100):
+        see(ground_size, boxes, 0.0)
+    assert abs(ground_size.ground.pitch_rad - pitch_rad) < sigma_rad
+    ground_size.keep_only([])
+    held = ground_size.ground, ground_size.sigma_pitch_rad
+    for _ in range(600):
+        ground_size.predict(PERIOD_S, 0.0, None, 0.0, 0.0)
+    assert ground_size.ground.pitch_rad == pytest.approx(held[0].pitch_rad, abs=1e-9)
+    assert ground_size.ground.roll_rad == pytest.approx(held[0].roll_rad, abs=1e-9)
+    assert ground_size.sigma_pitch_rad == pytest.approx(held[1], rel=1e-6)
+
+
+def test_what_is_known_of_the_road_is_forgotten_over_the_way_and_without_a_step_at_rest() -> None:
+    left = []
+    for speed_mps in (0.0, 0.1, 1.0, 3.0, 10.0, 30.0):
+        ground_size = GroundSizeFilter(CAMERA, CONFIG)
+        ground_size.predict(PERIOD_S, 0.02, None, 0.0, 0.0)
+        for _ in range(50):
+            ground_size.predict(PERIOD_S, 0.0, None, 0.0, speed_mps * PERIOD_S)
+        left.append(ground_size.ground.pitch_rad / 0.02)
+    assert left == sorted(left, reverse=True)
+    assert left[0] == pytest.approx(1.0)
+    assert left[1] > 0.9
+    assert left[-1] == pytest.approx(math.exp(-1.0), rel=0.01)  # its memory is 5 s of driving
+
+
+def test_the_same_image_again_tells_no_more_of_road_and_sizes_than_once() -> None:
+    ground_size = GroundSizeFilter(CAMERA, CONFIG)
+    boxes = [box_px(x, y, 1.53, 0.01) for x, y in CARS_M]
+    see(ground_size, boxes, 0.0)
+    once_rad, heights = ground_size.sigma_pitch_rad, [ground_size.size(i)[0] for i in range(len(boxes))]
+    for _ in range(600):
+        see(ground_size, boxes, 0.0)
+    assert ground_size.sigma_pitch_rad == pytest.approx(once_rad, rel=0.02)
+    assert [ground_size.size(i)[0] for i in range(len(boxes))] == pytest.approx(heights, rel=0.01)
+    passing = GroundSizeFilter(CAMERA, CONFIG)
+    for _ in range(600):
+        see(passing, boxes, 0.0, speed_mps=10.0)
+    assert passing.sigma_pitch_rad < 0.85 * once_rad  # who drives by shows a new view of itself in each frame
+
+
+def test_road_and_sizes_before_an_ego_that_stands_are_known_as_well_as_so_many_sizes_tell() -> None:
+    config = GroundSizeConfig(roof_reach_rel=0.0, sigma_kerb_m=1e-6, sigma_crown_rad=0.0)
+    sigma_size = (CAR.sigma_height_rel**-2 + CAR.sigma_width_rel**-2) ** -0.5
+    for cars_m in (CARS_M[:1], CARS_M[2:], CARS_M):
+        ground_size = GroundSizeFilter(CAMERA, config)
+        boxes = [box_px(x, y, 1.53, 0.0) for x, y in cars_m]
+        for _ in range(300):
+            see(ground_size, boxes, 0.0)
+        by_sizes = [CAMERA.height_m / (x_m - CAR.length_m / 2.0) * sigma_size for x_m, _ in cars_m]  # Eq. 1
+        exact_boxes = (config.sigma_pitch_rad**-2 + sum(s**-2 for s in by_sizes)) ** -0.5
+        assert exact_boxes < ground_size.sigma_pitch_rad < 1.5 * exact_boxes
+
+
+def test_who_begins_standing_is_as_sure_of_road_and_depths_as_it_says() -> None:
+    """Over seeds: cars of unknown sizes on a road of unknown pitch, whose boxes err alike in all frames."""
+    of_pitch, of_depth = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        pitch_rad, ground_size = 0.01 * float(rng.standard_normal()), GroundSizeFilter(CAMERA, CONFIG)
+        boxes = []
+        for x_m, y_m in CARS_M:
+            box = box_px(x_m, y_m, 1.53 * math.exp(0.08 * float(rng.standard_normal())), pitch_rad)
+            boxes.append(box + (0.7 + 0.02 * (box[3] - box[1])) * rng.standard_normal(4))
+        for _ in range(100):
+            depths_m, sigmas = see(ground_size, boxes, 0.0)
+        of_pitch.append((ground_size.ground.pitch_rad - pitch_rad) / ground_size.sigma_pitch_rad)
+        truth_m = np.array([x_m - CAR.length_m / 2.0 for x_m, _ in CARS_M])
+        of_depth.append(np.log(depths_m / truth_m) / sigmas)
+    assert 0.6 < np.sqrt(np.mean(np.square(of_pitch))) < 1.3
+    assert 0.6 < np.sqrt(np.mean(np.square(of_depth))) < 1.3
+
+
+def test_a_pitch_by_the_images_is_no_news_while_the_ego_stands() -> None:
+    ground_size = GroundSizeFilter(CAMERA, CONFIG)
+    ground_size.predict(PERIOD_S, 0.0, GroundPlane(CAMERA.height_m, 0.01), 0.003, 1.0)
+    before = ground_size.ground.pitch_rad, ground_size.sigma_pitch_rad
+    for k in range(100):  # it trembles in its last digits
+        ground_size.predict(PERIOD_S, 0.0, GroundPlane(CAMERA.height_m, 0.01 + 1e-6 * (k % 2)), 0.003, 0.0)
+    assert (ground_size.ground.pitch_rad, ground_size.sigma_pitch_rad) == pytest.approx(before, rel=1e-3)
+
+
+def test_the_front_end_holds_the_road_of_a_halted_ego_until_cars_come() -> None:
+    """It drives up to cars on a road that the camera is not calibrated for, halts, and they leave."""
+    frames, stands_from, pitch_rad = 120, 40, 0.02
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 2, 3] = 0.4 * np.minimum(np.arange(frames), stands_from)
+    sequence = TrackingSequence("9999", CAMERA, np.eye(4), poses, (), None)
+    detections = [Detections(np.zeros((0, 4)), np.zeros(0), ())] * frames
+    for k in range(stands_from):
+        boxes = [box_px(x_m + 16.0 - 0.4 * k, y_m, 1.5, pitch_rad) for x_m, y_m in CARS_M]
+        detections[k] = Detections(np.array(boxes), np.full(len(boxes), 0.9), ("car",) * len(boxes))
+    log = measure(sequence, detections, FrontEndConfig())
+    halted, last = log[stands_from + 1].ground, log[-1].ground
+    assert halted is not None
+    assert last is not None
+    assert halted.pitch_rad == pytest.approx(pitch_rad, abs=0.006)
+    assert last.pitch_rad == pytest.approx(halted.pitch_rad, abs=1e-6)
