@@ -35,6 +35,7 @@ from birdslam.types import Status
 CLIPS = Path(__file__).parent / "roads"
 NAMES = ("motorway_20", "motorway_40", "ramp_20", "ramp_21_glare", "night_street", "night_motorway")
 NOT_YET = {  # what fails, by how much; strict, so that whoever mends it must strike it out
+    "night_street": "one valid frame off by 10 %, of one start",
     "street+dirt": "two valid frames off by 11 %, of one start",
     "street+reflection": "one valid frame off by 13 %, of one start",
     "street+bonnet": "two valid frames off by 10 to 11 %, of one start: the near road is hidden",
