@@ -7,6 +7,8 @@ DATA := $(or $(BIRDSLAM_DATA),../shared/data)
 MODELS := $(or $(BIRDSLAM_MODELS),../shared/models)
 
 CORES := $(or $(shell nproc 2>/dev/null),2)
+# Each test starts processes, which would compile all modules anew
+unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
 .PHONY: setup test test-slow wheel-test wheels fuzz faults onroad perf lint train demo demo-kitti clean
