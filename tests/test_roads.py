@@ -6,8 +6,8 @@ The clips in tests/roads are rendered by
         --frames 26 --quality 70 --keep tests/roads
 
 From the first, the third and the fifth image, without networks: no valid frame has a speed off by more than a tenth,
-the way is off by 5 % at the most (in the median of the three), nothing says standstill while the car drives, four
-frames in five are valid. What does not hold yet is expected to fail, with its figures (NOT_YET).
+no way is off by more than 5 %, nothing says standstill while the car drives, four frames in five are valid. What does not
+hold yet is expected to fail, with its figures (NOT_YET).
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ CLIPS = Path(__file__).parent / "roads"
 NAMES = ("motorway_20", "motorway_40", "ramp_20", "ramp_21_glare", "night_street", "night_motorway")
 NOT_YET = {  # what fails, by how much; strict, so that whoever mends it must strike it out
     "night_street": "one valid frame off by 10 %, of one start",
+    "night_motorway": "way +6.0 %, of one start",
     "street+dirt": "two valid frames off by 11 %, of one start",
     "street+reflection": "one valid frame off by 13 %, of one start",
     "street+bonnet": "two valid frames off by 10 to 11 %, of one start: the near road is hidden",
@@ -61,7 +62,7 @@ def holds(row: dict[str, Any]) -> None:
     """The four things that are asked of every road."""
     assert row["way_m"] > 20.0
     assert row["standstill"] == 0
-    assert np.median(np.abs(row["scale_errors"])) <= SCALE_LIMIT
+    assert max(abs(error) for error in row["scale_errors"]) <= SCALE_LIMIT
     assert row["wrong_valid"] == []
     assert row["valid"] >= LEAST_VALID * row["motions"]
 
