@@ -6,8 +6,8 @@ The clips in tests/roads are rendered by
         --frames 26 --quality 70 --keep tests/roads
 
 From the first, the third and the fifth image, without networks: no valid frame has a speed off by more than a tenth,
-no way is off by more than 5 %, nothing says standstill while the car drives, four frames in five are valid. What does not
-hold yet is expected to fail, with its figures (NOT_YET).
+no way is off by more than 5 %, nothing says standstill while the car drives, four frames in five are valid. What does
+not hold yet is expected to fail, with its figures (NOT_YET).
 """
 
 from __future__ import annotations
