@@ -40,7 +40,6 @@ NOT_YET = {  # what fails, by how much; strict, so that whoever mends it must st
     "street+dirt": "two valid frames off by 11 %, of one start",
     "street+reflection": "one valid frame off by 13 %, of one start",
     "street+bonnet": "two valid frames off by 10 to 11 %, of one start: the near road is hidden",
-    "motorway+compression": "3 of 4 frames valid: from the third image on a scale is found late",
 }
 BEGIN_AT = (0, 2, 4)  # one start alone is luck: a rounding decides between 4 and 6 %
 FRAMES = 26

@@ -33,6 +33,9 @@ Floats = NDArray[np.float64]
 
 _SHORTEST_M = 0.1  # of a motion whose rotation says how the way bends
 _LANDMARKS_LOG = 0.4  # they are short by up to a tenth, and a wrong pitch of a degree makes another fifth
+# A comparison that the landmarks bear out so well may be so much less alike: their errors are not the same. A rendered
+# motorway behind a coarse encoder was looked at, whose comparisons reach 0.2
+_AGREED_LOG, _ALIKE_WHERE_AGREED = 0.15, 0.5
 _DRIVEN_PX = 3.0  # of what is below the horizon from one image to the next
 _BEND_PER_M = 0.2  # no car turns more tightly
 _LENGTHS_M = np.geomspace(0.03, 6.0, 84)  # tried where the length is not known at all
@@ -289,7 +292,10 @@ class RoadScale:
         fit, searched, prior_cov = found
         known = self._known() or self._car.measures
         expected = searched != 1.0 or not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
-        if fit.correlation < cfg.min_correlation or not expected:
+        least = cfg.min_correlation
+        if borne_out is not None and abs(float(np.log(searched / borne_out)) + fit.state[0]) < _AGREED_LOG:
+            least *= _ALIKE_WHERE_AGREED
+        if fit.correlation < least or not expected:
             self._refused += new
             self._tries += 1
             return 1.0

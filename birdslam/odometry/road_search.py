@@ -19,7 +19,7 @@ from birdslam.odometry.road_alignment import RoadImage, plane_normal
 Floats = NDArray[np.float64]
 
 _STANDS_M = 0.1  # a car that drives so little at a start stands as well as not
-_LEAD = 0.1  # of the correlation of the farther road as it moves over that as it stands
+_LEAD = 0.1  # of the correlation of what changed as it moves over that as it stands
 
 
 def search_length(
@@ -39,8 +39,8 @@ def search_length(
     tilts = [(pitch_rad, tilt[1]) for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01)]
     ways = lengths[:, None] * (T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9))
 
-    def alike(far: bool) -> Floats:
-        shown = farther_half(px) if far else px
+    def alike(changed: bool) -> Floats:
+        shown = far_and_changed(past, present, px) if changed else px
         return np.array([correlations(camera, past, present, T_past_present.R, ways, shown, each) for each in tilts])
 
     return float(lengths[most_alike(alike, lengths)[1]])
@@ -49,22 +49,27 @@ def search_length(
 def most_alike(alike: Callable[[bool], Floats], lengths: Floats) -> tuple[int, int]:
     """Which pitch and which of `lengths` (L,) ascending, in metres, make two images of the road most alike.
 
-    `alike` gives correlations (pitches, L), of the whole road, or where it is told so of the farther half alone: of a
-    car that stands that stands as well. Where it moves, what stands is the car's own bonnet on the near road.
+    `alike` gives correlations (pitches, L), of the whole road, or where it is told so of the farther road that
+    changed alone. Of a car that stands no length explains what changed. Where one does, what stands is no road: the
+    car's own bonnet on the near road, or grain that a video encoder left where it was.
     """
     whole = alike(False)
     pitch, length = np.unravel_index(int(whole.argmax()), whole.shape)
     if lengths[length] < _STANDS_M:
-        far = alike(True)
-        far_pitch, far_length = np.unravel_index(int(far.argmax()), far.shape)
-        if far[far_pitch, far_length] > far[:, lengths < _STANDS_M].max() + _LEAD:
-            pitch, length = far_pitch, far_length
+        moved = alike(True)
+        moved_pitch, moved_length = np.unravel_index(int(moved.argmax()), moved.shape)
+        if moved[moved_pitch, moved_length] > moved[:, lengths < _STANDS_M].max() + _LEAD:
+            pitch, length = moved_pitch, moved_length
     return int(pitch), int(length)
 
 
-def farther_half(px: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Those of the pixels (N, 2) of the road that lie above their median row."""
-    return px[px[:, 1] < np.median(px[:, 1])]
+def far_and_changed(past: RoadImage, present: RoadImage, px: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Of the pixels (N, 2) of the present image's road the farther half, above their median row, and of that the half
+    that differs most from the same pixels of the past image."""
+    far = px[px[:, 1] < np.median(px[:, 1])]
+    then, now = (image.grey[far[:, 1] - image.top_px, far[:, 0]] for image in (past, present))
+    change = np.abs(now - then)
+    return far[change >= np.median(change)] if len(far) else far
 
 
 def correlations(

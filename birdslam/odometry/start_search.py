@@ -9,7 +9,8 @@ next image's guess. So, at the start and after a loss:
   so that neither the exposure nor another car nor one near tree decides);
 - length: with that rotation the road's image is compared over forward travel and pitch together. A car rolls on its
   rear axle, so the direction of travel follows from the rotation and the length.
-  Where the near road seems to stand, the farther one is asked too: a bonnet stands.
+  Where the road seems to stand, what changed of its farther half is asked too: a bonnet stands, and so does
+  the grain that a video encoder leaves where it was.
 
 These are guesses for the flow, which says by its residuals which of them is right for each corner.
 """
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.road_alignment import RoadAligner, RoadImage
-from birdslam.odometry.road_search import correlations, farther_half, most_alike
+from birdslam.odometry.road_search import correlations, far_and_changed, most_alike
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.float32]
@@ -121,10 +122,10 @@ class StartSearch:
             if len(px) >= 50:
                 views.append((float(pitch_rad), self._ways(yaw_rad, float(pitch_rad)), px))
 
-        def alike(far: bool) -> Floats:
+        def alike(changed: bool) -> Floats:
             rows = []
             for pitch_rad, ways, px in views:
-                shown, tilt = farther_half(px) if far else px, (pitch_rad, self.camera.roll_rad)
+                shown, tilt = far_and_changed(past, present, px) if changed else px, (pitch_rad, self.camera.roll_rad)
                 rows.append(correlations(self.camera, past, present, R_past_present, ways, shown, tilt))
             return np.array(rows)
 
