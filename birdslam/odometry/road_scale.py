@@ -36,6 +36,7 @@ _LANDMARKS_LOG = 0.4  # they are short by up to a tenth, and a wrong pitch of a 
 # A comparison that the landmarks bear out so well may be so much less alike: their errors are not the same. A rendered
 # motorway behind a coarse encoder was looked at, whose comparisons reach 0.2
 _AGREED_LOG, _ALIKE_WHERE_AGREED = 0.15, 0.5
+_FOUND_LOG = 0.5  # a comparison that knows the length no better has found none
 _DRIVEN_PX = 3.0  # of what is below the horizon from one image to the next
 _BEND_PER_M = 0.2  # no car turns more tightly
 _LENGTHS_M = np.geomspace(0.03, 6.0, 84)  # tried where the length is not known at all
@@ -341,6 +342,8 @@ class RoadScale:
                     past, image, Pose(T.R, T.p * begin), px, prior, loose[:ROAD, :ROAD], sigma_motion
                 )
                 if other is None or _contradicts(float(np.log(begin)) + other.state[0], borne_out):
+                    continue
+                if other.cov[0, 0] > _FOUND_LOG**2:
                     continue
                 if fit is None or other.correlation > fit.correlation + lead:
                     fit, factor, cov = other, begin, loose
