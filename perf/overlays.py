@@ -4,8 +4,8 @@
 
 Each is drawn over the second half of each sequence, seeded, and stands still in the image (`windscreen.Overlay`);
 `night` blackens all but the end of the street, over 30 images, after which the road is back. Counts the frames of the
-second half that were called valid with a speed off by more than a tenth, and those called standstill while the car
-drove.
+second half that were called valid with a speed off by more than a tenth (and how many of them where the truth is
+interpolated or accelerates as no car does), and those called standstill while the car drove.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from birdslam.datasets.recording import DatasetError
+from birdslam.evaluation import truth_quality
 from birdslam.odometry.odometry import Odometry
 from birdslam.perception import ModelError
 from birdslam.perf.errors import PerfError
@@ -37,6 +38,7 @@ SEQUENCES = (
 )
 KINDS = (*windscreen.KINDS, "night")
 NIGHT_IMAGES = 30
+_COUNTS = ("frames", "valid", "wrong_valid", "wrong_valid_truth_doubtful", "standstill", "obstructed")
 DRIVES_M = 0.1  # in one image, by the truth: such a car does not stand
 
 
@@ -78,7 +80,8 @@ def _night(index: int, count: int, image: Image) -> Image:
 def measure(drive: Drive) -> dict[str, Any]:
     """What the odometry says of the second half."""
     odometry, half = Odometry(drive.camera), len(drive.images) // 2
-    row = dict.fromkeys(("frames", "valid", "wrong_valid", "standstill", "obstructed"), 0)
+    doubtful = truth_quality.doubtful(drive.poses, np.array(drive.t_ns, np.int64))
+    row = dict.fromkeys(_COUNTS, 0)
     way_m = true_m = 0.0
     for k, image in enumerate(drive.images):
         motion = odometry.estimate(odometry.track(image), k, drive.t_ns[k], *drive.seen[k])
@@ -87,7 +90,9 @@ def measure(drive: Drive) -> dict[str, Any]:
         step_m = float(np.linalg.norm(drive.poses[k, :3, 3] - drive.poses[motion.from_frame, :3, 3]))
         row["frames"] += 1
         row["valid"] += is_valid(motion)
-        row["wrong_valid"] += is_valid(motion) and is_wrong(motion, drive.poses)
+        wrong = is_valid(motion) and is_wrong(motion, drive.poses)
+        row["wrong_valid"] += wrong
+        row["wrong_valid_truth_doubtful"] += wrong and bool(doubtful[k])
         row["standstill"] += motion.standstill and step_m > DRIVES_M * (k - motion.from_frame)
         row["obstructed"] += Status.VIEW_OBSTRUCTED in motion.status
         if motion.from_frame == k - 1:
@@ -99,6 +104,7 @@ def told(row: dict[str, Any]) -> str:
     """A row for a person."""
     scale = "unknown" if row["scale_error"] is None else f"{row['scale_error']:+.1%}"
     return (
-        f"{row['frames']:4} frames  valid {row['valid']}, of them wrong {row['wrong_valid']}  standstill "
-        f"{row['standstill']}  view_obstructed {row['obstructed']}  scale {scale}"
+        f"{row['frames']:4} frames  valid {row['valid']}, of them wrong {row['wrong_valid']} "
+        f"({row['wrong_valid_truth_doubtful']} where the truth is doubtful)  standstill {row['standstill']}  "
+        f"view_obstructed {row['obstructed']}  scale {scale}"
     )

@@ -157,7 +157,7 @@ def measure(task: Task) -> tuple[str, list[dict[str, Any]]]:
     count = len(drive.images)
     starts = []
     interpolated = truth_quality.interpolated(drive.poses)
-    doubtful = interpolated | truth_quality.implausible(drive.poses, np.array(drive.t_ns, np.int64))
+    doubtful = truth_quality.doubtful(drive.poses, np.array(drive.t_ns, np.int64))
     for first in range(0, count - LEAST_IMAGES + 1, task.every):
         start = cold_start(drive, range(first, min(first + task.images, count)))
         if start is not None:

@@ -108,6 +108,7 @@ def test_a_step_that_no_car_makes_is_found_at_both_its_ends() -> None:
     steps[4] = SE2(1.2, 0.0, 0.0)  # 20 m/s^2
     t_ns = np.arange(11) * 100_000_000
     assert np.flatnonzero(truth_quality.implausible(drive(steps), t_ns)).tolist() == [4, 5, 6]
+    assert truth_quality.doubtful(drive(steps), t_ns)[[4, 5, 6]].all()
     steps[4] = SE2(1.1, 0.0, 0.0)
     assert not truth_quality.implausible(drive(steps), t_ns).any()
 

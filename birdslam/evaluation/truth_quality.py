@@ -75,3 +75,8 @@ def implausible(poses: Transform, t_ns: NDArray[np.int64]) -> Bools:
     out[1:-1] |= jumps
     out[2:] |= jumps
     return out
+
+
+def doubtful(poses: Transform, t_ns: NDArray[np.int64]) -> Bools:
+    """(N,) the frames whose step is interpolated or implausible."""
+    return interpolated(poses) | implausible(poses, t_ns)
