@@ -36,7 +36,9 @@ _LANDMARKS_LOG = 0.4  # they are short by up to a tenth, and a wrong pitch of a 
 # A comparison that the landmarks bear out so well may be so much less alike: their errors are not the same. A rendered
 # motorway behind a coarse encoder was looked at, whose comparisons reach 0.2
 _AGREED_LOG, _ALIKE_WHERE_AGREED = 0.15, 0.5
-_FOUND_LOG = 0.5  # a comparison that knows the length no better has found none
+# A comparison that knows the length no better has found none: drops over a rendered motorway that seem to stand have
+# 0.8, lengths that are found there and behind that encoder less than 0.4
+_FOUND_LOG = 0.5
 _DRIVEN_PX = 3.0  # of what is below the horizon from one image to the next
 _BEND_PER_M = 0.2  # no car turns more tightly
 _LENGTHS_M = np.geomspace(0.03, 6.0, 84)  # tried where the length is not known at all
@@ -294,7 +296,7 @@ class RoadScale:
         known = self._known() or self._car.measures
         expected = searched != 1.0 or not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
         least = cfg.min_correlation
-        if borne_out is not None and abs(float(np.log(searched / borne_out)) + fit.state[0]) < _AGREED_LOG:
+        if borne_out is not None and not _contradicts(float(np.log(searched)) + fit.state[0], borne_out, _AGREED_LOG):
             least *= _ALIKE_WHERE_AGREED
         if fit.correlation < least or not expected:
             self._refused += new
@@ -341,18 +343,18 @@ class RoadScale:
                 other = self._aligner.align(
                     past, image, Pose(T.R, T.p * begin), px, prior, loose[:ROAD, :ROAD], sigma_motion
                 )
-                if other is None or _contradicts(float(np.log(begin)) + other.state[0], borne_out):
+                if other is None or other.cov[0, 0] > _FOUND_LOG**2:
                     continue
-                if other.cov[0, 0] > _FOUND_LOG**2:
+                if _contradicts(float(np.log(begin)) + other.state[0], borne_out):
                     continue
                 if fit is None or other.correlation > fit.correlation + lead:
                     fit, factor, cov = other, begin, loose
         return None if fit is None else (fit, factor, cov)
 
 
-def _contradicts(log_length: float, borne_out: float | None) -> bool:
+def _contradicts(log_length: float, borne_out: float | None, limit_log: float = _LANDMARKS_LOG) -> bool:
     """Whether a factor on the lengths is none that the landmarks on the road could bear out."""
-    return borne_out is not None and abs(log_length - float(np.log(borne_out))) > _LANDMARKS_LOG
+    return borne_out is not None and abs(log_length - float(np.log(borne_out))) > limit_log
 
 
 def _bend_per_m(R_prev_curr: Floats, travelled_m: float) -> float:
