@@ -23,7 +23,7 @@ from birdslam.datasets.recording import DatasetError
 from birdslam.datasets.speed_file import read_speed_curve
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
-from birdslam.odometry.road_alignment import RoadFit
+from birdslam.odometry.road_fit import RoadFit
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.main import main
 from birdslam.types import Frame
@@ -222,7 +222,7 @@ def test_an_error_of_the_running_scale_is_in_what_the_road_says_however_many_com
     sigmas = []
     for count in (40, 400):
         seen = _Seen(fits=[(RoadFit(np.array([0.0, pitch_rad, 0.0, 0.0]), cov, 0.9, 1000), 3.0)] * count)
-        road = _by_road(seen, CalibrationConfig())
+        road = _by_road(seen, CAMERA, CalibrationConfig())
         assert road is not None
         sigmas.append(math.sqrt(road.cov[0]))
         assert abs(road.pitch_rad - 0.01) < 1.5 * sigmas[-1]

@@ -18,8 +18,8 @@ from birdslam.odometry.car_speed import CarSpeed, CarSpeedConfig
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry, OdometryConfig
 from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
-from birdslam.odometry.road_alignment import RoadFit
 from birdslam.odometry.road_filter import CAR_DELAY, CAR_FACTOR, STATES, RoadFilter, RoadScaleConfig
+from birdslam.odometry.road_fit import RoadFit
 from birdslam.types import INVALIDATING, NS_PER_S, EgoEdge, Measurements, SpeedReading, SpeedSource, Status
 
 Speed = Callable[[float], float]

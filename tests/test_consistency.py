@@ -18,8 +18,8 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
-from birdslam.odometry.road_alignment import RoadFit
 from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
+from birdslam.odometry.road_fit import RoadFit
 from birdslam.simulation.drive import Drive, DriveConfig, drive
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
 

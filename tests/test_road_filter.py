@@ -9,8 +9,9 @@ import pytest
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp
-from birdslam.odometry.road_alignment import RoadAlignConfig, RoadAligner, RoadFit
+from birdslam.odometry.road_alignment import RoadAlignConfig, RoadAligner
 from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
+from birdslam.odometry.road_fit import RoadFit
 from birdslam.perf.graded_road import CURVE_M, GradedRoad, Stand
 
 CAMERA = Camera(931, 282, 540.0, 540.0, 456.3, 139.2, height_m=1.65)

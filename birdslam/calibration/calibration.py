@@ -1,10 +1,11 @@
 """How a camera stands in its car, from a drive: pitch and roll over the road, and a check of its height.
 
-Three witnesses, each with its own covariance, and the least-squares mean of them with the disagreement in its
+Four witnesses, each with its own covariance, and the least-squares mean of them with the disagreement in its
 covariance (Birge's ratio):
 
 - the road's image: the homography of the road plane between two images gives pitch and roll (road_alignment.py);
 - the direction of travel: on a straight way the epipole lies on the road's horizon, above a camera that looks down;
+- the road's lines: the point where they meet lies on its horizon (road_lines.py);
 - the vehicles: bottoms and heights of many boxes put the horizon where they meet (vehicles/camera_height.py).
 
 What checks its height is in height_check.py.
@@ -34,7 +35,9 @@ from birdslam.frontend import FrontEnd, FrontEndConfig, Pending
 from birdslam.geometry.camera import Camera
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
-from birdslam.odometry.road_alignment import RoadFit, plane_normal
+from birdslam.odometry.road_alignment import plane_normal
+from birdslam.odometry.road_fit import RoadFit
+from birdslam.odometry.road_lines import LinesDirection
 from birdslam.types import Frame, Status
 from birdslam.vehicles.camera_height import BoxHeight, measure_heights
 
@@ -63,6 +66,8 @@ class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     straight_rad_per_m: Positive = 0.005
     sigma_direction_rad: Positive = 0.012  # of the direction of travel over one metre
     sigma_travel_rad: Positive = 0.003  # of its mean: a car squats on its springs, and climbs a little
+    crest_m: Positive = 30.0  # for so long a crest or a sag lasts
+    min_looks: Annotated[int, msgspec.Meta(ge=3)] = 5  # at the road's lines
     max_sigma_rad: Positive = 0.02  # of the result
     restart_rad: Positive = 0.01  # farther than this from where the drive began, it is driven again from there
     max_drives: Annotated[int, msgspec.Meta(ge=1)] = 3
@@ -112,6 +117,7 @@ class _Seen:
 
     fits: list[tuple[RoadFit, float]] = field(default_factory=list)  # and the way since the one before
     directions: list[tuple[Floats, float]] = field(default_factory=list)  # of straight travel, and its length
+    lines: list[LinesDirection] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     boxes: list[BoxHeight] = field(default_factory=list)
     times_ns: dict[int, int] = field(default_factory=dict)
@@ -187,6 +193,8 @@ def _watch(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: Calib
         if odometry.road_fit is not None:
             seen.fits.append((odometry.road_fit, since_m))
             since_m = 0.0
+        if odometry.road_lines is not None:
+            seen.lines.append(odometry.road_lines)
         if Status.SCALE_CARRIED in motion.status:
             continue
         seen.steps.append((motion.from_frame, motion.to_frame, length))
@@ -199,14 +207,16 @@ def _watch(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: Calib
 
 
 def _witnesses(seen: _Seen, camera: Camera, config: CalibrationConfig) -> list[Witness]:
-    found = [_by_road(seen, config), _by_travel(seen, camera, config), _by_vehicles(seen, camera, config)]
+    found = [by(seen, camera, config) for by in (_by_road, _by_travel, _by_lines, _by_vehicles)]
     witnesses = [witness for witness in found if witness is not None]
     if not witnesses:
-        raise CalibrationError("neither the road nor a straight way nor vehicles were seen: nothing shows the tilt")
+        raise CalibrationError(
+            "neither the road nor its lines nor a straight way nor vehicles were seen: nothing shows the tilt"
+        )
     return witnesses
 
 
-def _by_road(seen: _Seen, config: CalibrationConfig) -> Witness | None:
+def _by_road(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness | None:
     """The mean of the comparisons of the road; those of one bounce of the car are one sample."""
     if len(seen.fits) < config.min_fits:
         return None
@@ -248,6 +258,21 @@ def _by_travel(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witnes
     # A bounce comes and goes within bounce_m and turns the direction of the camera's travel back and forth
     variance = config.sigma_direction_rad**2 * max(1.0, config.bounce_m) / length.sum() + config.sigma_travel_rad**2
     return _witness("travel", np.array([centre, 0.0]), np.diag([variance, WIDE**2]), len(pitch), sees_roll=False)
+
+
+def _by_lines(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness | None:
+    """The road's lines lie in it: normal . direction = 0, solved for the pitch at the roll known so far."""
+    if len(seen.lines) < config.min_looks:
+        return None
+    normal, by_pitch, _ = plane_normal(camera.pitch_rad, camera.roll_rad)
+    directions = np.array([look.direction for look in seen.lines])
+    pitch = float(np.median(camera.pitch_rad - (directions @ normal) / (directions @ by_pitch)))
+    # A crest turns the road where the lines are seen, a bounce the camera; both last for longer than from look to look
+    distance_m = float(np.median([look.distance_m for look in seen.lines]))
+    lasting = config.sigma_bounce_rad**2 * config.bounce_m
+    lasting += (config.sigma_curvature_per_m * distance_m) ** 2 * config.crest_m
+    variance = lasting / max(seen.path_m, config.crest_m) + config.sigma_road_rad**2
+    return _witness("lines", np.array([pitch, 0.0]), np.diag([variance, WIDE**2]), len(seen.lines), sees_roll=False)
 
 
 def _by_vehicles(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness | None:

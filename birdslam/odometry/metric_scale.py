@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.car_scale import CarStep
-from birdslam.odometry.road_alignment import RoadFit
+from birdslam.odometry.road_fit import RoadFit
+from birdslam.odometry.road_lines import LinesDirection
 from birdslam.odometry.sliding_window import SlidingWindow
 from birdslam.types import SpeedReading, SpeedSource, Status
 
@@ -40,6 +41,7 @@ class MetricScale(Protocol):
     """Turns the odometry's unit of length into metres, image by image."""
 
     fit: RoadFit | None  # what the newest image's comparison alone said, where it was accepted
+    lines: LinesDirection | None  # where the newest image's lines lead, where they were accepted
 
     @property
     def ground(self) -> GroundPlane:

@@ -20,8 +20,9 @@ from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.metric_scale import RoadView
-from birdslam.odometry.road_alignment import RoadFit
 from birdslam.odometry.road_filter import RoadScaleConfig
+from birdslam.odometry.road_fit import RoadFit
+from birdslam.odometry.road_lines import LinesDirection
 from birdslam.odometry.road_points import on_road
 from birdslam.types import SpeedReading, SpeedSource, Status
 
@@ -40,6 +41,7 @@ class MedianScale:
     def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:
         self.camera, self.config = camera, config
         self.fit: RoadFit | None = None  # always None: no two images are compared
+        self.lines: LinesDirection | None = None  # nor are lines looked at
         self._scales: deque[float] = deque(maxlen=config.median_frames)
         self._given = 1.0
         self._carried_m = 0.0  # travelled since a frame gave a scale

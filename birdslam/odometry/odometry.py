@@ -33,8 +33,10 @@ from birdslam.odometry.metric_scale import MetricScale, RoadView
 from birdslam.odometry.motion import Motion, MotionConfig, planar, step_cov
 from birdslam.odometry.motion_records import MotionRecords
 from birdslam.odometry.moving_median import MedianScale
-from birdslam.odometry.road_alignment import RoadAligner, RoadFit
+from birdslam.odometry.road_alignment import RoadAligner
 from birdslam.odometry.road_filter import RoadScaleConfig
+from birdslam.odometry.road_fit import RoadFit
+from birdslam.odometry.road_lines import LinesDirection
 from birdslam.odometry.road_points import is_night, on_road, outside
 from birdslam.odometry.road_scale import RoadScale
 from birdslam.odometry.sliding_window import common
@@ -120,6 +122,11 @@ class Odometry:
     def road_fit(self) -> RoadFit | None:
         """What the road's image alone said of the last motion, where it was of use."""
         return self._scale.fit
+
+    @property
+    def road_lines(self) -> LinesDirection | None:
+        """Where the road's lines lead in the newest image, where they were looked at and of use."""
+        return self._scale.lines
 
     # --- feature tracking ---
 

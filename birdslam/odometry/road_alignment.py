@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.median import upper_median
+from birdslam.odometry.road_fit import MOTION, ROAD, RoadFit, Slopes, fit_alone
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -31,12 +32,11 @@ Bools = NDArray[np.bool_]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 _MARGIN_PX = 4  # from the image's edge, for the warp and the smoothing
-ROAD = 4  # log lambda, pitch, roll, curvature; then the errors of the odometry's motion, and the brightness
-MOTION = 5  # the rotation's error (3), that of the direction of travel to the right and down (2)
-_LEAST_INFORMATION = (1.0, 10.0, 10.0, 1e4)
 _LARGEST_STEP = np.array([0.1, 0.1, 0.1, 0.005] + [0.1] * MOTION)  # of one iteration
 # The change of each that counts as much as 1 rad; the motion's errors need not converge as far
 _STEP_UNITS = np.array([1.0, 1.0, 1.0, 0.05] + [3.0] * MOTION)
+_NEAREST, _BEHIND = 1e-3, 0.05  # depths in units of the road's: a place is no nearer, and one so near is not seen
+_SQUEEZED = 1e-3  # an area of the past image so small shows no slope
 _BEYOND_CREST = 0.01  # where a ray would miss the parabola: that is behind the crest
 
 
@@ -64,22 +64,26 @@ class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True)
-class RoadFit:
-    """What one comparison alone says: (log lambda, pitch_rad, roll_rad, curvature_per_m) and its covariance (4, 4)."""
-
-    state: Floats
-    cov: Floats
-    correlation: float
-    samples: int
-
-
-@dataclass(frozen=True)
 class _View:
     """Samples of the present image: their rays (3, N), those turned into the past camera (3, N), their grey (N,)."""
 
     rays: Floats
     turned: Floats
     grey: Floats
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where the past camera sees samples: at (x, y) of z = 1, (N,) each, of the inverse depth `by_z`.
+
+    `rho` is the inverse depth of the present camera, `root` what it is solved by.
+    """
+
+    x: Floats
+    y: Floats
+    by_z: Floats
+    rho: Floats
+    root: Floats
 
 
 def _brightness(there: Floats, here: Floats) -> tuple[float, float]:
@@ -237,13 +241,15 @@ class RoadAligner:
             (fine, 1, cfg.tolerance, 3),
         ):
             for _ in range(iterations):
-                seen, there = self._look(view, past, T_past_present, x)
+                places = self._places(view, T_past_present, x)
+                seen, grey, by_x, by_y = self._look(places, past)
                 if share * int(seen.sum()) < cfg.min_samples:
                     return None
                 if light is None:
-                    light = _brightness(there[0][seen], view.grey[seen])
-                r = there[0] - light[1] * view.grey - light[0]
-                J = self._derivative(view, there, T_past_present, x)
+                    light = _brightness(grey[seen], view.grey[seen])
+                r = grey - light[1] * view.grey - light[0]
+                slopes = self._slopes(view, places, by_x, by_y, T_past_present, x)
+                J = slopes.derivative
                 sigma = 1.4826 * upper_median(np.abs(r[seen])) + 0.5
                 w = np.where(seen, 1.0 / np.maximum(1.0, np.abs(r) * (1.0 / (1.5 * sigma))), 0.0)
                 w *= share * cfg.effective_sample_fraction / sigma**2
@@ -254,28 +260,23 @@ class RoadAligner:
                 A[-2, -2] += 1e-9
                 A[-1, -1] += 1e-6
                 step = -np.linalg.solve(A, g)
+                at, gain = x, light[1]  # what `r` and `slopes` are of
                 x = x + np.clip(step[:-2], -_LARGEST_STEP, _LARGEST_STEP)
                 light = (light[0] + step[-2], light[1] + step[-1])
                 if (np.abs(step[:-2]) < tolerance * _STEP_UNITS).all():
                     break
-        correlation = _correlation(there[0], fine.grey, w)
-        # What the images alone say: the prior that guided the fit is taken out again. A direction that they do not see
-        # keeps a variance far above what roads have, so that it is harmless.
-        data = A.copy()
-        data[:ROAD, :ROAD] -= weight_prior[:ROAD, :ROAD]
-        mixed = data[:ROAD, ROAD:]
-        info = data[:ROAD, :ROAD] - mixed @ np.linalg.solve(data[ROAD:, ROAD:], mixed.T) + np.diag(_LEAST_INFORMATION)
-        cov: Floats = np.asarray(np.linalg.inv(0.5 * (info + info.T)), np.float64)
-        measured: Floats = x[:ROAD] + cov @ weight_prior[:ROAD, :ROAD] @ (x[:ROAD] - prior)
-        return RoadFit(measured, cov, correlation, int(seen.sum()))
+        here = self._slopes_here(fine, present, px, T_past_present, at, gain)
+        motion = slice(ROAD, ROAD + MOTION)
+        state, cov = fit_alone(at, px, slopes, here, r, w, weight_prior[motion, motion])
+        return RoadFit(state, cov, _correlation(grey, fine.grey, w), int(seen.sum()))
 
     def driven(self, past: RoadImage, T_past_present: Pose, px: Ints, road: Floats) -> tuple[Floats, Bools]:
         """(N,) what the past image has where a motion and a road (4,) put the present pixels (N, 2), and if it has it.
 
         Nothing is fitted.
         """
-        view = self._view(past, px, T_past_present)
-        seen, (grey, *_) = self._look(view, past, T_past_present, np.append(road, np.zeros(MOTION)))
+        places = self._places(self._view(past, px, T_past_present), T_past_present, np.append(road, np.zeros(MOTION)))
+        seen, grey, _, _ = self._look(places, past)
         return grey, seen
 
     def _view(self, present: RoadImage, px: Ints, T_past_present: Pose) -> _View:
@@ -286,46 +287,74 @@ class RoadAligner:
         grey = present.grey[px[:, 1] - present.top_px, px[:, 0]].astype(np.float64)
         return _View(rays, T_past_present.R @ rays, grey)
 
-    def _look(self, view: _View, past: RoadImage, T_past_present: Pose, x: Floats) -> tuple[Bools, tuple[Floats, ...]]:
-        """Which samples the past image shows; its grey there, its slopes by q_x, q_y, q_z, 1 / depth, and its root."""
-        cam = self.camera
+    def _places(self, view: _View, T_past_present: Pose, x: Floats) -> _Places:
+        """Where the past camera sees the samples, on the road of `x` and after the motion that it has."""
         # Eq. 1 is X = rays / rho; with the curvature rho solves H rho^2 - below rho - curvature / 2 = 0
+        height_m = self.camera.height_m
         below = -(plane_normal(x[1], x[2])[0] @ view.rays)
-        root = np.sqrt(np.maximum(below**2 + 2.0 * cam.height_m * x[3], _BEYOND_CREST * below**2))
-        rho = (below + root) * (0.5 / cam.height_m)
+        root = np.sqrt(np.maximum(below**2 + 2.0 * height_m * x[3], _BEYOND_CREST * below**2))
+        rho = (below + root) * (0.5 / height_m)
         q = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned + rho * _translation(T_past_present, x)[:, None]
-        by_z = 1.0 / np.maximum(q[2], 1e-3)
-        px, py = q[0] * by_z, q[1] * by_z
-        u = (cam.fx_px * px + cam.cx_px).astype(np.float32)
-        v = (cam.fy_px * py + (cam.cy_px - past.top_px)).astype(np.float32)
+        by_z = 1.0 / np.maximum(q[2], _NEAREST)
+        return _Places(q[0] * by_z, q[1] * by_z, by_z, rho, root)
+
+    def _look(self, places: _Places, past: RoadImage) -> tuple[Bools, Floats, Floats, Floats]:
+        """Which samples the past image shows, its grey there, and its slopes by x and by y of z = 1."""
+        cam = self.camera
+        u = (cam.fx_px * places.x + cam.cx_px).astype(np.float32)
+        v = (cam.fy_px * places.y + (cam.cy_px - past.top_px)).astype(np.float32)
         rows, cols = past.grey.shape
-        seen = (u > 1) & (u < cols - 2) & (v > 1) & (v < rows - 2) & (q[2] > 0.05)
+        seen = (u > 1) & (u < cols - 2) & (v > 1) & (v < rows - 2) & (places.by_z < 1.0 / _BEHIND)
         grey, by_u, by_v = (
             cv2.remap(image, u, v, cv2.INTER_LINEAR).ravel().astype(np.float64) for image in (past.grey, *past.slopes)
         )
-        by_x, by_y = by_u * (cam.fx_px * by_z), by_v * (cam.fy_px * by_z)
-        return seen, (grey, by_x, by_y, -(by_x * px + by_y * py), rho, root)
+        return seen, grey, by_u * cam.fx_px, by_v * cam.fy_px
 
-    def _derivative(
-        self, view: _View, there: tuple[Floats, ...], T_past_present: Pose, x: Floats
-    ) -> Floats:  # fmt: skip
-        """(11, N) of the residual by (log lambda, pitch, roll, curvature, errors of the motion, bias, gain)."""
-        _, gx, gy, gz, rho, root = there
+    def _slopes_here(
+        self, view: _View, present: RoadImage, px: Ints, T_past_present: Pose, x: Floats, gain: float
+    ) -> Slopes:
+        """The slopes of the present image, as the past camera sees them, of `gain` times the contrast."""
+        cam = self.camera
+        places = self._places(view, T_past_present, x)
+        normal, t = plane_normal(x[1], x[2])[0], _translation(T_past_present, x)
+        R = rotation_exp(x[ROAD : ROAD + 3]) @ T_past_present.R
+        # By how much the place in the past image moves with the pixel of the present one; the road is flat enough
+        by_ray = R[:, :2] - np.outer(t, normal[:2]) / cam.height_m
+        (xx, xy), (yx, yy) = (
+            [(by_ray[axis, k] - place * by_ray[2, k]) * places.by_z for k in (0, 1)]
+            for axis, place in ((0, places.x), (1, places.y))
+        )
+        by_x, by_y = (
+            slope[px[:, 1] - present.top_px, px[:, 0]] * (gain * focal_px)
+            for slope, focal_px in zip(present.slopes, (cam.fx_px, cam.fy_px), strict=True)
+        )
+        det = xx * yy - xy * yx
+        det = np.where(np.abs(det) < _SQUEEZED, _SQUEEZED, det)
+        return self._slopes(
+            view, places, (yy * by_x - yx * by_y) / det, (xx * by_y - xy * by_x) / det, T_past_present, x
+        )
+
+    def _slopes(
+        self, view: _View, places: _Places, by_x: Floats, by_y: Floats, T_past_present: Pose, x: Floats
+    ) -> Slopes:
+        """With the residual's derivative that slopes by x and by y of z = 1 make, (N,) each."""
+        gx, gy = by_x * places.by_z, by_y * places.by_z
+        gz = -(gx * places.x + gy * places.y)
         _, by_pitch, by_roll = plane_normal(x[1], x[2])
         t = _translation(T_past_present, x)
         rx, ry, rz = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned
         along = gx * t[0] + gy * t[1] + gz * t[2]
         J = np.empty((ROAD + MOTION + 2, len(gx)))
-        np.multiply(along, rho, out=J[0])
-        np.divide(along, root, out=along)
+        np.multiply(along, places.rho, out=J[0])
+        np.divide(along, places.root, out=along)
         np.multiply(along, 0.5, out=J[3])
-        along *= -rho
+        along *= -places.rho
         np.multiply(along, by_pitch @ view.rays, out=J[1])
         np.multiply(along, by_roll @ view.rays, out=J[2])
         J[4], J[5], J[6] = ry * gz - rz * gy, rz * gx - rx * gz, rx * gy - ry * gx
-        by_length = rho * float(np.linalg.norm(t))
+        by_length = places.rho * float(np.linalg.norm(t))
         np.multiply(gx, by_length, out=J[7])
         np.multiply(gy, by_length, out=J[8])
         J[9] = -1.0
         np.negative(view.grey, out=J[10])
-        return J
+        return Slopes(gx, gy, J)

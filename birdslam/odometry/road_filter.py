@@ -1,8 +1,8 @@
 """The Kalman filter of the road under the camera: scale, tilt, curvature and mount.
 
-One comparison of two images (`road_alignment.py`) knows only some combination of scale, pitch, roll and curvature. Four
+One comparison of two images (`road_alignment.py`) knows only some combination of scale, pitch, roll and curvature. Five
 things join the comparisons from frame to frame: the camera's own rotation, the road's curvature, the direction of
-travel, which lies in the road, and the mount, about which the car bounces.
+travel and the road's own lines, which lie in the road, and the mount, about which the car bounces.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.odometry.bonnet import BonnetConfig
 from birdslam.odometry.car_speed import CarSpeedConfig
-from birdslam.odometry.road_alignment import ROAD, RoadAlignConfig, RoadFit, plane_normal, plane_tilt
+from birdslam.odometry.road_alignment import RoadAlignConfig, plane_normal, plane_tilt
+from birdslam.odometry.road_fit import ROAD, RoadFit
+from birdslam.odometry.road_lines import LinesDirection, RoadLinesConfig
 from birdslam.odometry.standing_pattern import StandingPatternConfig
 from birdslam.odometry.tilt_watch import TiltWatchConfig
 
@@ -39,6 +41,7 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     align: RoadAlignConfig = RoadAlignConfig()
     standing: StandingPatternConfig = StandingPatternConfig()
     bonnet: BonnetConfig = BonnetConfig()
+    lines: RoadLinesConfig = RoadLinesConfig()
     min_baseline_m: Positive = 0.35  # travelled between the two images; shorter says too little
     target_baseline_m: Positive = 1.1  # of the kept images the one nearest to this is compared
     kept_images: Annotated[int, msgspec.Meta(ge=2)] = 8  # earlier images of the road, to compare with
@@ -93,7 +96,8 @@ class RoadFilter:
     - Predicted by the camera's rotation and the distance travelled (`predict`). Over a crest or through a sag the
       touching plane turns by curvature times distance, and so, in the mean, does the car.
     - Measured: the tilt is the mount's in the mean (in `predict`), the direction of travel lies in the road (`travel`),
-      comparisons of the road's image (`accept`), ways by the car's own readings (`measure_car`).
+      so do the road's lines (`accept_lines`), comparisons of the road's image (`accept`), ways by the car's own
+      readings (`measure_car`).
     - Readers: `RoadScale`, for the factor on all lengths, the ground plane and its sigma; through it `TiltWatch`.
 
     The mount is a state, since otherwise what it learned of a tilt would be believed twice. The odometry is rescaled
@@ -231,6 +235,19 @@ class RoadFilter:
         var = self.config.sigma_travel_rad**2 + self.config.travel_lasts_m * corners_rad**2
         noise = np.array([[var / share]])
         self._update(np.array([-(normal @ d)]), H, noise)
+
+    def accept_lines(self, lines: LinesDirection) -> bool:
+        """The road's lines lie in it: what `travel` says of the way holds of them. False: refused, these are others."""
+        pitch_rad, roll_rad = self.tilt + np.array([self.x[3] * lines.distance_m, 0.0])
+        normal, by_pitch, by_roll = plane_normal(float(pitch_rad), float(roll_rad))
+        H = np.zeros((1, len(self.x)))
+        H[0, 1:3] = by_pitch @ lines.direction, by_roll @ lines.direction
+        H[0, 3] = H[0, 1] * lines.distance_m
+        beyond, var = -float(normal @ lines.direction), lines.sigma_rad**2
+        if beyond**2 > self.config.lines.max_innovation_sigma**2 * (float((H @ self.cov @ H.T)[0, 0]) + var):
+            return False
+        self._update(np.array([beyond]), H, np.array([[var]]))
+        return True
 
     def begin_travelling(self, t_prev_curr: Floats) -> None:
         """The first direction of travel: where it says that the camera file's pitch is far off, it goes before it."""

@@ -20,9 +20,11 @@ from birdslam.odometry.car_scale import CarScale, CarStep
 from birdslam.odometry.kept_images import Kept, KeptImages, Seen
 from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.motion import planar
-from birdslam.odometry.road_alignment import ROAD, RoadAligner, RoadFit, RoadImage
+from birdslam.odometry.road_alignment import RoadAligner, RoadImage
 from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
+from birdslam.odometry.road_fit import ROAD, RoadFit
 from birdslam.odometry.road_landmarks import length_unit
+from birdslam.odometry.road_lines import LinesDirection, RoadLines
 from birdslam.odometry.road_search import search_length
 from birdslam.odometry.sliding_window import SlidingWindow
 from birdslam.odometry.standing_pattern import StandingPattern
@@ -36,8 +38,8 @@ _LANDMARKS_LOG = 0.4  # they are short by up to a tenth, and a wrong pitch of a 
 # A comparison that the landmarks bear out so well may be so much less alike: their errors are not the same. A rendered
 # motorway behind a coarse encoder was looked at, whose comparisons reach 0.2
 _AGREED_LOG, _ALIKE_WHERE_AGREED = 0.15, 0.5
-# A comparison that knows the length no better has found none: drops over a rendered motorway that seem to stand have
-# 0.8, lengths that are found there and behind that encoder less than 0.4
+# A comparison that knows the length no better, and that no landmarks bear out, has found none: drops over a rendered
+# motorway that seem to stand have 0.8, lengths that are found there and behind that encoder less than 0.4
 _FOUND_LOG = 0.5
 _DRIVEN_PX = 3.0  # of what is below the horizon from one image to the next
 _BEND_PER_M = 0.2  # no car turns more tightly
@@ -59,6 +61,7 @@ class RoadScale:
         self._watch = TiltWatch(camera, config.watch)
         self._standing = StandingPattern(config.standing)
         self._bonnet = Bonnet(config.bonnet)
+        self._lines = RoadLines(camera, config.lines)
         self._kept = KeptImages(config.kept_images)
         self._confirmed = 0
         self._begun = False  # whether a scale was ever known: then the drive has shown how the camera is mounted
@@ -68,6 +71,7 @@ class RoadScale:
         self._held = False  # whether the speed was held since a comparison was accepted
         self._direction_held = False  # whether it is for the newest motion, whose direction the images do not show
         self.fit: RoadFit | None = None  # what the newest image's comparison alone said, where it was accepted
+        self.lines: LinesDirection | None = None  # where the newest image's lines lead, where they were accepted
 
     @property
     def ground(self) -> GroundPlane:
@@ -150,6 +154,7 @@ class RoadScale:
         if not self._direction_held:
             self._filter.travel(step.R.T @ step.p, travelled_m, view.sigma_across_m)
         self._direction_held = False
+        self._follow_lines(step, view, travelled_m)
         self._since_m += travelled_m
 
         self._learn_bonnet(view, travelled_m)
@@ -191,6 +196,23 @@ class RoadScale:
         if not standing.present:
             return Seen(plain, plain)
         return Seen(plain, RoadImage.of(standing.without(grey, top_px), top_px))
+
+    def _follow_lines(self, step: Pose, view: RoadView, travelled_m: float) -> None:
+        """The tilt by the road's lines, where they lead on along the way."""
+        self.lines = None
+        if travelled_m < _SHORTEST_M:
+            return
+        right, _, ahead = step.R.T @ step.p
+        lines = self._lines.look(
+            view.grey,
+            view.boxes_px,
+            float(self._filter.tilt[0]),
+            float(np.arctan2(right, ahead)),
+            _bend_per_m(step.R, travelled_m),
+            travelled_m,
+        )
+        if lines is not None and self._filter.accept_lines(lines):
+            self.lines = lines
 
     def _learn_bonnet(self, view: RoadView, travelled_m: float) -> None:
         """Where a bonnet turns out to have been taken for road, all that it said is forgotten."""
@@ -296,7 +318,7 @@ class RoadScale:
         known = self._known() or self._car.measures
         expected = searched != 1.0 or not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
         least = cfg.min_correlation
-        if borne_out is not None and not _contradicts(float(np.log(searched)) + fit.state[0], borne_out, _AGREED_LOG):
+        if _bears_out(float(np.log(searched)) + fit.state[0], borne_out):
             least *= _ALIKE_WHERE_AGREED
         if fit.correlation < least or not expected:
             self._refused += new
@@ -343,18 +365,26 @@ class RoadScale:
                 other = self._aligner.align(
                     past, image, Pose(T.R, T.p * begin), px, prior, loose[:ROAD, :ROAD], sigma_motion
                 )
-                if other is None or other.cov[0, 0] > _FOUND_LOG**2:
+                if other is None:
                     continue
-                if _contradicts(float(np.log(begin)) + other.state[0], borne_out):
+                log_length = float(np.log(begin)) + other.state[0]
+                if _contradicts(log_length, borne_out):
+                    continue
+                if other.cov[0, 0] > _FOUND_LOG**2 and not _bears_out(log_length, borne_out):
                     continue
                 if fit is None or other.correlation > fit.correlation + lead:
                     fit, factor, cov = other, begin, loose
         return None if fit is None else (fit, factor, cov)
 
 
-def _contradicts(log_length: float, borne_out: float | None, limit_log: float = _LANDMARKS_LOG) -> bool:
+def _contradicts(log_length: float, borne_out: float | None) -> bool:
     """Whether a factor on the lengths is none that the landmarks on the road could bear out."""
-    return borne_out is not None and abs(log_length - float(np.log(borne_out))) > limit_log
+    return borne_out is not None and abs(log_length - float(np.log(borne_out))) > _LANDMARKS_LOG
+
+
+def _bears_out(log_length: float, borne_out: float | None) -> bool:
+    """Whether the landmarks on the road show that factor themselves."""
+    return borne_out is not None and abs(log_length - float(np.log(borne_out))) <= _AGREED_LOG
 
 
 def _bend_per_m(R_prev_curr: Floats, travelled_m: float) -> float:
