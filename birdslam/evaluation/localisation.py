@@ -38,7 +38,7 @@ MEASURED_KIND = "Car"
 # The paper's: Eq. 1 on the bottom of the box alone, on level ground as calibrated, and the point that it gives; within
 # 20 m the depth, where there is a network for it
 PAPER = FrontEndConfig(
-    localisation=LocalisationConfig(reach_rel=0.0),
+    localisation=LocalisationConfig(reach_rel=0.0, overhang_rel=0.0),
     ground_size=GroundSizeConfig(
         sigma_pitch_rad=1e-6,
         pitch_memory_s=1e-3,

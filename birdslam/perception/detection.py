@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.perception.boxes3d import Boxes3d
-from birdslam.perception.manifest import BoxSigma, DetectorTable, DrawnInside, Input, Misfit, Yolox
+from birdslam.perception.manifest import BoxSigma, DetectorTable, DrawnInside, Input, LowerEdge, Misfit, Yolox
 from birdslam.perception.views import View
 
 CUT_MARGIN = 0.015  # of a tile's width: a box that ends so near to a tile's inner edge is taken to go on behind it
@@ -31,7 +31,7 @@ class Detections:
     """Boxes (N, 4) x1, y1, x2, y2 in pixels of the undistorted image, scores (N,) in [0, 1] falling, labels.
 
     `boxes3d` holds a body for each box, where the network knows of bodies. `edge_sigma` says how sure their edges are;
-    None: the network does not say.
+    None: the network does not say. `lower_edge` is as of `manifest.DetectorTable`.
     """
 
     boxes_px: NDArray[np.float64]
@@ -39,6 +39,7 @@ class Detections:
     labels: tuple[str, ...]
     boxes3d: Boxes3d | None = None
     edge_sigma: EdgeSigma | None = None
+    lower_edge: LowerEdge = "body"
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -165,7 +166,8 @@ def merge_views(
     order = alive[np.argsort(-scores[alive], kind="stable")]
     labels = tuple(table.labels[int(c)] for c in classes[order])
     outlines = drawn_out(boxes[order], table.drawn_inside, views[0])
-    return Detections(outlines, scores[order], labels, edge_sigma=edge_sigma(table.box_sigma, views[0]))
+    sigma = edge_sigma(table.box_sigma, views[0])
+    return Detections(outlines, scores[order], labels, edge_sigma=sigma, lower_edge=table.lower_edge)
 
 
 def _grid(width_px: int, height_px: int, strides: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -23,6 +23,7 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 Variance = Annotated[float, msgspec.Meta(gt=0.0, le=10.0)]
 SigmaRel = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 BiasRel = Annotated[float, msgspec.Meta(ge=-0.3, le=0.3)]
+LowerEdge = Literal["body", "tyres"]  # see DetectorTable
 Scoring = Literal["none", "sigmoid", "softmax"]  # what makes scores in [0, 1] of a detector's numbers
 Sha256 = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
 
@@ -115,7 +116,8 @@ class DetectorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """What every detector's table has.
 
     A class without a label in `labels` is not reported. Labels that stand together in `rivals` suppress each other in
-    NMS as if they were one class (one vehicle is not both a car and a truck).
+    NMS as if they were one class (one vehicle is not both a car and a truck). `lower_edge` says where boxes of vehicles
+    end: with the cuboid around the body, as labels of KITTI do, or where the outline ends, which is at the tyres.
     """
 
     classes: Count
@@ -125,6 +127,7 @@ class DetectorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     rivals: tuple[tuple[Label, ...], ...] = ()
     box_sigma: BoxSigma | None = None  # None: localisation.sigma_box_rel and sigma_box_px of the configuration
     drawn_inside: DrawnInside = DrawnInside()
+    lower_edge: LowerEdge = "body"
 
     def __post_init__(self) -> None:
         for index in self.labels:
@@ -304,6 +307,7 @@ class MultiTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     lane_logit: float = 0.0
     box_sigma: BoxSigma = BoxSigma(rel=0.045, px=0.5)  # of the shipped one, on held-out worlds at two image sizes
     drawn_inside: DrawnInside = DrawnInside()
+    lower_edge: LowerEdge = "tyres"  # boxes of the built-in world are outlines of its meshes
     depth_sigma_rel: Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)] = 0.15  # 1-sigma of a pixel's depth, as a fraction
 
     def __post_init__(self) -> None:

@@ -126,7 +126,8 @@ class MultiTaskDecoder:
         labels = tuple(KINDS[k] if c == 0 else "person" for c, k in zip(classes[rows], kinds, strict=True))
         bodies = self._bodies(at[rows], cells[rows], view, focal_rel)
         outlines = drawn_out(boxes[rows], self.table.drawn_inside, view)
-        return Detections(outlines, scores[rows], labels, bodies, edge_sigma(self.table.box_sigma, view))
+        sigma = edge_sigma(self.table.box_sigma, view)
+        return Detections(outlines, scores[rows], labels, bodies, sigma, self.table.lower_edge)
 
     def _peaks(self, heat: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Class, row and column of the cells that are hotter than their neighbours, best first."""

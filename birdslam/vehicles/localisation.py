@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception.detection import EdgeSigma
+from birdslam.perception.manifest import LowerEdge
 
 
 class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -59,6 +60,8 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     # of the box's height, at the image's bottom: detectors draw a cut edge a little inside of it
     cut_margin_rel: float = 0.1
     cut_margin_side_rel: float = 0.05  # of the box's width, at the image's sides
+    overhang_rel: float = 0.2  # of the length: from a body's end to its next axle, by how vehicles are built
+    clearance_m: float = 0.2  # from the road to the body's lower edge, by how cars are built
     shape_floor_m: float = 0.05  # across the line of sight: vehicles are no cuboids
     max_above_road_rad: float = 0.06  # a box whose bottom lies so far above where its height puts it hangs in the air
     same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
@@ -93,6 +96,7 @@ class Observation(msgspec.Struct, frozen=True):
     dimensions: Dimensions
     sigma_cut: float | None = None  # of slope_bottom where the image cuts the bottom off: the true one is no less
     row: int = 0  # of its box among those that it was observed in
+    on_tyres: bool = False  # the bottom is that of the tyres, and not of the nearest face (tyre_contact.py)
 
     @property
     def bearing(self) -> float:
@@ -230,11 +234,12 @@ def observe_boxes(
     ground: GroundPlane,
     config: LocalisationConfig,
     edge_sigma: EdgeSigma | None = None,
+    lower_edge: LowerEdge = "body",
 ) -> list[Observation]:
     """Observations of the vehicles among the boxes (N, 4) with scores (N,), best score first.
 
     A box that hangs over the road or lies past `max_range_m` is no vehicle on it and is left out. `edge_sigma` is what
-    the detector states, None the configuration's.
+    the detector states, None the configuration's; `lower_edge` where its boxes end (`manifest.DetectorTable`).
     """
     vehicles = np.array([label in config.vehicles for label in labels], dtype=np.bool_).reshape(-1)
     sizes = boxes_px[:, 2:] - boxes_px[:, :2]
@@ -249,8 +254,9 @@ def observe_boxes(
     boxes = boxes_px[chosen]
     hidden = hidden_edges(boxes)
     slopes = _slopes(camera, ground, boxes)
+    sigma, on_tyres = edge_sigma or config.edge_sigma, lower_edge == "tyres"
     found = (
-        _observe(i, box, float(scores[i]), labels[i], camera, slope, edges, edge_sigma or config.edge_sigma, config)
+        _observe(i, box, float(scores[i]), labels[i], camera, slope, edges, sigma, on_tyres, config)
         for i, box, slope, edges in zip(chosen.tolist(), boxes.tolist(), slopes.tolist(), hidden.tolist(), strict=True)
     )
     return [seen for seen in found if _is_on_road(seen, ground, config)]
@@ -286,6 +292,7 @@ def _observe(
     slopes: list[float],
     hidden: list[bool],
     edge_sigma: EdgeSigma,
+    on_tyres: bool,
     config: LocalisationConfig,
 ) -> Observation:
     x1, y1, x2, y2 = box
@@ -320,6 +327,7 @@ def _observe(
         dimensions=config.vehicles[label],
         sigma_cut=sigma_px(height_px, of_bottom, False, False) / camera.fy_px if cut_bottom else None,
         row=row,
+        on_tyres=on_tyres,
     )
 
 

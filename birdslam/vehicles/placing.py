@@ -33,6 +33,7 @@ from birdslam.vehicles.localisation import (
 from birdslam.vehicles.parallax import LearnedSize, Parallax, ParallaxConfig
 from birdslam.vehicles.parallax_measurements import measure_boxes
 from birdslam.vehicles.track import Track
+from birdslam.vehicles.tyre_contact import at_face
 
 Floats = NDArray[np.float64]
 
@@ -119,6 +120,7 @@ class Placing:
 
     def locate(self, assignments: Sequence[Assignment], T_world_ego: SE2, ground_size: GroundSizeFilter) -> list[Place]:
         """In ego, one place for each assignment; `ground_size` learns the road's tilt and their sizes from all."""
+        assignments = self._with_faces(assignments, T_world_ego, ground_size.ground.height_m)
         expected = self._expected(assignments, T_world_ego)
         sizes = self._sizes_by_parallax(assignments, expected, T_world_ego, ground_size)
         depths = _depths_by_eq_1(assignments, expected, sizes, ground_size)
@@ -130,6 +132,15 @@ class Placing:
                 both, assumed=self._assumed(depths, k, a.serial, float(both.cov[0, 0] / one.cov[0, 0]))
             )
             for k, (both, one, a) in enumerate(zip(fused, by_eq_1, assignments, strict=True))
+        ]
+
+    def _with_faces(self, assignments: Sequence[Assignment], T_world_ego: SE2, height_m: float) -> list[Assignment]:
+        """Their boxes with the lower edges that the nearest faces have, where they end at the tyres."""
+        return [
+            replace(
+                a, observation=at_face(a.observation, a.yaw_rad(T_world_ego, self.heading), height_m, self.localisation)
+            )
+            for a in assignments
         ]
 
     def _expected(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> _Expected:

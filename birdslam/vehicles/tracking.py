@@ -84,6 +84,7 @@ class Tracker:
             ground_size.ground,
             self.localisation,
             detections.edge_sigma,
+            detections.lower_edge,
         )
         observations, by_depth = locate_by_depth(
             observations,

@@ -1,0 +1,117 @@
+"""Boxes that end at the tyres: Eq. 1 on their lower edge gives the tyre, and `at_face` the nearest face."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.geometry import bev
+from birdslam.geometry.se2 import SE2
+from birdslam.perception.manifest import LowerEdge
+from birdslam.vehicles.depth_fusion import PseudoLidarConfig
+from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.heading import HeadingConfig
+from birdslam.vehicles.localisation import (
+    DIMENSIONS,
+    Dimensions,
+    LocalisationConfig,
+    Observation,
+    corners_of,
+    observe_boxes,
+)
+from birdslam.vehicles.parallax import ParallaxConfig
+from birdslam.vehicles.placing import Assignment, Placing
+from birdslam.vehicles.tyre_contact import at_face
+from tests.test_frontend import CAMERA
+
+CONFIG = LocalisationConfig()
+CAR = DIMENSIONS["car"]
+ends = st.floats(4.0, 80.0)  # depth of the nearest face
+yaws = st.floats(-math.pi, math.pi)
+kinds = st.sampled_from(sorted(DIMENSIONS))
+heights = st.floats(1.0, 3.0)
+
+
+def seen(slope: float, dimensions: Dimensions = CAR, lower_edge: LowerEdge = "tyres") -> Observation:
+    """An observation with this slope of its lower edge."""
+    box = np.array([[600.0, 150.0, 700.0, 230.0]])
+    (found,) = observe_boxes(box, np.ones(1), ("car",), CAMERA, CAMERA.ground, CONFIG, None, lower_edge)
+    return msgspec.structs.replace(found, slope_bottom=slope, sigma_bottom=0.01 * slope, dimensions=dimensions)
+
+
+def lowest_slope(face_m: float, yaw_rad: float, dimensions: Dimensions, height_m: float) -> float:
+    """Of all that a body on four tyres shows: the lower edge of its nearest corner, and its nearest tyre's contact."""
+    axles = msgspec.structs.replace(dimensions, length_m=dimensions.length_m * (1.0 - 2.0 * CONFIG.overhang_rel))
+    reach_m, to_tyre_m = (-min(x for x, _ in corners_of(d, yaw_rad)) for d in (dimensions, axles))
+    bumper = (height_m - CONFIG.clearance_m) / face_m
+    return max(bumper, height_m / (face_m + reach_m - to_tyre_m))
+
+
+@given(ends, yaws, kinds, heights)
+def test_the_face_of_a_body_on_tyres_is_found_at_any_yaw(
+    face_m: float, yaw_rad: float, kind: str, height_m: float
+) -> None:
+    dimensions = DIMENSIONS[kind]
+    slope = lowest_slope(face_m, yaw_rad, dimensions, height_m)
+    found = at_face(seen(slope, dimensions), yaw_rad, height_m, CONFIG)
+    assert bev.meet_road(np.ones(1), np.array([found.slope_bottom]), height_m)[0] == pytest.approx(face_m, rel=1e-9)
+
+
+@given(ends, yaws, heights)
+def test_the_face_is_never_behind_the_tyre_and_never_more_than_the_overhang_before_it(
+    face_m: float, yaw_rad: float, height_m: float
+) -> None:
+    found = at_face(seen(height_m / face_m), yaw_rad, height_m, CONFIG)
+    nearer_m = face_m - height_m / found.slope_bottom
+    assert -1e-9 <= nearer_m <= CONFIG.overhang_rel * CAR.length_m + 1e-9
+
+
+@given(ends, yaws, heights)
+def test_the_sigma_goes_with_the_slope(face_m: float, yaw_rad: float, height_m: float) -> None:
+    slope, step = height_m / face_m, 1e-7
+    low, here, high = (at_face(seen(s), yaw_rad, height_m, CONFIG) for s in (slope - step, slope, slope + step))
+    derivative = (high.slope_bottom - low.slope_bottom) / (2.0 * step)
+    at_kink = abs(CONFIG.overhang_rel * CAR.length_m * abs(math.cos(yaw_rad)) * slope - CONFIG.clearance_m) < 1e-5
+    assert at_kink or here.sigma_bottom == pytest.approx(0.01 * slope * derivative, rel=1e-4)
+
+
+@given(ends, yaws)
+def test_a_box_of_the_body_stays_as_it_is(face_m: float, yaw_rad: float) -> None:
+    of_body = seen(CAMERA.height_m / face_m, lower_edge="body")
+    assert at_face(of_body, yaw_rad, CAMERA.height_m, CONFIG) is of_body
+
+
+@given(ends, yaws)
+def test_it_is_done_once(face_m: float, yaw_rad: float) -> None:
+    once = at_face(seen(CAMERA.height_m / face_m), yaw_rad, CAMERA.height_m, CONFIG)
+    assert at_face(once, yaw_rad, CAMERA.height_m, CONFIG) is once
+
+
+def test_a_lower_edge_over_the_horizon_stays_as_it_is() -> None:
+    above = seen(-0.01)
+    assert at_face(above, 0.0, CAMERA.height_m, CONFIG) is above
+
+
+def test_a_car_is_placed_alike_whether_its_box_ends_at_the_body_or_at_the_tyres() -> None:
+    face_m, found = 9.0, {}
+    for lower_edge in ("body", "tyres"):
+        ground_size = GroundSizeFilter(CAMERA, GroundSizeConfig())
+        placing = Placing(CONFIG, ParallaxConfig(), PseudoLidarConfig(), HeadingConfig())
+        height_m = CAMERA.height_m
+        observation = seen(height_m / face_m, lower_edge="body")
+        if lower_edge == "tyres":
+            observation = seen(lowest_slope(face_m, 0.0, CAR, height_m))
+        top = (height_m - CAR.height_m) / face_m
+        half = CAR.width_m / face_m / 2.0
+        observation = msgspec.structs.replace(
+            observation, slope_top=top, left=half, right=-half, sigma_bottom=0.002, sigma_top=0.002
+        )
+        assignment = Assignment(0, None, observation)
+        (found[lower_edge],) = placing.locate([assignment], SE2(), ground_size)
+    assert found["tyres"].depth_m == pytest.approx(found["body"].depth_m, rel=0.005)
+    assert found["body"].depth_m == pytest.approx(face_m, rel=0.02)
