@@ -34,6 +34,7 @@ from birdslam.vehicles.heading import HeadingConfig
 from birdslam.vehicles.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes, place
 from birdslam.vehicles.placing import Assignment
 from birdslam.vehicles.pseudolidar import localise_by_depth, places_of
+from birdslam.vehicles.tyre_contact import at_face
 
 if TYPE_CHECKING:
     from birdslam.rendered_world.truth import WorldFrame, WorldObject
@@ -170,6 +171,7 @@ def _count(
 
 def by_bottom(seen: Observation, ground: GroundPlane, config: LocalisationConfig, yaw_rad: float = 0.0) -> Place:
     """Eq. 1 on the bottom edge of the box of a vehicle with a yaw in ego; the noise of its edge and of the pitch."""
+    seen = at_face(seen, yaw_rad, ground.height_m, config)
     slope = max(seen.slope_bottom, 1e-3)
     sigma = math.hypot(seen.sigma_bottom, PITCH_ERROR_RAD) / slope
     return place(seen, math.log(ground.height_m / slope), sigma**2, yaw_rad, config)
@@ -191,6 +193,7 @@ def _observed(
         frame.camera.ground,
         LOCALISATION,
         edge_sigma,
+        "tyres",  # the world's boxes are outlines
     )
     rows = [o.row for o in seen]
     return seen, [truth[row] for row in rows], rows
