@@ -35,7 +35,7 @@ CLIPS = Path(__file__).parent / "roads"
 NAMES = ("motorway_20", "motorway_40", "ramp_20", "ramp_21_glare", "night_street", "night_motorway")
 # Where a few valid frames are off by more than a tenth still: of the street's motions beside what lies on the glass, of
 # the night's between its lamps. A rounding decides between none and four
-NOT_YET = ("night_street", "street+drops", "street+dirt", "street+reflection", "street+bonnet")
+NOT_YET = ("night_street", *(f"street+{effect}" for effect in EFFECTS))
 MOST_WRONG = 4  # of their motions, some 70 to 120 in all
 BEGIN_AT = (0, 2, 4)  # one start alone is luck: a rounding decides between 4 and 6 %
 FRAMES = 26
