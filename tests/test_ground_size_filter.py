@@ -15,6 +15,7 @@ from birdslam.vehicles.parallax import LearnedSize
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 CAR = DIMENSIONS["car"]
 LOCALISATION = LocalisationConfig()
+NO_OUTLIERS = np.zeros((1, 2))
 CONFIG = GroundSizeConfig(roof_reach_rel=1.0)  # the world here is made of cuboids
 
 
@@ -202,7 +203,7 @@ def test_a_size_that_is_learned_elsewhere_counts_in_the_depth_and_is_not_kept() 
 
     def again(weights: list[float], heights_m: list[float], sigma: float) -> tuple[float, float]:
         variances = np.full((1, len(weights)), sigma**2)
-        learned = LearnedSize(np.array([weights]), np.log([heights_m]), variances, np.zeros(1))
+        learned = LearnedSize(np.array([weights]), np.log([heights_m]), variances, np.zeros(1), NO_OUTLIERS)
         ground_size = copy.deepcopy(road.ground_size)
         found = ground_size.estimate_depths([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), learned)
         assert ground_size.size(0)[0] < 1.62
@@ -228,7 +229,9 @@ def test_a_size_that_is_learned_elsewhere_counts_in_the_depth_and_is_not_kept() 
 def test_a_box_that_widens_is_of_a_car_that_turns_or_of_one_that_comes_nearer(speed_mps: float) -> None:
     """What stands shows no other side but by the ego's way, so that its width counts; who drives may turn."""
     road = Road()
-    motion = LearnedSize(np.ones((1, 1)), np.full((1, 1), math.log(1.53)), np.full((1, 1), 1e6), np.full(1, speed_mps))
+    motion = LearnedSize(
+        np.ones((1, 1)), np.full((1, 1), math.log(1.53)), np.full((1, 1), 1e6), np.full(1, speed_mps), NO_OUTLIERS
+    )
     cuboid = road.box(30.0, 0.0, 1.53)
     for k in range(40):
         half_px = (cuboid[2] - cuboid[0]) / 2.0 * max(0.0, 0.025 * (k - 10))

@@ -33,6 +33,7 @@ def measured(at: np.ndarray, height_m: float, noise: np.ndarray) -> ParallaxMeas
         reach_m=np.array([REACH_M]),
         turned_rad=np.zeros(1),
         yaw_rad=np.zeros(1),
+        tan_width=np.exp(values[1:2]),
     )
 
 

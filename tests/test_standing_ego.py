@@ -38,7 +38,9 @@ def see(
     n, ground = len(boxes), ground_size.ground
     seen = [observe_boxes(b[None], np.ones(1), ("car",), CAMERA, ground, LOCALISATION)[0] for b in boxes]
     extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen]).reshape(-1, 2)
-    learned = LearnedSize(np.ones((n, 1)), np.zeros((n, 1)), np.full((n, 1), 1e6), np.full(n, speed_mps))
+    learned = LearnedSize(
+        np.ones((n, 1)), np.zeros((n, 1)), np.full((n, 1), 1e6), np.full(n, speed_mps), np.zeros((n, 2))
+    )
     depths = ground_size.estimate_depths(list(range(n)), seen, extents[:, 1], extents[:, 0], np.zeros(n), learned)
     return np.exp(depths.log_depth), np.sqrt(depths.variance)
 

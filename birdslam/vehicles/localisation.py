@@ -47,7 +47,7 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     vehicles: dict[str, Dimensions] = msgspec.field(default_factory=lambda: dict(DIMENSIONS))
     sigma_box_rel: float = 0.02  # 1-sigma of a box's edges as a fraction of its size, where its detector states none
-    sigma_box_px: float = 0.7  # and beside it
+    sigma_box_px: float = 0.4  # and beside it
     # By how much of itself the 1-sigma of edges grows as the score falls from `sure_score` to 0: boxes of YOLOX-nano,
     # vehicle-detection-adas-0002 and the shipped network on KITTI tracking 0005's images, and RRC's on 0001 to 0020,
     # err 1.5 to 2.5 times as much at scores of 0.4 to 0.6 as at 0.9
@@ -55,14 +55,14 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     sure_score: float = 0.9  # see sigma_growth
     reach_rel: float = 1.0  # of the way from the nearest face to the centre; the paper stays at the face (0)
     sigma_cut_rel: float = 1.0  # an edge cut by the image says nothing within the whole box
-    sigma_hidden_rel: float = 0.05  # an edge behind a nearer vehicle is the detector's guess
+    sigma_hidden_rel: float = 0.025  # an edge behind a nearer vehicle is the detector's guess
     cut_margin_px: float = 4.0  # an edge so near to the image's border counts as cut
     # of the box's height, at the image's bottom: detectors draw a cut edge a little inside of it
     cut_margin_rel: float = 0.1
     cut_margin_side_rel: float = 0.05  # of the box's width, at the image's sides
     overhang_rel: float = 0.2  # of the length: from a body's end to its next axle, by how vehicles are built
     clearance_m: float = 0.2  # from the road to the body's lower edge, by how cars are built
-    shape_floor_m: float = 0.05  # across the line of sight: vehicles are no cuboids
+    shape_floor_m: float = 0.02  # across the line of sight: vehicles are no cuboids
     max_above_road_rad: float = 0.06  # a box whose bottom lies so far above where its height puts it hangs in the air
     same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
     max_range_m: float = 100.0  # by the height of its class

@@ -35,6 +35,7 @@ class ParallaxMeasurements:
     reach_m: Floats
     turned_rad: Floats  # by how much the line of sight turned since last seen: another side shows
     yaw_rad: Floats  # of the vehicle in ego, as known
+    tan_width: Floats  # of the box, at a depth of 1
 
 
 def measure_boxes(
@@ -70,6 +71,7 @@ def measure_boxes(
         reach_m=extents_m[:, 0] / 2.0,
         turned_rad=turned_rad,
         yaw_rad=yaw_rad,
+        tan_width=np.array([o.tan_width for o in seen]),
     )
 
 

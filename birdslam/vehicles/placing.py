@@ -123,6 +123,7 @@ class Placing:
         assignments = self._with_faces(assignments, T_world_ego, ground_size.ground.height_m)
         expected = self._expected(assignments, T_world_ego)
         sizes = self._sizes_by_parallax(assignments, expected, T_world_ego, ground_size)
+        assignments = self._with_doubtful_sides(assignments, sizes)
         depths = _depths_by_eq_1(assignments, expected, sizes, ground_size)
         by_eq_1 = self._places_at(depths, assignments, expected.yaw_rad)
         # The two sources of Fig. 2 become one
@@ -171,6 +172,18 @@ class Placing:
         )
         serials = [a.serial for a in assignments]
         return self.parallax.learn_sizes(serials, boxes, T_world_ego, height_m)
+
+    def _with_doubtful_sides(self, assignments: Sequence[Assignment], sizes: LearnedSize) -> list[Assignment]:
+        """Their boxes with wider sigmas of the sides that are off by far in all likelihood."""
+        off_rel = self.parallax.config.sigma_side_outlier_rel * np.sqrt(sizes.side_outlier)
+        out = []
+        for a, (left_rel, right_rel) in zip(assignments, off_rel.tolist(), strict=True):
+            seen = a.observation
+            sigma_left = math.hypot(seen.sigma_left, left_rel * seen.tan_width)
+            sigma_right = math.hypot(seen.sigma_right, right_rel * seen.tan_width)
+            doubtful = msgspec.structs.replace(seen, sigma_left=sigma_left, sigma_right=sigma_right)
+            out.append(replace(a, observation=doubtful))
+        return out
 
     def _places_at(self, depths: Depths, assignments: Sequence[Assignment], yaws_rad: Sequence[float]) -> list[Place]:
         """The places at these depths, with the uncertainty of the depths and of the yaws."""

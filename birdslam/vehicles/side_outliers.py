@@ -1,0 +1,73 @@
+"""A Kalman update by boxes, any of which may have one side that is off by far.
+
+Detectors end a box where a tree, a pole or a wall hides the rest of the vehicle, or draw it around two that stand side
+by side. Such a side tells of a narrower or wider vehicle at another bearing: taken as it is, the vehicle has moved. So
+each box comes of one of three: no side is an outlier, the left, or the right. An outlier's error moves width and
+bearing together, so that its noise is of rank one, u u', and each case follows from the first by Sherman and Morrison:
+
+    (S + u u')^-1 = S^-1 - S^-1 u u' S^-1 / (1 + u' S^-1 u),    det(S + u u') = det(S) (1 + u' S^-1 u)
+
+Their mixture becomes one normal distribution again, with its mean and its covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_LEAST_SHARE = 1e-300
+
+
+@dataclass(frozen=True)
+class SideUpdate:
+    """Of N boxes and F filters with D states each: `step` (N, F, D) to the mean, `cov` (N, F, D, D) after it.
+
+    `log_likelihood` (N, F) less a constant; `outlier` (2, N, F): the probabilities that the left, the right is one.
+    """
+
+    step: Floats
+    cov: Floats
+    log_likelihood: Floats
+    outlier: Floats
+
+
+def update(P: Floats, J: Floats, noise: Floats, innovation: Floats, off: Floats, share: Floats) -> SideUpdate:
+    """P (N, F, D, D), J (N, F, M, D), noise (N, F, M, M) and innovation (N, F, M) of boxes without outliers.
+
+    `off` (2, N, F, M): by how much an outlier of the left, the right side moves the measurements, 1-sigma.
+    `share` (2, N): the probabilities beforehand that the left, the right is an outlier.
+    """
+    PJt = P @ J.swapaxes(-1, -2)
+    S = J @ PJt + noise
+    information = np.linalg.inv(S)
+    weighted = (information @ innovation[..., None])[..., 0]
+    plain = -0.5 * ((innovation * weighted).sum(axis=-1) + np.log(np.linalg.det(S)))
+
+    of_off = np.einsum("nfab,snfb->snfa", information, off)  # S^-1 u
+    grown = 1.0 + np.einsum("snfa,snfa->snf", off, of_off)  # 1 + u' S^-1 u
+    misfit = np.einsum("snfa,nfa->snf", of_off, innovation)
+    log_share = np.log(np.maximum(np.concatenate([1.0 - share.sum(axis=0, keepdims=True), share]), _LEAST_SHARE))
+    cases = np.concatenate([plain[None], plain - 0.5 * (np.log(grown) - np.square(misfit) / grown)])
+    cases += log_share[..., None]
+    likeliest = cases.max(axis=0)
+    probability = np.exp(cases - likeliest)
+    total = probability.sum(axis=0)
+    outlier = probability[1:] / total
+
+    gain_off = np.moveaxis((PJt @ of_off[..., None])[..., 0], 0, -1)  # (N, F, D, 2)
+    outlier_last, pulled = np.moveaxis(outlier, 0, -1), np.moveaxis(misfit / grown, 0, -1)
+    # Each case steps by -pulled gain_off beside the step without outliers, and is less certain by gain_off^2 / grown
+    step = -(gain_off @ (outlier_last * pulled)[..., None])[..., 0]
+    spread = outlier_last * (np.square(pulled) + 1.0 / np.moveaxis(grown, 0, -1))
+    cov = P - PJt @ information @ PJt.swapaxes(-1, -2)
+    cov += (gain_off * spread[..., None, :]) @ gain_off.swapaxes(-1, -2) - step[..., :, None] * step[..., None, :]
+    return SideUpdate(
+        step=(PJt @ weighted[..., None])[..., 0] + step,
+        cov=(cov + cov.swapaxes(-1, -2)) / 2.0,
+        log_likelihood=likeliest + np.log(total),
+        outlier=outlier,
+    )
