@@ -120,6 +120,28 @@ def test_restarts_of_the_optimizer(tmp_path: Path, with_checkpoint: bool) -> Non
     assert verdict.epochs == (1 if with_checkpoint else 2)
 
 
+def test_measurements_of_a_frame_that_was_told_before_the_restart_enter_the_restored_graph_without_a_word(
+    tmp_path: Path,
+) -> None:
+    """Its frame was coasted over, and the measurements came as the optimizer was dead."""
+    tape, frames = Tape(tmp_path), measured(40)
+    for measurements in frames[:20]:
+        tape.step(measurements)
+    tape.coast(tape.frame(frames[20]))
+    tape.send(frames[20])
+    tape.restart(with_checkpoint=True)
+    tape.coast(tape.frame(frames[21]))
+    assert Status.GRAPH_RESTORED in tape.estimates[-1].status
+    tape.take(tape.send(frames[21]))
+    for measurements in frames[22:]:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    verdict = verdict_of(tape)
+    assert verdict.same, verdict.difference
+    assert verdict.equal == len(tape.estimates)
+    assert (verdict.restarts, verdict.epochs, verdict.unanswered) == (1, 1, 1)
+
+
 def test_a_restart_that_took_longer_than_perceive_keeps_measurements(tmp_path: Path) -> None:
     """The checkpoint is whole, but nothing ties it to the oldest of them: a new world, and nothing was restored."""
     tape, frames = Tape(tmp_path), measured(60)

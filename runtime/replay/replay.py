@@ -6,7 +6,8 @@ from the clock. What a recording can leave open, it is held to one by one, and t
 
 - measurements that no estimate answers: the optimizer never had them, or its estimate was lost on its way here;
 - a restart of the optimizer (the recording has it come alive again): in a new epoch, or from its last checkpoint, from
-  which on it was given all measurements, or none before those that begin a new epoch.
+  which on it was given all measurements, or none before those that begin a new epoch. Those of frames that had been
+  told of by coasting enter the restored graph without a word.
 
 Where measurements are missing that the optimizer had, its graph is not known any more: nothing is compared until a new
 epoch begins, and that is counted. A file that begins in the middle of a drive, since the recorder died, has in it the
@@ -15,6 +16,7 @@ graph of one frame, from which on it is compared. `estimates` is the same with a
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -89,6 +91,7 @@ class Comparison:
         self._checkpoint = _checkpoint(recording)
         self._since: list[Measurements] = []  # after it, for the first estimate that can be compared
         self._epoch: int | None = None
+        self._told_frame = -1
 
     def run(self) -> Verdict:
         """Raises RecordingError where the recording holds something that is no record."""
@@ -143,7 +146,10 @@ class Comparison:
             self.verdict.epochs += estimate.epoch != self._epoch
             self._epoch = estimate.epoch
             if not by_measurements:
-                self._replay(estimate, message.data, [], None)
+                taken = self._replay(estimate, message.data, self._told_before(estimate), None)
+                for _ in range(taken):
+                    self._measurements.popleft()
+                self.verdict.unanswered += taken
             elif place is None:  # the optimizer had measurements that the recording has not
                 self._state = None
                 self.verdict.unknown += 1
@@ -151,11 +157,13 @@ class Comparison:
                 given = [_record(self._measurements.popleft().data, Measurements) for _ in range(place + 1)]
                 self.verdict.unanswered += place
                 self._replay(estimate, message.data, given[:-1], given[-1])
+            self._told_frame = max(self._told_frame, estimate.frame_id)
 
-    def _replay(
-        self, estimate: Estimate, data: bytes, open_: list[Measurements], answered: Measurements | None
-    ) -> None:
-        """One estimate by each of the ways in which it may have come about; shown is the last, where none gives it."""
+    def _replay(self, estimate: Estimate, data: bytes, open_: list[Measurements], answered: Measurements | None) -> int:
+        """One estimate by each of the ways in which it may have come about; shown is the last, where none gives it.
+
+        Returns how many of the measurements `open_` it rests on.
+        """
         likeliest: Estimate | None = None
         for state, given, restarted in self._ways(estimate, open_, answered):
             replayed = self._through(state, given, estimate)
@@ -168,11 +176,19 @@ class Comparison:
                 self.verdict.equal += 1
                 self.verdict.coasted += answered is None
                 self.verdict.restarts += restarted
-                return
+                return len(given) - (answered is not None)
         if likeliest is None:
             self.verdict.unknown += 1
         else:
             self.verdict.difference = Difference(estimate.frame_id, differing(estimate, likeliest))
+        return 0
+
+    def _told_before(self, estimate: Estimate) -> list[Measurements]:
+        """The next measurements, of frames that were told of already: a restored graph may have them."""
+        if self._state is None or Status.GRAPH_RESTORED not in estimate.status:
+            return []
+        waiting = (_record(message.data, Measurements) for message in self._measurements)
+        return list(itertools.takewhile(lambda m: m.frame_id <= self._told_frame, waiting))
 
     def _ways(
         self, estimate: Estimate, open_: list[Measurements], answered: Measurements | None
@@ -196,10 +212,10 @@ class Comparison:
             yield self._fresh(estimate), now, True
             yield self._copy(), now, True  # from its checkpoint, which nothing ties to what perceive still had
         if came_again and Status.GRAPH_RESTORED in estimate.status:
-            for last in (self._state.last, None):
+            for last, given in itertools.product((self._state.last, None), ([*open_, *now], now)):
                 restored = self._copy()
                 restored.last, restored.untold = last, (Status.GRAPH_RESTORED,)
-                yield restored, [*open_, *now], True
+                yield restored, given, True
         if open_:
             yield self._copy(), now, False
         yield self._state, [*open_, *now], False
