@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Protocol, cast, get_args
@@ -38,6 +39,7 @@ from birdslam.perception.multitask import OUTPUTS, MultiTaskDecoder
 from birdslam.perception.onnx_file import has_weights_elsewhere
 from birdslam.perception.segmentation import ClassMapsDecoder
 from birdslam.perception.unread_outputs import without_outputs
+from birdslam.perception.verge import without_verge
 from birdslam.perception.views import Preparation, View, make_views
 
 
@@ -182,8 +184,14 @@ class Network:
             if not bound.infer():
                 return None
             parts.append(self.decoder.read(bound.tensors, view))
-        found = self.decoder.merge(parts, views)
-        return Findings(**{self._finding: found}) if self._finding else cast(Findings, found)
+        merged = self.decoder.merge(parts, views)
+        found = Findings(**{self._finding: merged}) if self._finding else cast(Findings, merged)
+        masks = found.segmentation
+        return (
+            found
+            if masks is None
+            else replace(found, segmentation=replace(masks, road=without_verge(masks.road, image)))
+        )
 
     def answer(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
         """The outputs as they are for an image's first view."""
