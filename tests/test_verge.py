@@ -49,6 +49,12 @@ def test_so_it_does_in_a_grey_image_and_at_night() -> None:
     assert (without_verge(mask(), street((0.1, 0.1, 0.1))) == mask()).all()
 
 
+def test_red_bricks_in_the_mask_make_no_grey_road_green() -> None:
+    image, road = street(), mask(VERGE_PX - SHRINK)
+    image[HORIZON_PX:, :130] = (60, 60, 110)
+    assert (without_verge(road, image) == road).all()
+
+
 def test_a_leaf_on_the_road_is_no_verge() -> None:
     image, road = street(), mask(VERGE_PX - SHRINK)
     image[HORIZON_PX + 40 : HORIZON_PX + 44, 100:104] = GRASS

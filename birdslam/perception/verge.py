@@ -6,7 +6,8 @@ plane, would see little else. Excess green (Woebbecke et al. 1995) tells the two
 
     2 g - r - b,    r, g, b = R / (R + G + B), G / (R + G + B), B / (R + G + B)
 
-It counts from the road's own level, so that neither the camera's white balance nor the light's colour matters.
+It counts from the road's own level where that is green itself, by the camera's white balance or by the light, else from
+grey.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def without_verge(road: NDArray[np.bool_], image: NDArray[np.uint8]) -> NDArray[
     if len(seen) < LEAST_PIXELS:
         return road
     at = int(ROAD_SHARE * len(seen))
-    level = np.partition(seen, at)[at]
+    level = max(float(np.partition(seen, at)[at]), 0.0)  # red bricks and cars in a mask make no grey road green
     # A pixel that stands alone is a leaf on the road, or a marking's fringe
     grass = cv2.medianBlur((told & (excess > level + LEAST_EXCESS)).view(np.uint8), 3)
     out = road.copy()
