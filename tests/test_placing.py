@@ -15,7 +15,7 @@ from birdslam.vehicles.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.ground_size_filter import Depths, GroundSizeConfig, GroundSizeFilter
 from birdslam.vehicles.heading import HeadingConfig
 from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes
-from birdslam.vehicles.parallax import ParallaxConfig
+from birdslam.vehicles.parallax_config import ParallaxConfig
 from birdslam.vehicles.placing import Assignment, Placing, no_farther_than_cut
 from tests.test_frontend import CAMERA
 

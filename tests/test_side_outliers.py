@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.parallax import Parallax, ParallaxConfig
+from birdslam.vehicles.parallax import Parallax
+from birdslam.vehicles.parallax_config import ParallaxConfig
 from birdslam.vehicles.parallax_measurements import ParallaxMeasurements
 from birdslam.vehicles.side_outliers import update
 
@@ -39,7 +40,8 @@ def kalman(P: Floats, J: Floats, noise: Floats, innovation: Floats) -> tuple[Flo
 @given(st.integers(0, 2**32 - 1))
 def test_without_outliers_it_is_kalmans_update(seed: int) -> None:
     P, J, noise, innovation, off = problem(seed)
-    after = update(P, J, noise, innovation, off, np.zeros((2, N)))
+    PJt = P @ J.swapaxes(-1, -2)
+    after = update(P, PJt, J @ PJt + noise, innovation, off, np.zeros((2, N)))
     for n, f in np.ndindex(N, FILTERS):
         step, cov, log_likelihood = kalman(P[n, f], J[n, f], noise[n, f], innovation[n, f])
         np.testing.assert_allclose(after.step[n, f], step, rtol=1e-6, atol=1e-8)
@@ -51,7 +53,8 @@ def test_without_outliers_it_is_kalmans_update(seed: int) -> None:
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 0.3))
 def test_it_is_the_mixture_of_its_three_cases(seed: int, share: float) -> None:
     P, J, noise, innovation, off = problem(seed)
-    after = update(P, J, noise, innovation, off, np.full((2, N), share))
+    PJt = P @ J.swapaxes(-1, -2)
+    after = update(P, PJt, J @ PJt + noise, innovation, off, np.full((2, N), share))
     for n, f in np.ndindex(N, FILTERS):
         more = [np.zeros((CUES, CUES)), *(np.outer(u, u) for u in off[:, n, f])]
         steps, covs, logs = zip(

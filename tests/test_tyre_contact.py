@@ -24,7 +24,7 @@ from birdslam.vehicles.localisation import (
     corners_of,
     observe_boxes,
 )
-from birdslam.vehicles.parallax import ParallaxConfig
+from birdslam.vehicles.parallax_config import ParallaxConfig
 from birdslam.vehicles.placing import Assignment, Placing
 from birdslam.vehicles.tyre_contact import at_face
 from tests.test_frontend import CAMERA

@@ -187,11 +187,9 @@ class Network:
         merged = self.decoder.merge(parts, views)
         found = Findings(**{self._finding: merged}) if self._finding else cast(Findings, merged)
         masks = found.segmentation
-        return (
-            found
-            if masks is None
-            else replace(found, segmentation=replace(masks, road=without_verge(masks.road, image)))
-        )
+        if masks is None:
+            return found
+        return replace(found, segmentation=replace(masks, road=without_verge(masks.road, image)))
 
     def answer(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
         """The outputs as they are for an image's first view."""

@@ -33,15 +33,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
+from birdslam.vehicles.parallax_config import ParallaxConfig
 from birdslam.vehicles.parallax_measurements import (
-    BEARING,
     BELOW,
     BY_HEIGHT,
     BY_WIDTH,
@@ -58,6 +56,7 @@ from birdslam.vehicles.parallax_measurements import (
     X,
     Y,
     linearised,
+    side_off,
 )
 from birdslam.vehicles.side_outliers import update
 
@@ -72,50 +71,6 @@ UNKNOWN = 1e6  # variance of a size on which motion says nothing, and of what is
 DEPTH_UNKNOWN = 1.0  # 1-sigma at birth, as a fraction
 MOST_OUTLIERS = 0.45  # probability beforehand of one side
 LEAST_WEIGHT = 1e-9  # of a filter: one that was ruled out may come back
-
-
-class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How vehicles move and stop, and how long a detector errs alike.
-
-    What is said of their road (tilt, kerb, bank, its width) and of moving across was chosen among two to four values
-    each on KITTI tracking 0001, 0005 and 0020 by RRC's boxes, and on 0005's images by YOLOX-nano's.
-    """
-
-    standing: float = 0.3  # of the vehicles, when first seen; those that drive are the rest
-    unusual: float = 0.03  # that stand and are of no usual size
-    creeping: float = 0.3  # of the vehicles, when first seen: slowly, along their heading
-    crossing: float = 0.05  # of the vehicles, when first seen: they drive in any direction
-    sigma_unusual_rel: float = 0.3  # of their height
-    sigma_creep_mps: float = 2.0  # 1-sigma of a creeping vehicle's velocity
-    sigma_drive_mps: float = 10.0  # 1-sigma of a driving vehicle's velocity
-    road_half_width_m: float = 10.0  # what moves farther aside than that may do so in any direction
-    sigma_across_rel: float = 0.1  # of it across the vehicle's heading, as a fraction
-    sigma_across_mps: float = 0.3  # and beside it
-    stands_for_s: float = 60.0  # on average, until it starts to creep
-    creeps_for_s: float = 10.0  # until it stops, or drives
-    drives_for_s: float = 20.0  # until it creeps
-    change_mps: float = 2.0  # 1-sigma by which the velocity of a vehicle that moves changes within a second
-    change_across_mps: float = 0.5  # the same across its heading
-    outline_drift_rel: float = 0.03  # of the outline's width, in a second: the yaw is not known as well
-    box_memory_s: float = 0.5  # a box errs in the next frame as in this: this time counts as one box
-    view_memory_s: float = 1.5  # and so does, for longer, what is taken for the nearest face
-    sigma_scale_rel: float = 0.02  # of the odometry's metres
-    sigma_tilt_rad: float = 0.004  # of the road at a vehicle against the ego's
-    tilt_memory_s: float = 5.0  # how long that lasts
-    sigma_kerb_m: float = 0.06  # how far the road under a vehicle in the ego's lane lies off the ego's plane
-    sigma_crown_rad: float = 0.007  # and the more the farther it stands to the side
-    sigma_bank_per_m: float = 0.001  # and more, by the square of that: what stands far aside is on another road
-    sigma_face_m: float = 1.0  # edges of a box lie not all at its nearest face, and on others as it turns
-    path_half_width_m: float = 1.75  # of the ego's path: half a lane
-    # Of the left sides of boxes, and of the right: hidden, or a neighbour's (side_outliers.py). Of the sides of KITTI
-    # tracking 0005's cars by YOLOX-nano, vehicle-detection-adas-0002 and the shipped network 0.031, 0.025 and 0.055 lie
-    # 15 % of the width or more inside of the label's hull; by RRC 0.002 of those of 0000 to 0020
-    side_outlier: Annotated[float, msgspec.Meta(ge=0.0, le=0.3)] = 0.03
-    # How long one lasts: of those of YOLOX-nano, vehicle-detection-adas-0002 and the shipped network on KITTI tracking
-    # 0005's images 0.46, 0.53 and 0.69 are there 0.1 s later
-    side_outlier_memory_s: Annotated[float, msgspec.Meta(gt=0.0)] = 0.15
-    sigma_side_outlier_rel: float = 0.3  # of the box's width; those that lie so far off: 0.31, 0.21, 0.25 (RMS)
-    gate_sigma: float = 3.0  # past it of all filters a measurement is an outlier: its noise is raised
 
 
 @dataclass(frozen=True)
@@ -262,9 +217,12 @@ class Parallax:
         )
         of_face = np.square(config.sigma_face_m / boxes.depth_m)
 
-        noise = self._noise(boxes, innovation, J @ P @ J.swapaxes(-1, -2), of_box, of_face * of_view)
+        PJt = P @ J.swapaxes(-1, -2)
+        S = J @ PJt
+        S = S + self._noise(boxes, innovation, S, of_box, of_face * of_view)
+        off = side_off(boxes, innovation, config.sigma_side_outlier_rel * np.sqrt(of_box))
         share = np.minimum(config.side_outlier + self._side_outlier[rows], MOST_OUTLIERS).T
-        after = update(P, J, noise, innovation, self._off(boxes, innovation, of_box), share)
+        after = update(P, PJt, S, innovation, off, share)
         self._x[rows] = x + after.step
         self._P[rows] = after.cov
 
@@ -278,18 +236,6 @@ class Parallax:
         side_outlier = (after.outlier[..., : len(WAYS)] * weight).sum(axis=-1).T
         self._side_outlier[rows] = side_outlier
         return self._learned(rows, of_face + config.sigma_scale_rel**2, in_path, side_outlier)
-
-    def _off(self, boxes: ParallaxMeasurements, innovation: Floats, of_box: Floats) -> Floats:
-        """(2, N, FILTERS, 4): by how much an outlier of the left, the right side moves the measurements, 1-sigma.
-
-        A box that lost the share h of its width w has it in log less by -log(1 - h), and its centre moved by h w / 2:
-        half of that times the geometric mean of both widths, seen and expected, which is right to h^3 / 24.
-        """
-        off = np.zeros((2, *innovation.shape))
-        off[..., BY_WIDTH] = self.config.sigma_side_outlier_rel * np.sqrt(of_box)[:, None]
-        width = boxes.tan_width[:, None] * np.exp(-innovation[..., BY_WIDTH] / 2.0)
-        off[..., BEARING] = off[..., BY_WIDTH] * width / 2.0 * np.array([1.0, -1.0])[:, None, None]
-        return off
 
     def _noise(
         self, boxes: ParallaxMeasurements, innovation: Floats, S: Floats, of_box: Floats, face_var: Floats

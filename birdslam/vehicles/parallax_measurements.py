@@ -96,3 +96,17 @@ def linearised(x: Floats, boxes: ParallaxMeasurements, T_world_ego: SE2, height_
     log_z = np.log(depth)
     expected = np.stack([x[..., HEIGHT] - log_z, x[..., WIDTH] - log_z, at[..., 1] / ahead, np.log(slope)], axis=-1)
     return seen - expected, J
+
+
+def side_off(boxes: ParallaxMeasurements, innovation: Floats, sigma_rel: Floats) -> Floats:
+    """(2, N, K, 4): by how much an outlier of the left, the right side moves the measurements, 1-sigma.
+
+    `innovation` (N, K, 4) is that of the boxes, `sigma_rel` (N,) the outlier's as a share of the width. A box that lost
+    the share h of its width w has it in log less by -log(1 - h), and its centre moved by h w / 2: half of that times
+    the geometric mean of both widths, seen and expected, which is right to h^3 / 24.
+    """
+    off = np.zeros((2, *innovation.shape))
+    off[..., BY_WIDTH] = sigma_rel[:, None]
+    width = boxes.tan_width[:, None] * np.exp(-innovation[..., BY_WIDTH] / 2.0)
+    off[..., BEARING] = off[..., BY_WIDTH] * width / 2.0 * np.array([1.0, -1.0])[:, None, None]
+    return off

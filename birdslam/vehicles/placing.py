@@ -30,7 +30,8 @@ from birdslam.vehicles.localisation import (
     extent_m,
     place,
 )
-from birdslam.vehicles.parallax import LearnedSize, Parallax, ParallaxConfig
+from birdslam.vehicles.parallax import LearnedSize, Parallax
+from birdslam.vehicles.parallax_config import ParallaxConfig
 from birdslam.vehicles.parallax_measurements import measure_boxes
 from birdslam.vehicles.track import Track
 from birdslam.vehicles.tyre_contact import at_face

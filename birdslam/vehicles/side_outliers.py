@@ -35,14 +35,12 @@ class SideUpdate:
     outlier: Floats
 
 
-def update(P: Floats, J: Floats, noise: Floats, innovation: Floats, off: Floats, share: Floats) -> SideUpdate:
-    """P (N, F, D, D), J (N, F, M, D), noise (N, F, M, M) and innovation (N, F, M) of boxes without outliers.
+def update(P: Floats, PJt: Floats, S: Floats, innovation: Floats, off: Floats, share: Floats) -> SideUpdate:
+    """From P (N, F, D, D), P J' (N, F, D, M), and the innovations (N, F, M) of boxes without outliers with their cov S.
 
     `off` (2, N, F, M): by how much an outlier of the left, the right side moves the measurements, 1-sigma.
     `share` (2, N): the probabilities beforehand that the left, the right is an outlier.
     """
-    PJt = P @ J.swapaxes(-1, -2)
-    S = J @ PJt + noise
     information = np.linalg.inv(S)
     weighted = (information @ innovation[..., None])[..., 0]
     plain = -0.5 * ((innovation * weighted).sum(axis=-1) + np.log(np.linalg.det(S)))
