@@ -47,7 +47,7 @@ fuzz: setup
 
 # Every fault on a running vehicle: docs/faults.md
 faults: setup
-	$(BIN)/python -m perf.faults --models $(MODELS) --markdown docs/faults.md
+	$(BIN)/python -m perf faults --models $(MODELS) --markdown docs/faults.md
 
 # The budgets of the running system, on a machine that does nothing else
 onroad: setup
@@ -59,10 +59,10 @@ perf: setup
 
 # The shipped networks from their seed, on the built-in world alone: hours on four cores; what was begun goes on
 train: $(TRAIN_VENV)/.ready
-	$(TRAIN_VENV)/bin/python -m birdslam.runtime.training.train --output out/train
-	$(TRAIN_VENV)/bin/python -m birdslam.runtime.training.quantise out/train/multitask.onnx
-	$(TRAIN_VENV)/bin/python -m birdslam.runtime.training.train_lanes
-	$(TRAIN_VENV)/bin/python -m birdslam.runtime.training.train_pointnet --output out/train/pointnet --ship
+	$(TRAIN_VENV)/bin/python -m birdslam.runtime.world.train --output out/train
+	$(TRAIN_VENV)/bin/python -m birdslam.runtime.world.quantise out/train/multitask.onnx
+	$(TRAIN_VENV)/bin/python -m birdslam.runtime.world.train_lanes
+	$(TRAIN_VENV)/bin/python -m birdslam.runtime.world.train_pointnet --output out/train/pointnet --ship
 	cp out/train/multitask.onnx out/train/multitask.toml out/train/multitask_int8.onnx out/train/multitask_int8.toml birdslam/perception/shipped/
 
 $(TRAIN_VENV)/.ready: pyproject.toml

@@ -17,17 +17,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the same names, for editors and mypy; a test holds them to `_MODULES`
-    from birdslam.datasets.camera_file import load_camera as load_camera
-    from birdslam.datasets.opening import open_recording as open_recording
-    from birdslam.datasets.recording import DatasetError as DatasetError
-    from birdslam.datasets.recording import Recording as Recording
-    from birdslam.evaluation.results import Recorder as Recorder
     from birdslam.frontend import FrontEnd as FrontEnd
     from birdslam.geometry.camera import Camera as Camera
     from birdslam.geometry.camera import Undistorter as Undistorter
     from birdslam.geometry.se2 import SE2 as SE2
     from birdslam.graph.pose_graph import PoseGraph as PoseGraph
     from birdslam.graph.weights import WeightsConfig as WeightsConfig
+    from birdslam.outputs.drive_files import Recorder as Recorder
     from birdslam.perception.manifest import ModelError as ModelError
     from birdslam.perception.network import ModelSpec as ModelSpec
     from birdslam.perception.schedule import Networks as Networks
@@ -35,6 +31,10 @@ if TYPE_CHECKING:  # the same names, for editors and mypy; a test holds them to 
     from birdslam.perception.shipped import shipped_networks as shipped_networks
     from birdslam.slam import BirdSLAM as BirdSLAM
     from birdslam.slam import SlamConfig as SlamConfig
+    from birdslam.sources.camera_file import load_camera as load_camera
+    from birdslam.sources.opening import open_recording as open_recording
+    from birdslam.sources.recording import DatasetError as DatasetError
+    from birdslam.sources.recording import Recording as Recording
     from birdslam.types import Estimate as Estimate
     from birdslam.types import Frame as Frame
     from birdslam.types import MapUpdate as MapUpdate
@@ -47,7 +47,7 @@ if TYPE_CHECKING:  # the same names, for editors and mypy; a test holds them to 
 _MODULES = {
     "BirdSLAM": "birdslam.slam",
     "Camera": "birdslam.geometry.camera",
-    "DatasetError": "birdslam.datasets.recording",
+    "DatasetError": "birdslam.sources.recording",
     "Estimate": "birdslam.types",
     "Frame": "birdslam.types",
     "FrontEnd": "birdslam.frontend",
@@ -57,8 +57,8 @@ _MODULES = {
     "ModelSpec": "birdslam.perception.network",
     "Networks": "birdslam.perception.schedule",
     "PoseGraph": "birdslam.graph.pose_graph",
-    "Recorder": "birdslam.evaluation.results",
-    "Recording": "birdslam.datasets.recording",
+    "Recorder": "birdslam.outputs.drive_files",
+    "Recording": "birdslam.sources.recording",
     "SE2": "birdslam.geometry.se2",
     "SlamConfig": "birdslam.slam",
     "SpeedReading": "birdslam.types",
@@ -67,9 +67,9 @@ _MODULES = {
     "Undistorter": "birdslam.geometry.camera",
     "VehicleEstimate": "birdslam.types",
     "WeightsConfig": "birdslam.graph.weights",
-    "load_camera": "birdslam.datasets.camera_file",
+    "load_camera": "birdslam.sources.camera_file",
     "load_networks": "birdslam.perception.shipped",
-    "open_recording": "birdslam.datasets.opening",
+    "open_recording": "birdslam.sources.opening",
     "shipped_networks": "birdslam.perception.shipped",
 }
 __all__ = sorted(_MODULES)

@@ -34,11 +34,11 @@ from birdslam.types import (
     VehicleEdge,
 )
 from birdslam.vehicles.camera_height import HeightWatch, HeightWatchConfig
-from birdslam.vehicles.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
-from birdslam.vehicles.localisation import LocalisationConfig
 from birdslam.vehicles.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
-from birdslam.vehicles.pseudolidar import FrustumNetwork
+from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
+from birdslam.vehicles.placement.localisation import LocalisationConfig
+from birdslam.vehicles.placement.pseudolidar import FrustumNetwork
+from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 from birdslam.vehicles.vehicle_edges import vehicle_edges

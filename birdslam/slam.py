@@ -13,7 +13,7 @@ from birdslam.mapping.lane_mapper import LaneHead
 from birdslam.perception import Networks, shipped_networks
 from birdslam.perception.completion import shipped_completion
 from birdslam.types import Estimate, Frame, MapUpdate, Measurements
-from birdslam.vehicles.pseudolidar import FrustumNetwork
+from birdslam.vehicles.placement.pseudolidar import FrustumNetwork
 
 LANES_HZ = 5.0  # that lanes are made out anew, where nothing else is said (`[perceive.schedule]`)
 

@@ -11,13 +11,23 @@ from birdslam import perf
 from birdslam.runtime.environment import ENVIRONMENT, INTERRUPTED_STATUS, USER_ERROR_STATUS
 
 
+def benchmark_modules() -> dict[str, str]:
+    """The full name of each module in the folders of the suite, by its own; benchmarks are those with a `label`."""
+    return {
+        module.name: f"{perf.__name__}.{folder.name}.{module.name}"
+        for folder in pkgutil.iter_modules(perf.__path__)
+        if folder.ispkg
+        for module in pkgutil.iter_modules([os.path.join(perf.__path__[0], folder.name)])
+    }
+
+
 def main(arguments: list[str]) -> int:
     os.environ.update(ENVIRONMENT)  # before numpy is loaded: computes as the nodes do
     from birdslam.perf.errors import PerfError  # and what loads numpy only now
 
-    names = [module.name for module in pkgutil.iter_modules(perf.__path__) if module.name[0] != "_"]
+    names = benchmark_modules()
     wanted = arguments[:1] if arguments and arguments[0] in names else names  # one that is named needs no other
-    modules = [importlib.import_module(f"{perf.__name__}.{name}") for name in wanted]
+    modules = [importlib.import_module(names[name]) for name in wanted]
     benchmarks = {module.__name__.rpartition(".")[2]: module for module in modules if hasattr(module, "label")}
     if arguments and arguments[0] in benchmarks:
         try:

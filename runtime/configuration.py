@@ -15,12 +15,10 @@ from typing import Annotated, Any
 
 import msgspec
 
-from birdslam.datasets.camera_file import load_camera
-from birdslam.datasets.recording import DatasetError
 from birdslam.geometry.camera import Camera
 from birdslam.mapping.atlas import AtlasConfig
 from birdslam.perception import ModelError, ModelSpec
-from birdslam.runtime import model_store
+from birdslam.runtime.models import store as model_store
 from birdslam.runtime.sections import (
     BudgetsConfig,
     DegradationConfig,
@@ -38,6 +36,8 @@ from birdslam.runtime.sections import (
     VehicleName,
 )
 from birdslam.slam import SlamConfig
+from birdslam.sources.camera_file import load_camera
+from birdslam.sources.recording import DatasetError
 
 __all__ = [
     "FILE_SCHEMES",

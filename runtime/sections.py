@@ -139,7 +139,7 @@ class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Processes, memory and time limits."""
 
     runtime_dir: str = ""  # sockets, locks and vitals; "": the user's own (runtime/transport/presence.py)
-    models_dir: str = ""  # installed networks; "": the user's own (runtime/model_store.py)
+    models_dir: str = ""  # installed networks; "": the user's own (runtime/models/store.py)
     ring_slots: Annotated[int, msgspec.Meta(ge=2, le=64)] = 8  # frames in shared memory
     in_flight_frames: PositiveInt = 4  # frames between capture and the estimate at rate "max"
     ready_timeout_s: Positive = 60.0  # for a node to load, warm up and find its peers

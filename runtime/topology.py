@@ -69,7 +69,7 @@ PROCESSES = {**NODES, RECORDER.name: RECORDER}  # the recorder is there only whe
 TOPICS = {
     topic.name: topic
     for topic in (
-        # As many as a frame bears (datasets/speed_log.py): what does not fit in no frame would have had
+        # As many as a frame bears (sources/speed_log.py): what does not fit in no frame would have had
         Topic("speed", SpeedReading, CAR.name, depth=200, pace="as often as the car says it, 20 to 100 times a second"),
         Topic("frame", FrameRef, "capture", depth=1, hot=True),
         # A lost one breaks the chain of edges: a few are queued, and an optimizer that begins anew asks for the last

@@ -26,10 +26,6 @@ import msgspec
 import numpy as np
 import zenoh
 
-from birdslam.datasets.camera_file import load_camera
-from birdslam.datasets.kitti import read_image, read_projection, read_times
-from birdslam.datasets.recording import DatasetError
-from birdslam.datasets.speed_file import read_speeds
 from birdslam.geometry.camera import Camera
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.perception.manifest import Manifest, ModelError
@@ -41,6 +37,10 @@ from birdslam.runtime.transport.bus import Subscriber
 from birdslam.runtime.transport.ring import FrameError, FrameReader, FrameRing
 from birdslam.runtime.wire import MAX_TRACE_BYTES, Trace, WireError, decode, encode
 from birdslam.slam import SlamConfig
+from birdslam.sources.camera_file import load_camera
+from birdslam.sources.kitti import read_image, read_projection, read_times
+from birdslam.sources.recording import DatasetError
+from birdslam.sources.speed_file import read_speeds
 from birdslam.types import INVALIDATING, FrameRef, Measurements
 from tests.mutations import Chance, mutated, mutated_text, with_other_fields
 from tests.test_wire import BY_NAME, EXAMPLES

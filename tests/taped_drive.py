@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.configuration import Configuration, RuntimeConfig
 from birdslam.runtime.nodes.capture import stamps
@@ -20,7 +21,6 @@ from birdslam.runtime.recording.recording import Alive, RecordingWriter
 from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.transport.presence import runtime_dir_of
 from birdslam.runtime.wire import Stage, Trace
-from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
 
 DISK_S = 20.0

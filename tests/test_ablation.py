@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from birdslam.evaluation import ablation
-from birdslam.evaluation.tracking import PAPER, Live, ours
+from birdslam.bench.simulation.drive import DriveConfig, drive
+from birdslam.bench.tracking import ablation
+from birdslam.bench.tracking.benchmark import PAPER, Live, ours
 from birdslam.graph.pose_graph import PoseGraph
-from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.slam import SlamConfig
 
 Floats = NDArray[np.float64]

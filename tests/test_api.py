@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import birdslam
-from birdslam.datasets.demo import DIRECTORY
-from birdslam.datasets.opening import open_recording
-from birdslam.datasets.recording import RecordedFrame, Recording
 from birdslam.runtime.configuration import Configuration, complete
 from birdslam.runtime.nodes.inference import Inference
+from birdslam.sources.opening import open_recording
+from birdslam.sources.recording import RecordedFrame, Recording
+from birdslam.sources.shipped_drive import DIRECTORY
 from birdslam.types import Estimate, Frame, Measurements
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "docs" / "examples"

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.mapping.atlas import Atlas, AtlasConfig
 from birdslam.queries import MapSnapshot, Trajectory
-from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.types import Estimate, MapUpdate, VehicleEstimate
 
 SMALL = AtlasConfig(key_poses=32, octaves=4, vehicles=3, vehicle_poses=8, map_cells=50, map_octaves=3)

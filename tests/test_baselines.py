@@ -9,13 +9,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.baselines import batch_se3, cubeslam, nair, namdev
-from birdslam.baselines.posegraph3 import solve_batch
-from birdslam.baselines.trajectories import LiveTrajectories, Trajectories, dead_reckoned
+from birdslam.bench.baselines import batch_se3, cubeslam, nair, namdev
+from birdslam.bench.baselines.posegraph3 import solve_batch
+from birdslam.bench.baselines.trajectories import LiveTrajectories, Trajectories, dead_reckoned
+from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.perf import incremental
-from birdslam.simulation.drive import Drive, DriveConfig, drive
+from birdslam.perf.latency import incremental
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65)

@@ -11,11 +11,11 @@ import msgspec
 import pytest
 from test_batch import contents, kitti, made
 
-from birdslam.datasets.recording import DatasetError
 from birdslam.runtime.batch.drive import DRIVES, Job, run_drive
 from birdslam.runtime.batch.drives import find_drives
 from birdslam.runtime.batch.fetch import at_hand
 from birdslam.runtime.cli.main import main
+from birdslam.sources.recording import DatasetError
 
 DRIVES_OF_ALL, FRAMES = 6, 150
 

@@ -7,9 +7,9 @@ import pytest
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
-from birdslam.odometry.beyond_road import BeyondRoad, BeyondRoadConfig
-from birdslam.odometry.road_points import is_night, outside
-from birdslam.odometry.sliding_window import SlidingWindow
+from birdslam.odometry.corners.below_plane import BeyondRoad, BeyondRoadConfig
+from birdslam.odometry.corners.sliding_window import SlidingWindow
+from birdslam.odometry.road.points import is_night, outside
 
 CAMERA = Camera(640, 192, 371.2, 371.2, 319.5, 90.0, height_m=1.65)
 LEVEL = GroundPlane(CAMERA.height_m)

@@ -12,9 +12,9 @@ from birdslam.geometry.camera import Camera
 from birdslam.perception import Boxes3d, Detections, Findings, Networks
 from birdslam.perception.body_overlap import with_bodies
 from birdslam.perception.manifest import Schedule
-from birdslam.vehicles.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.localisation import LocalisationConfig, observe_boxes
-from birdslam.vehicles.pseudolidar import bodies_by_detector
+from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
+from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
+from birdslam.vehicles.placement.pseudolidar import bodies_by_detector
 
 CAMERA = Camera(1242, 375, 720.0, 720.0, 620.0, 180.0, height_m=1.65)
 IMAGE = np.zeros((2, 2), np.uint8)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from birdslam.perception import Detections, ModelError, ModelSpec, load_network
-from birdslam.perception.box_lists import BoxListDecoder, SsdDecoder
+from birdslam.perception.decoding.box_lists import BoxListDecoder, SsdDecoder
 from birdslam.perception.manifest import BoxList, Input, Ssd, Stretch
 from birdslam.perception.views import make_views
 

@@ -18,14 +18,14 @@ from hypothesis import strategies as st
 from birdslam.calibration.calibration import CalibrationConfig, CalibrationError, _by_road, _Seen, calibrate
 from birdslam.calibration.height_check import VehicleHeightConfig, solve_mounting
 from birdslam.calibration.intrinsics import from_chessboard, read_intrinsics
-from birdslam.datasets.camera_file import camera_text, load_camera
-from birdslam.datasets.recording import DatasetError
-from birdslam.datasets.speed_file import read_speed_curve
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
-from birdslam.odometry.road_fit import RoadFit
+from birdslam.odometry.road.fit import RoadFit
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.main import main
+from birdslam.sources.camera_file import camera_text, load_camera
+from birdslam.sources.recording import DatasetError
+from birdslam.sources.speed_file import read_speed_curve
 from birdslam.types import Frame
 from birdslam.vehicles.camera_height import BoxHeight
 from tests.test_odometry import CAMERA, PITCH_RAD, render, street

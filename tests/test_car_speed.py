@@ -13,13 +13,13 @@ from test_odometry import CAMERA, NO_BOXES, path_m, render, street
 
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.se2 import SE2
-from birdslam.odometry.car_scale import CarScale
-from birdslam.odometry.car_speed import CarSpeed, CarSpeedConfig
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry, OdometryConfig
 from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
-from birdslam.odometry.road_filter import CAR_DELAY, CAR_FACTOR, STATES, RoadFilter, RoadScaleConfig
-from birdslam.odometry.road_fit import RoadFit
+from birdslam.odometry.road.fit import RoadFit
+from birdslam.odometry.road.kalman_filter import CAR_DELAY, CAR_FACTOR, STATES, RoadFilter, RoadScaleConfig
+from birdslam.odometry.speed.readings import CarSpeed, CarSpeedConfig
+from birdslam.odometry.speed.scale import CarScale
 from birdslam.types import INVALIDATING, NS_PER_S, EgoEdge, Measurements, SpeedReading, SpeedSource, Status
 
 Speed = Callable[[float], float]

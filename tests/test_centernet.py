@@ -10,8 +10,8 @@ import tiny_networks as tiny
 from numpy.typing import NDArray
 
 from birdslam.perception import ModelError, ModelSpec, load_network
-from birdslam.perception.centernet import CenterNetDecoder
-from birdslam.perception.detection import EdgeSigma
+from birdslam.perception.decoding.centernet import CenterNetDecoder
+from birdslam.perception.decoding.detection import EdgeSigma
 from birdslam.perception.manifest import CenterNet, FitPad, Input, Stretch, Tiles
 from birdslam.perception.views import make_views
 

@@ -8,9 +8,9 @@ import pytest
 
 from birdslam.perception import ModelSpec
 from birdslam.runtime.cli.main import main
-from birdslam.runtime.cli.options import configuration_of
 from birdslam.runtime.cli.parser import build_parser
 from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.options import configuration_of
 
 NOWHERE = "kitti:/nowhere/at/all"
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from birdslam.baselines.posegraph3 import BatchConfig, optimise_batch
-from birdslam.evaluation.completed_lanes import of_kind, with_completed_lanes
+from birdslam.bench.baselines.posegraph3 import BatchConfig, optimise_batch
+from birdslam.bench.tracking.completed_lanes import of_kind, with_completed_lanes
 from birdslam.geometry.se2 import SE2
 from birdslam.types import EgoEdge, LandmarkEdge, LandmarkKind, LanePoint, Measurements
 

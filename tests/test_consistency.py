@@ -11,16 +11,16 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from birdslam.baselines.batch_se2 import Solution, ego_key, solve, vehicle_key
+from birdslam.bench.baselines.batch_se2 import Solution, ego_key, solve, vehicle_key
+from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
-from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
-from birdslam.odometry.road_fit import RoadFit
-from birdslam.simulation.drive import Drive, DriveConfig, drive
+from birdslam.odometry.road.fit import RoadFit
+from birdslam.odometry.road.kalman_filter import RoadFilter, RoadScaleConfig
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
 
 Floats = NDArray[np.float64]

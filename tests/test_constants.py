@@ -10,13 +10,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.evaluation.leave_one_out import left_out, score
-from birdslam.evaluation.localisation import CarError
+from birdslam.bench.simulation.odometry import OdometryNoise
+from birdslam.bench.tracking.leave_one_out import left_out, score
+from birdslam.bench.tracking.localisation import CarError
 from birdslam.frontend import FrontEndConfig
-from birdslam.runtime.cli import configuration_page
-from birdslam.runtime.cli.evaluate_localisation import _sweep
 from birdslam.runtime.configuration import Configuration, ConfigurationError
-from birdslam.simulation.odometry import OdometryNoise
+from birdslam.runtime.evaluation.localisation import _sweep
+from birdslam.runtime.pages import configuration as configuration_page
 from birdslam.slam import SlamConfig
 
 PAGE = Path(__file__).parent.parent / "docs" / "constants.md"

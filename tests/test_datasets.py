@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from birdslam.datasets.camera_file import load_camera
-from birdslam.datasets.kitti import KittiRecording
-from birdslam.datasets.opening import open_recording
-from birdslam.datasets.recording import DatasetError, RecordedFrame, Recording
 from birdslam.geometry.camera import Camera
+from birdslam.sources.camera_file import load_camera
+from birdslam.sources.kitti import KittiRecording
+from birdslam.sources.opening import open_recording
+from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.trajectory import kitti_row
 
 WIDTH, HEIGHT = 64, 32

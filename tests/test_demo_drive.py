@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from birdslam.datasets.demo import COLUMNS, DIRECTORY, DemoRecording, write_drive
-from birdslam.datasets.opening import open_recording
-from birdslam.datasets.recording import DatasetError
 from birdslam.geometry import bev
 from birdslam.geometry.camera import GroundPlane
 from birdslam.runtime.configuration import load
 from birdslam.runtime.nodes.sources import open_source
+from birdslam.sources.opening import open_recording
+from birdslam.sources.recording import DatasetError
+from birdslam.sources.shipped_drive import COLUMNS, DIRECTORY, DemoRecording, write_drive
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_a_body_keeps_its_number_and_its_size(demo: DemoRecording) -> None:
 def test_it_is_read_without_the_renderer() -> None:
     code = (
         "import sys; sys.modules['numba'] = sys.modules['torch'] = None\n"
-        "from birdslam.datasets.opening import open_recording\n"
+        "from birdslam.sources.opening import open_recording\n"
         "assert next(open_recording('demo').frames()).image is not None"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=600)

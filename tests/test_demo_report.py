@@ -10,15 +10,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.datasets.demo import DemoRecording
-from birdslam.datasets.opening import open_recording
-from birdslam.evaluation.demo import VEHICLES, DemoGrade, grade, match, mount_pose_of, true_egos
-from birdslam.evaluation.video import SideBySide
+from birdslam.bench.tracking.shipped_drive import VEHICLES, DemoGrade, grade, match, mount_pose_of, true_egos
 from birdslam.geometry.se2 import SE2
+from birdslam.outputs.drive_video import SideBySide
 from birdslam.runtime.configuration import load
 from birdslam.runtime.supervision.demo_report import DemoReport, rows
 from birdslam.runtime.supervision.final_results import FinalResults
 from birdslam.runtime.supervision.final_results import rows as final_rows
+from birdslam.sources.opening import open_recording
+from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.trajectory import as_poses, inverse, split_pose
 from birdslam.types import IN_SIGHT_NS, Estimate, VehicleEstimate
 

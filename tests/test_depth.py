@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.perception import ModelError, ModelSpec, load_network
-from birdslam.perception.depth import DepthMap
+from birdslam.perception.decoding.depth import DepthMap
 from birdslam.perception.manifest import Disparity, MetricDepth
 
 INPUT = """

@@ -15,13 +15,14 @@ import pytest
 import yaml
 from msgspec.structs import replace
 
-from birdslam.evaluation.tracking import Row
-from birdslam.perf import faults, results
-from birdslam.perf.strikes import FAULTS
-from birdslam.runtime.cli import configuration_page
+from birdslam.bench.tracking.benchmark import Row
+from birdslam.perf.reporting import results
+from birdslam.perf.robustness import faults
+from birdslam.perf.robustness.strikes import FAULTS
 from birdslam.runtime.cli.main import main
-from birdslam.runtime.cli.pages import comments
 from birdslam.runtime.configuration import Configuration, ConfigurationError, load
+from birdslam.runtime.pages import configuration as configuration_page
+from birdslam.runtime.pages.tables import comments
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.evaluation.consistency import CERTAIN_M, Consistency
+from birdslam.bench.ego.consistency import CERTAIN_M, Consistency
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import ego_pose, inverse, mount_pose

@@ -14,11 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from birdslam.datasets.kitti import KittiRecording
-from birdslam.datasets.opening import open_recording
-from birdslam.datasets.recording import RecordedFrame, Recording
-from birdslam.evaluation.car_ahead import CarAhead, lidar_distance_m, near_face_m
-from birdslam.evaluation.odometry import (
+from birdslam.bench.ego.car_ahead import CarAhead, lidar_distance_m, near_face_m
+from birdslam.bench.ego.trajectory_errors import (
     GROUND_AXES,
     ate_aligned_m,
     ate_m,
@@ -32,9 +29,12 @@ from birdslam.evaluation.odometry import (
     segment_errors,
     standing_drift_m,
 )
-from birdslam.evaluation.results import ResultsError
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
+from birdslam.outputs.drive_files import ResultsError
+from birdslam.sources.kitti import KittiRecording
+from birdslam.sources.opening import open_recording
+from birdslam.sources.recording import RecordedFrame, Recording
 from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
 from birdslam.types import Attitude, Estimate, Ground, MapUpdate, Measurements, Status, VehicleEdge, VehicleEstimate
 

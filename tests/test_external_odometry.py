@@ -10,9 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.datasets.odometry_file import check_odometry, read_odometry
-from birdslam.datasets.opening import open_recording
-from birdslam.datasets.recording import DatasetError
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
@@ -26,6 +23,9 @@ from birdslam.perception import Perception, Ready
 from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig
 from birdslam.runtime.nodes.ego_motion import external_odometry
 from birdslam.runtime.nodes.sources import open_source
+from birdslam.sources.odometry_file import check_odometry, read_odometry
+from birdslam.sources.opening import open_recording
+from birdslam.sources.recording import DatasetError
 from birdslam.trajectory import ego_pose, inverse, kitti_row, mount_pose, tum_row
 from birdslam.types import NS_PER_S, Attitude, Estimate, Frame, Status
 

@@ -1,4 +1,4 @@
-"""A vehicle under faults: perf/faults.py has them; a short form here, the whole by `make faults`."""
+"""A vehicle under faults: perf/robustness/faults.py has them; a short form here, the whole by `make faults`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from birdslam.perf.faults import inflict, markdown, survived
-from birdslam.perf.faulty_vehicle import Vehicle, model_options, record_options
-from birdslam.perf.strikes import FAULTS
+from birdslam.perf.robustness.faults import inflict, markdown, survived
+from birdslam.perf.robustness.faulty_vehicle import Vehicle, model_options, record_options
+from birdslam.perf.robustness.strikes import FAULTS
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.presence import ring_path
 

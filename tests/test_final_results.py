@@ -13,14 +13,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.evaluation.final import FinalTracks, last_seen
-from birdslam.evaluation.results import Recorder, ResultsError
-from birdslam.evaluation.tracking import Final, ours
-from birdslam.evaluation.video import DriveVideo, SideBySide, check_video
+from birdslam.bench.tracking.benchmark import Final, ours
 from birdslam.geometry.camera import Camera
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
+from birdslam.outputs.drive_files import Recorder, ResultsError
+from birdslam.outputs.drive_video import DriveVideo, SideBySide, check_video
+from birdslam.outputs.final_trajectories import FinalTracks, last_seen
 from birdslam.runtime.cli import replay
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.cli.parser import build_parser
@@ -299,7 +299,7 @@ def test_a_video_that_cannot_be_is_named_before_anything_starts(
         assert reason in error
         assert error.count("\n") == 1
         assert not (tmp_path / "out").exists()
-    monkeypatch.setattr("birdslam.evaluation.video.CODEC", "none")
+    monkeypatch.setattr("birdslam.outputs.drive_video.CODEC", "none")
     with pytest.raises(ResultsError, match="can't write none"):
         check_video(tmp_path / "v.mp4", CAMERA, 10.0)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "is.mp4"]

@@ -10,8 +10,8 @@ import cv2
 import msgspec
 import pytest
 
-from birdslam.perf import foxglove
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting import foxglove
 from birdslam.runtime.recording.foxglove import schema
 from birdslam.runtime.recording.recording import JSON_CHANNELS, Recording
 from tests.test_pipeline import call

@@ -18,17 +18,17 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from birdslam.baselines.posegraph3 import BatchConfig
+from birdslam.bench.baselines.posegraph3 import BatchConfig
+from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.factors import sum_of_points
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
-from birdslam.perf import incremental, optimizer
 from birdslam.perf.__main__ import main as perf_main
-from birdslam.perf.optimizer import CONTENDERS
-from birdslam.simulation.drive import Drive, DriveConfig, drive
+from birdslam.perf.latency import incremental, optimizer
+from birdslam.perf.latency.optimizer import CONTENDERS
 from birdslam.types import EgoEdge, Estimate, LanePoint, Measurements, Status
 
 Floats = NDArray[np.float64]
@@ -505,7 +505,7 @@ REPLAY = """
 import hashlib, msgspec
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
-from birdslam.simulation.drive import DriveConfig, drive
+from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.graph.weights import WeightsConfig
 graph = PoseGraph(GraphConfig(), WeightsConfig(leave_out=()))
 world = drive(DriveConfig(frames=150, outliers=0.05, drop=0.1), seed=17)

@@ -8,9 +8,15 @@ import pytest
 
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
-from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, extent_m, observe_boxes
-from birdslam.vehicles.parallax import LearnedSize
+from birdslam.vehicles.placement.localisation import (
+    DIMENSIONS,
+    LocalisationConfig,
+    Observation,
+    extent_m,
+    observe_boxes,
+)
+from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.parallax import LearnedSize
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 CAR = DIMENSIONS["car"]

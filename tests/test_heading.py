@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from birdslam.evaluation.localisation import INSIDE_2_SIGMA
+from birdslam.bench.tracking.localisation import INSIDE_2_SIGMA
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera
-from birdslam.vehicles.heading import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
-from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes, place
+from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes, place
+from birdslam.vehicles.state.heading import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
 
 Floats = NDArray[np.float64]
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.runtime.cli import doctor, doctor_costs
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import (
     BudgetsConfig,
@@ -32,6 +31,8 @@ from birdslam.runtime.configuration import (
     complete,
     load,
 )
+from birdslam.runtime.doctor import checks as doctor
+from birdslam.runtime.doctor import costs as doctor_costs
 from birdslam.runtime.environment import ENVIRONMENT
 from birdslam.runtime.latency import Recent
 from birdslam.runtime.nodes.meter import PERIOD_NS, Meter

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from birdslam.geometry.pose import Pose, rotation_exp
-from birdslam.odometry.held_speed import HeldSpeed, HeldSpeedConfig, worst_sigma_m
 from birdslam.odometry.motion import Motion
+from birdslam.odometry.speed.constant_velocity import HeldSpeed, HeldSpeedConfig, worst_sigma_m
 from birdslam.types import INVALIDATING, Status
 from tests.test_odometry import CAMERA, drive, street
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from birdslam.perf.faulty_vehicle import Vehicle
-from birdslam.runtime.cli.interface import page
+from birdslam.perf.robustness.faulty_vehicle import Vehicle
 from birdslam.runtime.cli.main import main
+from birdslam.runtime.pages.interface import page
 from birdslam.runtime.topology import QUERIES, TOPICS
 from birdslam.runtime.transport.presence import socket_path
 from birdslam.types import INVALIDATING, Status

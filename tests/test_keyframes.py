@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from birdslam.geometry.pose import Pose
-from birdslam.odometry.keyframes import KeyframeConfig, KeyframeWindow
+from birdslam.odometry.corners.keyframes import KeyframeConfig, KeyframeWindow
+from birdslam.odometry.corners.relative_pose import locate
+from birdslam.odometry.corners.sliding_window import common
 from birdslam.odometry.median import quantile
-from birdslam.odometry.relative_pose import locate
-from birdslam.odometry.road_filter import RoadScaleConfig
-from birdslam.odometry.sliding_window import common
+from birdslam.odometry.road.kalman_filter import RoadScaleConfig
 
 Floats = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from birdslam.evaluation.lane_picture import draw_lanes
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.lane_view import lane_view
 from birdslam.mapping.lanes import BOUNDARY, AmodalLanes, Grids, LanesConfig
+from birdslam.outputs.lane_picture import draw_lanes
 from birdslam.runtime.cli.main import main
 
 CONFIG = LanesConfig()

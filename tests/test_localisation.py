@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.localisation import (
+from birdslam.vehicles.placement.localisation import (
     DIMENSIONS,
     LocalisationConfig,
     Observation,

@@ -6,9 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
-from birdslam.datasets.label_projection import Label
-from birdslam.evaluation.localisation import (
+from birdslam.bench.tracking.localisation import (
     INSIDE_1_SIGMA,
     INSIDE_2_SIGMA,
     PAPER,
@@ -21,6 +19,8 @@ from birdslam.evaluation.localisation import (
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections
+from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
+from birdslam.sources.label_projection import Label
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 HEIGHT_M, WIDTH_M, LENGTH_M = 1.5, 1.6, 4.0

@@ -15,7 +15,7 @@ from onnx import TensorProto
 
 from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
 from birdslam.perception.manifest_file import find_manifest, read_manifest
-from birdslam.perception.subnormal import without_tiny_weights
+from birdslam.perception.onnx_files.subnormal import without_tiny_weights
 from tests.tiny_networks import DETECTOR, SEGMENTER
 
 

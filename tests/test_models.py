@@ -19,14 +19,14 @@ from onnx.external_data_helper import set_external_data
 
 from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
 from birdslam.perception.manifest_file import read_manifest
-from birdslam.perception.onnx_file import has_weights_elsewhere
-from birdslam.runtime import model_store
-from birdslam.runtime.cli import catalogue as catalogue_module
-from birdslam.runtime.cli.download import DownloadError, download
+from birdslam.perception.onnx_files.onnx_file import has_weights_elsewhere
 from birdslam.runtime.cli.main import main
-from birdslam.runtime.cli.options import configuration_of
 from birdslam.runtime.cli.parser import build_parser
 from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.models import catalogue as catalogue_module
+from birdslam.runtime.models import store as model_store
+from birdslam.runtime.models.download import DownloadError, download
+from birdslam.runtime.options import configuration_of
 from tests.tiny_networks import DETECTOR, SEGMENTER
 
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.evaluation import truth_quality
-from birdslam.evaluation.motion_consistency import MotionConsistencyReport, Motions
+from birdslam.bench.ego import truth_quality
+from birdslam.bench.ego.motion_consistency import MotionConsistencyReport, Motions
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import ego_pose, inverse, mount_pose

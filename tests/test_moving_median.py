@@ -9,16 +9,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.evaluation.localisation import PAPER as PAPER_FRONT_END
-from birdslam.evaluation.tracking import PAPER
+from birdslam.bench.tracking.benchmark import PAPER
+from birdslam.bench.tracking.localisation import PAPER as PAPER_FRONT_END
 from birdslam.geometry.camera import AXES_EGO_CAM, Camera
 from birdslam.geometry.pose import Pose
+from birdslam.odometry.corners.sliding_window import SlidingWindow
 from birdslam.odometry.metric_scale import RoadView
-from birdslam.odometry.moving_median import MedianScale
 from birdslam.odometry.odometry import Odometry, OdometryConfig
-from birdslam.odometry.road_filter import RoadScaleConfig
-from birdslam.odometry.road_scale import RoadScale
-from birdslam.odometry.sliding_window import SlidingWindow
+from birdslam.odometry.road.kalman_filter import RoadScaleConfig
+from birdslam.odometry.road.moving_median import MedianScale
+from birdslam.odometry.road.scale import RoadScale
 from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.types import Status
 

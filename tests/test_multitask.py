@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.perception import Detections, Findings, ModelSpec, Networks, Segmentation, load_network
-from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, Misfit, MultiTask, Schedule, Stretch
-from birdslam.perception.multitask import (
+from birdslam.perception.decoding.multitask import (
     BODY_CHANNELS,
     CANONICAL_FOCAL,
     CLASSES,
@@ -28,16 +27,17 @@ from birdslam.perception.multitask import (
     MultiTaskDecoder,
     body_slices,
 )
-from birdslam.perception.unread_outputs import without_outputs
+from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, Misfit, MultiTask, Schedule, Stretch
+from birdslam.perception.onnx_files.unread_outputs import without_outputs
 from birdslam.perception.views import make_views
-from birdslam.rendered_world.truth import CLASSES as SURFACES
-from birdslam.rendered_world.truth import WorldFrame, WorldObject
-from birdslam.training.augmentation import AugmentationConfig
-from birdslam.training.grading import Grades, average_precision, best_score, extents
-from birdslam.training.stream import StreamConfig, examples
-from birdslam.training.targets import COLUMN, Example, TargetsConfig, Window, encode
-from birdslam.training.validation import validate
 from birdslam.types import Status
+from birdslam.world.training.augmentation import AugmentationConfig
+from birdslam.world.training.grading import Grades, average_precision, best_score, extents
+from birdslam.world.training.stream import StreamConfig, examples
+from birdslam.world.training.targets import COLUMN, Example, TargetsConfig, Window, encode
+from birdslam.world.training.validation import validate
+from birdslam.world.truth import CLASSES as SURFACES
+from birdslam.world.truth import WorldFrame, WorldObject
 
 WIDTH, HEIGHT, CELL = 320, 96, 4
 BODY = body_slices()
@@ -491,9 +491,9 @@ needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reas
 def test_the_perfect_answer_costs_least() -> None:
     import torch
 
-    from birdslam.training.losses import LossConfig, loss
-    from birdslam.training.stream import stack
-    from birdslam.training.trainer import as_batch, as_tensors
+    from birdslam.world.training.losses import LossConfig, loss
+    from birdslam.world.training.stream import stack
+    from birdslam.world.training.trainer import as_batch, as_tensors
 
     cam = camera()
     example = encode(world(cam, vehicle(cam, SE2(12.0, 1.0, 0.4))), WHOLE, WIDTH, HEIGHT, TargetsConfig())
@@ -508,8 +508,8 @@ def test_the_perfect_answer_costs_least() -> None:
 
 @needs_torch
 def test_steps_of_training_learn() -> None:
-    from birdslam.training.stream import examples as stream
-    from birdslam.training.trainer import Trainer, TrainerConfig, as_tensors
+    from birdslam.world.training.stream import examples as stream
+    from birdslam.world.training.trainer import Trainer, TrainerConfig, as_tensors
 
     config = StreamConfig(width_px=WIDTH, height_px=HEIGHT, batch=2, looks=100)
     cam = camera()
@@ -523,8 +523,8 @@ def test_steps_of_training_learn() -> None:
 def test_a_network_that_sees_further_begins_as_the_one_before_it() -> None:
     import torch
 
-    from birdslam.training.network import NetworkConfig
-    from birdslam.training.trainer import Trainer, TrainerConfig
+    from birdslam.world.training.network import NetworkConfig
+    from birdslam.world.training.trainer import Trainer, TrainerConfig
 
     torch.manual_seed(5)
     before = Trainer(TrainerConfig(network=NetworkConfig(context=0)), half=False)
@@ -544,7 +544,7 @@ def test_a_network_that_sees_further_begins_as_the_one_before_it() -> None:
 def test_borders_are_added_to_what_a_network_said_without_them() -> None:
     import torch
 
-    from birdslam.training.trainer import Trainer, TrainerConfig
+    from birdslam.world.training.trainer import Trainer, TrainerConfig
 
     torch.manual_seed(6)
     coarse, trainer = Trainer(TrainerConfig(), half=False), Trainer(TrainerConfig(), half=False)
@@ -564,8 +564,8 @@ def test_borders_are_added_to_what_a_network_said_without_them() -> None:
 def test_of_several_networks_one_begins_with_the_mean_of_their_weights() -> None:
     import torch
 
-    from birdslam.training.network import NetworkConfig
-    from birdslam.training.trainer import Trainer, TrainerConfig
+    from birdslam.world.training.network import NetworkConfig
+    from birdslam.world.training.trainer import Trainer, TrainerConfig
 
     torch.manual_seed(7)
     first, second, trainer = (Trainer(TrainerConfig(), half=False) for _ in range(3))
@@ -583,7 +583,7 @@ def test_of_several_networks_one_begins_with_the_mean_of_their_weights() -> None
 def test_of_two_depths_that_an_outline_leaves_open_the_nearer_costs_less() -> None:
     import torch
 
-    from birdslam.training.losses import Batch, LossConfig, _depth
+    from birdslam.world.training.losses import Batch, LossConfig, _depth
 
     near_m, far_m, share_near = 5.0, 20.0, 0.4
     truth = torch.full((1, 10, 10), far_m).log()
@@ -603,7 +603,7 @@ def test_of_two_depths_that_an_outline_leaves_open_the_nearer_costs_less() -> No
 @pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="needs the extra [train]: numba")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's, of its older ONNX export
 def test_a_training_leaves_a_network_that_loads_and_is_done_when_asked_again(tmp_path: Path) -> None:
-    from birdslam.runtime.training.train import main
+    from birdslam.runtime.world.train import main
 
     path, out = tmp_path / "a.toml", tmp_path / "out"
     path.write_text(

@@ -12,11 +12,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.datasets.opening import open_recording
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
 from birdslam.odometry.motion import planar
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
+from birdslam.sources.opening import open_recording
 from birdslam.types import Status
 
 WIDTH_PX, HEIGHT_PX = 620, 188

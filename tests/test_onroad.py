@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from birdslam.perf.faulty_vehicle import model_options
-from birdslam.perf.live import Ask, drive
-from birdslam.perf.machine import Steal
-from birdslam.perf.system import WARM_UP_S, figures, table
+from birdslam.perf.latency.live import Ask, drive
+from birdslam.perf.latency.system import WARM_UP_S, figures, table
+from birdslam.perf.reporting.machine import Steal
+from birdslam.perf.robustness.faulty_vehicle import model_options
 
 pytestmark = pytest.mark.processes
 

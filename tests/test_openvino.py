@@ -18,11 +18,11 @@ from test_models import left_in, refused, serve_files
 from tiny_ir import Ir, Port
 
 from birdslam.perception import ModelSpec, load_network
-from birdslam.perception.openvino_ir import IrError
-from birdslam.perception.openvino_onnx import convert, weights_sha256
-from birdslam.runtime.cli import catalogue as catalogue_module
-from birdslam.runtime.cli.catalogue import probing_image
+from birdslam.perception.onnx_files.openvino_ir import IrError
+from birdslam.perception.onnx_files.openvino_onnx import convert, weights_sha256
 from birdslam.runtime.cli.main import main
+from birdslam.runtime.models import catalogue as catalogue_module
+from birdslam.runtime.models.catalogue import probing_image
 
 MODELS = Path(os.environ.get("BIRDSLAM_MODELS", Path(__file__).parents[2] / "shared" / "models"))
 NETWORKS = {"vehicle_adas": "vehicle_detection_adas_0002_640x192", "road_adas": "road_segmentation_adas_0001_640x192"}

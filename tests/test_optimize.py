@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.runtime.configuration import (
@@ -27,7 +28,6 @@ from birdslam.runtime.nodes.optimize import OptimizeNode
 from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
 from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.wire import Trace
-from birdslam.simulation.drive import DriveConfig, drive
 from birdslam.types import INVALIDATING, Attitude, Estimate, FrameRef, Measurements, Status
 
 MS = 1_000_000

@@ -16,11 +16,11 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections, Perception, Ready
-from birdslam.perception.detection import EdgeSigma
+from birdslam.perception.decoding.detection import EdgeSigma
 from birdslam.types import Measurements
-from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
-from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, iou
 from birdslam.vehicles.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
+from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, iou
+from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion

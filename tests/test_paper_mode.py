@@ -8,8 +8,9 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from birdslam.baselines.batch_se2 import ego_key, solve, vehicle_key
-from birdslam.evaluation.tracking import PAPER
+from birdslam.bench.baselines.batch_se2 import ego_key, solve, vehicle_key
+from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
+from birdslam.bench.tracking.benchmark import PAPER
 from birdslam.geometry.se2 import SE2
 from birdslam.graph import pose_graph, vehicle_places
 from birdslam.graph.factors import CpEdge, CvEdge, VvEdge
@@ -17,7 +18,6 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.graph.window import Window
-from birdslam.simulation.drive import Drive, DriveConfig, drive
 from birdslam.slam import SlamConfig
 from birdslam.types import Estimate, LandmarkEdge, Measurements, Status
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from birdslam.rendered_world.rendering import materials as m
-from birdslam.rendered_world.street.street import Street
-from birdslam.rendered_world.street.street_plan import draw_street
-from birdslam.rendered_world.traffic.flow import Mover, populate
-from birdslam.rendered_world.traffic.parking import Lot, cleared, draw_lots
-from birdslam.rendered_world.traffic.placement import Standing, furnish
-from birdslam.rendered_world.traffic.poses import moving
+from birdslam.world.rendering import materials as m
+from birdslam.world.street.street import Street
+from birdslam.world.street.street_plan import draw_street
+from birdslam.world.traffic.flow import Mover, populate
+from birdslam.world.traffic.parking import Lot, cleared, draw_lots
+from birdslam.world.traffic.placement import Standing, furnish
+from birdslam.world.traffic.poses import moving
 
 EGO_S_M, EGO_D_M = 30.0, -1.5
 

@@ -28,7 +28,7 @@ from birdslam.perception import (
     Segmentation,
     load_network,
 )
-from birdslam.perception.detection import MOST_CANDIDATES, YoloxDecoder, intersections, suppress
+from birdslam.perception.decoding.detection import MOST_CANDIDATES, YoloxDecoder, intersections, suppress
 from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, Schedule, Stretch, Tiles, Yolox
 from birdslam.perception.views import Preparation, View, make_views
 from birdslam.types import Status

@@ -15,16 +15,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from birdslam.bench.simulation.drive import DriveConfig
 from birdslam.geometry.se2 import SE2
-from birdslam.perf import all as everything
-from birdslam.perf import compare, convoy, optimizer, ratios, report, scorecard, system, transport
 from birdslam.perf.__main__ import main
 from birdslam.perf.errors import PerfError
-from birdslam.perf.figures import BLOCKS, Ledger, curve, noise, spread
-from birdslam.perf.live import Run, Sample
+from birdslam.perf.latency import convoy, optimizer, system, transport
+from birdslam.perf.latency.live import Run, Sample
+from birdslam.perf.reporting import all as everything
+from birdslam.perf.reporting import compare, ratios, report, scorecard
+from birdslam.perf.reporting.figures import BLOCKS, Ledger, curve, noise, spread
 from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.wire import Stage, Trace
-from birdslam.simulation.drive import DriveConfig
 from birdslam.types import Estimate, Status
 
 MS = 1_000_000

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from test_batch import PLAIN, kitti
 
-from birdslam.perf import batch
+from birdslam.perf.latency import batch
 from birdslam.runtime.batch.drives import find_drives, tasks
 
 

@@ -19,8 +19,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.datasets.opening import open_recording
-from birdslam.datasets.speed_file import read_speeds
 from birdslam.runtime.batch.offline import pipeline
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import load
@@ -30,6 +28,8 @@ from birdslam.runtime.replay.replay import compare
 from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.wire import decode, encode
+from birdslam.sources.opening import open_recording
+from birdslam.sources.speed_file import read_speeds
 from birdslam.types import INVALIDATING, Estimate, FrameRef, MapUpdate, Measurements, Status
 
 pytestmark = pytest.mark.processes

@@ -11,12 +11,12 @@ from scipy.special import ndtr
 
 from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.ground_size_filter import Depths, GroundSizeConfig, GroundSizeFilter
-from birdslam.vehicles.heading import HeadingConfig
-from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes
-from birdslam.vehicles.parallax_config import ParallaxConfig
+from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
+from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes
 from birdslam.vehicles.placing import Assignment, Placing, no_farther_than_cut
+from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.heading import HeadingConfig
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
 from tests.test_frontend import CAMERA
 
 Floats = NDArray[np.float64]

@@ -17,8 +17,6 @@ import pytest
 from mcap.reader import make_reader
 from msgspec.structs import replace
 
-from birdslam.datasets.camera_file import load_camera
-from birdslam.datasets.recording import DatasetError
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import Configuration, ConfigurationError, RecordingConfig, SourceConfig
 from birdslam.runtime.nodes.recorder import about
@@ -38,6 +36,8 @@ from birdslam.runtime.recording.recording import (
 from birdslam.runtime.replay.replay import compare
 from birdslam.runtime.supervision.recording_files import choose_file
 from birdslam.runtime.wire import Health, decode, encode
+from birdslam.sources.camera_file import load_camera
+from birdslam.sources.recording import DatasetError
 from birdslam.types import Estimate, Measurements, Status
 from tests.taped_drive import CAMERA, Tape, measured
 from tests.test_bus import until

@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from test_tracking_evaluation import log_of
 
-from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking
-from birdslam.evaluation.motion_consistency import _of_length
-from birdslam.evaluation.relative_nees import NeesRow, nees_rows, over_seeds
-from birdslam.evaluation.tables import nees_table
-from birdslam.evaluation.tracking import ours
+from birdslam.bench.ego.motion_consistency import _of_length
+from birdslam.bench.simulation.odometry import EXACT
+from birdslam.bench.tracking.benchmark import ours
+from birdslam.bench.tracking.relative_nees import NeesRow, nees_rows, over_seeds
+from birdslam.bench.tracking.tables import nees_table
 from birdslam.geometry.se2 import SE2
-from birdslam.simulation.odometry import EXACT
 from birdslam.slam import SlamConfig
+from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking
 from birdslam.types import Measurements
 
 SIGMA = np.array([0.3, 0.2, 0.05])  # m, m, rad, of a vehicle's edge

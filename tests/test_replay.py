@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.graph.g2o import g2o_lines
-from birdslam.perf import replay as perf_replay
+from birdslam.perf.latency import replay as perf_replay
 from birdslam.runtime.cli import replay as replay_command
 from birdslam.runtime.cli.parser import build_parser
 from birdslam.runtime.configuration import ConfigurationError

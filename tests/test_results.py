@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.evaluation.picture import Track
-from birdslam.evaluation.results import Recorder, ResultsError, Thinned, claim_directory
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
+from birdslam.outputs.bev_picture import Track
+from birdslam.outputs.drive_files import Recorder, ResultsError, Thinned, claim_directory
 from birdslam.trajectory import read_kitti, read_tum
 from birdslam.types import Attitude, Estimate, MapUpdate, SpeedSource, Status, VehicleEstimate
 

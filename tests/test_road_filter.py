@@ -9,10 +9,10 @@ import pytest
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp
-from birdslam.odometry.road_alignment import RoadAlignConfig, RoadAligner
-from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
-from birdslam.odometry.road_fit import RoadFit
-from birdslam.perf.graded_road import CURVE_M, GradedRoad, Stand
+from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
+from birdslam.odometry.road.fit import RoadFit
+from birdslam.odometry.road.kalman_filter import RoadFilter, RoadScaleConfig
+from birdslam.perf.accuracy.graded_road import CURVE_M, GradedRoad, Stand
 
 CAMERA = Camera(931, 282, 540.0, 540.0, 456.3, 139.2, height_m=1.65)
 GRADE = 0.06

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.odometry.road_fit import MOTION, ROAD, Slopes, alike, fit_alone
+from birdslam.odometry.road.fit import MOTION, ROAD, Slopes, alike, fit_alone
 
 Floats = NDArray[np.float64]
 

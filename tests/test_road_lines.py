@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_exp
-from birdslam.odometry.road_alignment import plane_normal
-from birdslam.odometry.road_filter import RoadFilter, RoadScaleConfig
-from birdslam.odometry.road_lines import RoadLines, RoadLinesConfig, meeting
+from birdslam.odometry.road.alignment import plane_normal
+from birdslam.odometry.road.kalman_filter import RoadFilter, RoadScaleConfig
+from birdslam.odometry.road.vanishing_point import RoadLines, RoadLinesConfig, meeting
 
 Floats = NDArray[np.float64]
 

@@ -21,15 +21,15 @@ import cv2
 import numpy as np
 import pytest
 
-from birdslam.datasets.demo import DIRECTORY, DemoRecording
 from birdslam.geometry.pose import Pose, rotation_exp
-from birdslam.odometry.road_alignment import RoadAlignConfig, RoadAligner
-from birdslam.perf.roads import EFFECTS, measure, read
-from birdslam.perf.starts import SCALE_LIMIT, Drive, errors, follow
-from birdslam.rendered_world.compression import VideoEncoder
-from birdslam.rendered_world.windscreen import KINDS, Overlay, bonnet
+from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
+from birdslam.perf.accuracy.roads import EFFECTS, measure, read
+from birdslam.perf.accuracy.starts import SCALE_LIMIT, Drive, errors, follow
+from birdslam.sources.shipped_drive import DIRECTORY, DemoRecording
 from birdslam.trajectory import inverse
 from birdslam.types import Status
+from birdslam.world.compression import VideoEncoder
+from birdslam.world.windscreen import KINDS, Overlay, bonnet
 
 CLIPS = Path(__file__).parent / "roads"
 NAMES = ("motorway_20", "motorway_40", "ramp_20", "ramp_21_glare", "night_street", "night_motorway")
@@ -198,9 +198,9 @@ def test_a_clip_is_what_its_seed_renders(name: str, tmp_path: Path) -> None:
     """The truth to the bit; the images but for what another processor or another WebP rounds."""
     if importlib.util.find_spec("numba") is None:
         pytest.skip("the built-in world is rendered with numba (extra `train`)")
-    from birdslam.rendered_world.roads import ROADS, camera_of
-    from birdslam.rendered_world.scenario import drive
-    from birdslam.runtime.cli.demo_drive import SAMPLES, keep
+    from birdslam.runtime.world.demo_drive import SAMPLES, keep
+    from birdslam.world.roads import ROADS, camera_of
+    from birdslam.world.scenario import drive
 
     kept, road, camera = DemoRecording(directory=CLIPS / name), ROADS[name], camera_of(640)
     assert len(kept) == FRAMES

@@ -17,11 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from birdslam.datasets.opening import frame_size, open_recording
-from birdslam.datasets.recording import DatasetError, Recording
-from birdslam.datasets.rosbag import read_bag_camera
-from birdslam.datasets.rosbag_truth import east_north_up
-from birdslam.evaluation.odometry import evaluate_recordings
+from birdslam.bench.ego.trajectory_errors import evaluate_recordings
 from birdslam.geometry.camera import AXES_EGO_CAM, Camera, GroundPlane, Undistorter
 from birdslam.geometry.se2 import SE2
 from birdslam.ros.bag import BagTopics
@@ -29,6 +25,10 @@ from birdslam.ros.sensor import lens, pixels
 from birdslam.runtime.cli import calibrate
 from birdslam.runtime.configuration import load
 from birdslam.runtime.nodes.sources import open_source
+from birdslam.sources.opening import frame_size, open_recording
+from birdslam.sources.recording import DatasetError, Recording
+from birdslam.sources.rosbag import read_bag_camera
+from birdslam.sources.rosbag_truth import east_north_up
 from birdslam.trajectory import as_poses, mount_pose
 from birdslam.types import Estimate
 

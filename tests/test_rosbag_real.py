@@ -13,11 +13,7 @@ import numpy as np
 import pytest
 import ros_bags as ros
 
-from birdslam.datasets.kitti import KittiRecording
-from birdslam.datasets.opening import open_recording
-from birdslam.datasets.recording import Recording
-from birdslam.datasets.rosbag_truth import WGS84_A_M, WGS84_E2
-from birdslam.evaluation.odometry import evaluate_recordings
+from birdslam.bench.ego.trajectory_errors import evaluate_recordings
 from birdslam.geometry.camera import AXES_EGO_CAM, Camera
 from birdslam.ros.bag import Bag, BagTopics, stamp_ns
 from birdslam.ros.frames import StaticFrames
@@ -25,6 +21,10 @@ from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import Configuration, SourceConfig, dump
 from birdslam.runtime.recording.recording import About, RecordingWriter
 from birdslam.slam import BirdSLAM
+from birdslam.sources.kitti import KittiRecording
+from birdslam.sources.opening import open_recording
+from birdslam.sources.recording import Recording
+from birdslam.sources.rosbag_truth import WGS84_A_M, WGS84_E2
 from birdslam.trajectory import Transform, as_poses, inverse, mount_pose
 from birdslam.types import Estimate
 

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from birdslam.evaluation.odometry import rms
+from birdslam.bench.ego.trajectory_errors import rms
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2
@@ -18,7 +18,7 @@ from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Detections, Perception, Ready
 from birdslam.types import Measurements, Status, VehicleEdge
-from birdslam.vehicles.localisation import DIMENSIONS
+from birdslam.vehicles.placement.localisation import DIMENSIONS
 from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig, VehicleMeasurement, smooth_vehicle
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
 

@@ -12,9 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.datasets.kitti_tracking import open_tracking, read_detections
-from birdslam.datasets.opening import open_recording
-from birdslam.evaluation.localisation import measure
+from birdslam.bench.tracking.localisation import measure
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import rotation_exp
@@ -25,9 +23,11 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.plausibility import PlausibilityConfig
 from birdslam.perception import Perception, Ready, Segmentation
+from birdslam.sources.kitti_tracking import open_tracking, read_detections
+from birdslam.sources.opening import open_recording
 from birdslam.types import Estimate, Frame, Status, VehicleEdge
 from birdslam.vehicles.camera_height import HeightWatch, HeightWatchConfig
-from birdslam.vehicles.localisation import LocalisationConfig
+from birdslam.vehicles.placement.localisation import LocalisationConfig
 
 Image = np.ndarray
 Edit = Callable[[int, Image], Image]

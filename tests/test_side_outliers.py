@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.parallax import Parallax
-from birdslam.vehicles.parallax_config import ParallaxConfig
-from birdslam.vehicles.parallax_measurements import ParallaxMeasurements
-from birdslam.vehicles.side_outliers import update
+from birdslam.vehicles.state.parallax import Parallax
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from birdslam.vehicles.state.parallax_measurements import ParallaxMeasurements
+from birdslam.vehicles.state.side_outliers import update
 
 Floats = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from typing import Any
 import psutil
 import pytest
 
-from birdslam.perf import soak
-from birdslam.perf.soak import Series, Systemd, faults, sample, table
+from birdslam.perf.robustness import soak
+from birdslam.perf.robustness.soak import Series, Systemd, faults, sample, table
 from tests.test_bus import until
 
 WELL: dict[str, Any] = {

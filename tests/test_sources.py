@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.datasets.recording import DatasetError, RecordedFrame, Recording
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
 from birdslam.runtime.nodes.sources import (
@@ -26,6 +25,7 @@ from birdslam.runtime.nodes.sources import (
     open_source,
     to_frame,
 )
+from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.types import Status
 
 CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)

@@ -12,9 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.datasets.opening import open_recording
-from birdslam.datasets.recording import DatasetError, RecordedFrame, Recording
-from birdslam.datasets.speed_file import (
+from birdslam.geometry.camera import Camera
+from birdslam.runtime.cli.main import main
+from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
+from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_source
+from birdslam.runtime.options import speeds_of
+from birdslam.sources.opening import open_recording
+from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
+from birdslam.sources.speed_file import (
     SIGMA_MPS,
     YAW_RATE_SIGMA_RADPS,
     of_sequence,
@@ -22,12 +27,7 @@ from birdslam.datasets.speed_file import (
     read_speeds,
     with_speeds,
 )
-from birdslam.datasets.speed_log import KEPT_NS, KEPT_READINGS, SpeedLog
-from birdslam.geometry.camera import Camera
-from birdslam.runtime.cli.main import main
-from birdslam.runtime.cli.options import speeds_of
-from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
-from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_source
+from birdslam.sources.speed_log import KEPT_NS, KEPT_READINGS, SpeedLog
 from birdslam.types import SpeedReading
 
 CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)

@@ -19,8 +19,6 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.datasets.recording import RecordedFrame
-from birdslam.datasets.speed_log import KEPT_READINGS, added
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
@@ -40,6 +38,8 @@ from birdslam.runtime.recording.recording import Recording, RecordingWriter
 from birdslam.runtime.topology import key_of
 from birdslam.runtime.transport.bus import Bus, Message
 from birdslam.runtime.wire import Trace, decode, encode
+from birdslam.sources.recording import RecordedFrame
+from birdslam.sources.speed_log import KEPT_READINGS, added
 from birdslam.types import EgoEdge, FrameRef, Measurements, SpeedReading, SpeedSource, Status
 
 CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)

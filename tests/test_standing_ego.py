@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from birdslam.datasets.kitti_tracking import TrackingSequence
-from birdslam.evaluation.localisation import measure
+from birdslam.bench.tracking.localisation import measure
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import Detections
-from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
-from birdslam.vehicles.localisation import DIMENSIONS, LocalisationConfig, extent_m, observe_boxes
-from birdslam.vehicles.parallax import LearnedSize
+from birdslam.sources.kitti_tracking import TrackingSequence
+from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, extent_m, observe_boxes
+from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.parallax import LearnedSize
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 CAR = DIMENSIONS["car"]

@@ -7,20 +7,20 @@ import cv2
 import numpy as np
 import pytest
 
-from birdslam.datasets.opening import open_recording
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.geometry.pose import Pose, rotation_exp
-from birdslam.odometry.guided_two_view import first_pose, guided_two_view
+from birdslam.odometry.corners.initialisation import StartSearch, StartSearchConfig
+from birdslam.odometry.corners.two_view import first_pose, guided_two_view
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
-from birdslam.odometry.road_alignment import RoadAlignConfig, RoadAligner, RoadImage, plane_normal
-from birdslam.odometry.road_search import far_and_changed, most_alike
-from birdslam.odometry.start_search import StartSearch, StartSearchConfig
-from birdslam.perf.overlays import measure
-from birdslam.perf.starts import Task, mirrored_camera, read
-from birdslam.rendered_world.windscreen import from_middle
+from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner, RoadImage, plane_normal
+from birdslam.odometry.road.scale_search import far_and_changed, most_alike
+from birdslam.perf.accuracy.overlays import measure
+from birdslam.perf.accuracy.starts import Task, mirrored_camera, read
+from birdslam.sources.opening import open_recording
 from birdslam.trajectory import as_poses
 from birdslam.types import Status
+from birdslam.world.windscreen import from_middle
 
 CAMERA = Camera(640, 240, 360.0, 360.0, 320.0, 100.0, height_m=1.5)
 RADIUS_M, TEXEL_M, WALL_TEXEL_M = 150.0, 0.1, 0.5

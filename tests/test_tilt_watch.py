@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.odometry.tilt_watch import TiltWatch, TiltWatchConfig
+from birdslam.odometry.road.mount_change import TiltWatch, TiltWatchConfig
 
 Floats = NDArray[np.float64]
 STEP_M = 0.8

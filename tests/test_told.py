@@ -8,9 +8,9 @@ import pytest
 import tracking_world
 from msgspec.structs import replace
 
-from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking
-from birdslam.evaluation.told import HALF_SPAN, Sight, motion_row, range_rows, sights
+from birdslam.bench.tracking.reported import HALF_SPAN, Sight, motion_row, range_rows, sights
 from birdslam.geometry.se2 import SE2
+from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking
 from birdslam.types import Estimate, VehicleEstimate
 
 EYE = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)

@@ -9,9 +9,9 @@ import pytest
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2, wrap
-from birdslam.vehicles.depth_fusion import DepthPlace
-from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
-from birdslam.vehicles.localisation import LocalisationConfig, observe_boxes
+from birdslam.vehicles.placement.depth_fusion import DepthPlace
+from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
+from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 

@@ -17,13 +17,10 @@ import tracking_world
 from msgspec.structs import replace
 from test_label_projection import with_right_camera
 
-from birdslam.baselines.trajectories import Trajectories
-from birdslam.datasets.kitti_tracking import TrackingSequence, open_tracking, read_detections
-from birdslam.datasets.recording import DatasetError
-from birdslam.datasets.speed_log import SpeedLog
-from birdslam.evaluation import ablation, tables
-from birdslam.evaluation.tables import Published, read_published
-from birdslam.evaluation.tracking import (
+from birdslam.bench.baselines.trajectories import Trajectories
+from birdslam.bench.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig, Walk, fit_drift
+from birdslam.bench.tracking import ablation, tables
+from birdslam.bench.tracking.benchmark import (
     EGO,
     PAPER,
     Live,
@@ -36,6 +33,7 @@ from birdslam.evaluation.tracking import (
     run_trial,
     summarise,
 )
+from birdslam.bench.tracking.tables import Published, read_published
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
@@ -43,12 +41,14 @@ from birdslam.graph.weights import weighted
 from birdslam.mapping.landmark_edges import StaticMapConfig
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.cli.evaluate_parser import METHODS
-from birdslam.runtime.cli.evaluate_tracking import PUBLISHED, evaluate
 from birdslam.runtime.cli.parser import build_parser
-from birdslam.runtime.cli.tracking_job import EQ_1, frames_of
 from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
-from birdslam.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig, Walk, fit_drift
+from birdslam.runtime.evaluation.tracking import PUBLISHED, evaluate
+from birdslam.runtime.evaluation.tracking_job import EQ_1, frames_of
 from birdslam.slam import SlamConfig
+from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
+from birdslam.sources.recording import DatasetError
+from birdslam.sources.speed_log import SpeedLog
 from birdslam.types import Frame, Measurements, SpeedReading
 
 FRAMES = range(40)

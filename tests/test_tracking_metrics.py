@@ -9,9 +9,9 @@ import pytest
 from evo.core import metrics
 from evo.core.trajectory import PosePath3D
 
-from birdslam.datasets.label_projection import Label
-from birdslam.evaluation.tracking_metrics import BoxFrame, count_boxes, hota, idf1, match_vehicles, path_errors
+from birdslam.bench.tracking.metrics import BoxFrame, count_boxes, hota, idf1, match_vehicles, path_errors
 from birdslam.geometry.se2 import SE2
+from birdslam.sources.label_projection import Label
 from birdslam.trajectory import ego_pose
 from birdslam.types import Attitude
 

@@ -13,10 +13,8 @@ from hypothesis import strategies as st
 from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2
 from birdslam.perception.manifest import LowerEdge
-from birdslam.vehicles.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.ground_size_filter import GroundSizeConfig, GroundSizeFilter
-from birdslam.vehicles.heading import HeadingConfig
-from birdslam.vehicles.localisation import (
+from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
+from birdslam.vehicles.placement.localisation import (
     DIMENSIONS,
     Dimensions,
     LocalisationConfig,
@@ -24,9 +22,11 @@ from birdslam.vehicles.localisation import (
     corners_of,
     observe_boxes,
 )
-from birdslam.vehicles.parallax_config import ParallaxConfig
+from birdslam.vehicles.placement.tyre_contact import at_face
 from birdslam.vehicles.placing import Assignment, Placing
-from birdslam.vehicles.tyre_contact import at_face
+from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.heading import HeadingConfig
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
 from tests.test_frontend import CAMERA
 
 CONFIG = LocalisationConfig()

@@ -37,7 +37,7 @@ def tape(tmp_path: Path) -> Tape:
 
 @needs_rerun
 def test_a_recording_becomes_a_file_of_reruns(tape: Tape, tmp_path: Path) -> None:
-    from birdslam.runtime.cli import view
+    from birdslam.runtime.recording import rerun_view as view
 
     file = tmp_path / "drive.rrd"
     assert view.recorded(Recording(tape.path), file) == 0
@@ -50,7 +50,7 @@ def test_a_recording_becomes_a_file_of_reruns(tape: Tape, tmp_path: Path) -> Non
 @needs_rerun
 def test_everything_of_a_drive_is_sent(tape: Tape) -> None:
     """What goes to the stream, entity by entity."""
-    from birdslam.runtime.cli import view
+    from birdslam.runtime.recording import rerun_view as view
 
     class Stream:
         def __init__(self) -> None:

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera, GroundPlane
-from birdslam.odometry.bonnet import Bonnet, BonnetConfig
-from birdslam.odometry.standing_corners import StandingCorners, StandingCornersConfig
+from birdslam.odometry.obstruction.bonnet import Bonnet, BonnetConfig
+from birdslam.odometry.obstruction.fixed_corners import StandingCorners, StandingCornersConfig
 
 CAMERA = Camera(width_px=640, height_px=192, fx_px=371.0, fy_px=371.0, cx_px=320.0, cy_px=96.0, height_m=1.5)
 GROUND = GroundPlane(1.5)

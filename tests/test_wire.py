@@ -19,7 +19,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from birdslam.datasets.speed_log import KEPT_READINGS
 from birdslam.geometry.se2 import SE2
 from birdslam.queries import MapSnapshot, TimedPose, Trajectory, VehiclePath
 from birdslam.runtime.topology import CAR, NODES, PROCESSES, QUERIES, TOPICS, alive_key, check_name, key_of
@@ -34,6 +33,7 @@ from birdslam.runtime.wire import (
     decode,
     encode,
 )
+from birdslam.sources.speed_log import KEPT_READINGS
 from birdslam.types import (
     Attitude,
     EgoEdge,

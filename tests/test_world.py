@@ -13,8 +13,8 @@ from birdslam.geometry.camera import Camera
 
 pytest.importorskip("numba", reason="the built-in world is rendered with numba (extra `train`)")
 
-from birdslam.rendered_world.truth import CLASSES, WorldFrame
-from birdslam.rendered_world.world import World, WorldConfig, sample
+from birdslam.world.truth import CLASSES, WorldFrame
+from birdslam.world.world import World, WorldConfig, sample
 
 WIDTH, HEIGHT = 320, 96
 ROAD, LANE = CLASSES.index("road"), CLASSES.index("lane")

@@ -3,9 +3,9 @@
 Four witnesses, each with its own covariance, and the least-squares mean of them with the disagreement in its
 covariance (Birge's ratio):
 
-- the road's image: the homography of the road plane between two images gives pitch and roll (road_alignment.py);
+- the road's image: the homography of the road plane between two images gives pitch and roll (road/alignment.py);
 - the direction of travel: on a straight way the epipole lies on the road's horizon, above a camera that looks down;
-- the road's lines: the point where they meet lies on its horizon (road_lines.py);
+- the road's lines: the point where they meet lies on its horizon (road/vanishing_point.py);
 - the vehicles: bottoms and heights of many boxes put the horizon where they meet (vehicles/camera_height.py).
 
 What checks its height is in height_check.py.
@@ -35,9 +35,9 @@ from birdslam.frontend import FrontEnd, FrontEndConfig, Pending
 from birdslam.geometry.camera import Camera
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
-from birdslam.odometry.road_alignment import plane_normal
-from birdslam.odometry.road_fit import RoadFit
-from birdslam.odometry.road_lines import LinesDirection
+from birdslam.odometry.road.alignment import plane_normal
+from birdslam.odometry.road.fit import RoadFit
+from birdslam.odometry.road.vanishing_point import LinesDirection
 from birdslam.types import Frame, Status
 from birdslam.vehicles.camera_height import BoxHeight, measure_heights
 

@@ -17,8 +17,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from birdslam.datasets.kitti import read_image, read_projection
-from birdslam.datasets.recording import DatasetError
+from birdslam.sources.kitti import read_image, read_projection
+from birdslam.sources.recording import DatasetError
 
 Floats = NDArray[np.float64]
 

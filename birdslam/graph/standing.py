@@ -1,8 +1,8 @@
 """Whether vehicles stand or drive, and the velocity that planners are told of them.
 
 Two say how probably a vehicle stands, from the same images but with other errors: the front end by how it grows in the
-image (vehicles/parallax.py), and the graph by how far from nil its velocity is, against how far it was before anything
-was seen (the density ratio of Savage and Dickey):
+image (vehicles/state/parallax.py), and the graph by how far from nil its velocity is, against how far it was before
+anything was seen (the density ratio of Savage and Dickey):
 
     log N(0; v, P) - log N(0; 0, P_birth) = log sqrt(|P_birth| / |P|) - v' P^-1 v / 2
 

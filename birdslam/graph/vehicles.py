@@ -9,7 +9,7 @@ from birdslam.graph.edges import PoseEdges
 from birdslam.graph.factors import CvEdge, VvEdge, turned
 from birdslam.types import Moves, VehicleEdge
 
-PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/parallax.py
+PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/state/parallax.py
 BESIDE_M = 15.0  # farther aside is another road, or none: see standing.py
 SHORTEST_S = 1e-3  # source clocks that stand still or run backwards
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.pose import Pose
-from birdslam.odometry.car_scale import CarStep
-from birdslam.odometry.road_fit import RoadFit
-from birdslam.odometry.road_lines import LinesDirection
-from birdslam.odometry.sliding_window import SlidingWindow
+from birdslam.odometry.corners.sliding_window import SlidingWindow
+from birdslam.odometry.road.fit import RoadFit
+from birdslam.odometry.road.vanishing_point import LinesDirection
+from birdslam.odometry.speed.scale import CarStep
 from birdslam.types import SpeedReading, SpeedSource, Status
 
 

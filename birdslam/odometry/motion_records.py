@@ -9,9 +9,6 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.se2 import SE2
-from birdslam.odometry.car_reckoning import reckoned
-from birdslam.odometry.car_scale import CarStep
-from birdslam.odometry.last_motion import STILL, LastMotion
 from birdslam.odometry.metric_scale import MetricScale
 from birdslam.odometry.motion import (
     Motion,
@@ -22,6 +19,9 @@ from birdslam.odometry.motion import (
     planar,
     standing_cov,
 )
+from birdslam.odometry.motion_model import STILL, LastMotion
+from birdslam.odometry.speed.dead_reckoning import reckoned
+from birdslam.odometry.speed.scale import CarStep
 from birdslam.types import SpeedSource, Status
 
 Floats = NDArray[np.float64]

@@ -1,6 +1,6 @@
 """Ego-motion of one forward camera in metres, image by image.
 
-    track the corners (features.py) -> relative pose among the landmarks (relative_pose.py)
+    track the corners (corners/feature_tracks.py) -> relative pose among the landmarks (relative_pose.py)
     -> bundle adjustment over the keyframes (keyframes.py) -> metric scale from the road (metric_scale.py) -> Motion
 
 The paper takes this from an off-the-shelf SLAM and scales it by road points and a moving median (Sec. 3.1,
@@ -19,30 +19,30 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose
-from birdslam.odometry.beyond_road import BeyondRoad, BeyondRoadConfig
-from birdslam.odometry.car_reckoning import DRIVES_M, moves_sideways
-from birdslam.odometry.car_scale import CarStep
-from birdslam.odometry.corner_pose import Corners, Fitting, Located, pose_beside_glass
-from birdslam.odometry.corner_prediction import corners_of_unknown_depth_px
-from birdslam.odometry.features import FeatureConfig, FeatureTracker, Tracks
-from birdslam.odometry.guided_two_view import first_pose
-from birdslam.odometry.held_speed import HeldSpeed, HeldSpeedConfig, worst_sigma_m
-from birdslam.odometry.keyframes import KeyframeConfig, KeyframeWindow
-from birdslam.odometry.last_motion import STILL, LastMotion
+from birdslam.odometry.corners.below_plane import BeyondRoad, BeyondRoadConfig
+from birdslam.odometry.corners.feature_tracks import FeatureConfig, FeatureTracker, Tracks
+from birdslam.odometry.corners.initialisation import StartSearch, StartSearchConfig
+from birdslam.odometry.corners.keyframes import KeyframeConfig, KeyframeWindow
+from birdslam.odometry.corners.prediction import corners_of_unknown_depth_px
+from birdslam.odometry.corners.resection import Corners, Fitting, Located, pose_beside_glass
+from birdslam.odometry.corners.sliding_window import common
+from birdslam.odometry.corners.two_view import first_pose
 from birdslam.odometry.metric_scale import MetricScale, RoadView
 from birdslam.odometry.motion import Motion, MotionConfig, planar, step_cov
+from birdslam.odometry.motion_model import STILL, LastMotion
 from birdslam.odometry.motion_records import MotionRecords
-from birdslam.odometry.moving_median import MedianScale
-from birdslam.odometry.road_alignment import RoadAligner
-from birdslam.odometry.road_filter import RoadScaleConfig
-from birdslam.odometry.road_fit import RoadFit
-from birdslam.odometry.road_lines import LinesDirection
-from birdslam.odometry.road_points import is_night, on_road, outside
-from birdslam.odometry.road_scale import RoadScale
-from birdslam.odometry.sliding_window import common
-from birdslam.odometry.standing_corners import StandingCorners, StandingCornersConfig
-from birdslam.odometry.standstill import StandstillConfig, near_displacement_px, stands
-from birdslam.odometry.start_search import StartSearch, StartSearchConfig
+from birdslam.odometry.obstruction.fixed_corners import StandingCorners, StandingCornersConfig
+from birdslam.odometry.road.alignment import RoadAligner
+from birdslam.odometry.road.fit import RoadFit
+from birdslam.odometry.road.kalman_filter import RoadScaleConfig
+from birdslam.odometry.road.moving_median import MedianScale
+from birdslam.odometry.road.points import is_night, on_road, outside
+from birdslam.odometry.road.scale import RoadScale
+from birdslam.odometry.road.vanishing_point import LinesDirection
+from birdslam.odometry.speed.constant_velocity import HeldSpeed, HeldSpeedConfig, worst_sigma_m
+from birdslam.odometry.speed.dead_reckoning import DRIVES_M, moves_sideways
+from birdslam.odometry.speed.scale import CarStep
+from birdslam.odometry.speed.zero_velocity import StandstillConfig, near_displacement_px, stands
 from birdslam.types import SpeedReading, Status
 
 __all__ = ["Motion", "Odometry", "OdometryConfig", "Tracks"]

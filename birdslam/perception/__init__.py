@@ -1,14 +1,14 @@
 """Perception: networks by manifest, their schedule, and what they find in an image."""
 
 from birdslam.perception.boxes3d import Boxes3d
-from birdslam.perception.depth import DepthMap
-from birdslam.perception.detection import Detections
+from birdslam.perception.decoding.depth import DepthMap
+from birdslam.perception.decoding.detection import Detections
+from birdslam.perception.decoding.segmentation import Segmentation
 from birdslam.perception.findings import Findings
 from birdslam.perception.manifest import Label, ModelError
 from birdslam.perception.manifest_file import shipped_manifests
 from birdslam.perception.network import ModelSpec, Network, load_network
 from birdslam.perception.schedule import ROLES, Networks, Pending, Perception, Ready
-from birdslam.perception.segmentation import Segmentation
 from birdslam.perception.shipped import load_networks, shipped_networks
 
 __all__ = [

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.perception.boxes3d import Boxes3d
-from birdslam.perception.detection import Detections, intersections
+from birdslam.perception.decoding.detection import Detections, intersections
 
 LEAST_IOU = 0.5  # of two boxes on one object, as of a match in most benchmarks
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from birdslam.perception.depth import DepthMap
-from birdslam.perception.detection import Detections
-from birdslam.perception.segmentation import Segmentation
+from birdslam.perception.decoding.depth import DepthMap
+from birdslam.perception.decoding.detection import Detections
+from birdslam.perception.decoding.segmentation import Segmentation
 
 
 @dataclass(frozen=True)

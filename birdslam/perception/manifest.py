@@ -296,7 +296,7 @@ class MetricDepth(
 
 
 class MultiTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The shipped kind of network: boxes with bodies, masks and depth in one run (perception/multitask.py).
+    """The shipped kind of network: boxes with bodies, masks and depth in one run (perception/decoding/multitask.py).
 
     A box's centre counts from `score_threshold` on; a mask is where its logit is over the bar.
     """

@@ -13,10 +13,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.perception.box_lists import BoxListDecoder, SsdDecoder
-from birdslam.perception.centernet import CenterNetDecoder
-from birdslam.perception.depth import DisparityDecoder, MetricDepthDecoder
-from birdslam.perception.detection import YoloxDecoder
+from birdslam.perception.decoding.box_lists import BoxListDecoder, SsdDecoder
+from birdslam.perception.decoding.centernet import CenterNetDecoder
+from birdslam.perception.decoding.depth import DisparityDecoder, MetricDepthDecoder
+from birdslam.perception.decoding.detection import YoloxDecoder
+from birdslam.perception.decoding.multitask import OUTPUTS, MultiTaskDecoder
+from birdslam.perception.decoding.segmentation import ClassMapsDecoder
 from birdslam.perception.findings import Findings
 from birdslam.perception.manifest import (
     BoxList,
@@ -35,10 +37,8 @@ from birdslam.perception.manifest import (
     Yolox,
 )
 from birdslam.perception.manifest_file import find_manifest
-from birdslam.perception.multitask import OUTPUTS, MultiTaskDecoder
-from birdslam.perception.onnx_file import has_weights_elsewhere
-from birdslam.perception.segmentation import ClassMapsDecoder
-from birdslam.perception.unread_outputs import without_outputs
+from birdslam.perception.onnx_files.onnx_file import has_weights_elsewhere
+from birdslam.perception.onnx_files.unread_outputs import without_outputs
 from birdslam.perception.verge import without_verge
 from birdslam.perception.views import Preparation, View, make_views
 

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.perception.body_overlap import with_bodies
-from birdslam.perception.depth import DepthMap
-from birdslam.perception.detection import Detections
+from birdslam.perception.decoding.depth import DepthMap
+from birdslam.perception.decoding.detection import Detections
+from birdslam.perception.decoding.segmentation import Segmentation
 from birdslam.perception.findings import Findings
 from birdslam.perception.manifest import Role, Schedule
-from birdslam.perception.segmentation import Segmentation
 from birdslam.types import Status
 
 CARRIED: dict[Role, Status] = {

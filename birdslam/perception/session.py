@@ -6,7 +6,7 @@ import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from birdslam.perception.manifest import Input, Misfit
-from birdslam.perception.subnormal import without_tiny_weights
+from birdslam.perception.onnx_files.subnormal import without_tiny_weights
 
 SESSION_ERRORS = tuple(
     error for error in vars(ort_errors).values() if isinstance(error, type) and issubclass(error, Exception)

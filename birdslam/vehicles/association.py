@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.localisation import Observation
+from birdslam.vehicles.placement.localisation import Observation
 from birdslam.vehicles.track import Track
 
 HEIGHT_SHOWS_REL = 0.2  # 1-sigma of a box's height, as a fraction; past it the box says nothing of a size

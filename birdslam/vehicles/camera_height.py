@@ -6,7 +6,7 @@ The bottom edge of a box falls below the horizon by H / z (Eq. 1), its height is
 
 which is linear in the camera's height H and in its tilt, with the vehicles' heights h known by class to some per cent.
 Apart from a known speed this is the only cue that one camera has of how high it stands. The watch lets slopes count
-from the plane of the road as the images show it (road_scale.py), whose tilt does not depend on H; the one by the boxes
+from the plane of the road as the images show it (road/scale.py), whose tilt does not depend on H; the one by the boxes
 (ground_size_filter.py) would. What is left of its error, d_pitch and d_roll, is common to all vehicles and grows with
 their distance as H does not, so that near and far ones tell them apart. The calibration solves for the tilt as well
 (calibration/height_check.py).
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.odometry.motion import Motion
 from birdslam.types import SpeedSource, Status, VehicleEdge
-from birdslam.vehicles.localisation import LocalisationConfig, observe_boxes
+from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]

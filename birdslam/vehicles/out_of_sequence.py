@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import GroundPlane
 from birdslam.perception import DepthMap, Detections
-from birdslam.vehicles.ground_size_filter import GroundSizeFilter
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, Track
 from birdslam.vehicles.tracking import Tracker
 

@@ -18,10 +18,8 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.vehicles.association import NEAREST_M, in_ego
-from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
-from birdslam.vehicles.ground_size_filter import Depths, GroundSizeFilter
-from birdslam.vehicles.heading import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
-from birdslam.vehicles.localisation import (
+from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
+from birdslam.vehicles.placement.localisation import (
     AssumedSize,
     LocalisationConfig,
     Observation,
@@ -30,11 +28,13 @@ from birdslam.vehicles.localisation import (
     extent_m,
     place,
 )
-from birdslam.vehicles.parallax import LearnedSize, Parallax
-from birdslam.vehicles.parallax_config import ParallaxConfig
-from birdslam.vehicles.parallax_measurements import measure_boxes
+from birdslam.vehicles.placement.tyre_contact import at_face
+from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeFilter
+from birdslam.vehicles.state.heading import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
+from birdslam.vehicles.state.parallax import LearnedSize, Parallax
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from birdslam.vehicles.state.parallax_measurements import measure_boxes
 from birdslam.vehicles.track import Track
-from birdslam.vehicles.tyre_contact import at_face
 
 Floats = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
 from birdslam.types import Estimate, Measurements, VehicleEdge
-from birdslam.vehicles.localisation import Dimensions, corners_of
+from birdslam.vehicles.placement.localisation import Dimensions, corners_of
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]

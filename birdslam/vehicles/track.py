@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
 from birdslam.types import MotionEdge
-from birdslam.vehicles.heading import HeadingConfig
-from birdslam.vehicles.localisation import Observation, Place
-from birdslam.vehicles.parallax_config import ParallaxConfig
+from birdslam.vehicles.placement.localisation import Observation, Place
+from birdslam.vehicles.state.heading import HeadingConfig
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
 
 
 class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -18,13 +18,13 @@ from birdslam.geometry.se2 import SE2, wrap
 from birdslam.perception import DepthMap, Detections
 from birdslam.types import MotionEdge
 from birdslam.vehicles.association import predicted_boxes_px, within_gate
-from birdslam.vehicles.depth_fusion import DepthPlace, PseudoLidarConfig
-from birdslam.vehicles.ground_size_filter import GroundSizeFilter
-from birdslam.vehicles.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes
+from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig
+from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes
+from birdslam.vehicles.placement.pseudolidar import FrustumNetwork, locate_by_depth
 from birdslam.vehicles.placing import Assignment, Placing
-from birdslam.vehicles.pseudolidar import FrustumNetwork, locate_by_depth
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
+from birdslam.vehicles.state.yaw_filter import YawFilter
 from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig, turned_back
-from birdslam.vehicles.yaw_filter import YawFilter
 
 Floats = NDArray[np.float64]
 

@@ -22,9 +22,8 @@ os.environ.update(ENVIRONMENT)  # before numpy: this is the first that a worker 
 import msgspec
 import numpy as np
 
-from birdslam.datasets.recording import DatasetError, Recording
-from birdslam.evaluation.odometry import OdometryReport, evaluate_recordings
-from birdslam.evaluation.results import ResultsError
+from birdslam.bench.ego.trajectory_errors import OdometryReport, evaluate_recordings
+from birdslam.outputs.drive_files import ResultsError
 from birdslam.perception import ModelError
 from birdslam.runtime.batch.drives import Task
 from birdslam.runtime.batch.fetch import at_hand
@@ -32,6 +31,7 @@ from birdslam.runtime.batch.offline import Drive, pipeline
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.sources import RecordedSource, SourceError, open_source
 from birdslam.runtime.process.child import die_with
+from birdslam.sources.recording import DatasetError, Recording
 from birdslam.types import NS_PER_S, Estimate, MapUpdate, Measurements
 
 DRIVES, WORKING, FAILED = "drives", ".working", "failed"

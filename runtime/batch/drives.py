@@ -14,10 +14,10 @@ from typing import Any
 
 import msgspec
 
-from birdslam.datasets.kitti import find_layout
-from birdslam.datasets.recording import DatasetError
 from birdslam.runtime.batch.fetch import is_url
 from birdslam.runtime.configuration import FILE_SCHEMES, ConfigurationError, dump, load, parse_setting
+from birdslam.sources.kitti import find_layout
+from birdslam.sources.recording import DatasetError
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm")
 BAGS = (".bag", ".db3")

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
-from birdslam.datasets.recording import DatasetError
+from birdslam.sources.recording import DatasetError
 
 
 def is_url(address: str) -> bool:

@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator
 import cv2
 import msgspec
 
-from birdslam.datasets.recording import Recording
 from birdslam.runtime.configuration import Configuration, complete
 from birdslam.runtime.nodes.ego_motion import external_odometry
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
 from birdslam.slam import BirdSLAM
+from birdslam.sources.recording import Recording
 from birdslam.types import Estimate, MapUpdate, Measurements
 
 Drive = Callable[[Recording], Iterator[Measurements | Estimate | MapUpdate]]

@@ -17,7 +17,7 @@ from typing import IO, Any
 import msgspec
 import numpy as np
 
-from birdslam.evaluation.results import ResultsError
+from birdslam.outputs.drive_files import ResultsError
 from birdslam.runtime.batch.drive import DRIVES, RESULT, DriveResult, Failure, failure_file
 from birdslam.runtime.batch.drives import Task
 

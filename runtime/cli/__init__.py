@@ -1,4 +1,1 @@
-"""The command `birdslam`: one module a command; `*_options` have the command lines, imported before numpy.
-
-Read `main` first.
-"""
+"""The command `birdslam`: `parser` has the command lines, imported before numpy; `dispatch` says what each calls."""

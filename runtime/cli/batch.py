@@ -12,15 +12,15 @@ from pathlib import Path
 
 import msgspec
 
-from birdslam.evaluation.results import ResultsError, claim_directory
+from birdslam.outputs.drive_files import ResultsError, claim_directory
 from birdslam.runtime.batch.drive import WORKING, Failure, done, failure_file
 from birdslam.runtime.batch.drives import Task, find_drives, sweep, tasks
 from birdslam.runtime.batch.local import Event, fitting_jobs, run_local
 from birdslam.runtime.batch.on_ray import run_ray
 from birdslam.runtime.batch.report import write_report
-from birdslam.runtime.cli.options import overrides_of
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.environment import INTERRUPTED_STATUS
+from birdslam.runtime.options import overrides_of
 from birdslam.runtime.progress import Progress
 
 THOUSANDTHS = 1000  # of a drive, that progress counts

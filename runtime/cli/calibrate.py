@@ -14,19 +14,19 @@ import numpy as np
 from birdslam.calibration.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
 from birdslam.calibration.height_check import HeightCheck, KnownLength
 from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
-from birdslam.datasets.camera_file import camera_text, load_camera
-from birdslam.datasets.opening import frame_size, open_recording
-from birdslam.datasets.recording import DatasetError, Recording
-from birdslam.datasets.speed_file import read_speed_curve
-from birdslam.evaluation.results import ResultsError
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
+from birdslam.outputs.drive_files import ResultsError
 from birdslam.ros.bag import BagTopics
-from birdslam.runtime.cli.options import configuration_of
 from birdslam.runtime.configuration import FILE_SCHEMES, ConfigurationError
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
+from birdslam.runtime.options import configuration_of
 from birdslam.runtime.progress import shown
+from birdslam.sources.camera_file import camera_text, load_camera
+from birdslam.sources.opening import frame_size, open_recording
+from birdslam.sources.recording import DatasetError, Recording
+from birdslam.sources.speed_file import read_speed_curve
 from birdslam.types import Frame
 
 UNKNOWN_HEIGHT_M = 1.5  # where none was given: all lengths are in proportion to it, and it is replaced
@@ -44,7 +44,7 @@ def calibrate_camera(options: argparse.Namespace) -> int:
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
     recording = _open(uri, lens, height_m, options, topics)
-    known_height = height_m is not None or lens is None  # KITTI's own cameras stand where datasets/kitti.py says
+    known_height = height_m is not None or lens is None  # KITTI's own cameras stand where sources/kitti.py says
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     rate_max = msgspec.structs.replace(configuration.source, rate="max")
     configuration = msgspec.structs.replace(configuration, source=rate_max)
@@ -91,7 +91,7 @@ def _lens(options: argparse.Namespace, uri: str, topics: BagTopics) -> tuple[Int
         return from_chessboard(options.chessboard, int(board[1]), int(board[2]), options.square_mm / 1000.0), height_m
     scheme, _, path = uri.partition(":")
     if scheme == "rosbag":  # its CameraInfo has no height, and /tf_static may lack it: one that has both is not needed
-        from birdslam.datasets.rosbag import read_bag_camera
+        from birdslam.sources.rosbag import read_bag_camera
 
         own = read_bag_camera(Path(path).expanduser(), topics)
         height_m = height_m or (None if own.mount is None else own.mount.height_m)

@@ -7,33 +7,27 @@ import sys
 from collections.abc import Callable
 
 from birdslam.calibration.calibration import CalibrationError
-from birdslam.datasets.recording import DatasetError
-from birdslam.evaluation.results import ResultsError
+from birdslam.outputs.drive_files import ResultsError
 from birdslam.perception import ModelError
 from birdslam.ros.bag import BagError
-from birdslam.runtime.cli import (
-    calibrate,
-    configuration_page,
-    demo_drive,
-    deploy,
-    doctor,
-    evaluate_lanes,
-    evaluate_odometry,
-    interface,
-    listen,
-    models,
-    replay,
-    top,
-)
-from birdslam.runtime.cli.download import DownloadError
-from birdslam.runtime.cli.options import configuration_of
+from birdslam.runtime.cli import calibrate, deploy, listen, replay, top
 from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.doctor import checks as doctor
 from birdslam.runtime.environment import USER_ERROR_STATUS
+from birdslam.runtime.evaluation import lanes as evaluate_lanes
+from birdslam.runtime.evaluation import odometry as evaluate_odometry
+from birdslam.runtime.models import command as models
+from birdslam.runtime.models.download import DownloadError
 from birdslam.runtime.nodes.sources import SourceError
+from birdslam.runtime.options import configuration_of
+from birdslam.runtime.pages import configuration as configuration_page
+from birdslam.runtime.pages import interface
 from birdslam.runtime.recording.recording import RecordingError
 from birdslam.runtime.supervision import run as running
 from birdslam.runtime.transport.bus import BusError
 from birdslam.runtime.transport.presence import VehicleBusy
+from birdslam.runtime.world import demo_drive
+from birdslam.sources.recording import DatasetError
 
 USER_ERRORS = (
     BagError,
@@ -66,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
 
 def view(options: argparse.Namespace) -> int:
     """`birdslam view`; imported only here: rerun is an extra."""
-    from birdslam.runtime.cli import view as viewing
+    from birdslam.runtime.recording import rerun_view as viewing
 
     return viewing.view(options)
 
@@ -119,14 +113,14 @@ def batch(options: argparse.Namespace) -> int:
 
 def evaluate_tracking(options: argparse.Namespace) -> int:
     """`birdslam evaluate tracking` and `ablation`; imported only here: gtsam would lie in a drive's memory."""
-    from birdslam.runtime.cli import evaluate_tracking as tracking
+    from birdslam.runtime.evaluation import tracking
 
     return tracking.evaluate(options, configuration_of(options))
 
 
 def evaluate_localisation(options: argparse.Namespace) -> int:
     """`birdslam evaluate localisation`; imported only here: scipy.stats would lie in a drive's memory."""
-    from birdslam.runtime.cli import evaluate_localisation as localisation
+    from birdslam.runtime.evaluation import localisation
 
     return localisation.evaluate(options, configuration_of(options))
 

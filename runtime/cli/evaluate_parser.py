@@ -15,11 +15,8 @@ from birdslam.runtime.cli.arguments import (
     add_speeds,
     add_topics,
 )
+from birdslam.runtime.evaluation.methods import METHODS
 
-METHODS = (
-    *("birdslam", "birdslam_live", "paper", "paper_final", "batch_se3", "nair", "batch_se3_shape", "nair_shape"),
-    *("namdev", "cubeslam"),
-)
 SEEDS = 5
 
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import msgspec
 
-from birdslam.evaluation.final import FinalTracks, last_seen, write_final_ego
-from birdslam.evaluation.results import Recorder, claim_directory
-from birdslam.evaluation.video import DriveVideo, check_video
 from birdslam.graph.g2o import g2o_lines
+from birdslam.outputs.drive_files import Recorder, claim_directory
+from birdslam.outputs.drive_video import DriveVideo, check_video
+from birdslam.outputs.final_trajectories import FinalTracks, last_seen, write_final_ego
 from birdslam.runtime.configuration import ConfigurationError, parse_setting
 from birdslam.runtime.progress import Progress
 from birdslam.runtime.recording.recorded_drive import measurements_of

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from birdslam.datasets.recording import RecordedFrame
 from birdslam.geometry.camera import Undistorter
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.nodes.car_speeds import CarSpeeds
@@ -19,6 +18,7 @@ from birdslam.runtime.transport.bus import Bus, Message
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameRing
 from birdslam.runtime.wire import Trace
+from birdslam.sources.recording import RecordedFrame
 from birdslam.types import Frame, FrameRef, Measurements, Status
 
 

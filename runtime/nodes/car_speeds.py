@@ -8,8 +8,8 @@ from typing import Protocol
 
 import msgspec
 
-from birdslam.datasets.speed_log import KEPT_NS, KEPT_READINGS, shifted
 from birdslam.runtime.transport.bus import Message
+from birdslam.sources.speed_log import KEPT_NS, KEPT_READINGS, shifted
 from birdslam.types import SpeedReading
 
 log = logging.getLogger(__name__)

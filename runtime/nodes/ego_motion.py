@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from birdslam.datasets.odometry_file import read_odometry
-from birdslam.datasets.speed_file import of_sequence
 from birdslam.geometry.camera import Camera
 from birdslam.odometry.external import ExternalOdometry
 from birdslam.runtime.configuration import Configuration
+from birdslam.sources.odometry_file import read_odometry
+from birdslam.sources.speed_file import of_sequence
 
 
 def external_odometry(configuration: Configuration, camera: Camera, name: str = "") -> ExternalOdometry | None:

@@ -25,7 +25,6 @@ import cv2
 import msgspec
 import psutil
 
-from birdslam.datasets.speed_log import added
 from birdslam.runtime.configuration import Configuration, dump, without_passwords
 from birdslam.runtime.environment import LIBRARIES, USER_ERROR_STATUS
 from birdslam.runtime.latency import stages
@@ -41,6 +40,7 @@ from birdslam.runtime.transport.bus import Bus, Message
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameError, FrameReader
 from birdslam.runtime.wire import Health
+from birdslam.sources.speed_log import added
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedReading, Status
 
 TURN_S = 0.05  # what has come is written at least so often

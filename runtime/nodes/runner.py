@@ -21,7 +21,6 @@ from typing import TypeGuard
 import cv2
 import msgspec
 
-from birdslam.datasets.recording import DatasetError
 from birdslam.perception import ModelError
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.environment import USER_ERROR_STATUS
@@ -36,6 +35,7 @@ from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.topology import NODES, RECORDER, TOPICS
 from birdslam.runtime.transport.bus import Bus, Publisher
 from birdslam.runtime.wire import Health
+from birdslam.sources.recording import DatasetError
 from birdslam.types import Estimate, FrameRef, Measurements, Status
 
 log = logging.getLogger(__name__)

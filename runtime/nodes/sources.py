@@ -16,13 +16,13 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from birdslam.datasets.odometry_file import check_odometry
-from birdslam.datasets.opening import open_recording
-from birdslam.datasets.recording import RecordedFrame, Recording, undistorted
-from birdslam.datasets.speed_file import of_sequence, with_speeds
-from birdslam.datasets.speed_log import shifted
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, SourceConfig
+from birdslam.sources.odometry_file import check_odometry
+from birdslam.sources.opening import open_recording
+from birdslam.sources.recording import RecordedFrame, Recording, undistorted
+from birdslam.sources.speed_file import of_sequence, with_speeds
+from birdslam.sources.speed_log import shifted
 from birdslam.types import Frame, Status
 
 SOURCES = "kitti:DIR, video:FILE, rosbag:PATH, mcap:FILE, demo, demo:DIR, v4l2:/dev/videoN or rtsp://HOST/PATH"

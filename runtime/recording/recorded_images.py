@@ -9,7 +9,6 @@ import cv2
 import msgspec
 import numpy as np
 
-from birdslam.datasets.recording import DatasetError, RecordedFrame, Recording
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.configuration import RecordingConfig
 from birdslam.runtime.recording.foxglove import CompressedImage
@@ -17,6 +16,7 @@ from birdslam.runtime.recording.recording import Recording as File
 from birdslam.runtime.recording.recording import RecordingError
 from birdslam.runtime.recording.scene import timestamp
 from birdslam.runtime.wire import WireError, decode
+from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.types import NS_PER_S, FrameRef, Status
 
 READ = ("v1/frame", "/camera/image")

@@ -9,16 +9,16 @@ from typing import Any
 
 import msgspec
 
-from birdslam.datasets.demo import NAME, DemoRecording
-from birdslam.datasets.opening import open_recording
-from birdslam.evaluation.demo import VEHICLES, DemoGrade, grade
-from birdslam.evaluation.video import Floats, outline
+from birdslam.bench.tracking.shipped_drive import VEHICLES, DemoGrade, grade
+from birdslam.outputs.drive_video import Floats, outline
 from birdslam.runtime.configuration import Configuration
+from birdslam.sources.opening import open_recording
+from birdslam.sources.shipped_drive import NAME, DemoRecording
 from birdslam.types import Estimate, MapUpdate
 
 
 class DemoReport:
-    """Takes what planners are told, as birdslam.evaluation.results.Recorder does."""
+    """Takes what planners are told, as birdslam.outputs.drive_files.Recorder does."""
 
     def __init__(self, recording: DemoRecording) -> None:
         self._recording = recording

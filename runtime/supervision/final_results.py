@@ -16,11 +16,10 @@ from typing import Any
 
 import msgspec
 
-from birdslam.datasets.recording import DatasetError
-from birdslam.evaluation.final import FinalTracks, last_seen, write_final_ego
-from birdslam.evaluation.results import ResultsError, claim_directory
-from birdslam.evaluation.video import CODEC, DriveVideo, Floats, Image, check_video
 from birdslam.geometry.camera import Camera, Undistorter
+from birdslam.outputs.drive_files import ResultsError, claim_directory
+from birdslam.outputs.drive_video import CODEC, DriveVideo, Floats, Image, check_video
+from birdslam.outputs.final_trajectories import FinalTracks, last_seen, write_final_ego
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.sources import Source, open_source
 from birdslam.runtime.progress import Progress
@@ -28,6 +27,7 @@ from birdslam.runtime.recording.recorded_drive import measurements_of, recorded_
 from birdslam.runtime.recording.recorded_images import RecordedImages
 from birdslam.runtime.recording.recording import Recording
 from birdslam.runtime.supervision.demo_report import DemoReport
+from birdslam.sources.recording import DatasetError
 from birdslam.types import Estimate, MapUpdate, Measurements
 
 DEMO_VIDEO = "drive.mp4"  # of the shipped drive, asked for or not

@@ -16,8 +16,7 @@ from typing import Any
 
 import msgspec
 
-from birdslam.datasets.recording import DatasetError
-from birdslam.evaluation.results import Recorder, ResultsError, claim_directory
+from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
 from birdslam.perception import ModelError, load_network
 from birdslam.perception.pointnet import load_pointnet
 from birdslam.runtime.configuration import Configuration, ConfigurationError, ModelsConfig, complete
@@ -37,6 +36,7 @@ from birdslam.runtime.supervision.supervisor import Supervisor
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.transport.presence import VehicleLock, runtime_dir_of, socket_path
+from birdslam.sources.recording import DatasetError
 
 WITHOUT_MODELS = "no networks: odometry only, without vehicles and lanes"
 DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come to in a long drive among lane lines

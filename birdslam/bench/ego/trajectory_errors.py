@@ -1,0 +1,268 @@
+"""How good a trajectory is: ATE, RPE and scale against ground truth, with evo's definitions.
+
+Poses are (N, 4, 4) `T_first_i` in camera-0 axes. Nothing is aligned but the first pose, except where a name says se3 or
+sim3. KITTI's own poses are interpolated over the first dozen frames of a sequence (a constant twist: in 00 the heading
+is off by about a degree there), so that an alignment to the first pose turns the whole way by what they lack.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from birdslam.bench.ego.car_ahead import CarAhead, CarAheadReport
+from birdslam.bench.ego.consistency import Consistency, ConsistencyReport
+from birdslam.bench.ego.motion_consistency import MotionConsistencyReport, Motions
+from birdslam.outputs.drive_files import Recorder, claim_directory
+from birdslam.sources.recording import DatasetError, Recording
+from birdslam.trajectory import Transform, as_poses, inverse, read_kitti
+from birdslam.types import Estimate, MapUpdate, Measurements
+
+STANDING_RADIUS_M, STANDING_FRAMES = 0.05, 10  # a car whose truth stays within it for so long stands
+SEGMENTS_M = (10.0, 20.0, 30.0, 40.0, 50.0)  # KITTI's benchmark has 100 to 800 m, longer than a clip
+GROUND_AXES = (0, 2)  # x right and z forward of a camera: what is left of a position on the road
+
+
+class OdometryReport(msgspec.Struct, frozen=True, kw_only=True):
+    """One sequence against its ground truth; the errors are None where there is no truth."""
+
+    sequence: str
+    frames: int
+    path_m: float | None = None  # of the truth
+    ate_m: float | None = None  # root mean square of the positions' errors in 3-D, first pose aligned, no scale
+    ate_sim3_m: float | None = None  # the same after the best similarity (Umeyama 1991)
+    scale_error: float | None = None  # estimated path over true path, less 1
+    rpe_t_m: float | None = None  # root mean square over steps of one frame
+    rpe_r_deg: float | None = None
+    ate_planar_m: float | None = None  # of the two ground axes
+    ate_pct: float | None = None  # ate_m in percent of path_m
+    ate_se3_m: float | None = None  # after the best rigid motion, no scale: a truth whose first pose is off shows here
+    path_estimated_m: float = 0.0
+    standing_drift_m: float | None = None  # how far the estimate strays while the truth stands; None: it never does
+    statuses: dict[str, int] = {}  # how many frames carried each status
+    speed_sources: dict[str, int] = {}  # on how many frames the metres rested on each source
+    car_ahead: CarAheadReport | None = None  # where the recording has LiDAR
+    ego: ConsistencyReport | None = None  # what the ego's covariance is worth; None where only some frames are compared
+    motion: MotionConsistencyReport | None = None  # ... and each motion's, and what the truth is worth; None: as above
+    segment_t_pct: float | None = None  # mean error of stretches of SEGMENTS_M, each aligned at its own first pose:
+    segment_r_deg_per_m: float | None = None  # what the truth's first poses lack touches only those that begin there
+
+
+def rms(errors: NDArray[np.float64]) -> float:
+    """Root mean square of (N,) errors; 0 of none."""
+    return float(np.sqrt(np.mean(np.square(errors)))) if errors.size else 0.0
+
+
+def path_length_m(poses: Transform) -> float:
+    """Length of the way through (N, 4, 4) poses."""
+    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+
+
+def from_first(poses: Transform) -> Transform:
+    """The poses as seen from the first one: its alignment to the identity."""
+    return inverse(poses[0]) @ poses
+
+
+def in_camera0(poses: Transform, T_cam0_cam: Transform) -> Transform:
+    """`T_first_i` of a camera, as camera 0 of the same car moves: the lever arm between the two is taken out."""
+    out: Transform = T_cam0_cam @ poses @ inverse(T_cam0_cam)
+    return out
+
+
+def ate_m(truth: Transform, estimated: Transform, axes: tuple[int, ...] = (0, 1, 2)) -> float:
+    """Absolute trajectory error: root mean square distance of positions along `axes`, both from their first pose."""
+    difference = from_first(estimated)[:, :3, 3] - from_first(truth)[:, :3, 3]
+    return rms(np.linalg.norm(difference[:, axes], axis=1))
+
+
+def ate_aligned_m(truth: Transform, estimated: Transform, with_scale: bool) -> float:
+    """The same after the motion that fits best (Umeyama 1991, Eqs. 34-42), with its scale or without: what is left is
+    shape."""
+    goal, points = truth[:, :3, 3], estimated[:, :3, 3]
+    goal0, points0 = goal - goal.mean(axis=0), points - points.mean(axis=0)
+    U, d, Vt = np.linalg.svd(goal0.T @ points0 / len(goal))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    R = U @ np.diag(signs) @ Vt
+    variance = float(np.mean(np.sum(points0**2, axis=1)))
+    moved = variance > 1e-12  # an estimate that never moved has no scale: only its place fits
+    scale = float(d @ signs) / variance if with_scale and moved else 1.0
+    return rms(np.linalg.norm(goal0 - scale * points0 @ R.T, axis=1))
+
+
+def scale_error(truth: Transform, estimated: Transform) -> float | None:
+    """Estimated path length over the true one, less 1; None where the truth stands still."""
+    path_m = path_length_m(truth)
+    return path_length_m(estimated) / path_m - 1.0 if path_m > 0.0 else None
+
+
+def standing_drift_m(truth: Transform, estimated: Transform) -> float | None:
+    """The farthest that the estimate strays from where it was when the car came to stand; None: it never does."""
+    goal, points = truth[:, :3, 3], estimated[:, :3, 3]
+    drift, first = None, 0
+    while first < len(goal):
+        away = np.flatnonzero(np.linalg.norm(goal[first:] - goal[first], axis=1) > STANDING_RADIUS_M)
+        frames = int(away[0]) if len(away) else len(goal) - first
+        if frames >= STANDING_FRAMES:
+            strayed = np.linalg.norm(points[first : first + frames] - points[first], axis=1).max()
+            drift = max(drift or 0.0, float(strayed))
+            first += frames
+        else:
+            first += 1
+    return drift
+
+
+def rpe(truth: Transform, estimated: Transform) -> tuple[float, float]:
+    """Relative pose error over steps of one frame: root mean squares of translation (m) and rotation angle (deg)."""
+    if len(truth) < 2:
+        return 0.0, 0.0
+    steps = (inverse(poses[:-1]) @ poses[1:] for poses in (truth, estimated))
+    error = inverse(next(steps)) @ next(steps)
+    angles = Rotation.from_matrix(error[:, :3, :3]).magnitude()
+    return rms(np.linalg.norm(error[:, :3, 3], axis=1)), float(np.rad2deg(rms(angles)))
+
+
+def segment_errors(truth: Transform, estimated: Transform) -> tuple[float, float] | None:
+    """KITTI's odometry metric (Geiger et al. 2012): over stretches of SEGMENTS_M of the truth's way from every frame.
+
+    The mean error of their end in percent of their length, and of their direction in degrees a metre; None where the
+    truth is shorter than all of them.
+    """
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
+    pairs = [
+        (first, last, length)
+        for length in SEGMENTS_M
+        for first, last in enumerate(np.searchsorted(way, way + length).tolist())
+        if last < len(way)
+    ]
+    if not pairs:
+        return None
+    first, last, length = (np.array(column) for column in zip(*pairs, strict=True))
+    goal, own = (inverse(poses[first]) @ poses[last] for poses in (truth, estimated))
+    error = inverse(own) @ goal
+    turned_deg = np.rad2deg(Rotation.from_matrix(error[:, :3, :3]).magnitude())
+    strayed = np.linalg.norm(error[:, :3, 3], axis=1)
+    return 100.0 * float(np.mean(strayed / length)), float(np.mean(turned_deg / length))
+
+
+def compare(
+    sequence: str,
+    truth: Transform | None,
+    estimated: Transform,
+    statuses: dict[str, int],
+    compared: slice = slice(None),
+) -> OdometryReport:
+    """The report of one sequence; where not all are `compared`, of those, the first of them aligned.
+
+    Raises ValueError where the two don't have the same number of poses; a run may end with the last that is compared.
+    """
+    if truth is not None and len(estimated) not in (len(truth), compared.stop):
+        raise ValueError(f"sequence {sequence}: {len(estimated)} poses estimated for {len(truth)} frames")
+    if compared != slice(None):
+        estimated = from_first(estimated[compared])
+        truth = None if truth is None else from_first(truth[compared])
+    path_estimated_m = path_length_m(estimated)
+    if truth is None:
+        return OdometryReport(
+            sequence=sequence, frames=len(estimated), path_estimated_m=path_estimated_m, statuses=statuses
+        )
+    path_m, error_m = path_length_m(truth), ate_m(truth, estimated)
+    rpe_t_m, rpe_r_deg = rpe(truth, estimated)
+    segments = segment_errors(truth, estimated)
+    return OdometryReport(
+        sequence=sequence,
+        frames=len(estimated),
+        path_m=path_m,
+        ate_m=error_m,
+        ate_sim3_m=ate_aligned_m(truth, estimated, with_scale=True),
+        ate_se3_m=ate_aligned_m(truth, estimated, with_scale=False),
+        scale_error=scale_error(truth, estimated),
+        rpe_t_m=rpe_t_m,
+        rpe_r_deg=rpe_r_deg,
+        ate_planar_m=ate_m(truth, estimated, GROUND_AXES),
+        ate_pct=100.0 * error_m / path_m if path_m > 0.0 else None,
+        path_estimated_m=path_estimated_m,
+        standing_drift_m=standing_drift_m(truth, estimated),
+        statuses=statuses,
+        segment_t_pct=None if segments is None else segments[0],
+        segment_r_deg_per_m=None if segments is None else segments[1],
+    )
+
+
+def _check_known(name: str, truth: NDArray[np.float64], compared: slice) -> None:
+    """Raises DatasetError where the truth of a frame to be compared is not known (nan)."""
+    known: NDArray[np.bool_] = np.atleast_1d(np.isfinite(truth).all(axis=(1, 2)))
+    if not known[compared].all():
+        first, last = np.flatnonzero(known)[[0, -1]].tolist()
+        raise DatasetError(
+            f"{name}: the truth is known of {known.sum()} of {len(known)} frames, from {first} to {last}: compare "
+            f"those (--frames {first}:{last + 1})"
+        )
+
+
+def evaluate_recordings(
+    recordings: Iterable[Recording],
+    run: Callable[[Recording], Iterable[Measurements | Estimate | MapUpdate]],
+    directory: Path,
+    summary: Mapping[str, Any] | None = None,
+    compared: slice = slice(None),
+) -> list[OdometryReport]:
+    """Run the pipeline over each recording, keep its results in `directory/NAME`, and compare them with the truth.
+
+    `run` gives one Estimate a frame; before it the frame's Measurements, where motions or the car ahead are to be held
+    to the recording's truth or LiDAR, and after it what the map gained. `summary` goes into each summary.json. Of what
+    was run, the frames `compared` are held to the truth, aligned at the first of them. Writes
+    `directory/report.json`, a list of OdometryReport. Raises ValueError before the first run where two recordings share
+    a name, a truth file is torn or the directory can't be written to, and after a run that did not give one estimate a
+    frame.
+    """
+    recordings = list(recordings)
+    twice = [name for name, count in Counter(recording.name for recording in recordings).items() if count > 1]
+    if twice:
+        raise ValueError(f"two recordings of the name {', '.join(twice)}: their results would overwrite each other")
+    truths = [recording.truth_poses() for recording in recordings]
+    for recording, truth in zip(recordings, truths, strict=True):
+        if truth is not None:
+            _check_known(recording.name, truth, compared)
+    claim_directory(directory)
+    report = []
+    for recording, truth in zip(recordings, truths, strict=True):
+        mount, ahead = recording.camera.ground, CarAhead.of(recording)
+        ego, motions = Consistency(mount), Motions(mount)
+        with Recorder(directory / recording.name, recording.camera) as recorder:
+            for record in run(recording):
+                if isinstance(record, MapUpdate):
+                    recorder.add_map(record)
+                elif isinstance(record, Estimate):
+                    recorder.add(record)
+                    ego.add(record)
+                    if ahead:
+                        ahead.add_estimate(record)
+                else:
+                    motions.add(record)
+                    if ahead:
+                        ahead.add_measurements(record)
+            recorder.finish({"sequence": recording.name, **(summary or {})})
+        rows = as_poses(read_kitti(directory / recording.name / "ego.kitti.txt"))
+        estimated = in_camera0(rows, recording.T_cam0_cam())
+        goal = None if truth is None else as_poses(truth)
+        if goal is not None and compared == slice(None):
+            goal = from_first(goal)
+        row = compare(recording.name, goal, estimated, dict(sorted(recorder.statuses.items())), compared)
+        row = msgspec.structs.replace(row, speed_sources=dict(sorted(recorder.speed_sources.items())))
+        if goal is not None and compared == slice(None):
+            T_cam0_cam = recording.T_cam0_cam()
+            of_camera = inverse(T_cam0_cam) @ goal @ T_cam0_cam
+            row = msgspec.structs.replace(row, ego=ego.report(of_camera), motion=motions.report(of_camera))
+        report.append(msgspec.structs.replace(row, car_ahead=ahead.report()) if ahead else row)
+        encoded = msgspec.json.format(msgspec.json.encode(report), indent=2)
+        (directory / "report.json").write_bytes(
+            encoded + b"\n"
+        )  # after each, so that a long evaluation keeps what it has
+    return report

@@ -1,0 +1,135 @@
+"""The paper's ablations as variants of the incremental method (its Tables 3 and 4) and of the batch (Table 5).
+
+A variant is a change of weights, so that it runs on the same log. "Without" is a weight of as good as zero (1e-3,
+against the paper's 1 to 10000): CC keeps its motion as the guess that the graph starts from, CV the first sight of a
+vehicle, as nothing else says where they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import msgspec
+
+from birdslam.bench.baselines import batch_se3
+from birdslam.bench.baselines.trajectories import Method, Trajectories
+from birdslam.bench.tracking.benchmark import PAPER, Final, Live
+from birdslam.bench.tracking.completed_lanes import of_kind, with_completed_lanes
+from birdslam.geometry.camera import Camera
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.weights import NO_WEIGHT, EdgeType, WeightsConfig
+from birdslam.types import LandmarkKind, Measurements
+from birdslam.vehicles.rts_smoother import SmootherConfig
+
+CP_WEIGHTS = MappingProxyType({"cp_low": 0.01, "cp_medium": 1.0, "cp_high": 100.0})  # against CC's own
+DEPTHS_M = MappingProxyType(
+    {"depth_12": 12.0, "depth_15": 15.0, "depth_18": 18.0, "depth_20": 20.0, "depth_none": None}
+)
+FARTHEST_LANDMARK_M = 200.0  # beyond any threshold, so that the front end's own limit does not hide it
+
+
+def constraint_variants(base: Live) -> dict[str, Live]:
+    """Table 3: without one type of edge each, and with all."""
+    return {
+        "without_cc": _leave_out(base, "cc"),
+        "without_cv": _without_cv(base),
+        "without_vv": _without_vv(base),
+        "without_cp": _leave_out(base, "cp"),
+        "all": base,
+    }
+
+
+def landmark_variants(base: Live) -> dict[str, Live]:
+    """Table 4: the weight of CP against CC's, and the depth from which on landmarks are left out."""
+    out = {}
+    for name, factor in CP_WEIGHTS.items():
+        if base.weights.mode == "paper":
+            weight = factor * base.weights.cc
+            out[name] = _reweighted(base, cp=weight, cp_vehicles=base.weights.cp_vehicles and weight)
+        else:
+            out[name] = replace(base, cp_inflation=1.0 / factor)
+    for name, depth_m in DEPTHS_M.items():
+        out[name] = _reweighted(base, depth_threshold_m=depth_m)
+    return out
+
+
+def idea_variants() -> dict[str, Method]:
+    """What is ours in the back end, each alone over the paper's, by what it is; for a log of the paper's placing."""
+    default, paper = GraphConfig(), PAPER.graph
+    alone = {
+        "gates on outliers": ("detection_gate_sigma", "landmark_gate_sigma"),
+        "an error that all landmarks share": ("landmark_common_m",),
+        "landmarks where the last key frame saw them": ("landmark_anchor",),
+        "standstill held": ("hold_at_standstill",),
+        "a front that may be a back": ("ends_alike",),
+    }
+    out: dict[str, Method] = {"nothing (the paper)": PAPER}
+    for name, fields in alone.items():
+        more = {field: getattr(default, field) for field in fields}
+        base = _of_ego_alone(PAPER) if "landmark_anchor" in fields else PAPER
+        out[name] = replace(base, graph=msgspec.structs.replace(paper, **more))
+    out["CP of the ego alone"] = _of_ego_alone(PAPER)
+    out["measured covariances"] = replace(PAPER, weights=WeightsConfig(leave_out=()))
+    steady = replace(PAPER, graph=msgspec.structs.replace(paper, constant_velocity=True))
+    out["constant velocity in place of VV"] = _leave_out(steady, "vv")
+    out["the smoother"] = Final("", PAPER, SmootherConfig())
+    return out
+
+
+def placed_variants(base: Live) -> dict[str, Method]:
+    """The same for a log of our placing: that alone, and everything together, live and final."""
+    return {
+        "vehicles placed by measured ground and size": PAPER,
+        "all, live": base,
+        "all, final": Final("", base, SmootherConfig()),
+    }
+
+
+def lane_variants(images: bool = False) -> dict[str, Method]:
+    """Table 5: the batch before and after lane constraints; of a log of `images`, which has lanes, also with either."""
+    out: dict[str, Method] = {"before_lanes": _Batch("Batch SE(3) before lane constraints", False)}
+    out["after_lanes"] = batch_se3
+    if images:
+        out["corners_alone"] = _Batch("Batch SE(3), corners alone", of=LandmarkKind.ROAD_POINT)
+        out["completed_lanes"] = _Batch("Batch SE(3), completed lanes alone", of=LandmarkKind.LANE_STATION)
+    return out
+
+
+@dataclass(frozen=True)
+class _Batch:
+    label: str
+    landmarks: bool = True
+    of: LandmarkKind | None = None  # lanes are the completed ones then
+
+    def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
+        if self.of is not None:
+            log = of_kind(with_completed_lanes(log), self.of)
+        return batch_se3.run(log, camera, self.landmarks)
+
+
+def _leave_out(base: Live, edge: EdgeType) -> Live:
+    return _reweighted(base, leave_out=tuple({*base.weights.left_out, edge}))
+
+
+def _of_ego_alone(base: Live) -> Live:
+    """Without CP edges of vehicles, which say something only where landmarks stand in the world."""
+    return _reweighted(base, cp_vehicles=None)
+
+
+def _without_vv(base: Live) -> Live:
+    """Neither VV edges nor what stands in for them in our graph."""
+    base = _leave_out(base, "vv")
+    return replace(base, graph=msgspec.structs.replace(base.graph, constant_velocity=False))
+
+
+def _without_cv(base: Live) -> Live:
+    """Nor CP edges of vehicles, which tell once more what the CV edges told."""
+    if base.weights.mode == "paper":
+        return _reweighted(base, cv_near=NO_WEIGHT, cv_far=NO_WEIGHT, cp_vehicles=None)
+    return replace(base, cv_inflation=1.0 / NO_WEIGHT)
+
+
+def _reweighted(base: Live, **weights: object) -> Live:
+    return replace(base, weights=msgspec.structs.replace(base.weights, **weights))

@@ -1,0 +1,324 @@
+"""The paper's benchmark: every method on one log of measurements, held to KITTI tracking's labels and poses.
+
+A *log* is what the front end says of a drive. It is made once for each seed and given to every method, so that methods
+differ in nothing else. Track ids are our own tracker's; a label's track in a frame is the one whose box overlaps it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from birdslam.bench.baselines import batch_se3, cubeslam, nair, namdev
+from birdslam.bench.baselines.shape_prior import Initialised
+from birdslam.bench.baselines.trajectories import LiveTrajectories, Method, Trajectories
+from birdslam.bench.simulation.odometry import SimulatedOdometry
+from birdslam.bench.tracking.metrics import (
+    BoxFrame,
+    PathErrors,
+    count_boxes,
+    hota,
+    idf1,
+    match_vehicles,
+    path_errors,
+)
+from birdslam.frontend import EgoMotion, FrontEnd, FrontEndConfig, Pending
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.slam import SlamConfig
+from birdslam.sources.kitti import KITTI_RATE_HZ
+from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
+from birdslam.sources.speed_log import SpeedLog
+from birdslam.types import NS_PER_S, Frame, Measurements
+from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
+
+EGO = "ego"
+LEAST_FRAMES = 5  # a vehicle matched in fewer is left out of the report, unless the paper names it
+
+NO_IMAGE = np.zeros((1, 1), dtype=np.uint8)  # for an odometry that needs none
+
+
+@dataclass(frozen=True)
+class Live:
+    """Our incremental pose graph: the live estimate of each frame, which knows nothing of later ones."""
+
+    label: str
+    weights: WeightsConfig
+    graph: GraphConfig
+    cv_inflation: float = 1.0  # of the variances in the log
+    cp_inflation: float = 1.0
+
+    def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
+        """One update for each record."""
+        graph, live = PoseGraph(self.graph, self.weights), LiveTrajectories()
+        for measurements in log:
+            live.add(graph.optimise(self._reweighed(measurements)))
+        return live.result
+
+    def _reweighed(self, m: Measurements) -> Measurements:
+        if self.cv_inflation == self.cp_inflation == 1.0:
+            return m
+        cv = [replace(e, cov=tuple(self.cv_inflation * v for v in e.cov)) for e in m.cv]
+        cp = [replace(e, cov=tuple(self.cp_inflation * v for v in e.cov)) for e in m.cp]
+        return replace(m, cv=tuple(cv), cp=tuple(cp))
+
+
+@dataclass(frozen=True)
+class Final:
+    """The vehicles' trajectories smoothed over the whole log, and the ego's live one.
+
+    A batch, and the paper's graph, which keeps every pose, estimate each frame from the whole log: so does this.
+    """
+
+    label: str
+    live: Live
+    smoother: SmootherConfig
+
+    def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:
+        """One update for each record, and a smoother backwards over the log."""
+        graph, live = PoseGraph(self.live.graph, self.live.weights), LiveTrajectories()
+        smoother = RtsSmoother(self.smoother)
+        for measurements in log:
+            estimate = graph.optimise(measurements)
+            live.add(estimate)
+            smoother.add(measurements, estimate)
+        out = Trajectories(ego=live.result.ego)
+        for (epoch, vehicle), way in smoother.smooth().items():
+            for frame, pose in way.items():
+                out.put_vehicle(vehicle, frame, live.T_first_world[epoch] @ pose)
+        return out
+
+
+NO_GATE = 1e6  # sigmas: nothing is an outlier
+
+PAPER = Live(
+    "BirdSLAM as published",
+    WeightsConfig(mode="paper", cp_vehicles=10_000.0),
+    # CC, CP, CV and VV edges by Eqs. 5-8 and nothing else
+    GraphConfig(
+        constant_velocity=False,
+        detection_gate_sigma=NO_GATE,
+        landmark_gate_sigma=NO_GATE,
+        landmark_common_m=0.0,
+        landmark_anchor="first_sight",
+        scale_memory_m=0.0,
+        hold_at_standstill=False,
+        ends_alike=False,
+    ),
+)
+
+
+def ours(config: SlamConfig) -> Live:
+    """The method as configured: what a planner gets."""
+    return Live("BirdSLAM (this system), live", config.weights, config.graph)
+
+
+def methods(config: SlamConfig) -> dict[str, Method]:
+    """Every method by its name; `config` is that of `birdslam`."""
+    return {
+        "birdslam": Final("BirdSLAM (this system)", ours(config), SmootherConfig()),
+        "birdslam_live": ours(config),
+        "paper": PAPER,
+        "paper_final": Final("BirdSLAM as published, our smoother", PAPER, SmootherConfig()),
+        "batch_se3": batch_se3,
+        "nair": nair,
+        "batch_se3_shape": Initialised("Batch SE(3), unscaled odometry, shape prior", batch_se3),
+        "nair_shape": Initialised("Nair et al. (IV 2020), shape prior", nair),
+        "namdev": namdev,
+        "cubeslam": cubeslam,
+    }
+
+
+def make_log(
+    sequence: TrackingSequence,
+    frames: range,
+    odometry: EgoMotion | None,
+    perceive: Callable[[int, NDArray[np.uint8]], Pending],
+    images: Callable[[int], NDArray[np.uint8] | None] | None,
+    config: FrontEndConfig,
+    speeds: SpeedLog | None = None,
+) -> list[Measurements]:
+    """The front end's measurements of `frames`; frame ids are KITTI's.
+
+    `images` gives a frame's image, None where it is unreadable; without `images` the odometry needs none. `speeds` are
+    the car's own, by the frames' time from 0 on.
+    """
+    frontend, log = FrontEnd(sequence.camera, config, odometry), []
+    for index in frames:
+        image = NO_IMAGE if images is None else images(index)
+        t_ns = round(index / KITTI_RATE_HZ * NS_PER_S)
+        pending = perceive(index, NO_IMAGE if image is None else image)
+        said = () if speeds is None else speeds.until(t_ns)
+        m = frontend.measure(Frame(index, t_ns, t_ns, t_ns, image, speeds=said), pending)
+        if isinstance(odometry, SimulatedOdometry) and m.ground is not None:
+            ground = GroundPlane(m.ground.height_m, m.ground.pitch_rad, m.ground.roll_rad)
+            m = replace(m, cp=odometry.landmarks(index, ground, config.static_map))
+        log.append(m)
+    return log
+
+
+def most_labelled(sequence: TrackingSequence, cars: Iterable[int], frames: int) -> range:
+    """So many frames in which the labels of `cars` are the most together: the first of such stretches."""
+    length = len(sequence)
+    labels = np.zeros(length + 1)
+    for label in sequence.labels:
+        labels[label.frame + 1] += label.track in set(cars)
+    frames = min(frames, length)
+    so_far = np.cumsum(labels)
+    start = int(np.argmax(so_far[frames:] - so_far[: length + 1 - frames]))
+    return range(start, start + frames)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a log is held to: poses in the world of its first frame, and each frame's label -> track of ours."""
+
+    ego: dict[int, SE2]
+    vehicles: dict[int, dict[int, SE2]]  # label's id -> frame -> pose
+    kinds: dict[int, str]
+    matches: dict[int, dict[int, int]]  # frame -> label's id -> vehicle
+    boxes: list[BoxFrame]
+
+    @staticmethod
+    def of(sequence: TrackingSequence, log: Sequence[Measurements]) -> Truth:
+        """Raises ValueError for an empty log."""
+        if not log:
+            raise ValueError(f"sequence {sequence.name}: no frames to evaluate")
+        first = log[0].frame_id
+        ego = sequence.ego_truth(first)
+        out = Truth({m.frame_id: ego[m.frame_id] for m in log}, {}, {}, {}, [])
+        for m in log:
+            labels = sequence.labels_of(m.frame_id)
+            ids, boxes_px = [edge.vehicle for edge in m.cv], np.array([edge.box_px for edge in m.cv]).reshape(-1, 4)
+            for label in labels:
+                if label.kind in VEHICLE_KINDS:
+                    pose = sequence.vehicle_truth(label, first)
+                    out.vehicles.setdefault(label.track, {})[m.frame_id] = pose
+                    out.kinds[label.track] = label.kind
+            out.matches[m.frame_id] = match_vehicles(labels, ids, boxes_px)
+            out.boxes.append(count_boxes(labels, ids, boxes_px))
+        return out
+
+    def found(self, label: int, result: Trajectories) -> dict[int, SE2]:
+        """A label's poses as a method estimated them, through whichever track held it in each frame."""
+        out = {}
+        for frame, match in self.matches.items():
+            pose = result.vehicles.get(match.get(label, -1), {}).get(frame)
+            if pose is not None:
+                out[frame] = pose
+        return out
+
+    def tracks(self) -> dict[str, int]:
+        """How many tracks held each labelled vehicle, one after the other."""
+        held = {label: {m[label] for m in self.matches.values() if label in m} for label in self.vehicles}
+        return {str(label): len(tracks) for label, tracks in held.items()}
+
+    def errors(self, result: Trajectories, bodies: Iterable[str] | None = None) -> dict[str, PathErrors | None]:
+        """Errors of "ego" and of every labelled vehicle, or those of `bodies`; None for one that was never found."""
+        out = {EGO: path_errors(self.ego, result.ego)}
+        asked = self.vehicles if bodies is None else {label for label in self.vehicles if str(label) in bodies}
+        for label in sorted(asked):
+            out[str(label)] = path_errors(self.vehicles[label], self.found(label, result))
+        return out
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """One body in one sequence by one method: medians over the seeds, and the standard deviation of `ate_m`."""
+
+    sequence: str
+    method: str
+    body: str  # "ego", or the label's id
+    frames: float  # that count: the body has a label and an estimate
+    frames_labelled: int
+    seeds: int
+    ate_m: float | None = None
+    ate_m_spread: float | None = None
+    rpe_t_m: float | None = None
+    rpe_r_deg: float | None = None
+    motion_error_m: float | None = None
+    hota: float | None = None  # of the sequence's cars, in the rows of the ego; the same tracks for every method
+    idf1: float | None = None
+    odometry: str = ""
+    detections: str = ""
+    tracks: float | None = None  # how many of our tracks held the vehicle; the same for every method
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One seed: errors by method and body, and the tracks' quality in the image."""
+
+    errors: Mapping[str, Mapping[str, PathErrors | None]]
+    frames_labelled: Mapping[str, int]
+    tracks: Mapping[str, int]  # body -> tracks that held it
+    hota: float | None
+    idf1: float | None
+
+
+def run_trial(
+    sequence: TrackingSequence,
+    log: Sequence[Measurements],
+    chosen: Mapping[str, Method],
+    bodies: Sequence[str] | None = None,
+) -> Trial:
+    """Every method on one log; the errors of the labelled vehicles `bodies` alone, where these are named."""
+    truth = Truth.of(sequence, log)
+    labelled = {EGO: len(truth.ego)} | {str(label): len(poses) for label, poses in truth.vehicles.items()}
+    errors = {name: truth.errors(method.run(log, sequence.camera), bodies) for name, method in chosen.items()}
+    return Trial(errors, labelled, truth.tracks(), hota(truth.boxes), idf1(truth.boxes))
+
+
+def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odometry: str, detections: str) -> list[Row]:
+    """The rows of one sequence from its trials, one for each seed; bodies in `keep` stay however little was seen."""
+    rows, keep = [], set(keep) | {EGO}
+    for method in trials[0].errors:
+        for body, labelled in trials[0].frames_labelled.items():
+            found = [trial.errors[method].get(body) for trial in trials]
+            seen = [errors for errors in found if errors is not None]
+            frames = float(np.median([0 if errors is None else errors.frames for errors in found]))
+            if frames < LEAST_FRAMES and body not in keep:
+                continue
+            is_ego = body == EGO
+            rows.append(
+                Row(
+                    sequence=sequence,
+                    method=method,
+                    body=body,
+                    frames=frames,
+                    frames_labelled=labelled,
+                    seeds=len(trials),
+                    ate_m=_median([errors.ate_m for errors in seen]),
+                    ate_m_spread=float(np.std([errors.ate_m for errors in seen])) if seen else None,
+                    rpe_t_m=_median([errors.rpe_t_m for errors in seen]),
+                    rpe_r_deg=_median([errors.rpe_r_deg for errors in seen]),
+                    motion_error_m=_median([errors.motion_error_m for errors in seen]),
+                    hota=_median([trial.hota for trial in trials]) if is_ego else None,
+                    idf1=_median([trial.idf1 for trial in trials]) if is_ego else None,
+                    odometry=odometry,
+                    detections=detections,
+                    tracks=_median([trial.tracks.get(body) for trial in trials]),
+                )
+            )
+    return rows
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    numbers = [value for value in values if value is not None]
+    return float(np.median(numbers)) if numbers else None
+
+
+def mean_ate_m(rows: Iterable[Row], method: str, bodies: Mapping[str, Iterable[str]]) -> float | None:
+    """Mean of `ate_m` over bodies by sequence; None where one of them is missing, or there are none.
+
+    The rows must be of one odometry.
+    """
+    of = {(row.sequence, row.body): row.ate_m for row in rows if row.method == method}
+    errors = [of.get((sequence, body)) for sequence, names in bodies.items() for body in names]
+    return float(np.mean([e for e in errors if e is not None])) if errors and None not in errors else None

@@ -1,0 +1,346 @@
+"""The paper's Tables 1-5 as Markdown: published, re-implemented and ours in columns of their own.
+
+A row is a body here and a method a column, so that the three sources stand side by side; numbers are ATE (RMS, metres).
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from birdslam.bench.tracking.benchmark import EGO, Row, mean_ate_m
+from birdslam.bench.tracking.relative_nees import NeesRow
+from birdslam.bench.tracking.reported import MotionRow, RangeRow
+from birdslam.sources.recording import DatasetError
+
+ODOMETRIES = {  # as it is called in a row, and at length
+    "simulate": (
+        "simulated odometry",
+        "SIMULATED (true poses with the errors that our image odometry has on real clips, landmarks drawn beside the "
+        "true path)",
+    ),
+    "truth": ("true odometry", "TRUTH (no error)"),
+    "images": ("images", "from the images where a row says so"),
+}
+OURS = {"birdslam_live": "ours, live", "birdslam": "**ours, final**"}
+Cells = dict[str, dict[str, float]]  # sequence -> body -> metres
+
+METHOD_TITLES = {
+    "nair": "Nair",
+    "namdev": "Namdev",
+    "batch_se3": "batch SE(3)",
+    "cubeslam": "CubeSLAM",
+    "paper": "BirdSLAM",
+}
+REDONE_TITLES = {  # of the re-implemented; a batch knows the whole log, as what is final does
+    "nair": "Nair, batch",
+    "namdev": "Namdev, batch",
+    "batch_se3": "batch SE(3)",
+    "nair_shape": "Nair, batch, shape prior",
+    "batch_se3_shape": "batch SE(3), shape prior",
+    "cubeslam": "CubeSLAM, batch",
+    "paper": "BirdSLAM, live",
+    "paper_final": "BirdSLAM, final",
+    "paper_eq1": "BirdSLAM by Eq. 1, live",
+    "paper_eq1_final": "BirdSLAM by Eq. 1, final",
+}
+VARIANT_TITLES = {
+    "without_cc": "without CC",
+    "without_cv": "without CV",
+    "without_vv": "without VV",
+    "without_cp": "without CP",
+    "all": "with all",
+    "cp_low": "CP low",
+    "cp_medium": "CP medium",
+    "cp_high": "CP high",
+    "depth_12": "T = 12 m",
+    "depth_15": "T = 15 m",
+    "depth_18": "T = 18 m",
+    "depth_20": "T = 20 m",
+    "depth_none": "no T",
+    "before_lanes": "before lanes",
+    "after_lanes": "after lanes",
+    "corners_alone": "corners alone",
+    "completed_lanes": "completed lanes alone",
+}
+CONSTRAINTS, LANDMARKS = tuple(VARIANT_TITLES)[:5], tuple(VARIANT_TITLES)[5:13]
+LANES, LANES_OF_IMAGES = tuple(VARIANT_TITLES)[13:15], tuple(VARIANT_TITLES)[15:]
+
+
+class PaperSequence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the paper takes of a sequence: how many frames, and which cars it reports."""
+
+    frames: int
+    cars: tuple[int, ...]
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The cars' ids as they stand in rows."""
+        return tuple(str(car) for car in self.cars)
+
+
+class PublishedTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One table: `ate_m[column][sequence][body]`."""
+
+    where: str
+    what: str
+    ate_m: dict[str, Cells]
+    frames: dict[str, dict[str, int]] = {}
+    average_m: dict[str, float] = {}
+
+
+class PublishedRuntime(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Seconds that the paper states for a whole sequence."""
+
+    where: str
+    incremental_s: float
+    batch_s: float
+    frames: int
+    sequence: str
+
+
+class Published(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """birdslam/bench/tracking/published.toml."""
+
+    sequences: dict[str, PaperSequence]
+    runtime: PublishedRuntime
+    table1: PublishedTable
+    table2: PublishedTable
+    table3: PublishedTable
+    table4: PublishedTable
+    table5: PublishedTable
+
+
+def read_published(path: Path) -> Published:
+    """The paper's numbers. Raises DatasetError naming the file and the key."""
+    try:
+        return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), Published)
+    except OSError as error:
+        raise DatasetError(f"{path}: can't be read: {error.strerror}") from None
+    except (ValueError, msgspec.ValidationError) as error:
+        raise DatasetError(f"{path}: {error}") from None
+
+
+def methods_table(rows: Sequence[Row], published: Published, ego: bool) -> str:
+    """Table 1 (vehicles) or 2 (ego)."""
+    table = published.table2 if ego else published.table1
+    chosen = _chosen(rows)
+    redone = [name for name in REDONE_TITLES if name in chosen]
+    own = [name for name in OURS if name in chosen]
+    head = ["Seq", "Car", "odometry", "frames"]
+    head += [f"published: {title}" for title in METHOD_TITLES.values()]
+    head += [f"re-implemented: {REDONE_TITLES[name]}" for name in redone]
+    head += [OURS[name] for name in own]
+    bodies = {s: (EGO,) if ego else paper.bodies for s, paper in published.sequences.items()}
+    lines = []
+    for sequence, names in bodies.items():
+        for body in names:
+            here = [row for row in rows if (row.sequence, row.body) == (sequence, body)]
+            for odometry in dict.fromkeys(row.odometry for row in here) or ("",):
+                of = {row.method: row for row in here if row.odometry == odometry}
+                any_row = next(iter(of.values()), None)
+                line = [sequence, body, odometry_title(odometry)]
+                line.append("" if any_row is None else f"{any_row.frames:g} of {any_row.frames_labelled}")
+                line += [_number(table.ate_m.get(name, {}).get(sequence, {}).get(body)) for name in METHOD_TITLES]
+                line += [_row_number(of.get(name)) for name in (*redone, *own)]
+                lines.append(line)
+    for odometry in dict.fromkeys(row.odometry for row in rows) or ("",):
+        alike = [row for row in rows if row.odometry == odometry]
+        present = _present(alike, bodies)
+        means: list[str] = ["mean", "of those at hand", odometry_title(odometry), ""]
+        means += [_number(_published_mean(table.ate_m.get(name, {}), present)) for name in METHOD_TITLES]
+        means += [_number(mean_ate_m(alike, name, present)) for name in (*redone, *own)]
+        lines.append(means)
+    return _markdown(head, lines)
+
+
+def odometry_title(odometry: str) -> str:
+    """What a row says of where its ego motion comes from."""
+    return ODOMETRIES.get(odometry, (odometry,))[0]
+
+
+def variants_table(rows: Sequence[Row], published: Published, table: PublishedTable, columns: Sequence[str]) -> str:
+    """Table 3 or 4: `rows` have "paper/VARIANT" and "birdslam/VARIANT" for methods."""
+    chosen = _chosen(rows)
+    sources = [("re-implemented", "paper/"), ("ours", "birdslam/")]
+    sources = [(title, prefix) for title, prefix in sources if any(name.startswith(prefix) for name in chosen)]
+    head = ["Seq", "Car"]
+    for column in columns:
+        head += [f"{VARIANT_TITLES[column]}: published", *(title for title, _ in sources)]
+    bodies = {s: (*paper.bodies, EGO) for s, paper in published.sequences.items()}
+    lines = []
+    for sequence, names in bodies.items():
+        for body in names:
+            of = {row.method: row for row in rows if (row.sequence, row.body) == (sequence, body)}
+            line = [sequence, body]
+            for column in columns:
+                line.append(_number(table.ate_m[column].get(sequence, {}).get(body)))
+                line += [_row_number(of.get(prefix + column), spread=False) for _, prefix in sources]
+            lines.append(line)
+    present = _present(rows, bodies)
+    means = ["mean", "of those at hand"]
+    for column in columns:
+        means.append(_number(_published_mean(table.ate_m[column], present)))
+        means += [_number(mean_ate_m(rows, prefix + column, present)) for _, prefix in sources]
+    return _markdown(head, [*lines, means])
+
+
+def ideas_table(rows: Sequence[Row], published: Published) -> str:
+    """A row for each idea ("ideas/NAME"), the paper's bodies that are at hand in columns."""
+    paper = {s: (*one.bodies, EGO) for s, one in published.sequences.items()}
+    bodies = list(dict.fromkeys((row.sequence, row.body) for row in rows if row.body in paper.get(row.sequence, ())))
+    egos, cars = ([at for at in bodies if (at[1] == EGO) is ego] for ego in (True, False))
+    lines = []
+    for name in _chosen(rows):
+        of = {(row.sequence, row.body): row for row in rows if row.method == name}
+        means = [_mean(of[at].ate_m for at in some if at in of) for some in (cars, egos)]
+        cells = [_row_number(of.get(at)) for at in (*cars, *egos)]
+        lines.append([name.removeprefix("ideas/"), *cells, *map(_number, means)])
+    titles = [f"{sequence}/{body}" for sequence, body in (*cars, *egos)]
+    return _markdown(["ours over the paper", *titles, "mean, cars", "mean, ego"], lines)
+
+
+def lanes_table(rows: Sequence[Row], published: Published) -> str:
+    """Table 5, over the paper's bodies, by odometry; what only a log of images has is in columns of its own."""
+    head = ["Seq", "Car", "odometry", "frames: published", "at hand"]
+    for column in LANES:
+        head += [f"{VARIANT_TITLES[column]}: published", "re-implemented"]
+    head += [f"{VARIANT_TITLES[column]}: re-implemented" for column in LANES_OF_IMAGES]
+    rows = [row for row in rows if row.method in (*LANES, *LANES_OF_IMAGES)]
+    table, lines = published.table5, []
+    for sequence, paper in published.sequences.items():
+        for body in (*paper.bodies, EGO):
+            here = [row for row in rows if (row.sequence, row.body) == (sequence, body)]
+            frames = table.frames.get(sequence, {}).get(body)
+            if frames is None and not here:
+                continue
+            for odometry in dict.fromkeys(row.odometry for row in here) or ("",):
+                of = {row.method: row for row in here if row.odometry == odometry}
+                any_row = next(iter(of.values()), None)
+                line = [sequence, body, odometry_title(odometry), _number(frames, 0)]
+                line.append("" if any_row is None else f"{any_row.frames:g}")
+                for column in LANES:
+                    line.append(_number(table.ate_m[column].get(sequence, {}).get(body)))
+                    line.append(_row_number(of.get(column), spread=False))
+                line += [_row_number(of.get(column), spread=False) for column in LANES_OF_IMAGES]
+                lines.append(line)
+    return _markdown(head, lines)
+
+
+def tracks_table(rows: Sequence[Row], method: str) -> str:
+    """What the paper does not report: relative errors, object motion, and the tracks in the image."""
+    head = ["Seq", "odometry", "HOTA", "IDF1", "ego RPE m", "ego RPE deg", "vehicles", "tracks of each"]
+    head += ["ATE m", "RPE m", "RPE deg", "motion m"]
+    lines = []
+    of_method = [row for row in rows if row.method == method]
+    for ego in (row for row in of_method if row.body == EGO):
+        alike = [row for row in of_method if (row.sequence, row.odometry) == (ego.sequence, ego.odometry)]
+        cars = [row for row in alike if row.body != EGO]
+        line = [
+            ego.sequence,
+            odometry_title(ego.odometry),
+            _number(ego.hota, 3),
+            _number(ego.idf1, 3),
+            _number(ego.rpe_t_m, 3),
+        ]
+        line += [_number(ego.rpe_r_deg, 3), str(len(cars)), _number(_mean(car.tracks for car in cars))]
+        line += [_number(_mean(getattr(car, name) for car in cars)) for name in ("ate_m", "rpe_t_m", "rpe_r_deg")]
+        lines.append([*line, _number(_mean(car.motion_error_m for car in cars))])
+    return _markdown(head, lines)
+
+
+def ranges_table(rows: Sequence[RangeRow]) -> str:
+    """Of the cars asked for at each range: how many were found, and how far off."""
+    head = ["Seq", "range m", "asked", "found", "depth error", "depth bias", "across m"]
+    lines = [
+        [
+            row.sequence,
+            row.range,
+            str(row.asked),
+            _number(row.found / row.asked if row.asked else None),
+            _percent(row.depth_error_median_rel),
+            _percent(row.depth_bias_median_rel),
+            _number(row.across_error_median_m),
+        ]
+        for row in rows
+    ]
+    return _markdown(head, lines)
+
+
+def motion_table(rows: Sequence[MotionRow]) -> str:
+    """Of the found cars: their velocities, and how many standing and driving ones were told as the other."""
+    head = ["Seq", "sights", "velocity error m/s", "standing", "false movers", "sure of it"]
+    head += ["driving", "missed movers", "sure of it"]
+    lines = [
+        [
+            row.sequence,
+            str(row.asked),
+            _number(row.velocity_error_median_mps),
+            *map(str, (row.standing, row.false_movers, row.false_movers_sure)),
+            *map(str, (row.driving, row.missed_movers, row.missed_movers_sure)),
+        ]
+        for row in rows
+    ]
+    return _markdown(head, lines)
+
+
+def nees_table(rows: Sequence[NeesRow]) -> str:
+    """Relative NEES of ego, scale and vehicles, by frame and by 10 m."""
+    head = ["Seq", "odometry", "of", "per", "n", "NEES", "median"]
+    lines = [
+        [
+            row.sequence,
+            odometry_title(row.odometry),
+            row.of,
+            row.per,
+            f"{row.n} of {row.bodies}" if row.of == "vehicles" else str(row.n),
+            _number(row.nees),
+            _number(row.nees_median),
+        ]
+        for row in rows
+    ]
+    return _markdown(head, lines)
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100.0 * value:.1f} %"
+
+
+def _chosen(rows: Iterable[Row]) -> list[str]:
+    return list(dict.fromkeys(row.method for row in rows))
+
+
+def _present(rows: Iterable[Row], bodies: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str]]:
+    at_hand = {row.sequence for row in rows}
+    return {sequence: names for sequence, names in bodies.items() if sequence in at_hand}
+
+
+def _published_mean(cells: Cells, bodies: Mapping[str, Sequence[str]]) -> float | None:
+    numbers = [cells.get(sequence, {}).get(body) for sequence, names in bodies.items() for body in names]
+    return _mean(numbers) if None not in numbers else None
+
+
+def _mean(numbers: Iterable[Any]) -> float | None:
+    known = [float(number) for number in numbers if number is not None]
+    return sum(known) / len(known) if known else None
+
+
+def _number(value: float | None, digits: int = 2) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _row_number(row: Row | None, spread: bool = True) -> str:
+    if row is None or row.ate_m is None:
+        return "-"
+    return f"{row.ate_m:.2f}" + (
+        f" ± {row.ate_m_spread:.2f}" if spread and row.seeds > 1 and row.ate_m_spread is not None else ""
+    )
+
+
+def _markdown(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    rows = [head, ["---"] * len(head), *lines]
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"

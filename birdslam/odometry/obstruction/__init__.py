@@ -1,0 +1,1 @@
+"""What stands before the camera and moves with it: bonnet, dirt, drops and reflections, found and masked."""

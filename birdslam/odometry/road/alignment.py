@@ -1,0 +1,360 @@
+"""Direct alignment of the road in two images: scale, pitch, roll and curvature from the road's grey values.
+
+Corners that optical flow follows on the road give a length that is always short: the tracker's window sees a strong
+change of perspective there. So the earlier image is warped by the homography of the road plane,
+K (R + lambda t n(pitch, roll)^T / H) K^-1, against the present one, over the length's factor lambda, the pitch and the
+roll together: in one pair of images the three are correlated, and a wrong pitch biases the length by several per cent.
+
+So does a plane where the road bends: over a crest of 1000 m radius it lies 0.2 m below its tangent 20 m ahead, which a
+camera 1.65 m above it takes for 12 % of the distance. The road is therefore a parabola along the direction of travel,
+s^2 / 2 times `curvature` (1/m, > 0 in a sag) above the plane that touches it at the camera's foot; the tilt is of that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.pose import Pose, rotation_exp
+from birdslam.odometry.median import upper_median
+from birdslam.odometry.road.fit import MOTION, ROAD, RoadFit, Slopes, fit_alone
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Grey = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+
+_MARGIN_PX = 4  # from the image's edge, for the warp and the smoothing
+_LARGEST_STEP = np.array([0.1, 0.1, 0.1, 0.005] + [0.1] * MOTION)  # of one iteration
+# The change of each that counts as much as 1 rad; the motion's errors need not converge as far
+_STEP_UNITS = np.array([1.0, 1.0, 1.0, 0.05] + [3.0] * MOTION)
+_NEAREST, _BEHIND = 1e-3, 0.05  # depths in units of the road's: a place is no nearer, and one so near is not seen
+_SQUEEZED = 1e-3  # an area of the past image so small shows no slope
+_BEYOND_CREST = 0.01  # where a ray would miss the parabola: that is behind the crest
+
+
+class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is compared on the road, and how much it is believed."""
+
+    near_m: Positive = 4.0  # where the strip of road begins
+    far_m: Positive = 22.0  # where it ends
+    half_width_m: Positive = 3.2  # of the strip in front of the car; past it come crown, kerb and parked cars
+    lane_half_width_m: Positive = 2.0  # of the strip where no road mask is given: the car's own lane
+    max_samples: Annotated[int, msgspec.Meta(ge=200)] = 2600  # pixels of the road that are compared
+    min_samples: Annotated[int, msgspec.Meta(ge=50)] = 250  # fewer say nothing
+    contrast_window_px: Annotated[int, msgspec.Meta(ge=3)] = 13  # over which brightness and contrast are evened out
+    contrast_floor_grey: Positive = 2.0  # added to the contrast, so that noise on smooth road is not blown up
+    # Neighbouring pixels err together. After the true motion was disturbed at random, 0.12 gave the errors their sigma
+    # (KITTI 01, 06, 0005, the shipped drive, a rendered ramp and night); the road's shape errs the same way each time,
+    # most in short steps: the raw clip without boxes is 16 % too long by 0.12, 7 % by 0.04, 3 % by 0.013
+    effective_sample_fraction: Positive = 0.04
+    sigma_rotation_rad: Positive = 0.0005  # of the relative rotation that odometry hands over, at the least
+    sigma_direction_rad: Positive = 0.007  # of the direction of its translation, at the least
+    max_iterations: Annotated[int, msgspec.Meta(ge=3)] = 7  # of the alignment
+    coarse_step: Annotated[int, msgspec.Meta(ge=1)] = 4  # every so-manieth sample is used at first
+    coarse_tolerance: Positive = 2e-3  # the coarse steps end with a smaller change
+    tolerance: Positive = 1e-3  # the fine ones end with a smaller change
+
+
+@dataclass(frozen=True)
+class _View:
+    """Samples of the present image: their rays (3, N), those turned into the past camera (3, N), their grey (N,)."""
+
+    rays: Floats
+    turned: Floats
+    grey: Floats
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where the past camera sees samples: at (x, y) of z = 1, (N,) each, of the inverse depth `by_z`.
+
+    `rho` is the inverse depth of the present camera, `root` what it is solved by.
+    """
+
+    x: Floats
+    y: Floats
+    by_z: Floats
+    rho: Floats
+    root: Floats
+
+
+def _brightness(there: Floats, here: Floats) -> tuple[float, float]:
+    """Bias and gain by which the present image becomes the past one."""
+    gain = float(np.clip(((there - there.mean()) * (here - here.mean())).mean() / max(here.var(), 1e-6), 0.5, 2.0))
+    return float(there.mean() - gain * here.mean()), gain
+
+
+def _correlation(there: Floats, here: Floats, weights: Floats) -> float:
+    w = weights / weights.sum()
+    a, b = there - w @ there, here - w @ here
+    return float((w * a) @ b / np.sqrt(max(float((w * a) @ a * ((w * b) @ b)), 1e-12)))
+
+
+def _translation(T_past_present: Pose, x: Floats) -> Floats:
+    """(3,) in metres, its direction corrected by what x says of it."""
+    t, (right, down) = T_past_present.p, x[ROAD + 3 : ROAD + MOTION]
+    out: Floats = np.exp(x[0]) * (t + float(np.linalg.norm(t)) * np.array([right, down, 0.0]))
+    return out
+
+
+def plane_normal(pitch_rad: float, roll_rad: float) -> tuple[Floats, Floats, Floats]:
+    """The road's upward unit normal in camera axes and its derivatives by pitch and by roll, (3,) each."""
+    cp, sp, cr, sr = np.cos(pitch_rad), np.sin(pitch_rad), np.cos(roll_rad), np.sin(roll_rad)
+    return (
+        np.array([-cp * sr, -cp * cr, -sp]),
+        np.array([sp * sr, sp * cr, -cp]),
+        np.array([-cp * cr, cp * sr, 0.0]),
+    )
+
+
+def plane_tilt(normal: Floats) -> tuple[float, float]:
+    """(pitch_rad, roll_rad) of a unit normal in camera axes: the inverse of `plane_normal`."""
+    return float(-np.arcsin(np.clip(normal[2], -1.0, 1.0))), float(np.arctan2(-normal[0], -normal[1]))
+
+
+class RoadImage:
+    """The part of a grey image that can show road, its brightness and contrast evened out: made once for each image.
+
+    Without that the edges of shadows, and of the dark below other cars, which travels with them, outweigh the road's
+    own grain.
+    """
+
+    def __init__(self, grey: NDArray[np.uint8], top_px: int, config: RoadAlignConfig) -> None:
+        self.top_px = top_px
+        smooth = cv2.GaussianBlur(grey[top_px:], (5, 5), 1.0)
+        window = (config.contrast_window_px, config.contrast_window_px)
+        mean = cv2.boxFilter(smooth, cv2.CV_32F, window)
+        contrast = cv2.sqrBoxFilter(smooth, cv2.CV_32F, window)
+        cv2.subtract(contrast, cv2.multiply(mean, mean), dst=contrast)
+        cv2.sqrt(np.maximum(contrast, 0.0, out=contrast), dst=contrast)
+        np.add(contrast, np.float32(config.contrast_floor_grey), out=contrast)
+        difference = cv2.subtract(smooth, mean, dst=mean, dtype=cv2.CV_32F)
+        self.grey: Grey = cv2.divide(difference, contrast, dst=mean, scale=10.0)  # type: ignore[assignment]
+        self._slopes: tuple[Grey, Grey] | None = None
+
+    @classmethod
+    def of(cls, grey: Grey, top_px: int) -> RoadImage:
+        """Of rows from `top_px` on that are to be compared as they are."""
+        image = cls.__new__(cls)
+        image.top_px, image.grey, image._slopes = top_px, grey, None
+        return image
+
+    @property
+    def slopes(self) -> tuple[Grey, Grey]:
+        """d grey / du and d grey / dv, grey levels per pixel."""
+        if self._slopes is None:
+            self._slopes = (
+                cv2.Scharr(self.grey, cv2.CV_32F, 1, 0, scale=1.0 / 32.0),
+                cv2.Scharr(self.grey, cv2.CV_32F, 0, 1, scale=1.0 / 32.0),
+            )  # type: ignore[assignment]
+        assert self._slopes is not None
+        return self._slopes
+
+
+class RoadAligner:
+    """Compares two images of the road of one camera."""
+
+    def __init__(self, camera: Camera, config: RoadAlignConfig) -> None:
+        self.camera, self.config = camera, config
+        # The nearest row that could show road at far_m with the nose up by 3 degrees.
+        horizon = camera.cy_px + camera.fy_px * (camera.height_m / config.far_m - 0.05)
+        self.top_px = int(np.clip(horizon, 0, camera.height_px - 32))
+        # Every second row and third column: below it lie rows of one another's blur.
+        self._pixels = (
+            slice(self.top_px + _MARGIN_PX, camera.height_px - _MARGIN_PX, 2),
+            slice(_MARGIN_PX, camera.width_px - _MARGIN_PX, 3),
+        )
+        v, u = np.ogrid[self._pixels]
+        self._grid = (u, v, (u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px)
+
+    def image(self, grey: NDArray[np.uint8]) -> RoadImage:
+        return RoadImage(grey, self.top_px, self.config)
+
+    def samples(
+        self,
+        tilt: tuple[float, float],
+        boxes_px: Floats,
+        road_mask: Bools | None,
+        bend_per_m: float = 0.0,
+        wide: bool = False,
+    ) -> Ints:
+        """Pixels (N, 2) of the present image that show road: of the mask, else of a strip in front, less vehicles.
+
+        `bend_per_m` is the curvature of the car's way to the right: where no mask is given, the strip bends with it. A
+        `wide` one takes in the lines of the lane.
+        """
+        cam, cfg = self.camera, self.config
+        normal, _, _ = plane_normal(*tilt)
+        u, v, x, y = self._grid
+        rho = -(normal[0] * x + (normal[1] * y + normal[2])) / cam.height_m  # Eq. 1 is X = ray / rho
+        half_width_m = cfg.half_width_m if wide or road_mask is not None else cfg.lane_half_width_m
+        inside = (rho > 1.0 / cfg.far_m) & (rho < 1.0 / cfg.near_m)
+        middle_m = 0.0 if road_mask is not None else 0.5 * bend_per_m / np.where(inside, rho, 1.0)
+        keep = (np.abs(x - middle_m) < half_width_m * rho) & inside
+        if road_mask is not None:
+            keep &= road_mask[self._pixels]
+        x1, y1, x2, y2 = boxes_px.T
+        grow_x, grow_y = 4.0 + 0.04 * (x2 - x1), 4.0 + 0.12 * (y2 - y1)  # a box ends above the shadow of its car
+        rows = np.searchsorted(v[:, 0], [y1 - grow_y, y2 + grow_y]).T.tolist()
+        cols = np.searchsorted(u[0], [x1 - grow_x, x2 + grow_x]).T.tolist()
+        for (top, bottom), (left, right) in zip(rows, cols, strict=True):
+            keep[top:bottom, left:right] = False
+        at = np.flatnonzero(keep.ravel())
+        if len(at) > cfg.max_samples:
+            at = at[(np.arange(cfg.max_samples) * (len(at) / cfg.max_samples)).astype(np.int64)]
+        row, column = np.divmod(at, keep.shape[1])
+        return np.column_stack([u[0, column], v[row, 0]])
+
+    def align(
+        self, past: RoadImage, present: RoadImage, T_past_present: Pose, px: Ints, prior: Floats, prior_cov: Floats,
+        sigma_motion: tuple[float, float] = (0.0, 0.0),
+    ) -> RoadFit | None:  # fmt: skip
+        """Fits (log lambda, pitch, roll, curvature) of the present camera, with the prior; None: too few samples.
+
+        `T_past_present` is the motion with its length in the odometry's own unit, lambda times it are metres;
+        `sigma_motion` is 1-sigma of its rotation and of its direction (rad); the configured ones are the least.
+        """
+        cfg = self.config
+        if len(px) < cfg.min_samples:
+            return None
+        fine = self._view(present, px, T_past_present)
+        parts = fine.rays, fine.turned, fine.grey
+        coarse = _View(*(np.ascontiguousarray(part[..., :: cfg.coarse_step]) for part in parts))
+        x = np.concatenate([prior, np.zeros(MOTION)])
+        mean, weight_prior = x.copy(), np.zeros((ROAD + MOTION, ROAD + MOTION))
+        weight_prior[:ROAD, :ROAD] = np.linalg.inv(prior_cov)
+        weight_prior[ROAD:, ROAD:] = np.diag(
+            np.repeat(np.maximum(sigma_motion, [cfg.sigma_rotation_rad, cfg.sigma_direction_rad]) ** -2.0, [3, 2])
+        )
+        light = None  # bias and gain of the brightness
+        # Few samples first, for speed; then all of them.
+        for view, share, tolerance, iterations in (
+            (coarse, cfg.coarse_step, cfg.coarse_tolerance, cfg.max_iterations - 2),
+            (fine, 1, cfg.tolerance, 3),
+        ):
+            for _ in range(iterations):
+                places = self._places(view, T_past_present, x)
+                seen, grey, by_x, by_y = self._look(places, past)
+                if share * int(seen.sum()) < cfg.min_samples:
+                    return None
+                if light is None:
+                    light = _brightness(grey[seen], view.grey[seen])
+                r = grey - light[1] * view.grey - light[0]
+                slopes = self._slopes(view, places, by_x, by_y, T_past_present, x)
+                J = slopes.derivative
+                sigma = 1.4826 * upper_median(np.abs(r[seen])) + 0.5
+                w = np.where(seen, 1.0 / np.maximum(1.0, np.abs(r) * (1.0 / (1.5 * sigma))), 0.0)
+                w *= share * cfg.effective_sample_fraction / sigma**2
+                Jw = J * w
+                A, g = Jw @ J.T, Jw @ r
+                A[:-2, :-2] += weight_prior
+                g[:-2] += weight_prior @ (x - mean)
+                A[-2, -2] += 1e-9
+                A[-1, -1] += 1e-6
+                step = -np.linalg.solve(A, g)
+                at, gain = x, light[1]  # what `r` and `slopes` are of
+                x = x + np.clip(step[:-2], -_LARGEST_STEP, _LARGEST_STEP)
+                light = (light[0] + step[-2], light[1] + step[-1])
+                if (np.abs(step[:-2]) < tolerance * _STEP_UNITS).all():
+                    break
+        here = self._slopes_here(fine, present, px, T_past_present, at, gain)
+        motion = slice(ROAD, ROAD + MOTION)
+        state, cov = fit_alone(at, px, slopes, here, r, w, weight_prior[motion, motion])
+        return RoadFit(state, cov, _correlation(grey, fine.grey, w), int(seen.sum()))
+
+    def driven(self, past: RoadImage, T_past_present: Pose, px: Ints, road: Floats) -> tuple[Floats, Bools]:
+        """(N,) what the past image has where a motion and a road (4,) put the present pixels (N, 2), and if it has it.
+
+        Nothing is fitted.
+        """
+        places = self._places(self._view(past, px, T_past_present), T_past_present, np.append(road, np.zeros(MOTION)))
+        seen, grey, _, _ = self._look(places, past)
+        return grey, seen
+
+    def _view(self, present: RoadImage, px: Ints, T_past_present: Pose) -> _View:
+        cam = self.camera
+        rays = np.stack(
+            [(px[:, 0] - cam.cx_px) / cam.fx_px, (px[:, 1] - cam.cy_px) / cam.fy_px, np.ones(len(px))]
+        )  # fmt: skip
+        grey = present.grey[px[:, 1] - present.top_px, px[:, 0]].astype(np.float64)
+        return _View(rays, T_past_present.R @ rays, grey)
+
+    def _places(self, view: _View, T_past_present: Pose, x: Floats) -> _Places:
+        """Where the past camera sees the samples, on the road of `x` and after the motion that it has."""
+        # Eq. 1 is X = rays / rho; with the curvature rho solves H rho^2 - below rho - curvature / 2 = 0
+        height_m = self.camera.height_m
+        below = -(plane_normal(x[1], x[2])[0] @ view.rays)
+        root = np.sqrt(np.maximum(below**2 + 2.0 * height_m * x[3], _BEYOND_CREST * below**2))
+        rho = (below + root) * (0.5 / height_m)
+        q = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned + rho * _translation(T_past_present, x)[:, None]
+        by_z = 1.0 / np.maximum(q[2], _NEAREST)
+        return _Places(q[0] * by_z, q[1] * by_z, by_z, rho, root)
+
+    def _look(self, places: _Places, past: RoadImage) -> tuple[Bools, Floats, Floats, Floats]:
+        """Which samples the past image shows, its grey there, and its slopes by x and by y of z = 1."""
+        cam = self.camera
+        u = (cam.fx_px * places.x + cam.cx_px).astype(np.float32)
+        v = (cam.fy_px * places.y + (cam.cy_px - past.top_px)).astype(np.float32)
+        rows, cols = past.grey.shape
+        seen = (u > 1) & (u < cols - 2) & (v > 1) & (v < rows - 2) & (places.by_z < 1.0 / _BEHIND)
+        grey, by_u, by_v = (
+            cv2.remap(image, u, v, cv2.INTER_LINEAR).ravel().astype(np.float64) for image in (past.grey, *past.slopes)
+        )
+        return seen, grey, by_u * cam.fx_px, by_v * cam.fy_px
+
+    def _slopes_here(
+        self, view: _View, present: RoadImage, px: Ints, T_past_present: Pose, x: Floats, gain: float
+    ) -> Slopes:
+        """The slopes of the present image, as the past camera sees them, of `gain` times the contrast."""
+        cam = self.camera
+        places = self._places(view, T_past_present, x)
+        normal, t = plane_normal(x[1], x[2])[0], _translation(T_past_present, x)
+        R = rotation_exp(x[ROAD : ROAD + 3]) @ T_past_present.R
+        # By how much the place in the past image moves with the pixel of the present one; the road is flat enough
+        by_ray = R[:, :2] - np.outer(t, normal[:2]) / cam.height_m
+        (xx, xy), (yx, yy) = (
+            [(by_ray[axis, k] - place * by_ray[2, k]) * places.by_z for k in (0, 1)]
+            for axis, place in ((0, places.x), (1, places.y))
+        )
+        by_x, by_y = (
+            slope[px[:, 1] - present.top_px, px[:, 0]] * (gain * focal_px)
+            for slope, focal_px in zip(present.slopes, (cam.fx_px, cam.fy_px), strict=True)
+        )
+        det = xx * yy - xy * yx
+        det = np.where(np.abs(det) < _SQUEEZED, _SQUEEZED, det)
+        return self._slopes(
+            view, places, (yy * by_x - yx * by_y) / det, (xx * by_y - xy * by_x) / det, T_past_present, x
+        )
+
+    def _slopes(
+        self, view: _View, places: _Places, by_x: Floats, by_y: Floats, T_past_present: Pose, x: Floats
+    ) -> Slopes:
+        """With the residual's derivative that slopes by x and by y of z = 1 make, (N,) each."""
+        gx, gy = by_x * places.by_z, by_y * places.by_z
+        gz = -(gx * places.x + gy * places.y)
+        _, by_pitch, by_roll = plane_normal(x[1], x[2])
+        t = _translation(T_past_present, x)
+        rx, ry, rz = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned
+        along = gx * t[0] + gy * t[1] + gz * t[2]
+        J = np.empty((ROAD + MOTION + 2, len(gx)))
+        np.multiply(along, places.rho, out=J[0])
+        np.divide(along, places.root, out=along)
+        np.multiply(along, 0.5, out=J[3])
+        along *= -places.rho
+        np.multiply(along, by_pitch @ view.rays, out=J[1])
+        np.multiply(along, by_roll @ view.rays, out=J[2])
+        J[4], J[5], J[6] = ry * gz - rz * gy, rz * gx - rx * gz, rx * gy - ry * gx
+        by_length = places.rho * float(np.linalg.norm(t))
+        np.multiply(gx, by_length, out=J[7])
+        np.multiply(gy, by_length, out=J[8])
+        J[9] = -1.0
+        np.negative(view.grey, out=J[10])
+        return Slopes(gx, gy, J)

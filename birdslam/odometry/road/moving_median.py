@@ -1,0 +1,135 @@
+"""The paper's metric scale: a moving median over what each frame's road points say (Sec. 3.1).
+
+The road is the calibrated plane (the paper's flat-earth assumption). A landmark of the odometry that lies on the road
+has a depth in the odometry's unit, and by Eq. 1 with the known camera height one in metres. The median of their ratios
+is the frame's scale, and the moving median over the last frames is the scale that the odometry is given.
+
+The paper states no width of its window. The default is 21 frames: two seconds at 10 Hz, so that wrong scales have to
+last for a second to win, and some 20 m of a street in town, over which the visual scale drifts by little.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.pose import Pose
+from birdslam.odometry.metric_scale import RoadView
+from birdslam.odometry.road.fit import RoadFit
+from birdslam.odometry.road.kalman_filter import RoadScaleConfig
+from birdslam.odometry.road.points import on_road
+from birdslam.odometry.road.vanishing_point import LinesDirection
+from birdslam.types import SpeedReading, SpeedSource, Status
+
+Floats = NDArray[np.float64]
+
+_SIGMA_OF_MEDIAN = 1.4826 * 1.2533  # times the median absolute deviation over the root of the number, for normal noise
+
+
+class MedianScale:
+    """A `metric_scale.MetricScale`.
+
+    State: the last `median_frames` scales (metres per unit of length of the window as it began), and the scale that was
+    given out. Measurements: one scale a frame, from the window's landmarks on the road. Readers: `Odometry`.
+    """
+
+    def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:
+        self.camera, self.config = camera, config
+        self.fit: RoadFit | None = None  # always None: no two images are compared
+        self.lines: LinesDirection | None = None  # nor are lines looked at
+        self._scales: deque[float] = deque(maxlen=config.median_frames)
+        self._given = 1.0
+        self._carried_m = 0.0  # travelled since a frame gave a scale
+
+    @property
+    def ground(self) -> GroundPlane:
+        """The calibrated ground plane."""
+        return self.camera.ground
+
+    @property
+    def pitch_sigma_rad(self) -> float:
+        """The body pitches about the calibrated plane, and nothing here measures by how much."""
+        return float(np.hypot(self.config.sigma_mount_rad, self.config.sigma_bounce_rad))
+
+    @property
+    def sigma_rel(self) -> float:
+        """Of the moving median, by the spread of the scales that it is of; 1 before there are enough."""
+        if len(self._scales) < self.config.confirmations:
+            return 1.0
+        log_scales = np.log(self._scales)
+        deviation = float(np.median(np.abs(log_scales - np.median(log_scales))))
+        sigma = _SIGMA_OF_MEDIAN * deviation / np.sqrt(len(log_scales))
+        return float(np.clip(sigma, self.config.sigma_scale_floor_rel, 1.0))
+
+    @property
+    def unknown(self) -> bool:
+        """Too vague to be driven by."""
+        return self.sigma_rel > self.config.invalid_sigma_rel
+
+    def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
+        """A new window has a new unit of length: the scales of the old one say nothing of it."""
+        self._scales.clear()
+        self._given = 1.0
+
+    def length_held(self, sigma_rel: float) -> None:
+        """The moving median has a spread of its own."""
+
+    def turned_unseen(self) -> None:
+        """Nothing here follows the camera's tilt."""
+
+    def hear(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:
+        """The paper has the road alone."""
+
+    def car_step(self, from_ns: int, to_ns: int) -> None:
+        """None: the paper has the road alone."""
+
+    def car_status(self) -> list[Status]:
+        """Nothing: the paper has the road alone."""
+        return []
+
+    @property
+    def sources(self) -> tuple[SpeedSource, ...]:
+        """The road, or an older scale of it."""
+        return (SpeedSource.CARRIED if Status.SCALE_CARRIED in self.status() else SpeedSource.ROAD,)
+
+    @property
+    def motion_factor(self) -> float:
+        """1: the car's own speed is not heard."""
+        return 1.0
+
+    def measure_scale(self, step: Pose, view: RoadView) -> float:
+        """The factor by which the moving median has changed; 1 where no frame has given a scale yet."""
+        self._carried_m += float(np.linalg.norm(step.p))
+        scale = self.frame_scale(view)
+        if scale is not None:
+            self._scales.append(scale * self._given)
+            self._carried_m = 0.0
+        if not self._scales:
+            return 1.0
+        last, self._given = self._given, float(np.median(self._scales))
+        return self._given / last
+
+    def frame_scale(self, view: RoadView) -> float | None:
+        """Metres per present unit of length by this image's landmarks on the road; None where it shows too few."""
+        config, window = self.config, view.window
+        seen = np.isfinite(window.obs[-1, :, 0]) & (window.rho_sigma < config.median_sigma_depth_rel * window.rho)
+        px = self.camera.to_px(window.obs[-1, seen])
+        depth_m = bev.road_point_cam(self.camera, self.ground, px)[:, 2]  # Eq. 1
+        ratio = depth_m / window.depths(view.pose)[seen]
+        used = on_road(px, self.camera, self.ground, view.boxes_px, view.road_mask, config.align.half_width_m)
+        used &= (ratio > 0.0) & (depth_m < config.median_range_m)
+        return float(np.median(ratio[used])) if used.sum() >= config.median_landmarks else None
+
+    def status(self) -> list[Status]:
+        """Whether the scale is an older one, or not known."""
+        out = []
+        if self._carried_m > self.config.carried_after_m or len(self._scales) < self.config.confirmations:
+            out.append(Status.SCALE_CARRIED)
+        if self.unknown:
+            out.append(Status.SCALE_INVALID)
+        return out

@@ -1,0 +1,296 @@
+"""What a drive leaves on disk, written line by line as the estimates come.
+
+| file              | what                                                                                  |
+|-------------------|---------------------------------------------------------------------------------------|
+| ego.kitti.txt     | camera poses `T_first_i` as KITTI rows, row k is frame k (`trajectory.py`)            |
+| ego.tum.txt       | ego poses in world, TUM lines at the source's times                                   |
+| tracks/ID.tum.txt | footprint centres of one vehicle in world, a line for each frame in which it was seen |
+| map.csv           | road landmarks and lane points in world: epoch,kind,x_m,y_m,lane (-1: of none)        |
+| summary.json      | counts of this recording, and what the caller adds                                    |
+| bev.png           | all of it from above (`bev_picture.py`)                                                   |
+
+Final trajectories, where they are asked for, lie beside the live ones (`final_trajectories.py`).
+
+Where the optimizer began a new epoch, TUM files carry a comment line and begin in the new world frame. KITTI rows can't
+say that, and go on from the last pose, as the picture does; nothing is known of the motion in between. A frame without
+an estimate (dropped, unreadable) keeps the pose before it, so that row k is always frame k.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Self, TextIO
+
+import msgspec
+import numpy as np
+import scipy.spatial.transform  # noqa: F401  # at the start of a drive, not with its first frame (trajectory.py)
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.outputs.bev_picture import Scene, Track, draw
+from birdslam.outputs.final_trajectories import EGO_FILES
+from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row, tum_row
+from birdslam.types import Attitude, Estimate, MapUpdate, Status, VehicleEstimate
+
+FILLED_FRAMES = 10_000  # a longer gap in the frame numbers is a new source, not dropped frames
+KEPT_POSES, KEPT_TRACK_POSES, KEPT_POINTS, KEPT_TRACKS = 4000, 100, 20_000, 200  # in the picture; under 3 MB in all
+
+
+class ResultsError(ValueError):
+    """Results can't be written; the message names the directory and says why."""
+
+
+def claim_directory(directory: Path) -> None:
+    """Make the directory and see that it can be written to. Raises ResultsError where not."""
+    probe = directory / ".writable"
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        reason = "is a file" if directory.is_file() else error.strerror
+        raise ResultsError(f"output directory {directory}: {reason}") from None
+
+
+class Thinned:
+    """Rows of numbers, at most `keep` of them: past that, every second one goes, and every second one to come.
+
+    Room for `begin` rows is there from the start (None: for all), and doubles where that is not enough.
+    """
+
+    def __init__(self, width: int, keep: int, begin: int | None = None) -> None:
+        self._keep = keep
+        self._rows = np.full((keep if begin is None else min(begin, keep), width), np.nan)  # written to: it is there
+        self._kept = 0
+        self._step = 1
+        self._seen = 0
+
+    def add(self, *row: float) -> None:
+        """Keep this row, or pass over it."""
+        if self._seen % self._step == 0:
+            if self._kept >= self._keep:
+                left = self._rows[: self._kept : 2].copy()
+                self._rows[: len(left)], self._kept = left, len(left)
+                self._step *= 2
+            if self._seen % self._step == 0:
+                if self._kept == len(self._rows):
+                    more = np.full((min(2 * self._kept, self._keep) - self._kept, self._rows.shape[1]), np.nan)
+                    self._rows = np.concatenate([self._rows, more])
+                self._rows[self._kept] = row
+                self._kept += 1
+        self._seen += 1
+
+    def array(self) -> NDArray[np.float64]:
+        """(N, width) of the rows kept."""
+        return self._rows[: self._kept].copy()
+
+
+class _KeptTrack:
+    def __init__(self) -> None:
+        self.poses = Thinned(3, KEPT_TRACK_POSES, begin=16)
+        self.speeds = Thinned(1, KEPT_TRACK_POSES, begin=16)
+        self.described = ""
+        self.last: VehicleEstimate | None = None
+        self.T_picture_vehicle = SE2()
+        self.epoch = -1
+        self.farthest_m = 0.0
+
+
+class Recorder:
+    """Writes the results of one drive to a directory as they come; bounded in memory whatever its length.
+
+    The mount of `trajectory.py` is the camera's calibrated ground plane, as for who integrates `Estimate.attitude`.
+    A context, so that its files are closed where a run fails; `finish` ends a run that did not.
+    Raises ResultsError where the directory can't be written to; results of an earlier run in it are replaced.
+    """
+
+    def __init__(self, directory: Path, camera: Camera) -> None:
+        claim_directory(directory)
+        self._directory = directory
+        self._tracks_directory = directory / "tracks"
+        self._files = ExitStack()
+        try:
+            self._tracks_directory.mkdir(exist_ok=True)
+            later = (directory / name for name in ("summary.json", "bev.png", *EGO_FILES.values()))
+            for old in (*self._tracks_directory.glob("*.tum.txt"), *later):
+                old.unlink(missing_ok=True)  # stale tracks beside new ones would be taken for this run's
+            self._kitti, self._tum, self._map = map(self._open, ("ego.kitti.txt", "ego.tum.txt", "map.csv"))
+        except OSError as error:
+            self.close()
+            raise ResultsError(f"output directory {directory}: {error.strerror}: {error.filename}") from None
+        self._tum.write("# t_s x_m y_m z_m qx qy qz qw: the ego (the camera's foot on the road) in world\n")
+        self._map.write("epoch,kind,x_m,y_m,lane\n")
+        self.statuses: Counter[str] = Counter()
+        self.speed_sources: Counter[str] = Counter()
+        self._trajectory = CameraTrajectory(camera.ground)
+        self._next_row = 0
+        self._frames = self._invalid = 0
+        self._path_m = 0.0
+        self._last: Estimate | None = None
+        self._epoch: int | None = None
+        self._epoch_count = 0
+        self._T_picture_world = SE2()
+        self._ego, self._breaks = Thinned(3, KEPT_POSES), Thinned(2, KEPT_POSES)
+        self._lanes, self._landmarks = Thinned(2, KEPT_POINTS), Thinned(2, KEPT_POINTS)
+        self._tracks: dict[int, _KeptTrack] = {}
+        self._track_count = 0
+
+    def _open(self, name: str) -> TextIO:
+        return self._files.enter_context((self._directory / name).open("w", encoding="ascii", buffering=1))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files; what was added stays in them. `finish` does it too."""
+        self._files.close()
+
+    def add(self, estimate: Estimate) -> None:
+        """One frame's estimate. The last record of a run, END_OF_SOURCE, is no frame and leaves no row."""
+        if Status.END_OF_SOURCE in estimate.status:
+            return
+        if estimate.epoch != self._epoch:
+            self._begin_epoch(estimate)
+        elif self._last is not None:
+            step = self._last.T_world_ego.between(estimate.T_world_ego)
+            self._path_m += math.hypot(step.x_m, step.y_m)
+        self._frames += 1
+        self._invalid += not estimate.valid
+        self.statuses.update(status.value for status in estimate.status)
+        self.speed_sources.update(source.value for source in estimate.speed_sources)
+        pose = ego_pose(estimate.T_world_ego, estimate.attitude)
+        self._tum.write(tum_row(estimate.t_source_ns, pose) + "\n")
+        self._write_row(estimate, pose)
+        T_picture_ego = self._T_picture_world @ estimate.T_world_ego
+        self._ego.add(T_picture_ego.x_m, T_picture_ego.y_m, T_picture_ego.yaw_rad)
+        for vehicle in estimate.vehicles:
+            if vehicle.age_ns == 0:
+                self._add_vehicle(estimate, vehicle)
+        self._last = estimate
+
+    def add_map(self, update: MapUpdate) -> None:
+        """What the map gained."""
+        for kind, points, lanes, kept in (
+            ("landmark", update.landmarks_m, (), self._landmarks),
+            ("lane", update.lanes_m, update.lane_ids, self._lanes),
+        ):
+            self._map.writelines(
+                f"{update.epoch},{kind},{x_m:.3f},{y_m:.3f},{lane}\n"
+                for (x_m, y_m), lane in zip(points, lanes or (-1,) * len(points), strict=True)
+            )
+            if update.epoch == self._epoch:  # of an older epoch: its place is not known any more
+                for x_m, y_m in self._T_picture_world @ np.array(points).reshape(-1, 2):
+                    kept.add(float(x_m), float(y_m))
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """Write summary.json (`summary` over the recorder's own counts; a number that is not finite becomes null) and
+        bev.png, and close the files."""
+        self.close()
+        counts = {
+            "frames": self._frames,
+            "invalid_frames": self._invalid,
+            "path_m": round(self._path_m, 3),
+            "tracks": self._track_count,
+            "epochs": self._epoch_count,
+            "statuses": dict(sorted(self.statuses.items())),
+            "speed_sources": dict(sorted(self.speed_sources.items())),
+        }
+        encoded = msgspec.json.encode({**counts, **summary}, enc_hook=_plain)
+        (self._directory / "summary.json").write_bytes(msgspec.json.format(encoded, indent=2) + b"\n")
+        draw(self._scene(), self._directory / "bev.png")
+
+    def _begin_epoch(self, estimate: Estimate) -> None:
+        """Put the new world where the last one was left."""
+        if self._last is not None:
+            self._tum.write(f"# epoch {estimate.epoch}: a new world frame begins\n")
+            T_picture_ego = self._T_picture_world @ self._last.T_world_ego
+            self._T_picture_world = T_picture_ego @ estimate.T_world_ego.inverse()
+            self._breaks.add(T_picture_ego.x_m, T_picture_ego.y_m)
+        self._epoch = estimate.epoch
+        self._epoch_count += 1
+
+    def _write_row(self, estimate: Estimate, T_world_ego: Transform) -> None:
+        if 0 < estimate.frame_id - self._next_row <= FILLED_FRAMES:
+            held = kitti_row(self._trajectory.last)
+            self._kitti.writelines(held + "\n" for _ in range(estimate.frame_id - self._next_row))
+        self._kitti.write(kitti_row(self._trajectory.add(estimate.epoch, T_world_ego)) + "\n")
+        self._next_row = estimate.frame_id + 1
+
+    def _add_vehicle(self, estimate: Estimate, vehicle: VehicleEstimate) -> None:
+        path = self._tracks_directory / f"{vehicle.vehicle}.tum.txt"
+        track = self._tracks.pop(vehicle.vehicle, None)
+        lines = []
+        if track is None:
+            track = _KeptTrack()
+            if not path.exists():
+                self._track_count += 1
+                lines.append(
+                    f"# vehicle {vehicle.vehicle}: t_s x_m y_m z_m qx qy qz qw of its footprint's centre in world"
+                )
+                lines.append("# z is the height of the road under the ego: a vehicle's own is not estimated")
+        self._tracks[vehicle.vehicle] = track  # the one seen last stands last
+        if len(self._tracks) > KEPT_TRACKS:
+            del self._tracks[next(iter(self._tracks))]
+        if track.epoch not in (-1, estimate.epoch):
+            lines.append(f"# epoch {estimate.epoch}: a new world frame begins")
+        described = f"# class {vehicle.label}, length_m {vehicle.length_m:.1f}, width_m {vehicle.width_m:.1f}"
+        if described != track.described:
+            lines.append(described)
+        pose = ego_pose(vehicle.T_world_vehicle, Attitude(z_m=estimate.attitude.z_m))
+        lines.append(tum_row(estimate.t_source_ns, pose))
+        with path.open("a", encoding="ascii", errors="backslashreplace") as file:  # so many tracks, so few descriptors
+            file.write("\n".join(lines) + "\n")
+        track.described, track.epoch, track.last = described, estimate.epoch, vehicle
+        track.T_picture_vehicle = placed = self._T_picture_world @ vehicle.T_world_vehicle
+        track.poses.add(placed.x_m, placed.y_m, placed.yaw_rad)
+        seen_from = estimate.T_world_ego.between(vehicle.T_world_vehicle)
+        track.farthest_m = max(track.farthest_m, math.hypot(seen_from.x_m, seen_from.y_m))
+        track.speeds.add(math.hypot(*vehicle.velocity_mps))
+
+    def _scene(self) -> Scene:
+        tracks = [
+            Track(
+                vehicle=vehicle,
+                label=track.last.label,
+                length_m=track.last.length_m,
+                width_m=track.last.width_m,
+                poses=np.vstack([track.poses.array(), _numbers(track.T_picture_vehicle)]),
+                frames=track.last.frames,
+                speed_mps=float(np.median(track.speeds.array())),
+                farthest_m=track.farthest_m,
+            )
+            for vehicle, track in sorted(self._tracks.items())
+            if track.last is not None
+        ]
+        ego = self._ego.array()
+        if self._last is not None:
+            ego = np.vstack([ego, _numbers(self._T_picture_world @ self._last.T_world_ego)])
+        return Scene(
+            name=self._directory.resolve().name,
+            ego=ego,
+            breaks=self._breaks.array(),
+            tracks=tracks,
+            lanes=self._lanes.array(),
+            landmarks=self._landmarks.array(),
+            path_m=self._path_m,
+            frames=self._frames,
+            track_count=self._track_count,
+        )
+
+
+def _numbers(pose: SE2) -> tuple[float, float, float]:
+    return pose.x_m, pose.y_m, pose.yaw_rad
+
+
+def _plain(value: object) -> object:
+    """What JSON does not know: numpy's numbers and arrays, paths."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    return str(value)

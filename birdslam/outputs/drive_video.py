@@ -1,0 +1,272 @@
+"""The video of a drive: the camera's image with the vehicles' boxes beside the ego's bird's-eye view.
+
+Where the truth is known, thin white outlines show it in the bird's-eye view. All arrays are BGR.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.outputs.bev_picture import (
+    EGO,
+    EGO_AXLE_M,
+    EGO_LENGTH_M,
+    EGO_WIDTH_M,
+    FAINT,
+    GRID,
+    INK,
+    LANDMARK,
+    LANE,
+    PAPER,
+    colour_of,
+)
+from birdslam.outputs.drive_files import ResultsError
+from birdslam.types import Estimate, MapUpdate, VehicleEstimate
+
+Image = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+
+MOST_SCALE, MOST_WIDTH_PX = 1.5, 1280  # of the camera's image, enlarged or reduced
+STRIP_PX, PANEL_PX = 96, 368  # height of the strip of text below the image, width of the bird's-eye view
+AHEAD_M, BEHIND_M = 50.0, 10.0  # shown of the bird's-eye view
+BOX_HEIGHT_M = 1.5  # estimates have none
+KEPT_POINTS, KEPT_POSES = 12_000, 400
+SHIFT = 4  # OpenCV's fractional bits: outlines don't jump from pixel to pixel
+RING_M = 10.0
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+SUFFIX, CODEC = ".mp4", "mp4v"  # the codec that every build of OpenCV can write
+MOST_PICTURES_HZ = 20.0  # of the video: of faster cameras every second or third frame is drawn
+
+
+def _bgr(colour: str) -> tuple[int, int, int]:
+    return int(colour[5:7], 16), int(colour[3:5], 16), int(colour[1:3], 16)
+
+
+class SideBySide:
+    """Draws frame after frame; what the map gained is added as it came."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._scale = min(MOST_SCALE, MOST_WIDTH_PX / camera.width_px)
+        self._image_px = (round(camera.width_px * self._scale), round(camera.height_px * self._scale))
+        self.size_px = self._image_px[0] + PANEL_PX, self._image_px[1] + STRIP_PX  # width, height; both even
+        self.size_px = self.size_px[0] // 2 * 2, self.size_px[1] // 2 * 2
+        self._per_m = self.size_px[1] / (AHEAD_M + BEHIND_M)
+        self._epoch: int | None = None
+        self._lanes: deque[tuple[float, float]] = deque(maxlen=KEPT_POINTS)
+        self._landmarks: deque[tuple[float, float]] = deque(maxlen=KEPT_POINTS)
+        self._way: deque[tuple[float, float]] = deque(maxlen=KEPT_POSES)
+
+    def add_map(self, update: MapUpdate) -> None:
+        """Points in world of the update's epoch."""
+        self._enter(update.epoch)
+        self._lanes.extend(update.lanes_m)
+        self._landmarks.extend(update.landmarks_m)
+
+    def draw(self, image: Image, estimate: Estimate, true_outlines: Sequence[Floats], words: Sequence[str]) -> Image:
+        """(H, W, 3) of `size_px`, from the undistorted `image`, (H, W) grey or (H, W, 3) BGR.
+
+        `true_outlines` are (4, 2) footprints in ego.
+        """
+        self._enter(estimate.epoch)
+        self._way.append((estimate.T_world_ego.x_m, estimate.T_world_ego.y_m))
+        canvas = np.full((self.size_px[1], self.size_px[0], 3), _bgr(PAPER), np.uint8)
+        width_px, height_px = self._image_px
+        canvas[:height_px, :width_px] = self._camera_view(image, estimate)
+        for line, text in enumerate(words):
+            at = 14, height_px + 24 + 24 * line
+            colour = _bgr(INK if line == 0 else FAINT)
+            cv2.putText(canvas, text, at, FONT, 0.5, colour, 1, cv2.LINE_AA)
+        canvas[:, width_px:] = self._from_above(estimate, true_outlines)[:, : canvas.shape[1] - width_px]
+        return canvas
+
+    def _enter(self, epoch: int) -> None:
+        if epoch != self._epoch:  # nothing is known of where the old world lies in the new one
+            self._lanes.clear()
+            self._landmarks.clear()
+            self._way.clear()
+            self._epoch = epoch
+
+    def _camera_view(self, image: Image, estimate: Estimate) -> Image:
+        image = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
+        view: Image = cv2.resize(image, self._image_px, interpolation=cv2.INTER_LINEAR)  # type: ignore[assignment]
+        ground = self._camera.ground
+        if estimate.ground is not None:
+            ground = GroundPlane(estimate.ground.height_m, estimate.ground.pitch_rad, estimate.ground.roll_rad)
+        for vehicle in estimate.vehicles:
+            if not vehicle.in_sight:
+                continue
+            foot = outline(estimate.T_world_ego.between(vehicle.T_world_vehicle), vehicle.length_m, vehicle.width_m)
+            corners = np.vstack([np.column_stack([foot, np.full(4, z_m)]) for z_m in (0.0, BOX_HEIGHT_M)])
+            if corners[:, 0].min() < 1.0:  # reaches behind the image plane
+                continue
+            px = (bev.ego_to_pixel(self._camera, ground, corners) + 0.5) * self._scale - 0.5
+            low, high = _fixed(px[:4]), _fixed(px[4:])
+            colour = _colour_of(vehicle)
+            cv2.polylines(view, [low, high], True, colour, 1, cv2.LINE_AA, SHIFT)
+            for a, b in zip(low.tolist(), high.tolist(), strict=True):
+                cv2.line(view, a, b, colour, 1, cv2.LINE_AA, SHIFT)
+            at = np.clip(px[4:].min(axis=0), -1e4, 1e4)
+            text = f"{vehicle.vehicle}  {foot[:, 0].min():.0f} m"
+            cv2.putText(view, text, (int(at[0]), int(at[1]) - 4), FONT, 0.4, colour, 1, cv2.LINE_AA)
+        return view
+
+    def _from_above(self, estimate: Estimate, true_outlines: Sequence[Floats]) -> Image:
+        panel = np.full((self.size_px[1], PANEL_PX, 3), _bgr(PAPER), np.uint8)
+        T_ego_world = estimate.T_world_ego.inverse()
+        origin = self._panel_px(np.zeros((1, 2)))[0]
+        for ring in range(1, int(AHEAD_M / RING_M) + 1):
+            radius = round(ring * RING_M * self._per_m)
+            cv2.circle(panel, (int(origin[0]), int(origin[1])), radius, _bgr(GRID), 1, cv2.LINE_AA)
+        for points, colour in ((self._landmarks, LANDMARK), (self._lanes, LANE)):
+            if points:
+                at = np.rint(self._panel_px(T_ego_world @ np.array(points))).astype(np.int64)
+                at = at[((at >= 0) & (at < [PANEL_PX, self.size_px[1]])).all(axis=1)]
+                panel[at[:, 1], at[:, 0]] = _bgr(colour)
+        way = _fixed(self._panel_px(T_ego_world @ np.array(self._way)))
+        cv2.polylines(panel, [way], False, _bgr(EGO), 2, cv2.LINE_AA, SHIFT)
+        for vehicle in estimate.vehicles:
+            pose = estimate.T_world_ego.between(vehicle.T_world_vehicle)
+            px = self._panel_px(outline(pose, vehicle.length_m, vehicle.width_m))
+            if vehicle.in_sight:
+                cv2.fillPoly(panel, [_fixed(px)], _colour_of(vehicle), cv2.LINE_AA, SHIFT)
+            cv2.polylines(panel, [_fixed(px)], True, _colour_of(vehicle), 1, cv2.LINE_AA, SHIFT)
+            u, v = px.max(axis=0)
+            if 0 <= u < PANEL_PX and 0 <= v < len(panel):
+                cv2.putText(panel, f"{vehicle.vehicle}", (int(u) + 2, int(v)), FONT, 0.35, _bgr(INK), 1, cv2.LINE_AA)
+        for true in true_outlines:
+            cv2.polylines(panel, [_fixed(self._panel_px(true))], True, (255, 255, 255), 1, cv2.LINE_AA, SHIFT)
+        own = outline(SE2(EGO_AXLE_M - EGO_LENGTH_M / 2.0, 0.0, 0.0), EGO_LENGTH_M, EGO_WIDTH_M)
+        cv2.fillPoly(panel, [_fixed(self._panel_px(own))], _bgr(EGO), cv2.LINE_AA, SHIFT)
+        return panel
+
+    def _panel_px(self, points: Floats) -> Floats:
+        """Of points (N, 2) in ego: forward up, left to the left."""
+        out: Floats = np.column_stack(
+            [PANEL_PX / 2.0 - points[:, 1] * self._per_m, (AHEAD_M - points[:, 0]) * self._per_m]
+        )
+        return out
+
+
+class DriveVideo:
+    """Draws a drive's frames as its estimates come, in order; a context, so that the file is whole where a run ends.
+
+    `frames` are (frame_id, source time in ns, undistorted image or None), in order and without end or not: they are
+    taken up to the last estimate. A frame that was not estimated shows the estimate before it. `truth` gives the true
+    footprints (4, 2) in ego of a frame. Raises ResultsError where the file can't be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera,
+        rate_hz: float,
+        frames: Iterator[tuple[int, int, Image | None]],
+        truth: Callable[[int], Sequence[Floats]] | None = None,
+    ) -> None:
+        self._view = SideBySide(camera)
+        self._every = math.ceil(rate_hz / MOST_PICTURES_HZ)
+        self._frames, self._truth = frames, truth
+        self._next: tuple[int, int, Image | None] | None = None
+        self._estimate: Estimate | None = None
+        self._writer = _open_writer(path, rate_hz / self._every, self._view.size_px)
+        self.drawn_frame = -1
+
+    def add(self, estimate: Estimate) -> None:
+        """One frame's estimate; draws the frames before it."""
+        self._draw_until(estimate.frame_id)
+        self._estimate = estimate
+
+    def add_map(self, update: MapUpdate) -> None:
+        """What the map gained with the frame whose estimate was added last."""
+        self._view.add_map(update)
+
+    def finish(self) -> None:
+        """The frame of the last estimate, and the end of the file."""
+        if self._estimate is not None:
+            self._draw_until(self._estimate.frame_id + 1)
+        self._writer.release()
+
+    def _draw_until(self, end: int) -> None:
+        """All frames before `end`."""
+        while True:
+            self._next = next(self._frames, None) if self._next is None else self._next
+            if self._next is None or self._next[0] >= end:
+                return
+            frame_id, t_ns, image = self._next
+            self._next, self.drawn_frame = None, frame_id
+            if self._estimate is not None and image is not None and frame_id % self._every == 0:
+                self._writer.write(self._picture(t_ns, image, self._estimate))
+
+    def _picture(self, t_ns: int, image: Image, estimate: Estimate) -> Image:
+        seen = sum(vehicle.in_sight for vehicle in estimate.vehicles)
+        white = "white outlines: truth, " if self._truth else ""
+        words = (
+            f"BirdSLAM  {t_ns * 1e-9:5.1f} s  frame {estimate.frame_id}  {seen} vehicles in sight",
+            f"right: from above, 10 m rings; filled: estimates, {white}cyan: ego",
+            " ".join(status.value for status in estimate.status) or "all well",
+        )
+        truth = self._truth(estimate.frame_id) if self._truth else ()
+        return self._view.draw(image, estimate, truth, words)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._writer.release()
+
+
+def check_video(path: Path, camera: Camera, rate_hz: float) -> None:
+    """Raises ResultsError where a video of this camera can't be written there; what lies there stays as it is.
+
+    Folders on the way to it are made, as those of the results are.
+    """
+    if path.suffix != SUFFIX:
+        raise ResultsError(f"video {path}: expected FILE{SUFFIX}")
+    if path.is_dir():
+        raise ResultsError(f"video {path}: is a directory")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ResultsError(f"video {path}: {path.parent} can't be made: {error.strerror}") from None
+    probe = path.with_name(f".{path.stem}.probe{SUFFIX}")
+    try:
+        probe.touch()
+        _open_writer(probe, rate_hz, SideBySide(camera).size_px).release()
+    except OSError as error:
+        raise ResultsError(f"video {path}: {error.strerror}") from None
+    finally:
+        probe.unlink(missing_ok=True)
+
+
+def _open_writer(path: Path, rate_hz: float, size_px: tuple[int, int]) -> cv2.VideoWriter:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate_hz, size_px)
+    if not writer.isOpened():
+        raise ResultsError(f"video {path}: this OpenCV can't write {CODEC} there")
+    return writer
+
+
+def outline(pose: SE2, length_m: float, width_m: float) -> Floats:
+    """Corners (4, 2) of a footprint whose centre is `pose`."""
+    x_m, y_m = length_m / 2.0, width_m / 2.0
+    return pose @ np.array([[x_m, y_m], [x_m, -y_m], [-x_m, -y_m], [-x_m, y_m]])
+
+
+def _colour_of(vehicle: VehicleEstimate) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * share) for share in colour_of(vehicle.vehicle))
+    return blue, green, red
+
+
+def _fixed(px: Floats) -> NDArray[np.int32]:
+    return np.rint(np.clip(px, -1e5, 1e5) * 2**SHIFT).astype(np.int32)

@@ -1,0 +1,65 @@
+"""CenterNet outputs to boxes: an object is a peak of a heat map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.perception.decoding.detection import (
+    MOST_CANDIDATES,
+    Candidates,
+    Detections,
+    candidates_in_image,
+    merge_views,
+    rival_groups,
+)
+from birdslam.perception.manifest import CenterNet, Input, Misfit
+from birdslam.perception.views import View
+
+LARGEST_LOGIT = 60.0  # past it a sigmoid is 1 in any float
+
+
+class CenterNetDecoder:
+    """Reads CenterNet outputs (see `manifest.CenterNet`)."""
+
+    def __init__(self, table: CenterNet, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        """Raises Misfit where the outputs' shapes aren't what the manifest makes of them."""
+        self.table = table
+        heat = shapes[table.heat_map]
+        if len(heat) != 4 or heat[0] != 1:
+            raise Misfit("detector.heat_map", f"{table.heat_map} of shape (1, classes, h, w)", heat)
+        if heat[1] != table.classes:
+            raise Misfit("detector.classes", table.classes, f"{heat[1]} in {table.heat_map} {heat}")
+        for key, output in (("sizes", table.sizes), ("offsets", table.offsets)):
+            if output and shapes[output] != (1, 2, *heat[2:]):
+                raise Misfit(f"detector.{key}", f"{output} of shape {(1, 2, *heat[2:])}", shapes[output])
+        self._cell_px = np.array([input.width_px / heat[3], input.height_px / heat[2]])
+        self._groups = rival_groups(table.classes, table.labels, table.rivals)
+        self._wanted = np.array(sorted(table.labels))
+
+    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Candidates:
+        """The peaks of one run above the score threshold, as boxes in the image and cut to it."""
+        table = self.table
+        heat = tensors[table.heat_map][0, self._wanted]
+        if table.heat == "logits":
+            heat = 1.0 / (1.0 + np.exp(-np.clip(heat, -LARGEST_LOGIT, LARGEST_LOGIT)))
+        around = np.stack([cv2.dilate(plane, np.ones((3, 3), np.uint8)) for plane in heat])
+        planes, rows, columns = np.nonzero((heat >= table.score_threshold) & (heat == around))
+        scores = heat[planes, rows, columns].astype(np.float64)
+        best = np.argsort(-scores, kind="stable")[:MOST_CANDIDATES]
+        planes, rows, columns, scores = planes[best], rows[best], columns[best], scores[best]
+        centre = np.column_stack([columns, rows]).astype(np.float64)
+        if table.offsets:
+            centre += tensors[table.offsets][0][:, rows, columns].T
+        half = np.maximum(tensors[table.sizes][0][:, rows, columns].T.astype(np.float64), 0.0) / 2.0
+        if table.size_unit == "cells":
+            half = half * self._cell_px
+        centre = centre * self._cell_px
+        return candidates_in_image(np.hstack([centre - half, centre + half]), scores, self._wanted[planes], view)
+
+    def merge(self, parts: Sequence[Candidates], views: Sequence[View]) -> Detections:
+        """The boxes of all views of one image, each object once."""
+        return merge_views(parts, views, self._groups, self.table)

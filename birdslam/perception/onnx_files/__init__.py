@@ -1,0 +1,1 @@
+"""ONNX files: read, made faster, and made of OpenVINO's format."""

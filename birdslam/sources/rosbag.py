@@ -1,0 +1,234 @@
+"""ROS bags as recorded drives (docs/ros.md): which topics are read, the camera, the frames and the car's own speed.
+
+Times are those of the messages' headers; where a bag's images bear none that grow, it is when the bag received them.
+An image that is not later than the one before it is an unreadable frame, and a bag that can't be read on ends with one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.ros.bag import Bag, BagError, BagMessage, BagTopics, stamp_ns
+from birdslam.ros.frames import StaticFrames
+from birdslam.ros.sensor import CAMERA_INFO, IMAGES, SPEEDS, Lens, is_rectified, lens, pixels, speed, yaw_rate
+from birdslam.sources.kitti import decode_image
+from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
+from birdslam.sources.rosbag_truth import truth_rows
+from birdslam.sources.speed_file import SIGMA_MPS, YAW_RATE_SIGMA_RADPS
+from birdslam.sources.speed_log import SpeedLog
+from birdslam.types import NS_PER_S, SpeedReading
+
+RATED_IMAGES = 30  # of the beginning: the frame rate is the median of their distances in time
+
+
+class BagCamera(NamedTuple):
+    """What a bag says of its camera; `mount` is None where nothing in it says how the camera stands over the road."""
+
+    topic: str  # of the CameraInfo
+    frame: str
+    lens: Lens
+    mount: GroundPlane | None
+
+
+def read_bag_camera(path: Path, topics: BagTopics) -> BagCamera:
+    """The camera of a bag's images. Raises DatasetError."""
+    try:
+        with Bag(path) as bag:
+            return _camera(bag, topics)
+    except BagError as error:
+        raise DatasetError(str(error)) from None
+
+
+def bag_image_size(path: Path, topics: BagTopics) -> tuple[int, int]:
+    """(width, height) in pixels of the first image that can be read. Raises DatasetError."""
+    try:
+        with Bag(path) as bag:
+            return _first_image(bag, _image_topic(bag, topics)).shape[1::-1]
+    except BagError as error:
+        raise DatasetError(str(error)) from None
+
+
+class RosbagRecording(Recording):
+    """One camera's images in a ROS bag. Raises DatasetError where it can't be used."""
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera | None = None,
+        stride: int = 1,
+        topics: BagTopics = BagTopics(),  # noqa: B008
+    ) -> None:
+        self._path, self._stride, self._topics = path, stride, topics
+        self.name = path.stem
+        try:
+            with Bag(path) as bag:
+                self._topic = _image_topic(bag, topics)
+                height_px, width_px = _first_image(bag, self._topic).shape[:2]
+                self.camera = self._own_camera(bag) if camera is None else camera
+                if (self.camera.width_px, self.camera.height_px) != (width_px, height_px):
+                    given = "the camera given" if camera else "its CameraInfo"
+                    raise BagError(
+                        f"{path}: the images of {self._topic} are {width_px}x{height_px}, but {given} is for "
+                        f"{self.camera.width_px}x{self.camera.height_px}"
+                    )
+                self._count = bag.counts[self._topic]
+                self._stamped, self.rate_hz = self._rate(bag)
+                self.rate_hz /= stride
+                if topics.speed:
+                    self.speeds = SpeedLog(self._speeds(bag))
+                if topics.truth:
+                    bag.find(topics.truth, "nav_msgs/Odometry", "sensor_msgs/NavSatFix")
+        except BagError as error:
+            raise DatasetError(str(error)) from None
+
+    def _own_camera(self, bag: Bag) -> Camera:
+        found = _camera(bag, self._topics)
+        if found.mount is None:
+            raise BagError(
+                f"{self._path}: nothing in it says how high the camera stands over the road (no /tf_static from "
+                f"base_footprint or base_link to {found.frame or 'a frame that the images name'}): a camera file is "
+                f"needed (--camera FILE): `birdslam calibrate rosbag:{self._path} --height M --output FILE` writes one"
+            )
+        mount = msgspec.structs.asdict(found.mount)
+        try:
+            return Camera(**found.lens._asdict(), **mount)
+        except ValueError as error:
+            raise BagError(f"{self._path}: {found.topic}: {error}") from None
+
+    def _rate(self, bag: Bag) -> tuple[bool, float]:
+        """Whether the images' own times are used, and frames a second by them."""
+        first = list(islice(bag.messages(self._topic), RATED_IMAGES))
+        stamps = [stamp_ns(message.content) for message in first]
+        stamped = len(stamps) < 2 or stamps[1] > stamps[0]
+        times = stamps if stamped else [message.t_ns for message in first]
+        gaps = [gap for gap in np.diff(times).tolist() if gap > 0]
+        if not gaps:
+            raise BagError(f"{self._path}: {self._topic} holds {len(first)} images, and no two of growing time")
+        return stamped, NS_PER_S / float(np.median(gaps))
+
+    def _time_ns(self, message: BagMessage) -> int:
+        return stamp_ns(message.content) if self._stamped else message.t_ns
+
+    def _speeds(self, bag: Bag) -> list[SpeedReading]:
+        topic = bag.find(self._topics.speed, *SPEEDS)
+        messages = list(bag.messages(topic))
+        turns = any(yaw_rate(message.content) for message in messages)  # zero for ever: nothing measures it
+        return [
+            speed(message.content, self._time_ns(message), SIGMA_MPS, YAW_RATE_SIGMA_RADPS, turns)
+            for message in messages
+        ]
+
+    def __len__(self) -> int:
+        return -(-self._count // self._stride)
+
+    def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
+        """Every frame in order, decoded when asked for."""
+        last_ns, position = None, -1
+        try:
+            with Bag(self._path) as bag:
+                for position, message in enumerate(bag.messages(self._topic)):
+                    t_ns = self._time_ns(message)
+                    late = last_ns is not None and t_ns <= last_ns
+                    last_ns = last_ns + 1 if late and last_ns is not None else t_ns
+                    index, between = divmod(position, self._stride)
+                    if between or index < start:
+                        continue
+                    error = f"its time {t_ns / NS_PER_S:.3f} s is not later than the one before" if late else None
+                    yield self._frame(index, last_ns, message, error)
+            if position + 1 < self._count:
+                raise BagError(f"{self._path}: {self._topic} ends after {position + 1} of {self._count} images")
+        except BagError as error:
+            yield RecordedFrame(position // self._stride + 1, (last_ns or 0) + 1, None, str(error))
+
+    def _frame(self, index: int, t_ns: int, message: BagMessage, error: str | None) -> RecordedFrame:
+        image = None
+        if error is None:
+            try:
+                image = _pixels(message)
+            except ValueError as unfit:
+                error = str(unfit)
+        return RecordedFrame(index, t_ns, image, error and f"{self._path}: {self._topic}: image {index}: {error}")
+
+    def truth_poses(self) -> NDArray[np.float64] | None:
+        """(N, 3, 4) rows of the camera at the frames, by the topic of truth; nan outside its time."""
+        if not self._topics.truth:
+            return None
+        try:
+            with Bag(self._path) as bag:
+                messages = bag.messages(self._topic)
+                times = [self._time_ns(m) for i, m in enumerate(messages) if i % self._stride == 0]
+                frame = _image_frame(bag, self._topic)
+                truth = [(self._time_ns(message), message.content) for message in bag.messages(self._topics.truth)]
+                return truth_rows(times, truth, StaticFrames(bag), frame, self.camera.ground)
+        except ValueError as error:
+            raise DatasetError(f"{self._path}: {self._topics.truth}: {error}") from None
+
+
+def _image_topic(bag: Bag, topics: BagTopics) -> str:
+    if topics.image:
+        return bag.find(topics.image, *IMAGES)
+    found = bag.of_type(*IMAGES)
+    if len(found) != 1:
+        reason = "has no images" if not found else f"has {len(found)} topics of images: name one (--topic)"
+        raise BagError(f"{bag.path}: {reason}. {bag.listing(*IMAGES)}")
+    return found[0]
+
+
+def _camera(bag: Bag, topics: BagTopics) -> BagCamera:
+    image_topic = _image_topic(bag, topics)
+    topic, frame = _info_topic(bag, topics, image_topic), _image_frame(bag, image_topic)
+    try:
+        found = lens(next(bag.messages(topic)).content, is_rectified(image_topic))
+    except ValueError as error:
+        raise BagError(f"{bag.path}: {topic}: {error}: a camera file is needed (--camera FILE)") from None
+    try:
+        mount = StaticFrames(bag).mount(frame)
+    except ValueError as error:
+        raise BagError(f"{bag.path}: {error}: a camera file is needed (--camera FILE)") from None
+    return BagCamera(topic, frame, found, mount)
+
+
+def _info_topic(bag: Bag, topics: BagTopics, image_topic: str) -> str:
+    """By image_transport's rule it stands beside the images: /camera/image_raw/compressed, /camera/camera_info."""
+    if topics.camera_info:
+        return bag.find(topics.camera_info, CAMERA_INFO)
+    found = bag.of_type(CAMERA_INFO)
+    space = image_topic
+    while space:
+        space = space.rpartition("/")[0]
+        if f"{space}/camera_info" in found:
+            return f"{space}/camera_info"
+    if len(found) != 1:
+        reason = "no CameraInfo" if not found else f"{len(found)} topics of CameraInfo"
+        raise BagError(
+            f"{bag.path}: {reason} for {image_topic}: name one (--camera-info-topic), or give a camera file "
+            f"(--camera FILE). {bag.listing(CAMERA_INFO)}"
+        )
+    return found[0]
+
+
+def _image_frame(bag: Bag, topic: str) -> str:
+    return str(next(bag.messages(topic)).content.header.frame_id)
+
+
+def _first_image(bag: Bag, topic: str) -> NDArray[np.uint8]:
+    reason = ""
+    for message in bag.messages(topic):
+        try:
+            return _pixels(message)
+        except ValueError as error:
+            reason = reason or str(error)
+    raise BagError(f"{bag.path}: none of the images of {topic} can be read ({reason})")
+
+
+def _pixels(message: BagMessage) -> NDArray[np.uint8]:
+    content = message.content
+    return decode_image(bytes(content.data)) if hasattr(content, "format") else pixels(content)

@@ -1,0 +1,114 @@
+"""Speeds of the car beside a recording, as a text file.
+
+A line is a time in s by the recording's clock and a speed in m/s, then, where the car says more, the 1-sigma of the
+speed in m/s, a yaw rate in rad/s (counter-clockwise) and its 1-sigma; by commas (a cell may be empty) or blanks, with
+`#` comments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.sources.recording import DatasetError, Recording
+from birdslam.sources.speed_log import SpeedLog
+from birdslam.types import NS_PER_S, SpeedReading
+
+# Where a file says nothing of its noise; chosen on no data: some steps of a wheel sensor's message (often 0.1 km/h),
+# and the offset that a gyroscope of a stability control may keep (0.6 degrees a second).
+SIGMA_MPS = 0.1
+YAW_RATE_SIGMA_RADPS = 0.01
+
+_MOST_COLUMNS = 5
+_MOST_S = 9e9  # a time in ns has 63 bits
+
+
+def read_speeds(path: Path) -> SpeedLog:
+    """The readings of a file in its order; those of a sensor that failed (nan, backwards in time) as they are.
+
+    The method judges them. Raises DatasetError for a file that can't be read, a line that is none, and an empty file.
+    """
+    readings = [reading for _, reading in _lines(path)]
+    if not readings:
+        raise DatasetError(f"{path}: holds no speeds")
+    return SpeedLog(readings)
+
+
+def read_speed_curve(path: Path) -> NDArray[np.float64]:
+    """(N, 2) of a file: time in s, growing, and speed in m/s. Raises DatasetError where a line is no car's."""
+    lines = list(_lines(path))
+    for number, reading in lines:
+        if not 0.0 <= reading.speed_mps < 150.0:
+            t_s = reading.t_ns / NS_PER_S
+            raise DatasetError(f"{path}: line {number}: {reading.speed_mps:g} m/s at {t_s:g} s is no speed of a car")
+    for (_, before), (number, after) in pairwise(lines):
+        if after.t_ns <= before.t_ns:
+            raise DatasetError(f"{path}: line {number} is not later than the time before it")
+    if len(lines) < 2:
+        raise DatasetError(f"{path}: holds {len(lines)} speeds, 2 are needed")
+    return np.array([(reading.t_ns / NS_PER_S, reading.speed_mps) for _, reading in lines])
+
+
+def of_sequence(path: Path, name: str) -> Path:
+    """The speed file of a sequence: in a directory the one of its name."""
+    return path / f"{name}.txt" if path.is_dir() else path
+
+
+def with_speeds(recording: Recording, path: Path) -> Recording:
+    """The recording with the car's speeds of a file, which go before its own. Raises DatasetError.
+
+    That is also where the file's times lie all outside the recording's: then they are of another clock.
+    """
+    log = read_speeds(path)
+    times = [reading.t_ns for reading in log.readings]
+    first = next(iter(recording.frames()), None)
+    if first is not None:
+        length_ns = round(len(recording) / recording.rate_hz * NS_PER_S) if len(recording) else max(times)
+        begin_s, end_s = first.t_source_ns / NS_PER_S, (first.t_source_ns + length_ns) / NS_PER_S
+        if max(times) < first.t_source_ns or min(times) > first.t_source_ns + length_ns:
+            raise DatasetError(
+                f"{path}: its times {min(times) / NS_PER_S:g} to {max(times) / NS_PER_S:g} s lie outside the "
+                f"recording's, {begin_s:g} to {end_s:g} s"
+            )
+    recording.speeds = log
+    return recording
+
+
+def _lines(path: Path) -> Iterator[tuple[int, SpeedReading]]:
+    """Number and reading of each line that holds one. Raises DatasetError."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: can't be read: {getattr(error, 'strerror', None) or 'not UTF-8'}") from None
+    for number, line in enumerate(lines, start=1):
+        text = line.partition("#")[0].strip()
+        if not text:
+            continue
+        try:
+            yield number, _reading(text.split(",") if "," in text else text.split())
+        except ValueError:
+            raise DatasetError(
+                f"{path}: line {number} is no time in s and speed in m/s (with or without sigma, yaw rate and its "
+                f"sigma): {line[:40]!r}"
+            ) from None
+
+
+def _reading(words: list[str]) -> SpeedReading:
+    """Raises ValueError for what is no reading."""
+    t_s, speed_mps, *rest = (float(word) if word.strip() else None for word in words)
+    if t_s is None or speed_mps is None or not abs(t_s) < _MOST_S or len(words) > _MOST_COLUMNS:
+        raise ValueError
+    sigma_mps, yaw_rate_radps, yaw_rate_sigma_radps = (*rest, None, None, None)[:3]
+    if yaw_rate_radps is not None and yaw_rate_sigma_radps is None:
+        yaw_rate_sigma_radps = YAW_RATE_SIGMA_RADPS
+    return SpeedReading(
+        t_ns=round(t_s * NS_PER_S),
+        speed_mps=speed_mps,
+        sigma_mps=SIGMA_MPS if sigma_mps is None else sigma_mps,
+        yaw_rate_radps=yaw_rate_radps,
+        yaw_rate_sigma_radps=yaw_rate_sigma_radps or 0.0,
+    )

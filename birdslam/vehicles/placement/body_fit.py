@@ -1,0 +1,155 @@
+"""A vehicle's footprint fitted to the pseudo-lidar in its box, where no network reads the body from it.
+
+The pseudo-lidar gives the depth of the visible surface in each column of the box. It is compared with the surface that
+a footprint of the class's size would show, at each of a fan of yaws. The likelihoods of the yaws give centre, yaw and
+their covariance.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.perception import DepthMap
+from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, across_var, line_of_sight_cov
+from birdslam.vehicles.placement.localisation import CENTRE_STEPS, Observation
+
+Floats = NDArray[np.float64]
+
+
+def fit_footprint(
+    seen: Observation, depth: DepthMap, camera: Camera, ground: GroundPlane, config: PseudoLidarConfig
+) -> DepthPlace | None:
+    """The class's footprint fitted to the visible surface in the box's columns; `depth` in metres; None: too few."""
+    profile = visible_surface(seen, depth, camera, ground, config)
+    if profile is None:
+        return None
+    bearings, x_m = profile
+    middle_m = float(np.median(x_m))
+    if not 0.0 < middle_m <= config.max_range_m:
+        return None
+    yaws: Floats = np.arange(config.yaws, dtype=np.float64) * (math.pi / config.yaws) - math.pi / 2.0
+    corners = footprints(seen, yaws)
+    centres, misfit = _placed(seen, corners, bearings, x_m, middle_m, config)
+    # The probability of each yaw
+    sigma_m = math.hypot(config.sigma_shape_rel * middle_m, config.sigma_shape_m)
+    log_weight = -0.5 * misfit / sigma_m**2 * min(config.independent_columns, len(x_m))
+    log_weight -= 0.5 * _width_misfit(seen, corners, centres, depth.sigma_rel)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    centre = weight @ centres
+    spread = (centres - centre).T * weight @ (centres - centre)
+    axis = complex(weight @ np.exp(2j * yaws))
+    return DepthPlace(
+        centre,
+        spread + _own_cov(seen, centre, depth.sigma_rel, sigma_m),
+        math.atan2(axis.imag, axis.real) / 2.0,
+        _sigma_of_axis(abs(axis), math.pi / config.yaws),
+    )
+
+
+def visible_surface(
+    seen: Observation, depth: DepthMap, camera: Camera, ground: GroundPlane, config: PseudoLidarConfig
+) -> tuple[Floats, Floats] | None:
+    """Bearings (y / x) and x_m (C,) in ego of what the columns of a box show, the median of each over its rows."""
+    x1, y1, x2, y2 = seen.box_px
+    band = (x1, y1 + config.top_rel * (y2 - y1), x2, y1 + config.bottom_rel * (y2 - y1))
+    rows, columns = depth.cells(band)
+    count, width = rows.stop - rows.start, columns.stop - columns.start
+    if count < 1 or width < config.least_columns:
+        return None
+    points = depth.points_cam_m(camera, rows, columns) @ ground.R_ego_cam.T
+    ahead = points[:, 0].reshape(count, width)
+    bearing = points[:, 1].reshape(count, width)[count // 2] / ahead[count // 2]
+    x_m = np.median(ahead, axis=0)
+    picked = np.unique(np.linspace(0, width - 1, min(config.columns, width)).round().astype(np.int64))
+    return bearing[picked], x_m[picked]
+
+
+def footprints(seen: Observation, yaws_rad: Floats) -> Floats:
+    """(Y, 4, 2) corners about the centre, in order around it, of the class's footprint at each yaw."""
+    half_l, half_w = seen.dimensions.length_m / 2.0, seen.dimensions.width_m / 2.0
+    around = np.array([[half_l, half_w], [-half_l, half_w], [-half_l, -half_w], [half_l, -half_w]])
+    c, s = np.cos(yaws_rad), np.sin(yaws_rad)
+    turns = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)  # (Y, 2, 2)
+    out: Floats = np.einsum("yij,kj->yki", turns, around)
+    return out
+
+
+def surface_m(corners: Floats, bearings: Floats) -> Floats:
+    """(Y, C) x_m at which rays of the bearings (C,), y / x, first meet each footprint (Y, 4, 2); NaN: they pass it."""
+    a, b = corners, np.roll(corners, -1, axis=1)
+    # On an edge a + t (b - a) the ray has y = bearing * x
+    at_a = a[:, :, 1, None] - bearings * a[:, :, 0, None]
+    at_b = b[:, :, 1, None] - bearings * b[:, :, 0, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = at_a / (at_a - at_b)
+        x = a[:, :, 0, None] + t * (b[:, :, 0, None] - a[:, :, 0, None])
+    x = np.where((t >= 0.0) & (t <= 1.0), x, np.inf)
+    nearest = x.min(axis=1)
+    out: Floats = np.where(np.isfinite(nearest), nearest, np.nan)
+    return out
+
+
+def _placed(
+    seen: Observation,
+    corners: Floats,
+    bearings: Floats,
+    x_m: Floats,
+    middle_m: float,
+    config: PseudoLidarConfig,
+) -> tuple[Floats, Floats]:
+    """Centres (Y, 2) in m that fit box and surface best at each yaw, and the mean squared misfit there (Y,), m^2."""
+    along = middle_m + np.abs(corners[:, :, 0]).max(axis=1) / 2.0
+    across = _between_edges(seen, corners, along)
+    bound = config.outlier_sigma * math.hypot(config.sigma_shape_rel * middle_m, config.sigma_shape_m)
+    error = np.zeros((len(corners), len(bearings)))
+    for _ in range(CENTRE_STEPS):
+        model = surface_m(corners + np.stack([along, across], axis=-1)[:, None, :], bearings)
+        error = x_m - model  # NaN: the footprint is too narrow to reach this column
+        missed = np.isnan(model).all(axis=1, keepdims=True)
+        shift = np.asarray(np.nanmedian(np.where(missed, 0.0, error), axis=1))
+        along = np.maximum(along + shift, 1.0)
+        across = _between_edges(seen, corners, along)
+        error = error - shift[:, None]
+    misfit = np.minimum(np.nan_to_num(error, nan=bound) ** 2, bound**2).mean(axis=1)
+    return np.stack([along, across], axis=-1), misfit
+
+
+def _between_edges(seen: Observation, corners: Floats, along_m: Floats) -> Floats:
+    """(Y,) where sideways footprints at a depth look as wide and as far left as the box; as `localisation.place`."""
+    of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
+    across = seen.bearing * along_m
+    for _ in range(CENTRE_STEPS):
+        outline = (across[:, None] + corners[:, :, 1]) / np.maximum(along_m[:, None] + corners[:, :, 0], 0.1)
+        error = (seen.left - outline.max(axis=1)) * of_left + (seen.right - outline.min(axis=1)) * of_right
+        across = across + error / (of_left + of_right) * along_m
+    return across
+
+
+def _width_misfit(seen: Observation, corners: Floats, centres: Floats, sigma_rel: float) -> Floats:
+    """(Y,) squares of how wide each footprint looks against the box, in sigmas of what edges, class and depth allow."""
+    at = corners + centres[:, None, :]
+    bearings = at[:, :, 1] / np.maximum(at[:, :, 0], 0.1)
+    outline = np.log(np.maximum(bearings.max(axis=1) - bearings.min(axis=1), 1e-6))
+    edges = math.hypot(seen.sigma_left, seen.sigma_right) / seen.tan_width
+    sigma = math.hypot(edges, seen.dimensions.sigma_length_rel, sigma_rel)
+    out: Floats = ((math.log(seen.tan_width) - outline) / sigma) ** 2
+    return out
+
+
+def _own_cov(seen: Observation, centre_m: Floats, sigma_rel: float, sigma_m: float) -> Floats:
+    """(2, 2) of a centre at one yaw: the map's depth along the line of sight, the box's edges across it."""
+    x_m, y_m = centre_m.tolist()
+    length_m = seen.dimensions.sigma_length_rel * seen.dimensions.length_m / 2.0
+    along = (sigma_rel * x_m) ** 2 + sigma_m**2 + length_m**2
+    return line_of_sight_cov(x_m, y_m, along, across_var(seen, x_m))
+
+
+def _sigma_of_axis(resultant: float, step_rad: float) -> float:
+    """1-sigma of an axis whose doubled angles have this mean resultant length; no finer than the fan."""
+    circular = math.sqrt(max(0.0, -2.0 * math.log(max(min(resultant, 1.0), 1e-6)))) / 2.0
+    return max(circular, step_rad / math.sqrt(12.0))

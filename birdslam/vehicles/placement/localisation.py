@@ -1,0 +1,340 @@
+"""Vehicles in bird's-eye view from their boxes (paper, dynamic object localization).
+
+`observe_boxes` makes an `Observation` of a box: slopes and bearings against the road as it is known, with their sigmas.
+An edge that the image cuts off is no measurement, one that a nearer vehicle hides a poor one. The depths come from all
+boxes of a frame together, by Eq. 1 on their bottom edges (ground_size_filter.py). `place` then puts the centre of the
+footprint where the box's edges and the vehicle's yaw want it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.perception.decoding.detection import EdgeSigma
+from birdslam.perception.manifest import LowerEdge
+
+
+class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a class of vehicle measures, and how much its members differ (1-sigma, as a fraction)."""
+
+    length_m: float  # mean of the class
+    width_m: float  # mean of the class
+    height_m: float  # mean of the class
+    sigma_length_rel: float = 0.12  # of the length
+    sigma_width_rel: float = 0.2  # of the outline across the line of sight: the length shows too where it is oblique
+    sigma_height_rel: float = 0.08  # of the height
+
+
+DIMENSIONS = {
+    "car": Dimensions(3.9, 1.63, 1.53),
+    "van": Dimensions(5.0, 1.9, 2.1, sigma_height_rel=0.12),
+    "truck": Dimensions(7.0, 2.4, 3.0, sigma_length_rel=0.3, sigma_height_rel=0.2),
+    "bus": Dimensions(11.0, 2.5, 3.1, sigma_length_rel=0.2, sigma_height_rel=0.1),
+    "motorcycle": Dimensions(2.1, 0.8, 1.6, sigma_height_rel=0.12),
+}
+CENTRE_STEPS = 3  # each leaves about a tenth of the error
+HIDING_FRACTION = 0.1  # of a box's side: a nearer box that covers less hides nothing
+
+
+class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How boxes become places; the class table also says which labels are vehicles."""
+
+    vehicles: dict[str, Dimensions] = msgspec.field(default_factory=lambda: dict(DIMENSIONS))
+    sigma_box_rel: float = 0.02  # 1-sigma of a box's edges as a fraction of its size, where its detector states none
+    sigma_box_px: float = 0.4  # and beside it
+    # By how much of itself the 1-sigma of edges grows as the score falls from `sure_score` to 0: boxes of YOLOX-nano,
+    # vehicle-detection-adas-0002 and the shipped network on KITTI tracking 0005's images, and RRC's on 0001 to 0020,
+    # err 1.5 to 2.5 times as much at scores of 0.4 to 0.6 as at 0.9
+    sigma_growth: float = 2.0
+    sure_score: float = 0.9  # see sigma_growth
+    reach_rel: float = 1.0  # of the way from the nearest face to the centre; the paper stays at the face (0)
+    sigma_cut_rel: float = 1.0  # an edge cut by the image says nothing within the whole box
+    sigma_hidden_rel: float = 0.025  # an edge behind a nearer vehicle is the detector's guess
+    cut_margin_px: float = 4.0  # an edge so near to the image's border counts as cut
+    # of the box's height, at the image's bottom: detectors draw a cut edge a little inside of it
+    cut_margin_rel: float = 0.1
+    cut_margin_side_rel: float = 0.05  # of the box's width, at the image's sides
+    overhang_rel: float = 0.2  # of the length: from a body's end to its next axle, by how vehicles are built
+    clearance_m: float = 0.2  # from the road to the body's lower edge, by how cars are built
+    shape_floor_m: float = 0.02  # across the line of sight: vehicles are no cuboids
+    max_above_road_rad: float = 0.06  # a box whose bottom lies so far above where its height puts it hangs in the air
+    same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
+    max_range_m: float = 100.0  # by the height of its class
+
+    @property
+    def edge_sigma(self) -> EdgeSigma:
+        """Of the boxes of a detector that does not state its own."""
+        return EdgeSigma((self.sigma_box_rel,) * 4, self.sigma_box_px)
+
+
+class Observation(msgspec.Struct, frozen=True):
+    """One vehicle's box in one frame.
+
+    `left` and `right` are the bearings (y/x in ego) of its edges at the bottom. Slopes (-z/x in ego) count downwards
+    from the plane of the road, so that Eq. 1 puts the bottom edge at x = H / slope_bottom. The sigmas are standard
+    deviations of these numbers.
+    """
+
+    label: str
+    score: float
+    box_px: tuple[float, float, float, float]
+    left: float
+    sigma_left: float
+    right: float
+    sigma_right: float
+    slope_bottom: float
+    sigma_bottom: float
+    slope_top: float
+    sigma_top: float
+    cut_side: bool
+    dimensions: Dimensions
+    sigma_cut: float | None = None  # of slope_bottom where the image cuts the bottom off: the true one is no less
+    row: int = 0  # of its box among those that it was observed in
+    on_tyres: bool = False  # the bottom is that of the tyres, and not of the nearest face (tyre_contact.py)
+
+    @property
+    def bearing(self) -> float:
+        """Of its middle column."""
+        return (self.left + self.right) / 2.0
+
+    @property
+    def tan_width(self) -> float:
+        """Its width at a depth of 1."""
+        return self.left - self.right
+
+    @property
+    def tan_height(self) -> float:
+        """Its height at a depth of 1."""
+        return self.slope_bottom - self.slope_top
+
+    @property
+    def depth_by_height_m(self) -> float:
+        """Of a vehicle as tall as its class."""
+        return self.dimensions.height_m / max(self.tan_height, 1e-3)
+
+
+class AssumedSize(msgspec.Struct, frozen=True):
+    """The size that a vehicle was placed with, for the smoother (rts_smoother.py): later frames know the size better.
+
+    `log_height` is the logarithm of its height in metres, `depth_per_height` the derivative of the logarithm of its
+    depth by it.
+    """
+
+    log_height: float
+    sigma_log_height: float
+    depth_per_height: float
+    standing: float  # the probability that it stands
+
+
+class Place(msgspec.Struct, frozen=True):
+    """Where an observed vehicle is in ego: its nearest face's depth, its footprint's centre (2,), and cov (2, 2)."""
+
+    depth_m: float
+    centre_m: NDArray[np.float64]
+    cov: NDArray[np.float64]
+    assumed: AssumedSize | None = None
+
+
+def iou(a_px: NDArray[np.float64], b_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Intersection over union, (A, B), of boxes (A, 4) and (B, 4) given as x1, y1, x2, y2."""
+    a, b = np.reshape(a_px, (-1, 1, 4)), np.reshape(b_px, (1, -1, 4))
+    span = np.maximum(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0.0)
+    shared = span[..., 0] * span[..., 1]
+    area_a = (a[..., 2] - a[..., 0]) * (a[..., 3] - a[..., 1])
+    area_b = (b[..., 2] - b[..., 0]) * (b[..., 3] - b[..., 1])
+    out: NDArray[np.float64] = shared / np.maximum(area_a + area_b - shared, 1e-9)
+    return out
+
+
+def corners_of(dimensions: Dimensions, yaw_rad: float, size: float = 1.0) -> list[tuple[float, float]]:
+    """The footprint's corners about its centre, in ego's axes; `yaw_rad` is the vehicle's against the ego.
+
+    `size` is a factor of its length and width.
+    """
+    c, s = size * math.cos(yaw_rad), size * math.sin(yaw_rad)
+    half_l, half_w = dimensions.length_m / 2.0, dimensions.width_m / 2.0
+    lc, ls, wc, ws = half_l * c, half_l * s, half_w * c, half_w * s
+    return [(-lc + ws, -ls - wc), (-lc - ws, -ls + wc), (lc + ws, ls - wc), (lc - ws, ls + wc)]
+
+
+def extent_m(dimensions: Dimensions, yaw_rad: float, depth_m: float, bearing: float) -> tuple[float, float]:
+    """(extent along ego's x, width of its outline as seen at the depth of its nearest face) of a vehicle, in metres."""
+    corners = corners_of(dimensions, yaw_rad)
+    reach_m = _reach_m(corners)
+    x_m = depth_m + reach_m
+    y_m = bearing * x_m
+    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = corners
+    a, b = (y_m + y0) / max(x_m + x0, 0.1), (y_m + y1) / max(x_m + x1, 0.1)
+    c, d = (y_m + y2) / max(x_m + x2, 0.1), (y_m + y3) / max(x_m + x3, 0.1)
+    return 2.0 * reach_m, (max(a, b, c, d) - min(a, b, c, d)) * depth_m
+
+
+def _reach_m(corners: list[tuple[float, float]]) -> float:
+    """From the nearest corner to the centre, along ego's x."""
+    (a, _), (b, _), (c, _), (d, _) = corners
+    return -min(a, b, c, d)
+
+
+def centre_at(
+    seen: Observation, depth_m: float, yaw_rad: float, config: LocalisationConfig
+) -> tuple[float, float, float, float]:
+    """(x, y, reach, outline): the footprint's centre in ego by `place`, how far it lies behind the nearest face, in
+    metres, and the width of its outline at a depth of 1.
+
+    The middle of an oblique vehicle's outline is not the column of its centre: the centre is moved sideways until the
+    bearings of its outermost corners have those of the box's edges, each weighted by its information.
+    """
+    corners = corners_of(seen.dimensions, yaw_rad, config.reach_rel)
+    reach_m = _reach_m(corners)
+    x_m = depth_m + reach_m
+    left, right = seen.left, seen.right
+    y_m = (left + right) / 2.0 * x_m
+    of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
+    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = corners
+    x0, x1, x2, x3 = max(x_m + x0, 0.1), max(x_m + x1, 0.1), max(x_m + x2, 0.1), max(x_m + x3, 0.1)
+    widest = least = 0.0
+    for _ in range(CENTRE_STEPS):
+        a, b, c, d = (y_m + y0) / x0, (y_m + y1) / x1, (y_m + y2) / x2, (y_m + y3) / x3
+        widest, least = max(a, b, c, d), min(a, b, c, d)
+        y_m += ((left - widest) * of_left + (right - least) * of_right) / (of_left + of_right) * x_m
+    return x_m, y_m, reach_m, widest - least
+
+
+def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float, config: LocalisationConfig) -> Place:
+    """The observation's place in ego at a depth with its variance, both of the logarithm; yaw against the ego."""
+    depth_m = math.exp(log_depth)
+    x_m, y_m, reach_m, outline = centre_at(seen, depth_m, yaw_rad, config)
+    of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
+
+    # An edge alone gives the centre as well as half of the outline is known; of a vehicle that leaves the image at its
+    # side the nearest face is not seen
+    lopsided = (of_left - of_right) / (of_left + of_right)
+    sigma_half = seen.dimensions.sigma_width_rel * max(seen.tan_width, outline) / 2.0
+    sigma_across = math.hypot(
+        1.0 / math.sqrt(of_left + of_right), lopsided * sigma_half, config.shape_floor_m / max(x_m, 1.0)
+    )
+    sigma_reach_m = reach_m * (1.0 if seen.cut_side else seen.dimensions.sigma_length_rel)
+    along = x_m**2 * var_depth + sigma_reach_m**2
+    across, slope = (x_m * sigma_across) ** 2, y_m / x_m
+    cov = np.array([[along, along * slope], [along * slope, along * slope**2 + across]])
+    return Place(depth_m, np.array([x_m, y_m]), cov)
+
+
+def observe_boxes(
+    boxes_px: NDArray[np.float64],
+    scores: NDArray[np.float64],
+    labels: tuple[str, ...],
+    camera: Camera,
+    ground: GroundPlane,
+    config: LocalisationConfig,
+    edge_sigma: EdgeSigma | None = None,
+    lower_edge: LowerEdge = "body",
+) -> list[Observation]:
+    """Observations of the vehicles among the boxes (N, 4) with scores (N,), best score first.
+
+    A box that hangs over the road or lies past `max_range_m` is no vehicle on it and is left out. `edge_sigma` is what
+    the detector states, None the configuration's; `lower_edge` where its boxes end (`manifest.DetectorTable`).
+    """
+    vehicles = np.array([label in config.vehicles for label in labels], dtype=np.bool_).reshape(-1)
+    sizes = boxes_px[:, 2:] - boxes_px[:, :2]
+    candidates = np.flatnonzero(vehicles & (sizes >= 1.0).all(axis=1))
+    candidates = candidates[np.argsort(-scores[candidates], kind="stable")]
+    overlap = iou(boxes_px[candidates], boxes_px[candidates])
+    kept: list[int] = []  # rows of `overlap`
+    for row in range(len(candidates)):
+        if not kept or overlap[row, kept].max() <= config.same_vehicle_iou:
+            kept.append(row)
+    chosen = candidates[kept]
+    boxes = boxes_px[chosen]
+    hidden = hidden_edges(boxes)
+    slopes = _slopes(camera, ground, boxes)
+    sigma, on_tyres = edge_sigma or config.edge_sigma, lower_edge == "tyres"
+    found = (
+        _observe(i, box, float(scores[i]), labels[i], camera, slope, edges, sigma, on_tyres, config)
+        for i, box, slope, edges in zip(chosen.tolist(), boxes.tolist(), slopes.tolist(), hidden.tolist(), strict=True)
+    )
+    return [seen for seen in found if _is_on_road(seen, ground, config)]
+
+
+def hidden_edges(boxes_px: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N, 3): whether the left, right and bottom edge of each box lie behind a nearer one, whose bottom is lower."""
+    x1, y1, x2, y2 = (boxes_px[:, k, None] for k in range(4))
+    n1, m1, n2, m2 = (boxes_px[None, :, k] for k in range(4))
+    nearer = m2 > y2
+    rows = np.maximum(np.minimum(y2, m2) - np.maximum(y1, m1), 0.0) > HIDING_FRACTION * (y2 - y1)
+    columns = np.maximum(np.minimum(x2, n2) - np.maximum(x1, n1), 0.0) > HIDING_FRACTION * (x2 - x1)
+    left = nearer & rows & (n1 < x1) & (n2 > x1)
+    right = nearer & rows & (n1 < x2) & (n2 > x2)
+    bottom = nearer & columns & (m1 < y2)
+    edges: NDArray[np.bool_] = np.stack([left, right, bottom], axis=1)  # (N, 3, N)
+    return np.asarray(edges.any(axis=2))
+
+
+def _slopes(camera: Camera, ground: GroundPlane, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 4): bearings of the left and right edge at the bottom, slopes of bottom and top (the rays of Eq. 1)."""
+    px = np.concatenate([boxes_px[:, [0, 3]], boxes_px[:, [2, 3]], boxes_px[:, [0, 1]]])
+    left, right, top = bev.bearing_and_slope(camera, ground, px).reshape(3, -1, 2)
+    return np.column_stack([left[:, 0], right[:, 0], left[:, 1], top[:, 1]])
+
+
+def _observe(
+    row: int,
+    box: list[float],
+    score: float,
+    label: str,
+    camera: Camera,
+    slopes: list[float],
+    hidden: list[bool],
+    edge_sigma: EdgeSigma,
+    on_tyres: bool,
+    config: LocalisationConfig,
+) -> Observation:
+    x1, y1, x2, y2 = box
+    width_px, height_px = x2 - x1, y2 - y1
+    margin_px, cut_rel = config.cut_margin_px, config.sigma_cut_rel
+    side_margin_px = margin_px + config.cut_margin_side_rel * width_px
+    cut_left, cut_right = x1 < side_margin_px, x2 > camera.width_px - side_margin_px
+    cut_top = y1 < margin_px
+    cut_bottom = y2 > camera.height_px - margin_px - config.cut_margin_rel * height_px
+    hidden_left, hidden_right, hidden_bottom = hidden
+
+    of_left, of_right, of_top, of_bottom = edge_sigma.rel
+    doubtful = 1.0 + config.sigma_growth * max(0.0, config.sure_score - score)
+
+    def sigma_px(size_px: float, edge_rel: float, cut: bool, covered: bool) -> float:
+        rel = cut_rel if cut else config.sigma_hidden_rel if covered else 0.0
+        return math.hypot(doubtful * size_px * edge_rel, doubtful * edge_sigma.px, size_px * rel)
+
+    return Observation(
+        label=label,
+        score=score,
+        box_px=(x1, y1, x2, y2),
+        left=slopes[0],
+        sigma_left=sigma_px(width_px, of_left, cut_left, hidden_left) / camera.fx_px,
+        right=slopes[1],
+        sigma_right=sigma_px(width_px, of_right, cut_right, hidden_right) / camera.fx_px,
+        slope_bottom=slopes[2],
+        sigma_bottom=sigma_px(height_px, of_bottom, cut_bottom, hidden_bottom) / camera.fy_px,
+        slope_top=slopes[3],
+        sigma_top=sigma_px(height_px, of_top, cut_top, False) / camera.fy_px,
+        cut_side=cut_left or cut_right,
+        dimensions=config.vehicles[label],
+        sigma_cut=sigma_px(height_px, of_bottom, False, False) / camera.fy_px if cut_bottom else None,
+        row=row,
+        on_tyres=on_tyres,
+    )
+
+
+def _is_on_road(seen: Observation, ground: GroundPlane, config: LocalisationConfig) -> bool:
+    depth_m = seen.depth_by_height_m
+    hangs = (
+        seen.slope_bottom
+        < bev.road_slope(depth_m, ground.height_m) - config.max_above_road_rad - 3.0 * seen.sigma_bottom
+    )
+    return depth_m < config.max_range_m and not hangs

@@ -1,0 +1,342 @@
+"""How large vehicles are and whether they stand, from how they grow in the image as the ego drives.
+
+A box that grows from 20 to 40 pixels while the ego comes 30 m nearer is of a car that is 30 m away, however large cars
+are, if it stands. If it drives, its growth says little of its size. Kalman filters, one for each way to move, are mixed
+by how well each predicts the measurements (interacting multiple model, Blom and Bar-Shalom 1988). Each has
+
+    x = [x, y, vx, vy, log h, log w, tilt, d]
+
+in the odometry's world, m and m/s; h (m) is the vehicle's height, w its outline's width as a factor of its class's. The
+road at the vehicle is tilted against the ego's by `tilt` (rad), which lasts for seconds, and lies d (m) below it. The
+measurements of a box are made of its slopes (see localisation.Observation), with z the depth of the nearest face, r on
+to the roof's far edge, y/x the centre's bearing and H the camera's height:
+
+    log(bottom - top - (H - h) r / (z (z + r))) = log h - log z
+    log(left - right) = log w + log(class's outline) - log z
+    y / x
+    log(bottom) = log((H + d) / z - tilt)                                  (Eq. 1)
+
+So a queue in the next lane, which grows slower than what stands, is not taken for large cars that stand: their height
+has its class's prior, and the ground says how far they are. What moves has mostly the direction of its heading, so that
+keeping its lane is no sign of standing. One that started only now has a filter of its own: mixed into that of those
+which have driven all along, it would bring with it the size and the place of one that stands.
+
+The learned size is a measurement of log h that holds all that motion says, and nothing of what its class says. The
+ground is left out of it too, which the ground and size filter has: two more filters of what stands, with the weights
+of the first two, are never told where a box meets the road. There is none for a vehicle in the ego's own path: straight
+ahead there is no parallax. What stands there keeps its bearing, as does what drives on before the ego; growth alone
+gives how fast the gap closes as a share of itself, which any size fits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.se2 import SE2
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from birdslam.vehicles.state.parallax_measurements import (
+    BELOW,
+    BY_HEIGHT,
+    BY_WIDTH,
+    CUES,
+    GROUND,
+    HEIGHT,
+    LEAST_SLOPE,
+    STATES,
+    TILT,
+    VX,
+    VY,
+    WIDTH,
+    ParallaxMeasurements,
+    X,
+    Y,
+    linearised,
+    side_off,
+)
+from birdslam.vehicles.state.side_outliers import update
+
+Floats = NDArray[np.float64]
+
+# UNUSUAL stands too, and is of no usual size; STARTED stood when it was first seen
+WAYS = STANDING, UNUSUAL, STARTED, CREEPING, DRIVING, CROSSING = range(6)
+STILL, MOVING = [STANDING, UNUSUAL], [STARTED, CREEPING, DRIVING, CROSSING]
+BLIND = [6, 7]  # filters as STILL, and never told where the box meets the road
+FILTERS = len(WAYS) + len(BLIND)
+UNKNOWN = 1e6  # variance of a size on which motion says nothing, and of what is not measured
+DEPTH_UNKNOWN = 1.0  # 1-sigma at birth, as a fraction
+MOST_OUTLIERS = 0.45  # probability beforehand of one side
+LEAST_WEIGHT = 1e-9  # of a filter: one that was ruled out may come back
+
+
+@dataclass(frozen=True)
+class LearnedSize:
+    """Measurements of log h that exclude each other, (N, K): each holds with its weight, and has its variance.
+
+    `speed_mps` (N,) is the root mean square of the speeds that the ways to move have, each with its probability.
+    `side_outlier` (N, 2): the probabilities that the left side of a vehicle's box is off by far, and the right.
+    """
+
+    weight: Floats
+    log_height: Floats
+    variance: Floats
+    speed_mps: Floats
+    side_outlier: Floats
+
+
+class Parallax:
+    """predict() once a frame, then learn_sizes() from its boxes.
+
+    State, of each vehicle and each way to move: x, y (m), vx, vy (m/s) in the odometry's world, log height (of metres),
+    log of the outline's width as a factor, tilt (rad) and depth below (m) of its road, and the probability of that way.
+    Measurements: of each box the logs of its height, its width and its bottom as slopes, and the bearing of its centre
+    (see the module). `placing.Placing` hands the learned sizes to `ground_size_filter.GroundSizeFilter`; the tracker
+    and the smoother read `standing`.
+    """
+
+    def __init__(self, config: ParallaxConfig) -> None:
+        self.config = config
+        driving = 1.0 - config.standing - config.unusual - config.creeping - config.crossing
+        birth = [config.standing, config.unusual, 0.0, config.creeping, driving, config.crossing]
+        self._birth = np.maximum(birth, LEAST_WEIGHT)
+        self._vehicles: list[int] = []
+        self._x = np.zeros((0, FILTERS, len(STATES)))
+        self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
+        self._weight = np.zeros((0, len(WAYS)))
+        self._prior = np.zeros((0, 2))  # log h and its variance, as the class has it
+        self._unseen_s = np.zeros(0)
+        self._yaw_rad = np.zeros(0)  # in world
+        self._on_road = np.zeros(0, np.bool_)
+        self._side_outlier = np.zeros((0, 2))
+
+    def standing(self, vehicle: int) -> float:
+        """The probability that a vehicle stands."""
+        weight = self._weight[self._vehicles.index(vehicle)]
+        return float(weight[STANDING] + weight[UNUSUAL])
+
+    def begin(
+        self,
+        vehicle: int,
+        centre_m: Floats,
+        yaw_rad: float,
+        T_world_ego: SE2,
+        log_height: float,
+        sigmas: tuple[float, float],
+    ) -> None:
+        """A vehicle seen for the first time, at about `centre_m` (2,) and `yaw_rad` in ego; its first box says more.
+
+        `log_height` is that of its class, `sigmas` are those of log h and log w in it.
+        """
+        config = self.config
+        x = np.zeros((1, FILTERS, len(STATES)))
+        x[..., :2] = T_world_ego @ centre_m
+        x[..., HEIGHT] = log_height
+        P = np.zeros((1, FILTERS, len(STATES), len(STATES)))
+        P[..., :2, :2] = np.eye(2) * (DEPTH_UNKNOWN * float(centre_m[0])) ** 2
+        heading_rad = np.array([T_world_ego.yaw_rad + yaw_rad])
+        on_road = abs(float(centre_m[1])) < config.road_half_width_m
+        for moving, along_mps in ((CREEPING, config.sigma_creep_mps), (DRIVING, config.sigma_drive_mps)):
+            on_road_mps = math.hypot(config.sigma_across_mps, config.sigma_across_rel * along_mps)
+            across_mps = on_road_mps if on_road else along_mps
+            P[:, moving, VX:HEIGHT, VX:HEIGHT] = _turned(np.square([along_mps, across_mps]), heading_rad)
+        P[:, CROSSING, [VX, VY], [VX, VY]] = config.sigma_drive_mps**2
+        P[..., [HEIGHT, WIDTH], [HEIGHT, WIDTH]] = np.square(sigmas)
+        P[:, [UNUSUAL, BLIND[1]], HEIGHT, HEIGHT] = config.sigma_unusual_rel**2
+        P[..., TILT, TILT] = config.sigma_tilt_rad**2
+        aside_m = float(centre_m[1])
+        below_m = config.sigma_kerb_m, config.sigma_crown_rad * aside_m, config.sigma_bank_per_m * aside_m**2
+        P[..., BELOW, BELOW] = math.hypot(*below_m) ** 2
+        self._vehicles.append(vehicle)
+        self._x, self._P = np.concatenate([self._x, x]), np.concatenate([self._P, P])
+        self._weight = np.concatenate([self._weight, self._birth[None]])
+        self._prior = np.concatenate([self._prior, [[log_height, sigmas[0] ** 2]]])
+        self._yaw_rad = np.append(self._yaw_rad, heading_rad)
+        self._on_road = np.append(self._on_road, on_road)
+        self._side_outlier = np.concatenate([self._side_outlier, np.zeros((1, 2))])
+        self._unseen_s = np.append(self._unseen_s, max(config.box_memory_s, config.view_memory_s))
+
+    def predict(self, dt_s: float, T_world_ego: SE2, ego_cov: Floats | None) -> None:
+        """To the next frame, whose ego pose the odometry gives with `ego_cov` (3, 3) of the last step's tangent."""
+        self._unseen_s += dt_s
+        self._side_outlier *= math.exp(-dt_s / self.config.side_outlier_memory_s)
+        if not self._vehicles or dt_s <= 0.0:
+            return
+        self._mix(dt_s)
+        config = self.config
+        keep = math.exp(-dt_s / config.tilt_memory_s)
+        self._x[..., TILT] *= keep
+        self._P[..., TILT, :] *= keep
+        self._P[..., TILT] *= keep
+        self._P[..., TILT, TILT] += (1.0 - keep**2) * config.sigma_tilt_rad**2
+        F = np.eye(len(STATES))
+        F[X, VX] = F[Y, VY] = dt_s
+        self._x[:, MOVING] = self._x[:, MOVING] @ F.T
+        self._P[:, MOVING] = F @ self._P[:, MOVING] @ F.T
+        self._P[:, MOVING, : VY + 1, : VY + 1] += self._process_noise(dt_s)
+        if ego_cov is not None:  # an error of the ego's step moves the vehicle against it
+            at = self._x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]
+            J = np.zeros((*at.shape[:2], 2, 3))
+            J[..., :2, :2] = T_world_ego.rotation()
+            J[..., 0, 2], J[..., 1, 2] = -at[..., 1], at[..., 0]
+            self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
+
+    def _process_noise(self, dt_s: float) -> Floats:
+        """(N, len(MOVING), 4, 4) of x, y, vx, vy: along and across the heading, or alike in any direction."""
+        config = self.config
+        along_across = _turned(np.square([config.change_mps, config.change_across_mps]), self._yaw_rad)
+        of_velocity = np.stack([along_across] * len(MOVING), axis=1)
+        of_velocity[~self._on_road] = of_velocity[:, MOVING.index(CROSSING)] = np.eye(2) * config.change_mps**2
+        in_time = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
+        out: Floats = in_time[:, None, :, None] * of_velocity[:, :, None, :, None, :]  # the Kronecker product
+        return out.reshape(*of_velocity.shape[:2], 4, 4)
+
+    def learn_sizes(
+        self,
+        vehicles: Sequence[int],
+        boxes: ParallaxMeasurements,
+        T_world_ego: SE2,
+        height_m: float,
+    ) -> LearnedSize:
+        """What motion says of each vehicle's size; `height_m` is the camera's."""
+        rows = [self._vehicles.index(vehicle) for vehicle in vehicles]
+        if not rows:
+            nothing = np.zeros((0, len(BLIND) + 1))
+            return LearnedSize(nothing, nothing, nothing, np.zeros(0), np.zeros((0, 2)))
+        config = self.config
+        x, P = self._x[rows], self._P[rows]
+        outline_var = np.square(boxes.turned_rad) + config.outline_drift_rel**2 * self._unseen_s[rows]
+        P[..., WIDTH, WIDTH] += outline_var[:, None]
+        innovation, J = linearised(x, boxes, T_world_ego, height_m)
+        of_box, of_view = (
+            np.maximum(1.0, memory_s / np.maximum(self._unseen_s[rows], 1e-3))
+            for memory_s in (config.box_memory_s, config.view_memory_s)
+        )
+        of_face = np.square(config.sigma_face_m / boxes.depth_m)
+
+        PJt = P @ J.swapaxes(-1, -2)
+        S = J @ PJt
+        S = S + self._noise(boxes, innovation, S, of_box, of_face * of_view)
+        off = side_off(boxes, innovation, config.sigma_side_outlier_rel * np.sqrt(of_box))
+        share = np.minimum(config.side_outlier + self._side_outlier[rows], MOST_OUTLIERS).T
+        after = update(P, PJt, S, innovation, off, share)
+        self._x[rows] = x + after.step
+        self._P[rows] = after.cov
+
+        log_likelihood = after.log_likelihood[:, : len(WAYS)]
+        weight = self._weight[rows] * np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
+        weight = np.maximum(weight / weight.sum(axis=1, keepdims=True), LEAST_WEIGHT)
+        self._weight[rows] = weight
+        self._unseen_s[rows] = 0.0
+        self._yaw_rad[rows] = boxes.yaw_rad + T_world_ego.yaw_rad
+        in_path = np.abs(boxes.bearing) * (boxes.depth_m + boxes.reach_m) < config.path_half_width_m
+        side_outlier = (after.outlier[..., : len(WAYS)] * weight).sum(axis=-1).T
+        self._side_outlier[rows] = side_outlier
+        return self._learned(rows, of_face + config.sigma_scale_rel**2, in_path, side_outlier)
+
+    def _noise(
+        self, boxes: ParallaxMeasurements, innovation: Floats, S: Floats, of_box: Floats, face_var: Floats
+    ) -> Floats:
+        """(N, FILTERS, 4, 4): measurement noise, raised for outliers; S is of the predicted measurements.
+
+        Errors that last get in each frame so little weight that they count right over their memory: `of_box` (N,) is by
+        how much a box's variance grows for that, `face_var` (N,) the variance of the nearest face, grown already.
+        """
+        variance = np.empty((len(of_box), FILTERS, len(CUES)))
+        variance[..., :GROUND] = (np.square(boxes.sigma) * of_box[:, None])[:, None]
+        variance[..., [BY_HEIGHT, BY_WIDTH]] += face_var[:, None, None]
+        sigma_rel = boxes.sigma_bottom / np.maximum(boxes.bottom, LEAST_SLOPE)
+        variance[..., GROUND] = (np.square(sigma_rel) * of_box)[:, None]
+        variance[:, BLIND, GROUND] = UNKNOWN
+        noise = variance[..., None] * np.eye(len(CUES))
+        misfit = _squared(innovation, S + noise).min(axis=1)
+        noise *= np.maximum(1.0, misfit / self.config.gate_sigma**2)[:, None, None, None]
+        return noise
+
+    def keep_only(self, vehicles: Iterable[int]) -> None:
+        """Forget the others."""
+        wanted = set(vehicles)
+        rows = [k for k, vehicle in enumerate(self._vehicles) if vehicle in wanted]
+        if len(rows) == len(self._vehicles):
+            return
+        self._vehicles = [self._vehicles[k] for k in rows]
+        for name in ("_x", "_P", "_weight", "_prior", "_unseen_s", "_yaw_rad", "_on_road", "_side_outlier"):
+            setattr(self, name, getattr(self, name)[rows])
+
+    def _mix(self, dt_s: float) -> None:
+        """The filters' states and weights mixed by how often vehicles change their way to move within `dt_s`."""
+        config = self.config
+        starts, changes, slows = (
+            1.0 - math.exp(-dt_s / time_s) for time_s in (config.stands_for_s, config.creeps_for_s, config.drives_for_s)
+        )
+        share = np.eye(len(WAYS))  # (from, to)
+        share[STILL, STILL], share[STILL, STARTED] = 1.0 - starts, starts
+        for slow in (STARTED, CREEPING):
+            share[slow, slow], share[slow, STANDING] = 1.0 - changes / 2.0, changes / 2.0
+        share[CREEPING, CREEPING], share[CREEPING, DRIVING] = 1.0 - changes, changes / 2.0
+        for fast in (DRIVING, CROSSING):
+            share[fast, fast], share[fast, CREEPING] = 1.0 - slows, slows
+        joint = self._weight[:, :, None] * share
+        self._weight = joint.sum(axis=1)
+        share = joint / self._weight[:, None]
+        ways, blind = list(WAYS), BLIND + MOVING
+        x, P = self._x.copy(), self._P.copy()
+        self._x[:, ways], self._P[:, ways] = self._mixed(share, x[:, ways], P[:, ways])
+        self._x[:, BLIND], self._P[:, BLIND] = self._mixed(share[..., STILL], x[:, blind], P[:, blind])
+
+    def _mixed(self, share: Floats, x: Floats, P: Floats) -> tuple[Floats, Floats]:
+        """The moments of filters (N, 6) mixed by `share` (N, 6, K); of the six and of the K the first two stand."""
+        P[:, STILL, [[VX], [VY]], [[VX], [VY]]] = self.config.sigma_creep_mps**2  # it starts
+        to = share.swapaxes(1, 2)  # (N, to, from)
+        mean = to @ x
+        gap = x[:, None] - mean[:, :, None]  # (N, to, from, 8)
+        cov = (to @ P.reshape(*P.shape[:2], -1)).reshape(*mean.shape, P.shape[-1])
+        cov += (to[..., None] * gap).swapaxes(-1, -2) @ gap
+        speed = slice(VX, VY + 1)
+        mean[:, STILL, speed] = 0.0
+        cov[:, STILL, speed] = 0.0
+        cov[:, STILL, :, speed] = 0.0
+        return mean, cov
+
+    def _learned(
+        self, rows: list[int], lasting: Floats, in_path: NDArray[np.bool_], side_outlier: Floats
+    ) -> LearnedSize:
+        """Of each filter that stands, its log h less what the class says. Of the others nothing: they brake and turn
+        for seconds, and what looks like parallax there is none. `lasting` (N,) is a variance that time keeps.
+
+        Vehicles `in_path` (N,) are left out here, not in the filters: once the ego passes beside one, all counts.
+        """
+        mean, var = self._x[rows][:, BLIND, HEIGHT], self._P[rows][:, BLIND, HEIGHT, HEIGHT]
+        prior, prior_var = self._prior[rows].T[..., None]
+        information = 1.0 / var - 1.0 / prior_var
+        informed = information > 1.0 / UNKNOWN
+        informed[in_path] = False
+        information = np.where(informed, information, 1.0 / UNKNOWN)
+        log_height = np.where(informed, (mean / var - prior / prior_var) / information, prior)
+        variance = 1.0 / information + lasting[:, None]
+        weight = self._weight[rows]
+        square = np.square(self._x[rows][:, MOVING, VX:HEIGHT]).sum(axis=-1)
+        return LearnedSize(
+            np.column_stack([weight[:, STILL], weight[:, MOVING].sum(axis=1)]),
+            np.column_stack([log_height, prior]),
+            np.column_stack([variance, np.full(len(rows), UNKNOWN)]),
+            np.sqrt((weight[:, MOVING] * square).sum(axis=1)),
+            side_outlier,
+        )
+
+
+def _squared(gap: Floats, S: Floats) -> Floats:
+    """(...): Mahalanobis distances squared of gaps (..., 4) with covariances (..., 4, 4)."""
+    out: Floats = np.einsum("...a,...a->...", gap, np.linalg.solve(S, gap[..., None])[..., 0])
+    return out
+
+
+def _turned(variances: Floats, yaw_rad: Floats) -> Floats:
+    """(N, 2, 2) in world of `variances` (2,) along and across headings (N,)."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    R = np.stack([c, -s, s, c], axis=-1).reshape(-1, 2, 2)
+    out: Floats = R * variances @ R.swapaxes(-1, -2)
+    return out

@@ -1,0 +1,267 @@
+"""Roads that the odometry must master, each from its seed: bare motorways, ramps, a street and a motorway at night.
+
+Each is a scenario of its own: what lies beside a motorway is far, its asphalt smooth; a ramp begins in its bend.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from birdslam.geometry.camera import Camera
+from birdslam.world.rendering import materials as m
+from birdslam.world.rendering.night import Night, even_sky
+from birdslam.world.rendering.photometrics import Lens
+from birdslam.world.scenario import Scenario
+from birdslam.world.street.course import STEP_M, Course
+from birdslam.world.street.street import (
+    ASPHALT,
+    BAND,
+    CROSSING,
+    GRASS,
+    HATCHED,
+    LINE,
+    LINE_KINDS,
+    MARK,
+    Lane,
+    Street,
+)
+from birdslam.world.traffic.fleet import draw_shape, draw_truck
+from birdslam.world.traffic.flow import Mover
+from birdslam.world.traffic.placement import Standing, background, tree
+from birdslam.world.traffic.poses import place
+from birdslam.world.truth import Floats
+
+# The field of view of KITTI's cameras, at a size that renders in a sixth of a second
+CAMERA = Camera(640, 192, 371.2, 371.2, 319.5, 90.0, height_m=1.65, pitch_rad=0.008)
+
+AXLE_M = 1.7  # from the rear axle to the camera
+LANE_M, SHOULDER_M, MEDIAN_M = 3.6, 2.5, 3.0
+GERMAN, AMERICAN = (18.0, 6.0), (12.2, 3.05)  # a dashed line's period and dash
+RAIL_M, RAIL_HIGH_M = 4.0, 0.75  # a guard rail's piece
+POST_EVERY_M = 50.0  # posts beside a road
+EGO_M = 30.0  # where the ego begins
+NIGHT_GREY = 1.0  # cd/m^2: of the road ten metres ahead in its own beams such a camera makes a light grey
+_BEYOND_M = 280.0  # of road behind the last place of a drive
+_ACROSS = 0.75  # of a bend's radius: no further aside is there ground
+
+
+def camera_of(width_px: int) -> Camera:
+    """The same field of view in images of another width."""
+    k = width_px / CAMERA.width_px
+    middle_u, middle_v = (k * (c + 0.5) - 0.5 for c in (CAMERA.cx_px, CAMERA.cy_px))
+    size = width_px, round(k * CAMERA.height_px)
+    lens = k * CAMERA.fx_px, k * CAMERA.fy_px, middle_u, middle_v
+    return Camera(*size, *lens, height_m=CAMERA.height_m, pitch_rad=CAMERA.pitch_rad)
+
+
+@dataclass(frozen=True)
+class Road:
+    """A drive of `frames` images along a road; `told` says what is hard on it."""
+
+    told: str
+    scenario: Callable[[], Scenario]
+    rate_hz: float
+    frames: int = 100
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """How the road's asphalt and paint look."""
+
+    tone: float = 1.0
+    dashes: tuple[float, float] = GERMAN
+    yellow: float = 0.0  # the line beside the median
+
+
+def motorway(
+    seed: int, speed_mps: float, bend_per_m: float, surface: _Surface, traffic: bool = True, night: Night | None = None
+) -> Scenario:
+    """Three lanes each way; the ego in the right one or, where there is traffic, the middle one."""
+    rng = np.random.default_rng([seed, 6])
+    length_m = EGO_M + 14.0 * speed_mps + _BEYOND_M
+    s = np.arange(int(length_m / STEP_M) + 1) * STEP_M
+    course = Course(bend_per_m * np.ones_like(s), np.zeros_like(s))
+    street = _road(course, 3, 3, surface)
+    standing = _verge(rng, street, length_m)
+    lanes = sorted((lane for lane in street.lanes if lane.direction > 0), key=lambda lane: lane.d_m)
+    own = lanes[1] if traffic else lanes[0]
+    ego = Mover(draw_shape(rng, "estate"), EGO_M, own.d_m, 0.0, speed_mps, speed_mps, own.d_m)
+    movers = _traffic(rng, street, own.d_m, speed_mps) if traffic else ()
+    return Scenario(
+        street, standing, movers, ego, _sunny() if night is None else even_sky(),
+        _camera() if night is None else _dark_camera(), seed, AXLE_M, night,
+    )  # fmt: skip
+
+
+def ramp(seed: int, radius_m: float, speed_mps: float, arc_m: float, left: bool, glare: bool = False) -> Scenario:
+    """One lane that bends from before the first image on, straight after `arc_m`; in glare with chevrons beside it."""
+    rng = np.random.default_rng([seed, 7])
+    length_m = EGO_M + 14.0 * speed_mps + _BEYOND_M
+    s = np.arange(int(length_m / STEP_M) + 1) * STEP_M
+    straight = np.clip((s - EGO_M - arc_m) / 25.0, 0.0, 1.0)
+    before = np.clip((s - EGO_M + 12.0) / 4.0, 0.0, 1.0)  # what lies behind must not come round again
+    course = Course((1.0 if left else -1.0) / radius_m * (1.0 - straight) * before, np.zeros_like(s))
+    street = _road(course, 1, 0, _Surface(tone=1.7 if glare else 1.0))
+    if glare:
+        rows = [(HATCHED, at, at + 12.0, 0.6, 3.4, 0.0) for at in np.arange(EGO_M - 8.0, length_m, 12.0)]
+        street = replace(street, marks=np.array(rows, np.float32).reshape(-1, len(MARK)))
+    standing = _verge(rng, street, min(length_m, EGO_M + arc_m + 250.0))
+    lane = street.lanes[0]
+    ego = Mover(draw_shape(rng, "estate"), EGO_M, lane.d_m, 0.0, speed_mps, speed_mps, lane.d_m)
+    return Scenario(street, standing, (), ego, _sunny(), _camera(2.6 if glare else 1.0), seed, AXLE_M)
+
+
+def night_street(seed: int, speed_mps: float) -> Scenario:
+    """A country road with bends: a car ahead, others coming, posts and trees in the beams."""
+    rng = np.random.default_rng([seed, 8])
+    length_m = EGO_M + 14.0 * speed_mps + _BEYOND_M
+    s = np.arange(int(length_m / STEP_M) + 1) * STEP_M
+    course = Course(0.004 * np.sin(2.0 * math.pi * s / 220.0), np.zeros_like(s))
+    street = _road(course, 1, 1, _Surface(dashes=(12.0, 4.0)))
+    standing = _verge(rng, street, length_m)
+    forth, back = (next(lane for lane in street.lanes if lane.direction == sign) for sign in (1, -1))
+    ego = Mover(draw_shape(rng, "estate"), EGO_M, forth.d_m, 0.0, speed_mps, speed_mps, forth.d_m)
+    ahead = Mover(draw_shape(rng, "sedan"), EGO_M + 35.0, forth.d_m, 0.0, speed_mps, 1.02 * speed_mps, forth.d_m)
+    coming = [
+        Mover(draw_shape(rng, shape), EGO_M + at, back.d_m, math.pi, speed_mps, speed_mps, back.d_m)
+        for shape, at in (("hatchback", 70.0), ("suv", 190.0), ("van", 330.0))
+    ]
+    return Scenario(
+        street, standing, (ahead, *coming), ego, even_sky(0.25), _dark_camera(), seed, AXLE_M, Night()
+    )  # fmt: skip
+
+
+def _road(course: Course, forth: int, back: int, surface: _Surface) -> Street:
+    """Lanes forth and back, a median between more than one of each, shoulders, rails' and grass beside."""
+    apart = 0.5 * MEDIAN_M if min(forth, back) > 1 else 0.0
+    right, left = -apart - forth * LANE_M, apart + back * LANE_M
+    shoulder = SHOULDER_M if max(forth, back) > 1 or back == 0 else 0.5
+    far = min(_ACROSS / max(float(np.abs(course.curvature).max()), 1e-4), 75.0)
+    edges = right - shoulder, left + shoulder
+    bands = [(-far, edges[0], 0.0, 0.0, GRASS, 1.0), (edges[1], far, 0.0, 0.0, GRASS, 1.0)]
+    if apart > 0.0:
+        bands += [(edges[0], -apart, 0.0, 0.0, ASPHALT, surface.tone), (-apart, apart, 0.0, 0.0, GRASS, 0.9),
+                  (apart, edges[1], 0.0, 0.0, ASPHALT, surface.tone)]  # fmt: skip
+    else:
+        bands += [(*edges, 0.0, 0.0, ASPHALT, surface.tone)]
+    rows: list[tuple[float, ...]] = []
+
+    def line(d: float, name: str, thick: float = 0.15, yellow: float = 0.0) -> None:
+        rows.append((d, LINE_KINDS.index(name), thick, *surface.dashes, 3.0, yellow, 0.1, len(rows)))
+
+    line(right, "solid", 0.25)
+    line(left, "solid", 0.25)
+    for sign, count in ((-1.0, forth), (1.0, back)):
+        for k in range(1, count):
+            line(sign * (apart + k * LANE_M), "dashed")
+        if apart > 0.0:
+            line(sign * (apart + 0.4), "solid", 0.2, surface.yellow)
+    if back and apart == 0.0:
+        line(0.0, "dashed")
+    lanes = [Lane(-apart - (k + 0.5) * LANE_M, 1, 30.0) for k in range(forth)]
+    lanes += [Lane(apart + (k + 0.5) * LANE_M, -1, 30.0) for k in range(back)]
+    x, y, z, yaw = course.table()
+    return Street(
+        "motorway", x, y, z, yaw, np.array(sorted(bands), np.float32).reshape(-1, len(BAND)),
+        np.array(rows, np.float32).reshape(-1, len(LINE)), np.zeros((0, len(CROSSING)), np.float32),
+        np.zeros((0, len(MARK)), np.float32), tuple(lanes), (), *edges, *edges, 0.0, 0.3,
+    )  # fmt: skip
+
+
+def _verge(rng: np.random.Generator, street: Street, length_m: float):  # type: ignore[no-untyped-def]
+    """Guard rails outside and along the median, white posts, bushes, woods further off."""
+    out = Standing([], [], [], [], [])
+    wide = max(abs(lane.d_m) for lane in street.lanes) > LANE_M
+    rails = [street.right_m - 0.6, street.left_m + 0.6, *((-0.5, 0.5) if wide else ())]
+    inside = 1.0 if street.curvature(EGO_M + 20.0) > 0.0 else -1.0  # towards where a bend has its centre
+    for d in rails if wide else [rail for rail in rails if rail * inside < 0.0]:
+        for s in np.arange(0.0, length_m, RAIL_M):
+            P = out.add(m.WALLING, float(s) + 0.5 * RAIL_M, d, 0.0, (RAIL_M, 0.1, RAIL_HIGH_M))
+            P[8], P[:3], P[m.PICTURE] = 3.0, 0.3, -1
+    for sign, front in ((-1.0, street.front_right_m), (1.0, street.front_left_m)):
+        for s in np.arange(float(rng.uniform(0.0, POST_EVERY_M)), length_m, POST_EVERY_M if wide else 25.0):
+            P = out.add(m.POST, float(s), front + sign * 0.9, 0.0, (0.1, 0.06, 1.0))
+            P[:3] = 0.75
+        for s in np.arange(0.0, length_m, 9.0):
+            d = front + sign * float(rng.uniform(3.0, 8.0))
+            if rng.random() < 0.6 and street.curvature(float(s)) * d < 0.6:
+                tree(rng, out, float(s), d, float(rng.uniform(0.8, 2.5)), 1, 1)
+        background(rng, street, out, sign, front, 0.0, length_m)
+        for s in np.arange(0.0, length_m, 6.0):  # a sharp bend, about which it leaves all bare
+            bend = abs(street.curvature(float(s)))
+            d = front + sign * float(rng.uniform(4.0, 30.0))
+            if bend > 0.01 and abs(d) * bend < _ACROSS - 0.05:
+                tree(rng, out, float(s), d, float(rng.uniform(3.0, 12.0)), int(rng.choice([0, 2])), 3)
+    return place(street, out)
+
+
+def _traffic(rng: np.random.Generator, street: Street, own_d_m: float, speed_mps: float) -> tuple[Mover, ...]:
+    """Cars and trucks on the other lanes, nobody close ahead in the ego's own."""
+    movers = []
+    for lane in street.lanes:
+        mean = speed_mps * (0.85 if lane.d_m < own_d_m else 1.12) if lane.direction > 0 else speed_mps
+        s = EGO_M + float(rng.uniform(-30.0, 15.0)) + (75.0 if lane.d_m == own_d_m else 0.0)
+        while s < EGO_M + 600.0:
+            slow = lane.direction > 0 and lane.d_m < own_d_m
+            truck = slow and rng.random() < 0.5
+            body = draw_truck(rng) if truck else draw_shape(rng, str(rng.choice(["sedan", "estate", "suv", "mpv"])))
+            own = speed_mps if lane.d_m == own_d_m else mean
+            turn = 0.0 if lane.direction > 0 else math.pi
+            movers.append(Mover(body, s, lane.d_m, turn, own, own, lane.d_m))
+            s += float(rng.uniform(45.0, 90.0))
+    return tuple(movers)
+
+
+def _sunny() -> Floats:
+    """A clear day; asphalt without grit or cracks."""
+    sky = np.zeros(even_sky().shape)
+    sky[0:3] = 0.25, 0.62, 0.74
+    sky[3:6] = 4.8, 4.6, 4.1
+    sky[6:9], sky[9:12], sky[12:15] = (0.7, 0.9, 1.15), (1.6, 1.7, 1.8), (1.3, 1.4, 1.5)
+    sky[15], sky[17], sky[18], sky[19] = 2500.0, 0.3, 0.2, 0.4
+    sky[21], sky[22], sky[23], sky[25] = 1.0, 0.5, 0.5, 0.5
+    return sky
+
+
+def _camera(exposure: float = 1.0) -> Lens:
+    """A camera of the day; from an exposure of two on its road is nearly white."""
+    return Lens(exposure, 1.0 / 2.2, 1.05, (1.0, 1.0, 1.0), 0.4, 0.002, 0.004, 0.1, 0.0, 0.8, 0, 0.0)
+
+
+def _dark_camera() -> Lens:
+    """The same with all the gain that it has: noise, a glow about lamps."""
+    return Lens(
+        1.0, 1.0 / 2.2, 1.05, (1.0, 1.0, 1.0), 0.6, 0.0015, 0.015, 0.2, 0.1, 0.6, 0, 0.0, fixed=NIGHT_GREY
+    )  # fmt: skip
+
+
+ROADS: dict[str, Road] = {
+    "motorway_20": Road(
+        "straight, 20 m/s, lines of 12.2 m",
+        lambda: motorway(1, 20.0, 0.0, _Surface(0.75, AMERICAN, 1.0)), 10.0,
+    ),
+    "motorway_30": Road("gently bent, 30 m/s, lines of 18 m", lambda: motorway(2, 30.0, 1 / 900, _Surface(0.6)), 20.0),
+    "motorway_40": Road(
+        "straight and empty, 40 m/s", lambda: motorway(3, 40.0, 0.0, _Surface(0.6), traffic=False), 33.0, 150
+    ),
+    "motorway_33_10hz": Road(
+        "bent the other way, 33 m/s in 10 images a second",
+        lambda: motorway(4, 33.0, -1 / 700, _Surface(0.7, AMERICAN)), 10.0, 60,
+    ),
+    "ramp_20": Road("to the right, 20 m radius", lambda: ramp(5, 20.0, 8.7, 55.0, False), 10.0, 80),
+    "ramp_21_glare": Road(
+        "to the right, 21 m radius, 10 m/s; over-exposed asphalt with chevrons, as in KITTI 01",
+        lambda: ramp(6, 21.0, 10.0, 55.0, False, glare=True), 10.0, 80,
+    ),
+    "ramp_35": Road("to the left, 35 m radius", lambda: ramp(7, 35.0, 11.5, 90.0, True), 10.0, 80),
+    "ramp_60": Road("to the right, 60 m radius, 15 m/s", lambda: ramp(8, 60.0, 15.0, 150.0, False), 33.0, 150),
+    "night_street": Road("a country road in own headlights, 14 m/s", lambda: night_street(9, 14.0), 10.0),
+    "night_motorway": Road(
+        "a motorway in own headlights, 27 m/s",
+        lambda: motorway(10, 27.0, 0.0, _Surface(0.8), night=Night()), 20.0,
+    ),
+}  # fmt: skip

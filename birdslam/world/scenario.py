@@ -1,0 +1,116 @@
+"""A drive: a street, everybody on it with what they intend, and the camera's shaking; rendered frame by frame."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from birdslam.geometry.camera import Camera
+from birdslam.types import NS_PER_S
+from birdslam.world.labels import frame_of
+from birdslam.world.rendering.night import Night, lit
+from birdslam.world.rendering.photometrics import Lens, develop, draw_lens, draw_sky
+from birdslam.world.rendering.renderer import Renderer
+from birdslam.world.rendering.scene import Bodies
+from birdslam.world.street.course import SHARPEST, draw_course
+from birdslam.world.street.street import Street
+from birdslam.world.street.street_plan import draw_street
+from birdslam.world.traffic.fleet import draw_shape
+from birdslam.world.traffic.flow import Mover, advance, populate, settle
+from birdslam.world.traffic.placement import furnish
+from birdslam.world.traffic.poses import ego_pose, moving, place
+from birdslam.world.truth import Floats, WorldFrame
+
+STREET_M = 1500.0  # of a drawn drive
+SIGHT_M = 190.0  # what stands farther away is left out
+_STEPS = 4  # of the drivers' model within a frame
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A world at the begin of a drive. `ego` is the car that carries the camera, `shake_seed` how it shakes.
+
+    At `night` the sky is `night.even_sky`, and the car's own lamps light what is rendered under it.
+    """
+
+    street: Street
+    standing: Bodies
+    movers: tuple[Mover, ...]
+    ego: Mover
+    sky: Floats
+    lens: Lens
+    shake_seed: int
+    camera_ahead_m: float = 0.0  # of the rear axle: in a bend the axle is along its way, the camera is not
+    night: Night | None = None
+
+
+class Shake:
+    """How a driven body moves on its springs: slow heave and pitch, quick small vibration, nodding when it brakes."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng([seed, 4])
+        self._hz = np.concatenate([rng.uniform(0.7, 2.0, 3), rng.uniform(3.0, 7.0, 2)])
+        self._phase = rng.uniform(0.0, 2.0 * math.pi, (3, 5))
+        self._share = np.array([0.6, 0.6, 0.5, 0.12, 0.1])
+
+    def at(self, t_s: float, speed_mps: float, acceleration_mps2: float) -> tuple[float, float, float]:
+        """Pitch and roll in rad and heave in m, besides the camera's own."""
+        waves = np.sin(2.0 * math.pi * self._hz * t_s + self._phase) @ self._share
+        going = min(1.0, speed_mps / 6.0)
+        pitch = 0.0022 * going * float(waves[0]) - 0.0025 * acceleration_mps2
+        return pitch, 0.0014 * going * float(waves[1]), 0.006 * going * float(waves[2])
+
+
+def draw_scenario(rng: np.random.Generator, kind: str, ego_s_m: float) -> Scenario:
+    """A long street of a kind ("": drawn) with bends and grades all along, traffic on it, the ego in its lane."""
+    street = draw_street(rng, STREET_M, ego_s_m, kind or None)
+    bends = [draw_course(rng, STREET_M, ego_s_m + 150.0 * k, SHARPEST[street.kind]) for k in range(8)]
+    course = bends[0]
+    for k, bend in enumerate(bends[1:], start=1):
+        course = course.then(bend, ego_s_m + 150.0 * k)
+    street = street.along(course)
+    lane = next((lane for lane in street.lanes if lane.direction > 0), street.lanes[0])
+    standing = place(street, furnish(rng, street, ego_s_m - 12.0, STREET_M - 50.0))
+    movers = tuple(settle(populate(rng, street, ego_s_m, lane.d_m, 500.0), street))
+    speed = lane.speed_mps
+    ego = Mover(draw_shape(rng, "estate"), ego_s_m, lane.d_m, 0.0, 0.7 * speed, 0.9 * speed, lane.d_m)
+    return Scenario(street, standing, movers, ego, draw_sky(rng), draw_lens(rng), int(rng.integers(0, 2**31)))
+
+
+def drive(scenario: Scenario, camera: Camera, count: int, rate_hz: float, samples: int = 2) -> Iterator[WorldFrame]:
+    """`count` frames of the scenario from its begin, at `rate_hz`."""
+    street = scenario.street
+    movers, ego = copy.deepcopy(list(scenario.movers)), copy.deepcopy(scenario.ego)
+    renderer, shake = Renderer(street, scenario.sky, samples), Shake(scenario.shake_seed)
+    dt_s = 1.0 / rate_hz
+    for frame_id in range(count):
+        t_s = frame_id * dt_s
+        bend = street.curvature(ego.s_m)
+        T_world_ego = ego_pose(street, ego.s_m, ego.d_m, ego.turn_rad - scenario.camera_ahead_m * bend)
+        pitch, roll, heave = shake.at(t_s, ego.speed_mps, ego.acceleration_mps2)
+        shaken = msgspec.structs.replace(
+            camera,
+            height_m=camera.height_m + heave,
+            pitch_rad=camera.pitch_rad + pitch,
+            roll_rad=camera.roll_rad + roll,
+        )
+        near = np.linalg.norm(scenario.standing.position_m[:, :2] - T_world_ego[:2, 3], axis=1) < SIGHT_M
+        everybody = moving(street, movers)
+        close = np.linalg.norm(everybody.position_m[:, :2] - T_world_ego[:2, 3], axis=1) < SIGHT_M
+        scene = scenario.standing.subset(near).plus(everybody.subset(close))
+        rendered = renderer.render(scene, shaken, T_world_ego, ego.s_m)
+        light = rendered.light
+        if scenario.night is not None:
+            light = lit(scenario.night, rendered, scene, shaken, T_world_ego, ego.speed_mps, bend * ego.speed_mps)
+        image = develop(light, scenario.lens, np.random.default_rng([scenario.shake_seed, frame_id]))
+        yield frame_of(
+            image, rendered, scene, movers, street, shaken, T_world_ego, ego.s_m, frame_id,
+            round(frame_id * NS_PER_S / rate_hz),
+        )  # fmt: skip
+        for step in range(_STEPS):
+            advance(movers, ego, street, t_s + step * dt_s / _STEPS, dt_s / _STEPS)

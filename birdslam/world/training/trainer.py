@@ -1,0 +1,144 @@
+"""Steps of training of the multi-task network, its optimiser and its moving average; their state can be stored."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from birdslam.perception.decoding.multitask import OUTPUTS, body_slices
+from birdslam.world.training.losses import Batch, LossConfig, loss
+from birdslam.world.training.network import MultiTask, NetworkConfig
+from birdslam.world.training.stream import Examples
+
+
+class TrainerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The optimiser's numbers."""
+
+    network: NetworkConfig = NetworkConfig()
+    loss: LossConfig = LossConfig()
+    weight_decay: float = 0.01
+    warm_up_steps: int = 200
+    rate_end: float = 0.02  # of the stage's learning rate, at its end
+    clip: float = 5.0  # norm of the gradient
+    average: float = 0.998  # of the old weights, at each step
+
+
+class Trainer:
+    """Holds the network in training and its average, which is what is exported."""
+
+    def __init__(self, config: TrainerConfig, half: bool) -> None:
+        """`half`: compute in bfloat16 where that is safe."""
+        self.config = config
+        self.half = half
+        self.network = MultiTask(config.network).to(memory_format=torch.channels_last)
+        self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)
+        decayed = [p for p in self.network.parameters() if p.ndim > 1]
+        free = [p for p in self.network.parameters() if p.ndim <= 1]
+        self.optimiser = torch.optim.AdamW(
+            [{"params": decayed, "weight_decay": config.weight_decay}, {"params": free, "weight_decay": 0.0}], lr=1e-3
+        )
+
+    def train_step(
+        self,
+        examples: tuple[Tensor, ...],
+        progress: float,
+        step: int,
+        rate: float,
+        share: Callable[[Sequence[Parameter]], None] | None = None,
+    ) -> dict[str, float]:
+        """One step on a batch; `progress` through the stage in [0, 1], `rate` its learning rate. Returns the parts.
+
+        `share` averages the gradients of several trainers that run side by side.
+        """
+        cosine = 0.5 * (1.0 + math.cos(math.pi * min(progress, 1.0)))
+        warm = min(1.0, (step + 1) / self.config.warm_up_steps)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate * warm * (self.config.rate_end + (1.0 - self.config.rate_end) * cosine)
+        self.network.train()
+        batch = as_batch(examples)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
+            outputs = self.network(batch.image)
+        parts = loss(outputs, batch, self.config.loss)
+        total = torch.stack(list(parts.values())).sum()
+        self.optimiser.zero_grad()
+        total.backward()
+        if share is not None:
+            share([p for p in self.network.parameters() if p.grad is not None])
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
+        if bool(torch.isfinite(norm)):
+            self.optimiser.step()
+            self.average.update_parameters(self.network)
+        costs = {"total": total, **parts, "norm": norm}
+        return {name: float(cost.detach()) for name, cost in costs.items()}
+
+    def enlarge(self, factor: float) -> None:
+        """For inputs `factor` times as wide: what is as large on the image as before is `factor` times as far away."""
+        shift = math.log(factor)
+        with torch.no_grad():
+            for network in (self.network, self.average.module):
+                network.depth[-1].bias += shift
+                network.body[-1].bias[body_slices()["log_depth"]] += shift
+
+    def state(self) -> dict[str, Any]:
+        """All that is needed to go on; `load` takes it back."""
+        return {
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Goes on from a state of before."""
+        self.network.load_state_dict(state["network"])
+        self.average.load_state_dict(state["average"])
+        self.optimiser.load_state_dict(state["optimiser"])
+
+    def begin(self, *states: dict[str, Any]) -> None:
+        """Takes over the weights of others' states, as far as they have them; the optimiser begins anew.
+
+        Of several it is the mean of their weights: where runs began with the same weights, noise is what differs at
+        their ends, and the mean has less of it (Wortsman et al. 2022). Raises ValueError where they have weights that
+        this network has no place for, or not the same ones.
+        """
+        for name in ("network", "average"):
+            weights = [state[name] for state in states]
+            if any(other.keys() != weights[0].keys() for other in weights):
+                raise ValueError("checkpoints of different networks have no mean")
+            mean = {key: _mean([other[key] for other in weights]) for key in weights[0]}
+            unexpected = getattr(self, name).load_state_dict(mean, strict=False).unexpected_keys
+            if unexpected:
+                raise ValueError(f"weights of another network: {', '.join(unexpected[:3])}")
+
+    @torch.no_grad()
+    def answer(self, image: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+        """What the average says of images (B, 3, H, W) in [-1, 1], by the names of the outputs."""
+        self.average.eval()
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
+            outputs = self.average(torch.from_numpy(image))
+        return {name: output.float().numpy() for name, output in zip(OUTPUTS, outputs, strict=True)}
+
+
+def _mean(tensors: Sequence[Tensor]) -> Tensor:
+    """Of weights; of counters the last."""
+    return torch.stack(list(tensors)).mean(dim=0) if tensors[0].is_floating_point() else tensors[-1]
+
+
+def as_tensors(examples: Examples) -> tuple[Tensor, ...]:
+    """What passes between processes: bytes as they are."""
+    arrays = (examples.image, examples.masks, examples.log_depth, examples.sky, examples.objects)
+    return tuple(torch.from_numpy(array) for array in arrays)
+
+
+def as_batch(tensors: tuple[Tensor, ...]) -> Batch:
+    """The image as the network takes it."""
+    image, masks, log_depth, sky, objects = tensors
+    return Batch(image.permute(0, 3, 1, 2).float() / 127.5 - 1.0, masks, log_depth, sky, objects)

@@ -1,0 +1,110 @@
+"""Rain drops, dirt and a windscreen's reflection that come in the middle of a drive: does the ego-motion go on?
+
+    python -m perf overlays [SEQUENCE ...] [--output FILE.json] [--data DIR] [--networks] [--model ROLE=PATH ...]
+
+Each is drawn over the second half of each sequence, seeded, and stands still in the image (`windscreen.Overlay`);
+`night` blackens all but the end of the street, over 30 images, after which the road is back. Counts the frames of the
+second half that were called valid with a speed off by more than a tenth (and how many of them where the truth is
+interpolated or accelerates as no car does), and those called standstill while the car drove.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from birdslam.bench.ego import truth_quality
+from birdslam.odometry.odometry import Odometry
+from birdslam.perception import ModelError
+from birdslam.perf.accuracy.starts import Drive, Task, add_drive_options, is_valid, is_wrong, networks_of, read, uri_of
+from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.figures import Ledger
+from birdslam.sources.recording import DatasetError
+from birdslam.types import Status
+from birdslam.world import windscreen
+from birdslam.world.windscreen import Image
+
+label = "drops, dirt and a reflection from the middle of recorded drives on"
+
+SEQUENCES = (
+    "kitti_odometry/sequences/00",
+    "kitti_odometry/sequences/06",
+    "kitti_tracking/training/image_03/0005",
+)
+KINDS = (*windscreen.KINDS, "night")
+NIGHT_IMAGES = 30
+_COUNTS = ("frames", "valid", "wrong_valid", "wrong_valid_truth_doubtful", "standstill", "obstructed")
+DRIVES_M = 0.1  # in one image, by the truth: such a car does not stand
+
+
+def run(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m perf overlays", description=label)
+    add_drive_options(parser)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--output", type=Path, help="JSON")
+    options = parser.parse_args(arguments)
+    configuration = networks_of(options)
+    cv2.setNumThreads(1)
+    try:
+        with Ledger(options.output, label, seed=options.seed, networks=configuration is not None) as ledger:
+            for sequence in options.sequences or SEQUENCES:
+                task = Task(uri_of(sequence, options.data), "", False, 1, 1, 0, None)
+                for kind in KINDS:
+                    # The networks see the overlay as well
+                    name, drive = read(replace(task, configuration=configuration), edit_of(kind, options.seed))
+                    row = measure(drive)
+                    ledger.add(f"{name} {kind}", told(row), **row)
+    except (DatasetError, ModelError) as error:
+        raise PerfError(str(error)) from error
+
+
+def edit_of(kind: str, seed: int) -> windscreen.Edit:
+    """What is drawn over the images of the second half."""
+    return _night if kind == "night" else windscreen.from_middle(kind, seed)
+
+
+def _night(index: int, count: int, image: Image) -> Image:
+    if not count <= 2 * index < count + 2 * NIGHT_IMAGES:
+        return image
+    out, (height_px, width_px) = np.full_like(image, 40), image.shape[:2]
+    far = slice(0, round(0.55 * height_px)), slice(round(0.35 * width_px), round(0.65 * width_px))
+    out[far] = image[far]
+    return out
+
+
+def measure(drive: Drive) -> dict[str, Any]:
+    """What the odometry says of the second half."""
+    odometry, half = Odometry(drive.camera), len(drive.images) // 2
+    doubtful = truth_quality.doubtful(drive.poses, np.array(drive.t_ns, np.int64))
+    row = dict.fromkeys(_COUNTS, 0)
+    way_m = true_m = 0.0
+    for k, image in enumerate(drive.images):
+        motion = odometry.estimate(odometry.track(image), k, drive.t_ns[k], *drive.seen[k])
+        if motion is None or k < half:
+            continue
+        step_m = float(np.linalg.norm(drive.poses[k, :3, 3] - drive.poses[motion.from_frame, :3, 3]))
+        row["frames"] += 1
+        row["valid"] += is_valid(motion)
+        wrong = is_valid(motion) and is_wrong(motion, drive.poses)
+        row["wrong_valid"] += wrong
+        row["wrong_valid_truth_doubtful"] += wrong and bool(doubtful[k])
+        row["standstill"] += motion.standstill and step_m > DRIVES_M * (k - motion.from_frame)
+        row["obstructed"] += Status.VIEW_OBSTRUCTED in motion.status
+        if motion.from_frame == k - 1:
+            way_m, true_m = way_m + float(np.linalg.norm(motion.t_prev_curr_m)), true_m + step_m
+    return {**row, "scale_error": way_m / true_m - 1.0 if true_m else None}
+
+
+def told(row: dict[str, Any]) -> str:
+    """A row for a person."""
+    scale = "unknown" if row["scale_error"] is None else f"{row['scale_error']:+.1%}"
+    return (
+        f"{row['frames']:4} frames  valid {row['valid']}, of them wrong {row['wrong_valid']} "
+        f"({row['wrong_valid_truth_doubtful']} where the truth is doubtful)  standstill {row['standstill']}  "
+        f"view_obstructed {row['obstructed']}  scale {scale}"
+    )

@@ -1,0 +1,247 @@
+"""Roads of the built-in world that are hard on the ego-motion: bare motorways, ramps, nights; drops, dirt, a bonnet.
+
+    python -m perf roads [NAME ...] [--output DIR] [--keep DIR] [--drives DIR] [--frames N] [--width PX]
+
+A NAME is a road of `world/roads.py` or `demo`, the shipped drive's first 12 s in 11 images a second; with one
+of EFFECTS behind a plus (`motorway_30+drops`) that is drawn over its images. Without names: all roads, and the effects
+over two of them. Each road is rendered from its seed (extra `train`), `--keep DIR` writes it to DIR/NAME, so that
+`--source demo:DIR/NAME` plays it, and `--drives DIR` measures those that lie there instead of rendering them.
+
+The odometry runs without networks; the boxes of everybody of whom something is to be seen are the true ones. Each drive
+is followed from each image of `--begin-at` to its last (which image is the first decides much on such roads), and from
+every `--every`-th over `--images` anew. Writes roads.json, report.md, and roads.png, the errors of scale and rotation
+over the way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import itertools
+import math
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from birdslam.geometry.pose import Pose
+from birdslam.odometry.motion import Motion, planar
+from birdslam.perf.accuracy.starts import (
+    LEAST_IMAGES,
+    SCALE_LIMIT,
+    SPEED_LIMIT,
+    Drive,
+    cold_start,
+    draw,
+    errors,
+    follow,
+    is_valid,
+)
+from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.figures import Ledger
+from birdslam.runtime.progress import shown
+from birdslam.runtime.world.demo_drive import SAMPLES, keep
+from birdslam.sources.recording import DatasetError
+from birdslam.sources.shipped_drive import DemoRecording
+from birdslam.trajectory import inverse
+from birdslam.world.compression import VideoEncoder
+from birdslam.world.windscreen import Edit, bonnet, from_middle
+
+label = "hard roads of the built-in world: motorways, ramps, nights, drops, dirt, reflections, bonnets, compression"
+
+DEMO, DEMO_STRIDE, DEMO_FRAMES = "demo", 3, 132
+EFFECTS: dict[str, Callable[[], Edit]] = {
+    "drops": lambda: from_middle("drops", 1),
+    "dirt": lambda: from_middle("dirt", 1),
+    "reflection": lambda: from_middle("reflection", 1),
+    "bonnet": lambda: lambda index, count, image: bonnet(image),
+    "compression": lambda: _compressed(VideoEncoder()),
+}
+SEEN = 0.05  # of a body: whoever is hidden more has no box
+COLUMNS = ("road", "m/s", "Hz", "ways", "rotation", "valid", "of them wrong", "standstill", "NEES", "worst start")
+
+
+def run(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m perf roads", description=label)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="of a road, or ROAD+EFFECT")
+    parser.add_argument("--output", type=Path, help="folder of roads.json, roads.png and report.md")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="write each drive that is rendered to DIR/NAME")
+    parser.add_argument("--drives", type=Path, metavar="DIR", help="measure those that lie there; nothing is rendered")
+    parser.add_argument("--frames", type=int, help="of each drive; else all that its road has")
+    parser.add_argument("--width", type=int, default=640, help="of the images in pixels; KITTI's have 1242")
+    parser.add_argument("--quality", type=int, default=92, help="of the WebP images, 1 to 100")
+    parser.add_argument("--begin-at", type=int, nargs="+", default=[0], metavar="IMAGE", help="followed to the end")
+    parser.add_argument("--every", type=int, default=20, help="images from one cold start to the next")
+    parser.add_argument("--images", type=int, default=25, help="of each cold start")
+    options = parser.parse_args(arguments)
+    if options.every < 1 or options.images < LEAST_IMAGES or not 1 <= options.quality <= 100:
+        raise PerfError(f"--every must be at least 1, --images {LEAST_IMAGES}, --quality 1 to 100")
+    if min(options.begin_at) < 0:
+        raise PerfError(f"--begin-at {min(options.begin_at)}: images are counted from 0")
+    if options.frames is not None and options.frames < LEAST_IMAGES:
+        raise PerfError(f"--frames must be at least {LEAST_IMAGES}")
+    if not 160 <= options.width <= 4096:
+        raise PerfError(f"--width {options.width}: expected 160 to 4096")
+    cv2.setNumThreads(1)
+    path = None if options.output is None else options.output / "roads.json"
+    try:
+        with tempfile.TemporaryDirectory() as spare, Ledger(path, label) as ledger:
+            drives = _Drives(options, Path(spare))
+            for name in options.names or drives.names:
+                recording, edit = drives.open(name)
+                drive = read(recording, edit, drives.most(name))
+                row = measure(drive, options.begin_at, options.every, options.images)
+                ledger.add(name, told(row), hz=recording.rate_hz, **row)
+    except DatasetError as error:
+        raise PerfError(str(error)) from error
+    rows = ledger.content["rows"]
+    if options.output is not None and rows:
+        (options.output / "report.md").write_text(report(rows), encoding="utf-8")
+        draw(rows, options.output / "roads.png")
+        print(f"results in {options.output}")
+
+
+class _Drives:
+    """The drives by name, rendered where they do not lie on the disk; each once."""
+
+    def __init__(self, options: argparse.Namespace, spare: Path) -> None:
+        self._options, self._folder = options, options.drives or options.keep or spare
+        self._rendered: set[str] = set()
+        if options.drives is None:
+            if importlib.util.find_spec("numba") is None:
+                raise PerfError("roads are rendered with numba: install the extra [train], or give --drives")
+            from birdslam.world.roads import ROADS
+
+            known = list(ROADS)
+        else:
+            known = sorted(path.parent.name for path in options.drives.glob("*/drive.npz"))
+        over = [name for name in (DEMO, "motorway_30") if name in (DEMO, *known)]
+        self.names = [*known, DEMO, *(f"{road}+{effect}" for road in over for effect in EFFECTS)]
+
+    def most(self, name: str) -> int:
+        """How many images are looked at."""
+        return self._options.frames or (DEMO_FRAMES if name.partition("+")[0] == DEMO else 10**6)
+
+    def open(self, name: str) -> tuple[DemoRecording, Edit | None]:
+        """A drive, and what is drawn over it. Raises PerfError where there is none of the name."""
+        road, _, effect = name.partition("+")
+        if (name not in self.names and f"{DEMO}+{effect}" not in self.names) or road not in self.names:
+            raise PerfError(f"{name}: there is no such road; there are {', '.join(self.names)}")
+        edit = EFFECTS[effect]() if effect else None
+        if road == DEMO:
+            return DemoRecording(stride=DEMO_STRIDE), edit
+        if self._options.drives is None and road not in self._rendered:
+            self._render(road)
+        return DemoRecording(directory=self._folder / road), edit
+
+    def _render(self, name: str) -> None:
+        from birdslam.world.roads import ROADS, camera_of
+        from birdslam.world.scenario import drive
+
+        road = ROADS[name]
+        count = min(road.frames, self._options.frames or road.frames)
+        camera = camera_of(self._options.width)
+        frames = drive(road.scenario(), camera, count, road.rate_hz, SAMPLES)
+        keep(self._folder / name, shown(frames, name, count), camera, road.rate_hz, self._options.quality)
+        self._rendered.add(name)
+
+
+def _compressed(encoder: VideoEncoder) -> Edit:
+    return lambda index, count, image: encoder.code(image)
+
+
+def read(recording: DemoRecording, edit: Edit | None = None, most: int = 10**6) -> Drive:
+    """A drive of the built-in world, grey, with the true boxes of who can be seen; of it at `most` so many images."""
+    count = min(len(recording), most)
+    images, t_ns, seen = [], [], []
+    for frame in itertools.islice(recording.frames(), count):
+        if frame.image is None:
+            raise DatasetError(f"{recording.name}: image {frame.index}: {frame.error}")
+        image = frame.image if edit is None else edit(frame.index, count, frame.image)
+        boxes = [body.box_px for body in recording.truth_bodies(frame.index) if body.visible > SEEN]
+        seen.append((np.array(boxes, np.float64).reshape(-1, 4), None))
+        images.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
+        t_ns.append(frame.t_source_ns)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3] = recording.truth_poses()[:count]
+    return Drive(recording.camera, images, t_ns, poses, list(seen))
+
+
+def measure(
+    drive: Drive, begin_at: Sequence[int] = (0,), every: int | None = None, images: int = 25
+) -> dict[str, Any]:  # fmt: skip
+    """The odometry from some images on to the drive's last; and, with `every`, from each so many-th over some anew.
+
+    Of the ways "scale_errors" has each one's; all else counts them together.
+    """
+    count = len(drive.images)
+    ways, motions = [], []
+    for first in begin_at:
+        if first > count - LEAST_IMAGES:
+            raise DatasetError(f"begun at image {first} of {count}: {LEAST_IMAGES} are needed")
+        estimated, seen = follow(drive, range(first, count))
+        way = errors(drive, range(first, count), estimated, seen)
+        if way is None:
+            raise DatasetError("the car of this drive does not move")
+        ways.append(way)
+        motions += seen
+    firsts = range(0, count - LEAST_IMAGES + 1, every) if every else range(0)
+    starts = [cold_start(drive, range(first, min(first + images, count))) for first in firsts]
+    driven_s = (drive.t_ns[-1] - drive.t_ns[begin_at[0]]) * 1e-9
+    return {
+        "speed_mps": round(ways[0]["true_way_m"][-1] / driven_s, 1),
+        "way_m": ways[0]["true_way_m"][-1],
+        "scale_errors": [way["scale_error"][-1] for way in ways],
+        "rotation_error_deg": max(way["rotation_error_deg"][-1] for way in ways),
+        "motions": len(motions),
+        "valid": sum(way["valid"] for way in ways),
+        "wrong_valid": [frame for way in ways for frame in way["wrong_valid"]],
+        "standstill": sum(way["standstill"] for way in ways),
+        "nees": _nees(drive, motions),
+        "cold_starts": [start["scale_error"][-1] for start in starts if start is not None],
+        "starts": ways,
+    }
+
+
+def _nees(drive: Drive, motions: Sequence[Motion]) -> float | None:
+    """Mean of e' P^-1 e over its 3 degrees of freedom, of the valid motions from image to image; 1 is consistent."""
+    values = []
+    for motion in motions:
+        if is_valid(motion):
+            true = inverse(drive.poses[motion.from_frame]) @ drive.poses[motion.to_frame]
+            error = planar(Pose(true[:3, :3], true[:3, 3]), motion.ground).between(motion.T_prev_curr).log()
+            values.append(float(error @ np.linalg.solve(motion.cov, error)) / len(error))
+    return round(float(np.mean(values)), 2) if values else None
+
+
+def told(row: dict[str, Any]) -> str:
+    """A row for a person."""
+    return "  ".join(f"{name} {cell}" for name, cell in zip(COLUMNS[3:], _cells(row), strict=True))
+
+
+def _cells(row: dict[str, Any]) -> Iterator[str]:
+    yield " ".join(f"{error:+.1%}" for error in row["scale_errors"])
+    yield f"{row['rotation_error_deg']:.2f} deg"
+    yield f"{row['valid'] / max(row['motions'], 1):.0%}"
+    yield str(len(row["wrong_valid"]))
+    yield str(row["standstill"])
+    yield "-" if row["nees"] is None else f"{row['nees']:.1f}"
+    yield f"{max(row['cold_starts'], key=abs, default=math.nan):+.1%}"
+
+
+def report(rows: Sequence[dict[str, Any]]) -> str:
+    """The table of all roads."""
+    lines = [
+        "# Hard roads of the built-in world\n",
+        "Ways and rotation: the errors at the end, from each image that it was begun at, and the worst. Wrong: valid "
+        f"frames with a speed off by more than {SPEED_LIMIT:.0%}. Standstill: frames called so while the car drove. "
+        "NEES: of the motion between images: 1 is consistent. Worst start: the way of the worst cold start; "
+        f"{SCALE_LIMIT:.0%} is the limit.\n",
+        f"| {' | '.join(COLUMNS)} |",
+        "|---" * len(COLUMNS) + "|",
+    ]
+    lines += [f"| {row['name']} | {row['speed_mps']} | {row['hz']:.0f} | {' | '.join(_cells(row))} |" for row in rows]
+    return "\n".join(lines) + "\n"

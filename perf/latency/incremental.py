@@ -1,0 +1,185 @@
+"""The incremental optimizer against the batch on one sequence of measurements: time, and accuracy on the same edges.
+
+    python -m perf incremental [--frames 50,100,200,414] [--vehicles 3] [--seeds 8] [--output F.json]
+
+Time. The paper states 0.016 s for the incremental optimizer and 1.9 s for the batch "to solve the pose-graph
+optimization problem for a 414 frame long sequence". Both readings stand here: the whole sequence, all updates of the
+one against the one solve of the other; and an answer in the newest frame, one update (median) against one solve, which
+is what a planner waits for. The batches are of two kinds. With metric odometry dead reckoning is a start so good
+that a few iterations do; of unknown scale, as in the paper, it is not, and every edge bears the scale. A batch is
+solved until it has converged: its iterations stand beside its time, and one that has not (it stopped at its cap, or one
+more Gauss-Newton step would move a node by a centimetre) gets no ratio.
+
+Accuracy. Of each pose of sampled frames of the longest drive, on CC, CV and VV edges (Eq. 6): as the incremental
+optimizer has it when it is the newest; as gtsam's batch has it that sees the same edges, up to that frame; as
+it has it `--lag` frames later, when a fixed lag of that length would let go of it; and as the batch has it that knows
+the whole sequence. The first against the second is what linearising once and marginalising cost; the others are what
+waiting would bring. RMS over seeds and frames, in the frame of the first pose, no alignment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from birdslam.bench.baselines import batch_se2, batch_se3, nair
+from birdslam.bench.baselines.batch_se2 import Solution
+from birdslam.bench.baselines.posegraph3 import Convergence, solve_batch
+from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
+from birdslam.bench.tracking.benchmark import PAPER, ours
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.slam import SlamConfig
+from birdslam.types import Measurements
+
+label = "batch over incremental: time and accuracy on one sequence"
+
+PUBLISHED_RATIO = 1.9 / 0.016
+REPEATS = 3
+METHODS = 4  # rows of a length
+SAMPLES = 8  # frames of a drive whose poses are compared
+EQ_6 = GraphConfig(constant_velocity=False), WeightsConfig(leave_out=("cp",))
+WHO = ("incremental", "batch of the same edges", "batch after the lag", "batch of the whole sequence")
+
+
+def run(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m perf incremental", description=label)
+    parser.add_argument("--frames", default="50,100,200,414", help="a list")
+    parser.add_argument("--vehicles", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=0, help="of the drive that is timed")
+    parser.add_argument("--seeds", type=int, default=8, help="drives over which accuracy is taken; 0: time alone")
+    parser.add_argument("--lag", type=int, default=10, help="frames")
+    parser.add_argument("--output", type=Path)
+    options = parser.parse_args(arguments)
+    rows: list[dict[str, Any]] = []
+    print(f"{'':40} {'frames':>6} {'sequence':>10} {'ratio':>8} {'newest pose':>12} {'ratio':>8}  iterations")
+    for frames in sorted(int(n) for n in options.frames.split(",")):
+        config = DriveConfig(frames=frames, vehicles=options.vehicles, rate_hz=10.0)
+        rows += time_rows(drive(config, options.seed).measurements)
+        for row in rows[-METHODS:]:
+            print(
+                f"{row['method']:40} {row['frames']:6} {row['seconds']:8.3f} s {_ratio(row['ratio'])} "
+                f"{row['newest_s'] * 1e3:9.2f} ms {_ratio(row['newest_ratio'])}  {_ended(row)}",
+                flush=True,
+            )
+    print(f"{'published (one figure, either reading)':40} {414:6} {'':10} {PUBLISHED_RATIO:8.1f}")
+    accuracy = accuracy_rows(config, options.seeds, options.lag) if options.seeds else []
+    if accuracy:
+        title = f"ATE over {options.seeds} drives, m"
+        print(f"\n{title:40} {'ego':>8} {'ratio':>8} {'vehicles':>9} {'ratio':>8}")
+    for row in accuracy:
+        ratios = f"{row['ego_ratio']:8.3f} {row['vehicle_ate_m']:9.3f} {row['vehicle_ratio']:8.3f}"
+        print(f"{row['method']:40} {row['ego_ate_m']:8.3f} {ratios}")
+    if options.output:
+        options.output.write_text(json.dumps({"rows": rows, "accuracy": accuracy}, indent=2) + "\n", encoding="utf-8")
+
+
+# --- time ---
+
+
+def time_rows(log: Sequence[Measurements]) -> list[dict[str, Any]]:
+    """Every method's time for the whole log and for the newest pose, and how many times the live graph's that is."""
+    live = {"incremental": ours(SlamConfig()), "incremental, paper mode": PAPER}
+    batches = {
+        "batch SE(3), metric odometry": nair.CONFIG,
+        "batch SE(3), unscaled odometry, lanes": batch_se3.CONFIG,
+    }
+    took: dict[str, tuple[float, float]] = {}
+    for name, method in live.items():
+        whole = [_updates_s(PoseGraph(method.graph, method.weights), log) for _ in range(REPEATS)]
+        took[name] = float(np.median([updates.sum() for updates in whole])), float(np.median(np.concatenate(whole)))
+    ended: dict[str, Convergence] = {}
+    for name, config in batches.items():
+        _, ended[name] = solve_batch(log, config, check=True)
+        seconds = float(np.median([_seconds(lambda c=config: solve_batch(log, c)) for _ in range(REPEATS)]))  # type: ignore[misc]
+        took[name] = seconds, seconds
+    whole_s, newest_s = took["incremental"]
+    return [
+        {
+            "method": name,
+            "frames": len(log),
+            "seconds": s,
+            "ratio": s / whole_s if name not in ended or ended[name].converged else None,
+            "newest_s": newest,
+            "newest_ratio": newest / newest_s if name not in ended or ended[name].converged else None,
+            "iterations": ended[name].iterations if name in ended else None,
+            "last_step": ended[name].step if name in ended else None,
+            "converged": ended[name].converged if name in ended else None,
+        }
+        for name, (s, newest) in took.items()
+    ]
+
+
+def _ratio(ratio: float | None) -> str:
+    return f"{'-':>8}" if ratio is None else f"{ratio:8.1f}"
+
+
+def _ended(row: dict[str, Any]) -> str:
+    if row["iterations"] is None:
+        return ""
+    return f"{row['iterations']}, {'converged' if row['converged'] else 'NOT CONVERGED'}"
+
+
+def _updates_s(graph: PoseGraph, log: Sequence[Measurements]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array([_seconds(lambda m=m: graph.optimise(m)) for m in log])  # type: ignore[misc]
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+# --- accuracy ---
+
+
+def accuracy_rows(config: DriveConfig, seeds: int, lag: int) -> list[dict[str, Any]]:
+    """ATE of the ego and of all vehicles by who says it, and how many times that of the batch of the same edges."""
+    errors: dict[str, dict[str, list[float]]] = {who: {"ego": [], "vehicle": []} for who in WHO}
+    for seed in range(seeds):
+        for who, body, error_m in _errors(drive(config, seed), lag):
+            errors[who][body].append(error_m)
+    ate = {who: {body: float(np.sqrt(np.mean(np.square(e)))) for body, e in of.items()} for who, of in errors.items()}
+    same = ate[WHO[1]]
+    return [
+        {
+            "method": who,
+            "ego_ate_m": of["ego"],
+            "ego_ratio": of["ego"] / same["ego"],
+            "vehicle_ate_m": of["vehicle"],
+            "vehicle_ratio": of["vehicle"] / same["vehicle"],
+        }
+        for who, of in ate.items()
+    ]
+
+
+def _errors(world: Drive, lag: int) -> list[tuple[str, str, float]]:
+    """(who, body, metres) at the sampled frames; all that `WHO` names know of the same poses."""
+    log, out = world.measurements, []
+    graph = PoseGraph(*EQ_6)
+    live = [graph.optimise(m) for m in log]
+    whole = batch_se2.solve(log, *EQ_6)
+    for k in np.linspace(0, len(log) - 1 - lag, SAMPLES + 1).astype(int)[1:].tolist():
+        so_far, later = (batch_se2.solve(log[: n + 1], *EQ_6) for n in (k, k + lag))
+        answers: list[tuple[str, SE2, list[tuple[int, SE2]]]] = []
+        seen = [(v.vehicle, v.T_world_vehicle) for v in live[k].vehicles if v.age_ns == 0]
+        answers.append((WHO[0], live[k].T_world_ego, seen))
+        batches: tuple[Solution, ...] = (so_far, later, whole)
+        for who, batch in zip(WHO[1:], batches, strict=True):
+            answers.append((who, batch.ego(k), [(vehicle, batch.vehicle(vehicle, k)) for vehicle, _ in seen]))
+        for who, ego, vehicles in answers:
+            out.append((who, "ego", _away_m(ego, world.ego[k])))
+            out += [(who, "vehicle", _away_m(pose, world.vehicles[vehicle][k])) for vehicle, pose in vehicles]
+    return out
+
+
+def _away_m(pose: SE2, truth: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+    return float(np.hypot(pose.x_m - truth[0], pose.y_m - truth[1]))

@@ -1,0 +1,214 @@
+"""The optimizer against gtsam's own: time, memory and exceptions over a long drive.
+
+Every contender takes the same log of `Measurements` in a fresh process with one BLAS thread, as the optimize node runs,
+and the same edges of it: CC, CV, VV and CP (Eqs. 6 and 7). "ours" is Eq. 8 on just these; "ours_live" is the graph as
+it is configured by default, with its constant-velocity factor in VV's place. The log has CP edges in one frame of
+four, on our keyframes, so that ours uses them all: as one edge between keyframes, where gtsam has a node for each
+landmark; "incremental_fixed_lag_summed" is gtsam's with that one edge, and with its settings: "_qr" in place of
+Cholesky, "_once" never linearised again. The lag is the shortest with which that edge has both of its ends.
+
+What is timed is one frame from decoded record to the poses and covariances of the newest ego and of every vehicle in
+Python: for ours the whole `PoseGraph.optimise`, with lanes, velocities and the finished `Estimate` besides.
+`BatchFixedLagSmoother` gives no covariances. A contender that takes longer than `--limit-s` is stopped; its `frames`
+say how far it got. One that raises begins anew on the next frame. `kinds_us` tells frames with CP edges, frames in
+which vehicles came or went, and the others apart. `steal_percent` is what the hypervisor took meanwhile, `preempted`
+the share of updates that the scheduler broke off for another process, and `undisturbed_p99_us` is of the rest: on a
+busy machine the tail is the other processes'.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+import numpy as np
+import psutil
+from msgspec.structs import replace
+
+from birdslam.bench.baselines.smoothers import Smoother
+from birdslam.bench.simulation.drive import DriveConfig, drive
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.perf.reporting.figures import curve, noise, spread, write_json
+from birdslam.perf.reporting.machine import Steal
+from birdslam.types import Measurements
+
+label = "the pose graph's update against gtsam's smoothers"
+
+
+class Contender(Protocol):
+    def step(self, m: Measurements, /) -> object: ...
+
+    def between(self) -> None: ...
+
+
+_WARM_UP = 100  # frames before memory is looked at
+_PARTS = 50  # of a drive, for the plot over its frames
+_LAG_FRAMES = GraphConfig().ego_nodes
+
+
+def run(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m perf optimizer", description=label)
+    parser.add_argument("--vehicles", default="0,1,3,6,10,15", help="in sight, a list")
+    parser.add_argument("--frames", type=int, default=10_000)
+    parser.add_argument("--contenders", default=",".join(CONTENDERS), help="a list")
+    parser.add_argument("--limit-s", type=float, default=60.0, help="time for each contender's frames")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--output", type=Path, help="JSON, a list of objects")
+    options = parser.parse_args(arguments)
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for vehicles in (int(n) for n in options.vehicles.split(",")):
+            log = Path(folder) / f"{vehicles}.log"
+            config = DriveConfig(frames=options.frames, vehicles=vehicles, traffic="convoy")
+            write_log(log, config, options.seed)
+            for contender in options.contenders.split(","):
+                row = measure(contender, vehicles, log, options.limit_s)
+                rows.append({"name": f"{contender} {vehicles} vehicles", **row})
+                print(f"{rows[-1]['name']:44} {summary(row)}", flush=True)
+                if options.output is not None:
+                    write_json(options.output, rows)  # after each: Ctrl-C keeps what was measured
+
+
+def write_log(log: Path, config: DriveConfig, seed: int) -> None:
+    """What every contender takes."""
+    everything = drive(config, seed).measurements
+    with_key_frames = (m if k % _LAG_FRAMES == 0 else replace(m, cp=()) for k, m in enumerate(everything))
+    log.write_bytes(msgspec.msgpack.encode([msgspec.msgpack.encode(m) for m in with_key_frames]))
+
+
+def summary(row: dict[str, Any]) -> str:
+    """For a person."""
+    times = "  ".join(f"{name} {row[f'{name}_us'] / 1e3:.2f}" for name in ("p50", "p99", "undisturbed_p99", "max"))
+    times += f"  CPU {row['cpu_p50_us'] / 1e3:.2f}"
+    grown = f"frames {row['frames']}  memory {row['rss_growth_mb']:+.0f} MB  exceptions {row['exceptions']}"
+    return f"{times} ms  {grown}"
+
+
+def measure(contender: str, vehicles: int, log: Path, limit_s: float) -> dict[str, Any]:
+    """One contender in a process of its own."""
+    one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    command = [
+        sys.executable,
+        "-m",
+        "birdslam.perf.latency.optimizer",
+        contender,
+        str(vehicles),
+        str(log),
+        str(limit_s),
+    ]
+    done = subprocess.run(command, env=os.environ | one_thread, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{contender} with {vehicles} vehicles: {done.stderr}")
+    row: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return row
+
+
+def _drive_through(contender: str, vehicles: int, log: Path, limit_s: float) -> dict[str, Any]:
+    records = msgspec.msgpack.decode(log.read_bytes(), type=list[bytes])
+    decoder = msgspec.msgpack.Decoder(Measurements)
+    make, lag_frames = CONTENDERS[contender]
+    solver, exceptions = make(), 0
+    gc.collect()
+    gc.freeze()
+    process = psutil.Process()
+    times_us, cpu_us = np.zeros(len(records)), np.zeros(len(records))
+    kinds = np.full(len(records), "other", dtype="<U8")
+    rss_before = process.memory_info().rss
+    begun_s = time.perf_counter()
+    frames, seen = 0, set[int]()
+    broken_off = np.zeros(len(records), dtype=np.bool_)
+    steal = Steal()
+    for frame, record in enumerate(records):
+        measurements = decoder.decode(record)
+        seen, before = {edge.vehicle for edge in measurements.cv}, seen
+        kinds[frame] = "traffic" if seen != before else "cp" if measurements.cp else "other"
+        switches = resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw
+        cpu_ns, before_ns = time.process_time_ns(), time.perf_counter_ns()
+        try:
+            solver.step(measurements)
+        except RuntimeError:
+            exceptions += 1
+            solver = make()
+        times_us[frame] = (time.perf_counter_ns() - before_ns) / 1e3
+        cpu_us[frame] = (time.process_time_ns() - cpu_ns) / 1e3
+        broken_off[frame] = resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw > switches
+        frames = frame + 1
+        solver.between()
+        if frame == _WARM_UP:
+            rss_before = process.memory_info().rss
+        if time.perf_counter() - begun_s > limit_s:
+            break
+    rss = process.memory_info().rss
+    times_us = times_us[:frames]
+    p50, p99, p999 = np.percentile(times_us, [50.0, 99.0, 99.9])
+    return {
+        "contender": contender,
+        "vehicles": vehicles,
+        "frames": frames,
+        "lag_frames": lag_frames,
+        "p50_us": round(p50, 1),
+        "p99_us": round(p99, 1),
+        "p999_us": round(p999, 1),
+        "max_us": round(times_us.max(), 1),
+        "cpu_p50_us": round(float(np.median(cpu_us[:frames])), 1),  # of all its threads: others' load is not in it
+        "first_thousand_p50_us": round(np.median(times_us[:1000]), 1),
+        "last_thousand_p50_us": round(np.median(times_us[-1000:]), 1),
+        "rss_growth_mb": round((rss - rss_before) / 2**20, 2),
+        "exceptions": exceptions,
+        "steal_percent": steal.percent(),
+        "preempted": round(float(broken_off[:frames].mean()), 4),
+        "undisturbed_p99_us": round(spread(times_us[~broken_off[:frames]]).get("p99", p99), 1),
+        "kinds_us": {kind: spread(times_us[kinds[:frames] == kind]) for kind in ("cp", "traffic", "other")},
+        "curve_us": curve(times_us),
+        "over_frames_us": [round(float(np.median(part)), 1) for part in np.array_split(times_us, _PARTS) if part.size],
+        "noise": noise("time_us", times_us),
+    }
+
+
+# --- the contenders ---
+
+
+class _Ours:
+    def __init__(self, config: GraphConfig, weights: WeightsConfig) -> None:
+        self.graph = PoseGraph(config, weights)
+        self.step = self.graph.optimise
+
+    def between(self) -> None:
+        """The node publishes the map beside the estimate; it is not part of the update."""
+        self.graph.map_update()
+
+
+CONTENDERS: dict[str, tuple[Callable[[], Contender], int | None]] = {
+    "ours": (lambda: _Ours(GraphConfig(constant_velocity=False), WeightsConfig(leave_out=())), _LAG_FRAMES),
+    "ours_live": (lambda: _Ours(GraphConfig(), WeightsConfig()), _LAG_FRAMES),
+    "isam2": (lambda: Smoother("isam2", _LAG_FRAMES), None),
+    "incremental_fixed_lag_qr": (lambda: Smoother("incremental_fixed_lag_qr", _LAG_FRAMES), _LAG_FRAMES),
+    "incremental_fixed_lag_cholesky": (lambda: Smoother("incremental_fixed_lag_cholesky", _LAG_FRAMES), _LAG_FRAMES),
+    **{
+        kind: (lambda kind=kind: Smoother(kind, _LAG_FRAMES), _LAG_FRAMES)  # type: ignore[misc]
+        for kind in (
+            "incremental_fixed_lag_summed",
+            "incremental_fixed_lag_summed_qr",
+            "incremental_fixed_lag_summed_once",
+            "incremental_fixed_lag_summed_qr_once",
+        )
+    },
+    "batch_fixed_lag": (lambda: Smoother("batch_fixed_lag", _LAG_FRAMES), _LAG_FRAMES),
+}
+
+if __name__ == "__main__":
+    name, count, path, limit = sys.argv[1:]
+    print(json.dumps(_drive_through(name, int(count), Path(path), float(limit))))

@@ -1,0 +1,136 @@
+"""Pixels and messages between two processes: our ring and bus beside plain zenoh, zenoh's shared memory and a socket.
+
+    python -m perf transport [--seconds 3] [--carriers ring,zenoh] [--output F.json]
+
+Every case has two fresh processes. `ring` is what frames take (pixels in shared memory, verified by their checksum, a
+typed FrameRef over zenoh), `bus` what records take (typed and checked at both ends); the peers move bare bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from birdslam.perf.latency.carriers import CARRIERS
+from birdslam.perf.reporting.figures import Ledger, curve, noise, numbers, shown, spread
+from birdslam.perf.reporting.machine import Steal, loaded
+
+label = "pixels and messages across processes, by our ring and by its peers"
+
+SIZES_B = {200: "200 B", 4_000: "4 kB", 1_397_250: "1.4 MB"}  # the last: a colour frame of KITTI
+BUS_MAX_B = 60_000  # records only: pixels never take the bus
+PATIENCE_S = 30.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row."""
+
+    carrier: str
+    size: int
+    rate_hz: int
+    load: int
+
+    @property
+    def name(self) -> str:
+        where = f"{self.load} core loaded" if self.load else "idle"
+        return f"{self.carrier} {SIZES_B.get(self.size, f'{self.size} B')} {self.rate_hz} Hz {where}"
+
+
+def run(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m perf transport", description=label)
+    parser.add_argument("--carriers", default=",".join(CARRIERS), help="a list")
+    parser.add_argument("--bytes", type=numbers, default=tuple(SIZES_B), help="a list")
+    parser.add_argument("--rates", type=numbers, default=(33, 200), help="Hz, a list")
+    parser.add_argument("--loads", type=numbers, default=(0, 1), help="busy cores, a list")
+    parser.add_argument("--seconds", type=float, default=3.0, help="of each case")
+    parser.add_argument("--output", type=Path, help="JSON")
+    options = parser.parse_args(arguments)
+    carriers = options.carriers.split(",")
+    unknown = sorted(set(carriers) - set(CARRIERS))
+    if unknown:
+        parser.error(f"there is no carrier {unknown[0]!r}: {', '.join(CARRIERS)}")
+    with Ledger(options.output, label, seconds=options.seconds) as ledger:
+        for load in options.loads:
+            with loaded(load):
+                for case in cases(carriers, options.bytes, options.rates, load):
+                    row = measure(case, options.seconds)
+                    cpu = f"cpu {row['cpu_percent']['sender']:.1f} + {row['cpu_percent']['receiver']:.1f} %"
+                    line = f"{shown(row['latency_ms'], 'ms')}  {cpu}  dropped {row['dropped']} of {row['sent']}"
+                    ledger.add(case.name, line, **row)
+
+
+def cases(carriers: list[str], sizes: tuple[int, ...], rates: tuple[int, ...], load: int) -> Iterator[Case]:
+    """Peers one after the other, so that what changes on the machine meanwhile meets all of them."""
+    for size in sizes:
+        for rate_hz in rates:
+            for carrier in carriers:
+                if carrier != "bus" or size <= BUS_MAX_B:
+                    yield Case(carrier, size, rate_hz, load)
+
+
+def measure(case: Case, seconds: float) -> dict[str, Any]:
+    """One case in two fresh processes."""
+    messages = max(1, round(seconds * case.rate_hz))
+    steal = Steal()
+    with tempfile.TemporaryDirectory(prefix="perf") as place:
+        what = (case.carrier, place, str(case.size), str(case.rate_hz), str(messages))
+        listener = _start("listen", *what)
+        try:
+            _expect(listener, "listening")
+            sender = _start("send", *what)
+            try:
+                _expect(sender, "connected")
+                _tell(listener)
+                _tell(sender)
+                _expect(sender, "sent")
+                heard = json.loads(listener.communicate("\n", PATIENCE_S)[0])
+                sent = json.loads(sender.communicate("\n", PATIENCE_S)[0])
+            finally:
+                sender.kill()
+                sender.wait()
+        finally:
+            listener.kill()
+            listener.wait()
+    latency_ms = [ms for _, ms in sorted(heard["arrivals"])]
+    return {
+        "carrier": case.carrier,
+        "bytes": case.size,
+        "rate_hz": case.rate_hz,
+        "load": case.load,
+        "latency_ms": spread(latency_ms),
+        "curve_ms": curve(latency_ms),
+        "cpu_percent": {
+            "sender": round(100.0 * sent["cpu_s"] / sent["took_s"], 2),
+            "receiver": round(100.0 * heard["cpu_s"] / sent["took_s"], 2),
+        },
+        "sent": messages,
+        "dropped": messages - len(latency_ms),
+        "steal_percent": steal.percent(),
+        "noise": noise("latency_ms", latency_ms),
+    }
+
+
+def _start(*arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "birdslam.perf.latency.carriers", *arguments]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def _expect(process: subprocess.Popen[str], word: str) -> None:
+    assert process.stdout is not None
+    line = process.stdout.readline().strip()
+    if line != word:
+        raise RuntimeError(f"perf.carriers said {line!r} instead of {word!r}: {process.args!r}")
+
+
+def _tell(process: subprocess.Popen[str]) -> None:
+    assert process.stdin is not None
+    process.stdin.write("\n")
+    process.stdin.flush()

@@ -1,0 +1,143 @@
+"""Everything in turn, each in a fresh process, and one report that a person reads in two minutes.
+
+    python -m perf all --output DIR [--source URI] [--model ROLE=PATH]... [--thorough]
+
+The source is the shipped drive with the shipped network, so that it runs without data; the recordings of KITTI that are
+at hand have their rows of accuracy beside it, with the networks that are at hand. DIR gets report.json, report.md, its
+plots, and each benchmark's own JSON. Ctrl-C ends the suite: what was measured by then is in the report, which says what
+is missing. Without `--thorough` it takes some twenty minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from birdslam.perf.reporting import report
+from birdslam.perf.reporting.figures import write_json
+from birdslam.perf.reporting.machine import ROOT, describe
+
+label = "every benchmark, and their report"
+
+END_S = 60.0  # for a benchmark to keep what it has
+SEQUENCES = ("kitti_odometry/sequences/00", "kitti_odometry/sequences/06", "kitti_raw_clip")
+NETWORKS = {"detector": "yolox_nano_416.onnx", "segmenter": "twinlitenet_640x360.onnx"}
+
+
+@dataclass(frozen=True)
+class Step:
+    """One benchmark with its options: for a quick run, and for figures to be shown. `on`: its recording."""
+
+    file: str
+    benchmark: str
+    quick: str
+    thorough: str
+    on: Literal["", "source", "data"] = ""
+
+
+STEPS = (
+    Step("system", "system", "--seconds 120", "--seconds 600", "source"),
+    Step("system-loaded", "system", "--seconds 60 --load 1", "--seconds 120 --load 1", "source"),
+    Step("system-planners", "system", "--seconds 10 --planners 4", "--seconds 60 --planners 4", "source"),
+    Step("cores", "cores", "", "", "source"),
+    Step("vehicles", "system", "--vehicles 0,5,10,15 --seconds 31", "--vehicles 0,1,3,6,10,15 --seconds 60"),
+    Step("accuracy", "accuracy", "", "--rates 10,33", "source"),
+    Step("accuracy-data", "accuracy", "", "--rates 10,20,33", "data"),
+    Step("inference", "inference", "--seconds 2.5", "--seconds 10", "source"),
+    Step(
+        "optimizer",
+        "optimizer",
+        "--frames 10000 --vehicles 0,5,10,15 --limit-s 15 --contenders ours,isam2,incremental_fixed_lag_qr",
+        "--frames 10000 --limit-s 60",
+    ),
+    Step("incremental", "incremental", "--frames 200", "--frames 50,100,200,414"),
+    Step("transport", "transport", "--seconds 0.8", "--seconds 10"),
+    Step("ratios", "ratios", "--rounds 1", "--rounds 5"),
+)
+
+
+def run(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="python -m perf all", description=label)
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--source", default="demo", metavar="URI", help="default: demo, the shipped drive")
+    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="default: the shipped one")
+    parser.add_argument("--thorough", action="store_true", help="long enough for figures to be shown")
+    parser.add_argument("--only", default="", help="a list of steps: " + ",".join(step.file for step in STEPS))
+    options = parser.parse_args(arguments)
+    only = options.only.split(",") if options.only else [step.file for step in STEPS]
+    unknown = sorted(set(only) - {step.file for step in STEPS})
+    if unknown:
+        parser.error(f"there is no step {unknown[0]!r}")
+    options.output.mkdir(parents=True, exist_ok=True)
+    command = f"python -m perf {shlex.join(sys.argv[1:])}"
+    head = {"command": command, "source": options.source, "models": options.model, "machine": describe()}
+    outcome: dict[str, str] = {}
+    chosen = [step for step in STEPS if step.file in only]
+    for number, step in enumerate(chosen, 1):
+        print(f"\n[{number}/{len(chosen)}] {step.file}", flush=True)
+        begun_s = time.monotonic()
+        outcome[step.file] = _run(step, options)
+        print(f"[{number}/{len(chosen)}] {step.file}: {outcome[step.file]} in {time.monotonic() - begun_s:.0f} s")
+        _write(options.output, head, outcome)
+        if outcome[step.file] == "interrupted":
+            return 130
+    return int(any(how.startswith("failed") for how in outcome.values()))
+
+
+def _shared(variable: str, folder: str) -> Path:
+    return Path(os.environ.get(variable) or ROOT.parent / "shared" / folder)
+
+
+def _data() -> list[str]:
+    """Recordings, labels and networks; what is not there is named by the benchmark."""
+    data, networks = _shared("BIRDSLAM_DATA", "data"), _shared("BIRDSLAM_MODELS", "models")
+    given = [f"--source=kitti:{data / sequence}" for sequence in SEQUENCES]
+    given += [f"--model={role}={networks / file}" for role, file in NETWORKS.items() if (networks / file).is_file()]
+    return [*given, f"--labels={data / 'kitti_tracking' / 'training'}"]
+
+
+def _run(step: Step, options: argparse.Namespace) -> str:
+    """How it ended. What it prints goes to the terminal as it comes."""
+    file = options.output / f"{step.file}.json"
+    file.unlink(missing_ok=True)
+    command = [sys.executable, "-m", "birdslam.perf", step.benchmark, "--output", str(file)]
+    command += shlex.split(step.thorough if options.thorough else step.quick)
+    if step.on == "source":
+        command += ["--source", options.source, *(part for model in options.model for part in ("--model", model))]
+    elif step.on == "data":
+        command += _data()
+    process = subprocess.Popen(command, start_new_session=True)
+    try:
+        status = process.wait()
+    except KeyboardInterrupt:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(END_S)
+        finally:
+            process.kill()
+        return "interrupted"
+    if status == 0:
+        return "complete"
+    return "complete, but a budget or bound is not met" if status == 1 and file.is_file() else f"failed ({status})"
+
+
+def _write(folder: Path, head: dict[str, Any], outcome: dict[str, str]) -> None:
+    """After each step, so that nothing is lost."""
+    benchmarks = {}
+    for name in outcome:
+        file = folder / f"{name}.json"
+        if file.is_file():
+            content = json.loads(file.read_text(encoding="utf-8"))
+            benchmarks[name] = {"rows": content} if isinstance(content, list) else content
+    content = {**head, "outcome": outcome, "benchmarks": benchmarks}
+    write_json(folder / "report.json", content)
+    report.write(folder, content)

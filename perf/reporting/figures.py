@@ -1,0 +1,117 @@
+"""How figures are kept: distributions with their noise, in a file that is whole after every row."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from birdslam.perf.reporting.machine import Steal, describe
+
+BLOCKS = 10  # a series is cut into so many pieces one after the other; how they differ is its noise
+_LEVELS = (0.0, 1.0, 5.0, *range(10, 91, 10), 95.0, 98.0, 99.0, 99.5, 99.9, 99.99)  # percent, for the plots
+
+
+def spread(values: ArrayLike) -> dict[str, float]:
+    """p50, p99, p999 and max of a series, and how many there are; without figures where it is empty."""
+    series = np.asarray(values, dtype=np.float64)
+    if not series.size:
+        return {"n": 0}
+    p50, p99, p999 = np.percentile(series, [50.0, 99.0, 99.9])
+    found = {"p50": p50, "p99": p99, "p999": p999, "max": series.max()}
+    return {name: round(float(value), 4) for name, value in found.items()} | {"n": int(series.size)}
+
+
+def noise(name: str, values: ArrayLike) -> dict[str, list[float]]:
+    """p50 and p99 of the blocks of a series, for `compare`: "NAME.p50" and "NAME.p99"."""
+    series = np.asarray(values, dtype=np.float64)
+    if series.size < 2 * BLOCKS:
+        return {}
+    blocks = np.array_split(series, BLOCKS)
+    return {f"{name}.p{q}": [round(float(np.percentile(block, q)), 4) for block in blocks] for q in (50, 99)}
+
+
+def curve(values: ArrayLike) -> list[list[float]]:
+    """(percent, value) pairs of the cumulative distribution, denser where the tail is, as far as samples reach."""
+    series: NDArray[np.float64] = np.asarray(values, dtype=np.float64)
+    if not series.size:
+        return []
+    levels = [level for level in _LEVELS if level <= 100.0 * (1.0 - 1.0 / series.size)]
+    return [[level, round(float(np.percentile(series, level)), 4)] for level in levels]
+
+
+class Ledger:
+    """One benchmark's results, written to `path` (None: nowhere) whenever a row comes in; a context manager.
+
+    On Ctrl-C it keeps what was measured and says so: `complete` stays false.
+    """
+
+    def __init__(self, path: Path | None, label: str, **settings: Any) -> None:
+        self.path = path
+        self.content: dict[str, Any] = {
+            "label": label,
+            "command": f"python -m perf {shlex.join(sys.argv[1:])}",
+            "complete": False,
+            "settings": settings,
+            "machine": describe(),
+            "rows": [],
+        }
+        self._steal = Steal()
+
+    def add(self, name: str, shown: str, **row: Any) -> None:
+        """A row, named once in the file, and what a person sees of it."""
+        self.content["rows"].append({"name": name, **row})
+        self._write()
+        print(f"{name:44} {shown}", flush=True)
+
+    def set(self, **figures: Any) -> None:
+        """Figures beside the rows."""
+        self.content |= figures
+        self._write()
+
+    def _write(self) -> None:
+        self.content["steal_percent"] = self._steal.percent()
+        if self.path is not None:
+            write_json(self.path, self.content)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.content["complete"] = kind is None
+        self._write()
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(path.name + ".draft")
+    draft.write_text(json.dumps(content, indent=1, default=_plain) + "\n", encoding="utf-8")
+    draft.replace(path)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} has no place in a report")
+
+
+def shown(figures: dict[str, float], unit: str) -> str:
+    """A spread for a person."""
+    if not figures.get("n"):
+        return "nothing came"
+    return "  ".join(f"{name} {figures[name]:.3g}" for name in ("p50", "p99", "max")) + f" {unit}"
+
+
+def numbers(text: str) -> Sequence[int]:
+    """A list of the command line: "1,2,3"."""
+    return tuple(int(part) for part in text.split(","))

@@ -1,0 +1,84 @@
+"""The machine that is measured on: what it is, what the hypervisor takes from it, and load to put on it."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from birdslam.runtime.environment import LIBRARIES
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+_STEAL = 7  # of /proc/stat's columns: user nice system idle iowait irq softirq steal guest guest_nice
+_TICKS = slice(0, 8)  # guest time is counted in user time already
+_SPIN = "while True: pass"
+
+
+def describe() -> dict[str, Any]:
+    """What stands in the head of a report."""
+    models = [line.partition(":")[2].strip() for line in _lines("/proc/cpuinfo") if line.startswith("model name")]
+    return {
+        "utc": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "cpu": models[0] if models else platform.processor(),
+        "cores": os.cpu_count(),
+        "memory_gb": round(psutil.virtual_memory().total / 2**30, 1),
+        "kernel": f"{platform.system()} {platform.release()}",
+        "hypervisor": any("hypervisor" in line for line in _lines("/proc/cpuinfo") if line.startswith("flags")),
+        "load_before": round(os.getloadavg()[0], 2),
+        "commit": _git("rev-parse", "--short=12", "HEAD"),
+        "uncommitted_files": len(_git("status", "--porcelain").splitlines()),
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
+    }
+
+
+def _lines(path: str) -> list[str]:
+    return Path(path).read_text(encoding="utf-8").splitlines()
+
+
+def _git(*arguments: str) -> str:
+    try:
+        done = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return ""  # an installed copy without its history
+    return done.stdout.strip()
+
+
+def _version(name: str) -> str:
+    return importlib.metadata.version(name)
+
+
+class Steal:
+    """The share of processor time that the hypervisor gave to others since construction."""
+
+    def __init__(self) -> None:
+        self._begun = _ticks()
+
+    def percent(self) -> float:
+        """Of all time of all cores."""
+        passed = [now - then for now, then in zip(_ticks(), self._begun, strict=True)]
+        return round(100.0 * passed[_STEAL] / max(1, sum(passed)), 3)
+
+
+def _ticks() -> list[int]:
+    return [int(n) for n in _lines("/proc/stat")[0].split()[1:]][_TICKS]
+
+
+@contextlib.contextmanager
+def loaded(cores: int) -> Iterator[None]:
+    """So many cores are kept busy meanwhile."""
+    hogs = [subprocess.Popen([sys.executable, "-c", _SPIN], start_new_session=True) for _ in range(cores)]
+    try:
+        yield
+    finally:
+        for hog in hogs:
+            hog.kill()
+            hog.wait()

@@ -1,0 +1,324 @@
+"""report.md: what a person reads in two minutes, from what the benchmarks wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from birdslam.perf.reporting import plots
+from birdslam.perf.reporting.machine import ROOT
+from birdslam.runtime.latency import key_of
+
+FEW = 1000
+Benchmarks = Mapping[str, Mapping[str, Any]]
+
+
+def write(folder: Path, content: Mapping[str, Any]) -> None:
+    """`folder/report.md` and the plots beside it."""
+    drawn = plots.draw(folder, content["benchmarks"])
+    (folder / "report.md").write_text(markdown(content, drawn), encoding="utf-8")
+
+
+def markdown(content: Mapping[str, Any], drawn: Iterable[str] = ()) -> str:
+    """The report; `drawn` are files of plots."""
+    sections = [_head(content)]
+    benchmarks: Benchmarks = content["benchmarks"]
+    for title, section in SECTIONS:
+        body = "\n".join(section(benchmarks))
+        if body:
+            sections.append(f"## {title}\n\n{body}")
+    pictures = [f"![{Path(name).stem.replace('_', ' ')}]({name})" for name in drawn]
+    if pictures:
+        sections.append("## Plots\n\n" + "\n\n".join(pictures))
+    return "\n\n".join(sections).replace(str(ROOT.parent), "..") + "\n"
+
+
+def table(titles: Iterable[str], rows: Iterable[Iterable[object]]) -> Iterator[str]:
+    """Markdown; numbers to three digits."""
+    titles = list(titles)
+    yield f"| {' | '.join(titles)} |"
+    yield f"|{'---|' * len(titles)}"
+    for row in rows:
+        yield f"| {' | '.join(_cell(value) for value in row)} |"
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    return str(value)
+
+
+def _percentiles(figures: Mapping[str, Any], names: tuple[str, ...] = ("p50", "p99", "p999", "max")) -> list[object]:
+    few = figures.get("n", 0) < FEW  # then p99.9 says no more than the maximum
+    return [None if few and name == "p999" else figures.get(name) for name in names]
+
+
+def _head(content: Mapping[str, Any]) -> str:
+    machine = content["machine"]
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    shared = ", on a hypervisor" if machine["hypervisor"] else ""
+    changed = f" with {machine['uncommitted_files']} files not committed" if machine["uncommitted_files"] else ""
+    missing = [f"{name}: {how}" for name, how in content["outcome"].items() if how != "complete"]
+    lines = [
+        "# What BirdSLAM does on this machine",
+        "",
+        f"    {content['command']}",
+        "",
+        f"- {machine['utc']}, {machine['cpu']}, {machine['cores']} cores, {machine['memory_gb']} GB{shared}; "
+        f"{machine['kernel']}; load of 1 minute before: {machine['load_before']}",
+        f"- commit {machine['commit'] or 'unknown'}{changed}; {versions}",
+        f"- source {content['source']}; networks: {', '.join(content['models']) or 'the shipped ones'}",
+        f"- configuration: {_configuration(content['benchmarks'])}",
+        *(f"- **{line}**" for line in missing),
+        "",
+        "All times are in ms unless they say otherwise, at p50, p99, p99.9 and max. `steal` is the share of processor "
+        "time that the hypervisor gave to others meanwhile: where it is not near 0, the tail is the machine's.",
+    ]
+    return "\n".join(lines)
+
+
+def _configuration(benchmarks: Benchmarks) -> str:
+    """What of the product's configuration bears on times; all of it is in report.json."""
+    whole: Mapping[str, Any] = next((run["configuration"] for run in benchmarks.values() if "configuration" in run), {})
+    parts = [text for key in ("source", "perceive", "models") for text in _set(key, whole.get(key))]
+    networks = [network for run in benchmarks.values() for network in run.get("networks", {}).values()]
+    ran = dict.fromkeys(f"{n['file']} on {n['threads']} threads" for n in networks)
+    return "; ".join((*ran, ", ".join(parts), "whole in report.json"))
+
+
+def _set(key: str, value: object) -> Iterator[str]:
+    """KEY=VALUE of everything below a key that is not left to others."""
+    if isinstance(value, Mapping):
+        for name, below in value.items():
+            yield from _set(f"{key}.{name}", below)
+    elif value is not None:
+        yield f"{key}={_cell(value)}"
+
+
+def _system(benchmarks: Benchmarks) -> Iterator[str]:
+    runs = {name: run for name, run in benchmarks.items() if "age_ms" in run}
+    if not runs:
+        return
+    titles = ("run", "rate Hz", "dropped", "cores", "MB", "MB shared once", "age p50", "p99", "p99.9", "max", "steal %")
+    yield from table(
+        titles,
+        (
+            [
+                name,
+                run["rate_hz"],
+                f"{run['dropped']} of {run['frames']}",
+                run["cpu_cores"],
+                run["rss_mb"],
+                run.get("pss_mb"),
+                *_percentiles(run["age_ms"]),
+                run["steal_during_percent"],
+            ]
+            for name, run in runs.items()
+        ),
+    )
+    for name, run in runs.items():
+        yield f"\n**{name}**, where an estimate's age comes from (the means add up to {run['age_ms']['mean']:.2f}):\n"
+        budgets = {row["budget"]: row for row in run["budgets"]}
+        rows = []
+        for stage, figures in [*run["stages"].items(), ("whole", run["age_ms"])]:
+            key = "end_to_end_ms" if stage == "whole" else f"{key_of(stage)}_ms"
+            budget = budgets.get(key, {})
+            limit = f"p{budget['percentile']:g} {budget['limit_ms']:g}" if budget else None
+            figured = (figures["mean"], figures.get("mean_in_tail"), *_percentiles(figures, ("p50", "p99", "max")))
+            rows.append((stage, *figured, limit, budget.get("met")))
+        stage_titles = ("stage", "mean", "mean in the slowest 1 %", "p50", "p99", "max", "budget", "met")
+        yield from table(stage_titles, rows)
+    yield "\nCores by process: " + "; ".join(
+        f"{name}: " + ", ".join(f"{process} {cores:.2f}" for process, cores in run["cpu_cores_by"].items())
+        for name, run in runs.items()
+    )
+    yield (
+        "\nMB is every process at its most, spares included, with the pages that it shares with others; MB shared once "
+        "counts those once (PSS)."
+    )
+
+
+def _cores(benchmarks: Benchmarks) -> Iterator[str]:
+    rows = benchmarks.get("cores", {}).get("rows", [])
+    if rows:
+        yield "The source once, on the first so many cores by affinity:\n"
+        titles = (
+            "on",
+            "rate Hz",
+            "dropped",
+            "predicted",
+            "age p50",
+            "p99",
+            "cores",
+            "MB",
+            "MB shared once",
+            "seen in the frame",
+            "told",
+            "ego ATE m",
+        )
+        there = [row for row in rows if "missing" not in row]
+        yield from table(
+            titles,
+            (
+                [
+                    row["name"],
+                    row["rate_hz"],
+                    f"{row['dropped']} of {row['frames']}",
+                    row.get("predicted"),
+                    *_percentiles(row["age_ms"], ("p50", "p99")),
+                    *(row.get(name) for name in ("cpu_cores", "rss_mb", "pss_mb", "found", "told", "ate_m")),
+                ]
+                for row in there
+            ),
+        )
+        missing = [f"- **{row['name']} is missing**: {row['missing']}" for row in rows if "missing" in row]
+        yield from ["", *missing] if missing else []
+
+
+def _vehicles(benchmarks: Benchmarks) -> Iterator[str]:
+    rows = benchmarks.get("vehicles", {}).get("rows", [])
+    if rows:
+        yield "The optimize process on the real bus, at the rate, with so many vehicles in sight:\n"
+        titles = ("vehicles", "step p50", "p99", "p99.9", "max", "cores", "MB", "dropped", "steal %")
+        yield from table(
+            titles,
+            (
+                [
+                    row["vehicles"],
+                    *_percentiles(row["step_ms"]),
+                    row["cpu_cores"],
+                    row["rss_mb"],
+                    f"{row['dropped']} of {row['frames']}",
+                    row["steal_percent"],
+                ]
+                for row in rows
+            ),
+        )
+
+
+def _accuracy(benchmarks: Benchmarks) -> Iterator[str]:
+    rows = [row for name in ("accuracy", "accuracy-data") for row in benchmarks.get(name, {}).get("rows", [])]
+    if rows:
+        titles = {
+            **{"frames": "frames", "dropped": "dropped", "ate_m": "ego ATE m", "ate_se3_m": "aligned"},
+            **{"scale_error": "scale error", "rpe_t_m": "RPE m", "rpe_r_deg": "RPE deg"},
+            **{
+                "vehicle_ate_m": "vehicles' ATE m",
+                "vehicle_centre_rel": "place, of the range",
+                "found": "seen in the frame",
+                "told": "told",
+            },
+        }
+        there = [row for row in rows if "missing" not in row]
+        ages = (_percentiles(row.get("age_ms", {}), ("p50", "p99")) for row in there)
+        cells = ([row["name"], *(row.get(name) for name in titles), *age] for row, age in zip(there, ages, strict=True))
+        yield from table(("run", *titles.values(), "age p50", "p99"), cells)
+        missing = [f"- **{row['name']} is missing**: {row['missing']}" for row in rows if "missing" in row]
+        yield from ["", *missing] if missing else []
+        yield (
+            "\nThe demo's networks are the shipped ones, the recordings' those of the command. Frames that a live run "
+            "dropped hold the last pose. localisation and tracking read labelled boxes: no load changes them."
+        )
+
+
+def _inference(benchmarks: Benchmarks) -> Iterator[str]:
+    rows = benchmarks.get("inference", {}).get("rows", [])
+    if rows:
+        titles = ("what", "p50", "p99", "max", "prepare p50", "network p50", "read p50")
+        parts = ("prepare", "network", "read")
+        yield from table(
+            titles,
+            (
+                [
+                    row["name"],
+                    *_percentiles(row["total_ms"], ("p50", "p99", "max")),
+                    *(row["parts_ms"].get(part, {}).get("p50") for part in parts),
+                ]
+                for row in rows
+            ),
+        )
+
+
+def _optimizer(benchmarks: Benchmarks) -> Iterator[str]:
+    rows = benchmarks.get("optimizer", {}).get("rows", [])
+    if rows:
+        titles = (
+            "who",
+            "vehicles",
+            "frames",
+            "p50 us",
+            "p99",
+            "p99.9",
+            "max",
+            "first 1000",
+            "last 1000",
+            "MB more",
+        )
+        names = ("frames", "p50_us", "p99_us", "p999_us", "max_us", "first_thousand_p50_us", "last_thousand_p50_us")
+        picked = (*names, "rss_growth_mb")
+        yield from table(titles, ([row["contender"], row["vehicles"], *(row[name] for name in picked)] for row in rows))
+    batch = benchmarks.get("incremental", {}).get("rows", [])
+    if batch:
+        yield "\nA whole sequence, batch over incremental (the paper's own ratio is 1.9 s / 0.016 s = 119):\n"
+        yield from table(
+            ("who", "frames", "seconds", "ratio", "iterations"),
+            (
+                [
+                    row["method"],
+                    row.get("frames", ""),
+                    row["seconds"],
+                    "not converged" if row["ratio"] is None else row["ratio"],
+                    row.get("iterations") or "",
+                ]
+                for row in batch
+            ),
+        )
+
+
+def _transport(benchmarks: Benchmarks) -> Iterator[str]:
+    rows = benchmarks.get("transport", {}).get("rows", [])
+    if rows:
+        titles = ("case", "p50", "p99", "p99.9", "max", "cpu % send", "cpu % receive", "dropped", "steal %")
+        yield from table(
+            titles,
+            (
+                [
+                    row["name"],
+                    *_percentiles(row["latency_ms"]),
+                    *row["cpu_percent"].values(),
+                    f"{row['dropped']} of {row['sent']}",
+                    row["steal_percent"],
+                ]
+                for row in rows
+            ),
+        )
+
+
+def _ratios(benchmarks: Benchmarks) -> Iterator[str]:
+    rows = benchmarks.get("ratios", {}).get("rows", [])
+    if rows:
+        titles = ("ours over the peer", "median", "rounds", "reference", "bound")
+        yield from table(
+            titles,
+            (
+                [row["name"], row["median"], " ".join(_cell(v) for v in row["rounds"]), row["measured"], row["bound"]]
+                for row in rows
+            ),
+        )
+
+
+SECTIONS = (
+    ("The whole system", _system),
+    ("On fewer cores", _cores),
+    ("Vehicles", _vehicles),
+    ("Accuracy, offline and live", _accuracy),
+    ("Networks and the perceive step", _inference),
+    ("Optimizer", _optimizer),
+    ("Ratios", _ratios),
+    ("Transport", _transport),
+)

@@ -1,0 +1,1 @@
+"""What faults do to a running vehicle, what a long drive does, and many vehicles at one router."""

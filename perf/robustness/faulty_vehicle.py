@@ -1,0 +1,199 @@
+"""A running vehicle whose camera can be made to fail, with a planner that watches it: for faults.py and soak.py.
+
+The camera is software (faulty_camera/): a street without end (perf/accuracy/street.py), driven along at constant speed,
+so that where the car is follows from the time alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import psutil
+
+from birdslam.perf.accuracy.street import F_PX, FRAME_M, HEIGHT_M, HEIGHT_PX, WIDTH_PX, street_loop
+from birdslam.runtime.client import Planner
+from birdslam.runtime.process.vitals import COUNTERS
+from birdslam.runtime.topology import NODES, PROCESSES
+from birdslam.types import Estimate
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+RATE_HZ = 15.0
+SETTLE_S, PATIENCE_S = 2.5, 20.0
+VITALS = "memfd:birdslam-vitals"
+
+
+def ends_with_its_vehicle() -> None:
+    """A suite that gets SIGTERM ends its vehicle too, as on Ctrl-C."""
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+
+
+class Vehicle:
+    """`birdslam run` with the faulty camera, and a planner; a context manager.
+
+    `source` takes the camera's place: a recording, round and round.
+    """
+
+    vehicle = "faults"
+
+    def __init__(self, place: Path, *options: str, rate_hz: float = RATE_HZ, source: str = "") -> None:
+        self.place, self.runtime_dir, self.output = place, place / "rt", place / "out"
+        self.rate_hz, self.period_ns = rate_hz, round(1e9 / rate_hz)
+        self.camera = place / "camera"
+        self._options = options
+        self._input = ("--source", source, "--rate", f"{rate_hz:g}", "--set", "source.loop=true")
+        self._environment = {**os.environ}
+        if not source:
+            self._make_camera()
+            camera_file = f"camera={place / 'camera.toml'}"
+            self._input = ("--source", f"v4l2:{self.camera}", "--model", "none", "--set", camera_file)
+        self.start()
+
+    def _make_camera(self) -> None:
+        """It takes the place of OpenCV's in every process of the vehicle."""
+        path = os.pathsep.join(
+            [str(ROOT / "perf" / "robustness" / "faulty_camera"), str(ROOT), os.environ.get("PYTHONPATH", "")]
+        )
+        self._environment |= {"PYTHONPATH": path, "FAULTY_CAMERA": str(self.camera)}
+        self.camera.mkdir(exist_ok=True)
+        np.save(self.camera / "frames.npy", street_loop())
+        (self.camera / "rate_hz").write_text(f"{self.rate_hz}")
+        self.fault("")
+        (self.place / "camera.toml").write_text(
+            f"width_px = {WIDTH_PX}\nheight_px = {HEIGHT_PX}\nfx_px = {F_PX}\nfy_px = {F_PX}\n"
+            f"cx_px = {WIDTH_PX / 2}\ncy_px = {HEIGHT_PX / 2}\nheight_m = {HEIGHT_M}\n"
+        )
+
+    def start(self) -> None:
+        """Starts the system; again, where it was killed."""
+        settings = {
+            "runtime.runtime_dir": self.runtime_dir,
+            "runtime.restarts_max": 1000,
+            "runtime.watchdog_ms": 1000,
+        }
+        with (self.place / "run.log").open("ab") as log:
+            self.process = subprocess.Popen(
+                [
+                    *(sys.executable, "-P", "-m", "birdslam.runtime.cli.main", "run", *self._input),
+                    *("--vehicle", self.vehicle, "--output", str(self.output)),
+                    *(part for key, value in settings.items() for part in ("--set", f"{key}={value}")),
+                    *self._options,
+                ],
+                stdout=log,
+                stderr=log,
+                env=self._environment,
+                start_new_session=True,
+            )
+
+    def fault(self, name: str) -> None:
+        """The camera does this from its next frame on."""
+        draft = self.camera / "draft"
+        draft.write_text(name)
+        draft.rename(self.camera / "fault")
+
+    def truth_m(self, t_capture_ns: int) -> float:
+        """How far along the road the camera was then, to within a frame."""
+        return math.floor(t_capture_ns * 1e-9 * self.rate_hz) * FRAME_M
+
+    def node(self, name: str) -> psutil.Process:
+        """The process of a node that is at work: the spare beside it is younger."""
+        if name == "supervisor":
+            return psutil.Process(self.process.pid)
+        found = [child for child in psutil.Process(self.process.pid).children() if _is_node(child, name)]
+        return min(found, key=lambda child: (child.create_time(), child.pid))
+
+    def spares(self) -> int:
+        """Processes that stand by, with all loaded."""
+        return sum(map(_is_prepared, psutil.Process(self.process.pid).children())) - len(NODES)
+
+    def processes(self) -> dict[str, psutil.Process]:
+        """All of them by name: the supervisor, the nodes, the spare of each, and the recorder where there is one."""
+        found = {"supervisor": psutil.Process(self.process.pid)}
+        for child in sorted(found["supervisor"].children(), key=lambda child: (child.create_time(), child.pid)):
+            for name in PROCESSES:
+                if _is_node(child, name):
+                    found[f"{name} spare" if name in found else name] = child
+        return found
+
+    def __enter__(self) -> Self:
+        self.planner = Planner(self.vehicle, self.runtime_dir)
+        self.settle()
+        return self
+
+    def settle(self, settle_s: float = SETTLE_S) -> None:
+        """Until estimates are valid and have been for a while, and spares stand by."""
+        until_s, calm_s = time.monotonic() + 12 * PATIENCE_S, 0.0
+        while calm_s < settle_s or self.spares() < len(NODES):
+            if time.monotonic() > until_s or self.process.poll() is not None:
+                raise TimeoutError(f"no valid estimates: {(self.place / 'run.log').read_text()[-2000:]}")
+            begun_s = time.monotonic()
+            estimate = self.planner.wait(1.0)
+            calm_s = calm_s + time.monotonic() - begun_s if estimate is not None and estimate.valid else 0.0
+
+    def watch(self, see: Callable[[Estimate | None], bool], limit_s: float) -> bool:
+        """Shows what the planner gets (None: nothing for a moment), until `see` says enough; whether it did in time."""
+        end_s = time.monotonic() + limit_s
+        while time.monotonic() < end_s:
+            if see(self.planner.wait(0.05)):
+                return True
+        return False
+
+    def stop(self) -> int:
+        """An ordered end; gives the exit status."""
+        self.process.terminate()
+        return self.process.wait(6 * PATIENCE_S)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.planner.close()
+        if self.process.poll() is None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.stop()
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+
+def _is_node(process: psutil.Process, name: str) -> bool:
+    try:
+        return name in process.cmdline()
+    except psutil.Error:  # it has just ended
+        return False
+
+
+def _is_prepared(process: psutil.Process) -> bool:
+    """By the counters that it shares with its supervisor (runtime/process/vitals.py); a recorder never is."""
+    try:
+        for descriptor in Path(f"/proc/{process.pid}/fd").iterdir():
+            if VITALS in os.readlink(descriptor):
+                counters = np.frombuffer(descriptor.read_bytes(), dtype=np.int64)
+                return bool(counters[COUNTERS.index("prepared")])
+    except OSError:  # it has just ended
+        return False
+    return False
+
+
+def record_options(place: Path) -> list[str]:
+    """A recording of each start."""
+    folder = place / "recordings"
+    folder.mkdir(exist_ok=True)
+    return ["--record", str(folder)]
+
+
+def model_options(folder: Path | None) -> list[str]:
+    """Both networks, where the folder has them."""
+    networks = {"detector": "yolox_nano_416.onnx", "segmenter": "twinlitenet_640x360.onnx"}
+    if folder is None or not all((folder / file).is_file() for file in networks.values()):
+        return []
+    return [f"--model={role}={(folder / file).resolve()}" for role, file in networks.items()]

@@ -1,0 +1,199 @@
+"""A long drive at the full rate: memory, descriptors, watchdogs and drops of every process, from the first minute on.
+
+    python -m perf soak [--minutes 30] [--rate 33] [--source demo] [--record] [--models DIR]
+
+Without `--source` the software camera of the fault suite drives down its street. The soak stands in systemd's place,
+and hears whether the supervisor misses its watchdog. Ends with status 1, and says why, where after the first minute a
+process grew by more than 1 % or held more descriptors, where a process was begun anew, or a watchdog was missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import socket
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import psutil
+
+from birdslam.perf.robustness.faulty_vehicle import Vehicle, ends_with_its_vehicle, model_options, record_options
+
+label = "memory, descriptors, watchdogs and drops of every process over a long drive"
+
+WARM_S, SAMPLE_S, SAID_S = 60.0, 5.0, 30.0
+SPAN = 6  # samples at either end whose medians are compared: what a process holds swings by its garbage
+GROWTH = 0.01
+WATCHDOG_S = 5.0  # of the supervisor, as in deploy/birdslam.service
+
+
+class Systemd:
+    """Takes what the supervisor says of itself (sd_notify), and measures its silences; a context manager."""
+
+    def __init__(self, place: Path) -> None:
+        self.longest_s, self.missed = 0.0, 0
+        self._address = str(place / "notify")
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(self._address)
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """That the supervisor is started with."""
+        return {"NOTIFY_SOCKET": self._address, "WATCHDOG_USEC": str(round(WATCHDOG_S * 1e6))}
+
+    def _listen(self) -> None:
+        last_s: float | None = None
+        while message := self._socket.recv(4096):
+            now_s = time.monotonic()
+            if b"READY=1" in message or b"WATCHDOG=1" in message:
+                if last_s is not None:
+                    self.longest_s = max(self.longest_s, now_s - last_s)
+                    self.missed += now_s - last_s > WATCHDOG_S
+                last_s = now_s
+            if b"STOPPING=1" in message:
+                last_s = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
+            end.sendto(b"", self._address)
+        self._thread.join()
+        self._socket.close()
+
+
+@dataclass
+class Series:
+    """One process, sample by sample from the end of the first minute on."""
+
+    mib: list[float] = field(default_factory=list)
+    descriptors: list[int] = field(default_factory=list)
+    pids: set[int] = field(default_factory=set)
+
+    def ends(self) -> tuple[float, float]:
+        """Resident memory (MiB) at the beginning and at the end."""
+        span = max(1, min(SPAN, len(self.mib) // 2))
+        return float(np.median(self.mib[:span])), float(np.median(self.mib[-span:]))
+
+    @property
+    def growth(self) -> float:
+        before, after = self.ends()
+        return after / before - 1.0
+
+    @property
+    def leaked(self) -> int:
+        """Descriptors that it holds at the end and did not at the beginning."""
+        span = max(1, min(SPAN, len(self.descriptors) // 2))
+        return min(self.descriptors[-span:]) - max(self.descriptors[:span])
+
+
+def sample(processes: Mapping[str, psutil.Process], into: Mapping[str, Series]) -> None:
+    """Adds what each process holds now."""
+    for name, process in processes.items():
+        with contextlib.suppress(psutil.NoSuchProcess), process.oneshot():
+            into[name].mib.append(process.memory_info().rss / 2**20)
+            into[name].descriptors.append(process.num_fds())
+            into[name].pids.add(process.pid)
+
+
+def faults(series: Mapping[str, Series], summary: dict[str, Any], systemd: Systemd) -> Iterator[str]:
+    """What a soak must not show, a line each."""
+    for name, one in series.items():
+        if one.growth > GROWTH:
+            yield f"{name} grew by {one.growth:.1%}"
+        if one.leaked > 0:
+            yield f"{name} holds {one.leaked} descriptors more"
+        if len(one.pids) > 1:
+            yield f"{name} was {len(one.pids)} processes, one after the other"
+    for name, count in restarts(summary).items():
+        if count:
+            yield f"{name} was begun anew {count} times"
+    if systemd.missed:
+        yield f"the supervisor missed its watchdog {systemd.missed} times"
+
+
+def restarts(summary: dict[str, Any]) -> dict[str, int]:
+    """Of each node, and of the recorder where there is one: dead, or ended by its watchdog."""
+    recorder = {"record": summary["recording"]["restarts"]} if "recording" in summary else {}
+    return {**summary["restarts"], **recorder}
+
+
+def table(series: Mapping[str, Series], summary: dict[str, Any], systemd: Systemd) -> str:
+    """For a person."""
+    begun_anew = restarts(summary) | {"supervisor": systemd.missed}
+    dropped = summary["dropped_by"] | {"record": summary.get("recording", {}).get("dropped", 0)}
+    columns = "MiB at 1 min", "MiB at end", "growth", "descriptors", "watchdogs missed", "drops"
+    lines = ["| process | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    for name, one in series.items():
+        before, after = one.ends()
+        cells = (
+            *(f"{before:.1f}", f"{after:.1f}", f"{one.growth:+.2%}", f"{one.descriptors[0]} -> {one.descriptors[-1]}"),
+            *(str(begun_anew.get(name, "")), str(dropped.get(name, ""))),
+        )
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def drive(vehicle: Vehicle, minutes: float) -> dict[str, Series]:
+    """Samples until the time is over. Raises RuntimeError where the run ends before."""
+    begun_s = time.monotonic()
+    until_s = begun_s + max(60.0 * minutes, WARM_S + 2 * SAMPLE_S)
+    due_s, said_s, frames = begun_s + WARM_S, begun_s, 0
+    series: dict[str, Series] = defaultdict(Series)
+    while (now_s := time.monotonic()) < until_s:
+        frames += vehicle.planner.wait(1.0) is not None
+        if vehicle.process.poll() is not None:
+            raise RuntimeError(f"the run has ended by itself: {(vehicle.place / 'run.log').read_text()[-1000:]}")
+        if now_s >= due_s:
+            due_s += SAMPLE_S
+            sample(vehicle.processes(), series)
+        if now_s >= said_s + SAID_S:
+            said_s += SAID_S
+            held = ", ".join(f"{name} {one.mib[-1]:.1f} ({one.growth:+.2%})" for name, one in series.items())
+            print(f"{(now_s - begun_s) / 60.0:5.1f} min  {frames} estimates  {held or 'warming up'}", flush=True)
+    return dict(series)
+
+
+def run(arguments: list[str]) -> int:
+    """Gives the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m perf soak", description=__doc__)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--rate", type=float, default=33.0, metavar="HZ")
+    parser.add_argument("--source", default="", metavar="URI", help="goes round and round; left out: a software camera")
+    parser.add_argument("--record", action="store_true", help="with a recorder beside it")
+    parser.add_argument("--models", type=Path, help="folder of networks")
+    options = parser.parse_args(arguments)
+    ends_with_its_vehicle()
+    with tempfile.TemporaryDirectory(prefix="soak") as folder, Systemd(Path(folder)) as systemd:
+        place = Path(folder)
+        recorded = record_options(place) if options.record else []
+        os.environ.update(systemd.environment)
+        extra = [*model_options(options.models), *recorded]
+        with Vehicle(place, *extra, rate_hz=options.rate, source=options.source) as vehicle:
+            series = drive(vehicle, options.minutes)
+            status = vehicle.stop()
+            summary = json.loads((vehicle.output / "summary.json").read_text())
+    print(table(series, summary, systemd))
+    print(
+        f"frames {summary['frames_in']}, rate {summary['rate_hz']} Hz, age {summary['age_ms']} ms, {summary['budget']}"
+    )
+    print(f"longest silence of the supervisor's watchdog: {systemd.longest_s:.1f} s of {WATCHDOG_S:g}")
+    found = [*faults(series, summary, systemd), *([f"the run ended with status {status}"] if status else [])]
+    for line in found:
+        print(f"NOT WELL: {line}")
+    return int(bool(found))

@@ -1,0 +1,1 @@
+"""`birdslam doctor`: whether this machine can keep what a vehicle needs, and what its settings cost."""

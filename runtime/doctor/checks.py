@@ -1,0 +1,266 @@
+"""`birdslam doctor`: whether this machine can keep what a vehicle needs, and what to do where it can't.
+
+A row for each thing: `ok`; `warning`, where the vehicle drives but may not keep its budgets; `error`, where it can't
+start.
+It looks with the rights of whoever calls it: as the service's user, `sudo -u birdslam birdslam doctor CONFIG`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import ctypes
+import os
+import resource
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from birdslam.perception import ModelError, load_network
+from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.doctor.costs import costs
+from birdslam.runtime.nodes.look_rate import threads_of_a_network
+from birdslam.runtime.nodes.sources import CameraSource, SourceError, open_source
+from birdslam.runtime.options import configuration_of
+from birdslam.runtime.process import realtime
+from birdslam.runtime.process.cores import usable_cores
+from birdslam.runtime.topology import NODES
+from birdslam.runtime.transport.presence import ring_path, runtime_dir_of
+from birdslam.sources.recording import DatasetError
+
+Verdict = Literal["ok", "warning", "error"]
+LEAST_CORES = 4
+LEAST_MEMORY_GIB = 1.5
+_TIMEX_BYTES, _TIME_ERROR = 256, 5
+RING_MARGIN = 2.0  # /dev/shm holds a second ring while a restarted capture replaces its own
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One row: what was looked at, how it is, and what to do where it is not well."""
+
+    what: str
+    verdict: Verdict
+    found: str
+    advice: str = ""
+
+
+def check_machine(options: argparse.Namespace) -> int:
+    """`birdslam doctor`: a row for each check; 1 where one is an error."""
+    findings = list(examine(configuration_of(options)))
+    print(table(findings))
+    if options.measure:
+        print("\nwhat the settings cost, measured now:")
+        for what, cost in costs(len(os.sched_getaffinity(0))):
+            print(f"{what:26}{cost}", flush=True)
+    return int(any(finding.verdict == "error" for finding in findings))
+
+
+def examine(configuration: Configuration) -> Iterator[Finding]:
+    """All checks, one after the other; those of the source and the models only where they are configured."""
+    checks: tuple[Callable[[Configuration], Iterator[Finding]], ...] = (
+        *(_cores, _governor, _threads, _scheduling, _memory_lock, _memory, _runtime_dir, _shared_memory, _disk),
+        *(_clock, _utc, _models, _source),
+    )
+    for check in checks:
+        yield from check(configuration)
+
+
+def table(findings: list[Finding]) -> str:
+    """For a person."""
+    rows = [f"{f.verdict:8}{f.what:18}{f.found}{f'  ->  {f.advice}' if f.advice else ''}" for f in findings]
+    return "\n".join(rows)
+
+
+def _cores(configuration: Configuration) -> Iterator[Finding]:
+    usable = os.sched_getaffinity(0)
+    cores, load = usable_cores(), os.getloadavg()[0]
+    found = f"{cores:g} usable, load {load:.1f}"
+    wanted = {node: set(configuration.realtime.of(node).cpus) - usable for node in NODES}
+    beyond = {node: cpus for node, cpus in wanted.items() if cpus}
+    if beyond:
+        text = ", ".join(f"{node}: {', '.join(map(str, sorted(cpus)))}" for node, cpus in beyond.items())
+        yield Finding("cores", "warning", f"{found}; {text} can't be used", "correct realtime.NODE.cpus")
+    elif cores < LEAST_CORES - 0.5:
+        advice = (
+            f"33 frames a second want {LEAST_CORES} cores: choose smaller networks or a lower rate, or raise CPUQuota="
+        )
+        yield Finding("cores", "warning", found, advice)
+    elif load > cores:
+        yield Finding("cores", "warning", found, "other programs want all of them: end them, or give them a nice value")
+    else:
+        yield Finding("cores", "ok", found)
+
+
+def _threads(configuration: Configuration) -> Iterator[Finding]:
+    """What runs side by side on a frame. BLAS and its like have one thread in every node (runtime/cli/main.py)."""
+    cores = len(os.sched_getaffinity(0))
+    networks: dict[str, int] = {}
+    for role, spec in configuration.models.in_use().items():
+        with contextlib.suppress(ModelError):  # said with the models
+            networks[role] = load_network(role, spec, threads_of_a_network(usable_cores())).schedule.threads
+    opencv = configuration.perceive.opencv_threads
+    parts = [*(f"{role} {count}" for role, count in networks.items()), f"OpenCV {opencv}", "BLAS 1"]
+    if sum(networks.values()) >= cores or opencv > cores:
+        advice = f"leave a core to the odometry: models.ROLE.threads together below {cores}, perceive.opencv_threads"
+        yield Finding("threads", "warning", ", ".join(parts), advice)
+    else:
+        yield Finding("threads", "ok", ", ".join(parts))
+
+
+def _governor(configuration: Configuration) -> Iterator[Finding]:
+    files = sorted(Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"))
+    found = sorted({path.read_text().strip() for path in files})
+    if not found:
+        yield Finding("governor", "ok", "the kernel offers none (a virtual machine sets its own speed)")
+    elif found == ["performance"]:
+        yield Finding("governor", "ok", "performance")
+    else:
+        yield Finding("governor", "warning", ", ".join(found), "cpupower frequency-set -g performance")
+
+
+def _scheduling(configuration: Configuration) -> Iterator[Finding]:
+    if configuration.realtime.fifo == "off":
+        yield Finding("SCHED_FIFO", "ok", "not asked for (realtime.fifo)")
+        return
+    before, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    highest = max(configuration.realtime.of(node).priority for node in NODES)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(highest))
+        os.sched_setscheduler(0, before, parameter)
+    except PermissionError:
+        advice = f"LimitRTPRIO={highest} in the unit, or rtprio in /etc/security/limits.conf"
+        yield Finding("SCHED_FIFO", "warning", f"not permitted at priority {highest}", advice)
+    else:
+        yield Finding("SCHED_FIFO", "ok", f"permitted at priority {highest}")
+
+
+def _memory_lock(configuration: Configuration) -> Iterator[Finding]:
+    if configuration.realtime.lock_memory == "off":
+        yield Finding("memory lock", "ok", "not asked for (realtime.lock_memory)")
+    elif realtime.may_lock_memory():
+        yield Finding("memory lock", "ok", "permitted")
+    else:
+        limit_kib = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] // 1024
+        yield Finding("memory lock", "warning", f"limited to {limit_kib} KiB", "LimitMEMLOCK=infinity in the unit")
+
+
+def _memory(configuration: Configuration) -> Iterator[Finding]:
+    lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+    free_gib = int(lines["MemAvailable"].split()[0]) / 2**20
+    enough = free_gib >= LEAST_MEMORY_GIB
+    advice = (
+        "" if enough else f"the nodes and their spares want {LEAST_MEMORY_GIB:g} GiB: runtime.spares=false halves that"
+    )
+    yield Finding("memory", "ok" if enough else "warning", f"{free_gib:.1f} GiB available", advice)
+
+
+def _runtime_dir(configuration: Configuration) -> Iterator[Finding]:
+    try:
+        directory = runtime_dir_of(configuration.vehicle, configuration.runtime_dir)
+    except (OSError, ValueError) as error:
+        yield Finding("runtime directory", "error", str(error), "set runtime.runtime_dir to a directory of this user")
+    else:
+        yield Finding("runtime directory", "ok", str(directory))
+
+
+def _shared_memory(configuration: Configuration) -> Iterator[Finding]:
+    try:
+        place = ring_path(configuration.vehicle, configuration.runtime_dir).parent
+    except (OSError, ValueError):
+        return  # said already
+    camera = configuration.camera
+    pixels = 1920 * 1080 if camera is None else camera.width_px * camera.height_px
+    needed, free = RING_MARGIN * pixels * 3 * configuration.runtime.ring_slots, shutil.disk_usage(place).free
+    found = f"{place}: {free / 2**20:.0f} MiB free, frames need {needed / 2**20:.0f}"
+    if free < needed:
+        yield Finding("shared memory", "error", found, f"mount -o remount,size={needed / 2**20:.0f}M {place}")
+    elif str(place) != "/dev/shm":
+        yield Finding("shared memory", "warning", found, "/dev/shm is not writable: frames go over a file system")
+    else:
+        yield Finding("shared memory", "ok", found)
+
+
+def _disk(configuration: Configuration) -> Iterator[Finding]:
+    place = Path(configuration.output).absolute()
+    while not place.exists():
+        place = place.parent
+    free_gib = shutil.disk_usage(place).free / 2**30
+    if not os.access(place, os.W_OK):
+        yield Finding("output", "error", f"{place} can't be written", "choose another --output")
+    elif free_gib < 1.0:
+        yield Finding("output", "warning", f"{place}: {free_gib:.1f} GiB free", "an hour of results is about 0.1 GiB")
+    else:
+        yield Finding("output", "ok", f"{place}: {free_gib:.0f} GiB free")
+
+
+def _clock(configuration: Configuration) -> Iterator[Finding]:
+    source = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    name = source.read_text().strip() if source.exists() else "unknown"
+    if name in ("hpet", "acpi_pm", "jiffies"):
+        yield Finding("clock", "warning", f"{name} is slow to read", "clocksource=tsc on the kernel's command line")
+        return
+    late_ms = max(_lateness_ms() for _ in range(20))
+    verdict: Verdict = "ok" if late_ms < 5.0 else "warning"
+    advice = "" if verdict == "ok" else "the machine is busy, or sleeps too deep (cpupower idle-set -D 10)"
+    yield Finding("clock", verdict, f"{name}, a sleep of 5 ms is late by up to {late_ms:.1f} ms", advice)
+
+
+def _utc(configuration: Configuration) -> Iterator[Finding]:
+    """Ages need no UTC; planners on another machine do."""
+    advice = "start a time service (chrony, systemd-timesyncd): planners on other machines go by t_utc_ns"
+    if time.time() < 1.6e9:
+        yield Finding("UTC", "warning", "the date is before 2020", advice)
+    elif not _synchronised():
+        yield Finding("UTC", "warning", "no time service keeps it", advice)
+    else:
+        yield Finding("UTC", "ok", "kept by a time service")
+
+
+def _synchronised() -> bool:
+    """As the kernel has it from whoever steers the clock: adjtimex(2) gives TIME_ERROR where nobody does."""
+    libc, timex = ctypes.CDLL(None), ctypes.create_string_buffer(_TIMEX_BYTES)  # all zero: it only asks
+    return 0 <= libc.adjtimex(timex) < _TIME_ERROR
+
+
+def _lateness_ms() -> float:
+    begun_s = time.monotonic()
+    time.sleep(0.005)
+    return (time.monotonic() - begun_s - 0.005) * 1e3
+
+
+def _models(configuration: Configuration) -> Iterator[Finding]:
+    specs = configuration.models.in_use()
+    if not specs:
+        yield Finding("models", "warning", "none", "without --model none the shipped network runs; now odometry only")
+    for role, spec in specs.items():
+        try:
+            described = load_network(role, spec).describe()
+        except ModelError as error:
+            yield Finding(role, "error", str(error), "give the network that its manifest describes")
+        else:
+            yield Finding(role, "ok", f"{described['file']}, sha256 {described['sha256'][:12]}")
+
+
+def _source(configuration: Configuration) -> Iterator[Finding]:
+    if not configuration.source.uri:
+        yield Finding("camera", "warning", "none is configured", "--source v4l2:/dev/video0 --camera FILE")
+        return
+    try:
+        source = open_source(configuration)
+        first = next(source.frames())
+    except (ConfigurationError, DatasetError, SourceError) as error:
+        yield Finding("camera", "error", str(error), "check the cable, the files, and the group 'video'")
+        return
+    except StopIteration:
+        yield Finding("camera", "error", f"{source.name}: has no frame", "record it anew, or name another source")
+        return
+    if isinstance(source, CameraSource):
+        source.close()
+    size = "unreadable" if first.image is None else f"{first.image.shape[1]}x{first.image.shape[0]} px"
+    verdict: Verdict = "error" if first.image is None else "ok"
+    found = f"{source.name}: {size}, {source.rate_hz:g} Hz"
+    yield Finding("camera", verdict, found, "" if first.image is not None else f"{first.error}: look at the cable")

@@ -1,0 +1,315 @@
+"""One sequence of KITTI tracking in a process of its own: all methods, the ablations, the clock and the picture."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.bench.baselines import batch_se3, nair
+from birdslam.bench.baselines.posegraph3 import solve_batch
+from birdslam.bench.baselines.trajectories import Method
+from birdslam.bench.simulation.odometry import EXACT, SimulatedOdometry, SimulationConfig
+from birdslam.bench.tracking import ablation
+from birdslam.bench.tracking.benchmark import (
+    PAPER,
+    Row,
+    Trial,
+    Truth,
+    make_log,
+    methods,
+    most_labelled,
+    ours,
+    run_trial,
+    summarise,
+)
+from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
+from birdslam.bench.tracking.localisation import PAPER as PAPER_FRONT_END
+from birdslam.bench.tracking.picture import draw_sequence
+from birdslam.bench.tracking.relative_nees import nees_rows, over_seeds
+from birdslam.bench.tracking.report import BatchTiming, Outcome, Timing
+from birdslam.bench.tracking.reported import motion_row, range_rows, sights
+from birdslam.bench.tracking.tables import Published
+from birdslam.frontend import EgoMotion, FrontEndConfig, Pending
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.perception import Perception, Ready
+from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.sources.kitti import find_images, read_image
+from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
+from birdslam.sources.recording import DatasetError
+from birdslam.sources.speed_file import of_sequence, read_speeds
+from birdslam.trajectory import as_poses, inverse, read_kitti
+from birdslam.types import Estimate, Measurements
+
+# Methods whose log is that of the paper's placing of vehicles, by the ideas that they are
+EQ_1 = {"paper_eq1": "ideas/nothing (the paper)", "paper_eq1_final": "ideas/the smoother"}
+FIGURE_FRAMES = (50, 100, 200, 414)  # of the paper's figure of times
+BATCHES = frozenset({"batch_se3", "nair"})  # the methods that the figure of times is about
+REPEATS = 3  # of each time: the median counts
+
+
+@dataclass(frozen=True)
+class Job:
+    """All that one sequence's process is told."""
+
+    root: Path
+    sequence: str
+    frames: str  # "all", "paper" or "A:B"
+    methods: tuple[str, ...]  # those of Tables 1 and 2; none: the ablations alone
+    odometry: str
+    detections: str
+    seeds: int
+    ablate: bool  # the variants of Tables 3-5 too
+    output: Path
+    configuration: Configuration
+    published: Published
+
+    @property
+    def camera(self) -> int | None:
+        """Whose images and boxes count: with the networks' boxes that which has images."""
+        return None if self.detections == "network" else CAMERA_OF_BOXES
+
+
+def frames_of(text: str, sequence: TrackingSequence, published: Published) -> range:
+    """The frames that `--frames` names. Raises ConfigurationError."""
+    if text == "all":
+        return range(len(sequence))
+    if text == "paper":
+        paper = published.sequences.get(sequence.name)
+        if paper is None:
+            raise ConfigurationError(f"--frames paper: the paper has no sequence {sequence.name}")
+        return most_labelled(sequence, paper.cars, paper.frames)
+    first, colon, last = text.partition(":")
+    try:
+        frames = range(int(first or 0), int(last or len(sequence)))
+    except ValueError:
+        frames = range(0)
+    if not colon or not 0 <= frames.start < frames.stop <= len(sequence):
+        raise ConfigurationError(
+            f"--frames {text}: expected all, paper or A:B within the {len(sequence)} frames of {sequence.name}"
+        )
+    return frames
+
+
+def frames_to_make(job: Job) -> int:
+    """How many frames the front end goes through for a job, seeds and logs together."""
+    frames = frames_of(job.frames, open_tracking(job.root, job.sequence, job.camera), job.published)
+    logs = 1 + bool(_variants(job)) + bool(_ideas(job))
+    return len(frames) * job.seeds * logs
+
+
+def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> Outcome:
+    """All methods and ablations on one sequence; `frame_made` is told of each frame of the front end."""
+    cv2.setNumThreads(1)
+    sequence = open_tracking(job.root, job.sequence, job.camera)
+    frames = frames_of(job.frames, sequence, job.published)
+    slam = job.configuration.slam
+    chosen: dict[str, Method] = {name: methods(slam)[name] for name in job.methods}
+    variants = _variants(job)
+    ideas = _ideas(job)
+    paper = job.published.sequences.get(sequence.name)
+    bodies = () if paper is None else paper.bodies
+    named = bodies if job.frames == "paper" else None  # of the ablations; else of all
+    trials, ablations, worth, nees, log = [], [], [], [], []
+    with ExitStack() as stack:
+        make = _log_maker(job, sequence, frames, stack, frame_made)
+        for seed in range(job.seeds):
+            log = make(seed, slam.frontend)
+            nees.append(nees_rows(sequence, log, ours(slam), job.odometry))
+            if chosen:
+                trials.append(run_trial(sequence, log, chosen))
+            if variants:
+                far = msgspec.structs.replace(slam.frontend.static_map, landmark_range_m=ablation.FARTHEST_LANDMARK_M)
+                far_log = make(seed, msgspec.structs.replace(slam.frontend, static_map=far))
+                ablations.append(run_trial(sequence, far_log, variants, named))
+            if ideas:
+                placing = (
+                    PAPER_FRONT_END
+                    if job.odometry != "images"
+                    else msgspec.structs.replace(PAPER_FRONT_END, odometry=slam.frontend.odometry)
+                )
+                theirs = run_trial(sequence, make(seed, placing), ideas, named)
+                placed = {f"ideas/{name}": m for name, m in ablation.placed_variants(ours(slam)).items()}
+                own = run_trial(sequence, log, placed, named)
+                worth.append(replace(theirs, errors={**theirs.errors, **own.errors}))
+                if chosen:
+                    alone = {name: theirs.errors[idea] for name, idea in EQ_1.items()}
+                    trials[-1] = replace(trials[-1], errors={**trials[-1].errors, **alone})
+    if chosen:
+        name = next(iter(chosen))
+        truth, result = Truth.of(sequence, log), chosen[name].run(log, sequence.camera)
+        title = f"KITTI tracking {sequence.name}, {chosen[name].label}, odometry: {job.odometry}"
+        of_images = "_images" if job.odometry == "images" else ""
+        draw_sequence(title, truth, result, job.output / f"bev_{sequence.name}{of_images}.png")
+    updates_ms = {"all vehicles": _updates_ms(log, job), "one vehicle": _updates_ms(_one_vehicle(log), job)}
+
+    def rows_of(trials: Sequence[Trial]) -> list[Row]:
+        return summarise(sequence.name, trials, bodies, job.odometry, job.detections) if trials else []
+
+    seen = sights(sequence, _estimates(log, job)) if chosen and job.detections == "network" else []
+    return Outcome(
+        sequence=sequence.name,
+        odometry=job.odometry,
+        frames=frames,
+        rows=rows_of(trials),
+        ablation=rows_of(ablations),
+        ideas=rows_of(worth),
+        ranges=range_rows(sequence.name, seen) if seen else [],
+        motion=[motion_row(sequence.name, seen)] if seen else [],
+        timings=[_timing(log[:length], job) for length in _lengths(log, job)],
+        nees=over_seeds(nees),
+        updates_ms=updates_ms,
+    )
+
+
+def _ideas(job: Job) -> dict[str, Method]:
+    if not job.ablate or (job.methods and not {"paper", "birdslam"} <= set(job.methods)):
+        return {}
+    return {f"ideas/{name}": method for name, method in ablation.idea_variants().items()}
+
+
+def _lengths(log: Sequence[Measurements], job: Job) -> list[int]:
+    """Of the sequence that the paper states its times for, the frames of its figure; of the others all.
+
+    None where methods are named and no batch is among them.
+    """
+    if job.methods and BATCHES.isdisjoint(job.methods):
+        return []
+    if job.sequence != job.published.runtime.sequence:
+        return [len(log)]
+    return sorted({*(n for n in FIGURE_FRAMES if n < len(log)), len(log)})
+
+
+def _timing(log: Sequence[Measurements], job: Job) -> Timing:
+    """All updates of the live graph, and one solve of either batch: medians over REPEATS.
+
+    A batch that has not converged, which may take minutes, is solved once: nothing is made of its time.
+    """
+    batches = []
+    for config in (batch_se3.CONFIG, nair.CONFIG):
+        start = time.perf_counter()
+        _, ended = solve_batch(log, config, check=True)
+        seconds = [time.perf_counter() - start]
+        if ended.converged:
+            seconds = []
+            for _ in range(REPEATS):
+                start = time.perf_counter()
+                solve_batch(log, config)
+                seconds.append(time.perf_counter() - start)
+        batches.append(BatchTiming(float(np.median(seconds)), ended.iterations, ended.converged))
+    incremental_s = float(np.median([_updates_ms(log, job).sum() for _ in range(REPEATS)])) / 1e3
+    return Timing(len(log), incremental_s, *batches)
+
+
+def _variants(job: Job) -> dict[str, Method]:
+    """The ablations by "METHOD/VARIANT"; of Table 5 by the variant alone."""
+    out: dict[str, Method] = {}
+    images = job.odometry == "images"
+    if not job.ablate:  # these have their rows by another log of the sequence, but lanes are in the images' alone
+        return ablation.lane_variants(images) if images and "batch_se3" in job.methods else out
+    for name, base in (("paper", PAPER), ("birdslam", ours(job.configuration.slam))):
+        if not job.methods or name in job.methods:
+            for part in (ablation.constraint_variants(base), ablation.landmark_variants(base)):
+                out |= {f"{name}/{variant}": live for variant, live in part.items()}
+    reported = job.frames != "paper" or job.sequence in job.published.table5.frames
+    if reported and (not job.methods or "batch_se3" in job.methods):
+        out |= ablation.lane_variants(images)
+    return out
+
+
+def _log_maker(
+    job: Job, sequence: TrackingSequence, frames: range, stack: ExitStack, frame_made: Callable[[], object]
+) -> Callable[[int, FrontEndConfig], list[Measurements]]:
+    """Gives the log of a seed."""
+    paths = {} if sequence.images is None else find_images(sequence.images)
+    looks = job.odometry == "images" or job.detections == "network"
+
+    def image_of(frame: int) -> NDArray[np.uint8] | None:
+        try:
+            return read_image(paths[frame])
+        except (KeyError, ValueError):
+            return None
+
+    beside = job.configuration.source.speed if job.odometry == "images" else ""
+    speeds = read_speeds(of_sequence(Path(beside).expanduser(), sequence.name)) if beside else None
+    network = job.detections == "network"
+    folder = job.root / "det_02_rrc" if job.detections == "rrc" else Path(job.detections)
+    found = [] if network else read_detections(folder, sequence.name, len(sequence))
+
+    def given(frame: int, image: NDArray[np.uint8]) -> Pending:
+        return Ready(Perception(found[frame], None, {"detector": 0}, ()))
+
+    def make(seed: int, config: FrontEndConfig) -> list[Measurements]:
+        perceive: Callable[[int, NDArray[np.uint8]], Pending] = given
+        if network:
+            lossless = msgspec.structs.replace(job.configuration.source, rate="max")
+            configuration = msgspec.structs.replace(job.configuration, source=lossless)
+            perceive = stack.enter_context(Inference(configuration)).networks.start
+        odometry = _odometry(job, sequence, frames, np.random.default_rng([seed, *sequence.name.encode()]))
+
+        def counted(frame: int, image: NDArray[np.uint8]) -> Pending:
+            frame_made()
+            return perceive(frame, image)
+
+        return make_log(sequence, frames, odometry, counted, image_of if looks else None, config, speeds)
+
+    return make
+
+
+def _odometry(job: Job, sequence: TrackingSequence, frames: range, rng: np.random.Generator) -> EgoMotion | None:
+    """None: the front end's own, from the images."""
+    truth = sequence.camera_poses
+    if job.odometry == "images":
+        return None
+    if job.odometry in ("simulate", "truth"):
+        config = SimulationConfig() if job.odometry == "simulate" else EXACT
+        return SimulatedOdometry(sequence.camera, truth, config, rng)
+    path = Path(job.odometry)
+    if path.is_dir():
+        path = path / f"{sequence.name}.txt"
+    try:
+        rows = as_poses(read_kitti(path))
+    except ValueError as error:
+        raise DatasetError(str(error)) from None
+    if len(rows) == len(frames) < len(sequence):  # of the frames asked for alone
+        rows = np.concatenate([np.tile(rows[:1], (frames.start, 1, 1)), rows])
+    if len(rows) < frames.stop:
+        raise DatasetError(f"{path}: {len(rows)} poses for {len(frames)} frames of sequence {sequence.name}")
+    poses = inverse(sequence.T_cam0_camera) @ rows @ sequence.T_cam0_camera
+    return SimulatedOdometry(sequence.camera, poses, EXACT, rng, true_poses=truth)
+
+
+def _one_vehicle(log: Sequence[Measurements]) -> list[Measurements]:
+    """The log with the vehicle alone that is seen most."""
+    seen = [edge.vehicle for m in log for edge in m.cv]
+    kept = max(sorted(set(seen)), key=seen.count, default=-1)
+    return [
+        msgspec.structs.replace(
+            m, cv=tuple(e for e in m.cv if e.vehicle == kept), vv=tuple(e for e in m.vv if e.vehicle == kept)
+        )
+        for m in log
+    ]
+
+
+def _estimates(log: Sequence[Measurements], job: Job) -> list[Estimate]:
+    """What a planner was told in each frame."""
+    graph = PoseGraph(job.configuration.slam.graph, job.configuration.slam.weights)
+    return [graph.optimise(measurements) for measurements in log]
+
+
+def _updates_ms(log: Sequence[Measurements], job: Job) -> NDArray[np.float64]:
+    slam, took = job.configuration.slam, []
+    graph = PoseGraph(slam.graph, slam.weights)
+    for measurements in log:
+        start = time.perf_counter()
+        graph.optimise(measurements)
+        took.append((time.perf_counter() - start) * 1e3)
+    return np.array(took)

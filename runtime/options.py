@@ -1,0 +1,58 @@
+"""The configuration that a command line asks for: its file, with its options on top."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from birdslam.runtime.configuration import NO_MODEL, Configuration, ConfigurationError, load, parse_setting
+from birdslam.runtime.models import store as model_store
+
+
+def configuration_of(options: argparse.Namespace) -> Configuration:
+    """The configuration file with the options of the command line on top. Raises ConfigurationError."""
+    overrides, named = overrides_of(options)
+    return load(options.config, overrides, named)
+
+
+def overrides_of(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
+    """What the options of the command line say: keys with their values, and names of models."""
+    overrides: dict[str, Any] = dict(parse_setting(text) for text in options.set)
+    named: list[str] = []
+    for text in options.model:
+        role, equals, path = text.partition("=")
+        if text == NO_MODEL:
+            overrides["models.shipped"] = False
+        elif not equals and model_store.is_name(text):
+            named.append(text)
+        elif role and equals and path:
+            overrides[f"models.{role}.path"] = path
+        else:
+            raise ConfigurationError(f"--model {text}: expected ROLE=PATH, or the name of a model")
+    keys = {"source": "source.uri", "rate": "source.rate", "stride": "source.stride", "speed": "source.speed"}
+    keys |= {"other_odometry": "source.odometry"}
+    keys |= {"record": "recording.file", "record_images": "recording.images"}
+    keys |= {"topic": "source.topics.image", "camera_info_topic": "source.topics.camera_info"}
+    keys |= {"speed_topic": "source.topics.speed", "truth_topic": "source.topics.truth"}
+    keys |= {"smooth": "results.smooth", "video": "results.video"}
+    for name in ("camera", "vehicle", "output", *keys):
+        value = getattr(options, name, None)
+        if value is not None:
+            overrides[keys.get(name, name)] = _number(value) if name == "rate" else value
+    return overrides, named
+
+
+def speeds_of(configuration: Configuration, drives: int) -> Path:
+    """The car's own speed in so many drives: a file of one, or a directory. Raises ConfigurationError."""
+    path = Path(configuration.source.speed).expanduser()
+    if drives > 1 and not path.is_dir():
+        raise ConfigurationError(f"{path}: is the speed of one drive: for {drives} give a directory of their NAME.txt")
+    return path
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

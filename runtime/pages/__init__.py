@@ -1,0 +1,1 @@
+"""Pages that commands write: `birdslam interface`, `birdslam configuration`."""

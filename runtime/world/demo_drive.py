@@ -1,0 +1,87 @@
+"""`birdslam demo-drive make`: render the shipped drive and write it down."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.runtime.progress import shown
+from birdslam.sources.recording import DatasetError
+from birdslam.sources.shipped_drive import COLUMNS, LABELS, Floats, write_drive
+
+if TYPE_CHECKING:
+    from birdslam.world.truth import WorldFrame
+
+SAMPLES = 2  # of a pixel, across and down
+CAMERA_KEYS = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "height_m", "pitch_rad", "roll_rad")
+
+
+def make(options: argparse.Namespace) -> int:
+    """Renders every frame; progress on standard error. Raises DatasetError where the renderer is missing."""
+    try:
+        from birdslam.world.demo_world import CAMERA, FRAMES, RATE_HZ, demo_scenario
+        from birdslam.world.scenario import drive
+    except ImportError as error:
+        raise DatasetError(f"rendering needs the extra `train` (pip install 'birdslam[train]'): {error}") from None
+    if not 1 <= options.quality <= 100:
+        raise DatasetError(f"--quality {options.quality}: expected 1 to 100")
+    count = FRAMES if options.frames is None else options.frames
+    if not 1 <= count <= FRAMES:
+        raise DatasetError(f"--frames {count}: expected 1 to {FRAMES}")
+    frames = shown(drive(demo_scenario(), CAMERA, count, RATE_HZ, SAMPLES), "demo drive", count)
+    keep(options.output, frames, CAMERA, RATE_HZ, options.quality)
+    size = (options.output / "drive.npz").stat().st_size
+    print(f"{count} frames, {size / 1e6:.1f} MB in {options.output}")
+    return 0
+
+
+def keep(directory: Path, frames: Iterable[WorldFrame], camera: Camera, rate_hz: float, quality: int) -> None:
+    """Write a rendered drive so that `DemoRecording` reads it; `quality` is WebP's, 1 to 100."""
+    images: list[bytes] = []
+    poses: list[Floats] = []
+    ground: list[tuple[float, float, float]] = []
+    bodies: list[tuple[float, ...]] = []
+    for frame in frames:
+        images.append(_webp(frame.image, quality))
+        poses.append(frame.T_world_cam)
+        ground.append((frame.camera.height_m, frame.camera.pitch_rad, frame.camera.roll_rad))
+        bodies.extend(_rows(frame))
+    from_first = (np.linalg.inv(poses[0]) @ np.array(poses)).astype(np.float64)
+    write_drive(
+        directory, images, rate_hz, from_first[:, :3], np.array(ground), np.array(bodies).reshape(-1, len(COLUMNS))
+    )
+    (directory / "camera.toml").write_text(_toml(camera), encoding="utf-8")
+
+
+def _webp(image: NDArray[np.uint8], quality: int) -> bytes:
+    ok, data = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    if not ok:
+        raise DatasetError("this OpenCV can't write WebP")
+    return data.tobytes()
+
+
+def _rows(frame: WorldFrame) -> Iterator[tuple[float, ...]]:
+    """One of COLUMNS for each body in the frame; velocities turned to ego's axes."""
+    forward = frame.T_world_cam[:2, 2] / np.linalg.norm(frame.T_world_cam[:2, 2])
+    for body in frame.objects:
+        along = float(forward @ body.velocity_mps)
+        left = float(forward[0] * body.velocity_mps[1] - forward[1] * body.velocity_mps[0])
+        T = body.T_ego_object
+        yield (
+            frame.frame_id, body.object_id, LABELS.index(body.label), T.x_m, T.y_m, T.yaw_rad,
+            body.length_m, body.width_m, body.height_m, along, left, body.visible, body.truncated,
+            *body.box_px.tolist(),
+        )  # fmt: skip
+
+
+def _toml(camera: Camera) -> str:
+    lines = ["# The camera of a rendered drive; its springs move it about this height, pitch and roll"]
+    lines += [f"{name} = {getattr(camera, name)}" for name in CAMERA_KEYS]
+    return "\n".join(lines) + "\n"
