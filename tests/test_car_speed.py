@@ -18,8 +18,8 @@ from birdslam.odometry.odometry import Odometry, OdometryConfig
 from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import CAR_DELAY, CAR_FACTOR, STATES, RoadFilter, RoadScaleConfig
-from birdslam.odometry.speed.readings import CarSpeed, CarSpeedConfig
-from birdslam.odometry.speed.scale import CarScale
+from birdslam.odometry.speed.readings import CarSpeedConfig, SpeedReadings
+from birdslam.odometry.speed.scale import SpeedScale
 from birdslam.types import INVALIDATING, NS_PER_S, EgoEdge, Measurements, SpeedReading, SpeedSource, Status
 
 Speed = Callable[[float], float]
@@ -34,16 +34,16 @@ def readings_of(speed: Speed, to_s: float, factor: float = 1.0, delay_s: float =
     return [reading(t, factor * speed(t - delay_s)) for t in np.arange(0.0, to_s, 0.02)]
 
 
-def heard(readings: Iterable[SpeedReading], now_s: float) -> CarSpeed:
-    speed = CarSpeed(CONFIG)
-    speed.hear(readings, round(now_s * NS_PER_S))
+def heard(readings: Iterable[SpeedReading], now_s: float) -> SpeedReadings:
+    speed = SpeedReadings(CONFIG)
+    speed.add_readings(readings, round(now_s * NS_PER_S))
     return speed
 
 
-def way(speed: CarSpeed, from_s: float, to_s: float, delay_s: float = 0.0) -> tuple[float, float]:
-    found = speed.way(round(from_s * NS_PER_S), round(to_s * NS_PER_S), delay_s)
+def way(speed: SpeedReadings, from_s: float, to_s: float, delay_s: float = 0.0) -> tuple[float, float]:
+    found = speed.integrate(round(from_s * NS_PER_S), round(to_s * NS_PER_S), delay_s)
     assert found is not None
-    return found.way_m, found.var_m2
+    return found.distance_m, found.var_m2
 
 
 # --- readings ---
@@ -83,7 +83,7 @@ def test_a_way_is_the_speeds_integral(speed_mps: float, acceleration: float, del
 def test_a_way_is_the_less_sure_the_older_the_last_reading() -> None:
     variances = [way(heard(readings_of(lambda t: 10.0, 2.0 - late), 2.0), 1.5, 2.0)[1] for late in (0.0, 0.1, 0.2, 0.4)]
     assert all(np.diff(variances) > 0.0)
-    assert heard(readings_of(lambda t: 10.0, 1.0), 2.5).way(2 * NS_PER_S, 5 * NS_PER_S // 2, 0.0) is None
+    assert heard(readings_of(lambda t: 10.0, 1.0), 2.5).integrate(2 * NS_PER_S, 5 * NS_PER_S // 2, 0.0) is None
 
 
 def test_noise_that_the_readings_do_not_own_up_to_is_seen() -> None:
@@ -98,7 +98,7 @@ def test_old_readings_are_told() -> None:
     assert heard(readings, 1.1).status == []
     assert heard(readings, 1.0 + CONFIG.late_s + 0.1).status == [Status.CAR_SPEED_LATE]
     assert heard(readings, 1.0 + CONFIG.missing_s + 0.1).status == [Status.CAR_SPEED_MISSING]
-    assert CarSpeed(CONFIG).status == []  # of a car that never told any
+    assert SpeedReadings(CONFIG).status == []  # of a car that never told any
 
 
 def test_a_jump_is_refused_until_it_lasts() -> None:
@@ -122,8 +122,8 @@ class World:
     def __init__(self, unit_m: float = 1.0) -> None:
         self.config = RoadScaleConfig()
         self.filter = RoadFilter(CAMERA, self.config)
-        self.filter.forget_scale(1.0)
-        self.car = CarScale(self.config, self.filter)
+        self.filter.reset_scale(1.0)
+        self.car = SpeedScale(self.config, self.filter)
         self.unit_m = unit_m  # of the odometry's unit of length
         self.trembles = np.zeros(1)  # by which one image after the other sees its way too long, as a fraction
         self.error = 0.0  # of the last way, as a fraction
@@ -136,14 +136,16 @@ class World:
         for k in range(round((span_s[1] - span_s[0]) * hz)):
             a, b = span_s[0] + k / hz, span_s[0] + (k + 1) / hz
             now_ns = round(b * NS_PER_S)
-            self.car.hear([r for r in readings if now_ns - NS_PER_S < r.t_ns <= now_ns], now_ns)
+            self.car.add_readings([r for r in readings if now_ns - NS_PER_S < r.t_ns <= now_ns], now_ns)
             true_m = float(np.trapezoid([speed(t) for t in np.linspace(a, b, 21)], dx=(b - a) / 20))
             way = true_m / self.unit_m * (1.0 + float(self.trembles[k % len(self.trembles)]))
             self.filter.predict(np.eye(3), way)
             if road:
                 off = np.array([math.log(self.unit_m), *self.filter.x[1:4]])
-                way *= self._rescale(self.filter.accept(RoadFit(off, np.diag([1e-6, 1e-4, 1e-4, 1e-6]), 0.9, 1000)))
-            factor = self.car.follow(round(a * NS_PER_S), now_ns, way, way, road)
+                way *= self._rescale(
+                    self.filter.update_alignment(RoadFit(off, np.diag([1e-6, 1e-4, 1e-4, 1e-6]), 0.9, 1000))
+                )
+            factor = self.car.update(round(a * NS_PER_S), now_ns, way, way, road)
             metres = way * self._rescale(factor) * self.car.motion_factor
             self.error = metres / true_m - 1.0 if true_m > 0.0 else self.error
             self.errors.append(self.error)
@@ -255,7 +257,7 @@ def test_a_number_that_stops_changing_is_no_reading_any_more() -> None:
     assert Status.CAR_SPEED_FROZEN in speed.status
     assert speed.newest_ns is not None
     assert speed.newest_ns < 1.55 * NS_PER_S
-    speed.hear([reading(3.52, 10.2, 0.2)], round(3.52 * NS_PER_S))
+    speed.add_readings([reading(3.52, 10.2, 0.2)], round(3.52 * NS_PER_S))
     assert speed.status == []
     assert heard(readings_of(lambda t: 10.0, 3.5), 3.5).status == []  # of a car that only ever said one number
     stopped = readings_of(lambda t: max(0.0, 3.0 - 3.0 * t), 3.5)
@@ -266,12 +268,12 @@ def test_a_road_that_speaks_thrice_against_the_readings_bars_them() -> None:
     world = World()
     world.drive(lambda t: 12.0, readings_of(lambda t: 18.0, 6.0), (1.0, 5.0), road=False)
     for _ in range(2):
-        world.car.contradict(-0.4)
+        world.car.road_contradicts(-0.4)
     assert world.car.trusted
-    world.car.contradict(-0.42)
+    world.car.road_contradicts(-0.42)
     assert not world.car.trusted
     assert Status.CAR_SPEED_IMPLAUSIBLE in world.car.status()
-    assert world.car.step(4 * NS_PER_S, 5 * NS_PER_S) is None
+    assert world.car.motion(4 * NS_PER_S, 5 * NS_PER_S) is None
 
 
 # --- the odometry ---

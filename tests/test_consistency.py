@@ -228,7 +228,7 @@ def scale_nees(seed: int, outliers: float, comparisons: int) -> float:
     config = RoadScaleConfig()
     filter_ = RoadFilter(CAMERA, config)
     start = 0.1
-    filter_.forget_scale(start)
+    filter_.reset_scale(start)
     log_scale = start * rng.standard_normal()  # of true lengths over visual ones
     mount = config.sigma_mount_rad * rng.standard_normal(2)
     tilt = mount + config.sigma_bounce_rad * rng.standard_normal(2)
@@ -254,9 +254,9 @@ def scale_nees(seed: int, outliers: float, comparisons: int) -> float:
             state[0] += rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.0)  # the bonnet, a car's shadow
         fit = RoadFit(state=state, cov=cov, correlation=0.9, samples=1000)
         if filter_.innovation(fit)[2] < config.max_innovation_sigma:
-            log_scale -= np.log(filter_.accept(fit))
-        log_scale -= filter_.owed_log
-        filter_.owed_log = 0.0
+            log_scale -= np.log(filter_.update_alignment(fit))
+        log_scale -= filter_.pending_log
+        filter_.pending_log = 0.0
     return float(log_scale**2 / filter_.cov[0, 0])
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.corners.keyframes import KeyframeConfig, KeyframeWindow
-from birdslam.odometry.corners.relative_pose import locate
-from birdslam.odometry.corners.sliding_window import common
+from birdslam.odometry.corners.resection import resect
+from birdslam.odometry.corners.sliding_window import match_ids
 from birdslam.odometry.median import quantile
 from birdslam.odometry.road.kalman_filter import RoadScaleConfig
 
@@ -46,7 +46,7 @@ def unit_of_length(seed: int, way_m: float, sigma_px: float) -> Floats:
             continue
         pose = poses[-1] @ step
         if frame > 1:
-            pose, _, _ = locate(window, poses[-1] @ poses[-2].between(poses[-1]), ids, xy)
+            pose, _, _ = resect(window, poses[-1] @ poses[-2].between(poses[-1]), ids, xy)
         window.extend(frame, pose, ids, xy)
         poses.append(window.refine())
     ways_m = [float(np.linalg.norm(b.p - a.p)) for a, b in zip(poses[9::3], poses[12::3], strict=False)]
@@ -66,7 +66,7 @@ def test_the_unit_of_length_walks_no_faster_than_the_road_filter_is_told() -> No
 def test_common_ids_stand_where_numpy_finds_them(a: set[int], b: set[int]) -> None:
     first, second = (np.array(sorted(ids), dtype=np.int64) for ids in (a, b))
     _, at_first, at_second = np.intersect1d(first, second, return_indices=True)
-    found = common(first, second)
+    found = match_ids(first, second)
     assert found[0].tolist() == at_first.tolist()
     assert found[1].tolist() == at_second.tolist()
 

@@ -17,7 +17,7 @@ from birdslam.odometry.corners.sliding_window import SlidingWindow
 from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.odometry import Odometry, OdometryConfig
 from birdslam.odometry.road.kalman_filter import RoadScaleConfig
-from birdslam.odometry.road.moving_median import MedianScale
+from birdslam.odometry.road.moving_median import MovingMedianScale
 from birdslam.odometry.road.scale import RoadScale
 from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.types import Status
@@ -43,7 +43,7 @@ class Street:
         self._points = level @ AXES_EGO_CAM.T @ CAMERA.ground.R_ego_cam
         self._ahead = CAMERA.ground.R_ego_cam.T @ np.array([1.0, 0.0, 0.0])  # the car's own, in camera axes
 
-    def drive(self, scale: MedianScale, wrong: float = 1.0) -> tuple[Pose, float]:
+    def drive(self, scale: MovingMedianScale, wrong: float = 1.0) -> tuple[Pose, float]:
         """One frame on: the step in the window's unit before, and the factor on it."""
         self.frame += 1
         window, step = self.window, Pose(np.eye(3), self._ahead * STEP_M / self.unit_m)
@@ -68,7 +68,7 @@ class Street:
 
 @pytest.mark.parametrize("unit_m", [0.3, 1.0, 5.0])
 def test_without_noise_the_scale_is_found_exactly_and_kept(unit_m: float) -> None:
-    street, scale = Street(unit_m), MedianScale(CAMERA, CONFIG)
+    street, scale = Street(unit_m), MovingMedianScale(CAMERA, CONFIG)
     factors = [street.drive(scale)[1] for _ in range(12)]
     assert factors[1] == pytest.approx(unit_m, rel=1e-6)
     assert factors[2:] == pytest.approx([1.0] * 10, rel=1e-6)
@@ -79,7 +79,7 @@ def test_without_noise_the_scale_is_found_exactly_and_kept(unit_m: float) -> Non
 
 @pytest.mark.parametrize("wrong", [0.2, 5.0])
 def test_a_wrong_scale_of_one_frame_does_not_move_the_median(wrong: float) -> None:
-    street, scale = Street(2.0), MedianScale(CAMERA, CONFIG)
+    street, scale = Street(2.0), MovingMedianScale(CAMERA, CONFIG)
     for _ in range(6):
         street.drive(scale)
     assert scale.frame_scale(_view(street)) == pytest.approx(1.0, rel=1e-6)
@@ -96,7 +96,7 @@ def _view(street: Street) -> RoadView:
 
 def scales(given: Sequence[float], frames: int) -> list[float]:
     """What the moving median makes of the scales of a unit that is never rescaled."""
-    scale, out = MedianScale(CAMERA, msgspec.structs.replace(CONFIG, median_frames=frames)), []
+    scale, out = MovingMedianScale(CAMERA, msgspec.structs.replace(CONFIG, median_frames=frames)), []
     total, street = 1.0, Street(1.0)
     street.drive(scale)
     for wanted in given:
@@ -113,7 +113,7 @@ def test_it_is_the_median_of_the_last_frames() -> None:
 
 
 def test_a_hidden_road_carries_the_scale_and_a_new_window_forgets_it() -> None:
-    street, scale = Street(2.0), MedianScale(CAMERA, CONFIG)
+    street, scale = Street(2.0), MovingMedianScale(CAMERA, CONFIG)
     assert scale.status() == [Status.SCALE_CARRIED, Status.SCALE_INVALID]
     for _ in range(8):
         street.drive(scale)
@@ -132,7 +132,7 @@ def test_the_key_chooses_the_strategy_and_is_validated(tmp_path: Path) -> None:
     key = "slam.frontend.odometry.road.mode"
     assert isinstance(Odometry(CAMERA)._scale, RoadScale)
     paper = load(None, {key: "paper"}).slam.frontend.odometry
-    assert isinstance(Odometry(CAMERA, paper)._scale, MedianScale)
+    assert isinstance(Odometry(CAMERA, paper)._scale, MovingMedianScale)
     with pytest.raises(ConfigurationError, match=key):
         load(None, {key: "median"})
     with pytest.raises(msgspec.ValidationError, match="median_frames"):

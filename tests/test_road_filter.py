@@ -74,7 +74,7 @@ def test_the_mount_is_not_what_the_filter_told_itself() -> None:
     blind = RoadFit(np.array([0.0, 0.3, 0.3, 0.0]), np.diag([1e-4, 1e4, 1e4, 1e4]), 0.9, 1000)
     for _ in range(200):
         filter_.predict(np.eye(3), 1.0)
-        filter_.accept(blind)
+        filter_.update_alignment(blind)
     assert np.abs(filter_.x[4:]).max() < 1e-3
     assert filter_.cov[4, 4] >= config.sigma_mount_rad**2
 
@@ -87,7 +87,7 @@ def test_corners_that_err_alike_for_metres_do_not_make_a_tilt_sure() -> None:
     for sigma_across_m, filter_ in filters.items():
         for _ in range(3):
             filter_.predict(np.eye(3), 1.0)
-            filter_.travel(wrong, 1.0, sigma_across_m)
+            filter_.update_travel(wrong, 1.0, sigma_across_m)
     off_rad = {sigma_m: abs(float(filter_.tilt[0] - before[0])) for sigma_m, filter_ in filters.items()}
     assert off_rad[0.0] > 0.01  # corners that are sure are followed
     assert off_rad[0.02] < 0.7 * off_rad[0.0]

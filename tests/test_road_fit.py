@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.odometry.road.fit import MOTION, ROAD, Slopes, alike, fit_alone
+from birdslam.odometry.road.fit import MOTION, ROAD, Gradients, fit_without_prior, shared_gradient
 
 Floats = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ def pixels(rng: np.random.Generator) -> NDArray[np.int64]:
 
 def images(
     rng: np.random.Generator, noise: NDArray[np.float64], sigma: float
-) -> tuple[NDArray[np.int64], Slopes, Slopes, Floats]:
+) -> tuple[NDArray[np.int64], Gradients, Gradients, Floats]:
     """Samples of a road that lies by TRUE elsewhere than at the state 0: both images' slopes, and the residual.
 
     `noise` (N,) is that of either image's slopes where what they share has 1.
@@ -32,28 +32,30 @@ def images(
     px, shared = pixels(rng), rng.normal(size=(2, N))
     geometry = rng.normal(size=(ROAD + MOTION, N)), rng.normal(size=(ROAD + MOTION, N))
 
-    def seen(slopes: Floats) -> Slopes:
+    def seen(slopes: Floats) -> Gradients:
         by_state = SCALES[:, None] * (geometry[0] * slopes[0] + geometry[1] * slopes[1])
-        return Slopes(slopes[0], slopes[1], np.concatenate([by_state, np.ones((2, N)) * [[-1.0], [-90.0]]]))
+        return Gradients(slopes[0], slopes[1], np.concatenate([by_state, np.ones((2, N)) * [[-1.0], [-90.0]]]))
 
     road = seen(shared)
     residual = -(TRUE @ road.derivative[:ROAD]) + rng.normal(0.0, sigma, N)
-    there, here = (seen(shared + noise * rng.normal(size=(2, N))) for _ in range(2))
-    return px, there, here, residual
+    past, present = (seen(shared + noise * rng.normal(size=(2, N))) for _ in range(2))
+    return px, past, present, residual
 
 
 def fitted(seed: int, noise: NDArray[np.float64], sigma: float = 0.2) -> tuple[Floats, Floats]:
-    px, there, here, residual = images(np.random.default_rng(seed), noise, sigma)
+    px, past, present, residual = images(np.random.default_rng(seed), noise, sigma)
     weights = np.full(N, sigma**-2.0)
-    return fit_alone(np.zeros(ROAD + MOTION), px, there, here, residual, weights, np.eye(MOTION) * 1e8)
+    return fit_without_prior(np.zeros(ROAD + MOTION), px, past, present, residual, weights, np.eye(MOTION) * 1e8)
 
 
 @given(seed=st.integers(0, 500))
 @settings(max_examples=30, deadline=None)
 def test_slopes_that_both_images_have_give_the_least_squares(seed: int) -> None:
-    px, there, _, residual = images(np.random.default_rng(seed), np.zeros(N), 0.2)
-    state, cov = fit_alone(np.zeros(ROAD + MOTION), px, there, there, residual, np.full(N, 25.0), np.eye(MOTION) * 1e8)
-    J = there.derivative[[*range(ROAD), -1]].T
+    px, past, _, residual = images(np.random.default_rng(seed), np.zeros(N), 0.2)
+    state, cov = fit_without_prior(
+        np.zeros(ROAD + MOTION), px, past, past, residual, np.full(N, 25.0), np.eye(MOTION) * 1e8
+    )
+    J = past.derivative[[*range(ROAD), -1]].T
     J[:, -1] = 1.0
     expected = np.linalg.lstsq(J, -residual, rcond=None)[0][:ROAD]
     sigma = np.sqrt(np.diag(cov))
@@ -65,8 +67,8 @@ def test_noise_in_the_slopes_does_not_pull_the_length_towards_the_guess() -> Non
     """Least squares by noisy slopes finds half of it; with as many noisy pixels as good ones nothing is lost."""
     everywhere = np.array([fitted(seed, np.ones(N))[0] for seed in range(30)])
     assert np.mean(everywhere[:, 0]) == pytest.approx(TRUE[0], rel=0.1)
-    _, there, _, residual = images(np.random.default_rng(0), np.ones(N), 0.2)
-    J = there.derivative[:ROAD].T
+    _, past, _, residual = images(np.random.default_rng(0), np.ones(N), 0.2)
+    J = past.derivative[:ROAD].T
     assert np.linalg.lstsq(J, -residual, rcond=None)[0][0] < 0.7 * TRUE[0]
 
 
@@ -82,29 +84,29 @@ def test_a_fit_errs_by_as_much_as_it_says(noise: float) -> None:
 
 def test_grain_that_only_one_image_has_says_nothing() -> None:
     rng = np.random.default_rng(1)
-    px, there, _, residual = images(rng, np.zeros(N), 0.2)
+    px, past, _, residual = images(rng, np.zeros(N), 0.2)
     _, other, _, _ = images(rng, np.zeros(N), 0.2)
-    np.testing.assert_allclose(alike(px, there, there), 1.0)
-    assert np.mean(alike(px, there, other)) < 0.2
+    np.testing.assert_allclose(shared_gradient(px, past, past), 1.0)
+    assert np.mean(shared_gradient(px, past, other)) < 0.2
     weights, motion_info = np.full(N, 25.0), np.eye(MOTION) * 1e8
     sure, vague = (
-        fit_alone(np.zeros(ROAD + MOTION), px, there, here, residual, weights, motion_info)[1]
-        for here in (there, other)
+        fit_without_prior(np.zeros(ROAD + MOTION), px, past, present, residual, weights, motion_info)[1]
+        for present in (past, other)
     )
     assert (np.diag(vague) > 9.0 * np.diag(sure)).all()
 
 
 def test_what_is_painted_counts_beside_grain_that_was_left_out() -> None:
     """Pixels on the left have slopes that both images share, those on the right have noise alone."""
-    px, there, here, _ = images(np.random.default_rng(2), np.zeros(N), 0.2)
+    px, past, present, _ = images(np.random.default_rng(2), np.zeros(N), 0.2)
     right = px[:, 0] >= 320
     rng = np.random.default_rng(3)
-    there, here = (
-        Slopes(
+    past, present = (
+        Gradients(
             np.where(right, rng.normal(size=N), image.x), np.where(right, rng.normal(size=N), image.y), image.derivative
         )
-        for image in (there, here)
+        for image in (past, present)
     )
-    share = alike(px, there, here)
+    share = shared_gradient(px, past, present)
     assert share[~right].min() == pytest.approx(1.0)
     assert share[right].mean() < 0.3

@@ -32,12 +32,11 @@ from birdslam.calibration.height_check import (
     solve_mounting,
 )
 from birdslam.frontend import FrontEnd, FrontEndConfig, Pending
-from birdslam.geometry.camera import Camera
+from birdslam.geometry.camera import Camera, plane_normal
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
-from birdslam.odometry.road.alignment import plane_normal
 from birdslam.odometry.road.fit import RoadFit
-from birdslam.odometry.road.vanishing_point import LinesDirection
+from birdslam.odometry.road.vanishing_point import VanishingPoint
 from birdslam.types import Frame, Status
 from birdslam.vehicles.camera_height import BoxHeight, measure_heights
 
@@ -117,7 +116,7 @@ class _Seen:
 
     fits: list[tuple[RoadFit, float]] = field(default_factory=list)  # and the way since the one before
     directions: list[tuple[Floats, float]] = field(default_factory=list)  # of straight travel, and its length
-    lines: list[LinesDirection] = field(default_factory=list)
+    lines: list[VanishingPoint] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     boxes: list[BoxHeight] = field(default_factory=list)
     times_ns: dict[int, int] = field(default_factory=dict)
@@ -193,8 +192,8 @@ def _watch(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: Calib
         if odometry.road_fit is not None:
             seen.fits.append((odometry.road_fit, since_m))
             since_m = 0.0
-        if odometry.road_lines is not None:
-            seen.lines.append(odometry.road_lines)
+        if odometry.vanishing_point is not None:
+            seen.lines.append(odometry.vanishing_point)
         if Status.SCALE_CARRIED in motion.status:
             continue
         seen.steps.append((motion.from_frame, motion.to_frame, length))

@@ -46,6 +46,23 @@ def _rotation(pitch_rad: float, roll_rad: float) -> NDArray[np.float64]:
     return out
 
 
+def plane_normal(
+    pitch_rad: float, roll_rad: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """The road's upward unit normal in camera axes and its derivatives by pitch and by roll, (3,) each."""
+    cp, sp, cr, sr = np.cos(pitch_rad), np.sin(pitch_rad), np.cos(roll_rad), np.sin(roll_rad)
+    return (
+        np.array([-cp * sr, -cp * cr, -sp]),
+        np.array([sp * sr, sp * cr, -cp]),
+        np.array([-cp * cr, cp * sr, 0.0]),
+    )
+
+
+def plane_tilt(normal: NDArray[np.float64]) -> tuple[float, float]:
+    """(pitch_rad, roll_rad) of a unit normal in camera axes: the inverse of `plane_normal`."""
+    return float(-np.arcsin(np.clip(normal[2], -1.0, 1.0))), float(np.arctan2(-normal[0], -normal[1]))
+
+
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A pinhole camera over a road, as a camera file (TOML) states it.
 

@@ -1,6 +1,6 @@
 """Ego-motion from the images of one forward camera, in metres: the CC edges of the pose graph.
 
-Read `odometry` first. `corners` follows features from image to image and adjusts a window of keyframes: the relative
-pose. `road` compares images of the road, whose camera height is known: its metres. `speed` is what the car itself
-says, and what holds where images show nothing; `obstruction` masks what stands before the camera.
+Read `odometry` first. `corners` tracks features and adjusts a window of keyframes: the relative pose. `road` aligns
+images of the road, whose distance to the camera is known: the metric scale. `speed` has the car's own speed and motion
+where images show none; `obstruction` finds what is fixed to the car in front of the camera.
 """

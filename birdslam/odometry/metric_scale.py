@@ -1,7 +1,7 @@
-"""What the odometry asks of its metric scale (paper, Sec. 3.1, scale-unambiguous ego-motion initialisation).
+"""The interface of the odometry's metric scale (paper, Sec. 3.1, scale-unambiguous ego-motion initialisation).
 
-The scale comes from the known height of the camera over the road. Two strategies stand behind this interface:
-`road_scale.RoadScale`, a Kalman filter, and `moving_median.MedianScale`, the paper's moving median.
+The scale comes from the known height of the camera over the road. There are two strategies: `road.scale.RoadScale`, a
+Kalman filter, and `road.moving_median.MovingMedianScale`, the paper's moving median.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.corners.sliding_window import SlidingWindow
 from birdslam.odometry.road.fit import RoadFit
-from birdslam.odometry.road.vanishing_point import LinesDirection
-from birdslam.odometry.speed.scale import CarStep
+from birdslam.odometry.road.vanishing_point import VanishingPoint
+from birdslam.odometry.speed.scale import CarMotion
 from birdslam.types import SpeedReading, SpeedSource, Status
 
 
 @dataclass(frozen=True)
 class RoadView:
-    """What one image says of the road: its pixels, the camera's pose, and the landmarks, in the odometry's unit."""
+    """The input of the metric scale from one image, lengths in the odometry's unit."""
 
     grey: NDArray[np.uint8]  # (H, W)
     pose: Pose  # in the window's axes
     boxes_px: NDArray[np.float64]  # (N, 4) vehicles
     road_mask: NDArray[np.bool_] | None  # (H, W), may be some images old
     window: SlidingWindow  # its newest keyframe is this image
-    near_px: float = 0.0  # how far corners on the near road have moved since the last image: in no unit of length
+    flow_px: float = 0.0  # optical flow of the near road since the last image (speed/zero_velocity.py)
     interval_ns: tuple[int, int] = (0, 0)  # of the motion, by t_source_ns
-    sigma_across_m: float = 0.0  # 1-sigma of the pose by the corners: its place across the way
-    sigma_rotation_rad: float = 0.0  # ... and its rotation
+    sigma_across_m: float = 0.0  # 1-sigma of the position across the direction of travel, by the corners
+    sigma_rotation_rad: float = 0.0  # 1-sigma of the rotation, by the corners
 
 
 class MetricScale(Protocol):
     """Turns the odometry's unit of length into metres, image by image."""
 
-    fit: RoadFit | None  # what the newest image's comparison alone said, where it was accepted
-    lines: LinesDirection | None  # where the newest image's lines lead, where they were accepted
+    fit: RoadFit | None  # of the newest image's alignment without its prior, where it was accepted
+    vanishing_point: VanishingPoint | None  # of the newest image, where it was accepted
 
     @property
     def ground(self) -> GroundPlane:
@@ -62,24 +62,24 @@ class MetricScale(Protocol):
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
         """The window begins anew with this image; its unit of length is known to `sigma_rel`."""
 
-    def length_held(self, sigma_rel: float) -> None:
-        """The newest motion is the last speed, held to `sigma_rel`: the unit of length is known no better."""
+    def speed_predicted(self, sigma_rel: float) -> None:
+        """The newest motion's length comes from the velocity prior, so the unit of length is known to `sigma_rel`."""
 
-    def turned_unseen(self) -> None:
-        """The odometry lost sight of how the camera turned."""
+    def lose_tilt(self) -> None:
+        """The camera turned without being seen: its tilt is known no better than by the mount."""
 
-    def hear(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:
-        """The car's own speed, as it had come by the frame of this time."""
+    def add_readings(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:
+        """Readings of the car's own speed that had come by the frame of this time."""
 
-    def car_step(self, from_ns: int, to_ns: int) -> CarStep | None:
-        """The car's motion by its own readings; None where there are none that can be trusted."""
+    def car_motion(self, from_ns: int, to_ns: int) -> CarMotion | None:
+        """The car's motion by its own speed; None where there are no trusted readings."""
 
     @property
     def motion_factor(self) -> float:
-        """The factor on the newest motion alone, after that on all lengths: its own error, by the car's speed."""
+        """The factor on the newest motion alone, beside that on all lengths: its error by the car's own speed."""
 
     def measure_scale(self, step: Pose, view: RoadView) -> float:
-        """The factor on all lengths, about the present camera, after a motion T_prev_curr of `step`."""
+        """The factor on all lengths, about the present camera, after the motion T_prev_curr `step`."""
 
     def status(self) -> list[Status]:
         """What is wrong with the scale."""
@@ -89,4 +89,4 @@ class MetricScale(Protocol):
 
     @property
     def sources(self) -> tuple[SpeedSource, ...]:
-        """What the metres rest on."""
+        """Where the metres come from."""

@@ -1,4 +1,4 @@
-"""The record of one ego-motion: a camera's motion in space, that of its foot on the road, and its covariance."""
+"""One ego-motion: the camera's motion in space, that of its foot on the road, and its covariance."""
 
 from __future__ import annotations
 
@@ -17,14 +17,18 @@ from birdslam.types import SpeedSource, Status
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
+_MAX_SLIP = 0.25  # sideways over forwards: the camera may look 5 degrees aside, and a car drifts by as much
+_MAX_AHEAD_M = 2.5  # a bus's camera is so much farther in front of the rear axle than a passenger car's
+_SLIP_NOISE_M = 0.05  # error of the images in a near scene
+
 
 class MotionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a motion is known to: measured, standing, or coasting."""
+    """The uncertainty of a motion: measured, stationary, or coasting."""
 
     # Chosen on KITTI 00, 01, 06, tracking 0005, the raw clip and the shipped drive together, at the truth's own noise:
     # the mean NEES of one motion is 0.5 to 1.9 on each. Chosen without one of them, that one has 0.6 to 1.2, but 00 2.3
     covariance_inflation: Positive = 4.0  # of variances: tracks of neighbouring corners err together
-    # ... by night, when corners lie on the glow of lamps and in the light that travels with the car: two rendered
+    # ... by night, when corners lie on the glow of lamps and in the light that moves along with the car: two rendered
     # nights, from six images each, and KITTI 00 with its second half blackened chose between 1 and 64
     night_inflation: Positive = 8.0
     sigma_direction_rad: Positive = 0.0035  # of the direction of travel
@@ -32,14 +36,14 @@ class MotionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_floor_m: Positive = 0.001  # no motion is known better
     sigma_floor_rad: Positive = 0.0001  # no turn is known better
     sigma_turn_rel: Positive = 0.01  # of a turn
-    standing_sigma_m: Positive = 0.0005  # of a car that stands
-    standing_sigma_rad: Positive = 0.0001  # of a car that stands
+    stationary_sigma_m: Positive = 0.0005  # of a car that stands
+    stationary_sigma_rad: Positive = 0.0001  # of a car that stands
     coast_acceleration_mps2: Positive = 3.0  # 1-sigma, while nothing is measured
     coast_yaw_acceleration_radps2: Positive = 0.5  # 1-sigma, while nothing is measured
     coast_speed_mps: Positive = 0.3  # uncertainty of the last measured speed
     coast_yaw_rate_radps: Positive = 0.01  # uncertainty of the last measured yaw rate
     unknown_speed_mps: Positive = 10.0  # where none was ever measured
-    turn_fades_s: Positive = 1.0  # where the car tells its speed and no yaw rate, and images show nothing
+    yaw_rate_decay_s: Positive = 1.0  # where the car reports speed without yaw rate, and images show nothing
 
 
 class Motion(msgspec.Struct, frozen=True):
@@ -81,6 +85,16 @@ def on_plane(motion: SE2, ground: GroundPlane) -> Pose:
     return Pose(R.T @ turn @ R, R.T @ np.array([motion.x_m, motion.y_m, 0.0]))
 
 
+def violates_nonholonomic(T_prev_curr: SE2, camera_ahead_m: float) -> bool:
+    """Whether the motion of a driving car slips sideways as its wheels do not allow (nonholonomic constraint).
+
+    By night the corners on lights and noise show such motions; so does dirt on the windscreen.
+    """
+    forward_m, side_m, yaw_rad = T_prev_curr.log()
+    limit_m = _MAX_SLIP * abs(forward_m) + _MAX_AHEAD_M * abs(yaw_rad) + _SLIP_NOISE_M
+    return bool(abs(side_m - camera_ahead_m * yaw_rad) > limit_m)
+
+
 def step_cov(config: MotionConfig, info: Floats) -> Floats:
     """(6, 6) of the camera's step from its information, both of (translation, rotation) in its own axes."""
     return np.asarray(np.linalg.inv(info + np.eye(6) * 1e-3) * config.covariance_inflation, np.float64)
@@ -101,13 +115,13 @@ def measured_cov(
     return out
 
 
-def standing_cov(config: MotionConfig) -> Floats:
-    """(3, 3) of a pose that is held: small, since all images of one stop are compared with the same one."""
-    return np.diag([config.standing_sigma_m**2, config.standing_sigma_m**2, config.standing_sigma_rad**2])
+def stationary_cov(config: MotionConfig) -> Floats:
+    """(3, 3) of a zero-velocity update: small, since all images of one stop are compared with the same one."""
+    return np.diag([config.stationary_sigma_m**2, config.stationary_sigma_m**2, config.stationary_sigma_rad**2])
 
 
 def car_cov(config: MotionConfig, motion: SE2, sigma_m: float, scale_sigma_rel: float, yaw_sigma_rad: float) -> Floats:
-    """(3, 3) of a motion by the car's own readings: errors of its length, of its scale, and of its turn on an arc."""
+    """(3, 3) of a motion by wheel odometry: errors of its length, of the speed's scale, of the turn along the arc."""
     xy = np.array([motion.x_m, motion.y_m, 0.0])
     floor = config.sigma_floor_m**2
     sideways = floor + (config.sigma_direction_rad * math.hypot(motion.x_m, motion.y_m)) ** 2
@@ -120,7 +134,7 @@ def car_cov(config: MotionConfig, motion: SE2, sigma_m: float, scale_sigma_rel: 
 def coasting_cov(
     config: MotionConfig, motion: SE2, dt_s: float, speed_known: bool, scale_sigma_rel: float
 ) -> Floats:  # fmt: skip
-    """(3, 3) of a motion that is the last velocity over `dt_s`: what accelerations could have changed it."""
+    """(3, 3) of the motion model's prediction over `dt_s`: how far accelerations may have changed it."""
     speed = config.coast_speed_mps if speed_known else config.unknown_speed_mps
     length = math.hypot(motion.x_m, motion.y_m)
     along = 0.5 * config.coast_acceleration_mps2 * dt_s**2 + speed * dt_s

@@ -1,4 +1,4 @@
-"""The last measured motion, as a rate: it predicts the next one, and goes on where nothing is measured."""
+"""The constant-velocity motion model: the last measured velocity predicts the next motion, and coasts without one."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from birdslam.geometry.pose import Pose, rotation_exp, rotation_log
 
 Floats = NDArray[np.float64]
 
-STILL = Pose(np.eye(3), np.zeros(3))
+NO_MOTION = Pose(np.eye(3), np.zeros(3))
 
 
-class LastMotion:
-    """Of the camera, in its own axes. Unknown until the first motion was measured."""
+class MotionModel:
+    """State: the camera's velocity and yaw rate in its own axes; unknown until the first motion was measured."""
 
     def __init__(self) -> None:
         self._rate: tuple[Floats, Floats] | None = None  # (3,) m/s and (3,) rad/s
@@ -29,17 +29,17 @@ class LastMotion:
         """0 where none was ever measured."""
         return 0.0 if self._rate is None else float(np.linalg.norm(self._rate[0]))
 
-    def measured(self, step: Pose, dt_s: float) -> None:
-        """T_prev_curr of a motion that took `dt_s`."""
+    def update(self, step: Pose, dt_s: float) -> None:
+        """Takes T_prev_curr of a motion over `dt_s`."""
         self._rate, self.interval_s = (step.p / dt_s, rotation_log(step.R) / dt_s), dt_s
 
-    def stood(self) -> None:
-        """The camera stands."""
+    def stop(self) -> None:
+        """Zero velocity."""
         self._rate = np.zeros(3), np.zeros(3)
 
-    def over(self, dt_s: float) -> Pose:
-        """T_prev_curr at the same rate; no motion where none was ever measured."""
+    def predict(self, dt_s: float) -> Pose:
+        """T_prev_curr over `dt_s` at constant velocity; no motion where none was ever measured."""
         if self._rate is None:
-            return STILL
+            return NO_MOTION
         linear_mps, angular_radps = self._rate
         return Pose(rotation_exp(angular_radps * dt_s), linear_mps * dt_s)

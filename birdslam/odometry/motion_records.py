@@ -1,7 +1,8 @@
-"""The record of each motion: measured, standing, coasting, or by the car's own readings alone; with what is wrong."""
+"""The record of each motion: measured, stationary, predicted, or by wheel odometry alone; with what is wrong."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,15 +14,15 @@ from birdslam.odometry.metric_scale import MetricScale
 from birdslam.odometry.motion import (
     Motion,
     MotionConfig,
+    car_cov,
     coasting_cov,
     measured_cov,
     on_plane,
     planar,
-    standing_cov,
+    stationary_cov,
 )
-from birdslam.odometry.motion_model import STILL, LastMotion
-from birdslam.odometry.speed.dead_reckoning import reckoned
-from birdslam.odometry.speed.scale import CarStep
+from birdslam.odometry.motion_model import NO_MOTION, MotionModel
+from birdslam.odometry.speed.scale import CarMotion
 from birdslam.types import SpeedSource, Status
 
 Floats = NDArray[np.float64]
@@ -29,15 +30,15 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MotionRecords:
-    """Reads the metric scale and the last motion, and changes neither."""
+    """Reads the metric scale and the motion model, and changes neither."""
 
     config: MotionConfig
     camera_ahead_m: float  # of the rear axle
     scale: MetricScale
-    last: LastMotion
+    model: MotionModel
 
     def measured(self, frames: tuple[int, int], step: Pose, cov6: Floats, obstructed: bool) -> Motion:
-        """Of a step T_prev_curr in metres with covariance (6, 6); `obstructed`: corners on the glass were left out."""
+        """Of a step T_prev_curr in metres with covariance (6, 6); `obstructed`: fixed corners were left out."""
         T_prev_curr = planar(step, self.scale.ground)
         cov = measured_cov(self.config, cov6, T_prev_curr, self.scale.ground, self.scale.sigma_rel)
         status = self.scale.status()
@@ -46,24 +47,24 @@ class MotionRecords:
         return self._record(frames, step, T_prev_curr, cov, status)
 
     def standing(self, frames: tuple[int, int]) -> Motion:
-        """Of a pose that is held."""
-        return self._record(frames, STILL, SE2(), standing_cov(self.config), [Status.STANDSTILL])
+        """Of a zero-velocity update."""
+        return self._record(frames, NO_MOTION, SE2(), stationary_cov(self.config), [Status.STANDSTILL])
 
-    def coasted(self, frames: tuple[int, int], dt_s: float, status: list[Status], car: CarStep | None) -> Motion:
-        """The last velocity goes on, or what the car itself says of its motion."""
+    def coasted(self, frames: tuple[int, int], dt_s: float, status: list[Status], car: CarMotion | None) -> Motion:
+        """The motion model's prediction, or wheel odometry where the car reports its speed."""
         if car is not None:
-            return self._reckoned(frames, dt_s, status, car)
-        step = self.last.over(dt_s)
+            return self._by_wheels(frames, dt_s, status, car)
+        step = self.model.predict(dt_s)
         T_prev_curr = planar(step, self.scale.ground)
-        cov = coasting_cov(self.config, T_prev_curr, dt_s, self.last.known, self.scale.sigma_rel)
+        cov = coasting_cov(self.config, T_prev_curr, dt_s, self.model.known, self.scale.sigma_rel)
         return self._record(frames, step, T_prev_curr, cov, [*status, Status.ODOMETRY_COASTING])
 
-    def _reckoned(self, frames: tuple[int, int], dt_s: float, status: list[Status], car: CarStep) -> Motion:
-        """The motion by the car's own readings; without its yaw rate the last turn fades out."""
+    def _by_wheels(self, frames: tuple[int, int], dt_s: float, status: list[Status], car: CarMotion) -> Motion:
+        """The motion by the car's own speed; without its yaw rate the last turn decays."""
         if car.yaw_rad is None:
             status = [*status, Status.ODOMETRY_COASTING]
-        last_radps = planar(self.last.over(1.0), self.scale.ground).yaw_rad
-        T_prev_curr, cov = reckoned(self.config, car, last_radps, dt_s, self.camera_ahead_m)
+        last_radps = planar(self.model.predict(1.0), self.scale.ground).yaw_rad
+        T_prev_curr, cov = wheel_odometry(self.config, car, last_radps, dt_s, self.camera_ahead_m)
         step = on_plane(T_prev_curr, self.scale.ground)
         return self._record(frames, step, T_prev_curr, cov, status, car.sigma_rel)
 
@@ -76,14 +77,14 @@ class MotionRecords:
         status: list[Status],
         car_sigma_rel: float | None = None,
     ) -> Motion:
-        """`car_sigma_rel` is of the metres where they are the car's alone."""
+        """`car_sigma_rel`: 1-sigma of the metres where they are the car's alone."""
         scale, sources = self.scale, self.scale.sources
         if car_sigma_rel is not None:
             sources = (SpeedSource.CAR,)
         elif Status.ODOMETRY_COASTING in status:
             sources = (SpeedSource.CARRIED,)
         if car_sigma_rel is None and scale.unknown and Status.SCALE_INVALID not in status:
-            status = [*status, Status.SCALE_INVALID]  # standing or coasting, in metres that nobody knows
+            status = [*status, Status.SCALE_INVALID]  # stationary or coasting, in an unknown scale
         return Motion(
             from_frame=frames[0],
             to_frame=frames[1],
@@ -98,3 +99,18 @@ class MotionRecords:
             status=(*status, *scale.car_status()),
             speed_sources=sources,
         )
+
+
+def wheel_odometry(
+    config: MotionConfig, car: CarMotion, last_yaw_rate_radps: float, dt_s: float, camera_ahead_m: float
+) -> tuple[SE2, Floats]:
+    """T_prev_curr of the camera over `dt_s` and its covariance (3, 3), of a car that rolls on its rear axle.
+
+    Without the car's yaw rate the last one decays. The camera is `camera_ahead_m` in front of the rear axle.
+    """
+    yaw_rad, yaw_sigma_rad = car.yaw_rad, car.yaw_sigma_rad
+    if yaw_rad is None:
+        yaw_rad = last_yaw_rate_radps * config.yaw_rate_decay_s * (1.0 - math.exp(-dt_s / config.yaw_rate_decay_s))
+        yaw_sigma_rad = 0.5 * config.coast_yaw_acceleration_radps2 * dt_s**2 + config.coast_yaw_rate_radps * dt_s
+    T_prev_curr = SE2.exp(np.array([car.forward_m, camera_ahead_m * yaw_rad, yaw_rad]))
+    return T_prev_curr, car_cov(config, T_prev_curr, car.sigma_m, car.sigma_rel, yaw_sigma_rad)

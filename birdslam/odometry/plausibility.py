@@ -15,8 +15,8 @@ import msgspec
 from birdslam.types import EgoEdge, Measurements, SpeedSource, Status
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-_KEPT_FRAMES = 64
-_SHORTEST_S = 1e-3
+_MAX_FRAMES = 64
+_MIN_STEP_S = 1e-3
 _CLOCK_TOLERANCE = 0.1  # of a span
 
 
@@ -31,7 +31,7 @@ class PlausibilityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     steady_s: Positive = 0.5  # of source time, in which every motion is measured and possible
 
 
-class _Moved(NamedTuple):
+class _Step(NamedTuple):
     t_ns: int  # source time of its end
     dt_s: float
     x_m: float  # forwards
@@ -48,10 +48,10 @@ class PlausibilityGate:
 
     def __init__(self, config: PlausibilityConfig) -> None:
         self._config = config
-        self._times_ns: deque[tuple[int, int]] = deque(maxlen=_KEPT_FRAMES)  # (frame, source time)
-        self._moved: deque[_Moved] = deque(maxlen=_KEPT_FRAMES)  # the measured ones
-        self._turned_ns = 0  # source time of the last frame whose turn was not the car's guessed one
-        self._broken_ns: int | None = None  # source time of the last motion that was not measured or not possible
+        self._times_ns: deque[tuple[int, int]] = deque(maxlen=_MAX_FRAMES)  # (frame, source time)
+        self._steps: deque[_Step] = deque(maxlen=_MAX_FRAMES)  # the measured ones
+        self._turn_known_ns = 0  # source time of the last frame whose turn was not the car's guessed one
+        self._implausible_ns: int | None = None  # source time of the last motion that was not measured or not possible
 
     def admit(self, measurements: Measurements) -> Measurements:
         """The measurements as they are, or with MOTION_IMPLAUSIBLE, or, to begin a new epoch, without the CC edge."""
@@ -59,39 +59,39 @@ class PlausibilityGate:
         self._times_ns.append((m.frame_id, m.t_source_ns))
         coasting = Status.ODOMETRY_COASTING in m.status
         by_car = coasting and SpeedSource.CAR in m.speed_sources  # its way is measured, its turn is not
-        moved = None if cc is None or (coasting and not by_car) else self._measured(m, cc)
+        step = None if cc is None or (coasting and not by_car) else self._step_of(m, cc)
         if not by_car:
-            self._turned_ns = m.t_source_ns
-        if moved is not None:
-            self._moved.append(moved)
-            if not self._possible():
-                self._broken_ns = m.t_source_ns
-        elif self._moved and (m.t_source_ns - self._moved[-1].t_ns) * 1e-9 > self._config.blind_s:
-            self._broken_ns = m.t_source_ns
-        if self._broken_ns is None and (m.t_source_ns - self._turned_ns) * 1e-9 <= self._config.blind_s:
+            self._turn_known_ns = m.t_source_ns
+        if step is not None:
+            self._steps.append(step)
+            if not self._is_plausible():
+                self._implausible_ns = m.t_source_ns
+        elif self._steps and (m.t_source_ns - self._steps[-1].t_ns) * 1e-9 > self._config.blind_s:
+            self._implausible_ns = m.t_source_ns
+        if self._implausible_ns is None and (m.t_source_ns - self._turn_known_ns) * 1e-9 <= self._config.blind_s:
             return m
-        if self._broken_ns is None:
+        if self._implausible_ns is None:
             return msgspec.structs.replace(m, status=(*m.status, Status.MOTION_IMPLAUSIBLE))
-        if moved is None:
-            self._broken_ns = m.t_source_ns
-        if (m.t_source_ns - self._broken_ns) * 1e-9 >= self._config.steady_s:
-            self._broken_ns = None
+        if step is None:
+            self._implausible_ns = m.t_source_ns
+        if (m.t_source_ns - self._implausible_ns) * 1e-9 >= self._config.steady_s:
+            self._implausible_ns = None
             return msgspec.structs.replace(m, cc=None)
         return msgspec.structs.replace(m, status=(*m.status, Status.MOTION_IMPLAUSIBLE))
 
-    def _measured(self, m: Measurements, cc: EgoEdge) -> _Moved | None:
+    def _step_of(self, m: Measurements, cc: EgoEdge) -> _Step | None:
         """The motion of the edge; None where the frame that it starts from is too long ago."""
         times_ns = dict(self._times_ns)
         if cc.from_frame not in times_ns or cc.to_frame not in times_ns:
             return None
         dt_s = (times_ns[cc.to_frame] - times_ns[cc.from_frame]) * 1e-9
-        return _Moved(m.t_source_ns, dt_s, cc.T_from_to.x_m, m.scale_sigma_rel) if dt_s > _SHORTEST_S else None
+        return _Step(m.t_source_ns, dt_s, cc.T_from_to.x_m, m.scale_sigma_rel) if dt_s > _MIN_STEP_S else None
 
-    def _possible(self) -> bool:
+    def _is_plausible(self) -> bool:
         """Whether the speeds over the newest span_s and over the span before it are those of one car."""
-        config, moved = self._config, list(self._moved)
-        now, before = _newest(moved, config.span_s)
-        then, _ = _newest(before, config.span_s)
+        config, steps = self._config, list(self._steps)
+        now, before = _last_span(steps, config.span_s)
+        then, _ = _last_span(before, config.span_s)
         if not then:
             return True
         now_mps, then_mps = _speed_mps(now), _speed_mps(then)
@@ -101,14 +101,14 @@ class PlausibilityGate:
         return abs(now_mps - then_mps) <= config.change_mps + config.acceleration_mps2 * passed_s + scale
 
 
-def _newest(moved: list[_Moved], span_s: float) -> tuple[list[_Moved], list[_Moved]]:
+def _last_span(steps: list[_Step], span_s: float) -> tuple[list[_Step], list[_Step]]:
     """The last motions, of at least `span_s` together where there are so many, and those before them."""
-    total_s, k = 0.0, len(moved)
+    total_s, k = 0.0, len(steps)
     while k and total_s < (1.0 - _CLOCK_TOLERANCE) * span_s:
         k -= 1
-        total_s += moved[k].dt_s
-    return moved[k:], moved[:k]
+        total_s += steps[k].dt_s
+    return steps[k:], steps[:k]
 
 
-def _speed_mps(moved: list[_Moved]) -> float:
-    return sum(entry.x_m for entry in moved) / sum(entry.dt_s for entry in moved)
+def _speed_mps(steps: list[_Step]) -> float:
+    return sum(entry.x_m for entry in steps) / sum(entry.dt_s for entry in steps)

@@ -1,4 +1,5 @@
-"""Corners: followed by optical flow, resected among landmarks, adjusted in a window of keyframes.
+"""Feature corners: tracked by optical flow, resected against landmarks, adjusted over a window of keyframes.
 
-Read `feature_tracks` first, then `relative_pose` and `sliding_window`; `initialisation` is the start from two views.
+Read `feature_tracks` first, then `selection`, `resection` and `sliding_window`. `initialisation` and `two_view` give
+the first motion, where there are no landmarks yet.
 """

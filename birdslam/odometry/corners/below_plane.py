@@ -1,9 +1,9 @@
-"""Corners that seem to lie behind the road that they are seen on: wrong ones.
+"""Below-plane outliers: landmarks that appear to lie below the road surface they are seen on.
 
-Nothing that is seen below the horizon can be farther than the road there, but where the ground falls away. What seems
-to be so moves along with the car (another car, the glow of its lamps, what is fixed to the glass), slides along a line
-of the lane, or was taken for the next of several alike, as the posts of a rail are. Such corners agree with one
-another: that the camera turns less than it does, or hardly moves.
+A ray below the horizon meets the road; a landmark triangulated well beyond that point is wrong. It moves along with the
+car (another car, the glow of lamps, dirt on the windscreen), slides along a lane line, or was mismatched with a
+repetition of itself (the posts of a guard rail). Such corners agree with one another on a rotation that is too small or
+on no motion at all, so that a robust kernel does not reject them.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.camera import Camera, GroundPlane, plane_normal
 from birdslam.geometry.pose import Pose
-from birdslam.odometry.corners.sliding_window import SlidingWindow, common
-from birdslam.odometry.road.alignment import plane_normal
+from birdslam.odometry.corners.sliding_window import SlidingWindow, match_ids
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -25,37 +24,37 @@ Bools = NDArray[np.bool_]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 
-class BeyondRoadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """When a corner lies too far away. By judgement. On KITTI 00, 01 and 06 some 2 to 14 of 1000 corners below the
-    horizon do, on the two rendered nights every third, on 0005 without boxes every fourth (the car ahead)."""
+class BelowPlaneConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """When a landmark is an outlier. By judgement. On KITTI 00, 01 and 06 some 2 to 14 of 1000 corners below the
+    horizon are, on the two rendered nights every third, on 0005 without boxes every fourth (the car ahead)."""
 
-    depth_ratio: Positive = 2.0  # times the road's distance
-    far_m: Positive = 40.0  # the road's distance, past which crests and dips can hide more of it than that
-    sigmas: Positive = 2.0  # of the inverse depth, by which a corner must be too far
+    depth_ratio: Positive = 2.0  # of the landmark's depth to the road's, at the least
+    far_m: Positive = 40.0  # beyond it nothing is rejected: crests and dips hide more of the road there
+    sigmas: Positive = 2.0  # of the inverse depth, by which the landmark must be too far
 
 
-class BeyondRoad:
-    """State: the ids of the corners that were found so. Reader: `Odometry`, which corners to use."""
+class BelowPlaneFilter:
+    """State: the ids of the rejected corners, for as long as they are tracked. Reader: `CornerSelector`."""
 
-    def __init__(self, camera: Camera, config: BeyondRoadConfig) -> None:
+    def __init__(self, camera: Camera, config: BelowPlaneConfig) -> None:
         self.camera, self.config = camera, config
         self._ids: Ints = np.zeros(0, np.int64)
 
-    def judge(self, window: SlidingWindow, pose: Pose, ground: GroundPlane) -> None:
-        """Looks at the landmarks as a camera at `pose` sees them, in metres; those that are wrong leave the window."""
+    def update(self, window: SlidingWindow, pose: Pose, ground: GroundPlane) -> None:
+        """Tests the landmarks (in metres) from a camera at `pose`; the depth of an outlier is set to unknown."""
         cfg = self.config
         with np.errstate(invalid="ignore"):
             seen, inverse_depths = window.seen_from(pose)
-            on_road = -(plane_normal(ground.pitch_rad, ground.roll_rad)[0] @ seen) / self.camera.height_m
-            most = inverse_depths + cfg.sigmas * window.rho_sigma
-            wrong = (on_road > 1.0 / cfg.far_m) & (most < on_road / cfg.depth_ratio)
-        window.rho[wrong] = np.nan
-        self._ids = np.union1d(self._ids, window.ids[wrong])
+            road_inverse_depth = -(plane_normal(ground.pitch_rad, ground.roll_rad)[0] @ seen) / self.camera.height_m
+            upper_bound = inverse_depths + cfg.sigmas * window.rho_sigma
+            outlier = (road_inverse_depth > 1.0 / cfg.far_m) & (upper_bound < road_inverse_depth / cfg.depth_ratio)
+        window.rho[outlier] = np.nan
+        self._ids = np.union1d(self._ids, window.ids[outlier])
 
-    def without(self, ids: Ints) -> Bools:
-        """(N,) which of the corners (N,), ascending, are good; the others that are not among them are forgotten."""
-        wrong, at = common(self._ids, ids)
-        self._ids = self._ids[wrong]
-        good = np.ones(len(ids), bool)
-        good[at] = False
-        return good
+    def inliers(self, ids: Ints) -> Bools:
+        """(N,) which of the corners (N,), ascending, are no outliers. Outliers that are not tracked are forgotten."""
+        outlier, at = match_ids(self._ids, ids)
+        self._ids = self._ids[outlier]
+        inlier = np.ones(len(ids), bool)
+        inlier[at] = False
+        return inlier

@@ -1,8 +1,8 @@
 """Bundle adjustment of the sliding window: the keyframes' poses and the landmarks' inverse depths together.
 
-Gauss-Newton on robust reprojection errors in pixels. Each landmark is a single number, so that the Schur complement of
-the normal equations divides by scalars. Everything stands in a grid of F keyframes and M landmarks (the landmarks last:
-numpy is fast along the last axis); what was not seen, or is the anchor's own observation, has weight 0.
+Gauss-Newton on robust reprojection errors in pixels. Each landmark is one number, so that the Schur complement of the
+normal equations divides by scalars. Arrays are (F keyframes, M landmarks), the landmarks last, where numpy is fast;
+what was not seen, or is the anchor's own observation, has weight 0.
 """
 
 from __future__ import annotations
@@ -19,47 +19,46 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-_LEAST_LANDMARKS = 8
+_MIN_LANDMARKS = 8
 _HUBER_SIGMA = 1.5
 _CONVERGED = 1e-5
-_HELD = 0.1
+_POSITION_PRIOR_SHARE = 0.1
 
 
 def adjust(window: SlidingWindow, iterations: int, max_landmarks: int, prior: Floats) -> None:
-    """Adjusts all poses of the window but the oldest, and the `max_landmarks` depths that most keyframes saw.
+    """Adjusts all poses of the window but the oldest, and the `max_landmarks` landmarks with most observations.
 
-    A place that a held speed gave stays where it is, but for _HELD of its sigma: the images are in it already. `prior`
-    (6,) is the information of each pose (translation, rotation vector) against where it was before. It damps, and it
-    carries the unit of length: no image says anything of that, so the smallest step leaves it where all poses together
-    have it. Two poses held fixed would carry it as well, but from one short baseline whose error all the others then
-    take over.
+    `prior` (6,) is the information of each pose (translation, rotation vector) against its previous estimate. It damps,
+    and it holds the unit of length, which no image observes, at the mean of all poses. Fixing two poses would hold it
+    too, but with the error of one short baseline. A position from the velocity prior keeps _POSITION_PRIOR_SHARE of its
+    sigma: the images are in it already.
     """
-    problem = _choose(window, max_landmarks)
+    problem = _select(window, max_landmarks)
     if problem is None:
         return
     free = len(window.poses) - 1
     priors = np.tile(prior, (free, 1))
-    priors[:, :3] += 1.0 / np.square(_HELD * np.array(window.held_m[1:]))[:, None]
-    moved = np.zeros((free, 6))  # steps so far: (translation, rotation vector), both in the window's axes
+    priors[:, :3] += 1.0 / np.square(_POSITION_PRIOR_SHARE * np.array(window.predicted_sigma_m[1:]))[:, None]
+    total = np.zeros((free, 6))  # sum of the steps: (translation, rotation vector), both in the window's axes
     rho = window.rho[problem.landmarks].copy()
     for k in range(iterations):
         residuals = _reproject(window, problem, rho, outlier_factor=2.0 if k == 0 else 1.0)
         normal = _normal_equations(problem, residuals, rho)
-        pose_steps, rho_steps = _solve(normal, priors, moved)
+        pose_steps, rho_steps = _solve(normal, priors, total)
         if not np.isfinite(pose_steps).all():
             return
         rho = np.maximum(rho - rho_steps, 0.0)
         for at, (T, by) in enumerate(zip(window.poses[1:], pose_steps, strict=True), start=1):
             window.poses[at] = Pose(rotation_exp(by[3:]) @ T.R, T.p + by[:3])
-        moved += pose_steps
+        total += pose_steps
         if np.abs(pose_steps).max() < _CONVERGED:
             break
-    _store(window, problem, residuals, normal, rho)
+    _write_back(window, problem, residuals, normal, rho)
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """What is adjusted, and what it was observed as; landmarks of one anchor stand together."""
+    """The landmarks that are adjusted and their observations; landmarks of one anchor are adjacent."""
 
     landmarks: Ints  # (M,) of the window
     anchor: Ints  # (M,) ascending
@@ -72,10 +71,10 @@ class _Problem:
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Reprojection errors of all observations, and the geometry that they come from."""
+    """Reprojection errors of all observations, and their geometry."""
 
-    base: Floats  # (3, M) the rays in the window's axes
-    between: Floats  # (F, 3, M) from each keyframe to the anchor
+    rays_window: Floats  # (3, M) the rays in the window's axes
+    to_anchor: Floats  # (F, 3, M) from each keyframe to the anchor
     norm: Floats  # (F, M) in sigma
     whitened: Floats  # (F, 2, M)
     E: Floats  # (F, 3, 2, M) whitened derivative of both coordinates by the landmark in the window's axes
@@ -92,13 +91,13 @@ class _NormalEquations:
     g_rho: Floats  # (M,)
 
 
-def _choose(window: SlidingWindow, max_landmarks: int) -> _Problem | None:
-    """The landmarks that most keyframes saw; None where there is nothing to adjust."""
+def _select(window: SlidingWindow, max_landmarks: int) -> _Problem | None:
+    """The landmarks with most observations; None where there is nothing to adjust."""
     anchor = window.anchors()
     count = np.isfinite(window.obs[..., 0]).sum(axis=0)
     usable = np.isfinite(window.rho) & (count >= 2)
     F = len(window.poses)
-    if usable.sum() < _LEAST_LANDMARKS or F < 2:
+    if usable.sum() < _MIN_LANDMARKS or F < 2:
         return None
     chosen = np.flatnonzero(usable)
     if len(chosen) > max_landmarks:
@@ -118,12 +117,12 @@ def _choose(window: SlidingWindow, max_landmarks: int) -> _Problem | None:
 
 
 def _reproject(window: SlidingWindow, problem: _Problem, rho: Floats, outlier_factor: float) -> _Residuals:
-    """Errors of all observations; outliers, past `outlier_factor` times the window's limit, get weight 0."""
+    """Errors of all observations; beyond `outlier_factor` times the window's limit an observation has weight 0."""
     R, p = window.stacked()
     f, sigma_px = window.focal_px, window.sigma_px
-    base = np.concatenate([R[i] @ problem.rays[:, of] for i, of in enumerate(problem.groups)], axis=1)
-    between = (p.T - p[:, :, None]).take(problem.anchor, axis=2)
-    c = base + rho * between
+    rays_window = np.concatenate([R[i] @ problem.rays[:, of] for i, of in enumerate(problem.groups)], axis=1)
+    to_anchor = (p.T - p[:, :, None]).take(problem.anchor, axis=2)
+    c = rays_window + rho * to_anchor
     q = R.transpose(0, 2, 1) @ c
     ahead = q[:, 2] > MIN_DEPTH
     z = np.where(ahead, q[:, 2], 1.0)
@@ -134,21 +133,21 @@ def _reproject(window: SlidingWindow, problem: _Problem, rho: Floats, outlier_fa
     w = np.where(inlier, 1.0 / np.maximum(1.0, norm / _HUBER_SIGMA), 0.0) / sigma_px**2
     sw = np.sqrt(w)
     E = (R[:, :, :2, None] - R[:, :, 2, None, None] * uv[:, None]) * (f * sw / z)[:, None, None]
-    return _Residuals(base, between, norm, r * sw[:, None], E)
+    return _Residuals(rays_window, to_anchor, norm, r * sw[:, None], E)
 
 
 def _normal_equations(problem: _Problem, residuals: _Residuals, rho: Floats) -> _NormalEquations:
     """The linearised problem.
 
-    A pose that sees a landmark of another's moves it as the anchor does, but the other way and about itself: by -L
-    times the derivatives by the anchor, where L = [I 0; [b]x I] is one for all landmarks of an anchor, and b lies
-    between the two places. So the derivatives by the anchor alone are multiplied.
+    The derivative of a residual by the observing pose is -L times that by the anchor's pose, with L = [I 0; [b]x I] and
+    b the vector between the two positions: the same for all landmarks of an anchor. So only products of the anchor's
+    derivatives are summed over landmarks.
     """
     F, anchor = len(problem.groups), problem.anchor
     E, J_anchor, rw = residuals.E, problem.J_anchor, residuals.whitened
-    J_rho = (E * residuals.between[:, :, None]).sum(axis=1)  # (F, 2, M)
+    J_rho = (E * residuals.to_anchor[:, :, None]).sum(axis=1)  # (F, 2, M)
     np.multiply(E, rho, out=J_anchor[:, :3])
-    _cross(residuals.base[None, :, None], E, J_anchor[:, 3:])
+    _cross(residuals.rays_window[None, :, None], E, J_anchor[:, 3:])
 
     N, n = np.zeros((F, F, 6, 6)), np.zeros((F, F, 6))  # J J^T and J r of the derivatives, (anchor, seen by)
     L = np.zeros((F, F, 6, 6))
@@ -159,7 +158,7 @@ def _normal_equations(problem: _Problem, residuals: _Residuals, rho: Floats) -> 
         of_i = J_anchor[..., of].reshape(F, 6, -1)
         N[i] = of_i @ of_i.transpose(0, 2, 1)
         n[i] = (of_i @ rw[..., of].reshape(F, -1, 1))[..., 0]
-        x, y, z = residuals.between[:, :, of.start].T
+        x, y, z = residuals.to_anchor[:, :, of.start].T
         L[i, :, 3, 1], L[i, :, 3, 2], L[i, :, 4, 2] = -z, y, -x
         L[i, :, 4, 0], L[i, :, 5, 0], L[i, :, 5, 1] = z, -y, x
     mixed = -N @ L.swapaxes(2, 3)  # nothing where the keyframe is the anchor
@@ -170,7 +169,7 @@ def _normal_equations(problem: _Problem, residuals: _Residuals, rho: Floats) -> 
     by_depth = J_rho[:, None, 0] * J_anchor[:, :, 0] + J_rho[:, None, 1] * J_anchor[:, :, 1]  # (F, 6, M)
     B = np.empty_like(by_depth)
     np.negative(by_depth[:, :3], out=B[:, :3])
-    _cross(by_depth[:, :3], residuals.between, B[:, 3:])
+    _cross(by_depth[:, :3], residuals.to_anchor, B[:, 3:])
     B[:, 3:] -= by_depth[:, 3:]
     B[anchor, :, np.arange(len(anchor))] += by_depth.sum(axis=0).T
     B = B[1:].reshape(6 * (F - 1), -1).T
@@ -178,30 +177,30 @@ def _normal_equations(problem: _Problem, residuals: _Residuals, rho: Floats) -> 
     return _NormalEquations(A, B, C, g, (J_rho * rw).sum(axis=(0, 1)))
 
 
-def _solve(normal: _NormalEquations, priors: Floats, moved: Floats) -> tuple[Floats, Floats]:
-    """Steps of the poses but the oldest (F - 1, 6), and what is to be taken off the inverse depths (M,).
+def _solve(normal: _NormalEquations, priors: Floats, total: Floats) -> tuple[Floats, Floats]:
+    """Steps of the poses but the oldest (F - 1, 6), and those of the inverse depths (M,), to be subtracted.
 
-    `priors` (F - 1, 6) are those of the poses. The depths are eliminated first (Schur complement).
+    `priors` (F - 1, 6) are the poses' information. The depths are eliminated first (Schur complement).
     """
-    free, B, C = len(moved), normal.B, normal.C
+    free, B, C = len(total), normal.B, normal.C
     A = normal.A[1:, :, 1:].reshape(6 * free, 6 * free) + np.diag(priors.ravel())
-    g = (normal.g[1:] + priors * moved).reshape(-1)
+    g = (normal.g[1:] + priors * total).reshape(-1)
     S = A - B.T @ (B / C[:, None])
     step: Floats = np.negative(np.linalg.solve(S, g - B.T @ (normal.g_rho / C)))
     return step.reshape(free, 6), (normal.g_rho + B @ step) / C
 
 
-def _store(
+def _write_back(
     window: SlidingWindow, problem: _Problem, residuals: _Residuals, normal: _NormalEquations, rho: Floats
 ) -> None:
-    """Writes the result back. A landmark that most keyframes contradict is forgotten; it may be triangulated anew."""
+    """Writes the result back. A landmark with mostly outlier observations becomes unknown, until triangulated anew."""
     rotations = orthonormal(window.stacked()[0])
     window.poses = [Pose(R, T.p) for R, T in zip(rotations, window.poses, strict=True)]
     window.rho[problem.landmarks] = rho
     window.rho_sigma[problem.landmarks] = 1.0 / np.sqrt(normal.C)
     observed = problem.observed
-    fits = (observed & (residuals.norm < window.reject_px / window.sigma_px)).sum(axis=0)
-    window.rho[problem.landmarks[2 * fits < observed.sum(axis=0)]] = np.nan
+    inliers = (observed & (residuals.norm < window.reject_px / window.sigma_px)).sum(axis=0)
+    window.rho[problem.landmarks[2 * inliers < observed.sum(axis=0)]] = np.nan
 
 
 def _cross(a: Floats, b: Floats, out: Floats) -> None:

@@ -1,8 +1,8 @@
-"""Track keeping: corners with persistent ids, followed from image to image by pyramidal Lucas-Kanade.
+"""Feature tracks: corners with persistent ids, tracked from image to image by pyramidal Lucas-Kanade optical flow.
 
-The paper takes stable ORB corners (Sec. 3.1, static map initialisation); corners that optical flow can follow give the
-same persistent points at sub-pixel accuracy and a fraction of the time. Needs no network result, so it can run beside
-the networks (OpenCV releases the GIL).
+The paper takes ORB corners (Sec. 3.1, static map initialisation); tracked corners give the same persistent points at
+sub-pixel accuracy and a fraction of the time. No network result is needed, so tracking runs beside the networks
+(OpenCV releases the GIL).
 """
 
 from __future__ import annotations
@@ -16,33 +16,42 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.pose import Pose
+
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-# When Lucas-Kanade ends: after so many steps, or at a shorter one (px); the way back need not be exact
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.03)
+# Lucas-Kanade stops after so many iterations or at a smaller step (px); the backward pass need not be exact
+_FORWARD_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 0.03)
 _BACK_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 0.1)
-_BACK_OFF_PX = 2.0
+_BACKWARD_OFFSET_PX = 2.0
+# Of predicted corners: the smallest depth, as a share of the assumed one, and the largest shift, of the image's width
+_MIN_DEPTH_REL, _MAX_SHIFT_REL = 0.3, 0.4
 
 
 class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How corners are found and followed; lengths in pixels; cells are for an image 1242 px wide."""
 
-    max_tracks: Count = 450  # corners that are followed at once
-    refill_share: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.3  # of them gone, until new ones are looked for
+    max_tracks: Count = 450  # corners that are tracked at once
+    refill_share: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.3  # of them lost, until new ones are detected
     cell_px: Count = 24  # at most one new corner in a cell of this size
     min_corner_score: Positive = 8.0  # smaller eigenvalue of the structure tensor, (grey / px)^2, half image
-    # Of Lucas-Kanade: OpenCV's loop over a row takes eight columns at once, and a ninth costs as much as eight more
+    # Of Lucas-Kanade: OpenCV processes eight columns at once, so that a ninth costs as much as eight more
     window_columns_px: Annotated[int, msgspec.Meta(ge=5)] = 8
     window_rows_px: Annotated[int, msgspec.Meta(ge=5)] = 20  # of Lucas-Kanade
     pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 2  # of Lucas-Kanade, beside the image itself
-    max_roundtrip_px: Positive = 0.7  # forward and back again must end where it began
-    start_pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = 4  # from a guess that was searched for
-    least_followed: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.35  # of the corners; fewer: a wrong guess
-    search_pause: Count = 5  # images after a search that found no better
+    max_forward_backward_px: Positive = 0.7  # forward-backward error (Kalal et al. 2010)
+    start_pyramid_levels: Annotated[int, msgspec.Meta(ge=0, le=6)] = (
+        4  # from a predicted position that was searched for
+    )
+    least_followed: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = (
+        0.35  # of the corners; fewer: the prediction is wrong
+    )
+    search_pause: Count = 5  # images after a search that found no better prediction
     max_residual_grey: Positive = 14.0  # mean absolute difference of the windows (after LK), grey levels
     dark_mean_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 8.0  # an image that is darker on average is dark
     dark_std_grey: Annotated[float, msgspec.Meta(ge=0.0)] = 4.0  # and so is one with less contrast
@@ -52,8 +61,8 @@ class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Tracks:
     """Corners of one image. `ids` (N,) ascending and never used twice; `px` (N, 2) pixels (u right, v down).
 
-    `age` (N,) counts the images in which a corner was followed, 0 for one just found. `dark` and `frozen` say that the
-    image shows nothing, or is bit for bit the one before; then nothing was followed and the corners are the last ones.
+    `age` (N,) counts the images that a corner was tracked through, 0 for a new one. `dark`: too little contrast;
+    `frozen`: bit for bit the image before. In both cases nothing was tracked and the corners are the last ones.
     """
 
     ids: Ints
@@ -69,47 +78,47 @@ Search = Callable[[NDArray[np.uint8], NDArray[np.uint8], Tracks], list[Floats]] 
 
 
 class FeatureTracker:
-    """Keeps tracks over a stream of images of one size.
+    """Tracks corners over a stream of images of one size.
 
-    `accept` names the image that the next one is followed from: a dark image, or one of a standing car, is looked at
-    and not stepped onto, so that neither costs a track or lets one creep.
+    The next image is tracked from the reference image, which `accept` sets. A dark image or one of a stationary car is
+    tracked but does not become the reference, so that tracks are neither lost nor drift.
     """
 
     def __init__(self, width_px: int, height_px: int, config: FeatureConfig) -> None:
         self.width_px, self.height_px, self.config = width_px, height_px, config
         self._next_id = 0
-        self._base_image: NDArray[np.uint8] | None = None
+        self._reference_image: NDArray[np.uint8] | None = None
         self._candidate: NDArray[np.uint8] | None = None
         self._last_image: NDArray[np.uint8] | None = None
-        self._search_in = 0  # images
-        self.leave_base()
+        self._search_pause_left = 0  # images
+        self.drop_reference()
 
     @property
-    def base(self) -> Tracks:
-        """The tracks in the image that the next one is followed from."""
-        return self._base
+    def reference(self) -> Tracks:
+        """The tracks in the reference image."""
+        return self._reference
 
     def track(
         self, image: NDArray[np.uint8], predict: Predict | None = None, search: Search | None = None
     ) -> Tracks:  # fmt: skip
-        """Follows the base's corners into `image` ((H, W) grey or (H, W, 3) BGR, uint8) and finds new ones.
+        """Tracks the reference's corners into `image` ((H, W) grey or (H, W, 3) BGR, uint8) and detects new ones.
 
-        `predict` gives the pixels (N, 2) where the base's tracks are expected; where there is none, or the image does
-        not bear it out, `search` gives several such guesses. Raises ValueError for another size.
+        `predict` gives the predicted pixels (N, 2) of the reference's tracks. Without it, or where too few tracks
+        confirm it, `search` gives alternative predictions. Raises ValueError for another size.
         """
         grey = self._grey(image)
         frozen = self._last_image is not None and bool(np.array_equal(grey, self._last_image))
         self._last_image = grey
         mean, std = cv2.meanStdDev(grey[::4, ::4])
         dark = float(std[0, 0]) < self.config.dark_std_grey or float(mean[0, 0]) < self.config.dark_mean_grey
-        base = self._base
+        reference = self._reference
         if dark or frozen:
             self._candidate = None
-            return Tracks(base.ids, base.px, base.age, grey, dark=dark, frozen=frozen)
+            return Tracks(reference.ids, reference.px, reference.age, grey, dark=dark, frozen=frozen)
         self._candidate = grey
-        ids, px, age = base.ids, base.px, base.age
-        if self._base_image is not None and len(ids):
-            followed, good = self._follow_base(self._base_image, grey, predict, search)
+        ids, px, age = reference.ids, reference.px, reference.age
+        if self._reference_image is not None and len(ids):
+            followed, good = self._follow_reference(self._reference_image, grey, predict, search)
             ids, px, age = ids[good], followed[good], age[good] + 1
         fresh = self._new_corners(grey, px)
         ids = np.concatenate([ids, np.arange(self._next_id, self._next_id + len(fresh))])
@@ -117,14 +126,15 @@ class FeatureTracker:
         return Tracks(ids, np.concatenate([px, fresh]), np.concatenate([age, np.zeros(len(fresh), np.int64)]), grey)
 
     def accept(self, tracks: Tracks) -> None:
-        """Makes the image last tracked the base of the next one."""
+        """Makes the image last tracked the reference of the next one."""
         if self._candidate is not None:
-            self._base_image, self._base = self._candidate, tracks
+            self._reference_image, self._reference = self._candidate, tracks
 
-    def leave_base(self) -> None:
-        """The next image is followed from none; what it is compared with to be found frozen stays."""
-        self._base_image, self._candidate = None, None
-        self._base = Tracks(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros((0, 0), np.uint8))
+    def drop_reference(self) -> None:
+        """The next image is tracked from none; the last image is kept for the test of a frozen camera."""
+        self._reference_image, self._candidate = None, None
+        no_ids = np.zeros(0, np.int64)
+        self._reference = Tracks(no_ids, np.zeros((0, 2)), no_ids, np.zeros((0, 0), np.uint8))
 
     def reset(self) -> None:
         """Forgets all tracks; ids go on counting."""
@@ -144,27 +154,27 @@ class FeatureTracker:
             return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)  # type: ignore[return-value]
         return np.array(image)  # a copy: the caller may reuse the buffer
 
-    def _follow_base(
+    def _follow_reference(
         self, then: NDArray[np.uint8], now: NDArray[np.uint8], predict: Predict | None, search: Search | None
     ) -> tuple[Floats, Bools]:
-        """The base's tracks in the present image, and which of them were found there.
+        """The reference's tracks in the present image (N, 2), and which of them were tracked (N,).
 
-        Where too few were, the guess was wrong. Of several that are searched for each corner takes the one from
-        which it comes to what looks most alike.
+        Where too few were, the prediction was wrong: each corner then takes the searched prediction with the smallest
+        residual.
         """
-        cfg, px = self.config, self._base.px
-        start = predict(self._base) if predict is not None else px
+        cfg, px = self.config, self._reference.px
+        start = predict(self._reference) if predict is not None else px
         at, good, error = self._follow(then, now, px, start, cfg.pyramid_levels)
         wrong = predict is None or float(good.mean()) < cfg.least_followed
-        self._search_in = max(self._search_in - 1, 0)
-        if search is None or not wrong or (predict is not None and self._search_in):
+        self._search_pause_left = max(self._search_pause_left - 1, 0)
+        if search is None or not wrong or (predict is not None and self._search_pause_left):
             return at, good
         guesses = [
-            self._follow(then, now, px, guess, cfg.start_pyramid_levels) for guess in search(then, now, self._base)
+            self._follow(then, now, px, guess, cfg.start_pyramid_levels) for guess in search(then, now, self._reference)
         ]
         best = max(guesses, key=lambda guess: int(guess[1].sum()))
         if int(best[1].sum()) < 1.2 * int(good.sum()) and predict is not None:
-            self._search_in = cfg.search_pause
+            self._search_pause_left = cfg.search_pause
             return at, good
         at, good, error = best
         for other, found, its_error in guesses:
@@ -175,29 +185,29 @@ class FeatureTracker:
     def _follow(
         self, then: NDArray[np.uint8], now: NDArray[np.uint8], px: Floats, start: Floats, levels: int
     ) -> tuple[Floats, Bools, Floats]:
-        """Where corners came to (N, 2), whether that can be believed (N,), and the residual there (N,), grey levels."""
+        """New positions (N, 2), which of them are valid (N,), and the residuals there (N,), grey levels."""
         cfg = self.config
         window = (cfg.window_columns_px, cfg.window_rows_px)
         here = px.astype(np.float32).reshape(-1, 1, 2)
         guess = np.where(np.isfinite(start), start, px).astype(np.float32).reshape(-1, 1, 2)
         there, ok, error = cv2.calcOpticalFlowPyrLK(
             then, now, here, guess.copy(), winSize=window, maxLevel=levels,
-            criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
+            criteria=_FORWARD_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
         )  # fmt: skip  # type: ignore[call-overload]
-        # The way back starts off by the guess's own error, as far as it reaches without a pyramid, and not at the
-        # answer: a wrong match must not confirm itself.
-        off = np.clip(there - guess, -_BACK_OFF_PX, _BACK_OFF_PX)
+        # The backward pass starts off by the prediction's own error, as far as it reaches without a pyramid, and not at
+        # the corner itself: a wrong match must not confirm itself.
+        off = np.clip(there - guess, -_BACKWARD_OFFSET_PX, _BACKWARD_OFFSET_PX)
         back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
             now, then, there, (here + off).astype(np.float32), winSize=window, maxLevel=0,
             criteria=_BACK_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
         )  # fmt: skip  # type: ignore[call-overload]
-        roundtrip = np.abs(back - here).reshape(-1, 2).max(axis=1)
+        forward_backward = np.abs(back - here).reshape(-1, 2).max(axis=1)
         end: Floats = there.reshape(-1, 2).astype(np.float64)
         margin = 2.0
         inside = (
             (end >= margin).all(axis=1) & (end[:, 0] < self.width_px - margin) & (end[:, 1] < self.height_px - margin)
         )
-        good = (ok.ravel() == 1) & (ok_back.ravel() == 1) & (roundtrip < cfg.max_roundtrip_px) & inside
+        good = (ok.ravel() == 1) & (ok_back.ravel() == 1) & (forward_backward < cfg.max_forward_backward_px) & inside
         good &= (error.ravel() < cfg.max_residual_grey) & np.isfinite(end).all(axis=1)
         return end, good, np.where(good, error.ravel(), np.inf)
 
@@ -228,3 +238,18 @@ class FeatureTracker:
         v = order // cols * side + best[order] // side + edge
         u = order % cols * side + best[order] % side + edge
         return 2.0 * np.column_stack([u, v]).astype(np.float64)
+
+
+def predict_corners_px(camera: Camera, ground: GroundPlane, px: Floats, step: Pose) -> Floats:
+    """(N, 2) of corners `px` (N, 2) of unknown depth, after the motion T_prev_curr of `step` in metres.
+
+    Below the horizon a corner is assumed at twice the road's depth, above it at infinity. One that would leave the
+    image, or move too far, is predicted where it was.
+    """
+    rays = np.column_stack([camera.to_xy(px), np.ones(len(px))])
+    rho = np.maximum(-(rays @ ground.normal_cam) / camera.height_m, 0.0) * 0.5
+    q = (rays - rho[:, None] * step.p) @ step.R
+    out = camera.to_px(q[:, :2] / np.maximum(q[:, 2:], 0.2))
+    lost = (q[:, 2] < _MIN_DEPTH_REL) | (np.abs(out - px) > _MAX_SHIFT_REL * camera.width_px).any(axis=1)
+    out[lost] = px[lost]
+    return out

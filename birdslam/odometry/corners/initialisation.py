@@ -1,18 +1,10 @@
-"""How a car moved between two images, where nothing is known beforehand: searched, not followed.
+"""The motion between two images without a motion model: at the start and after a loss of tracking, it is searched for.
 
-Optical flow reaches as far as its pyramid: 16 px sideways, where a car in a bend of 21 m radius at 10 Hz turns by 33.
-From a guess that is too far off it follows the few corners that look alike, and the velocity that comes of these is the
-next image's guess. So, at the start and after a loss:
-
-- rotation: on a cylinder about the camera's vertical axis a yaw shifts the whole image, and a pitch nearly so. Blocks
-  above the horizon, which are mostly far away, vote for the shift that makes them alike (normalised cross-correlation,
-  so that neither the exposure nor another car nor one near tree decides);
-- length: with that rotation the road's image is compared over forward travel and pitch together. A car rolls on its
-  rear axle, so the direction of travel follows from the rotation and the length.
-  Where the road seems to stand, what changed of its farther half is asked too: a bonnet stands, and so does
-  the grain that a video encoder leaves where it was.
-
-These are guesses for the flow, which says by its residuals which of them is right for each corner.
+Optical flow reaches as far as its pyramid: 16 px sideways; a car in a bend of 21 m radius at 10 Hz turns by 33 px.
+- Rotation: on a cylinder about the vertical axis a yaw shifts the whole image. Blocks above the horizon, which are
+  mostly far away, vote for the shift (yaw and pitch) by normalised cross-correlation, independent of the exposure.
+- Length: with that rotation the road's image is compared over travelled distance and pitch (road/scale_search.py). The
+  car rolls on its rear axle, so that the direction follows from the rotation and the length.
 """
 
 from __future__ import annotations
@@ -27,25 +19,25 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.road.alignment import RoadAligner, RoadImage
-from birdslam.odometry.road.scale_search import correlations, far_and_changed, most_alike
+from birdslam.odometry.road.scale_search import best_correlation, correlations, far_changed_pixels
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.float32]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
-_BLOCK = (14, 24)  # rows and columns on the cylinder: 4.5 by 8 degrees, of which an image shows some dozens
+_BLOCK_SHAPE = (14, 24)  # rows and columns on the cylinder: 4.5 by 8 degrees; an image has some dozens
 _NO_BOXES = np.zeros((0, 4))
 
 
-class StartSearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class InitialisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How far a car turns and drives from one image to the next."""
 
-    resolution_px: Positive = 180.0  # a radian on the cylinder; the flow reaches farther than its pixel of 0.3 degrees
+    resolution_px: Positive = 180.0  # of a radian on the cylinder: 0.3 degrees a pixel, within reach of the flow
     max_yaw_rad: Positive = 0.16  # 35 degrees a second at 4 Hz
-    max_pitch_rad: Positive = 0.03  # by which a car nods from one image to the next
-    below_horizon_rad: Positive = 0.03  # so far down a block may reach, for a camera that looks up or down
+    max_pitch_rad: Positive = 0.03  # change of the car's pitch from one image to the next
+    below_horizon_rad: Positive = 0.03  # lower edge of the blocks, for a camera that looks up or down
     least_contrast: Positive = 0.08  # standard deviation of a block's log brightness: the sky has less
-    least_correlation: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.4  # a block less alike has no vote
+    least_correlation: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.4  # a block of less has no vote
     max_length_m: Positive = 8.0  # 40 m/s at 5 Hz
     lengths: Annotated[int, msgspec.Meta(ge=2)] = 80  # tried, each 6 % longer than the one before
     max_tilt_rad: Positive = 0.05  # of the camera's pitch against the file's
@@ -54,10 +46,10 @@ class StartSearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     camera_ahead_m: Annotated[float, msgspec.Meta(ge=0.0)] = 1.7  # of the rear axle, in a passenger car
 
 
-class StartSearch:
-    """`guesses` of the motion between two images of one camera."""
+class MotionInitialiser:
+    """Searches the motion between two images of one camera; the flow's residuals then select among its guesses."""
 
-    def __init__(self, camera: Camera, aligner: RoadAligner, config: StartSearchConfig) -> None:
+    def __init__(self, camera: Camera, aligner: RoadAligner, config: InitialisationConfig) -> None:
         self.camera, self.config, self._aligner = camera, config, aligner
         # No finer than half the image's own resolution
         self._scale = min(config.resolution_px, 0.5 * camera.fx_px)
@@ -72,39 +64,39 @@ class StartSearch:
         self._pitches_rad = camera.pitch_rad + np.linspace(-1.0, 1.0, config.tilts) * config.max_tilt_rad
 
     def guesses(self, past: NDArray[np.uint8], present: NDArray[np.uint8]) -> list[Pose]:
-        """T_past_present, from (H, W) grey images: turned alone, and turned and driven as the road has it."""
-        turned = self.rotation(past, present)
+        """T_past_present of (H, W) grey images: the rotation alone, and with the translation found on the road."""
+        turned = self.search_rotation(past, present)
         road = [self._aligner.image(image) for image in (past, present)]
-        return [Pose(turned, np.zeros(3)), self.driven(turned, *road)]
+        return [Pose(turned, np.zeros(3)), self.road_motion(turned, *road)]
 
     # --- rotation ---
 
-    def rotation(self, past: NDArray[np.uint8], present: NDArray[np.uint8]) -> Floats:
-        """(3, 3) R_past_present, to half a degree or so: yaw and pitch; the roll of a car is less than that."""
+    def search_rotation(self, past: NDArray[np.uint8], present: NDArray[np.uint8]) -> Floats:
+        """(3, 3) R_past_present by yaw and pitch, to half a degree or so; the car's roll is less than that."""
         cfg = self.config
-        then, now = self._on_cylinder(past), self._on_cylinder(present)
+        then, now = self._to_cylinder(past), self._to_cylinder(present)
         reach = tuple(int(np.ceil(angle * self._scale)) for angle in (cfg.max_pitch_rad, cfg.max_yaw_rad))
         border = (reach[0], reach[0], reach[1], reach[1])
         bordered = np.asarray(cv2.copyMakeBorder(then, *border, cv2.BORDER_REPLICATE), np.float32)
-        lively = _contrast(bordered) > 0.5 * cfg.least_contrast  # elsewhere a correlation is rounding errors
+        textured = _contrast(bordered) > 0.5 * cfg.least_contrast  # elsewhere a correlation is rounding error
         votes = np.zeros((2 * reach[0] + 1, 2 * reach[1] + 1), np.float32)
-        rows, cols = _BLOCK
+        rows, cols = _BLOCK_SHAPE
         for v in range(0, max(self._rows_used - rows, 0) + 1, rows // 2):
             for u in range(0, now.shape[1] - cols + 1, cols // 2):
                 block = now[v : v + rows, u : u + cols]
-                if block.shape != _BLOCK or float(block.std()) < cfg.least_contrast:
+                if block.shape != _BLOCK_SHAPE or float(block.std()) < cfg.least_contrast:
                     continue
                 where = bordered[v : v + rows + 2 * reach[0], u : u + cols + 2 * reach[1]]
-                alike = cv2.matchTemplate(where, block, cv2.TM_CCOEFF_NORMED)
-                there = lively[v : v + alike.shape[0], u : u + alike.shape[1]]
-                votes += np.where(there, np.maximum(alike - cfg.least_correlation, 0.0), 0.0)
+                score = cv2.matchTemplate(where, block, cv2.TM_CCOEFF_NORMED)
+                there = textured[v : v + score.shape[0], u : u + score.shape[1]]
+                votes += np.where(there, np.maximum(score - cfg.least_correlation, 0.0), 0.0)
         if not votes.any():
             return np.eye(3)
-        # A smooth peak's votes spread over its neighbours, a chance one's do not
+        # The votes of a true peak spread over its neighbours, those of a chance one do not
         j, i = np.unravel_index(int(cv2.GaussianBlur(votes, (3, 3), 0.0).argmax()), votes.shape)
         return rotation_exp(np.array([(j - reach[0]) / self._scale, (i - reach[1]) / self._scale, 0.0]))
 
-    def _on_cylinder(self, image: NDArray[np.uint8]) -> Grey:
+    def _to_cylinder(self, image: NDArray[np.uint8]) -> Grey:
         """Log brightness; columns are equal angles of yaw, rows equal slopes against the axis."""
         smooth = cv2.GaussianBlur(image, (0, 0), 0.5 * self.camera.fx_px / self._scale)
         out = cv2.remap(smooth, self._u, self._v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -112,38 +104,39 @@ class StartSearch:
 
     # --- length ---
 
-    def driven(self, R_past_present: Floats, past: RoadImage, present: RoadImage) -> Pose:
-        """T_past_present of this rotation and of the length at which the road is most alike."""
+    def road_motion(self, R_past_present: Floats, past: RoadImage, present: RoadImage) -> Pose:
+        """T_past_present of this rotation, with the length of best correlation on the road."""
         yaw_rad = float(np.arctan2(R_past_present[0, 2], R_past_present[2, 2]))
         views = []
         for pitch_rad in self._pitches_rad:
             px = self._aligner.samples((float(pitch_rad), self.camera.roll_rad), _NO_BOXES, None)
             px = px[:: max(1, len(px) // self.config.samples)]
             if len(px) >= 50:
-                views.append((float(pitch_rad), self._ways(yaw_rad, float(pitch_rad)), px))
+                views.append((float(pitch_rad), self._translations(yaw_rad, float(pitch_rad)), px))
 
-        def alike(changed: bool) -> Floats:
+        def correlate(changed: bool) -> Floats:
             rows = []
-            for pitch_rad, ways, px in views:
-                shown, tilt = far_and_changed(past, present, px) if changed else px, (pitch_rad, self.camera.roll_rad)
-                rows.append(correlations(self.camera, past, present, R_past_present, ways, shown, tilt))
+            for pitch_rad, translations, px in views:
+                tilt = (pitch_rad, self.camera.roll_rad)
+                shown = far_changed_pixels(past, present, px) if changed else px
+                rows.append(correlations(self.camera, past, present, R_past_present, translations, shown, tilt))
             return np.array(rows)
 
         if not views:
             return Pose(R_past_present, np.zeros(3))
-        pitch, length = most_alike(alike, self._lengths_m)
+        pitch, length = best_correlation(correlate, self._lengths_m)
         return Pose(R_past_present, views[pitch][1][length])
 
-    def _ways(self, yaw_rad: float, pitch_rad: float) -> Floats:
-        """(L, 3) translations of a camera in front of the rear axle that rolls on an arc, along the road."""
+    def _translations(self, yaw_rad: float, pitch_rad: float) -> Floats:
+        """(L, 3) translations of a camera in front of the rear axle, for arcs of constant curvature along the road."""
         half, ahead_m = 0.5 * yaw_rad, self.config.camera_ahead_m * np.sin(yaw_rad)
         forward = self._lengths_m * np.cos(half)
         return np.column_stack([self._lengths_m * np.sin(half) + ahead_m, -np.tan(pitch_rad) * forward, forward])
 
 
 def _contrast(image: Grey) -> Grey:
-    """The standard deviation of the block that begins at each pixel."""
-    size = (_BLOCK[1], _BLOCK[0])
+    """Standard deviation of the block whose first corner is at each pixel."""
+    size = (_BLOCK_SHAPE[1], _BLOCK_SHAPE[0])
     mean = cv2.boxFilter(image, cv2.CV_32F, size, anchor=(0, 0))
     square = cv2.sqrBoxFilter(image, cv2.CV_32F, size, anchor=(0, 0))
     return np.asarray(np.sqrt(np.maximum(square - mean * mean, 0.0)), np.float32)

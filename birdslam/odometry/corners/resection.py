@@ -1,4 +1,8 @@
-"""The corners of one image and its pose by them among the landmarks of the window, without those on the glass."""
+"""Resection: the pose of an image from the landmarks of the window that it shows (perspective-n-point).
+
+Gauss-Newton on robust reprojection errors, whose variance includes that of the landmark's depth. Corners fixed in the
+image are left out where they lead to another pose.
+"""
 
 from __future__ import annotations
 
@@ -9,78 +13,159 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.pose import Pose, rotation_log
-from birdslam.odometry.corners.relative_pose import locate
-from birdslam.odometry.corners.sliding_window import SlidingWindow, common
+from birdslam.odometry.corners.selection import Corners
+from birdslam.odometry.corners.sliding_window import MIN_DEPTH, SlidingWindow, match_ids, rotate_rays
+from birdslam.odometry.median import upper_median
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-Located = tuple[Pose, Floats]  # a pose and its information (6, 6), of (translation, rotation) in its own axes
+PoseEstimate = tuple[Pose, Floats]  # a pose and its information (6, 6), of (translation, rotation) in its own axes
 
-_SAME_RAD, _SAME_REL = 0.0007, 0.05  # poses that differ by less say the same: rotation, place over the way
-_ENOUGH = 0.7  # of the landmarks in sight that fit: no other guess is tried
-
-
-@dataclass(frozen=True)
-class Corners:
-    """The N corners of one image outside vehicles."""
-
-    ids: Ints  # (N,) ascending
-    xy: Floats  # (N, 2) normalised coordinates
-    displacement_px: Floats  # of those that the base image shows too
-    stands: Bools  # (N,) in the image while the car drives: on the glass, or on a line along the way
-
-    def of_street(self) -> Corners:
-        """Those that do not stand."""
-        moves = ~self.stands
-        return Corners(self.ids[moves], self.xy[moves], self.displacement_px, self.stands[moves])
+_MIN_LANDMARKS = 8
+_HUBER_SIGMA = 1.5
+_ITERATIONS = 8
+_CONVERGED = 1e-5
+_ADAPTIVE_ITERATIONS = 3  # the first ones, in which the outlier limit follows the residuals
+_SAME_RAD, _SAME_REL = 0.0007, 0.05  # two poses agree within this rotation and this share of the translation
+_GOOD_INLIER_RATIO = 0.7  # with so many inliers no further guess is tried
 
 
 @dataclass(frozen=True)
-class Fitting:
+class InlierLimits:
     """When a pose counts as measured."""
 
-    least: int  # landmarks that must agree
-    least_fraction: float  # and so large a part of those in sight
-    longest_m: float  # a longer step is no measurement
+    min_inliers: int  # landmarks
+    min_inlier_ratio: float  # of the landmarks in sight
+    max_step_m: float  # since the reference image
 
 
-def pose_beside_glass(
-    window: SlidingWindow, corners: Corners, base: Pose, guesses: Sequence[Pose], fitting: Fitting
-) -> tuple[Corners, Located | None]:
-    """The corners to use and the pose by them: the street's alone where those that stand lead to another pose.
+def pose_without_fixed_corners(
+    window: SlidingWindow, corners: Corners, reference: Pose, guesses: Sequence[Pose], limits: InlierLimits
+) -> tuple[Corners, PoseEstimate | None]:
+    """The corners used and the pose from them: without the fixed ones where these would change the pose.
 
-    Parameters are those of `pose_among_landmarks`; `corners` themselves are given back where none is left out.
+    Parameters as of `pose_from_landmarks`. Returns `corners` itself where none is left out.
     """
-    both = pose_among_landmarks(window, corners, base, guesses, fitting)
-    if not corners.stands.any():
+    both = pose_from_landmarks(window, corners, reference, guesses, limits)
+    if not corners.fixed.any():
         return corners, both
-    street = corners.of_street()
-    alone = pose_among_landmarks(window, street, base, guesses, fitting)
+    street = corners.without_fixed()
+    alone = pose_from_landmarks(window, street, reference, guesses, limits)
     if both is None or alone is None:
         return street, alone
-    between, step = both[0].between(alone[0]), base.between(alone[0])
+    between, step = both[0].between(alone[0]), reference.between(alone[0])
     turned = float(np.linalg.norm(rotation_log(between.R))) > _SAME_RAD
     moved = float(np.linalg.norm(between.p)) > _SAME_REL * float(np.linalg.norm(step.p))
     return (street, alone) if turned or moved else (corners, both)
 
 
-def pose_among_landmarks(
-    window: SlidingWindow, corners: Corners, base: Pose, guesses: Sequence[Pose], fitting: Fitting
-) -> Located | None:
-    """The image's pose in the window's frame and its information (6, 6); None where too few landmarks agree on one.
+def pose_from_landmarks(
+    window: SlidingWindow, corners: Corners, reference: Pose, guesses: Sequence[Pose], limits: InlierLimits
+) -> PoseEstimate | None:
+    """The image's pose in the window's frame and its information (6, 6); None where too few landmarks are inliers.
 
-    `base` is the pose of the image before, `guesses` are tried until one fits well.
+    `reference` is the pose of the reference image; `guesses` are tried in turn until one has enough inliers.
     """
-    shared = len(common(corners.ids, window.ids[np.isfinite(window.rho)])[0])
+    matches = len(match_ids(corners.ids, window.ids[np.isfinite(window.rho)])[0])
     best: tuple[int, Pose, Floats] | None = None
-    if shared >= fitting.least:
+    if matches >= limits.min_inliers:
         for guess in guesses:
-            pose, inliers, info = locate(window, guess, corners.ids, corners.xy)
+            pose, inliers, info = resect(window, guess, corners.ids, corners.xy)
             if best is None or inliers.sum() > best[0]:
                 best = (int(inliers.sum()), pose, info)
-            if best[0] > _ENOUGH * shared:
+            if best[0] > _GOOD_INLIER_RATIO * matches:
                 break
-    if best is None or best[0] < max(fitting.least, fitting.least_fraction * shared):
+    if best is None or best[0] < max(limits.min_inliers, limits.min_inlier_ratio * matches):
         return None
-    return best[1:] if float(np.linalg.norm(best[1].p - base.p)) <= fitting.longest_m else None
+    return best[1:] if float(np.linalg.norm(best[1].p - reference.p)) <= limits.max_step_m else None
+
+
+@dataclass(frozen=True)
+class _Landmarks:
+    """The N landmarks of known depth that the image shows."""
+
+    scaled: Floats  # (3, N) positions in the window's axes, times the inverse depths
+    rho: Floats  # (N,) inverse depth
+    rho_sigma: Floats  # (N,) 0 where unknown
+    p_anchor: Floats  # (3, N)
+    target: Floats  # (2, N) observations, normalised coordinates
+
+
+def resect(window: SlidingWindow, guess: Pose, ids: Ints, xy: Floats) -> tuple[Pose, Bools, Floats]:
+    """The pose from observations of landmarks: ids (N,), xy (N, 2) in normalised coordinates.
+
+    Returns the pose, the inliers (N,), and the pose's information (6, 6) of (translation, rotation) in the camera's own
+    axes; `guess` and no information where too few landmarks are seen.
+    """
+    inliers = np.zeros(len(ids), bool)
+    at, known = _match_landmarks(window, ids)
+    if known.sum() < _MIN_LANDMARKS:
+        return guess, inliers, np.zeros((6, 6))
+    landmarks = _landmarks(window, at[known], xy[known])
+    pose, info = guess, np.zeros((6, 6))
+    limit = window.reject_px / window.sigma_px
+    J = np.zeros((6, 2, len(landmarks.rho)))
+    for k in range(_ITERATIONS):
+        r, variance, ahead = _linearise(window, landmarks, pose, J)
+        norm = np.sqrt((r[0] ** 2 + r[1] ** 2) / variance)
+        gate = max(limit, 3.0 * 1.2 * upper_median(norm)) if k < _ADAPTIVE_ITERATIONS else limit
+        w = np.where(ahead & (norm < gate), 1.0 / (np.maximum(1.0, norm / _HUBER_SIGMA) * variance), 0.0)
+        flat = J.reshape(6, -1)
+        Jw = (J * w).reshape(6, -1)
+        info = Jw @ flat.T
+        g = Jw @ r.reshape(-1)
+        step = -np.linalg.solve(info + (1e-9 * np.trace(info) + 1e-9) * np.eye(6), g)
+        pose = pose.moved(step)
+        if k >= _ADAPTIVE_ITERATIONS and np.abs(step).max() < _CONVERGED:
+            break
+    inliers[np.flatnonzero(known)] = (norm < limit) & ahead
+    return pose, inliers, info
+
+
+def _match_landmarks(window: SlidingWindow, ids: Ints) -> tuple[Ints, Bools]:
+    """(N,) index of each id's landmark in the window, and (N,) whether it is there with a known depth."""
+    at = np.searchsorted(window.ids, ids)
+    at = np.minimum(at, max(len(window.ids) - 1, 0))
+    known = np.zeros(len(ids), bool)
+    if len(window.ids):
+        known = (window.ids[at] == ids) & np.isfinite(window.rho[at])
+    return at, known
+
+
+def _landmarks(window: SlidingWindow, m: Ints, xy: Floats) -> _Landmarks:
+    anchor = window.anchors()[m]
+    R, p = window.stacked()
+    rho, p_anchor = window.rho[m], p.T.take(anchor, axis=1)
+    return _Landmarks(
+        scaled=rotate_rays(R, anchor, window.xy_of(anchor, m)) + rho * p_anchor,
+        rho=rho,
+        rho_sigma=np.where(np.isfinite(window.rho_sigma[m]), window.rho_sigma[m], 0.0),
+        p_anchor=p_anchor,
+        target=np.ascontiguousarray(xy.T),
+    )
+
+
+def _linearise(window: SlidingWindow, seen: _Landmarks, pose: Pose, J: Floats) -> tuple[Floats, Floats, Bools]:
+    """Residuals (2, N) in px, variances (N,), and which landmarks lie ahead; fills the Jacobian J (6, 2, N)."""
+    f, rho = window.focal_px, seen.rho
+    place = (pose.R.T @ pose.p)[:, None]
+    q = pose.R.T @ seen.scaled - rho * place
+    ahead = q[2] > MIN_DEPTH
+    z = np.maximum(q[2], MIN_DEPTH)
+    u, v = uv = q[:2] / z
+    by_z = f / z
+    along_z, fu, fv = rho * by_z, f * u, f * v
+    J[0, 0] = J[1, 1] = -along_z
+    np.multiply(along_z, uv, out=J[2])
+    J[3, 0] = fu * v
+    np.negative(J[3, 0], out=J[4, 1])
+    f_z = f * (q[2] / z)
+    J[3, 1] = f_z + fv * v
+    J[4, 0] = -(f_z + fu * u)
+    J[5, 0] = fv
+    np.negative(fu, out=J[5, 1])
+    # An uncertain depth blurs the observation along its epipolar line; isotropic is near enough.
+    a = pose.R.T @ seen.p_anchor - place
+    along = (a[:2] - uv * a[2]) * (by_z * seen.rho_sigma)
+    return (uv - seen.target) * f, window.sigma_px**2 + (along[0] ** 2 + along[1] ** 2), ahead

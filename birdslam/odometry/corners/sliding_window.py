@@ -1,7 +1,7 @@
 """The sliding window of the odometry: the last keyframes and the landmarks that they share.
 
-A landmark is one number, its inverse depth along the ray of its anchor, the first keyframe of the window that saw it.
-All coordinates are normalised ones of an undistorted camera; the unit of length is the caller's.
+A landmark is parametrised by its inverse depth along the ray of its anchor, the first keyframe of the window that saw
+it (Civera et al. 2008). Coordinates are normalised ones of an undistorted camera; the unit of length is the caller's.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose
 
 Floats = NDArray[np.float64]
@@ -17,18 +18,18 @@ Ints = NDArray[np.int64]
 MIN_DEPTH = 1e-3  # of a ray's own length: nearer or behind counts as not visible
 
 
-def common(a: Ints, b: Ints) -> tuple[Ints, Ints]:
-    """Where each number that both have stands in a (N,) and in b (M,), which ascend; numpy.intersect1d sorts anew."""
+def match_ids(a: Ints, b: Ints) -> tuple[Ints, Ints]:
+    """Indices in a (N,) and in b (M,), both ascending, of the ids that both have; numpy.intersect1d would sort them."""
     at = np.searchsorted(b, a)
     at[at == len(b)] = 0
     both = np.flatnonzero(b[at] == a) if len(b) else np.zeros(0, np.int64)
     return both, at[both]
 
 
-def turned(R: Floats, anchor: Ints, xy: Floats) -> Floats:
-    """(3, M) rays of normalised coordinates (M, 2), each by the rotation, of (F, 3, 3), that `anchor` (M,) names.
+def rotate_rays(R: Floats, anchor: Ints, xy: Floats) -> Floats:
+    """(3, M) rays of normalised coordinates (M, 2), each rotated by R[anchor], R (F, 3, 3), anchor (M,).
 
-    Products of M small matrices take numpy twice as long, and so does a row for each by an index instead of `take`.
+    Written out, since M products of small matrices take numpy twice as long.
     """
     by, (x, y) = R.transpose(1, 2, 0).reshape(9, -1).take(anchor, axis=1), xy.T
     out: Floats = by[::3] * x + by[1::3] * y + by[2::3]
@@ -45,7 +46,9 @@ class SlidingWindow:
         self.focal_px, self.sigma_px, self.reject_px = focal_px, sigma_px, reject_px
         self.poses: list[Pose] = []
         self.frames: list[int] = []
-        self.held_m: list[float] = []  # 1-sigma of a place that a held speed gave; infinite where the images showed it
+        self.predicted_sigma_m: list[
+            float
+        ] = []  # 1-sigma of a position from the velocity prior; inf where the images gave it
         self.ids: Ints = np.zeros(0, np.int64)  # (M,) ascending
         self.obs: Floats = np.zeros((0, 0, 2))  # (F, M, 2), NaN where not seen
         self.rho: Floats = np.zeros(0)  # (M,) inverse depth along the anchor's ray (z = 1), NaN unknown
@@ -57,12 +60,12 @@ class SlidingWindow:
         return out
 
     def xy_of(self, anchor: Ints, landmarks: Ints) -> Floats:
-        """(N, 2) what the keyframes `anchor` (N,) saw of `landmarks` (N,), normalised coordinates."""
+        """(N, 2) observations of `landmarks` (N,) by the keyframes `anchor` (N,), normalised coordinates."""
         out: Floats = self.obs.reshape(-1, 2).take(anchor * self.obs.shape[1] + landmarks, axis=0)
         return out
 
-    def append(self, frame: int, pose: Pose, ids: Ints, xy: Floats, held_m: float = np.inf) -> None:
-        """A new keyframe: ids (N,) ascending, xy (N, 2) normalised coordinates; `held_m` as above."""
+    def append(self, frame: int, pose: Pose, ids: Ints, xy: Floats, predicted_sigma_m: float = np.inf) -> None:
+        """A new keyframe: ids (N,) ascending, xy (N, 2) normalised coordinates; `predicted_sigma_m` as in the class."""
         merged = np.concatenate([self.ids, ids])
         merged.sort(kind="stable")
         merged = merged[np.concatenate([[True], merged[1:] != merged[:-1]])] if len(merged) else merged
@@ -75,19 +78,19 @@ class SlidingWindow:
         self.ids, self.obs, self.rho, self.rho_sigma = merged, obs, rho, sigma
         self.poses.append(pose)
         self.frames.append(frame)
-        self.held_m.append(held_m)
+        self.predicted_sigma_m.append(predicted_sigma_m)
 
     def drop(self, index: int) -> None:
-        """Forgets one keyframe. Landmarks anchored in it move to the next keyframe that saw them."""
+        """Removes a keyframe. Landmarks anchored in it are re-anchored in the next keyframe that saw them."""
         anchor, gone, xy = self.anchors(), self.poses[index], self.obs[index]
         self.obs = self.obs[np.arange(len(self.poses)) != index]
-        del self.poses[index], self.frames[index], self.held_m[index]
+        del self.poses[index], self.frames[index], self.predicted_sigma_m[index]
         seen = np.isfinite(self.obs[..., 0]).any(axis=0)
         moved = np.flatnonzero(seen & (anchor == index) & np.isfinite(self.rho))
         if len(moved):
             new = self.anchors()[moved]
             R, p = self.stacked()
-            # A point at infinity stays there; one behind its new anchor is forgotten.
+            # A point at infinity stays there; one behind its new anchor becomes unknown.
             far = self.rho[moved] <= 1e-6
             depth = 1.0 / np.where(far, 1.0, self.rho[moved])
             X = (np.column_stack([xy[moved], np.ones(len(moved))]) * depth[:, None]) @ gone.R.T + gone.p
@@ -100,13 +103,22 @@ class SlidingWindow:
         """Multiplies all lengths, about the newest camera."""
         centre = self.poses[-1].p
         self.poses = [Pose(T.R, centre + factor * (T.p - centre)) for T in self.poses]
-        self.held_m = [factor * sigma_m for sigma_m in self.held_m]
+        self.predicted_sigma_m = [factor * sigma_m for sigma_m in self.predicted_sigma_m]
         self.rho = self.rho / factor
         self.rho_sigma = self.rho_sigma / factor
 
     def predict_xy(self, pose: Pose) -> Floats:
-        """(M, 2) where a camera at `pose` sees the landmarks; NaN where unknown or behind it."""
+        """(M, 2) projections of the landmarks into a camera at `pose`; NaN where unknown or behind it."""
         return self.seen_from(pose)[0][:2].T
+
+    def predict_px(self, camera: Camera, pose: Pose, ids: Ints, otherwise_px: Floats) -> Floats:
+        """(N, 2) pixels of the landmarks `ids` (N,) in a camera at `pose`; `otherwise_px` (N, 2) where not known."""
+        if not len(self.ids):
+            return otherwise_px
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        px = camera.to_px(self.predict_xy(pose)[at])
+        known = (self.ids[at] == ids) & np.isfinite(px).all(axis=1)
+        return np.where(known[:, None], px, otherwise_px)
 
     def depths(self, pose: Pose) -> Floats:
         """(M,) z of the landmarks in a camera at `pose`; NaN where unknown."""
@@ -125,20 +137,20 @@ class SlidingWindow:
         return q / z, self.rho / z
 
     def _seen_from(self, pose: Pose) -> Floats:
-        """(3, M) the landmarks in a camera at `pose`, times their inverse depths."""
+        """(3, M) the landmarks in the axes of a camera at `pose`, times their inverse depths."""
         anchor = self.anchors()
         R, p = self.stacked()
-        rays = turned(pose.R.T @ R, anchor, self.xy_of(anchor, np.arange(len(self.ids))))
+        rays = rotate_rays(pose.R.T @ R, anchor, self.xy_of(anchor, np.arange(len(self.ids))))
         out: Floats = rays + self.rho * (pose.R.T @ (p - pose.p).T).take(anchor, axis=1)
         return out
 
     def triangulate(self) -> None:
-        """Inverse depths of what the newest keyframe and another see, by linear least squares with the poses held."""
+        """Inverse depths of landmarks seen by the newest keyframe and another, by linear least squares, poses fixed."""
         newest = np.isfinite(self.obs[-1, :, 0])
         anchor, xy = self.anchors()[newest], self.obs[:, newest].transpose(0, 2, 1)
         R, p = self.stacked()
         R_w = R.transpose(0, 2, 1)
-        q0 = R_w @ turned(R, anchor, self.xy_of(anchor, np.flatnonzero(newest)))  # (F, 3, M)
+        q0 = R_w @ rotate_rays(R, anchor, self.xy_of(anchor, np.flatnonzero(newest)))  # (F, 3, M)
         dq = (R_w @ (p.T - p[:, :, None])).take(anchor, axis=2)
         others = np.isfinite(xy[:, 0]) & (np.arange(len(p))[:, None] != anchor[None])
         # r(rho) = (q0 + rho dq)_xy - xy (q0 + rho dq)_z is linear in rho; weights 1 / q_z make it a reprojection error

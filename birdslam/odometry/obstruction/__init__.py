@@ -1,1 +1,1 @@
-"""What stands before the camera and moves with it: bonnet, dirt, drops and reflections, found and masked."""
+"""What is fixed to the car in front of the camera: dirt, drops and reflections on the windscreen, the bonnet."""

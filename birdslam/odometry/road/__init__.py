@@ -1,4 +1,4 @@
-"""The road's image: direct alignment of two images, and a Kalman filter of scale, tilt and curvature over them.
+"""The metric scale from the road: direct alignment of two images, and a Kalman filter of scale, tilt and curvature.
 
-Read `scale` first (the metric scale), then `alignment` (one comparison) and `kalman_filter` (all of them).
+Read `scale` first (what happens with an image), then `alignment` (one pair of images) and `kalman_filter` (all pairs).
 """

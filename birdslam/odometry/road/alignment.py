@@ -1,13 +1,10 @@
 """Direct alignment of the road in two images: scale, pitch, roll and curvature from the road's grey values.
 
-Corners that optical flow follows on the road give a length that is always short: the tracker's window sees a strong
-change of perspective there. So the earlier image is warped by the homography of the road plane,
-K (R + lambda t n(pitch, roll)^T / H) K^-1, against the present one, over the length's factor lambda, the pitch and the
-roll together: in one pair of images the three are correlated, and a wrong pitch biases the length by several per cent.
-
-So does a plane where the road bends: over a crest of 1000 m radius it lies 0.2 m below its tangent 20 m ahead, which a
-camera 1.65 m above it takes for 12 % of the distance. The road is therefore a parabola along the direction of travel,
-s^2 / 2 times `curvature` (1/m, > 0 in a sag) above the plane that touches it at the camera's foot; the tilt is of that.
+The past image is warped by the homography of the road plane, K (R + lambda t n(pitch, roll)^T / H) K^-1, against the
+present one, over the length's factor lambda, pitch and roll together, since they are correlated. Optical flow of
+corners on the road gives lengths that are too short: the perspective changes strongly within the tracker's window. A
+bending road is a parabola, s^2 / 2 times `curvature` (1/m, > 0 in a sag) above the plane that touches it at the
+camera's foot; the tilt is against that plane. docs/method.md has what a plane would cost.
 """
 
 from __future__ import annotations
@@ -20,10 +17,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.camera import Camera
+from birdslam.geometry.camera import Camera, plane_normal
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.median import upper_median
-from birdslam.odometry.road.fit import MOTION, ROAD, RoadFit, Slopes, fit_alone
+from birdslam.odometry.road.fit import MOTION, ROAD, Gradients, RoadFit, fit_without_prior
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -32,40 +29,40 @@ Bools = NDArray[np.bool_]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 _MARGIN_PX = 4  # from the image's edge, for the warp and the smoothing
-_LARGEST_STEP = np.array([0.1, 0.1, 0.1, 0.005] + [0.1] * MOTION)  # of one iteration
-# The change of each that counts as much as 1 rad; the motion's errors need not converge as far
+_MAX_STEP = np.array([0.1, 0.1, 0.1, 0.005] + [0.1] * MOTION)  # of one iteration
+# Of convergence: the change of each state that counts as much as 1 rad
 _STEP_UNITS = np.array([1.0, 1.0, 1.0, 0.05] + [3.0] * MOTION)
-_NEAREST, _BEHIND = 1e-3, 0.05  # depths in units of the road's: a place is no nearer, and one so near is not seen
-_SQUEEZED = 1e-3  # an area of the past image so small shows no slope
-_BEYOND_CREST = 0.01  # where a ray would miss the parabola: that is behind the crest
+_MIN_DEPTH, _MIN_VISIBLE = 1e-3, 0.05  # depths, in m along the past camera's axis
+_MIN_DETERMINANT = 1e-3  # of the map from the present to the past image: a smaller area shows no gradient
+_BEHIND_CREST = 0.01  # where a ray misses the parabola: the road is hidden by its crest
 
 
 class RoadAlignConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is compared on the road, and how much it is believed."""
+    """Which pixels of the road are aligned, and with which uncertainty."""
 
     near_m: Positive = 4.0  # where the strip of road begins
     far_m: Positive = 22.0  # where it ends
-    half_width_m: Positive = 3.2  # of the strip in front of the car; past it come crown, kerb and parked cars
+    half_width_m: Positive = 3.2  # of the strip in front of the car; beyond it come crown, kerb and parked cars
     lane_half_width_m: Positive = 2.0  # of the strip where no road mask is given: the car's own lane
-    max_samples: Annotated[int, msgspec.Meta(ge=200)] = 2600  # pixels of the road that are compared
-    min_samples: Annotated[int, msgspec.Meta(ge=50)] = 250  # fewer say nothing
-    contrast_window_px: Annotated[int, msgspec.Meta(ge=3)] = 13  # over which brightness and contrast are evened out
-    contrast_floor_grey: Positive = 2.0  # added to the contrast, so that noise on smooth road is not blown up
-    # Neighbouring pixels err together. After the true motion was disturbed at random, 0.12 gave the errors their sigma
-    # (KITTI 01, 06, 0005, the shipped drive, a rendered ramp and night); the road's shape errs the same way each time,
-    # most in short steps: the raw clip without boxes is 16 % too long by 0.12, 7 % by 0.04, 3 % by 0.013
+    max_samples: Annotated[int, msgspec.Meta(ge=200)] = 2600  # pixels of the road that are aligned
+    min_samples: Annotated[int, msgspec.Meta(ge=50)] = 250  # with fewer there is no alignment
+    contrast_window_px: Annotated[int, msgspec.Meta(ge=3)] = 13  # over which brightness and contrast are normalised
+    contrast_floor_grey: Positive = 2.0  # added to the contrast, so that noise on smooth road is not amplified
+    # Errors of neighbouring pixels are correlated. With the true motion disturbed at random, 0.12 fits the errors
+    # (KITTI 01, 06, 0005, the shipped drive, a rendered ramp and night); the road's shape makes a systematic one, most
+    # in short steps: the raw clip without boxes is 16 % too long by 0.12, 7 % by 0.04, 3 % by 0.013
     effective_sample_fraction: Positive = 0.04
-    sigma_rotation_rad: Positive = 0.0005  # of the relative rotation that odometry hands over, at the least
+    sigma_rotation_rad: Positive = 0.0005  # of the odometry's relative rotation, at the least
     sigma_direction_rad: Positive = 0.007  # of the direction of its translation, at the least
     max_iterations: Annotated[int, msgspec.Meta(ge=3)] = 7  # of the alignment
-    coarse_step: Annotated[int, msgspec.Meta(ge=1)] = 4  # every so-manieth sample is used at first
-    coarse_tolerance: Positive = 2e-3  # the coarse steps end with a smaller change
-    tolerance: Positive = 1e-3  # the fine ones end with a smaller change
+    coarse_step: Annotated[int, msgspec.Meta(ge=1)] = 4  # at first only each n-th sample is used
+    coarse_tolerance: Positive = 2e-3  # of convergence, of the coarse iterations
+    tolerance: Positive = 1e-3  # of convergence, of the fine ones
 
 
 @dataclass(frozen=True)
 class _View:
-    """Samples of the present image: their rays (3, N), those turned into the past camera (3, N), their grey (N,)."""
+    """Samples of the present image: rays (3, N), rays rotated to the past camera (3, N), grey values (N,)."""
 
     rays: Floats
     turned: Floats
@@ -74,9 +71,9 @@ class _View:
 
 @dataclass(frozen=True)
 class _Places:
-    """Where the past camera sees samples: at (x, y) of z = 1, (N,) each, of the inverse depth `by_z`.
+    """Samples projected to the past camera: (x, y) at z = 1, (N,) each, and their inverse depth `by_z` there.
 
-    `rho` is the inverse depth of the present camera, `root` what it is solved by.
+    `rho` is the inverse depth in the present camera, `root` the square root in its solution.
     """
 
     x: Floats
@@ -86,45 +83,30 @@ class _Places:
     root: Floats
 
 
-def _brightness(there: Floats, here: Floats) -> tuple[float, float]:
-    """Bias and gain by which the present image becomes the past one."""
-    gain = float(np.clip(((there - there.mean()) * (here - here.mean())).mean() / max(here.var(), 1e-6), 0.5, 2.0))
-    return float(there.mean() - gain * here.mean()), gain
+def _brightness(past: Floats, present: Floats) -> tuple[float, float]:
+    """Bias and gain that map the present grey values (N,) to the past ones."""
+    gain = ((past - past.mean()) * (present - present.mean())).mean() / max(present.var(), 1e-6)
+    gain = float(np.clip(gain, 0.5, 2.0))
+    return float(past.mean() - gain * present.mean()), gain
 
 
-def _correlation(there: Floats, here: Floats, weights: Floats) -> float:
+def _correlation(past: Floats, present: Floats, weights: Floats) -> float:
     w = weights / weights.sum()
-    a, b = there - w @ there, here - w @ here
+    a, b = past - w @ past, present - w @ present
     return float((w * a) @ b / np.sqrt(max(float((w * a) @ a * ((w * b) @ b)), 1e-12)))
 
 
 def _translation(T_past_present: Pose, x: Floats) -> Floats:
-    """(3,) in metres, its direction corrected by what x says of it."""
+    """(3,) in metres, with the direction's error that is part of x."""
     t, (right, down) = T_past_present.p, x[ROAD + 3 : ROAD + MOTION]
     out: Floats = np.exp(x[0]) * (t + float(np.linalg.norm(t)) * np.array([right, down, 0.0]))
     return out
 
 
-def plane_normal(pitch_rad: float, roll_rad: float) -> tuple[Floats, Floats, Floats]:
-    """The road's upward unit normal in camera axes and its derivatives by pitch and by roll, (3,) each."""
-    cp, sp, cr, sr = np.cos(pitch_rad), np.sin(pitch_rad), np.cos(roll_rad), np.sin(roll_rad)
-    return (
-        np.array([-cp * sr, -cp * cr, -sp]),
-        np.array([sp * sr, sp * cr, -cp]),
-        np.array([-cp * cr, cp * sr, 0.0]),
-    )
-
-
-def plane_tilt(normal: Floats) -> tuple[float, float]:
-    """(pitch_rad, roll_rad) of a unit normal in camera axes: the inverse of `plane_normal`."""
-    return float(-np.arcsin(np.clip(normal[2], -1.0, 1.0))), float(np.arctan2(-normal[0], -normal[1]))
-
-
 class RoadImage:
-    """The part of a grey image that can show road, its brightness and contrast evened out: made once for each image.
+    """The part of a grey image that can show road, with local brightness and contrast normalised.
 
-    Without that the edges of shadows, and of the dark below other cars, which travels with them, outweigh the road's
-    own grain.
+    Otherwise the edges of shadows, and of the dark below other cars, outweigh the road's texture.
     """
 
     def __init__(self, grey: NDArray[np.uint8], top_px: int, config: RoadAlignConfig) -> None:
@@ -138,36 +120,36 @@ class RoadImage:
         np.add(contrast, np.float32(config.contrast_floor_grey), out=contrast)
         difference = cv2.subtract(smooth, mean, dst=mean, dtype=cv2.CV_32F)
         self.grey: Grey = cv2.divide(difference, contrast, dst=mean, scale=10.0)  # type: ignore[assignment]
-        self._slopes: tuple[Grey, Grey] | None = None
+        self._gradients: tuple[Grey, Grey] | None = None
 
     @classmethod
     def of(cls, grey: Grey, top_px: int) -> RoadImage:
-        """Of rows from `top_px` on that are to be compared as they are."""
+        """Of rows from `top_px` on that are not to be normalised."""
         image = cls.__new__(cls)
-        image.top_px, image.grey, image._slopes = top_px, grey, None
+        image.top_px, image.grey, image._gradients = top_px, grey, None
         return image
 
     @property
-    def slopes(self) -> tuple[Grey, Grey]:
+    def gradients(self) -> tuple[Grey, Grey]:
         """d grey / du and d grey / dv, grey levels per pixel."""
-        if self._slopes is None:
-            self._slopes = (
+        if self._gradients is None:
+            self._gradients = (
                 cv2.Scharr(self.grey, cv2.CV_32F, 1, 0, scale=1.0 / 32.0),
                 cv2.Scharr(self.grey, cv2.CV_32F, 0, 1, scale=1.0 / 32.0),
             )  # type: ignore[assignment]
-        assert self._slopes is not None
-        return self._slopes
+        assert self._gradients is not None
+        return self._gradients
 
 
 class RoadAligner:
-    """Compares two images of the road of one camera."""
+    """Aligns two images of the road of one camera."""
 
     def __init__(self, camera: Camera, config: RoadAlignConfig) -> None:
         self.camera, self.config = camera, config
         # The nearest row that could show road at far_m with the nose up by 3 degrees.
         horizon = camera.cy_px + camera.fy_px * (camera.height_m / config.far_m - 0.05)
         self.top_px = int(np.clip(horizon, 0, camera.height_px - 32))
-        # Every second row and third column: below it lie rows of one another's blur.
+        # Every second row and third column: the smoothing correlates those between.
         self._pixels = (
             slice(self.top_px + _MARGIN_PX, camera.height_px - _MARGIN_PX, 2),
             slice(_MARGIN_PX, camera.width_px - _MARGIN_PX, 3),
@@ -186,10 +168,10 @@ class RoadAligner:
         bend_per_m: float = 0.0,
         wide: bool = False,
     ) -> Ints:
-        """Pixels (N, 2) of the present image that show road: of the mask, else of a strip in front, less vehicles.
+        """Pixels (N, 2) of the present image that show road: of the mask, else of a strip ahead; without vehicles.
 
-        `bend_per_m` is the curvature of the car's way to the right: where no mask is given, the strip bends with it. A
-        `wide` one takes in the lines of the lane.
+        `bend_per_m` is the curvature of the car's path to the right, which the strip follows. A `wide` strip includes
+        the lines of the lane.
         """
         cam, cfg = self.camera, self.config
         normal, _, _ = plane_normal(*tilt)
@@ -202,7 +184,7 @@ class RoadAligner:
         if road_mask is not None:
             keep &= road_mask[self._pixels]
         x1, y1, x2, y2 = boxes_px.T
-        grow_x, grow_y = 4.0 + 0.04 * (x2 - x1), 4.0 + 0.12 * (y2 - y1)  # a box ends above the shadow of its car
+        grow_x, grow_y = 4.0 + 0.04 * (x2 - x1), 4.0 + 0.12 * (y2 - y1)  # a box ends above its vehicle's shadow
         rows = np.searchsorted(v[:, 0], [y1 - grow_y, y2 + grow_y]).T.tolist()
         cols = np.searchsorted(u[0], [x1 - grow_x, x2 + grow_x]).T.tolist()
         for (top, bottom), (left, right) in zip(rows, cols, strict=True):
@@ -217,10 +199,10 @@ class RoadAligner:
         self, past: RoadImage, present: RoadImage, T_past_present: Pose, px: Ints, prior: Floats, prior_cov: Floats,
         sigma_motion: tuple[float, float] = (0.0, 0.0),
     ) -> RoadFit | None:  # fmt: skip
-        """Fits (log lambda, pitch, roll, curvature) of the present camera, with the prior; None: too few samples.
+        """Fits (log lambda, pitch, roll, curvature) of the present camera with a prior; None: too few samples.
 
-        `T_past_present` is the motion with its length in the odometry's own unit, lambda times it are metres;
-        `sigma_motion` is 1-sigma of its rotation and of its direction (rad); the configured ones are the least.
+        The length of `T_past_present` is in the odometry's unit; lambda times it is in metres. `sigma_motion` is
+        1-sigma of its rotation and of its direction (rad); the configured ones are the least.
         """
         cfg = self.config
         if len(px) < cfg.min_samples:
@@ -242,14 +224,14 @@ class RoadAligner:
         ):
             for _ in range(iterations):
                 places = self._places(view, T_past_present, x)
-                seen, grey, by_x, by_y = self._look(places, past)
+                seen, grey, by_x, by_y = self._sample_past(places, past)
                 if share * int(seen.sum()) < cfg.min_samples:
                     return None
                 if light is None:
                     light = _brightness(grey[seen], view.grey[seen])
                 r = grey - light[1] * view.grey - light[0]
-                slopes = self._slopes(view, places, by_x, by_y, T_past_present, x)
-                J = slopes.derivative
+                of_past = self._gradients(view, places, by_x, by_y, T_past_present, x)
+                J = of_past.derivative
                 sigma = 1.4826 * upper_median(np.abs(r[seen])) + 0.5
                 w = np.where(seen, 1.0 / np.maximum(1.0, np.abs(r) * (1.0 / (1.5 * sigma))), 0.0)
                 w *= share * cfg.effective_sample_fraction / sigma**2
@@ -260,23 +242,23 @@ class RoadAligner:
                 A[-2, -2] += 1e-9
                 A[-1, -1] += 1e-6
                 step = -np.linalg.solve(A, g)
-                at, gain = x, light[1]  # what `r` and `slopes` are of
-                x = x + np.clip(step[:-2], -_LARGEST_STEP, _LARGEST_STEP)
+                at, gain = x, light[1]  # what `r` and `of_past` are of
+                x = x + np.clip(step[:-2], -_MAX_STEP, _MAX_STEP)
                 light = (light[0] + step[-2], light[1] + step[-1])
                 if (np.abs(step[:-2]) < tolerance * _STEP_UNITS).all():
                     break
-        here = self._slopes_here(fine, present, px, T_past_present, at, gain)
+        of_present = self._present_gradients(fine, present, px, T_past_present, at, gain)
         motion = slice(ROAD, ROAD + MOTION)
-        state, cov = fit_alone(at, px, slopes, here, r, w, weight_prior[motion, motion])
+        state, cov = fit_without_prior(at, px, of_past, of_present, r, w, weight_prior[motion, motion])
         return RoadFit(state, cov, _correlation(grey, fine.grey, w), int(seen.sum()))
 
-    def driven(self, past: RoadImage, T_past_present: Pose, px: Ints, road: Floats) -> tuple[Floats, Bools]:
-        """(N,) what the past image has where a motion and a road (4,) put the present pixels (N, 2), and if it has it.
+    def warp(self, past: RoadImage, T_past_present: Pose, px: Ints, road: Floats) -> tuple[Floats, Bools]:
+        """(N,) grey values of the past image, warped to the present pixels (N, 2) by a motion and a road state (4,).
 
-        Nothing is fitted.
+        And (N,) which of them it shows. Nothing is fitted.
         """
         places = self._places(self._view(past, px, T_past_present), T_past_present, np.append(road, np.zeros(MOTION)))
-        seen, grey, _, _ = self._look(places, past)
+        seen, grey, _, _ = self._sample_past(places, past)
         return grey, seen
 
     def _view(self, present: RoadImage, px: Ints, T_past_present: Pose) -> _View:
@@ -288,37 +270,38 @@ class RoadAligner:
         return _View(rays, T_past_present.R @ rays, grey)
 
     def _places(self, view: _View, T_past_present: Pose, x: Floats) -> _Places:
-        """Where the past camera sees the samples, on the road of `x` and after the motion that it has."""
+        """The samples projected to the past camera, on the road and by the motion of the state `x`."""
         # Eq. 1 is X = rays / rho; with the curvature rho solves H rho^2 - below rho - curvature / 2 = 0
         height_m = self.camera.height_m
         below = -(plane_normal(x[1], x[2])[0] @ view.rays)
-        root = np.sqrt(np.maximum(below**2 + 2.0 * height_m * x[3], _BEYOND_CREST * below**2))
+        root = np.sqrt(np.maximum(below**2 + 2.0 * height_m * x[3], _BEHIND_CREST * below**2))
         rho = (below + root) * (0.5 / height_m)
         q = rotation_exp(x[ROAD : ROAD + 3]) @ view.turned + rho * _translation(T_past_present, x)[:, None]
-        by_z = 1.0 / np.maximum(q[2], _NEAREST)
+        by_z = 1.0 / np.maximum(q[2], _MIN_DEPTH)
         return _Places(q[0] * by_z, q[1] * by_z, by_z, rho, root)
 
-    def _look(self, places: _Places, past: RoadImage) -> tuple[Bools, Floats, Floats, Floats]:
-        """Which samples the past image shows, its grey there, and its slopes by x and by y of z = 1."""
+    def _sample_past(self, places: _Places, past: RoadImage) -> tuple[Bools, Floats, Floats, Floats]:
+        """Which samples the past image shows, its grey values there, and its gradients by x and y at z = 1."""
         cam = self.camera
         u = (cam.fx_px * places.x + cam.cx_px).astype(np.float32)
         v = (cam.fy_px * places.y + (cam.cy_px - past.top_px)).astype(np.float32)
         rows, cols = past.grey.shape
-        seen = (u > 1) & (u < cols - 2) & (v > 1) & (v < rows - 2) & (places.by_z < 1.0 / _BEHIND)
+        seen = (u > 1) & (u < cols - 2) & (v > 1) & (v < rows - 2) & (places.by_z < 1.0 / _MIN_VISIBLE)
         grey, by_u, by_v = (
-            cv2.remap(image, u, v, cv2.INTER_LINEAR).ravel().astype(np.float64) for image in (past.grey, *past.slopes)
+            cv2.remap(image, u, v, cv2.INTER_LINEAR).ravel().astype(np.float64)
+            for image in (past.grey, *past.gradients)
         )
         return seen, grey, by_u * cam.fx_px, by_v * cam.fy_px
 
-    def _slopes_here(
+    def _present_gradients(
         self, view: _View, present: RoadImage, px: Ints, T_past_present: Pose, x: Floats, gain: float
-    ) -> Slopes:
-        """The slopes of the present image, as the past camera sees them, of `gain` times the contrast."""
+    ) -> Gradients:
+        """The present image's gradients in the past camera's axes, with the contrast times `gain`."""
         cam = self.camera
         places = self._places(view, T_past_present, x)
         normal, t = plane_normal(x[1], x[2])[0], _translation(T_past_present, x)
         R = rotation_exp(x[ROAD : ROAD + 3]) @ T_past_present.R
-        # By how much the place in the past image moves with the pixel of the present one; the road is flat enough
+        # Derivative of the projection by the present pixel, on a flat road
         by_ray = R[:, :2] - np.outer(t, normal[:2]) / cam.height_m
         (xx, xy), (yx, yy) = (
             [(by_ray[axis, k] - place * by_ray[2, k]) * places.by_z for k in (0, 1)]
@@ -326,18 +309,18 @@ class RoadAligner:
         )
         by_x, by_y = (
             slope[px[:, 1] - present.top_px, px[:, 0]] * (gain * focal_px)
-            for slope, focal_px in zip(present.slopes, (cam.fx_px, cam.fy_px), strict=True)
+            for slope, focal_px in zip(present.gradients, (cam.fx_px, cam.fy_px), strict=True)
         )
         det = xx * yy - xy * yx
-        det = np.where(np.abs(det) < _SQUEEZED, _SQUEEZED, det)
-        return self._slopes(
+        det = np.where(np.abs(det) < _MIN_DETERMINANT, _MIN_DETERMINANT, det)
+        return self._gradients(
             view, places, (yy * by_x - yx * by_y) / det, (xx * by_y - xy * by_x) / det, T_past_present, x
         )
 
-    def _slopes(
+    def _gradients(
         self, view: _View, places: _Places, by_x: Floats, by_y: Floats, T_past_present: Pose, x: Floats
-    ) -> Slopes:
-        """With the residual's derivative that slopes by x and by y of z = 1 make, (N,) each."""
+    ) -> Gradients:
+        """Image gradients by x and y at z = 1, (N,) each, and by them the residual's derivative."""
         gx, gy = by_x * places.by_z, by_y * places.by_z
         gz = -(gx * places.x + gy * places.y)
         _, by_pitch, by_roll = plane_normal(x[1], x[2])
@@ -357,4 +340,4 @@ class RoadAligner:
         np.multiply(gy, by_length, out=J[8])
         J[9] = -1.0
         np.negative(view.grey, out=J[10])
-        return Slopes(gx, gy, J)
+        return Gradients(gx, gy, J)

@@ -1,16 +1,10 @@
-"""Whether the camera's mount still has the tilt of its calibration: a bank of Kalman filters with change points.
+"""Mount-change detection: whether the camera still has the tilt of its calibration, by change-point Kalman filters.
 
-The tilt that is measured over a few metres (a look) is that of the mount, plus a wander about it: the road's crown and
-changes of grade, loads, braking. The wander lasts for tens of metres, so that looks are not independent, and the mean
-over a long distance is worth less than their number says. One Kalman filter for each of pitch and roll holds both:
-
-    look = mount + wander + noise        wander: an Ornstein-Uhlenbeck process over distance
-
-A knock turns the mount at once: a change point (Bayesian online change points, Adams and MacKay 2007). With each look a
-further filter starts, for the case that a knock has just happened. It is believed once it predicts the looks since then
-better than the filter without a knock, by more than knocks are rare. Such a step shows more clearly against the metres
-before it, whose wander is nearly the same, than against the camera file. A mount that was never as in the file shows in
-the mount's estimate itself.
+A tilt sample over a few metres is the mount's tilt plus a wander (crown, grade, load, braking) that is correlated over
+tens of metres, an Ornstein-Uhlenbeck process. A Kalman filter for each of pitch and roll has both as states. A knock is
+a change point (Bayesian online change-point detection, Adams and MacKay 2007): with each sample a further hypothesis
+starts with a knock there, and wins once its likelihood exceeds that of no knock by more than knocks are rare. A mount
+that was never as in the file shows in the mount's estimate.
 """
 
 from __future__ import annotations
@@ -31,36 +25,38 @@ AXES = 2  # pitch, roll
 MOUNT, WANDER = range(2)
 
 
-class TiltWatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How cameras lean in their cars, and cars on real roads."""
+class MountChangeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How far cameras tilt in their cars, and cars on real roads."""
 
-    look_m: Positive = 2.0  # the way from one look at the tilt to the next
-    sigma_look_rad: Positive = 0.003  # of one look: bounces, and errors of the filter
+    sample_m: Positive = 2.0  # travelled from one sample of the tilt to the next
+    sigma_sample_rad: Positive = 0.003  # of one sample: bounces, and errors of the filter
     wander_m: Positive = 40.0  # the wander's correlation length
     sigma_wander_pitch_rad: Positive = 0.005  # grade and load
     sigma_wander_roll_rad: Positive = 0.012  # grade, load and the road's crown
-    mount_walk_rad_per_sqrt_m: Positive = 2e-5  # by which the camera's mount gives way
-    sigma_knock_rad: Positive = 0.05  # 1-sigma of what a knock turns the camera by
-    knock_odds: Positive = 1e-5  # of a knock at one look, beforehand
-    gate_sigma: Positive = 3.5  # a look farther from the prediction is an outlier (a pothole) and is not used
-    kept_looks: Annotated[int, msgspec.Meta(ge=2)] = 24  # within so many a change point is confirmed or dropped
-    # A mount that is off by more is told as calibration_drift: 2.2 degrees where the file promises 0.86. None of KITTI
-    # 00, 01, 06, 0005 and the raw clip is told, whose files are off by up to 1.5; of 40 simulated drives of 1.5 km one
+    mount_walk_rad_per_sqrt_m: Positive = 2e-5  # drift of the mount
+    sigma_knock_rad: Positive = 0.05  # of the camera's turn by a knock
+    knock_odds: Positive = 1e-5  # prior odds of a knock at one sample
+    gate_sigma: Positive = 3.5  # a sample farther from its prediction is an outlier (a pothole)
+    max_hypotheses: Annotated[int, msgspec.Meta(ge=2)] = (
+        24  # samples within which a change point is confirmed or dropped
+    )
+    # A mount that is off by more is reported as calibration_drift: 2.2 degrees where the file's sigma is 0.86. None of
+    # KITTI 00, 01, 06, 0005 and the raw clip is, whose files are off by up to 1.5; of 40 simulated drives of 1.5 km one
     drift_sigma: Positive = 2.5  # that many sigma
 
 
-class TiltWatch:
+class MountChangeDetector:
     """State, measurements and readers:
 
-    - Each of K filters: mount and wander (rad, off the camera file's tilt), for pitch and roll: (K, AXES, 2). The first
-      filter assumes no further knock, each next one a later knock.
-    - Measurements: the tilt of `RoadFilter`, averaged over `look_m` metres (`see`).
+    - State of each of K hypotheses: mount and wander (rad, against the camera file's tilt), for pitch and roll:
+      (K, AXES, 2). The first assumes no further knock, each next one a later knock.
+    - Measurements: the tilt of `RoadFilter`, averaged over `sample_m` metres (`update`).
     - Readers: `RoadScale`, which reports CALIBRATION_DRIFT where `drifted`.
     """
 
-    def __init__(self, camera: Camera, config: TiltWatchConfig) -> None:
+    def __init__(self, camera: Camera, config: MountChangeConfig) -> None:
         self.config = config
-        self._calibrated = np.array([camera.pitch_rad, camera.roll_rad])
+        self._file_tilt = np.array([camera.pitch_rad, camera.roll_rad])
         self._calibrated_var = camera.tilt_sigma_rad**2
         self._wander_var = np.square([config.sigma_wander_pitch_rad, config.sigma_wander_roll_rad])
         self._x = np.zeros((1, AXES, 2))
@@ -68,59 +64,59 @@ class TiltWatch:
         self._P[..., MOUNT, MOUNT] = self._calibrated_var
         self._P[..., WANDER, WANDER] = self._wander_var
         self._log_odds = np.zeros(1)  # of each against the first
-        self._knocked = False
-        self._sum_rad_m, self._seen_m, self._unseen_m = np.zeros(AXES), 0.0, 0.0
+        self._has_changed = False
+        self._tilt_sum, self._averaged_m, self._skipped_m = np.zeros(AXES), 0.0, 0.0
 
     @property
     def mount(self) -> tuple[Floats, Floats]:
-        """(2,) each, rad: how far pitch and roll of the mount are off the camera file's, and 1-sigma."""
+        """(2,) each, rad: pitch and roll of the mount against the camera file's, and 1-sigma."""
         return self._x[0, :, MOUNT].copy(), np.sqrt(self._P[0, :, MOUNT, MOUNT])
 
     @property
     def drifted(self) -> bool:
-        """Whether the mount is off by more than chance: by the sigma of file and looks, after a knock by the looks'."""
+        """Whether the mount is significantly off: by file's and samples' sigma, after a knock by the samples' alone."""
         off, sigma = self.mount
-        # The variance that an estimate which starts at the file's tilt has where the file is right
-        var = np.square(sigma) if self._knocked else np.maximum(self._calibrated_var - np.square(sigma), 0.0)
+        # The variance of an estimate that starts at the file's tilt, if the file is right
+        var = np.square(sigma) if self._has_changed else np.maximum(self._calibrated_var - np.square(sigma), 0.0)
         return bool((np.abs(off) > self.config.drift_sigma * np.sqrt(var)).any())
 
-    def see(self, tilt_rad: Floats, travelled_m: float, measured: bool) -> None:
-        """Takes the tilt (pitch, roll) after a further `travelled_m`; one that was not `measured` is left out."""
+    def update(self, tilt_rad: Floats, travelled_m: float, measured: bool) -> None:
+        """The tilt (pitch, roll) after a further `travelled_m`; it is left out where it was not `measured`."""
         if not measured:
-            self._unseen_m += travelled_m
+            self._skipped_m += travelled_m
             return
-        self._sum_rad_m += (tilt_rad - self._calibrated) * travelled_m
-        self._seen_m += travelled_m
-        if self._seen_m >= self.config.look_m:
-            self._look(self._sum_rad_m / self._seen_m, self._seen_m + self._unseen_m)
-            self._sum_rad_m, self._seen_m, self._unseen_m = np.zeros(AXES), 0.0, 0.0
+        self._tilt_sum += (tilt_rad - self._file_tilt) * travelled_m
+        self._averaged_m += travelled_m
+        if self._averaged_m >= self.config.sample_m:
+            self._step(self._tilt_sum / self._averaged_m, self._averaged_m + self._skipped_m)
+            self._tilt_sum, self._averaged_m, self._skipped_m = np.zeros(AXES), 0.0, 0.0
 
-    def _look(self, off_rad: Floats, way_m: float) -> None:
+    def _step(self, off_rad: Floats, way_m: float) -> None:
         cfg = self.config
         keep = math.exp(-way_m / cfg.wander_m)
         F = np.array([1.0, keep])
         x, P = self._x * F, self._P * np.outer(F, F)
         P[..., WANDER, WANDER] += (1.0 - keep**2) * self._wander_var
         P[..., MOUNT, MOUNT] += cfg.mount_walk_rad_per_sqrt_m**2 * way_m
-        knocked = P[:1].copy()
-        knocked[..., MOUNT, MOUNT] += cfg.sigma_knock_rad**2
-        x, P = np.concatenate([x, x[:1]]), np.concatenate([P, knocked])
+        changed = P[:1].copy()
+        changed[..., MOUNT, MOUNT] += cfg.sigma_knock_rad**2
+        x, P = np.concatenate([x, x[:1]]), np.concatenate([P, changed])
         log_odds = np.append(self._log_odds, math.log(cfg.knock_odds))
 
         PH = P.sum(axis=-1)  # of H = [1, 1]
-        S = PH.sum(axis=-1) + cfg.sigma_look_rad**2
+        S = PH.sum(axis=-1) + cfg.sigma_sample_rad**2
         innovation = off_rad - x.sum(axis=-1)
-        misfit2 = np.square(innovation) / S
-        gain = np.where(misfit2 < cfg.gate_sigma**2, 1.0 / S, 0.0)[..., None] * PH
+        nis = np.square(innovation) / S
+        gain = np.where(nis < cfg.gate_sigma**2, 1.0 / S, 0.0)[..., None] * PH
         x = x + gain * innovation[..., None]
         P = P - gain[..., None] * PH[..., None, :]
-        log_odds = log_odds - 0.5 * (np.minimum(misfit2, cfg.gate_sigma**2) + np.log(S)).sum(axis=-1)
+        log_odds = log_odds - 0.5 * (np.minimum(nis, cfg.gate_sigma**2) + np.log(S)).sum(axis=-1)
 
         best = int(np.argmax(log_odds))
         if best > 0:
-            self._knocked = True
+            self._has_changed = True
             kept = slice(best, best + 1)
             x, P, log_odds = x[kept], P[kept], log_odds[kept]
-        elif len(x) > 1 + cfg.kept_looks:
+        elif len(x) > 1 + cfg.max_hypotheses:
             x, P, log_odds = (np.delete(array, 1, axis=0) for array in (x, P, log_odds))
         self._x, self._P, self._log_odds = x, P, log_odds - log_odds[0]

@@ -1,11 +1,9 @@
-"""The paper's metric scale: a moving median over what each frame's road points say (Sec. 3.1).
+"""The paper's metric scale: a moving median over the scales by the road points of each frame (Sec. 3.1).
 
-The road is the calibrated plane (the paper's flat-earth assumption). A landmark of the odometry that lies on the road
-has a depth in the odometry's unit, and by Eq. 1 with the known camera height one in metres. The median of their ratios
-is the frame's scale, and the moving median over the last frames is the scale that the odometry is given.
-
-The paper states no width of its window. The default is 21 frames: two seconds at 10 Hz, so that wrong scales have to
-last for a second to win, and some 20 m of a street in town, over which the visual scale drifts by little.
+The road is the calibrated plane (the paper's flat-earth assumption). A landmark on it has a depth in the odometry's
+unit, and by Eq. 1 one in metres: the median of their ratios is the frame's scale. The paper states no window's width;
+the default is 21 frames, 2 s at 10 Hz: wrong scales must last for a second to win, and in 20 m of a street in town the
+visual scale drifts by little.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import RoadScaleConfig
 from birdslam.odometry.road.points import on_road
-from birdslam.odometry.road.vanishing_point import LinesDirection
+from birdslam.odometry.road.vanishing_point import VanishingPoint
 from birdslam.types import SpeedReading, SpeedSource, Status
 
 Floats = NDArray[np.float64]
@@ -31,19 +29,19 @@ Floats = NDArray[np.float64]
 _SIGMA_OF_MEDIAN = 1.4826 * 1.2533  # times the median absolute deviation over the root of the number, for normal noise
 
 
-class MedianScale:
+class MovingMedianScale:
     """A `metric_scale.MetricScale`.
 
-    State: the last `median_frames` scales (metres per unit of length of the window as it began), and the scale that was
-    given out. Measurements: one scale a frame, from the window's landmarks on the road. Readers: `Odometry`.
+    State: the last `median_frames` scales (metres per unit of length of the window as it began), and the last median.
+    Measurements: one scale a frame, from the window's landmarks on the road. Readers: `Odometry`.
     """
 
     def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:
         self.camera, self.config = camera, config
-        self.fit: RoadFit | None = None  # always None: no two images are compared
-        self.lines: LinesDirection | None = None  # nor are lines looked at
+        self.fit: RoadFit | None = None  # always None: images are not aligned
+        self.vanishing_point: VanishingPoint | None = None  # always None: not measured
         self._scales: deque[float] = deque(maxlen=config.median_frames)
-        self._given = 1.0
+        self._last_scale = 1.0
         self._carried_m = 0.0  # travelled since a frame gave a scale
 
     @property
@@ -53,12 +51,12 @@ class MedianScale:
 
     @property
     def pitch_sigma_rad(self) -> float:
-        """The body pitches about the calibrated plane, and nothing here measures by how much."""
+        """The body pitches about the calibrated plane, which is not measured here."""
         return float(np.hypot(self.config.sigma_mount_rad, self.config.sigma_bounce_rad))
 
     @property
     def sigma_rel(self) -> float:
-        """Of the moving median, by the spread of the scales that it is of; 1 before there are enough."""
+        """Of the moving median, by the spread of its scales; 1 before there are enough."""
         if len(self._scales) < self.config.confirmations:
             return 1.0
         log_scales = np.log(self._scales)
@@ -72,24 +70,24 @@ class MedianScale:
         return self.sigma_rel > self.config.invalid_sigma_rel
 
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
-        """A new window has a new unit of length: the scales of the old one say nothing of it."""
+        """A new window has a new unit of length: the scales of the old one are dropped."""
         self._scales.clear()
-        self._given = 1.0
+        self._last_scale = 1.0
 
-    def length_held(self, sigma_rel: float) -> None:
-        """The moving median has a spread of its own."""
+    def speed_predicted(self, sigma_rel: float) -> None:
+        """Does nothing: the median's own spread is its uncertainty."""
 
-    def turned_unseen(self) -> None:
-        """Nothing here follows the camera's tilt."""
+    def lose_tilt(self) -> None:
+        """Does nothing: the tilt is not estimated."""
 
-    def hear(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:
-        """The paper has the road alone."""
+    def add_readings(self, readings: Iterable[SpeedReading], t_source_ns: int) -> None:
+        """Does nothing: the paper uses the road alone."""
 
-    def car_step(self, from_ns: int, to_ns: int) -> None:
-        """None: the paper has the road alone."""
+    def car_motion(self, from_ns: int, to_ns: int) -> None:
+        """None: the paper uses the road alone."""
 
     def car_status(self) -> list[Status]:
-        """Nothing: the paper has the road alone."""
+        """Nothing: the paper uses the road alone."""
         return []
 
     @property
@@ -99,23 +97,23 @@ class MedianScale:
 
     @property
     def motion_factor(self) -> float:
-        """1: the car's own speed is not heard."""
+        """1: the car's own speed is not used."""
         return 1.0
 
     def measure_scale(self, step: Pose, view: RoadView) -> float:
-        """The factor by which the moving median has changed; 1 where no frame has given a scale yet."""
+        """The change of the moving median; 1 where no frame has given a scale yet."""
         self._carried_m += float(np.linalg.norm(step.p))
         scale = self.frame_scale(view)
         if scale is not None:
-            self._scales.append(scale * self._given)
+            self._scales.append(scale * self._last_scale)
             self._carried_m = 0.0
         if not self._scales:
             return 1.0
-        last, self._given = self._given, float(np.median(self._scales))
-        return self._given / last
+        last, self._last_scale = self._last_scale, float(np.median(self._scales))
+        return self._last_scale / last
 
     def frame_scale(self, view: RoadView) -> float | None:
-        """Metres per present unit of length by this image's landmarks on the road; None where it shows too few."""
+        """Metres per present unit of length by this image's landmarks on the road; None where there are too few."""
         config, window = self.config, view.window
         seen = np.isfinite(window.obs[-1, :, 0]) & (window.rho_sigma < config.median_sigma_depth_rel * window.rho)
         px = self.camera.to_px(window.obs[-1, seen])

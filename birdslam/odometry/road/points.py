@@ -1,4 +1,4 @@
-"""Which corners lie on the road: those that the paper keeps for its static map and its metric scale (Sec. 3.1)."""
+"""Image points on the road, which the paper uses for static map and scale (Sec. 3.1), and outside vehicles."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ Bools = NDArray[np.bool_]
 
 FARTHEST_M = 30.0
 _BESIDE_PX, _BELOW_PX = 3, 6  # a box ends above its vehicle's shadow
-# By night a vehicle's lamps glow past its box, and a corner beside it sees them with its tracker's window: half of 8 x
-# 20 px, twice that across in the pyramid's next level. Rendered nights at 5 px keep such corners, at 8 none
+# By night a vehicle's lamps glow beyond its box, within reach of a corner's tracking window: half of 8 x 20 px, twice
+# that across in the pyramid's next level. On rendered nights 5 px keep such corners, 8 px none
 _GLOW_BESIDE_PX, _GLOW_ABOVE_PX = 8, 10
 _DARK_GREY = 55.0  # the two rendered nights have a mean of 29 to 38, KITTI 00, 01, 06, 0005 and the raw clip 83 to 144
 

@@ -1,25 +1,103 @@
-"""A search for the length of a motion of known direction: candidate lengths are compared on the road's image.
+"""The search for an unknown length: by the landmarks on the road, and by correlation of the road's image.
 
-An alignment (`road/alignment.py`) converges only from within the size of the road's texture. Where nothing is known of
-the length, this search gives it a start that is near enough.
+An alignment (alignment.py) converges only from within the size of the road's texture; a search gives it a start.
+Landmarks on the road give a length that is short by up to a tenth (see alignment.py), but no reflection on the
+windscreen, which has no depth, and no period of stripes can fake it. So they bound the alignments that are accepted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.camera import Camera
+from birdslam.geometry.camera import Camera, plane_normal
 from birdslam.geometry.pose import Pose
-from birdslam.odometry.road.alignment import RoadImage, plane_normal
+from birdslam.odometry.corners.sliding_window import SlidingWindow
+from birdslam.odometry.road.alignment import RoadAligner, RoadImage
+from birdslam.odometry.road.fit import ROAD, RoadFit
+from birdslam.odometry.road.kalman_filter import RoadFilter
 
 Floats = NDArray[np.float64]
 
-_STANDS_M = 0.1  # a car that drives so little at a start stands as well as not
-_LEAD = 0.1  # of the correlation of what changed as it moves over that as it stands
+_LENGTHS_M = np.geomspace(0.03, 6.0, 84)  # candidates, where the length is not known at all
+_STATIONARY_M = 0.1  # a shorter motion at a start counts as none
+_MIN_LEAD = 0.1  # of the changed pixels' correlation in motion over that at standstill
+# Of landmarks on the road: a lane and its neighbours; the depth's relative sigma; the mode's width, by tilt and crown
+_ROAD_NEAR_M, _ROAD_FAR_M, _ROAD_HALF_WIDTH_M = 3.0, 30.0, 6.0
+_DEPTH_SIGMA_REL = 0.25
+_MODE_WIDTH_LOG = 0.1
+_MIN_VOTES, _MIN_VOTE_SHARE = 6.0, 0.45
+_MODE_GRID_LOG = np.linspace(-4.0, 4.0, 321)
+# Of the log length: landmarks are short by up to a tenth, and a pitch that is off by a degree makes another fifth
+_LANDMARK_GATE, _AGREEMENT_GATE = 0.4, 0.15
+# A search that leaves the length this vague, without landmarks that agree, has found none: drops over a rendered
+# motorway that seem to stand leave 0.8, right lengths there and behind a coarse encoder less than 0.4
+_MAX_SIGMA_LOG = 0.5
+
+
+@dataclass(frozen=True)
+class LengthSearch:
+    """How a doubtful scale is searched for."""
+
+    tilt: tuple[float, float]  # (pitch, roll) in rad
+    lead: float  # of the correlation, by which a searched length must beat the expected one
+    tilt_sigma_rad: float  # by which the tilt's prior is widened
+
+
+def best_alignment(
+    aligner: RoadAligner,
+    filter_: RoadFilter,
+    past: RoadImage,
+    present: RoadImage,
+    T: Pose,
+    px: NDArray[np.int64],
+    by_landmarks: float | None,
+    sigma_motion: tuple[float, float],
+    search: LengthSearch | None,
+) -> tuple[RoadFit, float, Floats] | None:
+    """The fit, the factor on T_past_present that it starts from, and the filter's covariance to be joined with it.
+
+    The alignment starts from the expected length and, with a `search`, from the searched one and that `by_landmarks`.
+    Fits that the landmarks contradict are dropped; None where none is left.
+    """
+    (prior, predicted_cov), prior_cov = filter_.prediction, filter_.cov.copy()
+    fit, factor, cov = aligner.align(past, present, T, px, prior, predicted_cov, sigma_motion), 1.0, prior_cov
+    if fit is not None and _contradicts(fit.state[0], by_landmarks):
+        fit = None
+    if search is not None:
+        length = float(np.linalg.norm(T.p))
+        searched = search_length(aligner.camera, past, present, T, px, search.tilt, _LENGTHS_M) / length
+        loose = prior_cov.copy()
+        loose[0, :] = loose[:, 0] = 0.0
+        loose[0, 0] = 0.3**2
+        if search.tilt_sigma_rad:
+            loose[1:3, 1:3] += np.eye(2) * search.tilt_sigma_rad**2
+        for start in (searched,) if by_landmarks is None else (searched, by_landmarks):
+            other = aligner.align(past, present, Pose(T.R, T.p * start), px, prior, loose[:ROAD, :ROAD], sigma_motion)
+            if other is None:
+                continue
+            log_length = float(np.log(start)) + other.state[0]
+            if _contradicts(log_length, by_landmarks):
+                continue
+            if other.cov[0, 0] > _MAX_SIGMA_LOG**2 and not agrees(log_length, by_landmarks):
+                continue
+            if fit is None or other.correlation > fit.correlation + search.lead:
+                fit, factor, cov = other, start, loose
+    return None if fit is None else (fit, factor, cov)
+
+
+def _contradicts(log_length: float, by_landmarks: float | None) -> bool:
+    """Whether a factor on the lengths is farther from that of the landmarks than their errors allow."""
+    return by_landmarks is not None and abs(log_length - float(np.log(by_landmarks))) > _LANDMARK_GATE
+
+
+def agrees(log_length: float, by_landmarks: float | None) -> bool:
+    """Whether the landmarks on the road confirm a factor on the lengths."""
+    return by_landmarks is not None and abs(log_length - float(np.log(by_landmarks))) <= _AGREEMENT_GATE
 
 
 def search_length(
@@ -31,41 +109,44 @@ def search_length(
     tilt: tuple[float, float],
     lengths: Floats,
 ) -> float:
-    """The one of `lengths` (L,) in metres with the best correlation, on a flat road, over a few pitches about `tilt`.
+    """The one of `lengths` (L,) in metres with the best correlation on a flat road, over three pitches about `tilt`.
 
-    `px` (N, 2) are pixels of the present image that show road, `tilt` its (pitch, roll) in rad; only the direction of
-    `T_past_present`'s translation counts."""
+    `px` (N, 2) are pixels of the present image that show road, `tilt` is (pitch, roll) in rad; of `T_past_present`'s
+    translation only the direction counts.
+    """
     px = px[:: max(1, len(px) // 900)]
     tilts = [(pitch_rad, tilt[1]) for pitch_rad in (tilt[0] - 0.01, tilt[0], tilt[0] + 0.01)]
-    ways = lengths[:, None] * (T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9))
+    translations = lengths[:, None] * (T_past_present.p / max(float(np.linalg.norm(T_past_present.p)), 1e-9))
 
-    def alike(changed: bool) -> Floats:
-        shown = far_and_changed(past, present, px) if changed else px
-        return np.array([correlations(camera, past, present, T_past_present.R, ways, shown, each) for each in tilts])
+    def correlate(changed: bool) -> Floats:
+        shown = far_changed_pixels(past, present, px) if changed else px
+        return np.array(
+            [correlations(camera, past, present, T_past_present.R, translations, shown, each) for each in tilts]
+        )
 
-    return float(lengths[most_alike(alike, lengths)[1]])
+    return float(lengths[best_correlation(correlate, lengths)[1]])
 
 
-def most_alike(alike: Callable[[bool], Floats], lengths: Floats) -> tuple[int, int]:
-    """Which pitch and which of `lengths` (L,) ascending, in metres, make two images of the road most alike.
+def best_correlation(correlate: Callable[[bool], Floats], lengths: Floats) -> tuple[int, int]:
+    """Indices of the pitch and of the length, of `lengths` (L,) ascending in metres, with the best correlation.
 
-    `alike` gives correlations (pitches, L), of the whole road, or where it is told so of the farther road that
-    changed alone. Of a car that stands no length explains what changed. Where one does, what stands is no road: the
-    car's own bonnet on the near road, or grain that a video encoder left where it was.
+    `correlate(changed)` gives correlations (pitches, L) over the whole road, or over its changed far pixels. If the car
+    stands, no length explains the changed pixels. Where one does, what correlates at standstill is no road: the car's
+    bonnet, or grain that a video encoder left where it was.
     """
-    whole = alike(False)
-    pitch, length = np.unravel_index(int(whole.argmax()), whole.shape)
-    if lengths[length] < _STANDS_M:
-        moved = alike(True)
-        moved_pitch, moved_length = np.unravel_index(int(moved.argmax()), moved.shape)
-        if moved[moved_pitch, moved_length] > moved[:, lengths < _STANDS_M].max() + _LEAD:
-            pitch, length = moved_pitch, moved_length
+    by_road = correlate(False)
+    pitch, length = np.unravel_index(int(by_road.argmax()), by_road.shape)
+    if lengths[length] < _STATIONARY_M:
+        by_change = correlate(True)
+        changed_pitch, changed_length = np.unravel_index(int(by_change.argmax()), by_change.shape)
+        if by_change[changed_pitch, changed_length] > by_change[:, lengths < _STATIONARY_M].max() + _MIN_LEAD:
+            pitch, length = changed_pitch, changed_length
     return int(pitch), int(length)
 
 
-def far_and_changed(past: RoadImage, present: RoadImage, px: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of the pixels (N, 2) of the present image's road the farther half, above their median row, and of that the half
-    that differs most from the same pixels of the past image."""
+def far_changed_pixels(past: RoadImage, present: RoadImage, px: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Of the pixels (N, 2) of the present image's road: the half of the farther half that differs most from the same
+    pixels of the past image."""
     far = px[px[:, 1] < np.median(px[:, 1])]
     then, now = (image.grey[far[:, 1] - image.top_px, far[:, 0]] for image in (past, present))
     change = np.abs(now - then)
@@ -77,17 +158,17 @@ def correlations(
     past: RoadImage,
     present: RoadImage,
     R_past_present: Floats,
-    ways: Floats,
+    translations: Floats,
     px: NDArray[np.int64],
     tilt: tuple[float, float],
 ) -> Floats:
-    """(L,) correlation of the road's samples (N, 2) with the past image, for each translation of `ways` (L, 3)."""
+    """(L,) correlation of the road's samples (N, 2) with the past image, for each of the translations (L, 3)."""
     f32 = np.float32
     focal_px, centre_px = [camera.fx_px, camera.fy_px], [camera.cx_px, camera.cy_px]
     rays = np.stack([*((px - centre_px) / focal_px).T, np.ones(len(px))]).astype(f32)
     here = present.grey[px[:, 1] - present.top_px, px[:, 0]]
     rho = (plane_normal(*tilt)[0].astype(f32) @ rays) * f32(-1.0 / camera.height_m)
-    q = (R_past_present.astype(f32) @ rays)[:, None, :] + ways.astype(f32).T[:, :, None] * rho
+    q = (R_past_present.astype(f32) @ rays)[:, None, :] + translations.astype(f32).T[:, :, None] * rho
     by_z = f32(1.0) / np.maximum(q[2], f32(1e-3))
     u = q[0] * by_z * f32(camera.fx_px) + f32(camera.cx_px)
     v = q[1] * by_z * f32(camera.fy_px) + f32(camera.cy_px - past.top_px)
@@ -101,3 +182,30 @@ def correlations(
     out: Floats = (ab - count * mean_a * mean_b) / np.sqrt(np.maximum(variances, 1e-9))
     out[count < 0.5 * len(px)] = -1.0  # what leaves the image says nothing
     return out
+
+
+def scale_from_landmarks(camera: Camera, tilt: tuple[float, float], window: SlidingWindow) -> float | None:
+    """Metres in the window's unit of length, by the mode of the camera's height over the landmarks on the road ahead.
+
+    `tilt` is (pitch, roll) in rad. None where too few landmarks agree on one height.
+    """
+    seen = np.isfinite(window.obs[-1, :, 0]) & np.isfinite(window.rho) & (window.rho > 1e-6)
+    seen &= window.rho_sigma < _DEPTH_SIGMA_REL * window.rho
+    xy, newest = window.obs[-1, seen], window.poses[-1]
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    by_plane = -(rays @ plane_normal(*tilt)[0]) / camera.height_m  # 1 / m
+    inverse_depth = window.inverse_depths(newest)[seen]
+    road = (
+        (by_plane > 1.0 / _ROAD_FAR_M)
+        & (by_plane < 1.0 / _ROAD_NEAR_M)
+        & (np.abs(xy[:, 0]) < _ROAD_HALF_WIDTH_M * by_plane)
+    )
+    road &= np.isfinite(inverse_depth) & (inverse_depth > 0.0)
+    if road.sum() < _MIN_VOTES:
+        return None
+    ratio = np.log(inverse_depth[road] / by_plane[road])
+    votes = np.exp(-0.5 * np.square((_MODE_GRID_LOG[:, None] - ratio) / _MODE_WIDTH_LOG)).sum(axis=1)
+    best = int(votes.argmax())
+    if votes[best] < max(_MIN_VOTES, _MIN_VOTE_SHARE * len(ratio)):
+        return None
+    return float(np.exp(_MODE_GRID_LOG[best]))

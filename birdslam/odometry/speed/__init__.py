@@ -1,1 +1,1 @@
-"""The car's own speed, the metric scale from it, and motion where images show none."""
+"""The car's own speed, the metric scale by it, and what holds where images show no motion: zero velocity, a prior."""

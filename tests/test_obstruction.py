@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.odometry.obstruction.bonnet import Bonnet, BonnetConfig
-from birdslam.odometry.obstruction.fixed_corners import StandingCorners, StandingCornersConfig
+from birdslam.odometry.obstruction.fixed_corners import FixedCorners, FixedCornersConfig
 
 CAMERA = Camera(width_px=640, height_px=192, fx_px=371.0, fy_px=371.0, cx_px=320.0, cy_px=96.0, height_m=1.5)
 GROUND = GroundPlane(1.5)
@@ -23,57 +23,57 @@ def road_px(at_m: np.ndarray, across_m: np.ndarray) -> np.ndarray:
     return np.column_stack([CAMERA.cx_px + CAMERA.fx_px * across_m / at_m, CAMERA.cy_px + CAMERA.fy_px * 1.5 / at_m])
 
 
-def drive(images: int, dirt: int, step_m: float = STEP_M) -> tuple[StandingCorners, list[np.ndarray], np.ndarray]:
+def drive(images: int, dirt: int, step_m: float = STEP_M) -> tuple[FixedCorners, list[np.ndarray], np.ndarray]:
     """A street of 40 points, 20 far houses, and `dirt` corners of which half are below the horizon."""
     rng = np.random.default_rng(3)
-    glass = StandingCorners(CAMERA, StandingCornersConfig())
+    fixed_corners = FixedCorners(CAMERA, FixedCornersConfig())
     at_m, across_m = rng.uniform(8.0, 60.0, 40), rng.uniform(-6.0, 6.0, 40)
     across_m[np.abs(across_m) < 1.0] += 2.0
     houses = np.column_stack([rng.uniform(20.0, 620.0, 20), rng.uniform(5.0, 80.0, 20)])
     spots = np.column_stack(
         [rng.uniform(0.0, 640.0, dirt), np.where(np.arange(dirt) % 2, rng.uniform(0.0, 80.0, dirt), 170.0)]
     )
-    told = []
+    found = []
     for k in range(images):
         ahead_m = at_m - k * step_m
         seen = ahead_m > 3.0
         far = [320.0, 96.0] + (houses - [320.0, 96.0]) * (60.0 / (60.0 - k * step_m))
         px = np.concatenate([road_px(ahead_m[seen], across_m[seen]), far, spots])
         ids = np.concatenate([np.flatnonzero(seen), 100 + np.arange(20), 200 + np.arange(dirt)])
-        stands = glass.see(ids, px, GROUND, step_m if k else 0.0)
-        told.append(stands)
-    return glass, told, ids
+        fixed = fixed_corners.update(ids, px, GROUND, step_m if k else 0.0)
+        found.append(fixed)
+    return fixed_corners, found, ids
 
 
 def test_a_clean_windscreen_shows_nothing_that_stands() -> None:
-    glass, told, _ = drive(8, 0)
-    assert not glass.present
-    assert not np.concatenate(told).any()
+    fixed_corners, found, _ = drive(8, 0)
+    assert not fixed_corners.present
+    assert not np.concatenate(found).any()
 
 
 def test_dirt_is_told_from_the_street_above_the_horizon_too() -> None:
-    glass, told, ids = drive(10, 40)
-    assert glass.present
-    assert (told[-1] == (ids >= 200)).mean() > 0.9
-    assert not told[-1][ids < 200].any()
+    fixed_corners, found, ids = drive(10, 40)
+    assert fixed_corners.present
+    assert (found[-1] == (ids >= 200)).mean() > 0.9
+    assert not found[-1][ids < 200].any()
 
 
 def test_a_standing_car_has_no_dirt() -> None:
-    glass, told, _ = drive(10, 40, step_m=0.0)
-    assert not glass.present
-    assert not np.concatenate(told).any()
+    fixed_corners, found, _ = drive(10, 40, step_m=0.0)
+    assert not fixed_corners.present
+    assert not np.concatenate(found).any()
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 30))
 def test_corners_that_come_and_go_are_each_told(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
-    glass = StandingCorners(CAMERA, StandingCornersConfig())
+    fixed_corners = FixedCorners(CAMERA, FixedCornersConfig())
     for _ in range(4):
         ids = np.sort(rng.choice(60, count, replace=False))
         px = rng.uniform(0.0, [640.0, 192.0], (count, 2))
-        stands = glass.see(ids, px, GROUND, float(rng.uniform(0.0, 4.0)))
-        assert stands.shape == (count,)
-        assert stands.dtype == bool
+        fixed = fixed_corners.update(ids, px, GROUND, float(rng.uniform(0.0, 4.0)))
+        assert fixed.shape == (count,)
+        assert fixed.dtype == bool
 
 
 # --- the bonnet ---
@@ -100,7 +100,7 @@ def with_bonnet(image: np.ndarray, row: int, rng: np.random.Generator) -> np.nda
 def test_a_bonnet_is_found_where_it_begins(row: int) -> None:
     rng = np.random.default_rng(1)
     bonnet = Bonnet(BonnetConfig())
-    changes = [bonnet.learn(with_bonnet(road_image(rng), row, rng), TOP_PX, 1.0) for _ in range(8)]
+    changes = [bonnet.update(with_bonnet(road_image(rng), row, rng), TOP_PX, 1.0) for _ in range(8)]
     assert bonnet.present
     assert sum(changes) == 1
     assert bonnet.rows is not None
@@ -113,7 +113,7 @@ def test_a_bonnet_is_found_where_it_begins(row: int) -> None:
 def test_lines_of_the_lane_are_no_bonnet() -> None:
     rng = np.random.default_rng(2)
     bonnet = Bonnet(BonnetConfig())
-    assert not any(bonnet.learn(road_image(rng), TOP_PX, 1.0) for _ in range(12))
+    assert not any(bonnet.update(road_image(rng), TOP_PX, 1.0) for _ in range(12))
     assert not bonnet.present
     px = np.array([[320, 190]])
     assert bonnet.above(px) is px
@@ -122,9 +122,9 @@ def test_lines_of_the_lane_are_no_bonnet() -> None:
 def test_a_standing_car_learns_no_bonnet() -> None:
     rng = np.random.default_rng(1)
     bonnet, image = Bonnet(BonnetConfig()), with_bonnet(road_image(rng), 150, rng)
-    bonnet.learn(image, TOP_PX, 0.0)
+    bonnet.update(image, TOP_PX, 0.0)
     for _ in range(12):
-        bonnet.learn(image, TOP_PX, 0.0)
+        bonnet.update(image, TOP_PX, 0.0)
     assert not bonnet.present
 
 
@@ -132,7 +132,7 @@ def test_a_bonnet_that_is_gone_is_forgotten() -> None:
     rng = np.random.default_rng(1)
     bonnet = Bonnet(BonnetConfig())
     for _ in range(8):
-        bonnet.learn(with_bonnet(road_image(rng), 150, rng), TOP_PX, 1.0)
+        bonnet.update(with_bonnet(road_image(rng), 150, rng), TOP_PX, 1.0)
     for _ in range(30):
-        bonnet.learn(road_image(rng), TOP_PX, 1.0)
+        bonnet.update(road_image(rng), TOP_PX, 1.0)
     assert not bonnet.present

@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from birdslam.geometry.camera import Camera, Undistorter
+from birdslam.geometry.camera import Camera, Undistorter, plane_normal
 from birdslam.geometry.pose import Pose, rotation_exp
-from birdslam.odometry.corners.initialisation import StartSearch, StartSearchConfig
-from birdslam.odometry.corners.two_view import first_pose, guided_two_view
+from birdslam.odometry.corners.initialisation import InitialisationConfig, MotionInitialiser
+from birdslam.odometry.corners.two_view import initial_two_view, two_view_from_prior
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
-from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner, RoadImage, plane_normal
-from birdslam.odometry.road.scale_search import far_and_changed, most_alike
+from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner, RoadImage
+from birdslam.odometry.road.scale_search import best_correlation, far_changed_pixels
 from birdslam.perf.accuracy.overlays import measure
 from birdslam.perf.accuracy.starts import Task, mirrored_camera, read
 from birdslam.sources.opening import open_recording
@@ -68,13 +68,13 @@ def plain() -> Plain:
 
 
 @pytest.fixture(scope="module")
-def search() -> StartSearch:
-    return StartSearch(CAMERA, RoadAligner(CAMERA, RoadAlignConfig()), StartSearchConfig())
+def search() -> MotionInitialiser:
+    return MotionInitialiser(CAMERA, RoadAligner(CAMERA, RoadAlignConfig()), InitialisationConfig())
 
 
 @pytest.mark.parametrize(("yaw_deg", "length_m"), [(0.0, 1.2), (3.5, 1.0), (-5.0, 2.0), (0.0, 4.0)])
 def test_the_first_motion_is_found_without_a_guess(
-    plain: Plain, search: StartSearch, yaw_deg: float, length_m: float
+    plain: Plain, search: MotionInitialiser, yaw_deg: float, length_m: float
 ) -> None:
     step = _step(yaw_deg, length_m)
     turned, driven = search.guesses(plain.render(Pose(np.eye(3), np.zeros(3))), plain.render(step))
@@ -83,10 +83,10 @@ def test_the_first_motion_is_found_without_a_guess(
     assert np.linalg.norm(driven.p) == pytest.approx(np.linalg.norm(step.p), rel=0.2)
 
 
-def test_of_two_images_alike_the_search_says_that_nothing_turned(plain: Plain, search: StartSearch) -> None:
+def test_of_two_images_alike_the_search_says_that_nothing_turned(plain: Plain, search: MotionInitialiser) -> None:
     image = plain.render(Pose(np.eye(3), np.zeros(3)))
-    assert np.abs(search.rotation(image, image) - np.eye(3)).max() < 1e-9
-    assert np.abs(search.rotation(np.zeros_like(image), image) - np.eye(3)).max() < 1e-9  # nothing to see: no turn
+    assert np.abs(search.search_rotation(image, image) - np.eye(3)).max() < 1e-9
+    assert np.abs(search.search_rotation(np.zeros_like(image), image) - np.eye(3)).max() < 1e-9  # no texture
 
 
 def test_a_guided_two_view_holds_where_most_matches_are_far_or_wrong() -> None:
@@ -99,13 +99,15 @@ def test_a_guided_two_view_holds_where_most_matches_are_far_or_wrong() -> None:
     xy_b[150:170] += rng.uniform(-0.03, 0.03, (20, 2))  # wrong
     xy_b[:30] += [0.012, 0.0]  # a moving car
     guess = Pose(rotation_exp(np.array([0.0, np.radians(2.3), 0.0])), np.array([0.0, 0.0, 1.0]))
-    found = guided_two_view(xy, xy_b, guess, 700.0, 0.7)
+    found = two_view_from_prior(xy, xy_b, guess, 700.0, 0.7)
     assert found is not None
     pose, fits = found
     assert np.degrees(np.arccos(pose.p @ step.p / np.linalg.norm(step.p))) < 2.0
     assert np.degrees(np.arccos((np.trace(pose.R.T @ step.R) - 1.0) / 2.0)) < 0.1
     assert fits[30:150].mean() > 0.95
-    assert guided_two_view(xy, xy_b, Pose(np.eye(3), np.zeros(3)), 700.0, 0.7) is None  # a guess without a direction
+    assert (
+        two_view_from_prior(xy, xy_b, Pose(np.eye(3), np.zeros(3)), 700.0, 0.7) is None
+    )  # a guess without a direction
 
 
 def test_corners_that_move_backwards_along_their_lines_say_nothing_of_the_first_pose() -> None:
@@ -117,7 +119,7 @@ def test_corners_that_move_backwards_along_their_lines_say_nothing_of_the_first_
     there = (np.column_stack([xy, np.ones(150)]) - step.p / depth[:, None]) @ step.R
     xy_b = there[:, :2] / there[:, 2:] + rng.normal(0.0, 0.2 / 700.0, xy.shape)
     backwards = (depth < 0.0) & (np.linalg.norm(there[:, :2] / there[:, 2:] - xy @ step.R[:2, :2], axis=1) > 0.01)
-    for found in (first_pose(xy, xy_b, step, 700.0, 0.7), guided_two_view(xy, xy_b, step, 700.0, 0.7)):
+    for found in (initial_two_view(xy, xy_b, step, 700.0, 0.7), two_view_from_prior(xy, xy_b, step, 700.0, 0.7)):
         assert found is not None
         pose, fits = found
         assert np.degrees(np.arccos(min(pose.p @ step.p / np.linalg.norm(step.p), 1.0))) < 0.5
@@ -137,7 +139,7 @@ def test_corners_that_move_backwards_along_their_lines_say_nothing_of_the_first_
 def test_what_stands_is_no_road_where_what_changed_moves(changed: list[list[float]], found_m: float) -> None:
     lengths = np.array([0.05, 1.0, 2.0])
     whole = [[0.6, 0.2, 0.3], [0.8, 0.2, 0.3]]
-    pitch, length = most_alike(lambda half: np.array(changed if half else whole), lengths)
+    pitch, length = best_correlation(lambda half: np.array(changed if half else whole), lengths)
     assert lengths[length] == found_m
     assert pitch == 1
 
@@ -149,7 +151,7 @@ def test_what_changed_is_not_asked_where_the_whole_road_moves() -> None:
         asked.append(half)
         return np.array([[0.2, 0.8]])
 
-    assert most_alike(alike, np.array([0.05, 2.0])) == (0, 1)
+    assert best_correlation(alike, np.array([0.05, 2.0])) == (0, 1)
     assert asked == [False]
 
 
@@ -159,13 +161,13 @@ def test_what_changed_is_looked_for_on_the_farther_road() -> None:
     present.grey[1:3] = [[5.0], [-6.0]]  # rows 5 and 6 of the image
     present.grey[6:] = 20.0  # a shadow on the near road
     px = np.array([[u, v] for v in range(4, 12) for u in range(8)])
-    shown = far_and_changed(past, present, px)
+    shown = far_changed_pixels(past, present, px)
     assert sorted({tuple(one) for one in shown.tolist()}) == sorted((u, v) for v in (5, 6) for u in range(8))
 
 
 def test_of_a_road_of_one_row_nothing_is_farther() -> None:
     image = RoadImage.of(np.zeros((1, 8), np.float32), 4)
-    assert len(far_and_changed(image, image, np.array([[u, 4] for u in range(8)]))) == 0
+    assert len(far_changed_pixels(image, image, np.array([[u, 4] for u in range(8)]))) == 0
 
 
 # --- on recorded drives ---

@@ -7,7 +7,7 @@ import pytest
 
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.motion import Motion
-from birdslam.odometry.speed.constant_velocity import HeldSpeed, HeldSpeedConfig, worst_sigma_m
+from birdslam.odometry.speed.constant_velocity import ConstantVelocityConfig, ConstantVelocityPrior, largest_sigma_m
 from birdslam.types import INVALIDATING, Status
 from tests.test_odometry import CAMERA, drive, street
 
@@ -72,30 +72,32 @@ def _poses(ahead_m: float) -> tuple[Pose, Pose]:
 
 
 def test_images_that_show_the_way_are_believed() -> None:
-    held = HeldSpeed(HeldSpeedConfig())
-    held.settle(0.01, 0.1)
-    located, predicted = _poses(0.6)  # brakes
-    assert held.hold(START, located, predicted, np.diag([1e4] * 3 + [1e6] * 3), 0.1) is None
+    prior_model = ConstantVelocityPrior(ConstantVelocityConfig())
+    prior_model.update(0.01, 0.1)
+    measured, predicted = _poses(0.6)  # brakes
+    assert prior_model.fuse(START, measured, predicted, np.diag([1e4] * 3 + [1e6] * 3), 0.1) is None
 
 
 def test_without_a_speed_nothing_is_held() -> None:
-    located, predicted = _poses(0.6)
-    assert HeldSpeed(HeldSpeedConfig()).hold(START, located, predicted, np.zeros((6, 6)), 0.1) is None
+    measured, predicted = _poses(0.6)
+    assert (
+        ConstantVelocityPrior(ConstantVelocityConfig()).fuse(START, measured, predicted, np.zeros((6, 6)), 0.1) is None
+    )
 
 
 def test_a_held_step_is_the_last_one_and_its_sigma_grows_by_what_engines_and_brakes_give() -> None:
-    config = HeldSpeedConfig()
-    held = HeldSpeed(config)
-    held.settle(0.001, 0.1)
-    located, predicted = _poses(0.2)
+    config = ConstantVelocityConfig()
+    prior_model = ConstantVelocityPrior(config)
+    prior_model.update(0.001, 0.1)
+    measured, predicted = _poses(0.2)
     sigmas = []
     for _ in range(9):
-        found = held.hold(START, located, predicted, np.diag([1e6, 1e6, 0.0, 1e6, 1e6, 1e6]), 0.1)
+        found = prior_model.fuse(START, measured, predicted, np.diag([1e6, 1e6, 0.0, 1e6, 1e6, 1e6]), 0.1)
         assert found is not None
         pose, sigma_m = found
         np.testing.assert_allclose(pose.p, predicted.p, atol=2e-3)
-        np.testing.assert_allclose(pose.R, located.R, atol=1e-6)
-        held.settle(sigma_m, 0.1)
+        np.testing.assert_allclose(pose.R, measured.R, atol=1e-6)
+        prior_model.update(sigma_m, 0.1)
         sigmas.append(sigma_m)
     np.testing.assert_allclose(sigmas, 0.01 * config.acceleration_mps2 * np.sqrt(np.arange(1, 10)), rtol=0.02)
 
@@ -103,12 +105,12 @@ def test_a_held_step_is_the_last_one_and_its_sigma_grows_by_what_engines_and_bra
 def test_the_worst_sigma_is_that_of_the_direction_known_worst() -> None:
     turn = np.kron(np.eye(2), rotation_exp(np.array([0.2, -0.5, 0.1])))
     info = turn @ np.diag([1e4, 25.0, 1e4, 1e6, 1e6, 1e6]) @ turn.T
-    assert worst_sigma_m(info) == pytest.approx(0.2)
+    assert largest_sigma_m(info) == pytest.approx(0.2)
 
 
 def test_a_car_that_drives_off_at_33_hz_is_not_held_back() -> None:
     """A standing car's speed changes by less within 30 ms than corners show; they are believed all the same."""
-    held = HeldSpeed(HeldSpeedConfig())
-    held.settle(0.0, 1.0)
+    prior_model = ConstantVelocityPrior(ConstantVelocityConfig())
+    prior_model.update(0.0, 1.0)
     moved = Pose(START.R, START.R @ np.array([0.0, 0.0, 0.02]))
-    assert held.hold(START, moved, START, np.diag([1e4] * 3 + [1e6] * 3), 0.03) is None
+    assert prior_model.fuse(START, moved, START, np.diag([1e4] * 3 + [1e6] * 3), 0.03) is None

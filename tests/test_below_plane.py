@@ -7,7 +7,7 @@ import pytest
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
-from birdslam.odometry.corners.below_plane import BeyondRoad, BeyondRoadConfig
+from birdslam.odometry.corners.below_plane import BelowPlaneConfig, BelowPlaneFilter
 from birdslam.odometry.corners.sliding_window import SlidingWindow
 from birdslam.odometry.road.points import is_night, outside
 
@@ -21,46 +21,46 @@ def _window(rows_px: np.ndarray, ratio: float, sigma_rel: float = 0.05) -> Slidi
     window = SlidingWindow(CAMERA.fx_px, 0.35, 2.2)
     px = np.column_stack([np.full(len(rows_px), 300.0), rows_px])
     window.append(0, Pose(np.eye(3), np.zeros(3)), np.arange(len(rows_px)), CAMERA.to_xy(px))
-    on_road = np.maximum(CAMERA.to_xy(px)[:, 1] / CAMERA.height_m, 1e-3)
-    window.rho, window.rho_sigma = on_road / ratio, sigma_rel * on_road
+    road_inverse_depth = np.maximum(CAMERA.to_xy(px)[:, 1] / CAMERA.height_m, 1e-3)
+    window.rho, window.rho_sigma = road_inverse_depth / ratio, sigma_rel * road_inverse_depth
     return window
 
 
-def _judged(window: SlidingWindow) -> BeyondRoad:
-    beyond = BeyondRoad(CAMERA, BeyondRoadConfig())
-    beyond.judge(window, window.poses[-1], LEVEL)
-    return beyond
+def _updated(window: SlidingWindow) -> BelowPlaneFilter:
+    below_plane = BelowPlaneFilter(CAMERA, BelowPlaneConfig())
+    below_plane.update(window, window.poses[-1], LEVEL)
+    return below_plane
 
 
 @pytest.mark.parametrize("ratio", [0.3, 1.0, 1.6])
 def test_what_stands_on_the_road_or_before_it_is_kept(ratio: float) -> None:
     window = _window(ROWS_PX, ratio)
-    assert _judged(window).without(window.ids).all()
+    assert _updated(window).inliers(window.ids).all()
     assert np.isfinite(window.rho).all()
 
 
 def test_what_seems_to_lie_behind_the_road_leaves_the_window_and_stays_out_while_it_is_followed() -> None:
     window = _window(ROWS_PX, 4.0)
-    beyond = _judged(window)
+    below_plane = _updated(window)
     assert np.isnan(window.rho).all()
-    assert beyond.without(np.array([1, 2, 9])).tolist() == [False, False, True]
-    assert beyond.without(np.array([0, 2])).tolist() == [True, False]  # 0 was lost: an id never comes again
+    assert below_plane.inliers(np.array([1, 2, 9])).tolist() == [False, False, True]
+    assert below_plane.inliers(np.array([0, 2])).tolist() == [True, False]  # 0 was lost: an id never comes again
 
 
 def test_an_uncertain_depth_is_no_evidence() -> None:
     window = _window(ROWS_PX, 4.0, sigma_rel=0.5)
-    assert _judged(window).without(window.ids).all()
+    assert _updated(window).inliers(window.ids).all()
 
 
 def test_above_the_horizon_and_far_ahead_everything_is_kept() -> None:
     window = _window(np.array([40.0, 85.0, 100.0]), 50.0)
-    assert _judged(window).without(window.ids).all()
+    assert _updated(window).inliers(window.ids).all()
 
 
 def test_landmarks_of_unknown_depth_are_not_judged() -> None:
     window = _window(ROWS_PX, 4.0)
     window.rho[:] = np.nan
-    assert _judged(window).without(window.ids).all()
+    assert _updated(window).inliers(window.ids).all()
 
 
 def test_by_night_a_box_ends_past_the_glow_of_its_lamps() -> None:

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.odometry.road.mount_change import TiltWatch, TiltWatchConfig
+from birdslam.odometry.road.mount_change import MountChangeConfig, MountChangeDetector
 
 Floats = NDArray[np.float64]
 STEP_M = 0.8
@@ -29,14 +29,16 @@ def way(metres: float, seed: int) -> Floats:
     return out
 
 
-def told(tilts: Floats, camera: Camera = CAMERA, off: Floats | None = None) -> tuple[TiltWatch, NDArray[np.bool_]]:
+def detect(
+    tilts: Floats, camera: Camera = CAMERA, off: Floats | None = None
+) -> tuple[MountChangeDetector, NDArray[np.bool_]]:
     """Of tilts off the mount, which is `off` (N, 2) the file's."""
-    watch, out = TiltWatch(camera, TiltWatchConfig()), []
+    detector, out = MountChangeDetector(camera, MountChangeConfig()), []
     for k, tilt in enumerate(tilts):
         shift = np.zeros(2) if off is None else off[k]
-        watch.see(np.array([camera.pitch_rad, camera.roll_rad]) + tilt + shift, STEP_M, True)
-        out.append(watch.drifted)
-    return watch, np.array(out)
+        detector.update(np.array([camera.pitch_rad, camera.roll_rad]) + tilt + shift, STEP_M, True)
+        out.append(detector.drifted)
+    return detector, np.array(out)
 
 
 @pytest.mark.slow
@@ -46,7 +48,7 @@ def test_roads_as_they_are_raise_no_alarm() -> None:
     for seed in range(40):
         tilts = way(1500.0, seed)
         off = np.random.default_rng([1, seed]).standard_normal(2) * CAMERA.tilt_sigma_rad
-        alarms += bool(told(tilts, off=np.broadcast_to(off, tilts.shape))[1].any())
+        alarms += bool(detect(tilts, off=np.broadcast_to(off, tilts.shape))[1].any())
     assert alarms <= 1
 
 
@@ -60,11 +62,11 @@ def test_a_knock_is_told_wherever_the_mount_was_before(axis: int, step_deg: floa
         off[:, axis] = np.random.default_rng([2, seed]).uniform(-1.0, 1.0) * CAMERA.tilt_sigma_rad
         knocked = round(before_m / STEP_M)
         off[knocked:, axis] += math.radians(step_deg)
-        watch, drifted = told(tilts, off=off)
+        detector, drifted = detect(tilts, off=off)
         assert not drifted[:knocked].any()
         if drifted[-1]:
             found.append((np.flatnonzero(drifted)[0] - knocked) * STEP_M)
-            mount, sigma = watch.mount
+            mount, sigma = detector.mount
             assert abs(mount[axis] - off[-1, axis]) < 4.0 * sigma[axis]
     assert len(found) == 20
     assert np.median(found) < 12.0
@@ -74,7 +76,7 @@ def test_a_knock_that_is_mended_is_no_longer_told() -> None:
     tilts = way(400.0, 3)
     off = np.zeros(tilts.shape)
     off[100:250, 0] = math.radians(2.0)
-    _, drifted = told(tilts, off=off)
+    _, drifted = detect(tilts, off=off)
     assert drifted[130:250].all()
     assert not drifted[300:].any()
 
@@ -84,28 +86,28 @@ def test_a_file_that_was_never_right(sigmas: float, expected: bool) -> None:
     tilts = way(300.0, 5)
     off = np.zeros(tilts.shape)
     off[:, 0] = sigmas * CAMERA.tilt_sigma_rad
-    assert told(tilts, off=off)[1][-1] == expected
+    assert detect(tilts, off=off)[1][-1] == expected
 
 
 def test_a_file_that_promises_little_is_hard_to_break() -> None:
     tilts = way(300.0, 6)
     off = np.full(tilts.shape, 0.02)
     vague = replace(CAMERA, tilt_sigma_rad=0.015)
-    assert told(tilts, off=off)[1][-1]
-    assert not told(tilts, vague, off)[1].any()
+    assert detect(tilts, off=off)[1][-1]
+    assert not detect(tilts, vague, off)[1].any()
 
 
 def test_a_pothole_is_no_knock() -> None:
     tilts = way(200.0, 7)
     tilts[100:104, 0] += math.radians(3.0)
     tilts[160:163, 0] -= math.radians(4.0)
-    assert not told(tilts)[1].any()
+    assert not detect(tilts)[1].any()
 
 
 def test_a_tilt_that_was_not_measured_says_nothing() -> None:
-    watch = TiltWatch(CAMERA, TiltWatchConfig())
-    before = watch.mount
+    detector = MountChangeDetector(CAMERA, MountChangeConfig())
+    before = detector.mount
     for _ in range(200):
-        watch.see(np.array([0.2, 0.2]), STEP_M, False)
-    np.testing.assert_array_equal(watch.mount, before)
-    assert not watch.drifted
+        detector.update(np.array([0.2, 0.2]), STEP_M, False)
+    np.testing.assert_array_equal(detector.mount, before)
+    assert not detector.drifted

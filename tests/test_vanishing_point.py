@@ -11,16 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.geometry.camera import Camera
+from birdslam.geometry.camera import Camera, plane_normal
 from birdslam.geometry.pose import rotation_exp
-from birdslam.odometry.road.alignment import plane_normal
 from birdslam.odometry.road.kalman_filter import RoadFilter, RoadScaleConfig
-from birdslam.odometry.road.vanishing_point import RoadLines, RoadLinesConfig, meeting
+from birdslam.odometry.road.vanishing_point import VanishingPointConfig, VanishingPointDetector, vanishing_point
 
 Floats = NDArray[np.float64]
 
 CAMERA = Camera(640, 192, 371.2, 371.2, 319.5, 90.0, height_m=1.65)
-CONFIG = RoadLinesConfig()
+CONFIG = VanishingPointConfig()
 NO_BOXES = np.zeros((0, 4))
 LANES_M = (-5.4, -1.8, 1.8, 5.4)
 PIECES_M = ((5.0, 8.0), (8.0, 12.0), (12.0, 18.0), (18.0, 26.0))
@@ -44,7 +43,7 @@ def segments(pitch_rad: float, heading_rad: float, curvature_per_m: float = 0.0)
 def test_without_noise_the_pitch_is_exact_from_a_wrong_guess(
     pitch_rad: float, heading_rad: float, off_rad: float
 ) -> None:
-    lines = meeting(CAMERA, CONFIG, segments(pitch_rad, heading_rad), pitch_rad + off_rad, 0.0, 0.0)
+    lines = vanishing_point(CAMERA, CONFIG, segments(pitch_rad, heading_rad), pitch_rad + off_rad, 0.0, 0.0)
     assert lines is not None
     normal = plane_normal(pitch_rad, 0.0)[0]
     assert abs(float(normal @ lines.direction)) < 0.1 * lines.sigma_rad
@@ -61,7 +60,7 @@ def test_segments_of_other_directions_do_little() -> None:
         road = road + rng.normal(0.0, CONFIG.sigma_px, road.shape)
         start = rng.uniform([0.0, 120.0], [639.0, 190.0], (8, 2))
         others = np.stack([start, start + rng.normal(0.0, 25.0, (8, 2))], axis=1)
-        lines = meeting(CAMERA, CONFIG, np.concatenate([road, others]), -0.01, 0.0, 0.0)
+        lines = vanishing_point(CAMERA, CONFIG, np.concatenate([road, others]), -0.01, 0.0, 0.0)
         if lines is not None:
             off.append(abs(float(plane_normal(0.01, 0.0)[0] @ lines.direction)) / lines.sigma_rad)
     assert len(off) > 40
@@ -71,7 +70,7 @@ def test_segments_of_other_directions_do_little() -> None:
 @pytest.mark.parametrize("curvature_per_m", [0.0008, -0.0008])
 def test_in_a_sag_the_lines_meet_higher(curvature_per_m: float) -> None:
     """Where they lead lies in the road at the distance that is told."""
-    lines = meeting(CAMERA, CONFIG, segments(0.01, 0.0, curvature_per_m), 0.01, 0.0, 0.0)
+    lines = vanishing_point(CAMERA, CONFIG, segments(0.01, 0.0, curvature_per_m), 0.01, 0.0, 0.0)
     assert lines is not None
     there = plane_normal(0.01 + curvature_per_m * lines.distance_m, 0.0)[0]
     assert abs(float(there @ lines.direction)) < lines.sigma_rad
@@ -79,10 +78,10 @@ def test_in_a_sag_the_lines_meet_higher(curvature_per_m: float) -> None:
 
 def test_too_few_lines_say_nothing() -> None:
     every = segments(0.01, 0.0)
-    assert meeting(CAMERA, CONFIG, every[:0], 0.01, 0.0, 0.0) is None
-    assert meeting(CAMERA, CONFIG, every[:3], 0.01, 0.0, 0.0) is None
+    assert vanishing_point(CAMERA, CONFIG, every[:0], 0.01, 0.0, 0.0) is None
+    assert vanishing_point(CAMERA, CONFIG, every[:3], 0.01, 0.0, 0.0) is None
     level = np.array([[[100.0, v], [500.0, v]] for v in range(120, 180, 4)])  # across the road
-    assert meeting(CAMERA, CONFIG, level, 0.01, 0.0, 0.0) is None
+    assert vanishing_point(CAMERA, CONFIG, level, 0.01, 0.0, 0.0) is None
 
 
 def painted(pitch_rad: float) -> NDArray[np.uint8]:
@@ -99,26 +98,26 @@ def painted(pitch_rad: float) -> NDArray[np.uint8]:
 
 
 def test_an_image_is_looked_at_every_few_metres_of_a_straight_way() -> None:
-    looks, image = RoadLines(CAMERA, CONFIG), painted(0.02)
-    first = looks.look(image, NO_BOXES, 0.0, 0.0, 0.0, 0.5)
+    detector, image = VanishingPointDetector(CAMERA, CONFIG), painted(0.02)
+    first = detector.detect(image, NO_BOXES, 0.0, 0.0, 0.0, 0.5)
     assert first is not None  # what a file says of the pitch may be wrong
     assert abs(float(plane_normal(0.02, 0.0)[0] @ first.direction)) < 2.0 * first.sigma_rad
-    assert looks.look(image, NO_BOXES, 0.0, 0.0, 0.0, 0.9 * CONFIG.every_m) is None
-    assert looks.look(image, NO_BOXES, 0.0, 0.0, 2.0 * CONFIG.max_bend_per_m, CONFIG.every_m) is None
-    assert looks.look(image, NO_BOXES, 0.0, 0.0, 0.0, 0.0) is not None  # the bend is over
+    assert detector.detect(image, NO_BOXES, 0.0, 0.0, 0.0, 0.9 * CONFIG.every_m) is None
+    assert detector.detect(image, NO_BOXES, 0.0, 0.0, 2.0 * CONFIG.max_bend_per_m, CONFIG.every_m) is None
+    assert detector.detect(image, NO_BOXES, 0.0, 0.0, 0.0, 0.0) is not None  # the bend is over
 
 
 @pytest.mark.parametrize("grey", [np.zeros((192, 640), np.uint8), np.full((192, 640), 255, np.uint8)])
 def test_an_image_without_lines_says_nothing(grey: NDArray[np.uint8]) -> None:
-    assert RoadLines(CAMERA, CONFIG).look(grey, NO_BOXES, 0.0, 0.0, 0.0, 1.0) is None
+    assert VanishingPointDetector(CAMERA, CONFIG).detect(grey, NO_BOXES, 0.0, 0.0, 0.0, 1.0) is None
 
 
 def test_where_there_are_none_looks_are_fewer() -> None:
-    looks, empty, image = RoadLines(CAMERA, CONFIG), np.full((192, 640), 90, np.uint8), painted(0.02)
-    looks.look(empty, NO_BOXES, 0.0, 0.0, 0.0, 1.0)
-    assert looks.look(image, NO_BOXES, 0.0, 0.0, 0.0, CONFIG.every_m) is None
-    assert looks.look(image, NO_BOXES, 0.0, 0.0, 0.0, CONFIG.every_m) is not None
-    assert looks.look(image, NO_BOXES, 0.0, 0.0, 0.0, CONFIG.every_m) is not None  # as often as before
+    detector, empty, image = VanishingPointDetector(CAMERA, CONFIG), np.full((192, 640), 90, np.uint8), painted(0.02)
+    detector.detect(empty, NO_BOXES, 0.0, 0.0, 0.0, 1.0)
+    assert detector.detect(image, NO_BOXES, 0.0, 0.0, 0.0, CONFIG.every_m) is None
+    assert detector.detect(image, NO_BOXES, 0.0, 0.0, 0.0, CONFIG.every_m) is not None
+    assert detector.detect(image, NO_BOXES, 0.0, 0.0, 0.0, CONFIG.every_m) is not None  # as often as before
 
 
 @given(seed=st.integers(0, 1000))
@@ -127,25 +126,25 @@ def test_lines_that_meet_nowhere_are_no_roads(seed: int) -> None:
     rng = np.random.default_rng(seed)
     start = rng.uniform([0.0, 110.0], [639.0, 190.0], (40, 2))
     every = np.stack([start, start + rng.normal(0.0, 25.0, (40, 2))], axis=1)
-    assert meeting(CAMERA, CONFIG, every, 0.0, 0.0, 0.0) is None
+    assert vanishing_point(CAMERA, CONFIG, every, 0.0, 0.0, 0.0) is None
 
 
 def test_lines_of_vehicles_do_not_count() -> None:
     whole = np.array([[0.0, 0.0, CAMERA.width_px, CAMERA.height_px]])
-    assert RoadLines(CAMERA, CONFIG).look(painted(0.02), whole, 0.0, 0.0, 0.0, 1.0) is None
+    assert VanishingPointDetector(CAMERA, CONFIG).detect(painted(0.02), whole, 0.0, 0.0, 0.0, 1.0) is None
 
 
 def test_the_filter_takes_the_pitch_of_lines_and_refuses_what_is_far_off() -> None:
     filter_ = RoadFilter(CAMERA, RoadScaleConfig())
-    lines = meeting(CAMERA, CONFIG, segments(0.02, 0.0), 0.0, 0.0, 0.0)
+    lines = vanishing_point(CAMERA, CONFIG, segments(0.02, 0.0), 0.0, 0.0, 0.0)
     assert lines is not None
     before = float(filter_.cov[1, 1])
-    assert filter_.accept_lines(lines)
+    assert filter_.update_vanishing_point(lines)
     assert filter_.tilt[0] == pytest.approx(0.02, abs=0.003)
     assert filter_.cov[1, 1] < 0.1 * before
-    far = meeting(CAMERA, CONFIG, segments(0.02 + math.radians(3.0), 0.0), 0.05, 0.0, 0.0)
+    far = vanishing_point(CAMERA, CONFIG, segments(0.02 + math.radians(3.0), 0.0), 0.05, 0.0, 0.0)
     assert far is not None
     x, cov = filter_.x.copy(), filter_.cov.copy()
-    assert not filter_.accept_lines(far)
+    assert not filter_.update_vanishing_point(far)
     np.testing.assert_array_equal(filter_.x, x)
     np.testing.assert_array_equal(filter_.cov, cov)

@@ -1,0 +1,38 @@
+"""The parameters of the odometry; those of each part stand beside it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from birdslam.odometry.corners.below_plane import BelowPlaneConfig
+from birdslam.odometry.corners.feature_tracks import FeatureConfig
+from birdslam.odometry.corners.initialisation import InitialisationConfig
+from birdslam.odometry.corners.keyframes import KeyframeConfig
+from birdslam.odometry.motion import MotionConfig
+from birdslam.odometry.obstruction.fixed_corners import FixedCornersConfig
+from birdslam.odometry.road.kalman_filter import RoadScaleConfig
+from birdslam.odometry.speed.constant_velocity import ConstantVelocityConfig
+from birdslam.odometry.speed.zero_velocity import ZeroVelocityConfig
+
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
+    """One setting for every camera, road and frame rate."""
+
+    features: FeatureConfig = FeatureConfig()
+    road: RoadScaleConfig = RoadScaleConfig()
+    motion: MotionConfig = MotionConfig()
+    start: InitialisationConfig = InitialisationConfig()
+    two_view_px: Positive = 0.7  # inlier limit of the pose from two images, where the window does not show it
+    min_fitting: Count = 18  # inliers among the landmarks, for a pose to count as measured
+    min_fitting_fraction: Positive = 0.35  # and their ratio to the landmarks in sight
+    max_speed_mps: Positive = 70.0  # a faster motion is no measurement
+    max_coast_s: Positive = 1.0  # after that the window begins anew
+    zero_velocity: ZeroVelocityConfig = ZeroVelocityConfig()
+    fixed_corners: FixedCornersConfig = FixedCornersConfig()
+    constant_velocity: ConstantVelocityConfig = ConstantVelocityConfig()
+    below_plane: BelowPlaneConfig = BelowPlaneConfig()
