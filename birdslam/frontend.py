@@ -1,4 +1,4 @@
-"""The front end, from one image and what the networks say of it to the edges of the pose graph (paper, Fig. 2)."""
+"""The front end: from one image and the networks' results to the edges of the pose graph (paper, Fig. 2)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
 from birdslam.mapping.lane_edges import LaneEdgesConfig
 from birdslam.mapping.lane_mapper import LaneHead, LaneMapper, LaneOutput
-from birdslam.mapping.lane_view import LaneView
-from birdslam.mapping.lanes import LanesConfig
+from birdslam.mapping.lanes import LanesConfig, LaneView
 from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.external import ExternalConfig
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
@@ -48,7 +47,7 @@ class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The parts of the front end."""
 
     odometry: OdometryConfig = OdometryConfig()
-    external: ExternalConfig = ExternalConfig()  # of somebody else's odometry, where a file of it is given
+    external: ExternalConfig = ExternalConfig()  # of an external odometry, where its file is given
     plausibility: PlausibilityConfig = PlausibilityConfig()
     localisation: LocalisationConfig = LocalisationConfig()
     ground_size: GroundSizeConfig = GroundSizeConfig()
@@ -62,13 +61,13 @@ class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Pending(Protocol):
-    """What the networks are still at work on; `perception.Networks.start` returns one."""
+    """Results that the networks may still be computing; `perception.Networks.start` returns one."""
 
     def result(self) -> Perception: ...
 
 
 class EgoMotion(Protocol):
-    """What the front end asks of an odometry; `odometry.Odometry` measures it in the images."""
+    """The interface of an odometry; `odometry.Odometry` is that of the images."""
 
     def track(self, image: NDArray[np.uint8]) -> Any: ...
 
@@ -100,7 +99,7 @@ class FrontEnd:
         self.camera = camera
         self.config = config
         self.odometry: EgoMotion = odometry or Odometry(camera, config.odometry)
-        self._reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
+        self._dead_reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
         self._plausibility = PlausibilityGate(config.plausibility)
         self.vehicles = OutOfSequenceTracker(
             Tracker(camera, config.tracking, config.localisation, config.pseudolidar, frustum_network),
@@ -120,7 +119,7 @@ class FrontEnd:
         """
         status = [*frame.status, *self._dropped(frame)]
         if frame.image is None:
-            return self._plausibility.admit(_measurements(frame, status, attitude=self._reckoning.attitude))
+            return self._plausibility.admit(_measurements(frame, status, attitude=self._dead_reckoning.attitude))
         tracks = self.odometry.track(frame.image)
         perception = pending.result()
 
@@ -142,7 +141,7 @@ class FrontEnd:
             vv=vv,
             cp=(*cp, *lanes.edges),
             lanes=lanes.points,
-            attitude=self._reckoning.attitude,
+            attitude=self._dead_reckoning.attitude,
             ground=Ground(height_m=ground.height_m, pitch_rad=ground.pitch_rad, roll_rad=ground.roll_rad),
             scale_sigma_rel=0.0 if motion is None else motion.scale_sigma_rel,
             speed_sources=() if motion is None else motion.speed_sources,
@@ -151,8 +150,8 @@ class FrontEnd:
         return self._plausibility.admit(measurements)
 
     def lane_view(self) -> LaneView:
-        """What the lanes around the newest frame's ego are made of, for a picture."""
-        return self._lanes.view(self._reckoning.T_world_ego)
+        """The grids and lanes around the newest frame's ego, for a picture."""
+        return self._lanes.view(self._dead_reckoning.T_world_ego)
 
     def _dropped(self, frame: Frame) -> tuple[Status, ...]:
         gap = self._last_frame is not None and frame.frame_id > self._last_frame + 1
@@ -168,7 +167,7 @@ class FrontEnd:
         if motion is None:
             self._lanes.clear()
             return None, None
-        return motion, self._reckoning.advance(motion)
+        return motion, self._dead_reckoning.advance(motion)
 
     def _localise_vehicles(
         self, frame: Frame, motion: Motion | None, perception: Perception
@@ -186,9 +185,9 @@ class FrontEnd:
         return vehicle_edges(seen, opened.ego, self.vehicles.road.ground, self.camera, self.config.tracking)
 
     def _open_frame(self, frame: Frame, motion: Motion | None) -> OpenFrame:
-        """The ego, and the road as this frame's image and the camera's own pitching since the last frame give it."""
-        t_source_ns, pitch_rad = frame.t_source_ns, self._reckoning.attitude.pitch_rad
-        T_world_ego = self._reckoning.T_world_ego
+        """The ego, and the ground by this frame's image and by the camera's change of pitch since the last frame."""
+        t_source_ns, pitch_rad = frame.t_source_ns, self._dead_reckoning.attitude.pitch_rad
+        T_world_ego = self._dead_reckoning.T_world_ego
         (last_ns, last_rad, T_world_last), self._last = self._last, (t_source_ns, pitch_rad, T_world_ego)
         step = T_world_last.between(T_world_ego)
         step_cov = None if motion is None else np.asarray(motion.cov)
@@ -209,11 +208,11 @@ class FrontEnd:
         )
 
     def _map_lanes(self, frame: Frame, perception: Perception) -> LaneOutput:
-        """Lanes, by what is known of this frame's road or an earlier one's."""
+        """Lane points and edges, by this frame's segmentation or an earlier one's."""
         road, age = self.vehicles.road, perception.ages.get("segmenter", 0)
         return self._lanes.map_lanes(
             frame.frame_id,
-            self._reckoning.T_world_ego,
+            self._dead_reckoning.T_world_ego,
             road.ground,
             road.sigma_pitch_rad,
             perception.segmentation,

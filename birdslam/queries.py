@@ -1,4 +1,4 @@
-"""What planners are answered who ask for the whole way or map; frames and units as in types.py."""
+"""Records that answer planners' queries for the whole trajectory or map; frames and units as in types.py."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class TimedPose(msgspec.Struct, frozen=True, array_like=True):
 
 
 class VehiclePath(msgspec.Struct, frozen=True, kw_only=True):
-    """Where one vehicle was seen, oldest first."""
+    """One vehicle's poses, oldest first."""
 
     vehicle: BodyId
     poses: tuple[TimedPose, ...]
@@ -27,27 +27,27 @@ class VehiclePath(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to "where has everybody been": key poses in world of `epoch`, oldest first, the newest always last.
+    """The trajectories: key poses in world of `epoch`, oldest first, always with the newest.
 
-    Thinned: poses are further apart the further back they are (see atlas.AtlasConfig).
+    Older poses are farther apart (see atlas.AtlasConfig).
     """
 
     epoch: int
-    frame_id: FrameId  # of the newest estimate that is in it
+    frame_id: FrameId  # of the newest estimate
     t_source_ns: int
     ego: tuple[TimedPose, ...] = ()
     vehicles: tuple[VehiclePath, ...] = ()  # those seen in that time
 
 
 class MapSnapshot(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to "what is the road like": all points of the map, in world of `epoch`, thinned to one in a cell."""
+    """The map: all its points, in world of `epoch`, thinned to one in a cell."""
 
     epoch: int
-    frame_id: FrameId  # of the newest update that is in it
+    frame_id: FrameId  # of the newest update
     landmarks_m: tuple[tuple[float, float], ...] = ()  # road points
     lanes_m: tuple[tuple[float, float], ...] = ()  # points of lane lines
-    cell_m: float = 0.25  # the side of a cell near the car; far back they are larger
-    lane_ids: tuple[int, ...] = ()  # the lane of each of `lanes_m`, -1: of none; empty: of none at all
+    cell_m: float = 0.25  # side of a cell near the car; older ones are larger
+    lane_ids: tuple[int, ...] = ()  # the lane of each of `lanes_m`, -1: none; empty: all none
 
     def __post_init__(self) -> None:
         if len(self.lane_ids) not in (0, len(self.lanes_m)):

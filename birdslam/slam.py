@@ -15,11 +15,11 @@ from birdslam.perception.completion import shipped_completion
 from birdslam.types import Estimate, Frame, MapUpdate, Measurements
 from birdslam.vehicles.placement.pseudolidar import FrustumNetwork
 
-LANES_HZ = 5.0  # that lanes are made out anew, where nothing else is said (`[perceive.schedule]`)
+LANES_HZ = 5.0  # default rate of lane detection (`[perceive.schedule]`)
 
 
 class SlamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Every number of the method that can be tuned; one setting serves all roads.
+    """All parameters of the method; one setting serves all roads.
 
     docs/configuration.md has every key. `SlamConfig(weights=WeightsConfig(mode="paper"))` is the paper's graph;
     `msgspec.structs.replace` changes single fields; `msgspec.convert(tree, SlamConfig)` reads a TOML's tables.
@@ -38,9 +38,9 @@ class BirdSLAM:
 
     The three processes of `birdslam run` run the same front end and the same graph, and get the same bytes at
     `--rate max`. `networks` find vehicles, road and lanes (`perception.shipped_networks()`, `load_networks`);
-    `lane_head` says how often lanes are made out, and what completes them where something hid the road;
-    `frustum_network` reads bodies from a depth network's points; `odometry` is another than that of the images
-    (`odometry.external.ExternalOdometry`). Not for several threads at once.
+    `lane_head` says how often lanes are detected, and what completes them where something occluded the road;
+    `frustum_network` reads bodies from a depth network's points; `odometry` is an external one in place of that of the
+    images (`odometry.external.ExternalOdometry`). Not thread-safe.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class BirdSLAM:
     ) -> BirdSLAM:
         """With the networks that ship with the package, as `birdslam evaluate odometry` runs it.
 
-        `rate_hz` is that of the frames to come: lanes are made out anew LANES_HZ times a second. Raises ModelError.
+        `rate_hz` is that of the frames to come: lanes are detected LANES_HZ times a second. Raises ModelError.
         """
         completion = shipped_completion(config.frontend.lanes.shape)
         lane_head = LaneHead(completion, every=max(1, round(rate_hz / LANES_HZ)))
@@ -74,16 +74,16 @@ class BirdSLAM:
         """One undistorted frame: the networks run beside the feature tracking, then the back end.
 
         Frames come in the order of their `frame_id` and `t_source_ns`; motion is computed from the latter. Poses are
-        in metres and rad, in the world of `Estimate.epoch` (`types.py` has every frame and unit). What goes wrong with
-        a frame is a `Status` in both records, and `Estimate.valid` says whether it may be driven by. Raises ValueError
-        for an image of another size than the camera's, and nothing for what may be seen in it.
+        in metres and rad, in the world of `Estimate.epoch` (`types.py` has every frame and unit). Trouble with a frame
+        is a `Status` in both records, and `Estimate.valid` says whether it may be driven by. Raises ValueError for an
+        image of another size than the camera's, never for what it shows.
         """
         measurements = self.frontend.measure(frame, self.networks.start(frame.frame_id, frame.image))
         return measurements, self.graph.optimise(measurements)
 
     def map_update(self) -> MapUpdate | None:
-        """What the map gained since the last call, in world: landmarks that left the window, and points of lanes.
+        """The map's new points since the last call, in world: landmarks that left the window, and points of lanes.
 
-        None where it gained nothing.
+        None where there are none.
         """
         return self.graph.map_update()

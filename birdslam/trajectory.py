@@ -1,15 +1,11 @@
-"""Trajectories on disk: KITTI rows and TUM lines, and the one passage between ego poses and camera poses.
+"""Trajectory files (KITTI rows, TUM lines), and the conversion between ego and camera poses.
 
-KITTI rows are `T_first_i` (3, 4) row-major, in the axes of the recording's camera at its first frame (x right, y
-down, z forward), the first row the identity. TUM lines are `t[s] x y z qx qy qz qw` in the world of `types.py`.
-
-The ego rides on the road and the camera over it, at a constant `mount` (the calibrated height, pitch and roll):
+KITTI rows are `T_first_i` (3, 4) row-major in the axes of the first camera, TUM lines `t[s] x y z qx qy qz qw` in the
+world of `types.py`. The camera is mounted on the ego at a constant `mount` (calibrated height, pitch and roll):
 
     T_world_cam = T(x, y, z; Rz(yaw) Ry(pitch) Rx(roll)) @ T_ego_cam(mount)
 
-so a car's nodding is in the attitude, not in the mount. `ego_pose` and `split_pose` are inverse to each other: as long
-as one mount is used both ways, the camera's motion comes back exactly, whatever the mount. So a mount whose pitch is a
-little off tilts the world, in which a level road then seems to climb, but bends no camera trajectory.
+The car's pitching is in the attitude. A wrong mount tilts the world but leaves the camera's trajectory as it is.
 """
 
 from __future__ import annotations
@@ -28,8 +24,8 @@ Transform = NDArray[np.float64]  # (..., 4, 4) homogeneous, metres; one or many
 
 
 def ego_pose(T_world_ego: SE2, attitude: Attitude) -> Transform:
-    """`T_world_ego` (4, 4) of a planar pose and what it leaves out."""
-    from scipy.spatial.transform import Rotation  # here: few processes that import this module turn poses
+    """`T_world_ego` (4, 4) of a planar pose and its attitude."""
+    from scipy.spatial.transform import Rotation  # here: few processes need it
 
     out = np.eye(4)
     angles = [T_world_ego.yaw_rad, attitude.pitch_rad, attitude.roll_rad]
@@ -39,7 +35,7 @@ def ego_pose(T_world_ego: SE2, attitude: Attitude) -> Transform:
 
 
 def split_pose(T_world_ego: Transform) -> tuple[SE2, Attitude]:
-    """The inverse of `ego_pose`: pitch within a quarter turn."""
+    """The inverse of `ego_pose`, for a pitch within a quarter turn."""
     R, (x_m, y_m, z_m) = T_world_ego[:3, :3], T_world_ego[:3, 3]
     yaw_rad = math.atan2(R[1, 0], R[0, 0])
     pitch_rad = math.atan2(-R[2, 0], math.hypot(R[2, 1], R[2, 2]))
@@ -79,7 +75,7 @@ def kitti_row(T_first_i: Transform) -> str:
 
 def tum_row(t_ns: int, T_world_i: Transform) -> str:
     """One line of a TUM trajectory, without its end; the time is exact to the nanosecond, qw >= 0."""
-    from scipy.spatial.transform import Rotation  # here: few processes that import this module turn poses
+    from scipy.spatial.transform import Rotation  # here: few processes need it
 
     qx, qy, qz, qw = Rotation.from_matrix(T_world_i[:3, :3]).as_quat(canonical=True)
     numbers = " ".join(f"{number + 0.0:.9f}" for number in (*T_world_i[:3, 3], qx, qy, qz, qw))
@@ -121,7 +117,7 @@ def read_kitti(path: Path) -> NDArray[np.float64]:
 
 def read_tum(path: Path) -> tuple[NDArray[np.float64], Transform]:
     """Times (N,) in seconds and poses (N, 4, 4) of a TUM file, comments skipped. Raises ValueError naming the line."""
-    from scipy.spatial.transform import Rotation  # here: few processes that import this module turn poses
+    from scipy.spatial.transform import Rotation  # here: few processes need it
 
     rows = _read_numbers(path, 8, "TUM pose")
     wrong = np.flatnonzero(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0) > 1e-3)
@@ -137,8 +133,7 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], Transform]:
 class CameraTrajectory:
     """Ego poses, frame by frame, to camera poses `T_first_i` in the axes of the first camera (KITTI).
 
-    A new epoch begins in a world of its own, and nothing says how the car moved in between: it is put where the last
-    one ended, so that the rows go on.
+    A new epoch has a world of its own, and the motion in between is unknown: it is placed where the last one ended.
     """
 
     def __init__(self, mount: GroundPlane) -> None:

@@ -41,7 +41,7 @@ FrameId = Annotated[int, msgspec.Meta(ge=0)]
 Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 BodyId = Annotated[int, msgspec.Meta(ge=0)]
 NS_PER_S = 1_000_000_000
-IN_SIGHT_NS = 350_000_000  # three looks a second, the fewest of perceive, are a third of a second apart
+IN_SIGHT_NS = 350_000_000  # perceive runs its networks at least three times a second
 
 
 def check_finite(record: msgspec.Struct, *fields: str) -> None:
@@ -60,7 +60,7 @@ def _check_cov(record: msgspec.Struct, *fields: str) -> None:
 
 
 def _is_sound(total: float, *variances: float) -> bool:
-    """Whether numbers of this sum are finite and the variances not negative: no need then to look at each."""
+    """Whether the sum is finite and no variance negative: a fast test before those of each number."""
     return math.isfinite(total) and min(variances) >= 0.0
 
 
@@ -71,12 +71,12 @@ def check_points(record: msgspec.Struct, *points_m: tuple[float, float]) -> None
 
 
 class SpeedSource(enum.StrEnum):
-    """What the metres of a frame's motion rest on."""
+    """Where the metres of a frame's motion come from."""
 
     ROAD = "road"  # the road's image, under a camera of known height
     CAR = "car"  # the car's own speed
-    CARRIED = "carried"  # an earlier frame's: nothing showed it anew
-    UNKNOWN = "unknown"  # a source that a newer sender knows and this reader does not
+    CARRIED = "carried"  # the scale of an earlier frame
+    UNKNOWN = "unknown"  # a newer sender's source that this reader does not know
 
     @classmethod
     def _missing_(cls, value: object) -> SpeedSource | None:
@@ -86,8 +86,8 @@ class SpeedSource(enum.StrEnum):
 class Moves(enum.StrEnum):
     """Whether a vehicle stands or drives, decided with hysteresis."""
 
-    UNDECIDED = "undecided"  # too little was seen of it, or nothing says
-    STANDING = "standing"  # its velocity is told as nil
+    UNDECIDED = "undecided"  # too little was seen of it
+    STANDING = "standing"  # its velocity is reported as zero
     DRIVING = "driving"
 
     @classmethod
@@ -96,15 +96,15 @@ class Moves(enum.StrEnum):
 
 
 class SpeedReading(msgspec.Struct, frozen=True, kw_only=True):
-    """What the car itself says of its motion, from wheels or another source.
+    """A reading of the car's own speed, from wheels or another source.
 
-    Plausibility is judged where readings are used: a wrong one is told of by a status, it is no malformed record.
+    Plausibility is judged where readings are used: a wrong one is a status, not a malformed record.
     """
 
-    t_ns: int  # when it held, by the frames' t_source_ns; in topic `speed` by CLOCK_MONOTONIC, 0: when it came
+    t_ns: int  # its time, by the frames' t_source_ns; in topic `speed` by CLOCK_MONOTONIC, 0: on arrival
     speed_mps: float  # along the car's x axis, < 0 backwards
-    sigma_mps: float  # 1-sigma of its noise, without the scale factor that the tyres make
-    yaw_rate_radps: float | None = None  # counter-clockwise; None: the car does not say
+    sigma_mps: float  # 1-sigma of its noise, without the tyres' scale factor
+    yaw_rate_radps: float | None = None  # counter-clockwise; None: no yaw rate
     yaw_rate_sigma_radps: float = 0.0
 
 
@@ -121,7 +121,7 @@ class Frame:
     t_utc_ns: int
     image: NDArray[np.uint8] | None
     status: tuple[Status, ...] = ()
-    speeds: tuple[SpeedReading, ...] = ()  # the car's own that had come by now, of the last second; in order of coming
+    speeds: tuple[SpeedReading, ...] = ()  # readings of the last second, in order of arrival
 
 
 class FrameRef(msgspec.Struct, frozen=True, kw_only=True):
@@ -142,7 +142,7 @@ class FrameRef(msgspec.Struct, frozen=True, kw_only=True):
     channels: int = 0  # 1 grey, 3 BGR
     dropped: int = 0  # frames that capture itself had to drop since the start
     status: tuple[Status, ...] = ()
-    speeds: tuple[SpeedReading, ...] = ()  # as in `Frame`; a frame that is dropped loses none, the next has them too
+    speeds: tuple[SpeedReading, ...] = ()  # as in `Frame`; those of a dropped frame are in the next one too
 
 
 class EgoEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
@@ -173,12 +173,12 @@ class VehicleEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     box_px: Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)] = (0.0, 0.0, 0.0, 0.0)
     length_m: float = 4.0
     width_m: float = 1.7
-    # What it was taken for in this frame: later ones may know better, and where it was then with it
+    # The size by which it was placed in this frame; the place can be corrected once the size is known better
     log_height: float = 0.0  # of its height in metres
     sigma_log_height: float = 0.0
-    depth_per_height: float = 0.0  # by how much the logarithm of its depth goes with log_height; 0: not at all
+    depth_per_height: float = 0.0  # derivative of the log of its depth by log_height
     standing: float = 0.0  # the probability that it stands
-    delay_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # > 0: seen so long before this frame, and moved on to it
+    delay_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # > 0: seen that long before this frame, and predicted to it
 
     def __post_init__(self) -> None:
         cov, sizes = self.cov, self.length_m + self.width_m + self.log_height + self.sigma_log_height
@@ -205,19 +205,19 @@ class MotionEdge(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class LandmarkKind(enum.IntEnum):
-    """What a landmark of the static map is."""
+    """The kinds of landmarks of the static map."""
 
     ROAD_POINT = 0  # a feature on the road's surface
-    LANE_STATION = 1  # where a lane crosses a fixed line of world: known across the lane alone
+    LANE_STATION = 1  # crossing of a lane with a grid line in world: known across the lane only
 
 
-_STATION_IDS = 1 << 48  # stations' ids began here in records that had no `kind` yet
+_STATION_IDS = 1 << 48  # offset of stations' ids in older records, which have no `kind`
 
 
 class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
     """CP: a landmark of the static map seen from the ego (camera-point edge, Eq. 3), back-projected by Eq. 1.
 
-    It is known by `kind` and `landmark` together: each kind numbers its own.
+    `kind` and `landmark` together identify it: each kind has its own numbers.
     """
 
     landmark: BodyId
@@ -238,11 +238,11 @@ class LandmarkEdge(msgspec.Struct, frozen=True, kw_only=True, array_like=True, g
 
 
 class LanePoint(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """A point of a lane line on the road, in ego; it only feeds the map."""
+    """A point of a lane line on the road, in ego; for the map only."""
 
     x_m: float
     y_m: float
-    lane: int = -1  # points of one line share it, from frame to frame; -1: of no lane that is known
+    lane: int = -1  # persistent id of its lane; -1: of no known lane
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.x_m + self.y_m):
@@ -252,7 +252,7 @@ class LanePoint(msgspec.Struct, frozen=True, array_like=True, gc=False):
 class Attitude(msgspec.Struct, frozen=True, kw_only=True):
     """What SE(2) leaves out: the ego's height and tilt in the world, integrated from image odometry.
 
-    It is no part of the graph; trajectories are written in 6-DoF with it (a graded road, the camera's vibration).
+    Not in the graph; 6-DoF trajectories are written with it (a graded road, the camera's vibration).
     """
 
     z_m: float = 0.0  # the ego over the world's plane
@@ -275,16 +275,16 @@ class Ground(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Measurements(msgspec.Struct, frozen=True, kw_only=True):
-    """perceive -> optimize: all that the front end has to say about one frame, the edges of Eqs. 6 and 7.
+    """perceive -> optimize: the front end's measurements of one frame, the edges of Eqs. 6 and 7.
 
-    Its log replays the back end alone.
+    A log of them replays the back end alone.
     """
 
     frame_id: FrameId
     t_source_ns: int
     t_capture_ns: int
     t_utc_ns: int
-    cc: EgoEdge | None = None  # None: no motion to an earlier frame is known; the graph begins a new epoch
+    cc: EgoEdge | None = None  # None: the motion since earlier frames is unknown; the graph begins a new epoch
     cv: tuple[VehicleEdge, ...] = ()
     vv: tuple[MotionEdge, ...] = ()
     cp: tuple[LandmarkEdge, ...] = ()
@@ -292,9 +292,9 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     attitude: Attitude = Attitude()
     ground: Ground | None = None
     scale_sigma_rel: float = 0.0  # 1-sigma of the metric scale as a fraction
-    ages: dict[str, int] = {}  # frames since each network's result in use was computed; 0 is this frame
+    ages: dict[str, int] = {}  # frames since that of each network's result; 0 is this frame
     status: tuple[Status, ...] = ()
-    speed_sources: tuple[SpeedSource, ...] = ()  # what the metres of this frame's motion rest on
+    speed_sources: tuple[SpeedSource, ...] = ()  # where the metres of this frame's motion come from
 
     def __post_init__(self) -> None:
         check_finite(self, "scale_sigma_rel")
@@ -307,19 +307,19 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     T_world_vehicle: SE2  # where it is
     cov: Cov3  # of the pose
     velocity_mps: Annotated[tuple[float, ...], msgspec.Meta(min_length=2, max_length=2)]  # (x, y) in world
-    velocity_cov: Cov2  # of the velocity; that the vehicle may stand, or not, is in it
-    age_ns: int  # source time since the frame that last told of it; 0: this frame does
-    frames: int  # how many frames it has been seen in
+    velocity_cov: Cov2  # of the velocity, including the probability that it stands
+    age_ns: int  # source time since the last frame with a measurement of it; 0: this frame
+    frames: int  # the number of frames it has been seen in
     label: str = "car"  # its class
     length_m: float = 4.0  # of its footprint
     width_m: float = 1.7  # of its footprint
-    delay_ns: int = 0  # by so much older was the image that it was seen in: it was last seen age_ns + delay_ns ago
-    moves: Moves = Moves.UNDECIDED  # whether it stands or drives: decided on strong evidence, and kept until that turns
-    standing: Probability = 0.5  # the probability that it stands, as last told of
+    delay_ns: int = 0  # delay of the image that it was seen in: it was last seen age_ns + delay_ns ago
+    moves: Moves = Moves.UNDECIDED  # whether it stands or drives, with hysteresis
+    standing: Probability = 0.5  # the last probability that it stands
 
     @property
     def in_sight(self) -> bool:
-        """Seen so shortly ago that it counts as seen: networks need not look at every frame."""
+        """Seen within IN_SIGHT_NS: networks need not run on every frame."""
         return self.age_ns <= IN_SIGHT_NS
 
     def __post_init__(self) -> None:
@@ -331,26 +331,26 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
-    """optimize -> planners, one for each frame: where the ego and every other vehicle are (paper, Sec. 3).
+    """optimize -> planners, one for each frame: the poses of the ego and all other vehicles (paper, Sec. 3).
 
-    Poses are in m and rad in the world of `epoch`, covariances (3, 3) row-major of the tangent (x_m, y_m, yaw_rad). A
-    raised `epoch` says that the world frame began anew: poses of different epochs must not be compared.
+    Poses are in m and rad in the world of `epoch`, covariances (3, 3) row-major of the tangent (x_m, y_m, yaw_rad).
+    With a new `epoch` the world frame began anew: poses of different epochs must not be compared.
     """
 
-    epoch: int  # which world: raised where the world frame began anew
+    epoch: int  # number of the world frame, raised where that began anew
     frame_id: FrameId  # as capture counts them; never falls within a run
     t_source_ns: int  # the camera's or the recording's own clock
     t_capture_ns: int  # CLOCK_MONOTONIC of the vehicle's computer
     t_utc_ns: int  # UTC of the same moment
     T_world_ego: SE2  # where the ego is
     cov: Cov3  # of the pose
-    valid: bool  # may be driven by: none of its statuses is invalidating
-    vehicles: tuple[VehicleEstimate, ...] = ()  # all that are followed, those just out of sight too
+    valid: bool  # it may be driven by: no status invalidates it
+    vehicles: tuple[VehicleEstimate, ...] = ()  # all tracked vehicles, also those just out of sight
     attitude: Attitude = Attitude()  # height and tilt, which the pose leaves out
     ground: Ground | None = None  # the camera over the road
     scale_sigma_rel: float = 0.0  # 1-sigma of the metric scale as a fraction
     status: tuple[Status, ...] = ()  # expected trouble
-    speed_sources: tuple[SpeedSource, ...] = ()  # what the metres of this frame's motion rest on
+    speed_sources: tuple[SpeedSource, ...] = ()  # where the metres of this frame's motion come from
 
     def __post_init__(self) -> None:
         check_finite(self, "scale_sigma_rel")
@@ -362,9 +362,9 @@ class MapUpdate(msgspec.Struct, frozen=True, kw_only=True):
 
     epoch: int
     frame_id: FrameId
-    landmarks_m: tuple[tuple[float, float], ...] = ()  # road points that left the window, settled
+    landmarks_m: tuple[tuple[float, float], ...] = ()  # road points that left the graph's window
     lanes_m: tuple[tuple[float, float], ...] = ()  # points of lane lines
-    lane_ids: tuple[int, ...] = ()  # the lane of each of `lanes_m`, -1: of none; empty: of none at all
+    lane_ids: tuple[int, ...] = ()  # the lane of each of `lanes_m`, -1: none; empty: all none
 
     def __post_init__(self) -> None:
         if len(self.lane_ids) not in (0, len(self.lanes_m)):

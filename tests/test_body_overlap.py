@@ -10,7 +10,7 @@ import pytest
 
 from birdslam.geometry.camera import Camera
 from birdslam.perception import Boxes3d, Detections, Findings, Networks
-from birdslam.perception.body_overlap import with_bodies
+from birdslam.perception.decoding.detection import with_bodies
 from birdslam.perception.manifest import Schedule
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes

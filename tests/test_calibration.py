@@ -253,7 +253,7 @@ def test_a_rendered_drive_gives_the_pitch_and_checks_the_height() -> None:
     assert abs(found.camera.pitch_rad - PITCH_RAD) < 2.5 * sigma[0] < math.radians(0.6)
     assert abs(found.camera.roll_rad) < 2.5 * sigma[1]
     assert found.camera.tilt_sigma_rad == pytest.approx(sigma.max())
-    assert {w.cue for w in found.witnesses} == {"road", "travel"}
+    assert {w.cue for w in found.estimates} == {"road", "travel"}
     (check,) = found.height_checks
     assert abs(check.height_m - 1.65) < 2.5 * check.sigma_m < 0.15
     assert abs(check.height_m - 1.5) > 2.0 * check.sigma_m  # the wrong one is found out

@@ -129,11 +129,11 @@ def test_a_completion_makes_no_lane_of_what_nobody_saw() -> None:
 
 def test_only_what_moved_on_is_news() -> None:
     lanes = AmodalLanes(CONFIG)
-    assert lanes.is_news(SE2())
+    assert lanes.has_moved(SE2())
     lanes.add(SE2(), np.zeros((0, 2)), np.zeros((0, 2)))
-    assert not lanes.is_news(SE2(0.5 * CONFIG.step_m, 0.0, 0.5 * CONFIG.step_rad))
-    assert lanes.is_news(SE2(-CONFIG.step_m))
-    assert lanes.is_news(SE2(0.0, 0.0, 2.0 * CONFIG.step_rad))
+    assert not lanes.has_moved(SE2(0.5 * CONFIG.step_m, 0.0, 0.5 * CONFIG.step_rad))
+    assert lanes.has_moved(SE2(-CONFIG.step_m))
+    assert lanes.has_moved(SE2(0.0, 0.0, 2.0 * CONFIG.step_rad))
 
 
 @given(st.floats(-3.0, 3.0), st.floats(-50.0, 50.0), st.floats(-50.0, 50.0))

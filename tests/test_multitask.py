@@ -27,7 +27,7 @@ from birdslam.perception.decoding.multitask import (
     MultiTaskDecoder,
     body_slices,
 )
-from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, Misfit, MultiTask, Schedule, Stretch
+from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, ManifestMismatch, MultiTask, Schedule, Stretch
 from birdslam.perception.onnx_files.unread_outputs import without_outputs
 from birdslam.perception.views import make_views
 from birdslam.types import Status
@@ -292,7 +292,7 @@ def test_of_two_boxes_on_one_vehicle_the_better_stays() -> None:
 @pytest.mark.parametrize(("name", "channels"), [("segmentation", 3), ("heat", 1), ("body", 7), ("depth", 2)])
 def test_outputs_that_do_not_fit(name: str, channels: int) -> None:
     shape = SHAPES[name]
-    with pytest.raises(Misfit, match=name):
+    with pytest.raises(ManifestMismatch, match=name):
         MultiTaskDecoder(MultiTask(), SIZE, {**SHAPES, name: (1, channels, *shape[2:])})
 
 

@@ -1,14 +1,9 @@
-"""How a camera stands in its car, from a drive: pitch and roll over the road, and a check of its height.
+"""How a camera is mounted in its car, from a drive: pitch and roll over the road, and a check of its height.
 
-Four witnesses, each with its own covariance, and the least-squares mean of them with the disagreement in its
-covariance (Birge's ratio):
-
-- the road's image: the homography of the road plane between two images gives pitch and roll (road/alignment.py);
-- the direction of travel: on a straight way the epipole lies on the road's horizon, above a camera that looks down;
-- the road's lines: the point where they meet lies on its horizon (road/vanishing_point.py);
-- the vehicles: bottoms and heights of many boxes put the horizon where they meet (vehicles/camera_height.py).
-
-What checks its height is in height_check.py.
+Four cues, each with its covariance, are averaged by least squares, and their disagreement widens the covariance
+(Birge's ratio): the homography of the road plane between two images (road/alignment.py); the direction of travel, whose
+epipole on a straight way lies on the road's horizon; the vanishing point of the road's lines (road/vanishing_point.py);
+the vehicles, whose bottoms and heights give the horizon (vehicles/camera_height.py). height_check.py has the height.
 """
 
 from __future__ import annotations
@@ -42,7 +37,7 @@ from birdslam.vehicles.camera_height import BoxHeight, measure_heights
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-WIDE = 10.0  # rad, 1-sigma: not seen at all
+UNOBSERVED_RAD = 10.0  # 1-sigma of what is not observed
 
 
 class CalibrationError(ValueError):
@@ -50,53 +45,53 @@ class CalibrationError(ValueError):
 
 
 class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How far each witness is trusted, and what a drive must show."""
+    """The uncertainty of each cue, and what a drive must show."""
 
     vehicles: VehicleHeightConfig = VehicleHeightConfig()
     height: HeightCheckConfig = HeightCheckConfig()
-    min_path_m: Positive = 20.0  # of measured motion: less shows a few bounces of the car, not its mean
+    min_path_m: Positive = 20.0  # of measured motion: less shows bounces of the car, not their mean
     min_fits: Annotated[int, msgspec.Meta(ge=3)] = 10
-    bounce_m: Positive = 3.0  # for so long a bounce of the car lasts
+    bounce_m: Positive = 3.0  # correlation length of the car's bounce
     sigma_bounce_rad: Positive = 0.012
-    sigma_fit_rad: Positive = 0.004  # of one comparison of the road: it is no perfect plane
+    sigma_fit_rad: Positive = 0.004  # of one alignment: the road is no perfect plane
     sigma_length_rel: Positive = 0.02  # of the running scale
-    sigma_curvature_per_m: Positive = 0.0006  # of roads along the way
+    sigma_curvature_per_m: Positive = 0.0006  # of roads lengthwise
     sigma_road_rad: Positive = 0.002  # of their mean: crown and grade of the way driven
     straight_rad_per_m: Positive = 0.005
     sigma_direction_rad: Positive = 0.012  # of the direction of travel over one metre
     sigma_travel_rad: Positive = 0.003  # of its mean: a car squats on its springs, and climbs a little
-    crest_m: Positive = 30.0  # for so long a crest or a sag lasts
-    min_looks: Annotated[int, msgspec.Meta(ge=3)] = 5  # at the road's lines
+    crest_m: Positive = 30.0  # correlation length of crests and sags
+    min_looks: Annotated[int, msgspec.Meta(ge=3)] = 5  # at the vanishing point
     max_sigma_rad: Positive = 0.02  # of the result
-    restart_rad: Positive = 0.01  # farther than this from where the drive began, it is driven again from there
+    restart_rad: Positive = 0.01  # farther than this from the start's tilt, the drive is repeated from the result
     max_drives: Annotated[int, msgspec.Meta(ge=1)] = 3
 
 
-class Witness(msgspec.Struct, frozen=True, kw_only=True):
-    """(pitch_rad, roll_rad) as one cue sees them, cov (2, 2); `chi2` of its distance from the mean of all."""
+class CueEstimate(msgspec.Struct, frozen=True, kw_only=True):
+    """(pitch_rad, roll_rad) by one cue, cov (2, 2); `chi2` of its distance from the mean of all cues."""
 
     cue: str
     pitch_rad: float
-    roll_rad: float | None  # None: it does not see the roll
+    roll_rad: float | None  # None: not observed
     cov: tuple[float, ...]
     samples: int
     chi2: float = 0.0
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True):
-    """The camera found, with cov (2, 2) of (pitch_rad, roll_rad) and all that it rests on."""
+    """The calibrated camera, with cov (2, 2) of (pitch_rad, roll_rad) and what it is based on."""
 
     camera: Camera
     cov: tuple[float, ...]
-    witnesses: tuple[Witness, ...]
+    estimates: tuple[CueEstimate, ...]
     height_checks: tuple[HeightCheck, ...]
-    yaw_rad: float | None  # of the optical axis left of the direction of travel; for the reader, no part of the file
+    yaw_rad: float | None  # of the optical axis, to the left of the direction of travel; not in the camera file
     path_m: float
     frames: int
 
 
-class _Witnessed(Odometry):
-    """The odometry of the front end, whose last motion can be asked for."""
+class _RecordingOdometry(Odometry):
+    """The odometry of the front end, which keeps its last motion."""
 
     motion: Motion | None = None
 
@@ -105,16 +100,16 @@ class _Witnessed(Odometry):
         return self.motion
 
     def take(self) -> Motion | None:
-        """The motion of the frame at hand, once."""
+        """The motion of the present frame, once."""
         motion, self.motion = self.motion, None
         return motion
 
 
 @dataclass
-class _Seen:
-    """What one drive showed."""
+class _Observations:
+    """The measurements of one drive."""
 
-    fits: list[tuple[RoadFit, float]] = field(default_factory=list)  # and the way since the one before
+    fits: list[tuple[RoadFit, float]] = field(default_factory=list)  # and the distance since the one before
     directions: list[tuple[Floats, float]] = field(default_factory=list)  # of straight travel, and its length
     lines: list[VanishingPoint] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
@@ -137,18 +132,18 @@ def calibrate(
     config: CalibrationConfig,
     lengths: dict[str, KnownLength] | None = None,
 ) -> Calibration:
-    """From all frames of a drive, which is begun anew where it started with a tilt too far off.
+    """From all frames of a drive, which is repeated where it started with a tilt too far off.
 
-    `lengths` names what else knows the way between two frames. Raises CalibrationError.
+    `lengths` are known distances between two frames, by name of their source. Raises CalibrationError.
     """
     for _ in range(config.max_drives):
-        seen = _watch(drive, camera, frontend, config)
+        seen = _observe(drive, camera, frontend, config)
         if seen.path_m < config.min_path_m:
             raise CalibrationError(
                 f"too little motion: {seen.path_m:.1f} m measured in {seen.frames} frames, "
                 f"{config.min_path_m:g} m are needed"
             )
-        tilt, cov, witnesses = _mean(_witnesses(seen, camera, config))
+        tilt, cov, estimates = _mean(_cue_estimates(seen, camera, config))
         moved = float(np.abs(tilt - [camera.pitch_rad, camera.roll_rad]).max())
         sigma = np.sqrt(np.diag(cov))
         camera = msgspec.structs.replace(
@@ -164,7 +159,7 @@ def calibrate(
     return Calibration(
         camera=camera,
         cov=tuple(cov.ravel().tolist()),
-        witnesses=witnesses,
+        estimates=estimates,
         height_checks=(
             *checks_by_length(lengths or {}, seen.steps, seen.times_ns, camera, config.height),
             *checks_by_vehicles(seen.boxes, camera, cov, config.vehicles),
@@ -175,8 +170,8 @@ def calibrate(
     )
 
 
-def _watch(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: CalibrationConfig) -> _Seen:
-    odometry, seen = _Witnessed(camera, frontend.odometry), _Seen()
+def _observe(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: CalibrationConfig) -> _Observations:
+    odometry, seen = _RecordingOdometry(camera, frontend.odometry), _Observations()
     front = FrontEnd(camera, frontend, odometry)
     since_m = 0.0
     for frame, pending in drive():
@@ -205,27 +200,27 @@ def _watch(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: Calib
 # --- pitch and roll ---
 
 
-def _witnesses(seen: _Seen, camera: Camera, config: CalibrationConfig) -> list[Witness]:
+def _cue_estimates(seen: _Observations, camera: Camera, config: CalibrationConfig) -> list[CueEstimate]:
     found = [by(seen, camera, config) for by in (_by_road, _by_travel, _by_lines, _by_vehicles)]
-    witnesses = [witness for witness in found if witness is not None]
-    if not witnesses:
+    estimates = [estimate for estimate in found if estimate is not None]
+    if not estimates:
         raise CalibrationError(
             "neither the road nor its lines nor a straight way nor vehicles were seen: nothing shows the tilt"
         )
-    return witnesses
+    return estimates
 
 
-def _by_road(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness | None:
-    """The mean of the comparisons of the road; those of one bounce of the car are one sample."""
+def _by_road(seen: _Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
+    """The mean over the alignments of the road; those within one bounce of the car count as one sample."""
     if len(seen.fits) < config.min_fits:
         return None
-    # Each knows the tilt together with the length of its step, which the running scale knows better than it does, and
-    # with the road's curvature, which is little in the mean.
+    # In each the tilt is correlated with the length of its step, which the running scale knows better, and with the
+    # road's curvature, which is small in the mean
     known = np.diag([config.sigma_length_rel**-2, 0.0, 0.0, config.sigma_curvature_per_m**-2])
     own = np.linalg.inv([fit.cov for fit, _ in seen.fits])
     cov = np.linalg.inv(own + known)
     tilt = np.einsum("nij,njk,nk->ni", cov, own, [fit.state for fit, _ in seen.fits])[:, 1:3]
-    by_length = cov[:, 1:3, 0] * config.sigma_length_rel**-2  # of the tilt, by the log of the running scale
+    by_length = cov[:, 1:3, 0] * config.sigma_length_rel**-2  # derivative of the tilt by the log of the running scale
     noise = cov[:, 1:3, 1:3]
     noise = noise + np.eye(2) * (config.sigma_fit_rad**2 + config.sigma_bounce_rad**2)
     share = np.array([min(1.0, way_m / config.bounce_m) for _, way_m in seen.fits])
@@ -237,13 +232,13 @@ def _by_road(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness 
         mean = np.linalg.solve(total, np.einsum("n,nij,nj->i", weights, info, tilt))
         away = np.sqrt(np.einsum("ni,nij,nj->n", tilt - mean, np.linalg.inv(noise), tilt - mean))
         weights = 1.0 / np.maximum(1.0, away / 1.5)  # Huber
-    # An error of the running scale lasts: it tilts all comparisons alike, and no mean of many makes it less
+    # The running scale's error is systematic: it tilts all alignments alike and does not average out
     lasting = np.linalg.solve(total, np.einsum("n,nij,nj->i", weights, info, by_length)) * config.sigma_length_rel
     of_mean = np.linalg.inv(total) + np.outer(lasting, lasting) + np.eye(2) * config.sigma_road_rad**2
-    return _witness("road", mean, of_mean, len(tilt))
+    return _cue_estimate("road", mean, of_mean, len(tilt))
 
 
-def _by_travel(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness | None:
+def _by_travel(seen: _Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
     """A car travels along the road: normal . direction = 0, solved for the pitch at the roll known so far."""
     length = np.array([length for _, length in seen.directions])
     if length.sum() < config.min_path_m:
@@ -254,38 +249,42 @@ def _by_travel(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witnes
     order = np.argsort(pitch)
     cumulated = np.cumsum(length[order])
     centre = float(pitch[order[np.searchsorted(cumulated, 0.5 * cumulated[-1])]])  # the weighted median
-    # A bounce comes and goes within bounce_m and turns the direction of the camera's travel back and forth
+    # Bounces are correlated over bounce_m and turn the direction of the camera's travel back and forth
     variance = config.sigma_direction_rad**2 * max(1.0, config.bounce_m) / length.sum() + config.sigma_travel_rad**2
-    return _witness("travel", np.array([centre, 0.0]), np.diag([variance, WIDE**2]), len(pitch), sees_roll=False)
+    return _cue_estimate(
+        "travel", np.array([centre, 0.0]), np.diag([variance, UNOBSERVED_RAD**2]), len(pitch), sees_roll=False
+    )
 
 
-def _by_lines(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness | None:
+def _by_lines(seen: _Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
     """The road's lines lie in it: normal . direction = 0, solved for the pitch at the roll known so far."""
     if len(seen.lines) < config.min_looks:
         return None
     normal, by_pitch, _ = plane_normal(camera.pitch_rad, camera.roll_rad)
     directions = np.array([look.direction for look in seen.lines])
     pitch = float(np.median(camera.pitch_rad - (directions @ normal) / (directions @ by_pitch)))
-    # A crest turns the road where the lines are seen, a bounce the camera; both last for longer than from look to look
+    # A crest turns the road where the lines are, a bounce the camera; both are correlated over several detections
     distance_m = float(np.median([look.distance_m for look in seen.lines]))
     lasting = config.sigma_bounce_rad**2 * config.bounce_m
     lasting += (config.sigma_curvature_per_m * distance_m) ** 2 * config.crest_m
     variance = lasting / max(seen.path_m, config.crest_m) + config.sigma_road_rad**2
-    return _witness("lines", np.array([pitch, 0.0]), np.diag([variance, WIDE**2]), len(seen.lines), sees_roll=False)
+    return _cue_estimate(
+        "lines", np.array([pitch, 0.0]), np.diag([variance, UNOBSERVED_RAD**2]), len(seen.lines), sees_roll=False
+    )
 
 
-def _by_vehicles(seen: _Seen, camera: Camera, config: CalibrationConfig) -> Witness | None:
+def _by_vehicles(seen: _Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
     prior = np.array([camera.height_m, camera.pitch_rad, camera.roll_rad])
     mounting = solve_mounting(
         seen.boxes, prior, np.diag([(0.3 * camera.height_m) ** 2, 0.1**2, 0.1**2]), config.vehicles
     )
     if mounting is None:
         return None
-    return _witness("vehicles", mounting.state[1:], mounting.cov[1:, 1:], mounting.vehicles)
+    return _cue_estimate("vehicles", mounting.state[1:], mounting.cov[1:, 1:], mounting.vehicles)
 
 
-def _witness(cue: str, tilt: Floats, cov: Floats, samples: int, sees_roll: bool = True) -> Witness:
-    return Witness(
+def _cue_estimate(cue: str, tilt: Floats, cov: Floats, samples: int, sees_roll: bool = True) -> CueEstimate:
+    return CueEstimate(
         cue=cue,
         pitch_rad=float(tilt[0]),
         roll_rad=float(tilt[1]) if sees_roll else None,
@@ -294,20 +293,20 @@ def _witness(cue: str, tilt: Floats, cov: Floats, samples: int, sees_roll: bool 
     )
 
 
-def _mean(witnesses: list[Witness]) -> tuple[Floats, Floats, tuple[Witness, ...]]:
-    """Least squares over all witnesses; the covariance is wider by as much as they disagree."""
-    covs = [np.reshape(w.cov, (2, 2)) for w in witnesses]
-    states = [np.array([w.pitch_rad, 0.0 if w.roll_rad is None else w.roll_rad]) for w in witnesses]
+def _mean(estimates: list[CueEstimate]) -> tuple[Floats, Floats, tuple[CueEstimate, ...]]:
+    """Least squares over all cues; their disagreement widens the covariance (Birge's ratio)."""
+    covs = [np.reshape(w.cov, (2, 2)) for w in estimates]
+    states = [np.array([w.pitch_rad, 0.0 if w.roll_rad is None else w.roll_rad]) for w in estimates]
     cov: Floats = np.linalg.inv(np.sum([np.linalg.inv(c) for c in covs], axis=0))
     mean: Floats = cov @ np.sum([np.linalg.solve(c, s) for c, s in zip(covs, states, strict=True)], axis=0)
     chi2 = [float((s - mean) @ np.linalg.solve(c, s - mean)) for c, s in zip(covs, states, strict=True)]
-    freedom = sum(1 if w.roll_rad is None else 2 for w in witnesses) - 2
+    freedom = sum(1 if w.roll_rad is None else 2 for w in estimates) - 2
     if freedom > 0:
         cov = cov * max(1.0, sum(chi2) / freedom)
-    return mean, cov, tuple(msgspec.structs.replace(w, chi2=c) for w, c in zip(witnesses, chi2, strict=True))
+    return mean, cov, tuple(msgspec.structs.replace(w, chi2=c) for w, c in zip(estimates, chi2, strict=True))
 
 
-def _yaw_rad(seen: _Seen) -> float | None:
+def _yaw_rad(seen: _Observations) -> float | None:
     if not seen.directions:
         return None
     return float(np.median([np.arctan2(d[0], d[2]) for d, _ in seen.directions]))

@@ -1,8 +1,8 @@
-"""A check of the camera's height by what is known from elsewhere.
+"""A check of the camera's height by independent knowledge.
 
-The metric scale of one camera is its height: nothing in the images alone can tell whether that is right. What can is a
-speed or poses of the recording, or the sizes of vehicles (vehicles/camera_height.py has their measurement); each gives
-a height with its sigma. The vehicles give pitch and roll as well.
+The metric scale of one camera is its height: the images alone can't tell whether it is right. What can is a speed or
+poses of the recording, or the sizes of vehicles (vehicles/camera_height.py measures them); each gives a height with its
+sigma. The vehicles give pitch and roll as well.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ KnownLength = Callable[[int, int, int, int], float | None]  # (frames from, to; 
 
 
 class HeightCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How far known lengths are trusted."""
+    """The uncertainty of known lengths."""
 
     section_m: Positive = 8.0  # over which an estimated length is compared with a known one
     sigma_scale_rel: Positive = 0.015  # of the mean ratio of lengths
 
 
 class VehicleHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How much boxes of vehicles say of the camera."""
+    """The uncertainty of the camera's height by boxes of vehicles."""
 
     sigma_class_rel: Positive = 0.04  # of the mean height of a class on a country's roads, and of a detector's boxes
     sigma_kerb_m: Positive = 0.06  # how far the road under a vehicle lies off the ego's plane
     sigma_bounce_rad: Positive = 0.008  # of the camera's pitch in one frame against its mean
     sigma_pitch_rad: Positive = 0.003  # of the mean: edges of boxes lie alike above the wheels' contact
     sigma_crown_rad: Positive = 0.015  # of the mean roll: all that park on one side stand on the same crown or kerb
-    frames_alike: Positive = 5.0  # for so many frames in a row a detector errs alike
-    gate_sigma: Positive = 3.0  # a vehicle that misfits by more is left out
+    frames_alike: Positive = 5.0  # correlation time of a detector's errors, in frames
+    gate_sigma: Positive = 3.0  # of a vehicle's residual; beyond it is left out
     min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 5
 
 
 class HeightCheck(msgspec.Struct, frozen=True, kw_only=True):
-    """The camera's height as something of known size or speed has it."""
+    """The camera's height by something of known size or speed."""
 
     cue: str
     height_m: float
@@ -55,7 +55,7 @@ class HeightCheck(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Mounting:
-    """How the camera is mounted: (height_m, pitch_rad, roll_rad) with cov (3, 3), by so many vehicles."""
+    """The camera's mounting: (height_m, pitch_rad, roll_rad) with cov (3, 3), and the number of vehicles it is by."""
 
     state: Floats
     cov: Floats
@@ -92,9 +92,9 @@ def checks_by_vehicles(
 def solve_mounting(
     boxes: Sequence[BoxHeight], prior: Floats, prior_cov: Floats, config: VehicleHeightConfig
 ) -> Mounting | None:
-    """Generalised least squares over all boxes, joined with a prior of (height, pitch, roll); None where too few fit.
+    """Generalised least squares over all boxes with a prior of (height, pitch, roll); None with too few inliers.
 
-    The height's prior should be vague where its answer is to be a check of it.
+    The height's prior should be vague where the result is to be a check of it.
     """
     if not boxes:
         return None
@@ -105,36 +105,36 @@ def solve_mounting(
     table = table[np.argsort(table[:, 0], kind="stable")]
     _, first = np.unique(table[:, 0], return_index=True)
     groups = np.split(table, first[1:])
-    kept = np.ones(len(groups), bool)
+    inlier = np.ones(len(groups), bool)
     state = np.array(prior, dtype=np.float64)
     cov = np.array(prior_cov, dtype=np.float64)
     for _ in range(6):
         info, right = np.linalg.inv(prior_cov), np.linalg.solve(prior_cov, prior)
-        misfit = np.zeros(len(groups))
+        normalised = np.zeros(len(groups))
         for k, rows in enumerate(groups):
             bottom, sigma_bottom, tall, sigma_tall, bearing, height_m, sigma_rel = rows[:, 1:].T
-            looks = tall / height_m  # 1 / z of a vehicle as tall as its class
-            J = np.column_stack([looks, -np.ones(len(rows)), bearing])
+            inverse_depth = tall / height_m  # 1 / z of a vehicle as tall as its class
+            J = np.column_stack([inverse_depth, -np.ones(len(rows)), bearing])
             r = bottom - J @ state
-            own = sigma_bottom**2 + (state[0] / height_m * sigma_tall) ** 2 + config.sigma_bounce_rad**2
-            own = own * min(config.frames_alike, len(rows))
+            variance = sigma_bottom**2 + (state[0] / height_m * sigma_tall) ** 2 + config.sigma_bounce_rad**2
+            variance = variance * min(config.frames_alike, len(rows))
             # common to all boxes of the vehicle: its height and the road under it, both in proportion to 1 / z
-            common = np.hypot(state[0] * sigma_rel, config.sigma_kerb_m) * looks
-            weighed = J / own[:, None]
-            of_common = common / own
-            share = 1.0 / (1.0 + common @ of_common)  # Sherman-Morrison
-            Jc = J.T @ of_common
-            if kept[k]:
-                info = info + J.T @ weighed - share * np.outer(Jc, Jc)
-                right = right + weighed.T @ bottom - share * Jc * (of_common @ bottom)
-            misfit[k] = np.median(r) / np.sqrt(np.median(own) / min(len(rows), 4) + np.median(common) ** 2)
+            common = np.hypot(state[0] * sigma_rel, config.sigma_kerb_m) * inverse_depth
+            weighted = J / variance[:, None]
+            weighted_common = common / variance
+            share = 1.0 / (1.0 + common @ weighted_common)  # Sherman-Morrison
+            Jc = J.T @ weighted_common
+            if inlier[k]:
+                info = info + J.T @ weighted - share * np.outer(Jc, Jc)
+                right = right + weighted.T @ bottom - share * Jc * (weighted_common @ bottom)
+            normalised[k] = np.median(r) / np.sqrt(np.median(variance) / min(len(rows), 4) + np.median(common) ** 2)
         cov = np.linalg.inv(info)
         state = cov @ right
-        kept = np.abs(misfit) < config.gate_sigma
-        if kept.sum() < config.min_vehicles:
+        inlier = np.abs(normalised) < config.gate_sigma
+        if inlier.sum() < config.min_vehicles:
             return None
     cov += np.diag(np.square([state[0] * config.sigma_class_rel, config.sigma_pitch_rad, config.sigma_crown_rad]))
-    return Mounting(state, 0.5 * (cov + cov.T), int(kept.sum()))
+    return Mounting(state, 0.5 * (cov + cov.T), int(inlier.sum()))
 
 
 def _by_length(

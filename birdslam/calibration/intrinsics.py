@@ -1,7 +1,6 @@
-"""Intrinsics from what others measured: KITTI calibration files, camera_info YAML of ROS and OpenCV, chessboard images.
+"""Intrinsics from calibrations by others: KITTI files, camera_info YAML of ROS and OpenCV, chessboard images.
 
-Everything here raises DatasetError, which names the file and what is wrong with it. The numbers themselves are checked
-by `camera.Camera`.
+Everything here raises DatasetError with the file and the reason. `camera.Camera` checks the numbers themselves.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Single-view metrology: pixels of the road to metres in bird's-eye view, and back (paper, Eq. 1).
 
-Eq. 1 is stated for a normal n and a height H in camera axes; the points leave here in ego (x forward, y left), the
-frame at the camera's foot.
+Eq. 1 has a normal n and a height H in camera axes; the points here are in ego (x forward, y left), the frame at the
+camera's foot.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from birdslam.geometry.camera import Camera, GroundPlane
 
 Numbers = TypeVar("Numbers", float, NDArray[np.float64])
 
-MAX_RANGE_M = 200.0  # past it a pixel row covers tens of metres: such a point says nothing
+MAX_RANGE_M = 200.0  # beyond it a pixel row covers tens of metres
 
 
 def meet_road(rays: NDArray[np.float64], fall: NDArray[np.float64], height_m: float) -> NDArray[np.float64]:
     """Eq. 1: where rays from a camera `height_m` above the road meet it, in metres, in the axes of the rays.
 
-    `fall` is by how much a ray of the given length comes down towards the road, -n . ray for the road's unit normal n.
-    Rays are whole, (N, 3) with `fall` (N, 1), or one component of each, (N,) with `fall` (N,).
+    `fall` is the component of a ray towards the road, -n . ray for the road's unit normal n. Rays (N, 3) with `fall`
+    (N, 1), or one component of each ray, (N,) with `fall` (N,).
     """
     out: NDArray[np.float64] = height_m * rays / fall  # Eq. 1
     return out
 
 
 def road_slope(depth_m: Numbers, height_m: Numbers | float) -> Numbers:
-    """Eq. 1 solved for the slope: how steeply one looks down at the road `depth_m` ahead; both broadcast."""
+    """Eq. 1 solved for the slope of the ray to the road `depth_m` ahead; both broadcast."""
     return height_m / depth_m
 
 

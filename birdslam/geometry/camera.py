@@ -1,4 +1,4 @@
-"""The camera: intrinsics, lens distortion, and where it stands over the road."""
+"""The camera: intrinsics, lens distortion, and the ground plane under it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class GroundPlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.R_ego_cam[2]
 
 
-@lru_cache(maxsize=64)  # a frame asks for the same few rotations tens of times
+@lru_cache(maxsize=64)  # a frame uses the same few rotations tens of times
 def _rotation(pitch_rad: float, roll_rad: float) -> NDArray[np.float64]:
     cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
     cr, sr = math.cos(roll_rad), math.sin(roll_rad)
@@ -68,7 +68,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     `distortion` holds OpenCV's coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty for an undistorted image; of a
     `fisheye` lens those of its equidistant model (k1, k2, k3, k4; Kannala and Brandt 2006), as ROS and OpenCV have it.
-    `tilt_sigma_rad` is how well pitch and roll are known; by default as well as a bracket is screwed on.
+    `tilt_sigma_rad` is 1-sigma of pitch and roll; by default that of a bracket mounted by hand.
     Raises ValueError (on decoding: msgspec.ValidationError) where the numbers can't be a camera's.
     """
 
@@ -78,12 +78,12 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fy_px: Positive  # focal length
     cx_px: float  # principal point
     cy_px: float  # principal point
-    height_m: Positive  # over the road: all metres come from it
+    height_m: Positive  # over the road: the metric scale
     pitch_rad: float = 0.0  # of the camera against the road; > 0: nose down
     roll_rad: float = 0.0  # > 0: right side down
     # OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]; none: undistorted images
     distortion: tuple[float, ...] = ()
-    tilt_sigma_rad: Positive = 0.015  # 1-sigma of pitch and roll: by default as well as a bracket is screwed on
+    tilt_sigma_rad: Positive = 0.015  # 1-sigma of pitch and roll; by default of a bracket mounted by hand
     fisheye: bool = False  # `distortion` is k1, k2, k3, k4 of the equidistant model
 
     def __post_init__(self) -> None:
@@ -136,7 +136,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Undistorter:
-    """Takes the lens distortion out of images of one camera; the maps are made once."""
+    """Undistorts images of one camera; the maps are computed once."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera

@@ -1,7 +1,7 @@
 """Motion with a constant twist on the road plane, one body at a time.
 
-A pose is its position x + iy and its heading e^(i yaw), Python complex numbers: composing is then multiplying. A
-handful of bodies is sooner done one by one than as arrays, whose every operation costs as much as ten of these.
+A pose is its position x + iy and its heading e^(i yaw) as Python complex numbers, so that composing is multiplying. For
+a handful of bodies this is faster than numpy.
 """
 
 from __future__ import annotations

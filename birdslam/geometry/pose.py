@@ -1,4 +1,4 @@
-"""Rigid motions in space, as the image odometry needs them: rotations as matrices and as vectors, `Pose`."""
+"""Rigid motions in space for the image odometry: rotation matrices, rotation vectors, `Pose`."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def rotation_log(R: Floats) -> Floats:
 
 
 def orthonormal(R: Floats) -> Floats:
-    """The nearest rotations to (..., 3, 3) that lack little to be such: products of many rotations stay rotations.
+    """The nearest rotations to (..., 3, 3) that are nearly orthonormal.
 
-    One step of Newton for the polar factor: what is left is the square of what was lacking.
+    One Newton step for the polar factor, with quadratic convergence.
     """
     out: Floats = 1.5 * R - 0.5 * R @ np.swapaxes(R, -1, -2) @ R
     return out

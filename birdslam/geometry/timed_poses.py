@@ -1,4 +1,4 @@
-"""Poses of one body over time, as a trajectory file has them."""
+"""Timed poses of one body, as in a trajectory file."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""The atlas: the trajectories and the map of a whole drive, beside the graph's window, in bounded memory.
+"""The atlas: trajectories and map of a whole drive, beside the graph's window, in bounded memory.
 
-What is recent is kept finely and what is long past coarsely, in octaves: each is twice as coarse as the one before,
-what no longer fits into one falls into the next, and what falls out of the last is forgotten. So every call of `add`
-costs the same, however long the drive is, and the defaults reach back over 500 km.
+Octaves: each is half as fine as the one before. What exceeds an octave's size moves on to the next one, and leaves the
+last. So each `add` costs the same, however long the drive is; by default the atlas reaches back over 500 km.
 """
 
 from __future__ import annotations
@@ -24,27 +23,27 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Points = Iterable[tuple[float, float]]
 
-_FARTHEST_M = 1e7  # a point beyond it is none of a road
-_FRESH_NS = 10**9  # a vehicle's newest pose is a key pose at least once in so long
+_MAX_M = 1e7  # of a valid point's coordinates
+_MAX_KEY_POSE_NS = 10**9  # between two key poses of a vehicle
 
 
 class AtlasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How finely and how far back the drive is kept. A snapshot of either record stays under a mebibyte."""
+    """Resolution and length of the stored drive. A snapshot of either record stays under a mebibyte."""
 
     key_pose_m: Positive = 0.5  # apart, in the finest octave
     key_pose_rad: Positive = 0.1  # or turned, in the finest octave
     key_poses: Count = 1024  # in each octave
     octaves: Count = 10  # of poses: each is half as fine as the one before
-    vehicles: Count = 64  # whose paths are kept; the longest out of sight go first
+    vehicles: Count = 64  # whose paths are kept; the longest out of sight are dropped first
     vehicle_poses: Count = 64  # the newest of each
     map_cell_m: Positive = 0.25  # of the map, in the finest octave
     map_cells: Count = 4096  # in each octave, of landmarks and of lanes each
     map_octaves: Count = 5  # of the map: each is half as fine as the one before
-    epochs: Count = 3  # the newest; of an older one nothing is kept
+    epochs: Count = 3  # the newest ones
 
 
 class Atlas:
-    """`add` takes what the graph gives for a frame; `trajectory` and `map` give records of all that was added."""
+    """`add` takes the graph's output for each frame; `trajectory` and `map` return records of all that was added."""
 
     def __init__(self, config: AtlasConfig) -> None:
         self._config = config
@@ -53,37 +52,37 @@ class Atlas:
 
     @property
     def epochs(self) -> tuple[int, ...]:
-        """Those that can be asked for, oldest first."""
+        """The epochs that are kept, oldest first."""
         return tuple(self._by_epoch)
 
     def add(self, estimate: Estimate, map_update: MapUpdate | None = None) -> None:
-        """One frame. An estimate that is not valid leaves no pose behind."""
-        held = self._newest = self._epoch_of(estimate.epoch)
+        """One frame. An invalid estimate adds no pose."""
+        world = self._newest = self._epoch_of(estimate.epoch)
         if estimate.valid:
-            held.add_poses(estimate)
+            world.add_poses(estimate)
         if map_update is not None:
             self._epoch_of(map_update.epoch).add_points(map_update)
 
     def trajectory(self, last_s: float | None = None, epoch: int | None = None) -> Trajectory | None:
-        """The key poses of the last `last_s` of source time, or all; of the newest epoch if none is named.
+        """The key poses of the last `last_s` of source time, or all; of the newest epoch by default.
 
-        None where nothing is known of the epoch.
+        None for an unknown epoch.
         """
-        held = self._newest if epoch is None else self._by_epoch.get(epoch)
-        return None if held is None else held.trajectory(last_s)
+        world = self._newest if epoch is None else self._by_epoch.get(epoch)
+        return None if world is None else world.trajectory(last_s)
 
     def map(self, epoch: int | None = None) -> MapSnapshot | None:
-        """All of the map; of the newest epoch if none is named. None where nothing is known of the epoch."""
-        held = self._newest if epoch is None else self._by_epoch.get(epoch)
-        return None if held is None else held.map()
+        """The whole map of the newest epoch by default. None for an unknown epoch."""
+        world = self._newest if epoch is None else self._by_epoch.get(epoch)
+        return None if world is None else world.map()
 
     def _epoch_of(self, epoch: int) -> _Epoch:
-        held = self._by_epoch.get(epoch)
-        if held is None:
-            held = self._by_epoch[epoch] = _Epoch(self._config, epoch)
+        world = self._by_epoch.get(epoch)
+        if world is None:
+            world = self._by_epoch[epoch] = _Epoch(self._config, epoch)
             while len(self._by_epoch) > self._config.epochs:
                 del self._by_epoch[next(iter(self._by_epoch))]
-        return held
+        return world
 
 
 class _Epoch:
@@ -96,10 +95,10 @@ class _Epoch:
         self._t_ns = 0
         self._ego = _EgoPath(config)
         self._paths: dict[int, _VehiclePath] = {}  # by vehicle, the longest out of sight first
-        self._landmarks, self._lanes = _Cells(config), _Cells(config)
+        self._landmarks, self._lanes = _MapCells(config), _MapCells(config)
 
     def add_poses(self, estimate: Estimate) -> None:
-        """Everybody's poses of one frame."""
+        """The poses of the ego and the vehicles in one frame."""
         frame_id, t_ns = self._frame_id, self._t_ns = estimate.frame_id, estimate.t_source_ns
         self._ego.add(TimedPose(frame_id, t_ns, estimate.T_world_ego))
         for v in estimate.vehicles:
@@ -111,7 +110,7 @@ class _Epoch:
             del self._paths[next(iter(self._paths))]
 
     def add_points(self, update: MapUpdate) -> None:
-        """What the map gained."""
+        """The map's new points."""
         self._map_frame_id = update.frame_id
         self._landmarks.add(update.landmarks_m)
         self._lanes.add(update.lanes_m, update.lane_ids)
@@ -145,7 +144,7 @@ class _Epoch:
         )
 
 
-def _apart(a: SE2, b: SE2, least_m: float, least_rad: float) -> bool:
+def _is_apart(a: SE2, b: SE2, least_m: float, least_rad: float) -> bool:
     return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) >= least_m or abs(wrap(a.yaw_rad - b.yaw_rad)) >= least_rad
 
 
@@ -162,7 +161,7 @@ class _EgoPath:
         coarser, config = 1.0, self._config
         for octave in self._octaves:
             apart = config.key_pose_m * coarser, config.key_pose_rad * coarser
-            if octave and not _apart(octave[-1].T_world_body, pose.T_world_body, *apart):
+            if octave and not _is_apart(octave[-1].T_world_body, pose.T_world_body, *apart):
                 return
             octave.append(pose)
             if len(octave) <= config.key_poses:
@@ -189,8 +188,8 @@ class _VehiclePath:
         before = self.poses[-1] if self.poses else None
         if (
             before is None
-            or pose.t_source_ns - before.t_source_ns >= _FRESH_NS
-            or _apart(before.T_world_body, pose.T_world_body, config.key_pose_m, config.key_pose_rad)
+            or pose.t_source_ns - before.t_source_ns >= _MAX_KEY_POSE_NS
+            or _is_apart(before.T_world_body, pose.T_world_body, config.key_pose_m, config.key_pose_rad)
         ):
             self.poses.append(pose)
 
@@ -200,11 +199,8 @@ class _VehiclePath:
 
 
 @dataclass(slots=True)
-class _Cells:
-    """Points of the road, one for each cell that any fell into: their mean, and the newest id among them (-1: none).
-
-    In octaves of the cell's side.
-    """
+class _MapCells:
+    """Points of the road, averaged over cells, with the newest id in each (-1: none); octaves of the cell's side."""
 
     config: AtlasConfig
     octaves: list[dict[tuple[int, int], tuple[float, float, int, int]]] = field(init=False)  # sums, count, id
@@ -215,22 +211,22 @@ class _Cells:
     def add(self, points_m: Points, ids: Iterable[int] = ()) -> None:
         config = self.config
         for (x_m, y_m), own in zip(points_m, chain(ids, repeat(-1)), strict=False):
-            if abs(x_m) + abs(y_m) > _FARTHEST_M:
+            if abs(x_m) + abs(y_m) > _MAX_M:
                 continue
-            moment, side_m = (x_m, y_m, 1, own), config.map_cell_m
+            sums, side_m = (x_m, y_m, 1, own), config.map_cell_m
             for cells in self.octaves:
-                x, y, n, lane = moment
+                x, y, n, lane = sums
                 key = math.floor(x / n / side_m), math.floor(y / n / side_m)
                 before = cells.pop(key, None)  # and back in as the newest
                 if before is not None:
                     newest = lane if lane >= 0 else before[3]
-                    moment = before[0] + x, before[1] + y, before[2] + n, newest
-                cells[key] = moment
+                    sums = before[0] + x, before[1] + y, before[2] + n, newest
+                cells[key] = sums
                 if len(cells) <= config.map_cells:
                     break
-                moment, side_m = cells.pop(next(iter(cells))), 2.0 * side_m
+                sums, side_m = cells.pop(next(iter(cells))), 2.0 * side_m
 
     def newest_last(self) -> tuple[tuple[tuple[float, float], ...], tuple[int, ...]]:
         """The points, oldest first, and their ids."""
-        cells = [moment for octave in reversed(self.octaves) for moment in octave.values()]
+        cells = [sums for octave in reversed(self.octaves) for sums in octave.values()]
         return tuple((x / n, y / n) for x, y, n, _ in cells), tuple(lane for *_, lane in cells)

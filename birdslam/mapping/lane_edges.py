@@ -1,10 +1,8 @@
-"""CP edges of lanes (Eq. 3): where one frame's markings lie across the lanes that earlier frames put on the map.
+"""CP edges of lanes (Eq. 3): one frame's lane markings against the lanes that earlier frames put on the map.
 
-A point of a line can't be found again along the line, so a landmark is a *station*: the point where a lane crosses a
-line of a grid in world, the same whenever that lane is seen. An edge measures where the lane lies across its direction.
-Along the lane the point comes from the odometry's pose, not from the image, and so the covariance is large there. Only
-what one frame saw makes edges: the completed lanes are of many frames, put together with the odometry that the edges
-are to correct.
+A point of a line can't be recognised along the line, so a landmark is a *station*: the crossing of a lane with a line
+of a grid in world. An edge measures the lane's position across its direction; along it the covariance is large. Only
+what one frame saw makes edges: the completed lanes combine many frames by the odometry that the edges are to correct.
 """
 
 from __future__ import annotations
@@ -24,27 +22,27 @@ Floats = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
 _CELLS = 1 << 20  # stations of one lane along one axis, before their ids repeat: 4000 km
-_FULL = 0.7  # share of a station's stretch that its points must span: a line through fewer follows their noise
+_MIN_SPAN = 0.7  # of a station's length that its points must span: a line through fewer follows their noise
 
 
 class LaneEdgesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What of a lane becomes CP edges, and how sure they are."""
+    """Which points of a lane become CP edges, and their uncertainty."""
 
     station_m: float = 4.0  # between two of a lane's landmarks
     least_points: int = 8  # of a station
     sigma_px: float = 1.0  # of the markings' mask
-    sigma_across_m: float = 0.1  # where in its width a marking is found: half of a painted line's
-    sigma_along_m: float = 10.0  # nothing is known
-    bend_m: float = 0.25  # points of a station that lie further off their line are of something else
+    sigma_across_m: float = 0.1  # across the marking: half of a painted line's width
+    sigma_along_m: float = 10.0  # along the lane: unknown
+    bend_m: float = 0.25  # of a station's points about their line, at the most
     max_edges: int = 16  # of a frame, the nearest
-    # What one frame saw is told of so many more, moved on by the odometry: a segmenter that rests between two frames
-    # need not meet the graph's key frames. Fewer than are between two of those: none is told of twice
+    # One frame's stations are repeated in this many more, moved by the odometry, since a segmenter that does not run on
+    # each frame need not run on the graph's keyframes. Fewer than lie between two of those, so that none counts twice
     carried_frames: int = 3
 
 
 @dataclass(frozen=True)
 class Station:
-    """A station as one frame saw it: its landmark's id, its place (2,) in world and the covariance (2, 2) of that."""
+    """A station seen by one frame: its landmark's id, its position (2,) in world and the covariance (2, 2) of that."""
 
     landmark: int
     point_m: Floats
@@ -74,7 +72,7 @@ def stations(points_m: Floats, lanes: Ids, config: LaneEdgesConfig) -> list[tupl
         for cell in np.unique(cells).tolist():
             along, across = points[cells == cell][:, [axis, 1 - axis]].T
             middle_m = (cell + 0.5) * config.station_m
-            if len(along) < config.least_points or np.ptp(along) < _FULL * config.station_m:
+            if len(along) < config.least_points or np.ptp(along) < _MIN_SPAN * config.station_m:
                 continue
             gap_m = along - along.mean()
             slope = float(gap_m @ across) / float(gap_m @ gap_m)  # numpy.polyfit takes ten times as long
@@ -97,7 +95,7 @@ def lane_stations(
     sigma_height_rel: float,
     config: LaneEdgesConfig,
 ) -> list[Station]:
-    """The stations of what one frame saw, nearest first; `points_m` (N, 2) in world, the rest is of that frame."""
+    """The stations that one frame saw, nearest first; `points_m` (N, 2) in world, the rest is of that frame."""
     T_ego_world = T_world_ego.inverse()
     seen = [
         (T_ego_world @ point, landmark, point, along) for landmark, point, along in stations(points_m, lanes, config)

@@ -1,4 +1,4 @@
-"""Ids of lanes, which last from frame to frame: a lane is known by where in world it was."""
+"""Persistent ids of lanes: a lane is recognised by its position in world."""
 
 from __future__ import annotations
 
@@ -24,45 +24,48 @@ class LaneCloud:
 
 
 def cell_keys(points_m: Floats, cell_m: float) -> Ids:
-    """(N,) one number for each cell that points (N, 2) lie in, in the order of x and then y."""
+    """(N,) keys of the cells that points (N, 2) lie in, in the order of x and then y."""
     out: Ids = np.floor(points_m / cell_m).astype(np.int64) @ np.array([1 << 32, 1])
     return out
 
 
 class LaneIds:
-    """Gives the clouds of each frame the ids that they had: a lane is the one whose points, in world, lie nearest."""
+    """Associates the clouds of each frame with known lanes, by their nearest points in world.
+
+    State: the points of the lanes around the ego, in world, with their ids.
+    """
 
     def __init__(self, same_lane_m: float, cell_m: float, remembered_m: float) -> None:
-        """A lane seen again lies within `same_lane_m` of where it was; past `remembered_m` it is forgotten."""
-        from scipy.spatial import cKDTree  # half a second, which only who maps lanes pays: the other processes don't
+        """A lane seen again lies within `same_lane_m` of its points; beyond `remembered_m` these are dropped."""
+        from scipy.spatial import cKDTree  # here: it takes half a second, and only one process maps lanes
 
         self._tree = cKDTree
-        self._same_lane_m, self._cell_m, self._remembered_m = same_lane_m, cell_m, remembered_m
+        self._same_lane_m, self._cell_m, self._memory_m = same_lane_m, cell_m, remembered_m
         self._next = 0
-        self.forget()
+        self.clear()
 
-    def forget(self) -> None:
-        """Forgets where the lanes were."""
-        self._points = np.zeros((0, 2))  # remembered, in world
+    def clear(self) -> None:
+        """Drops all lanes; ids go on counting."""
+        self._points = np.zeros((0, 2))  # in world
         self._lanes = np.zeros(0, dtype=np.int64)
-        self._near = self._tree(self._points)
+        self._kd_tree = self._tree(self._points)
 
-    def of(self, points_m: Floats) -> Ids:
-        """(N,) the lanes that points (N, 2) in world lie on, NO_LANE where none is known to be."""
+    def lookup(self, points_m: Floats) -> Ids:
+        """(N,) the lanes that points (N, 2) in world lie on, NO_LANE where there is none."""
         out: Ids = np.full(len(points_m), NO_LANE)
         if len(self._points) and len(points_m):
-            distance, at = self._near.query(points_m, distance_upper_bound=self._same_lane_m)
+            distance, at = self._kd_tree.query(points_m, distance_upper_bound=self._same_lane_m)
             near = np.isfinite(distance)
             out[near] = self._lanes[at[near]]
         return out
 
-    def name(self, T_world_ego: SE2, clouds: list[Floats]) -> tuple[LaneCloud, ...]:
-        """Clouds (N, 2) in ego, each with an id; no two have the same."""
+    def assign(self, T_world_ego: SE2, clouds: list[Floats]) -> tuple[LaneCloud, ...]:
+        """Clouds (N, 2) in ego, each with an id of its own."""
         in_world = [T_world_ego @ cloud for cloud in clouds]
         votes: list[tuple[int, int, int]] = []  # (how many points, the cloud, the lane)
         if len(self._points):
             for k, points in enumerate(in_world):
-                distance, at = self._near.query(points, distance_upper_bound=self._same_lane_m)
+                distance, at = self._kd_tree.query(points, distance_upper_bound=self._same_lane_m)
                 seen, counts = np.unique(self._lanes[at[np.isfinite(distance)]], return_counts=True)
                 votes += [(int(n), k, int(lane)) for n, lane in zip(counts, seen, strict=True)]
         lane_of: dict[int, int] = {}
@@ -72,15 +75,15 @@ class LaneIds:
         for k in range(len(clouds)):
             if k not in lane_of:
                 lane_of[k], self._next = self._next, self._next + 1
-        self._remember(T_world_ego, in_world, [lane_of[k] for k in range(len(clouds))])
+        self._store(T_world_ego, in_world, [lane_of[k] for k in range(len(clouds))])
         return tuple(LaneCloud(lane_of[k], cloud) for k, cloud in enumerate(clouds))
 
-    def _remember(self, T_world_ego: SE2, clouds: list[Floats], lanes: list[int]) -> None:
-        """The newest points stand for a lane's cell, `cell_m` wide, that was seen before."""
+    def _store(self, T_world_ego: SE2, clouds: list[Floats], lanes: list[int]) -> None:
+        """Adds the clouds' points; of the points in a cell of `cell_m` the newest is kept."""
         points = np.concatenate([*clouds, self._points]) if clouds else self._points
         ids = np.concatenate([np.repeat(lanes, [len(c) for c in clouds]), self._lanes]) if clouds else self._lanes
-        near = np.linalg.norm(points - [T_world_ego.x_m, T_world_ego.y_m], axis=1) < self._remembered_m
+        near = np.linalg.norm(points - [T_world_ego.x_m, T_world_ego.y_m], axis=1) < self._memory_m
         points, ids = points[near], ids[near]
         _, first = np.unique(cell_keys(points, self._cell_m), return_index=True)
         self._points, self._lanes = points[first], ids[first].astype(np.int64)
-        self._near = self._tree(self._points)
+        self._kd_tree = self._tree(self._points)

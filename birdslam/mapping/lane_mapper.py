@@ -1,6 +1,6 @@
-"""Lanes in the front end: each segmentation's lane points and CP edges (paper, Sec. 3.2).
+"""Lanes in the front end: lane points and CP edges from each segmentation (paper, Sec. 3.2).
 
-Finding lanes takes longer than a frame, so it runs beside the frames where it can, and at a rate of its own.
+Detecting lanes takes longer than a frame, so that it runs in the background where it can, and at its own rate.
 """
 
 from __future__ import annotations
@@ -22,36 +22,35 @@ from birdslam.geometry.se2 import SE2
 from birdslam.mapping.landmark_edges import StaticMapConfig
 from birdslam.mapping.lane_edges import LaneEdgesConfig, Station, lane_stations
 from birdslam.mapping.lane_ids import NO_LANE, cell_keys
-from birdslam.mapping.lane_view import LaneView, lane_view
-from birdslam.mapping.lanes import AmodalLanes, Completion, LanesConfig, points_of
+from birdslam.mapping.lanes import AmodalLanes, Completion, LanesConfig, LaneView, lane_view, points_of
 from birdslam.perception import Segmentation
 from birdslam.types import LandmarkEdge, LanePoint, Status
 
 Floats = NDArray[np.float64]
 Ids = NDArray[np.int64]
-Aside = Callable[..., Future[Any]]  # (function, *arguments)
+Submit = Callable[..., Future[Any]]  # (function, *arguments), as of an executor
 
-REMEMBERED_FRAMES = 64  # the pose of a segmentation that is older is not known any more
+REMEMBERED_FRAMES = 64  # whose poses are kept for late segmentations
 
 
 @dataclass(frozen=True)
 class LaneHead:
-    """How lanes are found, and how often: perceive's schedule has them beside the networks' heads.
+    """How lanes are detected, and how often: perceive's schedule has them beside the networks' heads.
 
-    `complete` is the network that fills the grids where something hid the road; None leaves them as they were seen.
-    `aside` runs a function beside the frames, so that none waits for it; None: the frame does. Lanes are found anew
-    after `every` frames, times what `sparing` says at the time: a computer that is busy finds them less often.
+    `complete` is the network that completes the grids where something occluded the road; None: not completed. `submit`
+    runs a function in the background; None: within the frame. Lanes are detected after `every` frames, times
+    `slowdown()`, which a busy computer raises.
     """
 
     complete: Completion | None = None
-    aside: Aside | None = None
+    submit: Submit | None = None
     every: int = 1
-    sparing: Callable[[], int] = lambda: 1
+    slowdown: Callable[[], int] = lambda: 1
 
 
 @dataclass(frozen=True)
 class LaneOutput:
-    """What a frame gains, in its ego. `age`: frames since the one that lanes were last found in; None: never yet."""
+    """A frame's lane points and edges, in its ego. `age`: frames since lanes were last detected; None: never yet."""
 
     points: tuple[LanePoint, ...] = ()
     edges: tuple[LandmarkEdge, ...] = ()
@@ -60,19 +59,19 @@ class LaneOutput:
 
 
 @dataclass(frozen=True)
-class _Found:
-    """What a run found, in world: points (N, 2), their lanes (N,), and stations."""
+class _LaneResult:
+    """A run's result, in world: points (N, 2), their lanes (N,), and stations."""
 
     points_m: Floats
     lanes: Ids
     stations: list[Station]
-    with_lanes: bool  # the lanes of many frames too, and not only what this one frame saw
-    failed: bool  # their completion gave no usable numbers
+    with_lanes: bool  # lanes of many frames were detected too, not only this frame's points
+    failed: bool  # the completion network gave no usable numbers
 
 
 @dataclass(frozen=True)
 class _PastFrame:
-    """What the back-projection of an earlier frame's segmentation needs to know of that frame."""
+    """An earlier frame's pose and ground, for the back-projection of its segmentation."""
 
     frame_id: int
     T_world_ego: SE2
@@ -80,7 +79,7 @@ class _PastFrame:
     sigma_pitch_rad: float
 
 
-def _run_at_once(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
+def _run_now(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
     done: Future[Any] = Future()
     done.set_result(run(*arguments))
     return done
@@ -89,12 +88,12 @@ def _run_at_once(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
 class LaneMapper:
     """Lane points and lane edges of each segmentation, once, in the ego of the frame at hand.
 
-    A segmentation may come frames after its image. It is back-projected with the pose and the ground plane of its own
-    frame, which are kept until then. Every `LaneHead.every` frames the lanes that many segmentations show together are
-    found (`lanes.AmodalLanes`); points of this one that lie on no known lane are lane points without an id.
+    A segmentation may come frames after its image; it is back-projected with the pose and the ground plane of its own
+    frame. Every `LaneHead.every` frames the lanes of many segmentations are detected (`lanes.AmodalLanes`); points of
+    this one on no known lane are lane points without an id.
 
-    With `LaneHead.aside` what is found comes with a later frame, and a segmentation that comes meanwhile is skipped.
-    Where lanes were due with it, the status LANES_CARRIED says so.
+    With `LaneHead.submit` the result comes with a later frame, and a segmentation that comes meanwhile is skipped, with
+    the status LANES_CARRIED if lanes were due.
     """
 
     def __init__(
@@ -109,28 +108,28 @@ class LaneMapper:
         self.config = config
         self.edges = edges
         self.head = head
-        self._aside = head.aside or _run_at_once
+        self._submit = head.submit or _run_now
         self._amodal = AmodalLanes(lanes, head.complete)
         self._frames: deque[_PastFrame] = deque(maxlen=REMEMBERED_FRAMES)
         self._used_frame = -1
-        self._running: Future[_Found] | None = None
-        self._running_frame = -1
-        self._outdated = False  # the run under way belongs to a world that has ended
-        self._due_frame: int | None = None  # whose run finds lanes, or found them last
-        self._found_frame: int | None = None  # whose run found them last
-        self._stations: tuple[int, list[Station]] = (-1, [])  # the frame that saw them last
+        self._run: Future[_LaneResult] | None = None
+        self._run_frame = -1
+        self._run_outdated = False  # the run under way belongs to an earlier epoch
+        self._lanes_due_frame: int | None = None  # of the last run that detects lanes
+        self._lanes_frame: int | None = None  # of the last run that has detected lanes
+        self._stations: tuple[int, list[Station]] = (-1, [])  # and the frame that saw them
 
     def clear(self) -> None:
         """The world frame began anew."""
         self._frames.clear()
-        self._due_frame = self._found_frame = None
+        self._lanes_due_frame = self._lanes_frame = None
         self._stations = (-1, [])
-        self._outdated = self._running is not None
-        if not self._outdated:
+        self._run_outdated = self._run is not None
+        if not self._run_outdated:
             self._amodal.clear()
 
     def view(self, T_world_ego: SE2) -> LaneView:
-        """What the lanes around the ego are made of, for a picture; not while a run is under way aside."""
+        """The grids and lanes around the ego, for a picture; not while a run is under way."""
         return lane_view(self._amodal, T_world_ego)
 
     def map_lanes(
@@ -143,43 +142,45 @@ class LaneMapper:
         segmented_frame: int,
         boxes_px: Floats,
     ) -> LaneOutput:
-        """What the segmentation of `segmented_frame` adds, nothing where it was used before or the ego stands.
+        """Lane points and edges of the segmentation of `segmented_frame`, if it is new and the ego has moved.
 
-        `boxes_px` (N, 4) are the vehicles' latest boxes, under which no line is believed.
+        `boxes_px` (N, 4) are the vehicles' latest boxes, within which nothing is used.
         """
         self._frames.append(_PastFrame(frame_id, T_world_ego, ground, sigma_pitch_rad))
-        earlier = self._finished()
+        earlier = self._take_result()
         status: tuple[Status, ...] = ()
         if segmentation is not None and segmented_frame != self._used_frame:
-            every = self.head.every * self.head.sparing()
-            due = self._due_frame is None or not 0 <= frame_id - self._due_frame < every
+            every = self.head.every * self.head.slowdown()
+            due = self._lanes_due_frame is None or not 0 <= frame_id - self._lanes_due_frame < every
             then = next((f for f in self._frames if f.frame_id == segmented_frame), None)
-            if self._running is not None:
+            if self._run is not None:
                 status = (Status.LANES_CARRIED,) if due else ()
             elif then is not None:
                 self._used_frame = segmented_frame
-                if self._amodal.is_news(then.T_world_ego):
-                    self._due_frame = frame_id if due else self._due_frame
-                    self._running_frame = frame_id
-                    self._running = self._aside(self._gather, T_world_ego, then, segmentation, boxes_px, due)
-        return self._output(earlier or self._finished(), frame_id, T_world_ego, status)
+                if self._amodal.has_moved(then.T_world_ego):
+                    self._lanes_due_frame = frame_id if due else self._lanes_due_frame
+                    self._run_frame = frame_id
+                    self._run = self._submit(self._detect_lanes, T_world_ego, then, segmentation, boxes_px, due)
+        return self._output(earlier or self._take_result(), frame_id, T_world_ego, status)
 
-    def _finished(self) -> _Found | None:
-        """What a run found that has ended."""
-        if self._running is None or not self._running.done():
+    def _take_result(self) -> _LaneResult | None:
+        """The result of a run that has ended."""
+        if self._run is None or not self._run.done():
             return None
-        found, self._running = self._running.result(), None
-        if self._outdated:
-            self._outdated = False
+        found, self._run = self._run.result(), None
+        if self._run_outdated:
+            self._run_outdated = False
             self._amodal.clear()
             return None
-        self._stations = self._running_frame, found.stations
+        self._stations = self._run_frame, found.stations
         if found.with_lanes:
-            self._found_frame = self._running_frame
+            self._lanes_frame = self._run_frame
         return found
 
-    def _output(self, found: _Found | None, frame_id: int, T_world_ego: SE2, status: tuple[Status, ...]) -> LaneOutput:
-        age = None if self._found_frame is None else frame_id - self._found_frame
+    def _output(
+        self, found: _LaneResult | None, frame_id: int, T_world_ego: SE2, status: tuple[Status, ...]
+    ) -> LaneOutput:
+        age = None if self._lanes_frame is None else frame_id - self._lanes_frame
         seen_frame, seen = self._stations
         carried = 0 <= frame_id - seen_frame <= self.edges.carried_frames
         edges = tuple(station.edge(frame_id, T_world_ego) for station in seen) if carried else ()
@@ -193,14 +194,14 @@ class LaneMapper:
             (*status, Status.NETWORK_FAILED) if found.failed else status,
         )
 
-    def _gather(
+    def _detect_lanes(
         self, T_world_ego: SE2, then: _PastFrame, segmentation: Segmentation, boxes_px: Floats, due: bool
-    ) -> _Found:
+    ) -> _LaneResult:
         road_m, boundary_m = points_of(segmentation, self.camera, then.ground, boxes_px, self._amodal.config)
         on_world_m = then.T_world_ego @ boundary_m
         found = lane_stations(
             on_world_m,
-            self._amodal.ids.of(on_world_m),  # as they were known before this frame
+            self._amodal.ids.lookup(on_world_m),  # lanes known before this frame
             then.T_world_ego,
             self.camera,
             then.ground,
@@ -211,7 +212,7 @@ class LaneMapper:
         self._amodal.add(then.T_world_ego, road_m, boundary_m)
         points_m, lanes = self._lanes_m(T_world_ego) if due else (np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
         seen_m = then.T_world_ego @ self._points_m(segmentation, then.ground, boxes_px)
-        seen_m = seen_m[self._amodal.ids.of(seen_m) == NO_LANE]
+        seen_m = seen_m[self._amodal.ids.lookup(seen_m) == NO_LANE]
         if len(points_m):
             from scipy.spatial import cKDTree  # loaded by lane_ids.py
 
@@ -219,12 +220,12 @@ class LaneMapper:
         seen_m = seen_m[: self.config.max_lane_points - len(points_m)]
         all_lanes = np.concatenate([lanes, np.full(len(seen_m), NO_LANE)])
         failed = due and self._amodal.completion_failed
-        return _Found(np.concatenate([points_m, seen_m]), all_lanes, found, due, failed)
+        return _LaneResult(np.concatenate([points_m, seen_m]), all_lanes, found, due, failed)
 
     def _lanes_m(self, T_world_ego: SE2) -> tuple[Floats, Ids]:
-        """(N, 2) points, in world, of the lanes ahead, and their lanes (N,): the middle of what lies in each cell.
+        """(N, 2) points, in world, of the lanes ahead, and their lanes (N,): the mean of each cell.
 
-        Where there are too many they are thinned evenly, so that they reach as far.
+        Too many points are thinned evenly.
         """
         config = self.config
         clouds = self._amodal.lanes(T_world_ego)

@@ -1,11 +1,9 @@
-"""Amodal lanes (paper, Sec. 3.2): what many frames saw of the road, completed where something stood in the way.
+"""Amodal lanes (paper, Sec. 3.2): the road seen by many frames, completed where something occluded it.
 
-Near points of road and lane boundaries, gathered over a window of frames with the odometry, fill two occupancy grids in
-the ego of the newest frame. Lone cells are dropped, a network (ENet) completes the grids, opening and closing clean
-them, and the Hough transform segregates the boundary's cells into lanes, which keep their ids (lane_ids.py).
-`AmodalLanes.lanes` takes these steps.
-
-A grid is (rows, columns) over x (row 0 is `behind_m` behind the ego) and y (column 0 is `half_width_m` to the right).
+Near points of road and lane boundaries, accumulated over a window of frames with the odometry, fill two occupancy grids
+in the newest ego frame. Isolated cells are dropped, a network (ENet) completes the grids, opening and closing clean
+them, and the Hough transform segregates the boundary's cells into lanes with persistent ids (`AmodalLanes.lanes`).
+A grid is (rows, columns) over x (row 0: `behind_m` behind the ego) and y (column 0: `half_width_m` to the right).
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ import functools
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import cv2
@@ -35,33 +34,33 @@ ROAD, BOUNDARY = 0, 1  # the channels of a pair of grids
 
 
 class LanesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The grids of Sec. 3.2 and what makes a lane of their cells."""
+    """The grids of Sec. 3.2 and the extraction of lanes from them."""
 
     window_frames: int = 45  # segmented frames; the paper has 40 to 50
-    step_m: float = 0.4  # between two of them: a car that stands, or a faster camera, has nothing new to say
-    step_rad: float = 0.05  # or a turn by this
-    depth_m: float = 15.0  # nearer points are kept; the paper's 5 m end before a car's camera sees the road
-    lattice_m: float = 0.1  # sideways: finer than a painted line is wide
+    step_m: float = 0.4  # travelled between two of them, whatever the frame rate
+    step_rad: float = 0.05  # or turned
+    depth_m: float = 15.0  # of the points; within the paper's 5 m a car's camera does not see the road
+    lattice_m: float = 0.1  # sampling sideways: finer than a painted line
     behind_m: float = 8.0  # of the grid
     ahead_m: float = 24.0  # of the grid
     half_width_m: float = 16.0  # of the grid
     cell_m: float = 0.25  # side of a cell
-    full_count: int = 2  # sightings that make a cell certain
+    full_count: int = 2  # observations of a fully occupied cell
     neighbourhood_cells: int = 3  # m of the m x m cells around a cell
     neighbourhood_least: int = 3  # foreground cells among m x m, the cell itself included
     least_occupancy: float = 0.5  # of a completed cell
     # Hough
     line_votes: int = 10  # of the Hough transform: cells on a line
     line_least_m: float = 2.0  # shorter pieces are dropped
-    line_gap_m: float = 4.0  # a dashed line's
-    same_line_rad: float = 0.2  # pieces of one lane differ by less
-    bend_rad: float = 0.6  # and where they touch, by less than this
-    same_line_m: float = 0.5  # and lie so near to each other's line
-    cell_reach_m: float = 1.0  # a cell belongs to the nearest piece, no farther away than this
-    least_cells: int = 8  # of a lane, and of it near what was seen: what no frame saw a piece of is a guess
+    line_gap_m: float = 4.0  # of a dashed line
+    same_line_rad: float = 0.2  # angle between pieces of one lane
+    bend_rad: float = 0.6  # angle between adjacent pieces of one lane
+    same_line_m: float = 0.5  # distance of a piece from the other's line
+    cell_reach_m: float = 1.0  # of a cell from its nearest piece
+    least_cells: int = 8  # of a lane, and of its part that was seen: a lane that no frame saw is a guess
     # Ids
-    same_lane_m: float = 0.75  # a lane seen again lies so near to where it was
-    remembered_m: float = 40.0  # around the ego
+    same_lane_m: float = 0.75  # distance of a lane from its known points
+    remembered_m: float = 40.0  # radius around the ego in which lanes are known
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -81,27 +80,27 @@ class AmodalLanes:
     def __init__(self, config: LanesConfig, complete: Completion | None = None) -> None:
         self.config = config
         self.complete = complete
-        self.completion_failed = False  # the last time: its output was not finite, and the grids stayed as seen
+        self.completion_failed = False  # in the last run: its output was not finite and not used
         self._frames: deque[tuple[SE2, tuple[Points, Points]]] = deque(maxlen=config.window_frames)
         self.ids = LaneIds(config.same_lane_m, config.cell_m, config.remembered_m)
 
-    def is_news(self, T_world_ego: SE2) -> bool:
-        """Whether the ego has moved on since the frame that was added last."""
+    def has_moved(self, T_world_ego: SE2) -> bool:
+        """Whether the ego has moved since the last frame that was added."""
         if not self._frames:
             return True
         moved = self._frames[-1][0].between(T_world_ego)
         return math.hypot(moved.x_m, moved.y_m) >= self.config.step_m or abs(moved.yaw_rad) >= self.config.step_rad
 
     def add(self, T_world_ego: SE2, road_m: Floats, boundary_m: Floats) -> None:
-        """What one frame saw: points of the road (N, 2) and of lane boundaries (M, 2) in its ego."""
+        """Adds a frame's points of the road (N, 2) and of lane boundaries (M, 2) in its ego."""
         near = (points[points[:, 0] < self.config.depth_m] for points in (road_m, boundary_m))
         road, boundary = (points.astype(np.float32)[:, None] for points in near)
         self._frames.append((T_world_ego, (road, boundary)))
 
     def clear(self) -> None:
-        """The world frame began anew: what was gathered has no place in it, and no lane keeps its id."""
+        """The world frame began anew: points and lanes are dropped."""
         self._frames.clear()
-        self.ids.forget()
+        self.ids.clear()
 
     def lanes(self, T_world_ego: SE2) -> tuple[LaneCloud, ...]:
         """The lanes around the ego at `T_world_ego`, each with its id."""
@@ -109,14 +108,14 @@ class AmodalLanes:
         completed = None if self.complete is None else self.complete(grids)
         self.completion_failed = completed is not None and not np.isfinite(completed).all()
         if completed is None or self.completion_failed:
-            return self.ids.name(T_world_ego, segregate(grids, self.config))
+            return self.ids.assign(T_world_ego, segregate(grids, self.config))
         clouds = segregate(np.maximum(grids, completed), self.config)  # what was seen stays
         seen = cv2.dilate(grids[BOUNDARY], np.ones((5, 5), dtype=np.uint8)) > 0.0
         known = [cloud for cloud in clouds if np.sum(seen[_cells_of(cloud, self.config)]) >= self.config.least_cells]
-        return self.ids.name(T_world_ego, known)
+        return self.ids.assign(T_world_ego, known)
 
     def grids(self, T_world_ego: SE2) -> Grids:
-        """(2, rows, columns) occupancy of 0..1 of road and lane boundary, gathered and filtered."""
+        """(2, rows, columns) occupancy of 0..1 of road and lane boundary, accumulated and filtered."""
         config = self.config
         counts = np.stack([self._counts(T_world_ego, channel) for channel in (ROAD, BOUNDARY)])
         occupancy = np.minimum(counts / config.full_count, 1.0).astype(np.float32)
@@ -125,10 +124,28 @@ class AmodalLanes:
         return occupancy
 
     def _counts(self, T_world_ego: SE2, channel: int) -> Grids:
-        """(rows, columns) how often the frames saw a channel in each cell around the ego at `T_world_ego`."""
+        """(rows, columns) observations of a channel in each cell around the ego at `T_world_ego`."""
         T_ego_world = T_world_ego.inverse()
         clouds = [in_cells(seen[channel], T_ego_world @ T, self.config) for T, seen in self._frames]
         return count_cells(clouds, self.config)
+
+
+@dataclass(frozen=True)
+class LaneView:
+    """The grids and lanes around one ego pose, for a picture (paper, Fig. 4). Grids (2, rows, columns) of 0..1."""
+
+    seen: Grids
+    completed: Grids  # what was seen, and what the network added; without one the same as `seen`
+    lanes_seen: list[Floats]  # clouds (N, 2) in ego, without the network
+    lanes: list[Floats]  # with it: the amodal lanes
+
+
+def lane_view(amodal: AmodalLanes, T_world_ego: SE2) -> LaneView:
+    """The steps of `AmodalLanes.lanes`, each kept. Changes nothing: no lane gets an id."""
+    seen = amodal.grids(T_world_ego)
+    added = seen if amodal.complete is None else amodal.complete(seen)
+    completed = np.maximum(seen, added) if np.isfinite(added).all() else seen
+    return LaneView(seen, completed, segregate(seen, amodal.config), segregate(completed, amodal.config))
 
 
 def points_of(
@@ -136,14 +153,14 @@ def points_of(
 ) -> tuple[Floats, Floats]:
     """Points of road (N, 2) and of lane boundaries (M, 2) in the ego of the segmentation's frame, up to `depth_m`.
 
-    Each point of a lattice on the road is looked up in the masks (the inverse of Eq. 1), so that near and far road has
-    as many points. What `boxes_px` (B, 4) cover is left out: a vehicle hides the road there.
+    The masks are sampled at a regular grid on the road (the inverse of Eq. 1), so that near and far road have the same
+    density. What `boxes_px` (B, 4) cover is left out: vehicles occlude the road there.
     """
-    x_m, y_m = _lattice(config)
-    # As bev.ego_to_pixel, but that of a lattice each coordinate in the camera is a sum over its rows and columns
-    ahead, aside, up = ground.R_ego_cam
+    x_m, y_m = _road_grid(config)
+    # As bev.ego_to_pixel, but of a grid each camera coordinate is a sum of a row's and a column's part
+    ahead, submit, up = ground.R_ego_cam
     right, down, depth = (
-        (a * x_m - c * ground.height_m)[:, None] + b * y_m for a, b, c in zip(ahead, aside, up, strict=True)
+        (a * x_m - c * ground.height_m)[:, None] + b * y_m for a, b, c in zip(ahead, submit, up, strict=True)
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         u = camera.fx_px * (right / depth) + camera.cx_px
@@ -157,7 +174,7 @@ def points_of(
 
 
 def without_boxes(mask: Bools, boxes_px: Floats) -> Bools:
-    """A copy of a mask (H, W) that is False in every pixel (u, v) that a box x1, y1, x2, y2 of (B, 4) covers."""
+    """A copy of a mask (H, W), False in the pixels that the boxes (B, 4) cover."""
     out = mask.copy()
     first = np.maximum(np.ceil(boxes_px[:, :2]), 0.0).astype(np.int64)
     past = np.maximum(np.floor(boxes_px[:, 2:]) + 1.0, 0.0).astype(np.int64)
@@ -167,15 +184,15 @@ def without_boxes(mask: Bools, boxes_px: Floats) -> Bools:
 
 
 @functools.lru_cache(maxsize=4)
-def _lattice(config: LanesConfig) -> tuple[Floats, Floats]:
-    """The rows' x (N,) and the columns' y (M,) of the points of the road that are looked up."""
+def _road_grid(config: LanesConfig) -> tuple[Floats, Floats]:
+    """x (N,) of the rows and y (M,) of the columns of the points of the road at which masks are sampled."""
     x_m = np.arange(0.5 * config.cell_m, config.depth_m, config.cell_m)
     y_m = np.arange(-config.half_width_m, config.half_width_m, config.lattice_m)
     return x_m, y_m
 
 
 def in_cells(points_m: Points, T_ego_then: SE2, config: LanesConfig) -> Points:
-    """Points of an earlier frame's ego in cells of the grid: (row, column) of each, with its fraction."""
+    """Points of an earlier ego frame as fractional (row, column) of the grid."""
     if not len(points_m):  # OpenCV transforms at least one
         return points_m
     origin_m = _origin_m(config) + np.array([T_ego_then.x_m, T_ego_then.y_m])
@@ -184,7 +201,7 @@ def in_cells(points_m: Points, T_ego_then: SE2, config: LanesConfig) -> Points:
 
 
 def count_cells(clouds: Sequence[Points], config: LanesConfig) -> Grids:
-    """(rows, columns) how many points of all clouds, as `in_cells` gives them, lie in each cell."""
+    """(rows, columns) number of points of the clouds (see `in_cells`) in each cell."""
     rows, columns = config.shape
     points = np.concatenate([np.zeros((0, 1, 2), np.float32), *clouds])
     if not len(points):
@@ -193,18 +210,18 @@ def count_cells(clouds: Sequence[Points], config: LanesConfig) -> Grids:
 
 
 def _cells_of(centres_m: Floats, config: LanesConfig) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The rows and columns of cells by their centres (N, 2) in ego."""
+    """Rows and columns of cells, given their centres (N, 2) in ego."""
     row, column = np.floor((centres_m + _origin_m(config)) / config.cell_m).astype(np.int64).T
     return row, column
 
 
 def _origin_m(config: LanesConfig) -> Floats:
-    """(2,) the ego from the grid's first corner."""
+    """(2,) position of the ego from the grid's first corner."""
     return np.array([config.behind_m, config.half_width_m])
 
 
 def dense(cells: Bools, config: LanesConfig) -> Bools:
-    """The cells that have at least `neighbourhood_least` foreground cells in their m x m neighbourhood (Sec. 3.2)."""
+    """The cells with at least `neighbourhood_least` foreground cells in their m x m neighbourhood (Sec. 3.2)."""
     m = config.neighbourhood_cells
     counts = cv2.boxFilter(cells.astype(np.float32), -1, (m, m), normalize=False, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(cells & (counts > config.neighbourhood_least - 0.5))
@@ -217,11 +234,11 @@ def cell_centres_m(cells: Bools, config: LanesConfig) -> Floats:
 
 
 def segregate(grids: Grids, config: LanesConfig) -> list[Floats]:
-    """The boundary's cells as one cloud (N, 2) in ego for each lane, from the right to the left.
+    """The boundary's cells as one cloud (N, 2) in ego for each lane, from right to left.
 
-    Opening the road drops specks, closing it fills holes; a boundary lies on the road or beside it. The boundary's
-    lines are one cell wide, so they are closed and never opened: `dense` has dropped their specks. Pieces of line from
-    the Hough transform that continue each other are one lane, straight or bent.
+    Opening the road removes specks, closing it fills holes; a boundary lies on the road or beside it. The boundary's
+    lines are one cell wide, so they are closed and not opened: `dense` has removed their specks. Line segments of the
+    Hough transform that continue each other are one lane, straight or bent.
     """
     kernel = np.ones((3, 3), dtype=np.uint8)
     road, boundary = (np.asarray(grid >= config.least_occupancy).astype(np.uint8) for grid in grids)
@@ -232,10 +249,10 @@ def segregate(grids: Grids, config: LanesConfig) -> list[Floats]:
     cells = cell_centres_m(on_road, config)
     if not len(pieces) or not len(cells):
         return []
-    along, aside = _along_and_aside_m(pieces, cells)
-    distance = np.hypot(aside, np.maximum(np.abs(along) - 0.5 * _lengths_m(pieces), 0.0))  # (cells, pieces)
+    along, submit = _along_and_aside_m(pieces, cells)
+    distance = np.hypot(submit, np.maximum(np.abs(along) - 0.5 * _lengths_m(pieces), 0.0))  # (cells, pieces)
     piece = np.where(distance.min(axis=1) < config.cell_reach_m, distance.argmin(axis=1), -1)
-    lane_of_piece = _join(pieces, _touching(piece, on_road, len(pieces)), config)
+    lane_of_piece = _merge_pieces(pieces, _adjacent(piece, on_road, len(pieces)), config)
     lane = np.where(piece >= 0, lane_of_piece[piece], -1)
     clouds = [cells[lane == k] for k in range(lane_of_piece.max() + 1)]
     clouds = [cloud for cloud in clouds if len(cloud) >= config.least_cells]
@@ -243,7 +260,7 @@ def segregate(grids: Grids, config: LanesConfig) -> list[Floats]:
 
 
 def _line_pieces_m(boundary: Bools, config: LanesConfig) -> Floats:
-    """(P, 2, 2) ends, in ego, of straight pieces: the Hough transform of Sec. 3.2."""
+    """(P, 2, 2) ends, in ego, of line segments by the Hough transform of Sec. 3.2."""
     lines = cv2.HoughLinesP(
         boundary.astype(np.uint8) * np.uint8(255),
         rho=1.0,
@@ -260,7 +277,7 @@ def _line_pieces_m(boundary: Bools, config: LanesConfig) -> Floats:
 
 
 def _along_and_aside_m(pieces: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """(N, P) of points (N, 2) against pieces (P, 2, 2): along each from its middle, and aside."""
+    """(N, P) each: points (N, 2) relative to segments (P, 2, 2), along from the middle, and across."""
     direction = pieces[:, 1] - pieces[:, 0]
     direction = direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-9)[:, None]
     gap = points[:, None, :] - pieces.mean(axis=1)[None]
@@ -275,8 +292,8 @@ def _lengths_m(pieces: Floats) -> Floats:
     return out
 
 
-def _touching(piece: NDArray[np.int64], cells: Bools, count: int) -> Bools:
-    """(P, P) which pieces have cells beside each other; `piece` is that of each cell that is set, or -1."""
+def _adjacent(piece: NDArray[np.int64], cells: Bools, count: int) -> Bools:
+    """(P, P) which segments have adjacent cells; `piece` is the segment of each cell that is set, or -1."""
     grid = np.full(np.add(cells.shape, 2), -1)
     grid[1:-1, 1:-1][cells] = piece
     out = np.zeros((count, count), dtype=np.bool_)
@@ -288,20 +305,20 @@ def _touching(piece: NDArray[np.int64], cells: Bools, count: int) -> Bools:
     return out | out.T
 
 
-def _join(pieces: Floats, touching: Bools, config: LanesConfig) -> NDArray[np.int64]:
-    """(P,) the lane that each piece belongs to: pieces that touch in a bend, or of which one ends on the other's line.
+def _merge_pieces(pieces: Floats, adjacent: Bools, config: LanesConfig) -> NDArray[np.int64]:
+    """(P,) the lane of each segment: segments are joined if adjacent in a bend, or if one ends on the other's line.
 
-    An end that lies past the other piece may do so by a dashed line's gap. A stop line touches too, but turns too much.
+    Beyond the other's end up to a dashed line's gap. A stop line is adjacent too, but at too large an angle.
     """
     count = len(pieces)
     vector = pieces[:, 1] - pieces[:, 0]
     yaw = np.arctan2(vector[:, 1], vector[:, 0])
     turn = np.abs((yaw[:, None] - yaw[None] + 0.5 * math.pi) % math.pi - 0.5 * math.pi)
-    along, aside = _along_and_aside_m(pieces, pieces.reshape(-1, 2))
+    along, submit = _along_and_aside_m(pieces, pieces.reshape(-1, 2))
     past = np.abs(along) - 0.5 * _lengths_m(pieces)
-    meets = (np.abs(aside) < config.same_line_m) & (past < config.line_gap_m)
+    meets = (np.abs(submit) < config.same_line_m) & (past < config.line_gap_m)
     joined = meets.reshape(count, 2, count).any(axis=1) & (turn < config.same_line_rad)
-    joined |= touching & (turn < config.bend_rad)
+    joined |= adjacent & (turn < config.bend_rad)
     from scipy.sparse import coo_array  # loaded by lane_ids.py's import of scipy.spatial
     from scipy.sparse.csgraph import connected_components
 

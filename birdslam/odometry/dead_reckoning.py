@@ -1,4 +1,4 @@
-"""Dead reckoning: the odometry's motions chained to a pose of the ego on the road plane, and its height and tilt."""
+"""Dead reckoning: motions chained to the ego's pose on the road plane, its height and its tilt."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from birdslam.types import Attitude, EgoEdge
 
 
 class DeadReckoning:
-    """The ego's pose in the frame of its first motion: what tracks, lanes and attitude are placed by.
+    """The ego's pose in the frame of its first motion, in which tracks, lanes and attitude are kept.
 
     State: `T_world_ego` (m, rad) and `attitude` (m, rad), both of frame `frame`. Input: each `Motion`. A motion starts
-    at the frame that it names, which need not be the newest: a coasted motion is superseded by the next measured one.
-    The tilt is forgotten over `memory_m` metres of travel, since roads are level on average.
+    at the frame that it names, which need not be the newest: the next measured motion replaces a coasted one. The tilt
+    decays over `memory_m` metres of travel, since roads are level on average.
     """
 
     def __init__(self, camera: Camera, memory_m: float) -> None:
@@ -38,11 +38,11 @@ class DeadReckoning:
         return self._to[0]
 
     def advance(self, motion: Motion) -> EgoEdge:
-        """Goes to `motion.to_frame` and gives the CC edge from the frame that stood there before.
+        """Moves to `motion.to_frame` and returns the CC edge from the frame before.
 
-        The motion starts at the pose of `motion.from_frame` where that was the last motion's start or end. A coasted
-        frame has a pose of its own, which the next edge starts from. So a long blindness is a chain of edges, none of
-        which reaches back to a frame that the graph has let go.
+        The motion starts at the pose of `motion.from_frame`, the last motion's start or end. The edge starts at the
+        last frame, also if that was coasted: without images the edges are a chain, none of which reaches back to a
+        frame that the graph has marginalised.
         """
         last_frame, T_world_last = self.frame, self.T_world_ego
         self._chain(motion)

@@ -1,10 +1,9 @@
-"""Somebody else's ego motion in place of our own: a trajectory of any visual odometry, or of the car.
+"""External odometry in place of our own: a trajectory of any visual odometry, or of the car.
 
-The poses are metric and of the camera, or of the ego on the road; each frame takes the motion between its pose and that
-of the last frame that had one. Between two poses that are close enough in time it is interpolated. A frame for which
-there is none gets no guess of a pose: the last velocity goes on, as uncertain as accelerations make it, and the record
-says so. The ground under the camera is taken as calibrated, and no corners are followed: there are no CP edges of
-corners, only of lanes.
+The poses are metric, of the camera or of the ego on the road; a frame's motion is that between its pose and the last
+frame's that had one, interpolated between poses that are near enough in time. A frame without a pose is predicted at
+constant velocity, as uncertain as accelerations make it, with the status odometry_coasting. The ground is the
+calibrated plane, and no corners are tracked: there are CP edges of lanes only.
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ _LEAST_S = 1e-6
 
 
 class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is believed of a trajectory that states no covariance; by judgement, chosen on no data."""
+    """The uncertainty of a trajectory that states none; by judgement, chosen on no data."""
 
     ego: bool = False  # the poses are of the ego on the road, x forward (as ours); False: of the camera, z forward
     sigma_scale_rel: NotNegative = 0.02  # 1-sigma of its metres: of each metre that it goes, along the way
     sigma_direction_rad: NotNegative = 0.005  # of the direction of travel: of each metre, across
     sigma_yaw_rad: Positive = 0.0005  # of a turn between two frames
     sigma_turn_rel: NotNegative = 0.01  # and of the turn, as a fraction
-    sigma_floor_m: Positive = 0.002  # no motion is known better
-    longest_gap_s: Positive = 0.25  # between two poses of the file that a frame's is interpolated from
-    longest_coast_s: Positive = 2.0  # without a pose; then nothing is known, and the world begins anew
+    sigma_floor_m: Positive = 0.002  # of a motion, at the least
+    longest_gap_s: Positive = 0.25  # between two poses that are interpolated
+    longest_coast_s: Positive = 2.0  # without a pose; after that the world begins anew
     sigma_pitch_rad: Positive = 0.006  # of the road against the calibrated plane
 
 
@@ -54,11 +53,11 @@ class ExternalOdometry:
         self._longest_gap_ns = round(config.longest_gap_s * NS_PER_S)
         self._coasting = MotionConfig()
         self._last: tuple[int, int, Pose] | None = None  # frame, time and pose of the last that had one
-        self._velocity: tuple[SE2, float] | None = None  # the motion before it, and over how many seconds
+        self._velocity: tuple[SE2, float] | None = None  # the last motion, and its duration in s
 
     @property
     def road_tracks(self) -> tuple[NDArray[np.int64], Floats]:
-        """Empty: no corners are followed."""
+        """Empty: no corners are tracked."""
         return np.zeros(0, np.int64), np.zeros((0, 2))
 
     def track(self, image: NDArray[np.uint8]) -> None:
@@ -73,7 +72,7 @@ class ExternalOdometry:
         road_mask: NDArray[np.bool_] | None = None,
         speeds: Sequence[SpeedReading] = (),
     ) -> Motion | None:
-        """The motion since the last frame that had a pose; None where there is none. The car's speed is not fused."""
+        """The motion since the last frame that had a pose; None where there is none. The car's speed is not used."""
         pose, last = self._trajectory.at(frame_id, t_source_ns, self._longest_gap_ns), self._last
         if last is None or pose is None:
             if pose is not None:
@@ -91,7 +90,7 @@ class ExternalOdometry:
         return self._motion(last_frame, frame_id, step, T, self._cov(T))
 
     def _coast(self, from_frame: int, from_ns: int, frame_id: int, t_source_ns: int) -> Motion | None:
-        """The last velocity goes on; None where it has for too long."""
+        """The prediction at constant velocity; None after too long."""
         since_s = (t_source_ns - from_ns) / NS_PER_S
         if since_s > self.config.longest_coast_s:
             self._last = self._velocity = None

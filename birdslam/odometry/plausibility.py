@@ -1,8 +1,8 @@
 """The plausibility gate: whether the ego's measured motions are those of a car.
 
-Images that came out of order, or were replayed, give motions that no car makes. From such a motion on, or after a long
-blindness, no motion is trusted until the odometry has been steady for a while. Then the CC edge is left out, so that
-the graph begins a new epoch: how far the car has come meanwhile is not known.
+Images out of order, or replayed, give motions that no car makes. After such a motion, or after a long time without a
+measured one, the estimate is invalid until the odometry has been steady for a while. Then the CC edge is left out, so
+that the graph begins a new epoch, since the motion in between is unknown.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ _CLOCK_TOLERANCE = 0.1  # of a span
 
 
 class PlausibilityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How fast a car's speed may change, and how long the odometry must be steady to be believed again."""
+    """How fast a car's speed may change, and how long the odometry must be steady to be valid again."""
 
     acceleration_mps2: Positive = 15.0  # no car changes its speed faster
     change_mps: Positive = 3.0  # beside acceleration_mps2, for the noise of the motions within span_s
-    span_s: Positive = 0.1  # over which a speed is taken: that of one motion at 33 Hz is three times as noisy as at 10
+    span_s: Positive = 0.1  # over which a speed is averaged: one motion at 33 Hz is three times as noisy as at 10
     sigmas: Positive = 3.0  # beside both: of the metric scale
-    blind_s: Positive = 0.5  # of source time without a measured motion: where the car is by then is not known
-    steady_s: Positive = 0.5  # of source time, in which every motion is measured and possible
+    blind_s: Positive = 0.5  # of source time without a measured motion: after it the car's place is unknown
+    steady_s: Positive = 0.5  # of source time, in which every motion is measured and plausible
 
 
 class _Step(NamedTuple):
@@ -50,15 +50,15 @@ class PlausibilityGate:
         self._config = config
         self._times_ns: deque[tuple[int, int]] = deque(maxlen=_MAX_FRAMES)  # (frame, source time)
         self._steps: deque[_Step] = deque(maxlen=_MAX_FRAMES)  # the measured ones
-        self._turn_known_ns = 0  # source time of the last frame whose turn was not the car's guessed one
-        self._implausible_ns: int | None = None  # source time of the last motion that was not measured or not possible
+        self._turn_known_ns = 0  # source time of the last frame with a measured turn
+        self._implausible_ns: int | None = None  # source time of the last motion that was not measured or not plausible
 
     def admit(self, measurements: Measurements) -> Measurements:
         """The measurements as they are, or with MOTION_IMPLAUSIBLE, or, to begin a new epoch, without the CC edge."""
         m, cc = measurements, measurements.cc
         self._times_ns.append((m.frame_id, m.t_source_ns))
         coasting = Status.ODOMETRY_COASTING in m.status
-        by_car = coasting and SpeedSource.CAR in m.speed_sources  # its way is measured, its turn is not
+        by_car = coasting and SpeedSource.CAR in m.speed_sources  # its distance is measured, its turn is not
         step = None if cc is None or (coasting and not by_car) else self._step_of(m, cc)
         if not by_car:
             self._turn_known_ns = m.t_source_ns
@@ -80,7 +80,7 @@ class PlausibilityGate:
         return msgspec.structs.replace(m, status=(*m.status, Status.MOTION_IMPLAUSIBLE))
 
     def _step_of(self, m: Measurements, cc: EgoEdge) -> _Step | None:
-        """The motion of the edge; None where the frame that it starts from is too long ago."""
+        """The motion of the edge; None where its first frame is too long ago."""
         times_ns = dict(self._times_ns)
         if cc.from_frame not in times_ns or cc.to_frame not in times_ns:
             return None
@@ -88,7 +88,7 @@ class PlausibilityGate:
         return _Step(m.t_source_ns, dt_s, cc.T_from_to.x_m, m.scale_sigma_rel) if dt_s > _MIN_STEP_S else None
 
     def _is_plausible(self) -> bool:
-        """Whether the speeds over the newest span_s and over the span before it are those of one car."""
+        """Whether the change of speed between the last two spans of span_s is plausible for a car."""
         config, steps = self._config, list(self._steps)
         now, before = _last_span(steps, config.span_s)
         then, _ = _last_span(before, config.span_s)
@@ -102,7 +102,7 @@ class PlausibilityGate:
 
 
 def _last_span(steps: list[_Step], span_s: float) -> tuple[list[_Step], list[_Step]]:
-    """The last motions, of at least `span_s` together where there are so many, and those before them."""
+    """The last motions, together at least `span_s` long if there are enough, and those before them."""
     total_s, k = 0.0, len(steps)
     while k and total_s < (1.0 - _CLOCK_TOLERANCE) * span_s:
         k -= 1

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.mapping.lane_view import LaneView
-from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig
+from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig, LaneView
 
 TITLES = (
     "lane boundary, seen",

@@ -1,10 +1,10 @@
-"""Perception: networks by manifest, their schedule, and what they find in an image."""
+"""Perception: networks described by manifests, their schedule, and their results."""
 
 from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.decoding.depth import DepthMap
 from birdslam.perception.decoding.detection import Detections
+from birdslam.perception.decoding.multitask import Findings
 from birdslam.perception.decoding.segmentation import Segmentation
-from birdslam.perception.findings import Findings
 from birdslam.perception.manifest import Label, ModelError
 from birdslam.perception.manifest_file import shipped_manifests
 from birdslam.perception.network import ModelSpec, Network, load_network

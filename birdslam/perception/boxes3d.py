@@ -1,4 +1,4 @@
-"""A vehicle's body as a network finds it: where its centre is, how large it is, which way it faces."""
+"""A vehicle's 3-D box by a network: centre, size and heading, each with its uncertainty."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from birdslam.geometry.camera import Camera, GroundPlane
 class Boxes3d:
     """N bodies, one for each 2-D box and in its order; sigmas are standard deviations.
 
-    `alpha_rad` is the observation angle: the yaw in ego less the bearing under which the centre is seen, REP-103
-    (0 faces away from the camera, pi/2 faces left). The axis can be sure where its front is not: `flip` is the
-    probability that the front is the rear.
+    `alpha_rad` is the observation angle: the yaw in ego less the centre's bearing, REP-103 (0 faces away from the
+    camera, pi/2 faces left). `flip` is the probability that front and rear are swapped.
 
-    With `canonical_focal_rel` > 0 depths are those of a camera whose focal length is so many times its image's width:
-    `in_metres` makes them the camera's own.
+    With `canonical_focal_rel` > 0 depths are those of a canonical camera, whose focal length is so many times its
+    image's width; `in_metres` converts them.
     """
 
     centre_px: NDArray[np.float64]  # (N, 2) the body's centre in the undistorted image, also beyond its edge
@@ -38,7 +37,7 @@ class Boxes3d:
         return len(self.depth_m)
 
     def take(self, rows: NDArray[np.int64] | Sequence[int]) -> Boxes3d:
-        """Those in the given rows, in that order."""
+        """The given rows, in that order."""
         return Boxes3d(
             self.centre_px[rows],
             self.depth_m[rows],
@@ -52,7 +51,7 @@ class Boxes3d:
         )
 
     def in_metres(self, camera: Camera) -> Boxes3d:
-        """The bodies with the depths of this camera; itself where its depths are not canonical."""
+        """The bodies with this camera's depths; itself where its depths are not canonical."""
         if self.canonical_focal_rel <= 0.0:
             return self
         factor = camera.fx_px / (self.canonical_focal_rel * camera.width_px)
@@ -70,7 +69,7 @@ class Boxes3d:
         return self.in_metres(camera).depth_m[:, None] * np.column_stack([x, y, np.ones_like(x)])
 
     def in_ego(self, camera: Camera, ground: GroundPlane) -> NDArray[np.float64]:
-        """(N, 3) x_m, y_m, yaw_rad in ego: the bodies dropped onto the road."""
+        """(N, 3) x_m, y_m, yaw_rad in ego: the bodies projected onto the road."""
         centres_m = self.centres_cam_m(camera) @ ground.R_ego_cam.T
         yaw_rad = self.alpha_rad + np.arctan2(centres_m[:, 1], centres_m[:, 0])
         return np.column_stack([centres_m[:, :2], np.remainder(yaw_rad + math.pi, 2.0 * math.pi) - math.pi])

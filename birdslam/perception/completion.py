@@ -1,4 +1,4 @@
-"""The network that completes lane grids where something hid the road (paper, Sec. 3.2: ENet)."""
+"""The network that completes lane grids where something occluded the road (paper, Sec. 3.2: ENet)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Model manifests: a small TOML file states a network's input and what each of its outputs means.
+"""Model manifests: a small TOML file states a network's input and the meaning of each output.
 
-Unknown keys are errors. manifest_file.py says how a network's manifest is found.
+Unknown keys are errors. manifest_file.py finds a network's manifest.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class ModelError(ValueError):
     """A network or its manifest that can't be used; the message names the file, the key and both sides' statements."""
 
 
-class Misfit(ValueError):
+class ManifestMismatch(ValueError):
     """One key of a manifest that its network contradicts; `load_network` makes a ModelError of it."""
 
     def __init__(self, key: str, stated: object, has: object) -> None:

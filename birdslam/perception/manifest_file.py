@@ -1,8 +1,7 @@
 """Manifests as files.
 
-A manifest is found by the first of these that exists: the one named explicitly (a path, or the name of a shipped one),
-the file beside the network with the same stem, the shipped one with the network's SHA-256, the shipped one with the
-network's stem.
+A manifest is the first of these that exists: the one named explicitly (a path, or the name of a shipped one), the file
+beside the network with the same stem, the shipped one with the network's SHA-256, the shipped one with its stem.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ class Described(Protocol):
 Kind = TypeVar("Kind", bound=Described)
 
 
-class Glance(msgspec.Struct, frozen=True):
-    """The fields by which a manifest of any kind is recognised."""
+class ManifestHeader(msgspec.Struct, frozen=True):
+    """The fields that identify a manifest of any kind."""
 
     role: str
     title: str = ""

@@ -1,4 +1,4 @@
-"""One network, its file, manifest and onnxruntime session: `Network.run` makes findings of an image."""
+"""One network: its file, manifest and onnxruntime session. `Network.run` takes an image to findings."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from birdslam.perception.decoding.box_lists import BoxListDecoder, SsdDecoder
 from birdslam.perception.decoding.centernet import CenterNetDecoder
 from birdslam.perception.decoding.depth import DisparityDecoder, MetricDepthDecoder
 from birdslam.perception.decoding.detection import YoloxDecoder
-from birdslam.perception.decoding.multitask import OUTPUTS, MultiTaskDecoder
+from birdslam.perception.decoding.multitask import OUTPUTS, Findings, MultiTaskDecoder
 from birdslam.perception.decoding.segmentation import ClassMapsDecoder
-from birdslam.perception.findings import Findings
 from birdslam.perception.manifest import (
     BoxList,
     CenterNet,
@@ -27,8 +26,8 @@ from birdslam.perception.manifest import (
     Count,
     Disparity,
     Manifest,
+    ManifestMismatch,
     MetricDepth,
-    Misfit,
     ModelError,
     MultiTask,
     Role,
@@ -54,17 +53,17 @@ class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Decoder(Protocol):
-    """Makes findings of a network's outputs: `read` those of each view, then `merge` those of one image."""
+    """Decodes a network's outputs to findings: `read` those of each view, then `merge` those of one image."""
 
     def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Any: ...
 
     def merge(self, parts: Any, views: Any) -> Any: ...
 
 
-# The decodings there are: a manifest's table -> (what reads it, the field of Findings that it fills, outputs it reads).
-# Where the field is "" the reader makes Findings itself.
-# The reader is called with (table, input, shapes of the outputs) and raises Misfit. A new decoding is a row here, its
-# table in manifest.py and, for a new role, a field in Manifest and in Findings.
+# The decodings: a manifest's table -> (decoder, the field of Findings that it fills, the outputs that it reads). Where
+# the field is "" the decoder returns Findings itself. A decoder is called with (table, input, shapes of the outputs)
+# and raises ManifestMismatch. A new decoding is a row here, its table in manifest.py and, for a new role, a field in
+# Manifest and in Findings.
 DECODINGS: dict[type, tuple[Callable[..., Decoder], str, Callable[[Any], tuple[str, ...]]]] = {
     Yolox: (YoloxDecoder, "detections", lambda table: (table.output,)),
     CenterNet: (
@@ -252,7 +251,7 @@ def load_network(
     try:
         outputs = (unread, apart) if manifest.role == "multitask" else ((), ())
         return Network(name, path, manifest, sha256, content, schedule, *outputs)
-    except Misfit as error:
+    except ManifestMismatch as error:
         raise ModelError(f"{path}: {error} (manifest {origin})") from error
     except SESSION_ERRORS as error:
         raise ModelError(f"{path}: no network that onnxruntime can run: {error}") from error

@@ -1,7 +1,7 @@
 """Frustum-PointNet: locates the body in each box from the pseudo-lidar points inside the box.
 
-A manifest states the network's input and outputs, as for the networks of images. The points of a box are turned about
-the camera's down axis until the box's middle lies straight ahead, as Frustum-PointNet has it. Where the manifest says
+A manifest states the network's input and outputs, as for networks on images. The points of a box are rotated about the
+camera's down axis until the box's middle lies straight ahead, as in the Frustum-PointNet paper. Where the manifest says
 `centred` they are relative to the point of that ray at the depth of the box's middle.
 """
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.perception.boxes3d import Boxes3d
-from birdslam.perception.manifest import Misfit, ModelError, Schedule
+from birdslam.perception.manifest import ManifestMismatch, ModelError, Schedule
 from birdslam.perception.manifest_file import find_as
 from birdslam.perception.network import (
     ModelSpec,
@@ -32,7 +32,7 @@ from birdslam.perception.pointnet_manifest import Bins, Body, PointNetManifest, 
 Floats = NDArray[np.float64]
 
 CORE = 0.5  # of a box's width and height, about its middle: where its vehicle is
-REACH_M = 8.0  # from the depth of the core: points farther off are another body's, or the background's
+REACH_M = 8.0  # from the depth of the core: points farther off are of another body or the background
 LEAST_POINTS = 16
 REFERENCE_M = 20.0  # of the feature log_depth
 MIN_HALF_SPAN = 1e-6  # of a box, at a depth of 1
@@ -54,7 +54,7 @@ class Frustum:
 
 
 def frustum_of(points_cam_m: Floats, points: Points) -> Frustum | None:
-    """Picks the points (N, 3) of one box that are near its body, turns and centres them; None where too few are."""
+    """Selects the points (N, 3) of one box near its body, rotates and centres them; None where there are too few."""
     if len(points_cam_m) < LEAST_POINTS:
         return None
     u, v = points_cam_m[:, 0] / points_cam_m[:, 2], points_cam_m[:, 1] / points_cam_m[:, 2]
@@ -92,19 +92,21 @@ class PointNet:
         has = {i.name: i for i in self._session.get_inputs()}
         wanted = [points.name, *([points.class_name] if points.class_name else [])]
         if sorted(has) != sorted(wanted):
-            raise Misfit("points.name", wanted, f"the inputs {sorted(has)}")
+            raise ManifestMismatch("points.name", wanted, f"the inputs {sorted(has)}")
         self._batch = has[points.name].shape[0] if isinstance(has[points.name].shape[0], int) else None
         self._outputs = (table.output,) if isinstance(table, Body) else _outputs_of(table)
         missing = set(self._outputs) - {o.name for o in self._session.get_outputs()}
         if missing:
-            raise Misfit("pointnet", sorted(missing), f"the outputs {[o.name for o in self._session.get_outputs()]}")
+            raise ManifestMismatch(
+                "pointnet", sorted(missing), f"the outputs {[o.name for o in self._session.get_outputs()]}"
+            )
         shapes = {
             name: out.shape for name, out in self._run(np.zeros((1, *self._box_shape), np.float32), ["car"]).items()
         }
         self.output_shapes = shapes
         for name, shape in self._expected().items():
             if shapes[name] != shape:
-                raise Misfit("pointnet", f"{name} of shape {('N', *shape[1:])}", shapes[name])
+                raise ManifestMismatch("pointnet", f"{name} of shape {('N', *shape[1:])}", shapes[name])
 
     @property
     def _box_shape(self) -> tuple[int, int]:
@@ -140,7 +142,7 @@ class PointNet:
     def locate(self, frusta_cam_m: Sequence[Floats], labels: Sequence[str], camera: Camera) -> Boxes3d | None:
         """A body for the points (N, 3) of each box, in camera; None where the network gave no usable numbers.
 
-        A box with too few points near its middle has a body of which nothing is known: its sigmas are infinite.
+        A box with too few points near its middle has an unknown body, with infinite sigmas.
         """
         frusta = [frustum_of(points, self.manifest.points) for points in frusta_cam_m]
         known = [(i, frustum) for i, frustum in enumerate(frusta) if frustum is not None]
@@ -224,7 +226,7 @@ def _write(frustum: Frustum, centre_m: Floats, yaw_rad: float, camera: Camera, o
 
 
 def _unknown(count: int) -> Boxes3d:
-    """Bodies of which nothing is known: infinite sigmas."""
+    """Unknown bodies: infinite sigmas."""
     return Boxes3d(
         centre_px=np.zeros((count, 2)),
         depth_m=np.ones(count),
@@ -256,7 +258,7 @@ def load_pointnet(spec: ModelSpec) -> PointNet:
 
     try:
         return PointNet(path, manifest, sha256, content, msgspec.structs.replace(manifest.schedule, **stated))
-    except Misfit as error:
+    except ManifestMismatch as error:
         raise ModelError(f"{path}: {error} (manifest {origin})") from error
     except SESSION_ERRORS as error:
         raise ModelError(f"{path}: no network that onnxruntime can run: {error}") from error

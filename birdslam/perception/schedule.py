@@ -1,4 +1,4 @@
-"""Which network runs on which frame, and which results a frame gets once it can wait no longer."""
+"""The networks' schedule: which runs on which frame, and which results a frame gets once it can wait no longer."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.perception.body_overlap import with_bodies
 from birdslam.perception.decoding.depth import DepthMap
-from birdslam.perception.decoding.detection import Detections
+from birdslam.perception.decoding.detection import Detections, with_bodies
+from birdslam.perception.decoding.multitask import Findings
 from birdslam.perception.decoding.segmentation import Segmentation
-from birdslam.perception.findings import Findings
 from birdslam.perception.manifest import Role, Schedule
 from birdslam.types import Status
 
@@ -31,10 +30,9 @@ ROLES: dict[Role, tuple[Role, ...]] = {"multitask": ("detector", "segmenter", "d
 class Perception:
     """The latest results of the networks at one frame.
 
-    `ages`: head name -> frames since the frame that its result in use was computed on, 0 is this one; a head without
-    any result yet is absent. A head that fills several roles stands there with these roles, not with its name. Each
-    head whose result is of an earlier frame has its status in `status`. `awaited_from`: of frames before it no
-    detections will come after these.
+    `ages`: head's name -> frames since that of its result, 0 is this frame; a head without a result yet is absent. A
+    head with several roles has an entry for each role, not for its name. A result of an earlier frame has its status in
+    `status`. `awaited_from`: no detections of frames before it are still to come.
     """
 
     detections: Detections | None = None
@@ -46,14 +44,14 @@ class Perception:
 
 
 class Pending(Protocol):
-    """A perception that may still be under way."""
+    """A perception that may still be running."""
 
     def result(self) -> Perception: ...
 
 
 @dataclass(frozen=True)
 class Ready:
-    """A perception that is there already."""
+    """A finished perception."""
 
     perception: Perception
 
@@ -78,12 +76,12 @@ class _Slot:
     """One head's run and its last results."""
 
     head: Head
-    fills: tuple[Role, ...]  # what its findings are used for
+    fills: tuple[Role, ...]  # the roles that its findings are used for
     running: Future[Findings | None] | None = None
     started_frame: int | None = None
-    masks: bool = True  # the last run that was started makes masks too
-    without_masks: int = 0  # runs since the last one that made them
-    outdated: bool = False  # the run under way belongs to frames of before a restart of the source
+    masks: bool = True  # the last run started includes masks
+    without_masks: int = 0  # runs since the last one that included them
+    outdated: bool = False  # the run under way is of frames before a restart of the source
     findings: Findings = field(default_factory=Findings)
     found: dict[Role, int] = field(default_factory=dict)  # the frame that each result was computed on
 
@@ -111,15 +109,14 @@ class _Slot:
 class Networks:
     """Starts each head on the frames that it is due on and carries its last result in between.
 
-    A head is due when `every` frames have passed since the one it last started on, so that a dropped frame doesn't
-    starve it; while its last run is under way it isn't started again. `sparing` may be set between two frames: then
-    each head is due after so many times as many. A head that fills several roles leaves those to others that have a
-    head of their own; with `bodies` what it knows of vehicles' bodies counts in the other detector's boxes all the
-    same, where both looked at one image (body_overlap.py). `boxes_alone` runs such a head without its masks: where
-    `masks_every` is set too, its masks come with one run in so many. `submit(run, image) -> Future` is the executor's
-    (birdslam has no threads of its own; it needs one for each head). `patience_s` None awaits every head that runs, so
-    that the results depend on the frames alone. Else `result()` waits that long in all, for the heads that started on
-    its frame and are `awaited`; what isn't there is carried and goes on in the background.
+    A head is due when `every` frames, times `slowdown`, have passed since the one it last started on; while its run is
+    under way it is not started again. `slowdown` may be set between two frames. A head with several roles leaves those
+    to others that have a head of their own; with `bodies` its 3-D boxes are still used in the other detector's boxes,
+    if of the same image (`decoding.detection.with_bodies`). `boxes_alone` runs such a head without its masks; with
+    `masks_every` one run in so many includes them. `submit(run, image) -> Future` is an executor's (birdslam has no
+    threads of its own; it needs one for each head). With `patience_s` None every running head is awaited, so that the
+    results depend on the frames alone. Else `result()` waits that long in all, for the heads that started on its frame
+    and are `awaited`; the others' results are carried, and they go on in the background.
     """
 
     def __init__(
@@ -149,7 +146,7 @@ class Networks:
             for head in heads
         ]
         self._last_frame = -1
-        self.sparing = self.masks_every = 1
+        self.slowdown = self.masks_every = 1
         self.looks = 0  # frames on which a head was begun
 
     def start(self, frame_id: int, image: NDArray[np.uint8] | None, only: Collection[Role] | None = None) -> Pending:
@@ -164,7 +161,7 @@ class Networks:
         self._last_frame = frame_id
         begun = False
         for slot in self._slots:
-            every = slot.head.schedule.every * self.sparing
+            every = slot.head.schedule.every * self.slowdown
             due = slot.started_frame is None or frame_id - slot.started_frame >= every
             feeds = {*slot.fills, *(("detector",) if self._bodies and slot.head.role in ROLES else ())}
             wanted = bool(feeds) and (only is None or not feeds.isdisjoint(only))

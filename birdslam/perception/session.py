@@ -1,11 +1,11 @@
-"""onnxruntime sessions as every network here runs. Imported by who runs one alone: the library takes 18 MB."""
+"""onnxruntime sessions. Imported only where networks run: the library takes 18 MB."""
 
 from __future__ import annotations
 
 import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
-from birdslam.perception.manifest import Input, Misfit
+from birdslam.perception.manifest import Input, ManifestMismatch
 from birdslam.perception.onnx_files.subnormal import without_tiny_weights
 
 SESSION_ERRORS = tuple(
@@ -41,24 +41,26 @@ def open_session(content: bytes, input: Input, outputs: tuple[str, ...], threads
     probe = ort.InferenceSession(content, probe_options, providers=PROVIDERS)
     has_inputs = [i.name for i in probe.get_inputs()]
     if has_inputs != [input.name]:
-        raise Misfit("input.name", repr(input.name), f"the inputs {has_inputs}")
+        raise ManifestMismatch("input.name", repr(input.name), f"the inputs {has_inputs}")
     (has,) = probe.get_inputs()
     if has.type != _FLOAT32:
-        raise Misfit("input", f"{_FLOAT32} (all that manifests can say)", has.type)
+        raise ManifestMismatch("input", f"{_FLOAT32} (all that manifests can say)", has.type)
     axes = {"N": 1, "C": 3, "H": input.height_px, "W": input.width_px}
     if len(has.shape) != 4:
-        raise Misfit("input.layout", input.layout, f"the shape {has.shape}")
+        raise ManifestMismatch("input.layout", input.layout, f"the shape {has.shape}")
     options = session_options(threads)
     for axis, size in zip(input.layout, has.shape, strict=True):
         key = {"H": "input.height_px", "W": "input.width_px"}.get(axis, "input.layout")
         if isinstance(size, str):
             options.add_free_dimension_override_by_name(size, axes[axis])
         elif size is not None and size != axes[axis]:
-            raise Misfit(key, f"{axis} = {axes[axis]} in {input.layout}", f"{size} in {has.shape}")
+            raise ManifestMismatch(key, f"{axis} = {axes[axis]} in {input.layout}", f"{size} in {has.shape}")
     has_outputs = {o.name: o.type for o in probe.get_outputs()}
     for output in outputs:
         if output not in has_outputs:
-            raise Misfit("output", repr(output), f"the outputs {list(has_outputs)}")
+            raise ManifestMismatch("output", repr(output), f"the outputs {list(has_outputs)}")
         if has_outputs[output] != _FLOAT32:
-            raise Misfit("output", f"{output} as {_FLOAT32} (all that manifests can say)", has_outputs[output])
+            raise ManifestMismatch(
+                "output", f"{output} as {_FLOAT32} (all that manifests can say)", has_outputs[output]
+            )
     return ort.InferenceSession(without_tiny_weights(content), options, providers=PROVIDERS)

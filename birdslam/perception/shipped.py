@@ -1,4 +1,4 @@
-"""The networks of a program of one process: those that ship with the package, or others by their files."""
+"""The networks of a single-process program: those that ship with the package, or others by their files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the image to the network's input and back: which part of the image a run sees, and where in the input."""
+"""From the image to the network's input and back: the part of the image that a run sees, and its place in the input."""
 
 from __future__ import annotations
 

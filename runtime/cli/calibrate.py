@@ -198,12 +198,12 @@ def _report(
     sigma = np.degrees(np.sqrt(np.diag(np.reshape(found.cov, (2, 2)))))
     pitch_deg, roll_deg = np.degrees([camera.pitch_rad, camera.roll_rad])
     yield f"pitch {pitch_deg:+.2f} +- {sigma[0]:.2f} deg, roll {roll_deg:+.2f} +- {sigma[1]:.2f} deg"
-    for witness in found.witnesses:
-        own = np.degrees(np.sqrt(np.diag(np.reshape(witness.cov, (2, 2)))))
-        roll = "" if witness.roll_rad is None else f", roll {np.degrees(witness.roll_rad):+.2f} +- {own[1]:.2f} deg"
+    for estimate in found.estimates:
+        own = np.degrees(np.sqrt(np.diag(np.reshape(estimate.cov, (2, 2)))))
+        roll = "" if estimate.roll_rad is None else f", roll {np.degrees(estimate.roll_rad):+.2f} +- {own[1]:.2f} deg"
         yield (
-            f"  by {witness.cue}: pitch {np.degrees(witness.pitch_rad):+.2f} +- {own[0]:.2f} deg{roll} "
-            f"(of {witness.samples}, chi2 {witness.chi2:.1f})"
+            f"  by {estimate.cue}: pitch {np.degrees(estimate.pitch_rad):+.2f} +- {own[0]:.2f} deg{roll} "
+            f"(of {estimate.samples}, chi2 {estimate.chi2:.1f})"
         )
     if found.yaw_rad is not None:
         yield f"optical axis {np.degrees(found.yaw_rad):+.2f} deg left of the way driven (for information)"

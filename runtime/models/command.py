@@ -25,7 +25,7 @@ import numpy as np
 
 from birdslam.geometry.camera import Camera
 from birdslam.perception import ModelError, ModelSpec, Network, load_network, shipped_manifests
-from birdslam.perception.manifest_file import Glance, find_as
+from birdslam.perception.manifest_file import ManifestHeader, find_as
 from birdslam.perception.pointnet import PointNet, load_pointnet
 from birdslam.runtime.models import store as model_store
 from birdslam.runtime.models.catalogue import Ir, catalogue, check_answers, converted
@@ -160,7 +160,7 @@ def install(order: Order, directory: Path) -> list[str]:
 
 def examine(network: Path, manifest: str) -> list[str]:
     """Opens a network as a run would and runs it once on made input: a few lines on it. Raises ModelError."""
-    role = _glance(network, manifest).role
+    role = _read_header(network, manifest).role
     return _examine_frusta(network, manifest) if role == "pointnet" else _examine_images(network, manifest)
 
 
@@ -204,19 +204,19 @@ def _fits(network: Path, model: Network | PointNet, given: str, test_run: str) -
     ]
 
 
-def _glance(network: Path, manifest: str = "") -> Glance:
+def _read_header(network: Path, manifest: str = "") -> ManifestHeader:
     try:
         content = network.read_bytes()
     except OSError as error:
         raise ModelError(f"{network}: the network can't be read: {error.strerror}") from error
-    return find_as(network, hashlib.sha256(content).hexdigest(), manifest, Glance)[0]
+    return find_as(network, hashlib.sha256(content).hexdigest(), manifest, ManifestHeader)[0]
 
 
 def _row(network: Path) -> tuple[str, str, str]:
     """Role, size and what it is, of the list; the network is not run."""
     size = f"{network.stat().st_size / 1e6:.1f}"
     try:
-        manifest = _glance(network)
+        manifest = _read_header(network)
     except ModelError as error:
         return "", size, f"unusable: {error}"
     return manifest.role, size, manifest.title
@@ -234,7 +234,7 @@ def _manifest_text(order: Order, network: Path, sha256: str, scratch: Path) -> t
     elif not order.remote and not explicit and Path(beside).is_file():
         explicit = beside
     try:
-        manifest, path = find_as(network, sha256, explicit, Glance)
+        manifest, path = find_as(network, sha256, explicit, ManifestHeader)
     except ModelError as error:
         raise ModelError(f"refused: {str(error).replace(str(network), order.source)}") from error
     text = path.read_text()

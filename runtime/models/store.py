@@ -14,7 +14,7 @@ from pathlib import Path
 
 from birdslam.perception.completion import SHIPPED as COMPLETION
 from birdslam.perception.manifest import SHIPPED_NETWORKS, ModelError
-from birdslam.perception.manifest_file import Glance, find_as
+from birdslam.perception.manifest_file import ManifestHeader, find_as
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
@@ -60,5 +60,5 @@ def find(name: str, models_dir: str | Path | None) -> Path:
 
 def role_of(network: Path) -> str:
     """The role that a network's manifest states. Raises ModelError."""
-    manifest, _ = find_as(network, hashlib.sha256(network.read_bytes()).hexdigest(), "", Glance)
+    manifest, _ = find_as(network, hashlib.sha256(network.read_bytes()).hexdigest(), "", ManifestHeader)
     return manifest.role

@@ -126,7 +126,7 @@ class Inference(Closing):
 
     def look_as(self, rate: LookRate) -> None:
         """From now on the networks look as often as this says."""
-        self.networks.sparing, self.networks.masks_every = rate.sparing, rate.masks_every
+        self.networks.slowdown, self.networks.masks_every = rate.sparing, rate.masks_every
 
     @property
     def aside(self) -> Run | None:
@@ -154,7 +154,7 @@ class Inference(Closing):
     def lane_head(self) -> LaneHead:
         """Lanes, on their schedule; half as often where the networks look less often than on theirs."""
         return LaneHead(
-            self.completion, self.aside, self._lanes_every, lambda: min(self.networks.sparing, LANES_SPARING)
+            self.completion, self.aside, self._lanes_every, lambda: min(self.networks.slowdown, LANES_SPARING)
         )
 
     @property

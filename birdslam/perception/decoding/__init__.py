@@ -1,1 +1,1 @@
-"""Outputs of networks to findings: one module a family of networks; manifests name them."""
+"""Decoders from network outputs to findings, one module for each family of networks; manifests name them."""

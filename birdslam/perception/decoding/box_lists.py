@@ -1,4 +1,4 @@
-"""Detectors that answer with a list of boxes: SSD's shifted priors, and boxes that the network itself has decoded."""
+"""Detectors with lists of boxes: SSD's shifted priors, and boxes that the network has decoded itself."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from birdslam.perception.decoding.detection import (
     merge_views,
     rival_groups,
 )
-from birdslam.perception.manifest import BoxList, Input, Misfit, Scoring, Ssd
+from birdslam.perception.manifest import BoxList, Input, ManifestMismatch, Scoring, Ssd
 from birdslam.perception.views import View
 
 Floats = NDArray[np.float64]
@@ -57,10 +57,12 @@ class SsdDecoder(_ListDecoder):
         self.table = table
         priors = shapes[table.priors]
         if len(priors) != 2 or priors[1] != 4:
-            raise Misfit("detector.priors", f"{table.priors} of shape (N, 4)", priors)
+            raise ManifestMismatch("detector.priors", f"{table.priors} of shape (N, 4)", priors)
         for key, output, channels in (("locations", table.locations, 4), ("scores", table.scores, table.classes)):
             if shapes[output] != (1, priors[0], channels):
-                raise Misfit(f"detector.{key}", f"{output} of shape {(1, priors[0], channels)}", shapes[output])
+                raise ManifestMismatch(
+                    f"detector.{key}", f"{output} of shape {(1, priors[0], channels)}", shapes[output]
+                )
 
     def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Candidates:
         """The boxes of one run above the score threshold, in the image and cut to it."""
@@ -88,12 +90,12 @@ class BoxListDecoder(_ListDecoder):
             axis = 2 if table.layout == "boxes" else 1
             if len(shape) != 3 or shape[0] != 1 or shape[axis] != channels:
                 stated = f"(1, N, {channels})" if axis == 2 else f"(1, {channels}, N)"
-                raise Misfit(
+                raise ManifestMismatch(
                     "detector.boxes" if output == table.boxes else "detector.scores", f"{output} {stated}", shape
                 )
             counts.add(shape[3 - axis])
         if len(counts) != 1:
-            raise Misfit("detector.scores", f"as many as {table.boxes} has boxes", shapes[table.scores])
+            raise ManifestMismatch("detector.scores", f"as many as {table.boxes} has boxes", shapes[table.scores])
 
     def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Candidates:
         """The boxes of one run above the score threshold, in the image and cut to it."""

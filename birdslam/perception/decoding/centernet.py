@@ -1,4 +1,4 @@
-"""CenterNet outputs to boxes: an object is a peak of a heat map."""
+"""CenterNet: an object is a peak of a heat map."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from birdslam.perception.decoding.detection import (
     merge_views,
     rival_groups,
 )
-from birdslam.perception.manifest import CenterNet, Input, Misfit
+from birdslam.perception.manifest import CenterNet, Input, ManifestMismatch
 from birdslam.perception.views import View
 
 LARGEST_LOGIT = 60.0  # past it a sigmoid is 1 in any float
@@ -30,12 +30,12 @@ class CenterNetDecoder:
         self.table = table
         heat = shapes[table.heat_map]
         if len(heat) != 4 or heat[0] != 1:
-            raise Misfit("detector.heat_map", f"{table.heat_map} of shape (1, classes, h, w)", heat)
+            raise ManifestMismatch("detector.heat_map", f"{table.heat_map} of shape (1, classes, h, w)", heat)
         if heat[1] != table.classes:
-            raise Misfit("detector.classes", table.classes, f"{heat[1]} in {table.heat_map} {heat}")
+            raise ManifestMismatch("detector.classes", table.classes, f"{heat[1]} in {table.heat_map} {heat}")
         for key, output in (("sizes", table.sizes), ("offsets", table.offsets)):
             if output and shapes[output] != (1, 2, *heat[2:]):
-                raise Misfit(f"detector.{key}", f"{output} of shape {(1, 2, *heat[2:])}", shapes[output])
+                raise ManifestMismatch(f"detector.{key}", f"{output} of shape {(1, 2, *heat[2:])}", shapes[output])
         self._cell_px = np.array([input.width_px / heat[3], input.height_px / heat[2]])
         self._groups = rival_groups(table.classes, table.labels, table.rivals)
         self._wanted = np.array(sorted(table.labels))

@@ -1,4 +1,4 @@
-"""Depth for the pixels of an image, and the decoders of the networks that give it."""
+"""Depth maps, and the decoders of the networks that give them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.perception.manifest import Disparity, Input, MetricDepth, Misfit
+from birdslam.perception.manifest import Disparity, Input, ManifestMismatch, MetricDepth
 from birdslam.perception.views import View
 
 Table = TypeVar("Table", Disparity, MetricDepth)
@@ -129,7 +129,7 @@ class MetricDepthDecoder(_MapDecoder[MetricDepth]):
 
 def _check_map(output: str, shape: tuple[int, ...]) -> None:
     if len(shape) not in (3, 4) or any(size != 1 for size in shape[:-2]):
-        raise Misfit("depth.output", f"{output} of shape (1, 1, h, w) or (1, h, w)", shape)
+        raise ManifestMismatch("depth.output", f"{output} of shape (1, 1, h, w) or (1, h, w)", shape)
 
 
 def _of_image(tensor: NDArray[np.float32], view: View, input: Input) -> NDArray[np.float32]:

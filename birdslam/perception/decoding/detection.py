@@ -1,4 +1,4 @@
-"""Detector outputs to boxes in the image: decoding, class-wise NMS, and the merging of tiles."""
+"""Detections in the image: YOLOX decoding, class-wise NMS, merging of tiles, and bodies by another network."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.perception.boxes3d import Boxes3d
-from birdslam.perception.manifest import BoxSigma, DetectorTable, DrawnInside, Input, LowerEdge, Misfit, Yolox
+from birdslam.perception.manifest import BoxSigma, DetectorTable, DrawnInside, Input, LowerEdge, ManifestMismatch, Yolox
 from birdslam.perception.views import View
 
 CUT_MARGIN = 0.015  # of a tile's width: a box that ends so near to a tile's inner edge is taken to go on behind it
 INSIDE = 0.6  # of a cut box's area inside a whole box: the same object
 MOST_CANDIDATES = 400  # of one run: a network that fails must not cost memory and time without bound
 SAME_ROWS = 0.5  # overlap over union of the rows of two halves of one object
+MIN_BODY_IOU = 0.5  # of two networks' boxes of one object, as of a match in most benchmarks
 
 
 @dataclass(frozen=True)
@@ -74,13 +75,13 @@ class YoloxDecoder:
         cells, strides = _grid(input.width_px, input.height_px, table.strides)
         shape = shapes[table.output]
         if len(shape) != 3 or shape[0] != 1:
-            raise Misfit("detector.output", f"{table.output} of shape (1, cells, 5 + classes)", shape)
+            raise ManifestMismatch("detector.output", f"{table.output} of shape (1, cells, 5 + classes)", shape)
         if shape[1] != len(cells):
             stated = f"{list(table.strides)} over {input.width_px}x{input.height_px}, which are {len(cells)} cells"
-            raise Misfit("detector.strides", stated, f"{shape[1]} cells in {table.output} {shape}")
+            raise ManifestMismatch("detector.strides", stated, f"{shape[1]} cells in {table.output} {shape}")
         if shape[2] != 5 + table.classes:
             stated = f"{table.classes}, so {5 + table.classes} channels"
-            raise Misfit("detector.classes", stated, f"{shape[2]} channels in {table.output} {shape}")
+            raise ManifestMismatch("detector.classes", stated, f"{shape[2]} channels in {table.output} {shape}")
         self._cells, self._strides = cells, strides
         self._groups = rival_groups(table.classes, table.labels, table.rivals)
         self._wanted = np.isin(np.arange(table.classes), list(table.labels))
@@ -235,3 +236,32 @@ def join_halves(
                 boxes[i] = np.concatenate([np.minimum(a[:2], b[:2]), np.maximum(a[2:], b[2:])])
                 stands[j] = False
     return boxes, np.flatnonzero(stands)
+
+
+def with_bodies(detections: Detections, others: Detections | None) -> Detections:
+    """The detections (N) with the bodies of the boxes of `others`, of the same image, that overlap them most.
+
+    A box without such an overlap has an unknown body, with infinite sigmas. Detections with bodies of their own stay as
+    they are.
+    """
+    if others is None or others.boxes3d is None or detections.boxes3d is not None:
+        return detections
+    n, bodies = len(detections), others.boxes3d
+    if not n or not len(bodies):
+        return detections
+    shared = intersections(np.concatenate([detections.boxes_px, others.boxes_px]))
+    area = np.diagonal(shared)
+    both = shared[:n, n:]
+    overlap = both / np.maximum(area[:n, None] + area[None, n:] - both, 1e-9)
+    best = overlap.argmax(axis=1)
+    return replace(detections, boxes3d=_unknown_unless(bodies.take(best), overlap[np.arange(n), best] >= MIN_BODY_IOU))
+
+
+def _unknown_unless(bodies: Boxes3d, known: NDArray[np.bool_]) -> Boxes3d:
+    return replace(
+        bodies,
+        sigma_depth_m=np.where(known, bodies.sigma_depth_m, np.inf),
+        sigma_size_m=np.where(known[:, None], bodies.sigma_size_m, np.inf),
+        sigma_alpha_rad=np.where(known, bodies.sigma_alpha_rad, np.inf),
+        flip=np.where(known, bodies.flip, 0.5),
+    )

@@ -1,13 +1,14 @@
-"""The multi-task network's outputs to findings: boxes with their bodies, masks, and a depth map, of one run.
+"""The multi-task network: boxes with 3-D boxes, masks, and a depth map, of one run.
 
 Its depths are canonical, z * (0.58 * width / fx): those of a camera whose focal length is `CANONICAL_FOCAL` of the
-image's width. So one network serves many cameras; `in_metres` makes the depths metric by the camera's focal length.
+image's width. So one network serves many cameras; `in_metres` converts by the camera's focal length.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,8 +18,7 @@ from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.decoding.depth import DepthMap
 from birdslam.perception.decoding.detection import Detections, drawn_out, edge_sigma, suppress
 from birdslam.perception.decoding.segmentation import Segmentation
-from birdslam.perception.findings import Findings
-from birdslam.perception.manifest import Input, Label, Misfit, MultiTask
+from birdslam.perception.manifest import Input, Label, ManifestMismatch, MultiTask
 from birdslam.perception.views import View
 
 CANONICAL_FOCAL = 0.58  # of the image's width
@@ -42,6 +42,15 @@ MEAN_SIZE_M = (4.3, 1.8, 1.6)
 SIGMA_SIZE_REL = (0.10, 0.045, 0.07)  # what is left of a size's spread, on held-out simulated frames
 MOST_CANDIDATES = 100  # of one run
 _LOG_SIDE_MAX = 6.0  # a side of 400 cells is longer than any input
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Detections, masks and depth of one image; None where the network does not give them."""
+
+    detections: Detections | None = None
+    segmentation: Segmentation | None = None
+    depth: DepthMap | None = None
 
 
 def body_slices() -> dict[str, slice]:
@@ -68,9 +77,9 @@ class MultiTaskDecoder:
                 continue
             shape = shapes[output]
             if len(shape) != 4 or shape[:2] != (1, count):
-                raise Misfit("multitask", f"{output} of shape (1, {count}, h, w)", shape)
+                raise ManifestMismatch("multitask", f"{output} of shape (1, {count}, h, w)", shape)
         if shapes["heat"][2:] != shapes["body"][2:]:
-            raise Misfit("multitask", "heat and body on one grid", f"{shapes['heat']} and {shapes['body']}")
+            raise ManifestMismatch("multitask", "heat and body on one grid", f"{shapes['heat']} and {shapes['body']}")
         self._cell = np.array([input.width_px / shapes["heat"][3], input.height_px / shapes["heat"][2]])
         self._kernel = np.ones((3, 3), dtype=np.uint8)
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.perception.manifest import ClassMap, ClassMaps, Input, Meaning, Misfit
+from birdslam.perception.manifest import ClassMap, ClassMaps, Input, ManifestMismatch, Meaning
 from birdslam.perception.views import View
 
 
@@ -31,10 +31,10 @@ class ClassMapsDecoder:
             shape = shapes[entry.output]
             if len(shape) != 4 or shape[0] != 1:
                 stated = f"{entry.output} of shape (1, channels, h, w)"
-                raise Misfit(f"segmenter.maps[{index}].output", stated, shape)
+                raise ManifestMismatch(f"segmenter.maps[{index}].output", stated, shape)
             if shape[1] != entry.channels:
                 has = f"{shape[1]} in {entry.output} {shape}"
-                raise Misfit(f"segmenter.maps[{index}].channels", entry.channels, has)
+                raise ManifestMismatch(f"segmenter.maps[{index}].channels", entry.channels, has)
 
     def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Segmentation:
         """The masks of one run over the whole image."""

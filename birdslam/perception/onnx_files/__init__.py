@@ -1,1 +1,1 @@
-"""ONNX files: read, made faster, and made of OpenVINO's format."""
+"""ONNX files: reading, speeding up, and conversion from OpenVINO's format."""

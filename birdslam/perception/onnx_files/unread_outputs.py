@@ -1,6 +1,6 @@
-"""Takes outputs that nobody reads out of an ONNX file's bytes, with all that only they need, for speed.
+"""Removes outputs that nobody reads from an ONNX file's bytes, with all that only they need, for speed.
 
-onnxruntime computes every node of a graph, whoever asks for what: the depth map is a seventh of the shipped network.
+onnxruntime computes every node of a graph, whatever is asked for: the depth map is a seventh of the shipped network.
 """
 
 from __future__ import annotations

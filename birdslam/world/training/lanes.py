@@ -167,7 +167,7 @@ def samples(
         seen = GroundPlane(
             ground.height_m, ground.pitch_rad + config.sigma_pitch_rad * rng.standard_normal(), ground.roll_rad
         )
-        if gathered.is_news(T_world_ego):
+        if gathered.has_moved(T_world_ego):
             boxes = np.array([o.box_px for o in frame.objects if o.pixels > 0]).reshape(-1, 4)
             masks = _noisy_masks(frame, rng, config)
             gathered.add(T_world_ego, *points_of(masks, frame.camera, seen, boxes, lanes))
