@@ -16,6 +16,7 @@ import yaml
 from msgspec.structs import replace
 
 from birdslam.bench.tracking.benchmark import Row
+from birdslam.perf.__main__ import benchmark_modules
 from birdslam.perf.reporting import results
 from birdslam.perf.robustness import faults
 from birdslam.perf.robustness.strikes import FAULTS
@@ -213,7 +214,7 @@ def help_of(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 def test_every_command_that_a_page_shows_is_one(help_of: Callable[..., str]) -> None:
     """`birdslam WORD`, `python -m perf WORD` and `make WORD`, in the words of the programs."""
     commands = {words: set(re.findall(r"^    ([a-z][a-z-]+)", help_of(*words), re.MULTILINE)) for words in WORDS}
-    benchmarks = {path.stem for path in (ROOT / "perf").glob("*.py")}
+    benchmarks = benchmark_modules()
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for page in PAGES:
         text = page.read_text()
@@ -221,7 +222,7 @@ def test_every_command_that_a_page_shows_is_one(help_of: Callable[..., str]) -> 
             assert first in commands[()], f"{page}: birdslam {first}"
             if first in NESTED and second:
                 assert second in commands[(first,)], f"{page}: birdslam {first} {second}"
-        for word in re.findall(r"python -m perf[. ]([a-z_]+)", text):
+        for word in re.findall(r"python -m perf(?: |\.[a-z_]+\.)([a-z_]+)", text):
             assert word in benchmarks, f"{page}: python -m perf {word}"
         for word in re.findall(r"`make ([a-z][a-z-]*)`", text):
             assert word in targets, f"{page}: make {word}"

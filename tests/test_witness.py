@@ -16,7 +16,7 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Perception, Ready
-from birdslam.perf.accuracy.accuracy import street
+from birdslam.perf.accuracy import street
 from birdslam.perf.robustness.faulty_vehicle import RATE_HZ
 from birdslam.perf.robustness.witness import Witness
 from birdslam.types import Estimate, Frame
