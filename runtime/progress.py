@@ -9,6 +9,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Self, TextIO, TypeVar
 
 REFRESH_S = 0.2
@@ -100,9 +101,14 @@ class Progress:
             self._shown = False
 
 
-def shown(items: Iterable[_Item], what: str, total: int | None, unit: str = "frames") -> Iterator[_Item]:
+def with_progress(items: Iterable[_Item], what: str, total: int | None, unit: str = "frames") -> Iterator[_Item]:
     """The items, with progress."""
     with Progress(what, total, unit) as progress:
         for item in items:
             yield item
             progress.advance()
+
+
+def file_progress(what: str, path: Path) -> Progress:
+    """For reading a file, in MB."""
+    return Progress(what, path.stat().st_size if path.is_file() else None, "MB", 1e6)

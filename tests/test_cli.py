@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from birdslam.perception import ModelSpec
+from birdslam.runtime.cli.commands import COMMANDS, Command, parse
 from birdslam.runtime.cli.main import main
-from birdslam.runtime.cli.parser import build_parser
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.options import configuration_of
 
@@ -16,7 +18,7 @@ NOWHERE = "kitti:/nowhere/at/all"
 
 
 def configuration(*arguments: str):  # type: ignore[no-untyped-def]
-    return configuration_of(build_parser().parse_args(arguments))
+    return configuration_of(parse(arguments))
 
 
 def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
@@ -24,6 +26,22 @@ def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--version"])
     assert end.value.code == 0
     assert capsys.readouterr().out.startswith("birdslam ")
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.words)
+def test_each_command_of_the_table_is_there(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([*command.words.split(), "--help"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out.startswith(f"usage: birdslam {command.words} [-h]")
+
+
+@pytest.mark.processes
+def test_the_help_is_light(tmp_path: Path) -> None:
+    """It loads none of the libraries that the commands compute with."""
+    code = "import sys; from birdslam.runtime.cli.commands import parse\ntry: parse(['--help'])\n"
+    code += "except SystemExit: assert not {'numpy', 'cv2', 'zenoh', 'msgspec'} & set(sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False).returncode == 0
 
 
 @pytest.mark.parametrize("arguments", [[], ["fly"], ["run", "--pace", "3"], ["evaluate", "odometry"]])

@@ -15,7 +15,7 @@ from birdslam.bench.tracking.leave_one_out import left_out, score
 from birdslam.bench.tracking.localisation import CarError
 from birdslam.frontend import FrontEndConfig
 from birdslam.runtime.configuration import Configuration, ConfigurationError
-from birdslam.runtime.evaluation.localisation import _sweep
+from birdslam.runtime.evaluation.localisation import read_sweep
 from birdslam.runtime.pages import configuration as configuration_page
 from birdslam.slam import SlamConfig
 
@@ -100,12 +100,12 @@ def test_one_sequence_can_not_be_left_out() -> None:
 
 
 def test_a_constant_to_choose_is_a_number_of_the_front_end() -> None:
-    key, as_it_is, found = _sweep("slam.frontend.ground_size.sigma_kerb_m=0.02,0.08", Configuration())
+    key, as_it_is, found = read_sweep("slam.frontend.ground_size.sigma_kerb_m=0.02,0.08", Configuration())
     assert (key, as_it_is, [*found]) == ("slam.frontend.ground_size.sigma_kerb_m", "0.04", ["0.04", "0.02", "0.08"])
     assert found["0.08"].ground_size.sigma_kerb_m == 0.08
     assert found["0.04"] == FrontEndConfig()
     for text in ("sigma_kerb_m=1", "slam.frontend.none=1", "slam.frontend.ground_size.cues=1", "slam.frontend.x"):
         with pytest.raises(ConfigurationError, match="--leave-one-out"):
-            _sweep(text, Configuration())
+            read_sweep(text, Configuration())
     with pytest.raises(ConfigurationError, match="wide"):
-        _sweep("slam.frontend.ground_size.sigma_kerb_m=wide", Configuration())
+        read_sweep("slam.frontend.ground_size.sigma_kerb_m=wide", Configuration())

@@ -21,9 +21,9 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.outputs.drive_files import Recorder, ResultsError
 from birdslam.outputs.drive_video import DriveVideo, SideBySide, check_video
 from birdslam.outputs.final_trajectories import FinalTracks, last_seen
-from birdslam.runtime.cli import replay
+from birdslam.runtime.cli.commands import parse
+from birdslam.runtime.cli.drives import replay
 from birdslam.runtime.cli.main import main
-from birdslam.runtime.cli.parser import build_parser
 from birdslam.runtime.configuration import ConfigurationError, RecordingConfig, ResultsConfig, load
 from birdslam.runtime.recording import scene
 from birdslam.runtime.recording.recorded_drive import recorded_drive
@@ -176,8 +176,8 @@ def test_results_without_final_ones_replace_those_of_an_earlier_run(tmp_path: Pa
 def test_replay_writes_them_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     frames = measured(40)
     tape = taped(tmp_path / "t", frames)
-    options = build_parser().parse_args(["replay", str(tape.path), "--smooth", "--output", str(tmp_path / "out")])
-    assert replay.replay(options) == 0
+    options = parse(["replay", str(tape.path), "--smooth", "--output", str(tmp_path / "out")])
+    assert replay.run(options) == 0
     assert "results in" in capsys.readouterr().out
     assert tracks(tmp_path / "out" / "tracks") == smoothed(zip(frames, tape.estimates, strict=False))
     assert (tmp_path / "out" / "ego.final.tum.txt").read_bytes() == (tmp_path / "out" / "ego.tum.txt").read_bytes()
@@ -282,7 +282,7 @@ def test_the_images_of_a_recording_are_drawn_by_their_numbers_in_the_run(tmp_pat
     ]
     video = tmp_path / "v.mp4"
     options = ["replay", str(tape.path), "--video", str(video), "--output", str(tmp_path / "out")]
-    assert replay.replay(build_parser().parse_args(options)) == 0
+    assert replay.run(parse(options)) == 0
     assert len(pictures(video)) == 10  # every second frame of 33 Hz
 
 

@@ -29,7 +29,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.runtime.cli import fleet as commands
-from birdslam.runtime.cli.fleet import FleetWatch
+from birdslam.runtime.cli.vehicle.top import FleetTable
 from birdslam.runtime.configuration import ConfigurationError, FleetConfig, RouterConfig, load
 from birdslam.runtime.fleet.link import open_link
 from birdslam.runtime.fleet.listener import Fleet, FleetReading
@@ -260,7 +260,7 @@ def test_one_listener_follows_three_vehicles(tmp_path_factory: pytest.TempPathFa
             assert not silent.alive
             assert not silent.on_time
             say(red, fleet)
-            table = FleetWatch(fleet).table()
+            table = FleetTable(fleet).table()
             assert "4 vehicles: 3 alive" in table
             rows = {line.split()[0]: line.split() for line in table.splitlines()}
             assert rows["red"][1:3] == ["alive", "yes"]
@@ -409,7 +409,7 @@ def test_a_router_that_comes_back_is_found(tmp_path_factory: pytest.TempPathFact
         first(red, fleet)
         router.close()
         until(lambda: not fleet.connected and not fleet.latest("red").alive, "the router is gone")
-        assert "THE ROUTER IS GONE" in FleetWatch(fleet).table()
+        assert "THE ROUTER IS GONE" in FleetTable(fleet).table()
         with zenoh.open(router_config(table)):
             first(red, fleet)
             assert fleet.latest("red", 1e6).usable

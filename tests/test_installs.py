@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from birdslam.runtime.cli.parser import build_parser
+from birdslam.runtime.cli.commands import parse
 from tests import containerfile, wheels
 
 PROJECT = tomllib.loads((wheels.ROOT / "pyproject.toml").read_text())["project"]
@@ -72,7 +72,7 @@ def test_the_containerfile_is_one() -> None:
     assert steps.index(last["USER"]) < steps.index(smoke[0])  # not as root
     commands = [shlex.split(smoke[0].text.partition("&&")[0]), last["ENTRYPOINT"].words + last["CMD"].words]
     commands.append(containerfile.Instruction("CMD", last["HEALTHCHECK"].text.partition("CMD ")[2]).words)
-    assert [build_parser().parse_args(words[1:]).command for words in commands] == ["run", "run", "top"]
+    assert [parse(words[1:]).command for words in commands] == ["run", "run", "top"]
     assert {words[0] for words in commands} == {"birdslam"}
 
 

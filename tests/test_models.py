@@ -20,8 +20,8 @@ from onnx.external_data_helper import set_external_data
 from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
 from birdslam.perception.manifest_file import read_manifest
 from birdslam.perception.onnx_files.onnx_file import has_weights_elsewhere
+from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.cli.main import main
-from birdslam.runtime.cli.parser import build_parser
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.models import catalogue as catalogue_module
 from birdslam.runtime.models import store as model_store
@@ -96,7 +96,7 @@ def test_files_are_installed_pinned_and_found_by_name(tmp_path: Path, store: Pat
         copy = store / network.stem / network.name
         assert copy.read_bytes() == network.read_bytes()
         assert read_manifest(copy.with_suffix(".toml")).sha256 == sha256(network)
-    options = build_parser().parse_args(["run", "--model", "seg", "--model", "detector=det"])
+    options = parse(["run", "--model", "seg", "--model", "detector=det"])
     given = configuration_of(options).models.given()
     assert given == {
         "detector": ModelSpec(str(store / "det" / "det.onnx")),
@@ -112,10 +112,10 @@ def test_a_configuration_file_may_name_models_and_their_directory(tmp_path: Path
     assert left_in(store) == set()
     path = tmp_path / "car.toml"
     path.write_text('[runtime]\nmodels_dir = "elsewhere"\n[models.segmenter]\npath = "seg"\nevery = 4\n')
-    made = configuration_of(build_parser().parse_args(["run", str(path)]))
+    made = configuration_of(parse(["run", str(path)]))
     assert made.models.segmenter == ModelSpec(str(elsewhere / "seg" / "seg.onnx"), every=4)
     with pytest.raises(ConfigurationError, match=r"no model 'det': at hand are .*seg"):
-        configuration_of(build_parser().parse_args(["run", str(path), "--model", "det"]))
+        configuration_of(parse(["run", str(path), "--model", "det"]))
 
 
 def test_a_changed_file_of_an_installed_model_is_refused_when_it_is_loaded(tmp_path: Path, store: Path) -> None:
@@ -264,7 +264,7 @@ def test_an_address_needs_a_hash_and_brings_its_manifest(
     network.with_suffix(".toml").write_text(f'sha256 = "{sha256(network)}"\n{SEGMENTER}')
     assert main(["models", "add", f"{address}/seg.onnx", "--name", "again"]) == 0
     assert left_in(store) == {"seg", "again"}
-    assert str(network.stem) in configuration_of(build_parser().parse_args(["run", "--model", "again"])).models.given()[
+    assert str(network.stem) in configuration_of(parse(["run", "--model", "again"])).models.given()[
         "segmenter"
     ].path.replace("again", "seg")
 

@@ -6,7 +6,7 @@ import io
 
 import pytest
 
-from birdslam.runtime.progress import Progress, shown, time_to_go
+from birdslam.runtime.progress import Progress, time_to_go, with_progress
 
 
 class Terminal(io.StringIO):
@@ -65,5 +65,5 @@ def test_no_terminal_has_a_line_a_minute() -> None:
 
 
 def test_items_pass_through(capsys: pytest.CaptureFixture[str]) -> None:
-    assert list(shown(iter("abc"), "letters", 3)) == ["a", "b", "c"]
+    assert list(with_progress(iter("abc"), "letters", 3)) == ["a", "b", "c"]
     assert capsys.readouterr().err == ""

@@ -15,15 +15,15 @@ from hypothesis import strategies as st
 
 from birdslam.graph.g2o import g2o_lines
 from birdslam.perf.latency import replay as perf_replay
-from birdslam.runtime.cli import replay as replay_command
-from birdslam.runtime.cli.parser import build_parser
+from birdslam.runtime.cli.commands import parse
+from birdslam.runtime.cli.drives import replay as replay_command
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest
 from birdslam.runtime.nodes.recorder import about
 from birdslam.runtime.recording.recording import Alive, GraphCheckpoint, Recording, RecordingError, RecordingWriter
 from birdslam.runtime.replay import replay
 from birdslam.runtime.replay.replay import compare
-from birdslam.runtime.replay.report import told
+from birdslam.runtime.replay.report import report
 from birdslam.runtime.replay.verdict import Verdict
 from birdslam.types import Estimate, Status
 from tests.taped_drive import CAMERA, Tape, measured
@@ -31,9 +31,7 @@ from tests.taped_drive import CAMERA, Tape, measured
 
 def options(recording: Path, values: Sequence[str] = (), output: Path | None = None) -> argparse.Namespace:
     settings = [word for value in values for word in ("--set", value)]
-    return build_parser().parse_args(
-        ["replay", str(recording), *settings, *(("--output", str(output)) if output else ())]
-    )
+    return parse(["replay", str(recording), *settings, *(("--output", str(output)) if output else ())])
 
 
 def verdict_of(tape: Tape) -> Verdict:
@@ -75,8 +73,8 @@ def test_the_last_bit_counts_and_the_first_that_differs_is_named(tmp_path: Path)
     assert verdict.difference is not None
     assert verdict.difference.frame_id == frames[17].frame_id
     assert [where for where, _, _ in verdict.difference.fields] == ["T_world_ego[1]"]
-    assert f"frame {frames[17].frame_id} DIFFERS" in told(verdict, Recording(tape.path))
-    assert replay_command.replay(options(tape.path)) == 1
+    assert f"frame {frames[17].frame_id} DIFFERS" in report(verdict, Recording(tape.path))
+    assert replay_command.run(options(tape.path)) == 1
 
 
 def test_frames_that_were_coasted_over_and_measurements_that_came_too_late(tmp_path: Path) -> None:
@@ -192,7 +190,7 @@ def test_measurements_that_the_recorder_never_had_end_the_comparison_until_a_new
     assert verdict.same
     assert verdict.unknown == 10
     assert verdict.equal == 10 + 19 + 1
-    assert "were not recorded: 10" in told(verdict, Recording(tape.path))
+    assert "were not recorded: 10" in report(verdict, Recording(tape.path))
 
 
 EVENTS = ("well", "well", "well", "dropped", "estimate lost", "late", "restored", "new world")
@@ -279,7 +277,7 @@ def test_a_recording_that_was_cut_off_replays_up_to_there(tmp_path: Path) -> Non
     assert verdict.same
     assert 5 < verdict.equal < 40
     assert not recording.complete
-    assert "was cut off" in told(verdict, recording)
+    assert "was cut off" in report(verdict, recording)
 
 
 def test_the_last_estimates_of_a_file_that_was_cut_off_may_have_come_before_their_measurements(tmp_path: Path) -> None:
@@ -305,7 +303,7 @@ def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureF
         tape.step(measurements)
     tape.end(frames[-1])
     for name, values in (("same", ()), ("paper", ("slam.weights.mode=paper",))):
-        assert replay_command.replay(options(tape.path, values, tmp_path / name)) == 0
+        assert replay_command.run(options(tape.path, values, tmp_path / name)) == 0
         assert "results in" in capsys.readouterr().out
     same, paper = ((tmp_path / name / "ego.tum.txt").read_text() for name in ("same", "paper"))
     assert same != paper
@@ -315,9 +313,9 @@ def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureF
     again = [out for out in replay.estimates(recording, replay.back_end(recording)) if isinstance(out, Estimate)]
     assert again == recorded
     with pytest.raises(ConfigurationError, match="back end alone"):
-        replay_command.replay(options(tape.path, ["slam.frontend.x=1"], tmp_path / "no"))
+        replay_command.run(options(tape.path, ["slam.frontend.x=1"], tmp_path / "no"))
     with pytest.raises(ConfigurationError, match="no_such"):
-        replay_command.replay(options(tape.path, ["slam.graph.no_such=1"], tmp_path / "no"))
+        replay_command.run(options(tape.path, ["slam.graph.no_such=1"], tmp_path / "no"))
 
 
 def test_the_graph_is_written_as_g2o(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -327,7 +325,7 @@ def test_the_graph_is_written_as_g2o(tmp_path: Path, capsys: pytest.CaptureFixtu
     tape.end(frames[-1])
     asked = options(tape.path, ("slam.weights.mode=paper",))
     asked.g2o = tmp_path / "drive.g2o"
-    assert replay_command.replay(asked) == 0
+    assert replay_command.run(asked) == 0
     assert "graph in" in capsys.readouterr().out
     _, weights = replay.back_end(Recording(tape.path))
     expected = list(g2o_lines(frames, msgspec.structs.replace(weights, mode="paper")))
@@ -335,7 +333,7 @@ def test_the_graph_is_written_as_g2o(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert asked.g2o.read_text().splitlines() == expected
     asked.g2o = tmp_path / "nowhere" / "drive.g2o"
     with pytest.raises(RecordingError, match="can't be written"):
-        replay_command.replay(asked)
+        replay_command.run(asked)
 
 
 @pytest.mark.slow

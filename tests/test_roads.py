@@ -198,13 +198,13 @@ def test_a_clip_is_what_its_seed_renders(name: str, tmp_path: Path) -> None:
     """The truth to the bit; the images but for what another processor or another WebP rounds."""
     if importlib.util.find_spec("numba") is None:
         pytest.skip("the built-in world is rendered with numba (extra `train`)")
-    from birdslam.runtime.world.demo_drive import SAMPLES, keep
+    from birdslam.runtime.world.demo_drive import SAMPLES, write
     from birdslam.world.roads import ROADS, camera_of
     from birdslam.world.scenario import drive
 
     kept, road, camera = DemoRecording(directory=CLIPS / name), ROADS[name], camera_of(640)
     assert len(kept) == FRAMES
-    keep(tmp_path, drive(road.scenario(), camera, FRAMES, road.rate_hz, SAMPLES), camera, road.rate_hz, QUALITY)
+    write(tmp_path, drive(road.scenario(), camera, FRAMES, road.rate_hz, SAMPLES), camera, road.rate_hz, QUALITY)
     again = DemoRecording(directory=tmp_path)
     assert again.camera == kept.camera
     assert again.rate_hz == kept.rate_hz

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from birdslam.geometry.se2 import SE2
-from birdslam.runtime.cli.top import CLEAR, Watch, top
+from birdslam.runtime.cli.vehicle.top import CLEAR, VehicleTable, top
 from birdslam.runtime.configuration import BudgetsConfig, Configuration
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Bus
@@ -78,7 +78,7 @@ def row(text: str, name: str) -> str:
 
 def test_the_table_says_how_every_node_is(vehicle: Path) -> None:
     with Bus("car", f"top-{os.getpid()}", runtime_dir=vehicle) as bus:
-        watch = Watch(bus)
+        watch = VehicleTable(bus)
         watch.wait(LIMIT_S)
         now_ns = time.monotonic_ns()
         text = watch.table(now_ns)

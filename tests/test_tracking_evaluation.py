@@ -40,10 +40,10 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.weights import weighted
 from birdslam.mapping.landmark_edges import StaticMapConfig
 from birdslam.perception import Perception, Ready
-from birdslam.runtime.cli.evaluate_parser import METHODS
-from birdslam.runtime.cli.parser import build_parser
+from birdslam.runtime.cli.commands import parse
+from birdslam.runtime.cli.evaluate.tracking import evaluate
 from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
-from birdslam.runtime.evaluation.tracking import PUBLISHED, evaluate
+from birdslam.runtime.evaluation.tracking import METHODS, PUBLISHED
 from birdslam.runtime.evaluation.tracking_job import EQ_1, frames_of
 from birdslam.slam import SlamConfig
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
@@ -389,7 +389,7 @@ def test_tables_have_every_cell_of_the_paper(published: Published) -> None:
 
 
 def options(*arguments: str) -> argparse.Namespace:
-    return build_parser().parse_args(["evaluate", *arguments])
+    return parse(["evaluate", *arguments])
 
 
 def test_the_command_writes_its_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,7 +40,7 @@ def test_a_recording_becomes_a_file_of_reruns(tape: Tape, tmp_path: Path) -> Non
     from birdslam.runtime.recording import rerun_view as view
 
     file = tmp_path / "drive.rrd"
-    assert view.recorded(Recording(tape.path), file) == 0
+    view.show_recording(Recording(tape.path), file)
     data = file.read_bytes()
     assert data.startswith(b"RRF")
     for entity in (b"world/vehicles", b"bev/bodies", b"latency/capture_to_perceive", b"camera/boxes", b"world/map"):
@@ -66,7 +66,7 @@ def test_everything_of_a_drive_is_sent(tape: Tape) -> None:
             self.blueprint = blueprint
 
     stream = Stream()
-    view.show(Recording(tape.path), view.Viewer(stream))
+    view.send_recording(Recording(tape.path), view.Viewer(stream))
     logged = stream.logged
     for entity in ("camera", "camera/boxes", "bev/lanes", "latency/age", "latency/left"):
         assert logged[entity] == 30, entity

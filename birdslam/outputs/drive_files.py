@@ -56,6 +56,11 @@ def claim_directory(directory: Path) -> None:
         raise ResultsError(f"output directory {directory}: {reason}") from None
 
 
+def write_json(path: Path, report: object) -> None:
+    """Writes structs, or lists of them, for people to read too."""
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
+
+
 class Thinned:
     """Rows of numbers, at most `keep` of them: past that, every second one goes, and every second one to come.
 

@@ -42,8 +42,8 @@ from birdslam.perf.accuracy.starts import (
 )
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.figures import Ledger
-from birdslam.runtime.progress import shown
-from birdslam.runtime.world.demo_drive import SAMPLES, keep
+from birdslam.runtime.progress import with_progress
+from birdslam.runtime.world.demo_drive import SAMPLES, write
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.trajectory import inverse
@@ -145,7 +145,7 @@ class _Drives:
         count = min(road.frames, self._options.frames or road.frames)
         camera = camera_of(self._options.width)
         frames = drive(road.scenario(), camera, count, road.rate_hz, SAMPLES)
-        keep(self._folder / name, shown(frames, name, count), camera, road.rate_hz, self._options.quality)
+        write(self._folder / name, with_progress(frames, name, count), camera, road.rate_hz, self._options.quality)
         self._rendered.add(name)
 
 

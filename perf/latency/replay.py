@@ -23,7 +23,7 @@ from birdslam.perf.reporting.figures import Ledger
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.recording.recording import Recording
 from birdslam.runtime.replay.replay import compare
-from birdslam.runtime.replay.report import told
+from birdslam.runtime.replay.report import report
 from birdslam.runtime.wire import Health
 
 label = "a recorded drive and its replay, bit for bit, and what recording costs"
@@ -73,7 +73,7 @@ def run(arguments: list[str]) -> int:
         print(f"frames: {summary['frames_processed']} processed, {summary['frames_dropped']} dropped by the nodes")
         print(f"recording: {file.stat().st_size / 1e6:.1f} MB, {summary['recording']}")
         print("recorder: {cpu_percent:.1f} % of a core at the median, {rss_mb:.0f} MB".format(**_recorder(recording)))
-        print(told(verdict, recording))
+        print(report(verdict, recording))
         print(f"replayed in {replay_s:.1f} s, {options.minutes * 60.0 / replay_s:.0f} times as fast as it was driven")
         whole = recording.complete and not summary["recording"]["dropped"] and not verdict.unknown
         return int(not (verdict.same and whole))

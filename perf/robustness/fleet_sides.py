@@ -157,7 +157,7 @@ def listener(plan: Plan, ended: threading.Event) -> None:
         while fleet.wait(0.0) is not None:
             continue  # of before
         counted = [name for name in plan.vehicles if name not in plan.left_out]
-        before = {name: fleet.heard(name) for name in fleet.vehicles}
+        before = {name: fleet.received(name) for name in fleet.vehicles}
         begun_s, cpu_s = time.monotonic(), time.process_time()
         while (left_s := begun_s + plan.seconds - time.monotonic()) > 0.0 and not ended.is_set():
             if plan.mode == "each":
@@ -171,7 +171,7 @@ def listener(plan: Plan, ended: threading.Event) -> None:
                 if name not in not_alive_ns and name in fleet.vehicles and not fleet.alive(name):
                     not_alive_ns[name] = time.monotonic_ns()
         took_s, cpu_s = time.monotonic() - begun_s, time.process_time() - cpu_s
-        after = {name: fleet.heard(name) for name in fleet.vehicles}
+        after = {name: fleet.received(name) for name in fleet.vehicles}
     said: dict[str, Any] = {
         "arrival_ms": arrivals,
         "read_ms": reads,

@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 
 from birdslam.bench.ego.trajectory_errors import OdometryReport, evaluate_recordings
-from birdslam.outputs.drive_files import ResultsError
+from birdslam.outputs.drive_files import ResultsError, write_json
 from birdslam.perception import ModelError
 from birdslam.runtime.batch.drives import Task
 from birdslam.runtime.batch.fetch import at_hand
@@ -127,8 +127,7 @@ def _run(task: Task, output: Path, uri: str, on_frame: OnFrame) -> None:
             motion, known = _Motion(frames, on_frame), _known(recording, frames)
             (report,) = evaluate_recordings([recording], motion.watched(drive), working, compared=known)
         result = _result(task, working / task.name, motion, report)
-        encoded = msgspec.json.format(msgspec.json.encode(result), indent=2) + b"\n"
-        (working / task.name / RESULT).write_bytes(encoded)
+        write_json(working / task.name / RESULT, result)
         place.parent.mkdir(parents=True, exist_ok=True)
         try:
             (working / task.name).rename(place)

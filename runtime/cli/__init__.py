@@ -1,1 +1,1 @@
-"""The command `birdslam`: `parser` has the command lines, imported before numpy; `dispatch` says what each calls."""
+"""The command `birdslam`: modules here parse and print; what a command does lies with its subject."""

@@ -1,12 +1,11 @@
-"""Arguments that several commands have in common. As light as parser.py."""
+"""Arguments that several commands have in common."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TypeAlias
 
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+RECORDING = "FILE.mcap"
 
 
 def add_pipeline(parser: argparse.ArgumentParser) -> None:
@@ -49,6 +48,14 @@ def add_topics(parser: argparse.ArgumentParser, *more: str) -> None:
         parser.add_argument("--truth-topic", metavar="TOPIC", help=text)
 
 
+def add_final_results(parser: argparse.ArgumentParser) -> None:
+    """What is written when a drive is over."""
+    text = "also write the final trajectories, by the RTS smoother: tracks/ID.final.tum.txt, ego.final.*"
+    parser.add_argument("--smooth", action="store_true", default=None, help=text)
+    text = "draw the frames with the estimated boxes beside the bird's-eye view, when the drive is over"
+    parser.add_argument("--video", metavar="FILE.mp4", help=text)
+
+
 def add_vehicle(parser: argparse.ArgumentParser) -> None:
     """Which vehicle on the bus."""
     parser.add_argument("--vehicle", metavar="NAME", default="car")
@@ -69,3 +76,9 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 def add_settings(parser: argparse.ArgumentParser, text: str = "any key") -> None:
     """Single keys of the configuration."""
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=text)
+
+
+def add_tracking_root(parser: argparse.ArgumentParser) -> None:
+    """A KITTI tracking folder and its sequences."""
+    parser.add_argument("root", type=Path, metavar="ROOT", help="KITTI tracking: calib, label_02, oxts, ...")
+    parser.add_argument("--sequences", metavar="N,N", help="e.g. 0002,0003; default: all at hand")

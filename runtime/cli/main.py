@@ -5,18 +5,21 @@ from __future__ import annotations
 import os
 import sys
 
-from birdslam.runtime.cli.parser import build_parser
-from birdslam.runtime.environment import CLOSED_PIPE_STATUS, ENVIRONMENT, INTERRUPTED_STATUS
+from birdslam.runtime.cli.commands import parse
+from birdslam.runtime.environment import CLOSED_PIPE_STATUS, ENVIRONMENT, INTERRUPTED_STATUS, USER_ERROR_STATUS
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point; gives the exit status."""
-    options = build_parser().parse_args(arguments)
-    os.environ.update(ENVIRONMENT)
-    try:
-        from birdslam.runtime.cli import dispatch  # only now: numpy's libraries read the environment when loaded
+    os.environ.update(ENVIRONMENT)  # before anything loads numpy, whose libraries read it then
+    options = parse(sys.argv[1:] if arguments is None else arguments)
+    from birdslam.runtime.cli.errors import USER_ERRORS
 
-        return dispatch.execute(options)
+    try:
+        return int(options.call(options))
+    except USER_ERRORS as error:
+        print(f"birdslam: {' '.join(str(error).split())}", file=sys.stderr)
+        return USER_ERROR_STATUS
     except KeyboardInterrupt:
         return INTERRUPTED_STATUS
     except BrokenPipeError:  # `| head` has seen enough; Python would complain once more when it flushes

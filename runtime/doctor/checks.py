@@ -7,7 +7,6 @@ It looks with the rights of whoever calls it: as the service's user, `sudo -u bi
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import ctypes
 import os
@@ -21,10 +20,8 @@ from typing import Literal
 
 from birdslam.perception import ModelError, load_network
 from birdslam.runtime.configuration import Configuration, ConfigurationError
-from birdslam.runtime.doctor.costs import costs
 from birdslam.runtime.nodes.look_rate import threads_of_a_network
 from birdslam.runtime.nodes.sources import CameraSource, SourceError, open_source
-from birdslam.runtime.options import configuration_of
 from birdslam.runtime.process import realtime
 from birdslam.runtime.process.cores import usable_cores
 from birdslam.runtime.topology import NODES
@@ -46,17 +43,6 @@ class Finding:
     verdict: Verdict
     found: str
     advice: str = ""
-
-
-def check_machine(options: argparse.Namespace) -> int:
-    """`birdslam doctor`: a row for each check; 1 where one is an error."""
-    findings = list(examine(configuration_of(options)))
-    print(table(findings))
-    if options.measure:
-        print("\nwhat the settings cost, measured now:")
-        for what, cost in costs(len(os.sched_getaffinity(0))):
-            print(f"{what:26}{cost}", flush=True)
-    return int(any(finding.verdict == "error" for finding in findings))
 
 
 def examine(configuration: Configuration) -> Iterator[Finding]:

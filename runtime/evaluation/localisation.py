@@ -1,17 +1,16 @@
-"""`birdslam evaluate localisation`: where the front end puts the labelled cars of KITTI tracking."""
+"""Where the front end puts the labelled cars of KITTI tracking, and how each sequence fares without its own vote."""
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
 from birdslam.bench.tracking.leave_one_out import LeftOut, left_out
 from birdslam.bench.tracking.localisation import (
     CAMERA_OF_BOXES,
-    PAPER,
     CarError,
     LocalisationRow,
     match_cars,
@@ -19,37 +18,70 @@ from birdslam.bench.tracking.localisation import (
     summarise_ranges,
 )
 from birdslam.frontend import FrontEndConfig
-from birdslam.outputs.drive_files import claim_directory
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.progress import Progress
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.sources.recording import DatasetError
 
 
-def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
-    """Writes report.json and prints a table; gives the exit status."""
-    modes = {"default": configuration.slam.frontend, "paper": PAPER}
-    output = Path(options.output)
-    sweeps = [_sweep(text, configuration) for text in options.leave_one_out]
-    claim_directory(output)
-    if sweeps:
-        return _leave_one_out(options, sweeps, configuration, output)
-    errors: list[CarError] = []
-    sequences = [open_tracking(options.root, name, CAMERA_OF_BOXES) for name in _sequences(options)]
+class Sweep(NamedTuple):
+    """A constant of the front end, its value as it is, and the front ends with each of its values."""
+
+    key: str
+    as_it_is: str
+    by_value: dict[str, FrontEndConfig]
+
+
+def evaluate_localisation(
+    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig
+) -> list[LocalisationRow]:
+    """The errors of the placed cars by range; `detections`: "rrc" or a folder as det_02_rrc. Raises DatasetError."""
+    sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
     with Progress("localisation", sum(map(len, sequences))) as progress:
         progress.reach(0)
-        for sequence in sequences:
-            errors += _errors(options.root, sequence, options.detections, modes[options.mode])
-            progress.advance(len(sequence))
-    rows = summarise_ranges(errors)
-    (output / "report.json").write_bytes(msgspec.json.format(msgspec.json.encode(rows), indent=2) + b"\n")
-    print(_table(rows))
-    print(f"results in {output}")
-    return 0
+        by_sequence = _errors(root, sequences, detections, config, progress.advance)
+    return summarise_ranges([error for errors in by_sequence.values() for error in errors])
 
 
-def _sweep(text: str, configuration: Configuration) -> tuple[str, str, dict[str, FrontEndConfig]]:
-    """KEY=V1,V2 as the key, its value as it is, and the front ends by value. Raises ConfigurationError."""
+def evaluate_left_out(
+    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, sweeps: Sequence[Sweep]
+) -> list[LeftOut]:
+    """How each sequence fares by the value that the others choose, for each sweep. Raises ConfigurationError."""
+    sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
+    drives = 1 + sum(len(sweep.by_value) - 1 for sweep in sweeps)
+    rows: list[LeftOut] = []
+    with Progress("localisation", drives * sum(map(len, sequences))) as progress:
+        as_they_are = _errors(root, sequences, detections, config, progress.advance)
+        for key, as_it_is, by_value in sweeps:
+            found = {
+                value: _errors(root, sequences, detections, varied, progress.advance)
+                for value, varied in by_value.items()
+                if value != as_it_is
+            }
+            try:
+                rows += left_out(key, as_it_is, {as_it_is: as_they_are, **found})
+            except ValueError as error:
+                raise ConfigurationError(f"--leave-one-out: {error}") from None
+    return rows
+
+
+def _errors(
+    root: Path,
+    sequences: Sequence[TrackingSequence],
+    detections: str,
+    config: FrontEndConfig,
+    advance: Callable[[int], None],
+) -> dict[str, list[CarError]]:
+    folder, out = root / "det_02_rrc" if detections == "rrc" else Path(detections), {}
+    for sequence in sequences:
+        found = read_detections(folder, sequence.name, len(sequence))
+        out[sequence.name] = match_cars(sequence, measure(sequence, found, config))
+        advance(len(sequence))
+    return out
+
+
+def read_sweep(text: str, configuration: Configuration) -> Sweep:
+    """KEY=V1,V2 of `--leave-one-out`. Raises ConfigurationError."""
     key, _, values = text.partition("=")
     if not key.startswith("slam.frontend.") or not values:
         raise ConfigurationError(f"--leave-one-out {text}: expected slam.frontend.KEY=V1,V2")
@@ -67,75 +99,20 @@ def _sweep(text: str, configuration: Configuration) -> tuple[str, str, dict[str,
             found[str(branch[leaf])] = msgspec.convert(tree, FrontEndConfig)
         except (ValueError, msgspec.ValidationError) as error:
             raise ConfigurationError(f"--leave-one-out {text}: {value}: {error}") from None
-    return key, str(as_it_is), found
+    return Sweep(key, str(as_it_is), found)
 
 
-def _leave_one_out(
-    options: argparse.Namespace,
-    sweeps: Sequence[tuple[str, str, dict[str, FrontEndConfig]]],
-    configuration: Configuration,
-    output: Path,
-) -> int:
-    sequences = [open_tracking(options.root, name, CAMERA_OF_BOXES) for name in _sequences(options)]
-    drives = 1 + sum(len(by_value) - 1 for _, _, by_value in sweeps)
-    rows: list[LeftOut] = []
-    with Progress("localisation", drives * sum(map(len, sequences))) as progress:
+def sequences_of(root: Path, asked: str | None, known: Sequence[str] | None = None) -> list[str]:
+    """The sequences "0002,0003" of a KITTI tracking folder; None: those of `known` that it has, or all.
 
-        def errors_of(config: FrontEndConfig) -> dict[str, list[CarError]]:
-            out = {}
-            for sequence in sequences:
-                out[sequence.name] = _errors(options.root, sequence, options.detections, config)
-                progress.advance(len(sequence))
-            return out
-
-        as_they_are = errors_of(configuration.slam.frontend)
-        for key, as_it_is, by_value in sweeps:
-            found = {value: errors_of(config) for value, config in by_value.items() if value != as_it_is}
-            try:
-                rows += left_out(key, as_it_is, {as_it_is: as_they_are, **found})
-            except ValueError as error:
-                raise ConfigurationError(f"--leave-one-out: {error}") from None
-    (output / "leave_one_out.json").write_bytes(msgspec.json.format(msgspec.json.encode(rows), indent=2) + b"\n")
-    print(f"{'sequence':10}{'as it is':>10}{'chosen':>10}{'score':>9}{'chosen':>9}{'depth':>9}{'chosen':>9}  constant")
-    for row in rows:
-        print(
-            f"{row.sequence:10}{row.as_it_is:>10}{row.chosen:>10}{row.score_as_it_is:9.3f}{row.score_chosen:9.3f}"
-            f"{row.depth_error_as_it_is_rel:9.1%}{row.depth_error_chosen_rel:9.1%}  {row.key}"
-        )
-    print(f"results in {output}")
-    return 0
-
-
-def _sequences(options: argparse.Namespace) -> list[str]:
-    labels = options.root / "label_02"
+    Raises ConfigurationError, DatasetError.
+    """
+    labels = root / "label_02"
     if not labels.is_dir():
-        raise DatasetError(f"{options.root}: is no KITTI tracking folder: it has no label_02")
-    known = sorted(path.stem for path in labels.glob("*.txt"))
-    chosen = list(dict.fromkeys(options.sequences.split(","))) if options.sequences else known
-    missing = [name for name in chosen if name not in known]
+        raise DatasetError(f"{root}: is no KITTI tracking folder: it has no label_02")
+    there = sorted(path.stem for path in labels.glob("*.txt"))
+    chosen = list(dict.fromkeys(asked.split(","))) if asked else [n for n in there if known is None or n in known]
+    missing = [name for name in chosen if name not in there]
     if missing or not chosen:
-        raise ConfigurationError(f"--sequences: {options.root} has no {', '.join(missing) or 'sequences'}")
+        raise ConfigurationError(f"--sequences: {root} has no {', '.join(missing) or 'sequences'}")
     return chosen
-
-
-def _errors(root: Path, sequence: TrackingSequence, detections: str, config: FrontEndConfig) -> list[CarError]:
-    folder = root / "det_02_rrc" if detections == "rrc" else Path(detections)
-    found = read_detections(folder, sequence.name, len(sequence))
-    return match_cars(sequence, measure(sequence, found, config))
-
-
-def _table(rows: Sequence[LocalisationRow]) -> str:
-    lines = [
-        f"{'sequence':10}{'range m':>9}{'n':>7}{'depth':>9}{'bias':>9}{'across m':>10}{'1 sigma':>9}{'2 sigma':>9}"
-    ]
-    for row in rows:
-        cells = (
-            (row.depth_error_median_rel, "9.1%"),
-            (row.depth_bias_median_rel, "+9.1%"),
-            (row.lateral_error_median_m, "10.2f"),
-            (row.inside_1_sigma, "9.0%"),
-            (row.inside_2_sigma, "9.0%"),
-        )
-        numbers = "".join(format(value, form) for value, form in cells if value is not None)
-        lines.append(f"{row.sequence:10}{row.range:>9}{row.n:>7}{numbers}")
-    return "\n".join(lines)

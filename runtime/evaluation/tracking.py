@@ -1,113 +1,88 @@
-"""`birdslam evaluate tracking` and `birdslam evaluate ablation`: the paper's tables on KITTI tracking.
+"""The paper's tables on KITTI tracking: which jobs there are, their outcomes, and the report of all.
 
-One process a sequence, each with everything that its sequence needs; the numbers come from birdslam/, the clock and the
-files are here.
+One process a sequence, each with everything that its sequence needs.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
 from pathlib import Path
 
 import msgspec
 
 from birdslam.bench.tracking import tables
+from birdslam.bench.tracking.benchmark import methods as every_method
 from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
 from birdslam.bench.tracking.picture import draw_runtime
 from birdslam.bench.tracking.report import Outcome, Setting, render_report
-from birdslam.outputs.drive_files import claim_directory
+from birdslam.outputs.drive_files import write_json
 from birdslam.runtime.configuration import Configuration, ConfigurationError
-from birdslam.runtime.evaluation.methods import METHODS
+from birdslam.runtime.evaluation.localisation import sequences_of
 from birdslam.runtime.evaluation.tracking_job import Job, frames_to_make, run_sequence
 from birdslam.runtime.options import speeds_of
 from birdslam.runtime.process.workers import workers
 from birdslam.runtime.progress import Progress, time_to_go
+from birdslam.slam import SlamConfig
 from birdslam.sources.kitti_tracking import camera_with_images
-from birdslam.sources.recording import DatasetError
 
 PUBLISHED = Path(tables.__file__).with_name("published.toml")
+METHODS = tuple(every_method(SlamConfig()))
+
+OnDone = Callable[[Outcome, int, int, str], object]  # a job's outcome, how many are done, of how many, the time to go
 
 
-def evaluate(options: argparse.Namespace, configuration: Configuration) -> int:
-    """Both commands; gives the exit status."""
-    jobs = _jobs(options, configuration)
-    output = Path(options.output)
-    claim_directory(output)
-    outcomes = sorted(_run_all(jobs, max(1, options.jobs)), key=lambda o: (o.sequence, o.odometry == "images"))
-    rows = [row for outcome in outcomes for row in outcome.rows]
-    variants = [row for outcome in outcomes for row in outcome.ablation]
-    job = jobs[0]
-    ideas = [row for outcome in outcomes for row in outcome.ideas]
-    if ideas:
-        _write_json(output / "ideas.json", ideas)
-    _write_json(output / "report.json", rows if job.methods else variants)
-    if job.methods and variants:
-        _write_json(output / "ablation.json", variants)
-    told: list[msgspec.Struct] = [row for outcome in outcomes for row in (*outcome.ranges, *outcome.motion)]
-    if told:
-        _write_json(output / "told.json", told)
-    longest = max(outcomes, key=lambda outcome: len(outcome.frames))
-    draw_runtime(longest.updates_ms, output / "runtime.png")
-    setting = Setting(job.frames, job.methods, max(job.seeds for job in jobs))
-    report = render_report(setting, job.published, outcomes)
-    (output / "report.md").write_text(report, encoding="utf-8")
-    print(report)
-    print(f"results in {output}")
-    return 0
+def jobs_of(
+    root: Path,
+    sequences: str | None,
+    configuration: Configuration,
+    output: Path,
+    *,
+    methods: Sequence[str] | None,
+    frames: str = "all",
+    odometry: str = "",
+    detections: str = "",
+    seeds: int = 1,
+) -> list[Job]:
+    """The jobs of the sequences "0002,0003" (None: all at hand); `methods` None: the ablations alone.
 
-
-# --- what is asked for ---
-
-
-def _jobs(options: argparse.Namespace, configuration: Configuration) -> list[Job]:
-    root, published = options.root, tables.read_published(PUBLISHED)
-    if not (root / "label_02").is_dir():
-        raise DatasetError(f"{root}: is no KITTI tracking folder: it has no label_02")
-    known = sorted(path.stem for path in (root / "label_02").glob("*.txt"))
-    taken = [name for name in known if options.frames != "paper" or name in published.sequences]
-    sequences = options.sequences.split(",") if options.sequences else taken
-    missing = [name for name in sequences if name not in known]
-    if missing or not sequences:
-        raise ConfigurationError(f"--sequences: {root} has no {', '.join(missing) or 'sequences'}")
-    if options.seeds < 1:
-        raise ConfigurationError(f"--seeds {options.seeds}: needs 1 or more")
-    compare = options.command == "evaluate tracking"
-    chosen = tuple(options.methods.split(",")) if compare else ()
-    unknown = [name for name in chosen if name not in METHODS]
+    `frames`: "all", "paper" or "A:B"; `odometry` and `detections`: "" for what a sequence has. Raises
+    ConfigurationError, DatasetError.
+    """
+    published = tables.read_published(PUBLISHED)
+    names = sequences_of(root, sequences, [*published.sequences] if frames == "paper" else None)
+    unknown = [name for name in methods or () if name not in METHODS]
     if unknown:
         raise ConfigurationError(f"--methods: there is no {', '.join(unknown)}; there are {', '.join(METHODS)}")
     jobs = [
         Job(
             root=root,
             sequence=name,
-            frames=options.frames,
-            methods=chosen,
-            odometry=odometry,
-            detections=detections,
-            seeds=options.seeds if odometry == "simulate" else 1,
-            ablate=own or not compare,
-            output=Path(options.output),
+            frames=frames,
+            methods=tuple(methods or ()),
+            odometry=source,
+            detections=boxes,
+            seeds=seeds if source == "simulate" else 1,
+            ablate=ablate or methods is None,
+            output=output,
             configuration=configuration,
             published=published,
         )
-        for name in dict.fromkeys(sequences)
-        for odometry, detections, own in _sources(options, root, name, compare, configuration)
+        for name in names
+        for source, boxes, ablate in _sources(root, name, odometry, detections, methods is not None, configuration)
     ]
     if configuration.source.speed:
-        speeds_of(configuration, len(set(sequences)))
-        simulated = set(sequences) - {job.sequence for job in jobs if job.odometry == "images"}
+        speeds_of(configuration, len(names))
+        simulated = set(names) - {job.sequence for job in jobs if job.odometry == "images"}
         if simulated:
-            names = ", ".join(sorted(simulated))
-            raise ConfigurationError(f"--speed: the odometry of {names} fuses none; --odometry images does")
+            without = ", ".join(sorted(simulated))
+            raise ConfigurationError(f"--speed: the odometry of {without} fuses none; --odometry images does")
     return jobs
 
 
 def _sources(
-    options: argparse.Namespace, root: Path, name: str, compare: bool, configuration: Configuration
+    root: Path, name: str, asked_odometry: str, asked_detections: str, tables: bool, configuration: Configuration
 ) -> list[tuple[str, str, bool]]:
     """Odometry and detections of a sequence's jobs, and whether the ablations go with it.
 
@@ -116,11 +91,11 @@ def _sources(
     """
     camera = camera_with_images(root, name)
     boxes = (root / "det_02_rrc").is_dir()
-    detections = options.detections or ("rrc" if boxes else "network")
+    detections = asked_detections or ("rrc" if boxes else "network")
     seen = camera is not None and (detections == "network" or camera == CAMERA_OF_BOXES)
-    odometry = options.odometry or ("images" if seen and (options.detections or not boxes) else "simulate")
+    odometry = asked_odometry or ("images" if seen and (asked_detections or not boxes) else "simulate")
     out = [(odometry, detections, True)]
-    if compare and camera is not None and boxes and not options.odometry and not options.detections:
+    if tables and camera is not None and boxes and not asked_odometry and not asked_detections:
         out.append(("images", "network", False))
     for odometry, detections, _ in out:
         own = detections == "network"
@@ -134,34 +109,47 @@ def _sources(
     return out
 
 
-def _run_all(jobs: Sequence[Job], processes: int) -> list[Outcome]:
-    """Every job in a process of its own, and a line for each that is done."""
-    begun_s = time.monotonic()
+def run_jobs(jobs: Sequence[Job], processes: int, on_done: OnDone) -> list[Outcome]:
+    """Every job in a process of its own, several at once; the outcomes by sequence."""
+    begun_s, outcomes = time.monotonic(), []
+
+    def take(outcome: Outcome) -> None:
+        outcomes.append(outcome)
+        left = len(jobs) - len(outcomes)
+        to_go = time_to_go((time.monotonic() - begun_s) * left / len(outcomes)) if left else ""
+        on_done(outcome, len(outcomes), len(jobs), to_go)
+
     if processes == 1 or len(jobs) == 1:
         with Progress("front end", sum(map(frames_to_make, jobs))) as progress:
-            outcomes = []
-            for k, job in enumerate(jobs, start=1):
+            for job in jobs:
                 outcome = run_sequence(job, progress.advance)
                 progress.clear()
-                outcomes.append(_shown(outcome, k, jobs, begun_s))
-            return outcomes
-    with workers(min(processes, len(jobs))) as pool:
-        # The longest first: a long one that begins last is waited for alone
-        running = [pool.submit(run_sequence, job) for job in sorted(jobs, key=frames_to_make, reverse=True)]
-        return [_shown(done.result(), k, jobs, begun_s) for k, done in enumerate(as_completed(running), start=1)]
+                take(outcome)
+    else:
+        with workers(min(processes, len(jobs))) as pool:
+            # The longest first: a long one that begins last is waited for alone
+            running = [pool.submit(run_sequence, job) for job in sorted(jobs, key=frames_to_make, reverse=True)]
+            for done in as_completed(running):
+                take(done.result())
+    return sorted(outcomes, key=lambda o: (o.sequence, o.odometry == "images"))
 
 
-def _shown(outcome: Outcome, number: int, jobs: Sequence[Job], begun_s: float) -> Outcome:
-    left = len(jobs) - number
-    to_go = f", {time_to_go((time.monotonic() - begun_s) * left / number)} to go" if left else ""
-    print(
-        f"sequence {outcome.sequence}: {len(outcome.frames)} frames, odometry: {outcome.odometry}, done "
-        f"({number} of {len(jobs)}{to_go})",
-        file=sys.stderr,
-        flush=True,
-    )
-    return outcome
-
-
-def _write_json(path: Path, rows: Sequence[msgspec.Struct]) -> None:
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(rows), indent=2) + b"\n")
+def write_report(jobs: Sequence[Job], outcomes: Sequence[Outcome], output: Path) -> str:
+    """Writes report.md and what it is made of, as JSON and pictures; gives the report."""
+    job = jobs[0]
+    rows = [row for outcome in outcomes for row in outcome.rows]
+    variants = [row for outcome in outcomes for row in outcome.ablation]
+    ideas = [row for outcome in outcomes for row in outcome.ideas]
+    reported: list[msgspec.Struct] = [row for outcome in outcomes for row in (*outcome.ranges, *outcome.motion)]
+    write_json(output / "report.json", rows if job.methods else variants)
+    if ideas:
+        write_json(output / "ideas.json", ideas)
+    if job.methods and variants:
+        write_json(output / "ablation.json", variants)
+    if reported:
+        write_json(output / "told.json", reported)
+    longest = max(outcomes, key=lambda outcome: len(outcome.frames))
+    draw_runtime(longest.updates_ms, output / "runtime.png")
+    report = render_report(Setting(job.frames, job.methods, max(job.seeds for job in jobs)), job.published, outcomes)
+    (output / "report.md").write_text(report, encoding="utf-8")
+    return report

@@ -29,7 +29,7 @@ import zenoh
 from birdslam.queries import MapSnapshot, Trajectory
 from birdslam.runtime.configuration import FleetConfig
 from birdslam.runtime.fleet.link import open_link
-from birdslam.runtime.fleet.reading import FleetReading, Heard, VehicleSlot
+from birdslam.runtime.fleet.reading import FleetReading, Received, VehicleSlot
 from birdslam.runtime.topology import TOPICS, check_name, every_key, key_of, vehicle_and_topic
 from birdslam.runtime.transport.bus import BusClosed
 from birdslam.runtime.transport.closing import Closing
@@ -40,7 +40,7 @@ from birdslam.runtime.wire import Health, WireError, decode
 MOST_VEHICLES = 1_000  # of those that are not expected: what more says something is counted, not kept
 _SWEEPS = 4  # so often within max_age_ms it is looked who has fallen silent
 
-__all__ = ["Fleet", "FleetReading", "Heard"]
+__all__ = ["Fleet", "FleetReading", "Received"]
 
 log = logging.getLogger(__name__)
 
@@ -140,11 +140,11 @@ class Fleet(Closing):
         with self._changed:
             return frozenset(self._slots[vehicle].alive)
 
-    def heard(self, vehicle: str) -> Heard:
-        """What has come of a vehicle so far. Raises KeyError for one that nobody has heard of."""
+    def received(self, vehicle: str) -> Received:
+        """How much has been received of a vehicle so far. Raises KeyError for one that nobody has heard of."""
         with self._changed:
             slot = self._slots[vehicle]
-            return slot.heard
+            return slot.received
 
     def latest(self, vehicle: str, max_age_ms: float = 500.0) -> FleetReading:
         """The newest estimate of one vehicle so far, at once. Raises KeyError for one that nobody has heard of."""

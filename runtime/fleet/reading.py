@@ -45,8 +45,8 @@ class FleetReading:
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What has come of one vehicle since this client listens."""
+class Received:
+    """How much has been received of one vehicle since this client listens."""
 
     estimates: int
     received_bytes: int  # payloads and attachments of all its messages
@@ -72,9 +72,9 @@ class VehicleSlot:
     healths: dict[str, bytes] = field(default_factory=dict)
 
     @property
-    def heard(self) -> Heard:
-        """What has come so far."""
-        return Heard(self.estimates, self.received_bytes, self.lost, self.malformed)
+    def received(self) -> Received:
+        """Counts so far."""
+        return Received(self.estimates, self.received_bytes, self.lost, self.malformed)
 
     def receive(self, vehicle: str, sample: zenoh.Sample, t_received_ns: int) -> bool:
         """Takes an estimate in, undecoded, in place of the one before; False where it is malformed."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -57,12 +56,6 @@ class Section:
     name: str
     about: str
     keys: tuple[Key, ...]
-
-
-def print_page(options: argparse.Namespace) -> int:
-    """`birdslam configuration`: the page of every key."""
-    print(page(), end="")
-    return 0
 
 
 def page() -> str:

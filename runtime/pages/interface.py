@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import inspect
 import re
 import types
@@ -103,12 +102,6 @@ On the wire a pose `T_a_b`, that of b in a, is `[x_m, y_m, yaw_rad]`.
 
 {records}
 """
-
-
-def print_page(options: argparse.Namespace) -> int:
-    """`birdslam interface`: the page of keys, records and statuses."""
-    print(page(), end="")
-    return 0
 
 
 def page() -> str:

@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import time
@@ -227,13 +226,6 @@ def _blueprint() -> Any:
     )
 
 
-def view(options: argparse.Namespace) -> int:
-    """`birdslam view`: a recording or the running system in rerun."""
-    if options.what == "live":
-        return live(options.vehicle, options.runtime_dir, options.save, options.seconds)
-    return recorded(Recording(Path(options.what)), options.save)
-
-
 def _stream(save: Path | None) -> Any:
     """Where it goes: a file, or the viewer, which is started. Raises ConfigurationError where neither can be."""
     stream = rr.RecordingStream(APPLICATION)
@@ -247,16 +239,15 @@ def _stream(save: Path | None) -> Any:
     return stream
 
 
-def recorded(recording: Recording, save: Path | None) -> int:
-    """A whole recording."""
+def show_recording(recording: Recording, save: Path | None) -> None:
+    """Sends a whole recording to rerun's viewer, or with `save` to a file. Raises ConfigurationError."""
     stream = _stream(save)
-    show(recording, Viewer(stream))
+    send_recording(recording, Viewer(stream))
     stream.flush()
     stream.disconnect()
-    return 0
 
 
-def show(recording: Recording, viewer: Viewer) -> None:
+def send_recording(recording: Recording, viewer: Viewer) -> None:
     """Sends all of a recording."""
     if recording.camera is not None:
         viewer.camera(recording.camera)
@@ -276,14 +267,14 @@ def show(recording: Recording, viewer: Viewer) -> None:
             viewer.map(decode(message.data, MapUpdate))
 
 
-def live(vehicle: str, runtime_dir: Path | None, save: Path | None, seconds: float | None) -> int:
-    """What goes on now, until the source ends, or for some seconds; 1 where nothing came."""
+def show_live(vehicle: str, runtime_dir: Path | None, save: Path | None, seconds: float | None) -> bool:
+    """What goes on now, until the source ends, or for some seconds; gives whether anything came."""
     stream = _stream(save)
     viewer = Viewer(stream)
     with Bus(vehicle, f"view-{os.getpid()}", runtime_dir=runtime_dir) as bus:
         _ask_camera(bus, viewer)
         seen = False
-        for record in _heard(bus, FrameReader(ring_path(vehicle, runtime_dir)), seconds):
+        for record in _live_records(bus, FrameReader(ring_path(vehicle, runtime_dir)), seconds):
             if isinstance(record, bytes):
                 viewer.image(record)
             elif isinstance(record, FrameRef):
@@ -299,7 +290,7 @@ def live(vehicle: str, runtime_dir: Path | None, save: Path | None, seconds: flo
                 viewer.estimate(record)
     stream.flush()
     stream.disconnect()
-    return int(not seen)
+    return seen
 
 
 def _ask_camera(bus: Bus, viewer: Viewer) -> None:
@@ -311,7 +302,7 @@ def _ask_camera(bus: Bus, viewer: Viewer) -> None:
         return
 
 
-def _heard(bus: Bus, ring: FrameReader, seconds: float | None) -> Iterator[Any]:
+def _live_records(bus: Bus, ring: FrameReader, seconds: float | None) -> Iterator[Any]:
     estimates = bus.subscriber("estimate", QUEUE)
     others = [bus.subscriber(topic, depth) for topic, depth in (("measurements", QUEUE), ("map", QUEUE))]
     frames = bus.subscriber("frame", IMAGES)

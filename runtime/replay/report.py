@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+
 from birdslam.runtime.recording.recording import Recording
 from birdslam.runtime.replay.verdict import Verdict
 
 SHOWN_FIELDS = 12
 
 
-def told(verdict: Verdict, recording: Recording) -> str:
-    """The verdict for a person."""
+def report(verdict: Verdict, recording: Recording) -> str:
+    """The verdict for a person; where something differs, the libraries that were others then."""
     lines = [
         f"equal bit for bit: {verdict.equal} estimates ({verdict.coasted} of them coasted), {verdict.maps} map updates",
         f"epochs: {verdict.epochs}, restarts of the optimizer: {verdict.restarts}",
@@ -29,6 +31,17 @@ def told(verdict: Verdict, recording: Recording) -> str:
         lines += [f"  {where}: recorded {recorded}, replayed {replayed}" for where, recorded, replayed in shown]
         if len(difference.fields) > SHOWN_FIELDS:
             lines.append(f"  and {len(difference.fields) - SHOWN_FIELDS} more")
+        for name, version in recording.about.versions.items():
+            now = _version(name)
+            if now is not None and now != version:
+                lines.append(f"  recorded with {name} {version}, here it is {now}")
     elif not verdict.equal:
         lines.append("nothing could be compared")
     return "\n".join(lines)
+
+
+def _version(library: str) -> str | None:
+    try:
+        return importlib.metadata.version(library)
+    except importlib.metadata.PackageNotFoundError:
+        return None

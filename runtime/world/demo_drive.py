@@ -1,8 +1,7 @@
-"""`birdslam demo-drive make`: render the shipped drive and write it down."""
+"""Rendering the shipped drive anew, and writing it as `DemoRecording` reads it."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.runtime.progress import shown
+from birdslam.runtime.progress import with_progress
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.shipped_drive import COLUMNS, LABELS, Floats, write_drive
 
@@ -23,26 +22,27 @@ SAMPLES = 2  # of a pixel, across and down
 CAMERA_KEYS = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "height_m", "pitch_rad", "roll_rad")
 
 
-def make(options: argparse.Namespace) -> int:
-    """Renders every frame; progress on standard error. Raises DatasetError where the renderer is missing."""
+def make(directory: Path, frames: int | None, quality: int) -> int:
+    """Renders the first `frames` (None: all) with progress on standard error; gives how many.
+
+    `quality` is that of the WebP images, 1 to 100. Raises DatasetError for other numbers, and without the renderer.
+    """
     try:
         from birdslam.world.demo_world import CAMERA, FRAMES, RATE_HZ, demo_scenario
         from birdslam.world.scenario import drive
     except ImportError as error:
         raise DatasetError(f"rendering needs the extra `train` (pip install 'birdslam[train]'): {error}") from None
-    if not 1 <= options.quality <= 100:
-        raise DatasetError(f"--quality {options.quality}: expected 1 to 100")
-    count = FRAMES if options.frames is None else options.frames
+    if not 1 <= quality <= 100:
+        raise DatasetError(f"--quality {quality}: expected 1 to 100")
+    count = FRAMES if frames is None else frames
     if not 1 <= count <= FRAMES:
         raise DatasetError(f"--frames {count}: expected 1 to {FRAMES}")
-    frames = shown(drive(demo_scenario(), CAMERA, count, RATE_HZ, SAMPLES), "demo drive", count)
-    keep(options.output, frames, CAMERA, RATE_HZ, options.quality)
-    size = (options.output / "drive.npz").stat().st_size
-    print(f"{count} frames, {size / 1e6:.1f} MB in {options.output}")
-    return 0
+    rendered = with_progress(drive(demo_scenario(), CAMERA, count, RATE_HZ, SAMPLES), "demo drive", count)
+    write(directory, rendered, CAMERA, RATE_HZ, quality)
+    return count
 
 
-def keep(directory: Path, frames: Iterable[WorldFrame], camera: Camera, rate_hz: float, quality: int) -> None:
+def write(directory: Path, frames: Iterable[WorldFrame], camera: Camera, rate_hz: float, quality: int) -> None:
     """Write a rendered drive so that `DemoRecording` reads it; `quality` is WebP's, 1 to 100."""
     images: list[bytes] = []
     poses: list[Floats] = []

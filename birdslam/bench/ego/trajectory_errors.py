@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from birdslam.bench.ego.car_ahead import CarAhead, CarAheadReport
 from birdslam.bench.ego.consistency import Consistency, ConsistencyReport
 from birdslam.bench.ego.motion_consistency import MotionConsistencyReport, Motions
-from birdslam.outputs.drive_files import Recorder, claim_directory
+from birdslam.outputs.drive_files import Recorder, claim_directory, write_json
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.trajectory import Transform, as_poses, inverse, read_kitti
 from birdslam.types import Estimate, MapUpdate, Measurements
@@ -261,8 +261,5 @@ def evaluate_recordings(
             of_camera = inverse(T_cam0_cam) @ goal @ T_cam0_cam
             row = msgspec.structs.replace(row, ego=ego.report(of_camera), motion=motions.report(of_camera))
         report.append(msgspec.structs.replace(row, car_ahead=ahead.report()) if ahead else row)
-        encoded = msgspec.json.format(msgspec.json.encode(report), indent=2)
-        (directory / "report.json").write_bytes(
-            encoded + b"\n"
-        )  # after each, so that a long evaluation keeps what it has
+        write_json(directory / "report.json", report)  # after each: a long evaluation keeps what it has
     return report

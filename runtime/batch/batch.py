@@ -1,52 +1,51 @@
-"""`birdslam batch`: many drives, one report. Exit status 1 where a drive failed, 130 after Ctrl-C."""
+"""Many drives, each through the whole pipeline offline, and one report of all; goes on where it was stopped."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import fcntl
 import shutil
 import sys
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
-
-from birdslam.outputs.drive_files import ResultsError, claim_directory
+from birdslam.outputs.drive_files import ResultsError, claim_directory, write_json
 from birdslam.runtime.batch.drive import WORKING, Failure, done, failure_file
-from birdslam.runtime.batch.drives import Task, find_drives, sweep, tasks
+from birdslam.runtime.batch.drives import Task
 from birdslam.runtime.batch.local import Event, fitting_jobs, run_local
 from birdslam.runtime.batch.on_ray import run_ray
 from birdslam.runtime.batch.report import write_report
-from birdslam.runtime.configuration import ConfigurationError
-from birdslam.runtime.environment import INTERRUPTED_STATUS
-from birdslam.runtime.options import overrides_of
 from birdslam.runtime.progress import Progress
 
 THOUSANDTHS = 1000  # of a drive, that progress counts
 
 
-def batch(options: argparse.Namespace) -> int:
-    """The command; gives the exit status."""
-    output = Path(options.output)
-    overrides, models = overrides_of(options)
-    overrides.pop("output", None)
-    jobs = options.jobs
-    if jobs is not None and jobs < 1:
-        raise ConfigurationError(f"--jobs {jobs}: one or more")
-    todo = tasks(find_drives(options.drives), sweep(options.sweep), options.config, overrides, models)
+@dataclass(frozen=True)
+class BatchOutcome:
+    """How many drives there were, and what became of them."""
+
+    drives: int
+    failed: int
+    interrupted: int  # not ended when Ctrl-C came
+
+
+def run_batch(todo: Sequence[Task], output: Path, jobs: int | None, ray_address: str | None) -> BatchOutcome:
+    """Runs those drives that are not done, and writes the report of all.
+
+    `jobs`: drives at once, None: as many as fit; `ray_address`: of a Ray cluster, None: on this computer alone. Raises
+    ResultsError.
+    """
     with _alone(output):
         left = [task for task in todo if not done(output, task)]
-        if len(left) < len(todo):
-            print(f"{len(todo) - len(left)} of {len(todo)} drives are done already")
-        on_ray = options.engine == "ray"
         events = (
-            run_ray(left, output, jobs, options.address) if on_ray else run_local(left, output, jobs or fitting_jobs())
+            run_local(left, output, jobs or fitting_jobs())
+            if ray_address is None
+            else run_ray(left, output, jobs, ray_address)
         )
         failed, interrupted = _run(left, output, events)
         write_report(todo, output)
-    print(f"{len(todo) - failed - interrupted} of {len(todo)} drives: {output / 'report.html'}")
-    return INTERRUPTED_STATUS if interrupted else int(failed > 0)
+    return BatchOutcome(len(todo), failed, interrupted)
 
 
 @contextlib.contextmanager
@@ -76,7 +75,7 @@ def _run(left: list[Task], output: Path, events: Generator[Event]) -> tuple[int,
                         shares.pop(event.task.name)
                     if event.failure is not None:
                         failed += 1
-                        _keep(output, event.failure)
+                        _write_failure(output, event.failure)
                         progress.clear()
                         print(f"{event.failure.drive}: {event.failure.error}", file=sys.stderr)
                     progress.reach(round((ended + sum(shares.values())) * THOUSANDTHS))
@@ -85,10 +84,10 @@ def _run(left: list[Task], output: Path, events: Generator[Event]) -> tuple[int,
     return failed, 0
 
 
-def _keep(output: Path, failure: Failure) -> None:
+def _write_failure(output: Path, failure: Failure) -> None:
     file = failure_file(output, failure.drive)
     try:
         file.parent.mkdir(exist_ok=True)
-        file.write_bytes(msgspec.json.format(msgspec.json.encode(failure), indent=2) + b"\n")
+        write_json(file, failure)
     except OSError as error:
         raise ResultsError(f"{file}: {error.strerror}") from None

@@ -1,8 +1,7 @@
-"""`birdslam deploy`: what installs the service, out of the package: deploy/install.sh needs no checkout."""
+"""What installs the service on a vehicle computer, out of the package: deploy/install.sh needs no checkout."""
 
 from __future__ import annotations
 
-import argparse
 import shutil
 from importlib.metadata import version
 from pathlib import Path
@@ -14,9 +13,8 @@ PARTS = ("deploy", "configs/vehicle.toml")
 PACKAGE = "package"  # what install.sh hands to pip
 
 
-def deploy(options: argparse.Namespace) -> int:
-    """Writes the folder; gives the exit status."""
-    target: Path = options.directory
+def write_deployment(target: Path) -> Path:
+    """Writes the new folder `target`; gives its folder `deploy`. Raises ConfigurationError."""
     if target.exists():
         raise ConfigurationError(f"{target}: is there already")
     source = Path(birdslam.__file__).parent
@@ -30,5 +28,4 @@ def deploy(options: argparse.Namespace) -> int:
         (target / PACKAGE).write_text(f"birdslam=={version('birdslam')}\n", encoding="utf-8")
     except OSError as error:
         raise ConfigurationError(f"{error.filename or target}: {error.strerror}") from None
-    print(f"as root: {target / 'deploy' / 'install.sh'}; {target / 'deploy' / 'README.md'} says more")
-    return 0
+    return target / "deploy"

@@ -1,10 +1,9 @@
-"""`birdslam calibrate`: a camera file from a drive."""
+"""A camera file from a drive: intrinsics read or measured, pitch and roll estimated, the height checked."""
 
 from __future__ import annotations
 
-import argparse
-import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -18,11 +17,10 @@ from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.ros.bag import BagTopics
-from birdslam.runtime.configuration import FILE_SCHEMES, ConfigurationError
+from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
-from birdslam.runtime.options import configuration_of
-from birdslam.runtime.progress import shown
+from birdslam.runtime.progress import with_progress
 from birdslam.sources.camera_file import camera_text, load_camera
 from birdslam.sources.opening import frame_size, open_recording
 from birdslam.sources.recording import DatasetError, Recording
@@ -34,16 +32,33 @@ MAX_SIGMA_HEIGHT_REL = 0.1
 AGREES_SIGMA = 2.0
 
 
-def calibrate_camera(options: argparse.Namespace) -> int:
-    """Writes the camera file, prints what it rests on; gives the exit status."""
-    configuration = configuration_of(options)
-    uri = options.source if options.source.partition(":")[0] in FILE_SCHEMES else f"kitti:{options.source}"
+@dataclass(frozen=True)
+class Given:
+    """What is known of the camera beside the drive: intrinsics from at most one of the first three, and lengths."""
+
+    camera: Path | None = None  # an older camera file
+    intrinsics: Path | None = None  # KITTI's calib.txt, or ROS or OpenCV YAML
+    chessboard: Path | None = None  # a directory of images
+    board: tuple[int, int] = (9, 6)  # the chessboard's inner corners: columns, rows
+    square_m: float = 0.025
+    height_m: float | None = None
+    speed: Path | None = None  # lines of time in s, speed in m/s
+
+
+def calibrate_drive(
+    configuration: Configuration, source: str, given: Given, stride: int = 1
+) -> tuple[Camera, list[str]]:
+    """The camera, and what it rests on, a line each. `source`: a KITTI directory or a source's URI.
+
+    Raises CalibrationError, ConfigurationError, DatasetError.
+    """
+    uri = source if source.partition(":")[0] in FILE_SCHEMES else f"kitti:{source}"
     topics = configuration.source.topics
-    lens, height_m = _lens(options, uri, topics)
+    lens, height_m = _lens(given, uri, topics)
     size = frame_size(uri, topics)
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
-    recording = _open(uri, lens, height_m, options, topics)
+    recording = _open(uri, lens, height_m, stride, topics)
     known_height = height_m is not None or lens is None  # KITTI's own cameras stand where sources/kitti.py says
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     rate_max = msgspec.structs.replace(configuration.source, rate="max")
@@ -52,43 +67,40 @@ def calibrate_camera(options: argparse.Namespace) -> int:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
             frames = offline_frames(RecordedSource(recording, configuration.source))
-            for frame in shown(frames, "calibrate", len(recording) or None):
+            for frame in with_progress(frames, "calibrate", len(recording) or None):
                 yield frame, inference.start(frame)
 
         try:
             found = calibrate(
-                drive, recording.camera, configuration.slam.frontend, CalibrationConfig(), _lengths(recording, options)
+                drive,
+                recording.camera,
+                configuration.slam.frontend,
+                CalibrationConfig(),
+                _lengths(recording, given.speed),
             )
         except CalibrationError as error:
             raise CalibrationError(f"{uri}: {error}") from None
     camera, chosen = _with_height(found, known_height, uri)
-    report = [*_report(found, camera, chosen, uri, lens)]
-    _write(Path(options.output), camera, report)
-    print("\n".join(report))
-    print(f"camera file: {options.output}")
-    return 0
+    return camera, [*_report(found, camera, chosen, uri, lens)]
 
 
 # --- what is given ---
 
 
-def _lens(options: argparse.Namespace, uri: str, topics: BagTopics) -> tuple[Intrinsics | None, float | None]:
+def _lens(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | None, float | None]:
     """Intrinsics from elsewhere than the recording, and the height that the user states."""
-    height_m = options.height
+    height_m = given.height_m
     if height_m is not None and not 0.2 < height_m < 5.0:
         raise ConfigurationError(f"--height {height_m:g}: is no height of a camera over the road (0.2 to 5 m)")
-    if options.camera is not None:
-        old = load_camera(Path(options.camera))
+    if given.camera is not None:
+        old = load_camera(given.camera)
         numbers = {name: getattr(old, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "fisheye")}
-        lens = Intrinsics(**numbers, width_px=old.width_px, height_px=old.height_px, source=options.camera)
+        lens = Intrinsics(**numbers, width_px=old.width_px, height_px=old.height_px, source=str(given.camera))
         return lens, height_m or old.height_m
-    if options.intrinsics is not None:
-        return read_intrinsics(options.intrinsics), height_m
-    if options.chessboard is not None:
-        board = re.fullmatch(r"(\d+)x(\d+)", options.board)
-        if board is None:
-            raise ConfigurationError(f"--board {options.board}: expected COLSxROWS, as 9x6")
-        return from_chessboard(options.chessboard, int(board[1]), int(board[2]), options.square_mm / 1000.0), height_m
+    if given.intrinsics is not None:
+        return read_intrinsics(given.intrinsics), height_m
+    if given.chessboard is not None:
+        return from_chessboard(given.chessboard, *given.board, given.square_m), height_m
     scheme, _, path = uri.partition(":")
     if scheme == "rosbag":  # its CameraInfo has no height, and /tf_static may lack it: one that has both is not needed
         from birdslam.sources.rosbag import read_bag_camera
@@ -99,10 +111,7 @@ def _lens(options: argparse.Namespace, uri: str, topics: BagTopics) -> tuple[Int
     return None, height_m
 
 
-def _open(
-    uri: str, lens: Intrinsics | None, height_m: float | None, options: argparse.Namespace, topics: BagTopics
-) -> Recording:
-    stride = options.stride or 1
+def _open(uri: str, lens: Intrinsics | None, height_m: float | None, stride: int, topics: BagTopics) -> Recording:
     if lens is None:
         recording = open_recording(uri, stride=stride)
         if height_m is not None:
@@ -131,7 +140,7 @@ def _open(
     return open_recording(uri, camera, stride, topics=topics)
 
 
-def _lengths(recording: Recording, options: argparse.Namespace) -> dict[str, KnownLength]:
+def _lengths(recording: Recording, speed_file: Path | None) -> dict[str, KnownLength]:
     """What else knows the way between two frames: the recording's poses, a speed file."""
     out: dict[str, KnownLength] = {}
     truth = recording.truth_poses()
@@ -142,8 +151,8 @@ def _lengths(recording: Recording, options: argparse.Namespace) -> dict[str, Kno
             return float(np.linalg.norm(np.diff(at[start : end + 1], axis=0), axis=1).sum())
 
         out["poses"] = by_poses
-    if options.known_speed is not None:
-        t_s, speed_mps = read_speed_curve(options.known_speed).T
+    if speed_file is not None:
+        t_s, speed_mps = read_speed_curve(speed_file).T
         way_m = np.concatenate([[0.0], np.cumsum(np.diff(t_s) * 0.5 * (speed_mps[1:] + speed_mps[:-1]))])
 
         def by_speed(start: int, end: int, start_ns: int, end_ns: int) -> float | None:
@@ -154,7 +163,7 @@ def _lengths(recording: Recording, options: argparse.Namespace) -> dict[str, Kno
         first, last = recording_span_s(recording)
         if t_s[-1] < first or t_s[0] > last:
             raise DatasetError(
-                f"{options.known_speed}: its times {t_s[0]:g} to {t_s[-1]:g} s lie outside the recording's, "
+                f"{speed_file}: its times {t_s[0]:g} to {t_s[-1]:g} s lie outside the recording's, "
                 f"{first:g} to {last:g} s"
             )
         out["speed"] = by_speed
@@ -219,7 +228,8 @@ def _report(
         yield "  not checked: neither poses nor a speed nor enough vehicles were there"
 
 
-def _write(path: Path, camera: Camera, report: list[str]) -> None:
+def write_camera_file(path: Path, camera: Camera, report: Sequence[str]) -> None:
+    """Writes the camera, with the report as comment. Raises ResultsError."""
     text = camera_text(camera, ("A camera file of BirdSLAM, by `birdslam calibrate`", *report))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,19 +1,23 @@
-"""`birdslam top`: the nodes of a running vehicle as a table, from what they say of themselves once a second.
+"""`birdslam top`: the nodes of a running vehicle as a table, or all vehicles of a fleet, once a second.
 
 On a terminal it is refreshed in place; elsewhere (a pipe, a dumb terminal) a table follows the other.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
 import msgspec
 
-from birdslam.runtime.configuration import BudgetsConfig
+from birdslam.runtime.cli.arguments import add_fleet, add_vehicle
+from birdslam.runtime.configuration import BudgetsConfig, load
+from birdslam.runtime.fleet.listener import Fleet, FleetReading, Received
 from birdslam.runtime.topology import NODES, PROCESSES
 from birdslam.runtime.transport.bus import Bus, BusError, Message, Subscriber
 from birdslam.runtime.wire import Health
@@ -21,16 +25,35 @@ from birdslam.types import Estimate
 
 PERIOD_S = 1.0
 STALE_PERIODS = 3.0  # a health as old as that says nothing of now
+FLEET_MAX_AGE_MS = 1000.0  # of an estimate that counts as on time: what a watching person needs
 CLEAR = "\x1b[H\x1b[2J"
 COLUMNS = (
     *(("node", 10), ("state", 9), ("mode", 9), ("Hz", 6)),
     *(("wait p50/p99", 14), ("step p50/p99", 14), ("budget", 7), ("age p50/p99/max ms", 20)),
     *(("over", 6), ("late", 6), ("drop", 6), ("torn", 5), ("again", 6), ("cpu %", 6), ("MB", 6)),
 )
+FLEET_COLUMNS = (
+    *(("vehicle", 17), ("state", 8), ("valid", 7), ("Hz", 6), ("age ms", 8), ("heard s ago", 12)),
+    *(("lost", 7), ("kB/s", 7), ("frame", 9), ("epoch", 6), ("tracks", 7), ("status", 8)),
+)
 
 
-class Watch:
-    """What can be known of a vehicle from outside."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """One vehicle, or all of a fleet."""
+    add_vehicle(parser)
+    add_fleet(parser)
+    parser.add_argument("--once", action="store_true", help="one table, and end; 1 where no node is there")
+
+
+def run(options: argparse.Namespace) -> int:
+    """The table of a vehicle's nodes, or of a fleet's vehicles."""
+    if options.all is None:
+        return top(options.vehicle, options.runtime_dir, options.once)
+    return top_all(options.all, options.once)
+
+
+class VehicleTable:
+    """The nodes of a vehicle, by their health records, and its newest estimate."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -62,7 +85,7 @@ class Watch:
         """Everything, as lines."""
         if self._budgets is None:
             self._budgets = _budgets(self._bus)
-        head = _line_of(tuple(title for title, _ in COLUMNS))
+        head = _line_of([title for title, _ in COLUMNS], COLUMNS)
         rows = [self._row(name, now_ns) for name in PROCESSES if name in NODES or self._healths[name].newest]
         causes = [
             f"{name} was begun anew {health.restarts} times, at last since it {health.cause}"
@@ -78,7 +101,7 @@ class Watch:
     def _row(self, name: str, now_ns: int) -> str:
         alive, health = name in self._bus.alive, self._health(name)
         if health is None:
-            return _line_of((name, _state(alive, stale=True)))
+            return _line_of((name, _state(alive, stale=True)), COLUMNS)
         stale = now_ns - health.t_ns > STALE_PERIODS * PERIOD_S * 1e9
         budget = "" if self._budgets is None or name not in NODES else f"{self._budgets.step_ms(name):g}"
         cells = (
@@ -88,7 +111,7 @@ class Watch:
             *(str(n) for n in (health.overruns, health.late, health.dropped, health.torn, health.restarts)),
             *(f"{health.cpu_percent:.0f}", f"{health.rss_bytes / 2**20:.0f}"),
         )
-        return _line_of(cells)
+        return _line_of(cells, COLUMNS)
 
     def _car(self) -> list[str]:
         """What the car has said of its speed, where it says anything."""
@@ -127,8 +150,8 @@ def _pair(p50_ms: float, p99_ms: float) -> str:
     return f"{p50_ms:.1f} / {p99_ms:.1f}"
 
 
-def _line_of(cells: tuple[str, ...]) -> str:
-    return "".join(f"{text:<{width - 1}} " for text, (_, width) in zip(cells, COLUMNS, strict=False)).rstrip()
+def _line_of(cells: Sequence[str], columns: Sequence[tuple[str, int]]) -> str:
+    return "".join(f"{text:<{width - 1}} " for text, (_, width) in zip(cells, columns, strict=False)).rstrip()
 
 
 def _budgets(bus: Bus) -> BudgetsConfig | None:
@@ -142,16 +165,72 @@ def _budgets(bus: Bus) -> BudgetsConfig | None:
     return None
 
 
-def top(vehicle: str, runtime_dir: Path | None, once: bool, out: TextIO = sys.stdout) -> int:
-    """A table once a second, until Ctrl-C; with `once` a single one, and 1 where there is no node."""
+class FleetTable:
+    """The table of all vehicles, with rates since the table before."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._fleet = fleet
+        self._before: dict[str, Received] = {}
+        self._before_s = time.monotonic()
+
+    def table(self) -> str:
+        """Everything, as lines."""
+        now_s = time.monotonic()
+        took_s, self._before_s = max(now_s - self._before_s, 1e-3), now_s
+        readings = self._fleet.readings(FLEET_MAX_AGE_MS)
+        rows = [self._row(reading, took_s) for reading in readings]
+        alive, usable = sum(r.alive for r in readings), sum(r.usable for r in readings)
+        router = "" if self._fleet.connected else "  THE ROUTER IS GONE"
+        head = f"{len(readings)} vehicles: {alive} alive, {usable} alive, on time and valid{router}"
+        return "\n".join([head, _line_of([title for title, _ in FLEET_COLUMNS], FLEET_COLUMNS), *rows])
+
+    def _row(self, reading: FleetReading, took_s: float) -> str:
+        received, estimate = self._fleet.received(reading.vehicle), reading.estimate
+        before = self._before.get(reading.vehicle, Received(0, 0, 0, 0))
+        self._before[reading.vehicle] = received
+        ago = f"{reading.silent_ms / 1e3:.1f}" if estimate else ""
+        cells: tuple[str, ...] = (
+            *(reading.vehicle, _fleet_state(reading), "" if estimate is None else "yes" if reading.valid else "NO"),
+            f"{(received.estimates - before.estimates) / took_s:.1f}",
+            *(f"{reading.age_ms:.0f}" if estimate else "", ago),
+            *(str(reading.lost), f"{(received.received_bytes - before.received_bytes) / took_s / 1e3:.1f}"),
+        )
+        if estimate is not None:
+            cells += (str(estimate.frame_id), str(estimate.epoch), str(len(estimate.vehicles)))
+            cells += (" ".join(estimate.status),)
+        return _line_of(cells, FLEET_COLUMNS)
+
+
+def _fleet_state(reading: FleetReading) -> str:
+    if not reading.alive:
+        return "GONE" if reading.estimate else "UNHEARD"
+    return "alive" if reading.on_time else "LATE" if reading.estimate else "SILENT"
+
+
+def refresh(table: Callable[[], str], pause: Callable[[], object], once: bool, out: TextIO) -> None:
+    """Writes the table again after each pause, until Ctrl-C; with `once` a single time."""
     in_place = out.isatty() and os.environ.get("TERM", "dumb") != "dumb" and not once
+    while True:
+        text = table()
+        out.write(f"{CLEAR}{text}\n" if in_place else f"{text}\n")
+        out.flush()
+        if once:
+            return
+        pause()
+
+
+def top(vehicle: str, runtime_dir: Path | None, once: bool, out: TextIO = sys.stdout) -> int:
+    """A table of a vehicle's nodes once a second; with `once` a single one, and 1 where there is no node."""
     with Bus(vehicle, f"top-{os.getpid()}", runtime_dir=runtime_dir) as bus:
-        watch = Watch(bus)
-        watch.wait(PERIOD_S)
-        while True:
-            text = watch.table(time.monotonic_ns())
-            out.write(f"{CLEAR}{text}\n" if in_place else f"{text}\n")
-            out.flush()
-            if once:
-                return int(not watch.anybody)
-            watch.pause(PERIOD_S)
+        nodes = VehicleTable(bus)
+        nodes.wait(PERIOD_S)
+        refresh(lambda: nodes.table(time.monotonic_ns()), lambda: nodes.pause(PERIOD_S), once, out)
+        return int(not nodes.anybody)
+
+
+def top_all(config: Path, once: bool, out: TextIO = sys.stdout) -> int:
+    """A table of all vehicles once a second; with `once` a single one, and 1 where none is alive."""
+    with Fleet(load(config).fleet) as fleet:
+        time.sleep(PERIOD_S)  # rates are of this second
+        refresh(FleetTable(fleet).table, lambda: time.sleep(PERIOD_S), once, out)
+        return int(not any(reading.alive for reading in fleet.readings()))

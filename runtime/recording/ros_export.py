@@ -1,36 +1,27 @@
-"""`birdslam export`: a recording in the formats of others."""
+"""A recording as a ROS 2 bag."""
 
 from __future__ import annotations
 
-import argparse
+from pathlib import Path
 
-from birdslam.ros.bag_writer import BagWriter
+from birdslam.ros.bag_writer import BagWriter, Storage
 from birdslam.ros.messages import RosMessages, t_of
 from birdslam.runtime.configuration import FILE_SCHEMES, SourceConfig
-from birdslam.runtime.progress import Progress
 from birdslam.runtime.recording.recorded_drive import recorded_drive
 from birdslam.runtime.recording.recording import Recording, RecordingError
 from birdslam.types import EgoEdge, Estimate, MapUpdate
 
 
-def export(options: argparse.Namespace) -> int:
-    """A recording as a ROS 2 bag; gives the exit status."""
-    size = options.recording.stat().st_size if options.recording.is_file() else None
-    with Progress("export", size, "MB", 1e6) as progress:
-        recording = Recording(options.recording, progress.reach)
-        frames = _write(recording, options)
-    print(f"{frames} frames of {options.recording} as a ROS 2 bag: {options.ros2}")
-    if not recording.complete:
-        print(f"{options.recording} was cut off: this is what it holds")
-    return 0
+def write_bag(recording: Recording, directory: Path, storage: Storage) -> int:
+    """Writes the bag into a new directory, stored as "mcap" or "sqlite3"; gives how many frames it has.
 
-
-def _write(recording: Recording, options: argparse.Namespace) -> int:
+    Raises BagError, and RecordingError for a recording without a camera or an estimate.
+    """
     if recording.camera is None:
         raise RecordingError(f"{recording.path}: has no camera")
     live = recording.part("source", SourceConfig).uri.partition(":")[0] not in FILE_SCHEMES
     frames, t_ns = 0, 0
-    with BagWriter(options.ros2, options.storage) as bag:
+    with BagWriter(directory, storage) as bag:
         vehicle = str(recording.about.configuration.get("vehicle", ""))
         messages = RosMessages(bag.make, recording.camera, vehicle, keeps_way=True)
         motion: EgoEdge | None = None

@@ -1,0 +1,46 @@
+"""`birdslam batch`: many drives, one report. Exit status 1 where a drive failed, 130 after Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from birdslam.runtime.batch.batch import run_batch
+from birdslam.runtime.batch.drive import done
+from birdslam.runtime.batch.drives import find_drives, sweep, tasks
+from birdslam.runtime.cli.arguments import add_config, add_pipeline, add_topics
+from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.environment import INTERRUPTED_STATUS
+from birdslam.runtime.options import overrides_of
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The drives, where they run, and the pipeline of each."""
+    text = "a source, a KITTI directory, a bag, a recording, a video; a directory with such; a text file of them"
+    parser.add_argument("drives", nargs="+", metavar="DRIVE", help=text)
+    parser.add_argument("--jobs", type=int, metavar="N", help="drives at once (as many as fit this computer)")
+    text = "ray: on a cluster (pip install birdslam[ray]); the output folder is on storage that all nodes share"
+    parser.add_argument("--engine", choices=("local", "ray"), default="local", help=text)
+    text = "of the Ray cluster (auto: the one of this computer)"
+    parser.add_argument("--address", default="auto", metavar="HOST:PORT", help=text)
+    text = "every drive with each of these settings; may be repeated: every combination"
+    parser.add_argument("--sweep", action="append", default=[], metavar="KEY=V1,V2", help=text)
+    add_config(parser)
+    add_topics(parser, "speed", "truth")
+    add_pipeline(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs what is not done yet, and says where the report is."""
+    output = Path(options.output)
+    overrides, models = overrides_of(options)
+    overrides.pop("output", None)
+    if options.jobs is not None and options.jobs < 1:
+        raise ConfigurationError(f"--jobs {options.jobs}: one or more")
+    todo = tasks(find_drives(options.drives), sweep(options.sweep), options.config, overrides, models)
+    if before := sum(done(output, task) for task in todo):
+        print(f"{before} of {len(todo)} drives are done already")
+    outcome = run_batch(todo, output, options.jobs, options.address if options.engine == "ray" else None)
+    ended = outcome.drives - outcome.failed - outcome.interrupted
+    print(f"{ended} of {outcome.drives} drives: {output / 'report.html'}")
+    return INTERRUPTED_STATUS if outcome.interrupted else int(outcome.failed > 0)

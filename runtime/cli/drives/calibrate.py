@@ -1,0 +1,53 @@
+"""`birdslam calibrate`: a camera file from a drive."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+from birdslam.runtime.calibration import Given, calibrate_drive, write_camera_file
+from birdslam.runtime.cli.arguments import add_config, add_settings, add_topics
+from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.options import configuration_of
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The drive, and what is known of its camera."""
+    parser.add_argument("source", metavar="SOURCE", help="a KITTI directory, or kitti:DIR, video:FILE, rosbag:PATH")
+    parser.add_argument("--output", required=True, metavar="CAMERA.toml", help="the camera file to write")
+    lens = parser.add_mutually_exclusive_group()
+    lens.add_argument("--camera", metavar="FILE", help="an older camera file: its intrinsics and height")
+    lens.add_argument("--intrinsics", type=Path, metavar="FILE", help="KITTI's calib.txt, or ROS or OpenCV YAML")
+    lens.add_argument("--chessboard", type=Path, metavar="DIR", help="images of a chessboard")
+    parser.add_argument("--board", default="9x6", metavar="COLSxROWS", help="its inner corners (default 9x6)")
+    parser.add_argument("--square-mm", type=float, default=25.0, metavar="MM", help="a square's side (default 25)")
+    parser.add_argument("--height", type=float, metavar="M", help="the camera's height over the road, as measured")
+    text = "lines of time in s, speed in m/s"
+    parser.add_argument("--speed", dest="known_speed", type=Path, metavar="FILE", help=text)
+    add_topics(parser)
+    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="networks: vehicles and road")
+    parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame")
+    add_config(parser)
+    add_settings(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Writes the camera file, prints what it rests on."""
+    board = re.fullmatch(r"(\d+)x(\d+)", options.board)
+    if board is None:
+        raise ConfigurationError(f"--board {options.board}: expected COLSxROWS, as 9x6")
+    given = Given(
+        camera=None if options.camera is None else Path(options.camera),
+        intrinsics=options.intrinsics,
+        chessboard=options.chessboard,
+        board=(int(board[1]), int(board[2])),
+        square_m=options.square_mm / 1000.0,
+        height_m=options.height,
+        speed=options.known_speed,
+    )
+    camera, report = calibrate_drive(configuration_of(options), options.source, given, options.stride or 1)
+    write_camera_file(Path(options.output), camera, report)
+    print("\n".join(report))
+    print(f"camera file: {options.output}")
+    return 0

@@ -1,0 +1,23 @@
+"""`birdslam demo-drive make`: the shipped drive, rendered anew."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from birdslam.runtime.world.demo_drive import make
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Where it goes, how much of it, and how good its images are."""
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="for drive.npz and camera.toml")
+    parser.add_argument("--frames", type=int, metavar="N", help="end after N frames")
+    parser.add_argument("--quality", type=int, default=32, metavar="1-100", help="of its WebP images (32)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Renders it; says how large it is."""
+    count = make(options.output, options.frames, options.quality)
+    size = (options.output / "drive.npz").stat().st_size
+    print(f"{count} frames, {size / 1e6:.1f} MB in {options.output}")
+    return 0

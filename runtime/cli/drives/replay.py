@@ -1,0 +1,45 @@
+"""`birdslam replay`: a recording through the back end again, to be compared or with other results."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from birdslam.runtime.cli.arguments import RECORDING, add_final_results, add_settings
+from birdslam.runtime.configuration import parse_setting
+from birdslam.runtime.progress import file_progress
+from birdslam.runtime.recording.recording import Recording
+from birdslam.runtime.replay.replay import back_end, compare
+from birdslam.runtime.replay.report import report
+from birdslam.runtime.replay.results import changed_back_end, write_g2o, write_results
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The recording, and what is made of it; nothing: a comparison."""
+    parser.add_argument("recording", type=Path, metavar=RECORDING)
+    text = "with another back end (slam.graph.*, slam.weights.*): nothing is compared, results are written"
+    add_settings(parser, text)
+    parser.add_argument("--output", type=Path, metavar="DIR", help="where results go; with it they are always written")
+    add_final_results(parser)
+    parser.add_argument("--g2o", type=Path, metavar="FILE.g2o", help="write the graph's edges for other solvers, alone")
+
+
+def run(options: argparse.Namespace) -> int:
+    """0 where the back end gives the recorded estimates, 1 where not; or new results."""
+    with file_progress("replay", options.recording) as progress:
+        recording = Recording(options.recording, progress.reach)
+        if options.g2o or options.set or options.output or options.smooth or options.video:
+            config = changed_back_end(back_end(recording), dict(parse_setting(text) for text in options.set))
+            if options.g2o:
+                write_g2o(recording, config, options.g2o)
+                text, status = f"graph in {options.g2o}", 0
+            else:
+                output = options.output or Path("out") / recording.path.stem
+                video = Path(options.video) if options.video else None
+                write_results(recording, config, output, bool(options.smooth), video)
+                text, status = f"results in {output}{f', video {video}' if video else ''}", 0
+        else:
+            verdict = compare(recording)
+            text, status = report(verdict, recording), int(not verdict.same)
+    print(text)
+    return status

@@ -1,0 +1,27 @@
+"""What a user can mend: each of these is one line on standard error, and exit status 2."""
+
+from birdslam.calibration.calibration import CalibrationError
+from birdslam.outputs.drive_files import ResultsError
+from birdslam.perception import ModelError
+from birdslam.ros.bag import BagError
+from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.models.download import DownloadError
+from birdslam.runtime.nodes.sources import SourceError
+from birdslam.runtime.recording.recording import RecordingError
+from birdslam.runtime.transport.bus import BusError
+from birdslam.runtime.transport.presence import VehicleBusy
+from birdslam.sources.recording import DatasetError
+
+USER_ERRORS = (
+    BagError,
+    BusError,
+    CalibrationError,
+    ConfigurationError,
+    DatasetError,
+    DownloadError,
+    ModelError,
+    RecordingError,
+    ResultsError,
+    SourceError,
+    VehicleBusy,
+)

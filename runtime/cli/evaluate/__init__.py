@@ -1,0 +1,1 @@
+"""Commands that compare with ground truth: `birdslam evaluate WHAT`."""

@@ -1,0 +1,76 @@
+"""`birdslam evaluate localisation`: where the front end puts the labelled cars of KITTI tracking."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from birdslam.bench.tracking.leave_one_out import LeftOut
+from birdslam.bench.tracking.localisation import PAPER, LocalisationRow
+from birdslam.outputs.drive_files import claim_directory, write_json
+from birdslam.runtime.cli.arguments import add_config, add_settings, add_tracking_root
+from birdslam.runtime.evaluation.localisation import evaluate_left_out, evaluate_localisation, read_sweep, sequences_of
+from birdslam.runtime.options import configuration_of
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Sequences, boxes, and how they are placed."""
+    add_tracking_root(parser)
+    parser.add_argument("--detections", default="rrc", metavar="rrc|DIR", help="DIR: as det_02_rrc")
+    parser.add_argument("--mode", choices=("default", "paper"), default="default", help="paper: Eq. 1 on level ground")
+    text = "how each sequence fares by a constant that the others chose of these values; may be repeated"
+    parser.add_argument("--leave-one-out", action="append", default=[], metavar="KEY=V1,V2", help=text)
+    add_config(parser)
+    add_settings(parser)
+    parser.add_argument("--output", required=True, metavar="DIR", help="where the report goes")
+    parser.set_defaults(model=[])
+
+
+def run(options: argparse.Namespace) -> int:
+    """Writes report.json, or leave_one_out.json, and prints a table of it."""
+    configuration = configuration_of(options)
+    config = configuration.slam.frontend
+    output = Path(options.output)
+    sweeps = [read_sweep(text, configuration) for text in options.leave_one_out]
+    claim_directory(output)
+    names = sequences_of(options.root, options.sequences)
+    if sweeps:
+        left = evaluate_left_out(options.root, names, options.detections, config, sweeps)
+        write_json(output / "leave_one_out.json", left)
+        print(_table_of_left_out(left))
+    else:
+        rows = evaluate_localisation(
+            options.root, names, options.detections, PAPER if options.mode == "paper" else config
+        )
+        write_json(output / "report.json", rows)
+        print(_table(rows))
+    print(f"results in {output}")
+    return 0
+
+
+def _table_of_left_out(rows: Sequence[LeftOut]) -> str:
+    titles = f"{'as it is':>10}{'chosen':>10}{'score':>9}{'chosen':>9}{'depth':>9}{'chosen':>9}"
+    lines = (
+        f"{row.sequence:10}{row.as_it_is:>10}{row.chosen:>10}{row.score_as_it_is:9.3f}{row.score_chosen:9.3f}"
+        f"{row.depth_error_as_it_is_rel:9.1%}{row.depth_error_chosen_rel:9.1%}  {row.key}"
+        for row in rows
+    )
+    return "\n".join([f"{'sequence':10}{titles}  constant", *lines])
+
+
+def _table(rows: Sequence[LocalisationRow]) -> str:
+    lines = [
+        f"{'sequence':10}{'range m':>9}{'n':>7}{'depth':>9}{'bias':>9}{'across m':>10}{'1 sigma':>9}{'2 sigma':>9}"
+    ]
+    for row in rows:
+        cells = (
+            (row.depth_error_median_rel, "9.1%"),
+            (row.depth_bias_median_rel, "+9.1%"),
+            (row.lateral_error_median_m, "10.2f"),
+            (row.inside_1_sigma, "9.0%"),
+            (row.inside_2_sigma, "9.0%"),
+        )
+        numbers = "".join(format(value, form) for value, form in cells if value is not None)
+        lines.append(f"{row.sequence:10}{row.range:>9}{row.n:>7}{numbers}")
+    return "\n".join(lines)

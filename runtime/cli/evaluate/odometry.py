@@ -1,0 +1,103 @@
+"""`birdslam evaluate odometry` and `evaluate car-ahead`: the whole method in one process, against poses and LiDAR."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any, cast
+
+from birdslam.bench.ego.trajectory_errors import OdometryReport
+from birdslam.runtime.cli.arguments import add_config, add_other_odometry, add_pipeline, add_speeds, add_topics
+from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.evaluation.odometry import evaluate_odometry
+from birdslam.runtime.options import configuration_of
+from birdslam.runtime.supervision.run import WITHOUT_MODELS
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Sequences, the frames that count, and the pipeline."""
+    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE_DIR", help="a KITTI directory, or a source's URI")
+    add_config(parser)
+    parser.add_argument("--frames", default=":", metavar="FIRST:END", help="compare these alone; all are driven")
+    add_speeds(parser)
+    add_other_odometry(parser, "FILE|DIR")
+    add_topics(parser, "speed", "truth")
+    add_pipeline(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Trajectories against the truth: a table."""
+    print(_table(_evaluate(options)))
+    return 0
+
+
+def run_car_ahead(options: argparse.Namespace) -> int:
+    """The distance to the car ahead against the recording's LiDAR: a line for each sequence."""
+    for report in _evaluate(options):
+        ahead = report.car_ahead
+        if ahead is None:
+            raise ConfigurationError(f"{report.sequence}: has no LiDAR (lidar_cam0 beside its images) to compare with")
+        if ahead.error_median_rel is None or ahead.error_p90_rel is None or ahead.bias_median_rel is None:
+            print(f"{report.sequence}: no car ahead in {report.frames} frames")
+        else:
+            print(
+                f"{report.sequence}: {ahead.frames} frames with a car ahead, error of its distance: "
+                f"median {ahead.error_median_rel:.1%}, 90 % within {ahead.error_p90_rel:.1%}, "
+                f"bias {ahead.bias_median_rel:+.1%}"
+            )
+    return 0
+
+
+def _evaluate(options: argparse.Namespace) -> list[OdometryReport]:
+    configuration = configuration_of(options)
+    compared = _frames(options.frames)
+    if not configuration.models.in_use():
+        print(WITHOUT_MODELS)
+    reports = evaluate_odometry(configuration, options.sequences, compared)
+    print(f"results in {configuration.output}")
+    return reports
+
+
+def _frames(text: str) -> slice:
+    """FIRST:END, of which either may be missing."""
+    first, colon, end = text.partition(":")
+    if not colon or not all(part.isdecimal() for part in (first, end) if part):
+        raise ConfigurationError(f"--frames {text}: expected FIRST:END, such as 14: or 14:120")
+    return slice(int(first) if first else None, int(end) if end else None)
+
+
+def _table(reports: Sequence[OdometryReport]) -> str:
+    columns = (
+        ("frames", "frames", 0),
+        ("path m", "path_m", 1),
+        ("ATE m", "ate_m", 3),
+        ("ATE %", "ate_pct", 2),
+        ("ATE se3 m", "ate_se3_m", 3),
+        ("ATE sim3 m", "ate_sim3_m", 3),
+        ("scale error", "scale_error", 4),
+        ("RPE m", "rpe_t_m", 4),
+        ("RPE deg", "rpe_r_deg", 4),
+        ("segments %", "segment_t_pct", 2),
+        ("standing m", "standing_drift_m", 3),
+        ("NEES", "ego.nees", 2),
+        ("inside 95 %", "ego.inside_95", 2),
+        ("motion NEES", "motion.frames.nees", 2),
+        ("its median", "motion.frames.nees_median", 2),
+        ("measured", "motion.frames.nees_measured", 2),
+        ("10 m NEES", "motion.stretches.nees", 2),
+        ("its median", "motion.stretches.nees_median", 2),
+        ("measured", "motion.stretches.nees_measured", 2),
+    )
+    lines = [f"{'sequence':16}" + "".join(f"{title:>12}" for title, _, _ in columns)]
+    for report in reports:
+        values = [(_field(report, name), digits) for _, name, digits in columns]
+        cells = "".join(f"{'-' if value is None else format(value, f'.{digits}f'):>12}" for value, digits in values)
+        lines.append(f"{report.sequence:16}{cells}")
+    return "\n".join(lines)
+
+
+def _field(report: Any, name: str) -> float | None:
+    """A field of a report, or of a report in it: `ego.nees`; None where that is not there."""
+    for part in name.split("."):
+        report = None if report is None else getattr(report, part)
+    return cast("float | None", report)

@@ -1,0 +1,19 @@
+"""`birdslam interface` and `birdslam configuration`: pages of docs/ that are made from the code."""
+
+from __future__ import annotations
+
+import argparse
+
+from birdslam.runtime.pages import configuration, interface
+
+
+def print_interface(options: argparse.Namespace) -> int:
+    """Keys, records and statuses: docs/interface.md."""
+    print(interface.page(), end="")
+    return 0
+
+
+def print_configuration(options: argparse.Namespace) -> int:
+    """Every key with its default: docs/configuration.md."""
+    print(configuration.page(), end="")
+    return 0

@@ -1,0 +1,1 @@
+"""Commands on a vehicle's computer, and over many vehicles."""
