@@ -1,15 +1,4 @@
-"""The planner's client: live estimates, with alive, on time and valid kept apart.
-
-    from birdslam.runtime.client import Planner
-
-    with Planner("car") as planner:
-        for reading in planner.estimates(max_age_ms=150):      # each as it comes, or that none came in time
-            if reading.usable:
-                drive(reading.estimate)
-            else:
-                slow_down(reading)                             # not alive, not on time, or not valid
-
-    reading = planner.latest(max_age_ms=150)                   # or the newest one, whenever you need it
+"""The planner's client: live estimates, with alive, on time and valid as separate answers.
 
 A planner can start before the system does, and lives through its restarts (`Estimate.epoch` then says that the world
 frame began anew). It can never slow the vehicle down: a planner that is busy gets only the newest estimate. One that
@@ -62,6 +51,14 @@ class Reading:
 
 class Planner(Closing):
     """A subscriber of one vehicle's estimates; a context manager.
+
+        with Planner("car") as planner:
+            for reading in planner.estimates(max_age_ms=150):      # each as it comes, or that none came in time
+                if reading.usable:
+                    drive(reading.estimate)
+                else:
+                    slow_down(reading)                             # not alive, not on time, or not valid
+        reading = planner.latest(max_age_ms=150)                   # or the newest one, whenever you need it
 
     Raises ValueError for a bad vehicle name, PermissionError where the runtime directory is open to other users.
     """
@@ -138,9 +135,9 @@ class Planner(Closing):
         return parts[0] if parts else None
 
     def health(self, node: str, timeout_s: float = 2.0) -> Health | None:
-        """What a node said last of itself, within the last second or so; None where it does not answer."""
-        said = self._bus.kept(f"health/{node}", timeout_s)
-        return said[-1].record if said else None
+        """A node's last health, of the last second or so; None where it does not answer."""
+        healths = self._bus.retained(f"health/{node}", timeout_s)
+        return healths[-1].record if healths else None
 
     def close(self) -> None:
         """Leaves the bus, and wakes who waits; a second call does nothing."""

@@ -1,13 +1,10 @@
 """The gate: planners outside the vehicle's own user read its estimates here, by mutual TLS, and write nothing.
 
-The car itself, by its own certificate, may write its speed here and nothing else.
-
     python -m birdslam.runtime.gate /etc/birdslam/vehicle.toml /etc/birdslam/gate.json5 --runtime-dir /run/birdslam
 
-A process of its own, so that what comes in from outside never touches one of the vehicle's. It is one zenoh session
-that forwards what its file allows (deploy/gate.json5: listening address, certificates, access control), with the
-sockets of the vehicle's nodes put in. It sends and decodes nothing itself. Exit status: 0 after SIGTERM; 2, with one
-line on standard error, where it can't be what a gate must be.
+A process of its own: one zenoh session that forwards what its file allows (deploy/gate.json5: listening address,
+certificates, access control) and decodes nothing. The car alone, by its own certificate, may write its speed here.
+Exit status: 0 after SIGTERM; 2, with one line on standard error, where the file does not make a closed gate.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class Progress:
         self.done = 0
         self._first: tuple[float, int] | None = None  # when the first piece was done, and how many were then
         self._due_s = clock() + (0.0 if self._terminal else PLAIN_LINE_S)
-        self._shown = False
+        self._visible = False
 
     def advance(self, pieces: int = 1) -> None:
         """So much more is done."""
@@ -82,7 +82,7 @@ class Progress:
     def _write(self, text: str) -> None:
         if self._terminal:
             self._stream.write(f"\r\x1b[K{text[: shutil.get_terminal_size().columns - 1]}")
-            self._shown = True
+            self._visible = True
         else:
             self._stream.write(f"{text}\n")
         self._stream.flush()
@@ -95,10 +95,10 @@ class Progress:
 
     def clear(self) -> None:
         """Takes the line away: what follows says how it went."""
-        if self._shown:
+        if self._visible:
             self._stream.write("\r\x1b[K")
             self._stream.flush()
-            self._shown = False
+            self._visible = False
 
 
 def with_progress(items: Iterable[_Item], what: str, total: int | None, unit: str = "frames") -> Iterator[_Item]:

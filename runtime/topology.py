@@ -31,7 +31,7 @@ class Topic:
 
     A reader's queue holds `depth` messages: of a `hot` topic only the newest counts (depth 1), of others a few wait.
     When it is full the oldest is dropped, and counted. `urgent` topics are sent before the rest, in the order of puts.
-    The producer answers a query of the topic's own key with its last `kept` messages, for those that come late.
+    The producer answers a query of the topic's own key with its last `retained` messages, for those that come late.
     `pace`: how often there is one.
     """
 
@@ -41,7 +41,7 @@ class Topic:
     depth: int
     hot: bool = False
     urgent: bool = True
-    kept: int = 0
+    retained: int = 0
     pace: str = "each frame"
 
 
@@ -73,11 +73,11 @@ TOPICS = {
         Topic("speed", SpeedReading, CAR.name, depth=200, pace="as often as the car says it, 20 to 100 times a second"),
         Topic("frame", FrameRef, "capture", depth=1, hot=True),
         # A lost one breaks the chain of edges: a few are queued, and an optimizer that begins anew asks for the last
-        Topic("measurements", Measurements, "perceive", depth=8, kept=96),
-        Topic("estimate", Estimate, "optimize", depth=1, hot=True, kept=1),
+        Topic("measurements", Measurements, "perceive", depth=8, retained=96),
+        Topic("estimate", Estimate, "optimize", depth=1, hot=True, retained=1),
         Topic("map", MapUpdate, "optimize", depth=256, pace="each frame in which the map gained something"),
         *(
-            Topic(f"health/{name}", Health, name, depth=4, urgent=False, kept=1, pace="once a second")
+            Topic(f"health/{name}", Health, name, depth=4, urgent=False, retained=1, pace="once a second")
             for name in PROCESSES
         ),
     )

@@ -2,7 +2,7 @@
 
 What comes in is never trusted: sizes are limited before anything is built, then types, ranges and finite numbers are
 checked. Whatever is wrong with the bytes, the only exception is WireError. Of a SpeedReading alone numbers may be other
-than finite: a sensor that fails says such things, and what reads it answers with a status.
+than finite: a failing sensor sends such numbers, and the reader answers with a status.
 Versions: fields that a newer sender appended are ignored; a changed meaning is a new version in the topic's key.
 """
 

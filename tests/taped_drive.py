@@ -126,7 +126,7 @@ class Tape:
         self.take(self.send(measurements))
 
     def restart(self, with_checkpoint: bool, noticed: bool = True) -> None:
-        """The optimizer is killed, and begun anew."""
+        """The optimizer is killed, and restarted."""
         self._restarts += 1
         if not with_checkpoint:
             CheckpointFile(runtime_dir_of("tape", self.configuration.runtime_dir) / "checkpoint").take()

@@ -13,7 +13,7 @@ from test_batch import contents, kitti, made
 
 from birdslam.runtime.batch.drive import DRIVES, Job, run_drive
 from birdslam.runtime.batch.drives import find_drives
-from birdslam.runtime.batch.fetch import at_hand
+from birdslam.runtime.batch.fetch import local_copy
 from birdslam.runtime.cli.main import main
 from birdslam.sources.recording import DatasetError
 
@@ -24,15 +24,15 @@ def test_a_drive_is_fetched_for_as_long_as_it_is_read(tmp_path: Path) -> None:
     fsspec = pytest.importorskip("fsspec")
     with fsspec.filesystem("memory").open("/store/drive.mp4", "wb") as file:
         file.write(b"film")
-    with at_hand("video:memory://store/drive.mp4") as uri:
+    with local_copy("video:memory://store/drive.mp4") as uri:
         place = Path(uri.removeprefix("video:"))
         assert (place.name, place.read_bytes()) == ("drive.mp4", b"film")
     assert not place.exists()
-    with at_hand("video:/a/b.mp4") as uri:
+    with local_copy("video:/a/b.mp4") as uri:
         assert uri == "video:/a/b.mp4"
     with (
         pytest.raises(DatasetError, match=r"memory://store/none\.mp4: can't be fetched"),
-        at_hand("video:memory://store/none.mp4"),
+        local_copy("video:memory://store/none.mp4"),
     ):
         pass
     for argument in ("video:memory://store/drive.mp4", "memory://store/drive.mp4"):

@@ -119,4 +119,4 @@ def test_a_node_that_keeps_dying_ends_the_run_with_its_name(place: Path) -> None
         assert vehicle.process.wait(120.0) == 1
         last = (place / "run.log").read_text().splitlines()[-1]
         assert last.startswith("birdslam: optimize was killed by SIGKILL")
-        assert "2 times in 60 s: it is not begun anew" in last
+        assert "2 times in 60 s: it is not restarted" in last

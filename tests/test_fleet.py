@@ -459,7 +459,7 @@ def test_the_commands_find_each_other_again(tmp_path_factory: pytest.TempPathFac
         bus.declare_alive()
         uplink, uplink_log = start("uplink", str(base / "red.toml"), says="no connection within")
         router, log = start("router", str(base / "router.toml"), says="is open for 1 vehicles")
-        until(lambda: "speaks at" in uplink_log.read_text(), "the uplink has found its router")
+        until(lambda: "is connected to" in uplink_log.read_text(), "the uplink has found its router")
         fleet = stack.enter_context(Fleet(load(base / "operator.toml").fleet, LIMIT_S))
 
         def comes() -> bool:

@@ -210,17 +210,17 @@ def test_a_spare_loads_below_all_others_and_comes_back() -> None:
     with subprocess.Popen(["sleep", "600"], start_new_session=True) as process:
         group = Path(f"/proc/{process.pid}/autogroup")
         try:
-            realtime.stand_by(process.pid)
+            realtime.lower_to_idle(process.pid)
             if group.exists():
                 assert group.read_text().split()[-1] == "19"
             assert os.sched_getscheduler(process.pid) in (os.SCHED_IDLE, policy)  # who may not come back is not sent
-            realtime.to_work(process.pid)
+            realtime.raise_from_idle(process.pid)
             assert os.sched_getscheduler(process.pid) == policy
             if group.exists():
                 assert group.read_text().split()[-1] == "0"
         finally:
             process.kill()
-    realtime.to_work(process.pid)  # it has ended: nothing to do
+    realtime.raise_from_idle(process.pid)  # it has ended: nothing to do
 
 
 def test_who_may_not_come_back_is_not_sent_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,7 +228,7 @@ def test_who_may_not_come_back_is_not_sent_there(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(realtime, "_has", lambda bit: False)
     monkeypatch.setattr(os, "sched_setscheduler", lambda *of: pytest.fail("it was"))
     with subprocess.Popen(["sleep", "600"], start_new_session=True) as process:
-        realtime.stand_by(process.pid)
+        realtime.lower_to_idle(process.pid)
         process.kill()
 
 
@@ -432,7 +432,7 @@ import sys
 from birdslam.runtime.process import realtime
 gc.collect()  # which empties the store
 if sys.argv[1] == "settled":
-    realtime.settle()
+    realtime.freeze_objects()
 before = sys.getallocatedblocks()
 for size in range(1, 21):
     tuples = [tuple(range(size)) for _ in range(1_500)]

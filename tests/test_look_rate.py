@@ -141,7 +141,7 @@ def test_a_thread_that_gives_way_is_alone_in_that() -> None:
     nice: dict[str, int] = {}
 
     def behind() -> None:
-        realtime.give_way()
+        realtime.lower_priority()
         nice["behind"] = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
 
     before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())

@@ -252,7 +252,7 @@ def test_a_bump_where_the_window_begins_anew_is_not_a_camera_that_is_mounted_oth
     _, motions = drive(truth, edit=nothing_to_see)
     learned_rad = next(m for m in motions if m.to_frame == 7).ground.pitch_rad
     anew = [m for m in motions if m.to_frame >= 23]
-    assert Status.ODOMETRY_COASTING in next(m for m in motions if m.to_frame == 22).status  # begun anew there
+    assert Status.ODOMETRY_COASTING in next(m for m in motions if m.to_frame == 22).status  # restarted there
     assert max(abs(m.ground.pitch_rad - learned_rad) for m in anew) < math.radians(1.0)
 
 

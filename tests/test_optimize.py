@@ -23,7 +23,7 @@ from birdslam.runtime.configuration import (
     SourceConfig,
 )
 from birdslam.runtime.nodes.checkpoints import MOST_BYTES, CheckpointFile, newest
-from birdslam.runtime.nodes.coasting import Announced, Overdue, deadline_ns, unmeasured
+from birdslam.runtime.nodes.coasting import Overdue, PendingFrames, deadline_ns, unmeasured
 from birdslam.runtime.nodes.optimize import OptimizeNode
 from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
 from birdslam.runtime.transport.bus import Message
@@ -96,7 +96,7 @@ def alone(records: list[Measurements], epoch: int = 0) -> list[Estimate]:
 def test_a_frame_is_overdue_when_its_estimate_could_not_come_in_time() -> None:
     budgets = BudgetsConfig(end_to_end_ms=150.0, optimize_ms=12.0, optimize_to_planner_ms=8.0)
     assert deadline_ns(Configuration(budgets=budgets)) == 130 * MS
-    announced = Announced(130 * MS)
+    announced = PendingFrames(130 * MS)
     assert announced.wait_s(0) == pytest.approx(0.13)
     for frame_id in range(3):
         announced.add(Message(ref(frame_id, 1000 * MS + frame_id * 30 * MS), Trace(), 0))
@@ -111,7 +111,7 @@ def test_a_frame_is_overdue_when_its_estimate_could_not_come_in_time() -> None:
 
 
 def test_a_frame_that_was_answered_before_it_was_announced_is_never_overdue() -> None:
-    announced = Announced(MS)
+    announced = PendingFrames(MS)
     announced.answered(7)
     for frame_id in (6, 7):
         announced.add(Message(ref(frame_id, 0), Trace(), 0))
@@ -123,7 +123,7 @@ def test_a_frame_that_was_answered_before_it_was_announced_is_never_overdue() ->
 
 
 def test_the_end_of_the_source_is_no_frame_to_wait_for() -> None:
-    announced = Announced(MS)
+    announced = PendingFrames(MS)
     announced.add(Message(ref(0, 0, (Status.END_OF_SOURCE,)), Trace(), 0))
     assert announced.overdue(10**12) is None
 

@@ -54,15 +54,15 @@ def test_the_last_messages_are_kept_for_those_that_come_late(join: Any) -> None:
     join("supervisor", hub=True)
     perceive = join("perceive")
     out = perceive.publisher("measurements")
-    for number in range(TOPICS["measurements"].kept + 5):  # and nobody listens
+    for number in range(TOPICS["measurements"].retained + 5):  # and nobody listens
         out.put(measurements(number))
     optimize = join("optimize")
     perceive.declare_alive()
     assert not optimize.wait_alive({"perceive"}, LIMIT_S)
-    kept = optimize.kept("measurements")
-    assert [message.record.frame_id for message in kept] == list(range(5, TOPICS["measurements"].kept + 5))
+    kept = optimize.retained("measurements")
+    assert [message.record.frame_id for message in kept] == list(range(5, TOPICS["measurements"].retained + 5))
     assert [message.trace.stages[-1].node for message in kept] == ["perceive"] * len(kept)
-    assert optimize.kept("estimate", timeout_s=0.2) == []  # nobody sends them
+    assert optimize.retained("estimate", timeout_s=0.2) == []  # nobody sends them
 
 
 def test_a_planner_that_comes_late_has_the_last_estimate(join: Any, base: Path) -> None:

@@ -383,7 +383,7 @@ def test_a_recorder_that_dies_or_stalls_is_begun_anew_in_a_file_of_its_own(
     finally:
         run.kill()
     assert status == 0, err
-    assert f"record {cause}; it is begun anew" in out
+    assert f"record {cause}; it is restarted" in out
     assert set(run.summary()["restarts"].values()) == {0}
     summary = run.summary()["recording"]
     assert summary["files"] == [str(file) for file in files]

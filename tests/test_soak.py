@@ -52,8 +52,8 @@ def test_what_grows_is_named(one: Series, said: str, systemd: Systemd) -> None:
 def test_what_was_begun_anew_is_named(systemd: Systemd) -> None:
     restarted = {**WELL, "restarts": {"capture": 2, "perceive": 0}, "recording": {"restarts": 1, "dropped": 0}}
     assert list(faults({}, restarted, systemd)) == [
-        "capture was begun anew 2 times",
-        "record was begun anew 1 times",
+        "capture was restarted 2 times",
+        "record was restarted 1 times",
     ]
 
 

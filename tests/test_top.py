@@ -92,7 +92,7 @@ def test_the_table_says_how_every_node_is(vehicle: Path) -> None:
     perceive = row(text, "perceive")
     for cell in ("alive", "34.0", "1.5 / 2.5", "77", "41", "42"):
         assert cell in perceive.split() or cell in perceive, cell
-    assert "perceive was begun anew 2 times, at last since it was killed by SIGKILL" in text
+    assert "perceive was restarted 2 times, at last since it was killed by SIGKILL" in text
     assert "SILENT" in row(later, "optimize")
     assert "record" not in text  # nothing is recorded
 

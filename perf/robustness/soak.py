@@ -4,7 +4,7 @@
 
 Without `--source` the software camera of the fault suite drives down its street. The soak stands in systemd's place,
 and hears whether the supervisor misses its watchdog. Ends with status 1, and says why, where after the first minute a
-process grew by more than 1 % or held more descriptors, where a process was begun anew, or a watchdog was missed.
+process grew by more than 1 % or held more descriptors, where a process was restarted, or a watchdog was missed.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def faults(series: Mapping[str, Series], summary: dict[str, Any], systemd: Syste
             yield f"{name} was {len(one.pids)} processes, one after the other"
     for name, count in restarts(summary).items():
         if count:
-            yield f"{name} was begun anew {count} times"
+            yield f"{name} was restarted {count} times"
     if systemd.missed:
         yield f"the supervisor missed its watchdog {systemd.missed} times"
 

@@ -36,7 +36,7 @@ def run_batch(todo: Sequence[Task], output: Path, jobs: int | None, ray_address:
     `jobs`: drives at once, None: as many as fit; `ray_address`: of a Ray cluster, None: on this computer alone. Raises
     ResultsError.
     """
-    with _alone(output):
+    with _exclusive(output):
         left = [task for task in todo if not done(output, task)]
         events = (
             run_local(left, output, jobs or fitting_jobs())
@@ -49,7 +49,7 @@ def run_batch(todo: Sequence[Task], output: Path, jobs: int | None, ray_address:
 
 
 @contextlib.contextmanager
-def _alone(output: Path) -> Iterator[None]:
+def _exclusive(output: Path) -> Iterator[None]:
     """The only batch of this folder; what one that was killed left half done is removed."""
     claim_directory(output)
     with (output / ".lock").open("w") as file:

@@ -26,11 +26,11 @@ from birdslam.bench.ego.trajectory_errors import OdometryReport, evaluate_record
 from birdslam.outputs.drive_files import ResultsError, write_json
 from birdslam.perception import ModelError
 from birdslam.runtime.batch.drives import Task
-from birdslam.runtime.batch.fetch import at_hand
+from birdslam.runtime.batch.fetch import local_copy
 from birdslam.runtime.batch.offline import Drive, pipeline
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.sources import RecordedSource, SourceError, open_source
-from birdslam.runtime.process.child import die_with
+from birdslam.runtime.process.child import end_with_parent
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.types import NS_PER_S, Estimate, MapUpdate, Measurements
 
@@ -39,7 +39,7 @@ RESULT = "result.json"
 TOP_PERCENTILE = 95.0  # of the speeds: a single wrong step is no top speed
 EXPECTED = (ConfigurationError, DatasetError, ModelError, ResultsError, SourceError, OSError)
 
-OnFrame = Callable[[int, int], object]  # told how many frames are done, and of how many (0: nobody knows)
+OnFrame = Callable[[int, int], object]  # called with the frames done, and of how many (0: unknown)
 
 
 class Job(msgspec.Struct, frozen=True):
@@ -105,7 +105,7 @@ def run_drive(job: Job, on_frame: OnFrame) -> None:
     task, output = job.task, Path(job.output)
     if done(output, task):  # by a worker that was thought lost
         return
-    with at_hand(task.uri) as uri:
+    with local_copy(task.uri) as uri:
         _run(task, output, uri, on_frame)
 
 
@@ -206,7 +206,7 @@ def _result(task: Task, folder: Path, motion: _Motion, report: OdometryReport) -
 
 def main() -> int:
     """The program; gives the exit status."""
-    die_with(int(sys.argv[1]))
+    end_with_parent(int(sys.argv[1]))
     job = msgspec.json.decode(sys.stdin.buffer.read(), type=Job)
 
     def on_frame(frames: int, total: int) -> None:

@@ -16,7 +16,7 @@ def is_url(address: str) -> bool:
 
 
 @contextlib.contextmanager
-def at_hand(uri: str) -> Iterator[str]:
+def local_copy(uri: str) -> Iterator[str]:
     """The URI of a drive as this computer can read it. Raises DatasetError where it can't be fetched."""
     scheme, _, address = uri.partition(":")
     if not is_url(address):

@@ -1,4 +1,4 @@
-"""Drives on this computer, several at once, each in a process of its own: what one of them does ends no other."""
+"""Drives on this computer, several at once, each in a process of its own: a crash ends one drive alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is told of all drives: report.json, report.csv, and a page with a table and plots.
+"""The report of all drives: report.json, report.csv, and a page with a table and plots.
 
 It is made of what lies in the output folder, drive by drive, so that it takes no memory of the drives' number but what
 is plotted: some numbers each.
@@ -179,7 +179,7 @@ def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
         most = sorted(outcome.statuses.items(), key=lambda one: -one[1])[:MOST_IN_A_CELL]
         cells.append(", ".join(f"{name} {count}" for name, count in most))
         link = f'<a href="{DRIVES}/{name}/bev.png">{name}</a>'
-        file.write(f"<tr><td>{link}</td>" + "".join(f"<td>{_shown(cell)}</td>" for cell in cells) + "</tr>\n")
+        file.write(f"<tr><td>{link}</td>" + "".join(f"<td>{_text(cell)}</td>" for cell in cells) + "</tr>\n")
     file.write("</table>\n")
 
 
@@ -191,7 +191,7 @@ def _write_sweep(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
         head = " ".join(f"{key}={value}" for key, value in outcome.settings.items())
         heads[head] = None
         found = row(outcome)
-        shown = f"{found['ate_m']:.3f} m ATE" if found["ate_m"] is not None else f"{_shown(found['path_m'])} m way"
+        shown = f"{found['ate_m']:.3f} m ATE" if found["ate_m"] is not None else f"{_text(found['path_m'])} m way"
         cells.setdefault(outcome.source, {})[head] = "failed" if isinstance(outcome, Failure) else shown
     file.write("<h2>By settings</h2>\n<table><tr><th>drive</th>")
     file.write("".join(f"<th>{html.escape(head or 'as it is')}</th>" for head in heads) + "</tr>\n")
@@ -201,5 +201,5 @@ def _write_sweep(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
     file.write("</table>\n")
 
 
-def _shown(value: Any) -> str:
+def _text(value: Any) -> str:
     return "" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""`birdslam doctor`: whether this machine can keep what a vehicle needs, and what to do where it can't.
+"""Checks of this machine for what a vehicle needs, with what to do where one fails (`birdslam doctor`).
 
 A row for each thing: `ok`; `warning`, where the vehicle drives but may not keep its budgets; `error`, where it can't
 start.

@@ -1,4 +1,4 @@
-"""`birdslam doctor --measure`: what this computer's settings cost a frame, measured here and now, in some six seconds.
+"""What this computer's settings cost a frame, measured in some six seconds (`birdslam doctor --measure`).
 
 Each row measures the same thing with a setting and without it: how late a thread wakes that waited for a frame, with
 others that want its core and without, at normal priority and by SCHED_FIFO; what the processor's rest between two
@@ -81,22 +81,22 @@ def fresh_page_us() -> float:
     return max(0.0, took[0] - took[1]) / pages * 1e6
 
 
-def _shown(late_ms: list[float]) -> str:
+def _percentiles(late_ms: list[float]) -> str:
     p50, p99 = np.percentile(late_ms, [50, 99])
     return f"wakes late by p50 {p50:.2f}, p99 {p99:.2f}, max {max(late_ms):.2f} ms"
 
 
 def costs(cores: int) -> Iterator[tuple[str, str]]:
     """(what, what it costs), a row each."""
-    yield "as it is", _shown(lateness_ms())
+    yield "as it is", _percentiles(lateness_ms())
     with others(cores):
-        yield "every core wanted", _shown(lateness_ms())
+        yield "every core wanted", _percentiles(lateness_ms())
         try:
-            yield "the same, SCHED_FIFO", _shown(lateness_ms(fifo=True))
+            yield "the same, SCHED_FIFO", _percentiles(lateness_ms(fifo=True))
         except PermissionError:
             yield "the same, SCHED_FIFO", "not permitted (LimitRTPRIO=, CAP_SYS_NICE): not measured"
     with others(cores, nice=19):
-        yield "wanted at nice 19", _shown(lateness_ms())
+        yield "wanted at nice 19", _percentiles(lateness_ms())
     in_a_row, rested = work_ms(0.0), work_ms(REST_S)
     yield (
         "governor, idle",

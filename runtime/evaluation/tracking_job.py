@@ -58,7 +58,7 @@ REPEATS = 3  # of each time: the median counts
 
 @dataclass(frozen=True)
 class Job:
-    """All that one sequence's process is told."""
+    """What one sequence's process works on."""
 
     root: Path
     sequence: str
@@ -107,7 +107,7 @@ def frames_to_make(job: Job) -> int:
 
 
 def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> Outcome:
-    """All methods and ablations on one sequence; `frame_made` is told of each frame of the front end."""
+    """All methods and ablations on one sequence; `frame_made` is called after each frame of the front end."""
     cv2.setNumThreads(1)
     sequence = open_tracking(job.root, job.sequence, job.camera)
     frames = frames_of(job.frames, sequence, job.published)
@@ -290,17 +290,17 @@ def _odometry(job: Job, sequence: TrackingSequence, frames: range, rng: np.rando
 def _one_vehicle(log: Sequence[Measurements]) -> list[Measurements]:
     """The log with the vehicle alone that is seen most."""
     seen = [edge.vehicle for m in log for edge in m.cv]
-    kept = max(sorted(set(seen)), key=seen.count, default=-1)
+    most_seen = max(sorted(set(seen)), key=seen.count, default=-1)
     return [
         msgspec.structs.replace(
-            m, cv=tuple(e for e in m.cv if e.vehicle == kept), vv=tuple(e for e in m.vv if e.vehicle == kept)
+            m, cv=tuple(e for e in m.cv if e.vehicle == most_seen), vv=tuple(e for e in m.vv if e.vehicle == most_seen)
         )
         for m in log
     ]
 
 
 def _estimates(log: Sequence[Measurements], job: Job) -> list[Estimate]:
-    """What a planner was told in each frame."""
+    """The live estimate of each frame."""
     graph = PoseGraph(job.configuration.slam.graph, job.configuration.slam.weights)
     return [graph.optimise(measurements) for measurements in log]
 

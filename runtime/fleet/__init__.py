@@ -2,6 +2,6 @@
 
     vehicle's bus --> [uplink] --mutual TLS--> [router] --mutual TLS--> listeners: `birdslam top --all`, Fleet
 
-`uplink` is a planner of its own vehicle's bus that says again what it hears; nothing comes in through it but queries.
+`uplink` is a planner of its own vehicle's bus that forwards to the router what it receives; only queries come in.
 `router` lets each vehicle write its own keys alone. `listener` is the client of all vehicles. docs/fleet.md sets it up.
 """

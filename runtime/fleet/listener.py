@@ -1,15 +1,4 @@
-"""The client of a whole fleet: each vehicle's newest estimate, with alive, on time and valid kept apart.
-
-    from birdslam.runtime.configuration import FleetConfig
-    from birdslam.runtime.fleet.listener import Fleet
-
-    here = FleetConfig(router="tls/10.0.0.1:7448", ca="ca.pem", certificate="operator.pem", key="operator.key")
-    with Fleet(here) as fleet:
-        for reading in fleet.estimates(max_age_ms=500):    # of whichever vehicle; each as it comes, or that none came
-            if not reading.usable:
-                look_after(reading.vehicle)                # not alive, not on time, or not valid
-
-    for reading in fleet.readings(max_age_ms=500):         # or the newest one of each, whenever you need them
+"""The client of a whole fleet: each vehicle's newest estimate, with alive, on time and valid as separate answers.
 
 It keeps one message of each vehicle, the newest, and decodes it when it is read: whoever reads slowly reads less and
 newer, and a vehicle that floods takes nothing from the others, which are read in turn.
@@ -48,7 +37,14 @@ log = logging.getLogger(__name__)
 class Fleet(Closing):
     """A subscriber of all vehicles' estimates at one router; a context manager.
 
-    Vehicles that `config.vehicles` names are told of from the beginning, others once something of them was heard.
+        here = FleetConfig(router="tls/10.0.0.1:7448", ca="ca.pem", certificate="operator.pem", key="operator.key")
+        with Fleet(here) as fleet:
+            for reading in fleet.estimates(max_age_ms=500):    # of any vehicle; each as it comes, or that none came
+                if not reading.usable:
+                    look_after(reading.vehicle)                # not alive, not on time, or not valid
+        for reading in fleet.readings(max_age_ms=500):         # or the newest one of each, whenever you need them
+
+    Vehicles that `config.vehicles` names are reported from the beginning, others once a message of them has come.
     Raises ConfigurationError for a table that can't be, BusError where no router lets it in within `timeout_s`.
     """
 
@@ -92,7 +88,7 @@ class Fleet(Closing):
                 self._unread.append(vehicle)
                 self._changed.notify_all()
 
-    def _receive_kept(self, reply: zenoh.Reply) -> None:
+    def _receive_retained(self, reply: zenoh.Reply) -> None:
         """A vehicle's last estimate of before this client; it counts only where none came since."""
         if reply.ok is not None:
             named = vehicle_and_topic(str(reply.ok.key_expr))
@@ -119,7 +115,7 @@ class Fleet(Closing):
             asks = alive and node == "optimize" and not slot.t_received_ns
             self._changed.notify_all()
         if asks:
-            callback = zenoh.handlers.Callback(self._receive_kept, indirect=False)
+            callback = zenoh.handlers.Callback(self._receive_retained, indirect=False)
             self._session.get(key_of(vehicle, "estimate"), callback, timeout=REPLY_S)
 
     # --- what the user calls ---
@@ -131,23 +127,23 @@ class Fleet(Closing):
 
     @property
     def vehicles(self) -> tuple[str, ...]:
-        """Those that were expected or heard of, by name."""
+        """Those that were expected or have sent something, by name."""
         with self._changed:
             return tuple(sorted(self._slots))
 
     def alive(self, vehicle: str) -> frozenset[str]:
-        """The nodes of a vehicle that are alive. Raises KeyError for one that nobody has heard of."""
+        """The nodes of a vehicle that are alive. Raises KeyError for an unknown one."""
         with self._changed:
             return frozenset(self._slots[vehicle].alive)
 
     def received(self, vehicle: str) -> Received:
-        """How much has been received of a vehicle so far. Raises KeyError for one that nobody has heard of."""
+        """How much has been received of a vehicle so far. Raises KeyError for an unknown one."""
         with self._changed:
             slot = self._slots[vehicle]
             return slot.received
 
     def latest(self, vehicle: str, max_age_ms: float = 500.0) -> FleetReading:
-        """The newest estimate of one vehicle so far, at once. Raises KeyError for one that nobody has heard of."""
+        """The newest estimate of one vehicle so far, at once. Raises KeyError for an unknown one."""
         with self._changed:
             return self._slots[vehicle].reading(vehicle, max_age_ms)
 
@@ -186,23 +182,24 @@ class Fleet(Closing):
                 return
             now_ns = time.monotonic_ns()
             if reading is not None and reading.estimate is not None:
-                self._slots[reading.vehicle].t_told_ns = now_ns
+                self._slots[reading.vehicle].t_reported_ns = now_ns
                 yield reading
             if now_ns >= sweep_ns:
                 sweep_ns = now_ns + period_ns // _SWEEPS
                 for vehicle in self.vehicles:
                     slot = self._slots[vehicle]
-                    if now_ns - slot.t_told_ns >= period_ns and not (late := self.latest(vehicle, max_age_ms)).on_time:
-                        slot.t_told_ns = now_ns
+                    late = self.latest(vehicle, max_age_ms)
+                    if now_ns - slot.t_reported_ns >= period_ns and not late.on_time:
+                        slot.t_reported_ns = now_ns
                         yield late
 
     def health(self, vehicle: str, node: str) -> Health | None:
-        """What a vehicle's node said last of itself; None where nothing of it was heard, or it was no health."""
+        """The last health of a vehicle's node; None where none has come, or it was malformed."""
         with self._changed:
             slot = self._slots.get(vehicle)
-            said = slot.healths.get(node) if slot else None
+            data = slot.healths.get(node) if slot else None
         try:
-            return None if said is None else decode(said, Health)
+            return None if data is None else decode(data, Health)
         except WireError:
             return None
 

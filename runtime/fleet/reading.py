@@ -68,7 +68,7 @@ class VehicleSlot:
     received_bytes: int = 0
     lost: int = 0
     malformed: int = 0
-    t_told_ns: int = 0  # when a reading of it was last given by `estimates`
+    t_reported_ns: int = 0  # when a reading of it was last given by `estimates`
     healths: dict[str, bytes] = field(default_factory=dict)
 
     @property

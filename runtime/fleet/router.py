@@ -1,4 +1,4 @@
-"""The router of a fleet: `birdslam router CONFIG.toml`, with the tables [router] that says who may do what.
+"""The router of a fleet: `birdslam router CONFIG.toml`, with the table [router]: who may do what.
 
 A zenoh session in router mode. A vehicle's certificate, by its common name "vehicle NAME", may write the keys of NAME
 and answer queries of them, and read nothing; a listener's may read and query all, and write nothing; everything else
@@ -19,8 +19,8 @@ from birdslam.runtime.topology import QUERIES, VERSION, every_key
 
 _LOOK_S = 1.0
 _ACCEPT_MS = 2_000  # who connects and then says nothing is let go
-SAID = ("estimate", "health/*")  # what leaves a vehicle by itself; no images, no measurements
-ASKED = (*SAID, *QUERIES)  # what it answers queries of
+PUBLISHED = ("estimate", "health/*")  # by a vehicle; no images, no measurements
+QUERYABLE = (*PUBLISHED, *QUERIES)  # a vehicle answers queries of these
 ALIVE = "alive/*"
 
 
@@ -28,7 +28,7 @@ def router_config(config: RouterConfig) -> zenoh.Config:
     """Of the router's session. Raises ConfigurationError, which names the key."""
     check("router", config, "listen")
     if not config.vehicles:
-        raise ConfigurationError("router.vehicles: name those that may say something here")
+        raise ConfigurationError("router.vehicles: name those that may publish here")
     settings = settings_of("router") | {
         "listen/endpoints": [config.listen],
         "transport/unicast/accept_timeout": _ACCEPT_MS,
@@ -45,7 +45,7 @@ def router_config(config: RouterConfig) -> zenoh.Config:
                 "id": "no flood",
                 "flows": ["ingress"],
                 "messages": ["put", "delete"],
-                "rules": [{"key_expr": every_key(topic), "freq": config.messages_hz} for topic in SAID],
+                "rules": [{"key_expr": every_key(topic), "freq": config.messages_hz} for topic in PUBLISHED],
             }
         ],
     }
@@ -55,7 +55,7 @@ def router_config(config: RouterConfig) -> zenoh.Config:
 def access_control(vehicles: tuple[str, ...], listeners: tuple[str, ...]) -> dict[str, Any]:
     """zenoh's access control: what is not allowed here is denied."""
     rules = [
-        _rule("vehicles are asked", "egress", ["declare_subscriber", "query"], map(every_key, ASKED)),
+        _rule("vehicles are queried", "egress", ["declare_subscriber", "query"], map(every_key, QUERYABLE)),
         _rule(
             "vehicles are watched", "egress", ["declare_liveliness_subscriber", "liveliness_query"], [every_key(ALIVE)]
         ),
@@ -65,24 +65,24 @@ def access_control(vehicles: tuple[str, ...], listeners: tuple[str, ...]) -> dic
     for vehicle in vehicles:
         base = f"birdslam/{vehicle}/{VERSION}"
         rules += [
-            _rule(f"{vehicle} says", "ingress", ["put"], [f"{base}/{topic}" for topic in SAID]),
-            _rule(f"{vehicle} answers", "ingress", ["declare_queryable", "reply"], [f"{base}/{t}" for t in ASKED]),
+            _rule(f"{vehicle} publishes", "ingress", ["put"], [f"{base}/{topic}" for topic in PUBLISHED]),
+            _rule(f"{vehicle} answers", "ingress", ["declare_queryable", "reply"], [f"{base}/{t}" for t in QUERYABLE]),
             _rule(f"{vehicle} is alive", "ingress", ["liveliness_token"], [f"{base}/{ALIVE}"]),
         ]
         subjects.append(_subject(f"vehicle {vehicle}", [f"vehicle {vehicle}"]))
         own = [rule["id"] for rule in rules[-3:]]
-        policies.append(_policy(f"vehicle {vehicle}", [*own, "vehicles are asked", "vehicles are watched"]))
+        policies.append(_policy(f"vehicle {vehicle}", [*own, "vehicles are queried", "vehicles are watched"]))
     if listeners:
         rules += [
-            _rule("listeners ask", "ingress", ["declare_subscriber", "query"], map(every_key, ASKED)),
+            _rule("listeners query", "ingress", ["declare_subscriber", "query"], map(every_key, QUERYABLE)),
             _rule(
-                "listeners watch",
+                "listeners watch liveliness",
                 "ingress",
                 ["declare_liveliness_subscriber", "liveliness_query"],
                 [every_key(ALIVE)],
             ),
-            _rule("listeners hear", "egress", ["put", "reply"], map(every_key, ASKED)),
-            _rule("listeners see who lives", "egress", ["liveliness_token"], [every_key(ALIVE)]),
+            _rule("listeners receive", "egress", ["put", "reply"], map(every_key, QUERYABLE)),
+            _rule("listeners receive liveliness", "egress", ["liveliness_token"], [every_key(ALIVE)]),
         ]
         subjects.append(_subject("listeners", list(listeners)))
         policies.append(_policy("listeners", [rule["id"] for rule in rules[-4:]]))
@@ -122,5 +122,5 @@ def run(config: RouterConfig) -> None:
         print(f"the router is open for {len(config.vehicles)} vehicles: {config.listen}", flush=True)
         notifier.once("READY=1")
         while not signals.asked_to_end(notifier.period_s or _LOOK_S):
-            notifier.alive(f"{len(config.vehicles)} vehicles may speak, open at {config.listen}")
+            notifier.alive(f"{len(config.vehicles)} vehicles may publish, open at {config.listen}")
         notifier.once("STOPPING=1")

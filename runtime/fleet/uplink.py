@@ -1,7 +1,7 @@
 """A vehicle's way to the router of its fleet: `birdslam uplink CONFIG.toml`, with the table [fleet].
 
 A process of its own, and of its vehicle's bus a planner like any other: it can slow nothing down, and only queries come
-in through it. It says again what it hears: estimates (`fleet.estimates_hz` of them at most), the nodes' healths, which
+in through it. It forwards estimates (`fleet.estimates_hz` of them at most), the nodes' healths, which
 nodes are alive; and it answers what a planner may query. Images and measurements stay in the vehicle. Everything is
 sent with congestion control DROP: a slow network loses messages, which the listener counts.
 """
@@ -29,16 +29,16 @@ from birdslam.runtime.transport.closing import Closing
 from birdslam.runtime.transport.queries import QueryRefused, QueryResponder, positive
 from birdslam.runtime.wire import Stage, Trace, WireError
 
-TOPICS_SAID = ("estimate", *(f"health/{node}" for node in PROCESSES))
+FORWARDED = ("estimate", *(f"health/{node}" for node in PROCESSES))
 _NODE = "uplink"
 _MOST_STAGES = 7  # of a trace that comes in, so that one more fits
 _TRY_S = 2.0  # one attempt to reach the router
-_TELL_S = 60.0  # between two lines that say that there is none
+_REPORT_S = 60.0  # between two lines that say that there is none
 _LOOK_S = 1.0
 
 
 class Uplink(Closing):
-    """Says again at the router what a vehicle says on its bus, until it is closed, and the session with it.
+    """Forwards to the router what a vehicle publishes on its bus, until it is closed, and the session with it.
 
     A context manager. Raises as Bus does.
     """
@@ -49,19 +49,19 @@ class Uplink(Closing):
         self._session, self._vehicle = session, vehicle
         self._period_ns = 0 if config.estimates_hz is None else round(1e9 / config.estimates_hz)
         self._bus = Bus(vehicle, f"{_NODE}-{threading.get_native_id()}", runtime_dir=runtime_dir)
-        self._subscribers = {topic: self._bus.subscriber(topic) for topic in TOPICS_SAID}
+        self._subscribers = {topic: self._bus.subscriber(topic) for topic in FORWARDED}
         self._publishers = {
             topic: Publisher(session, key_of(vehicle, topic), TOPICS[topic], _NODE, lossless=False, express=False)
-            for topic in TOPICS_SAID
+            for topic in FORWARDED
         }
         handlers = {key_of(vehicle, name): self._handler(name) for name in QUERIES}
         self._responder = QueryResponder(session, handlers)
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._changes: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
         self._threads = [
-            threading.Thread(target=self._forward, args=(topic,), name=topic, daemon=True) for topic in TOPICS_SAID
+            threading.Thread(target=self._forward, args=(topic,), name=topic, daemon=True) for topic in FORWARDED
         ]
-        self._threads.append(threading.Thread(target=self._tell_who_lives, name="alive", daemon=True))
+        self._threads.append(threading.Thread(target=self._forward_liveliness, name="alive", daemon=True))
         for thread in self._threads:
             thread.start()
         self._bus.on_alive(self._alive_changed)
@@ -80,7 +80,7 @@ class Uplink(Closing):
                 if self._subscribers[topic].newest is None:
                     self._bus.catch_up(topic, self._subscribers[topic])
 
-    def _tell_who_lives(self) -> None:
+    def _forward_liveliness(self) -> None:
         """On a thread of its own: zenoh's own is never kept waiting for the network."""
         while (change := self._changes.get()) is not None:
             node, alive = change
@@ -119,7 +119,7 @@ class Uplink(Closing):
         return ask
 
     def close(self) -> None:
-        """Says nothing more; the vehicle's nodes are then not alive for the fleet."""
+        """Forwards nothing more; the vehicle's nodes are then not alive for the fleet."""
         self._bus.close()  # wakes those that forward
         self._changes.put(None)
         for thread in self._threads:
@@ -138,7 +138,7 @@ def run(configuration: Configuration) -> None:
     """Until SIGTERM or SIGINT; waits for the router, for ever. Raises ConfigurationError, and as Bus does."""
     vehicle, config = configuration.vehicle, configuration.fleet
     if not config.router:
-        raise ConfigurationError("fleet.router: there is none: where to does this vehicle speak?")
+        raise ConfigurationError("fleet.router: names no router to publish at")
     check("fleet", config, "router")
     signals.block()
     zenoh.init_log_from_env_or("error")
@@ -152,8 +152,8 @@ def run(configuration: Configuration) -> None:
         while True:
             if (now := bool(session.info.routers_zid())) != reached:
                 reached = now
-                said = f"speaks at {config.router}" if now else f"has lost {config.router} and looks for it"
-                print(f"the uplink of vehicle {vehicle!r} {said}", flush=True)
+                state = f"is connected to {config.router}" if now else f"has lost {config.router} and looks for it"
+                print(f"the uplink of vehicle {vehicle!r} {state}", flush=True)
             notifier.alive(f"router {'reached' if reached else 'GONE'}, {len(uplink.alive)} nodes alive")
             if signals.asked_to_end(notifier.period_s or _LOOK_S):
                 break
@@ -162,13 +162,13 @@ def run(configuration: Configuration) -> None:
 
 def _wait_for_router(config: FleetConfig, notifier: Notifier) -> zenoh.Session | None:
     """The session, as soon as it can be had; None where a signal came first."""
-    told_s = -_TELL_S
+    reported_s = -_REPORT_S
     while True:
         try:
             return open_link(config, _TRY_S)
         except BusError as error:
-            if time.monotonic() - told_s >= _TELL_S:
-                told_s = time.monotonic()
+            if time.monotonic() - reported_s >= _REPORT_S:
+                reported_s = time.monotonic()
                 print(f"birdslam: uplink: {error}", file=sys.stderr, flush=True)
         notifier.alive(f"looks for {config.router}")
         if signals.asked_to_end(_LOOK_S):  # a refusal may come at once

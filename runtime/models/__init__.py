@@ -1,1 +1,1 @@
-"""`birdslam models`: networks by name, where they are kept, and how they are had from their authors."""
+"""Networks by name: installed ones, the catalogue, download and installation."""

@@ -54,7 +54,7 @@ class CaptureNode:
         self._ring = FrameRing(path, camera.height_px, camera.width_px, slots=configuration.runtime.ring_slots)
         self._pacer = Pacer(configuration.source.rate)
         self._estimates = bus.subscriber("estimate")
-        # Those of a file go with the frames, and a run at rate "max" is to repeat: neither hears the bus
+        # Those of a file go with the frames, and a run at rate "max" is to repeat: neither listens to the bus
         own = configuration.source.speed or configuration.lossless
         self._speeds = None if own else CarSpeeds(bus.subscriber("speed"))
         self._reader: ReadAhead | None = None
@@ -101,7 +101,7 @@ class CaptureNode:
         return Message(Captured(frame_id, recorded, t_capture_ns), Trace(), t_capture_ns)
 
     def _go_on(self, resume: Resume) -> int:
-        """The frame that is due now; it leaves out one at least, so that perceive is told of a gap."""
+        """The frame that is due now; it leaves out one at least, so that perceive sees a gap."""
         rate = self._config.source.rate
         hz = rate if isinstance(rate, float) else self._source.rate_hz
         missed = max(1, math.floor((time.monotonic_ns() - resume.t_capture_ns) * 1e-9 * hz))
@@ -144,8 +144,8 @@ class CaptureNode:
         t_capture_ns = captured.t_capture_ns
         frame = to_frame(self._undistort, captured.frame_id, captured.recorded, t_capture_ns, _utc_ns(t_capture_ns))
         if self._speeds is not None:
-            said = self._speeds.at(frame.t_source_ns, t_capture_ns)
-            frame = replace(frame, speeds=frame.speeds or said)  # a recording's own go before
+            readings = self._speeds.at(frame.t_source_ns, t_capture_ns)
+            frame = replace(frame, speeds=frame.speeds or readings)  # a recording's own go before
         self._sent = frame.frame_id + 1
         self._t_source_ns = frame.t_source_ns
         yield self._reference(frame)

@@ -1,4 +1,4 @@
-"""What the car says of its own speed on the bus, as the frames of a live drive bear it."""
+"""Readings of the car's own speed from the bus, attached to the frames of a live drive."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class CarSpeeds:
 
     def __init__(self, subscriber: Readings) -> None:
         self._subscriber = subscriber
-        self._kept: deque[tuple[int, SpeedReading]] = deque(maxlen=KEPT_READINGS)  # when it came, by CLOCK_MONOTONIC
+        self._recent: deque[tuple[int, SpeedReading]] = deque(maxlen=KEPT_READINGS)  # when it came, by CLOCK_MONOTONIC
         self._taken = 0
-        self._told = False
+        self._warned = False
 
     def at(self, t_source_ns: int, t_capture_ns: int) -> tuple[SpeedReading, ...]:
         """For the frame of that time.
@@ -48,14 +48,14 @@ class CarSpeeds:
                 reading = msgspec.structs.replace(reading, t_ns=message.t_received_ns)
             if t_source_ns != t_capture_ns:
                 reading = shifted(reading, t_source_ns - t_capture_ns)
-            self._kept.append((message.t_received_ns, reading))
+            self._recent.append((message.t_received_ns, reading))
             self._taken += 1
-        while self._kept and self._kept[0][0] <= t_capture_ns - KEPT_NS:
-            self._kept.popleft()
-        if self._subscriber.dropped and not self._told:
-            self._told = True
+        while self._recent and self._recent[0][0] <= t_capture_ns - KEPT_NS:
+            self._recent.popleft()
+        if self._subscriber.dropped and not self._warned:
+            self._warned = True
             log.warning("the car's speed: readings are lost: more come than a frame bears, or some on their way")
-        return tuple(reading for _, reading in self._kept)
+        return tuple(reading for _, reading in self._recent)
 
     def counters(self) -> dict[str, int]:
         """Since the start, as in wire.Health."""

@@ -1,4 +1,4 @@
-"""The optimizer's last checkpoints, in a file of the vehicle's runtime directory that outlives a kill -9 of it.
+"""The optimizer's last checkpoints, in a file of the vehicle's runtime directory that survives a kill -9.
 
 The file is mapped, so that a store is a copy in memory. Two places take turns, and a place's number is written last:
 whatever a kill cuts short, the other one is whole. (What is inside is checked by `PoseGraph.restore`.)
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Kept:
+class Checkpoint:
     """A checkpoint: the last frame that is in it, and the epoch that it is of."""
 
     frame_id: int
@@ -67,17 +67,17 @@ class CheckpointFile:
         head[_TURN] = self._turn
         return True
 
-    def take(self) -> list[Kept]:
-        """What there is, the newest first. It is gone then: what a checkpoint brings about, it does not do twice."""
+    def take(self) -> list[Checkpoint]:
+        """What there is, the newest first. They are removed: a checkpoint that crashes the optimizer does so once."""
         found = []
         for head, body in sorted(zip(self._heads, self._bodies, strict=True), key=lambda place: -int(place[0][_TURN])):
             if head[_TURN] > 0 and 0 < head[_BYTES] <= MOST_BYTES:
-                found.append(Kept(int(head[_FRAME]), int(head[_EPOCH]), body[: int(head[_BYTES])].tobytes()))
+                found.append(Checkpoint(int(head[_FRAME]), int(head[_EPOCH]), body[: int(head[_BYTES])].tobytes()))
             head[_TURN] = 0
         return found
 
 
-def newest(path: Path) -> Kept | None:
+def newest_checkpoint(path: Path) -> Checkpoint | None:
     """The newest whole checkpoint in the file, as another process sees it; None where there is none now."""
     size = _HEAD_BYTES + MOST_BYTES
     try:
@@ -91,7 +91,7 @@ def newest(path: Path) -> Kept | None:
             return None
         data = os.pread(fd, length, place * size + _HEAD_BYTES)
         whole = len(data) == length and _head(fd, place * size)[_TURN] == turn  # else the optimizer is writing there
-        return Kept(frame_id, epoch, data) if whole else None
+        return Checkpoint(frame_id, epoch, data) if whole else None
     finally:
         os.close(fd)
 

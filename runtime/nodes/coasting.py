@@ -1,7 +1,7 @@
-"""What the optimizer says of frames that perceive does not answer in time: a prediction with a growing covariance.
+"""Frames whose measurements are late: the optimizer publishes a prediction with a growing covariance.
 
-A planner is told at each frame, by its budget, whether perceive is dead, stalled or merely slow. Nothing of it enters
-the graph: when the measurements come after all, it goes on as if they had come in time.
+A planner gets an estimate of each frame within its budget, whether perceive is dead, stalled or merely slow. Nothing of
+it enters the graph: when the measurements come after all, it goes on as if they had come in time.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from birdslam.runtime.nodes.capture import stamps
 from birdslam.runtime.transport.bus import Message
 from birdslam.types import INVALIDATING, Attitude, Estimate, FrameRef, Measurements, Status
 
-ANNOUNCED_FRAMES = 64  # more than are captured within any deadline
-# What a planner must hear with the next frame, where its own was late
-TOLD_AGAIN = frozenset({Status.GRAPH_RESET, Status.GRAPH_RESTORED})
+PENDING_FRAMES = 64  # more than are captured within any deadline
+# Statuses that go with the next frame, where their own was late
+REPORTED_LATE = frozenset({Status.GRAPH_RESET, Status.GRAPH_RESTORED})
 
 
 class Overdue(msgspec.Struct, frozen=True):
@@ -26,12 +26,12 @@ class Overdue(msgspec.Struct, frozen=True):
     ref: FrameRef
 
 
-class Announced:
+class PendingFrames:
     """The frames that capture has announced and perceive has not answered, oldest first."""
 
     def __init__(self, deadline_ns: int) -> None:
         self._deadline_ns = deadline_ns  # from a frame's capture on
-        self._waiting: deque[Message] = deque(maxlen=ANNOUNCED_FRAMES)
+        self._waiting: deque[Message] = deque(maxlen=PENDING_FRAMES)
         self._answered_frame = -1
 
     def add(self, message: Message) -> None:
@@ -52,7 +52,7 @@ class Announced:
         return max(0.0, (self._waiting[0].record.t_capture_ns + self._deadline_ns - now_ns) / 1e9)
 
     def overdue(self, now_ns: int) -> Message | None:
-        """The newest frame that is, as Overdue; those before it are not worth a word any more."""
+        """The newest frame that is, as Overdue; those before it are not reported any more."""
         newest = None
         while self._waiting and now_ns - self._waiting[0].record.t_capture_ns >= self._deadline_ns:
             newest = self._waiting.popleft()
@@ -66,7 +66,7 @@ def deadline_ns(configuration: Configuration) -> int:
 
 
 def unmeasured(ref: FrameRef, last: Estimate | None, max_ns: int) -> Measurements:
-    """What stands for a frame's measurements meanwhile; `last` is the last estimate that rests on some.
+    """Stands in for a frame's measurements meanwhile; `last` is the last estimate that rests on some.
 
     What made that one invalid still holds, and after `max_ns` of source time without measurements all is. The ego's
     height and tilt are those of that one.
@@ -82,9 +82,9 @@ def unmeasured(ref: FrameRef, last: Estimate | None, max_ns: int) -> Measurement
     return Measurements(**stamps(ref), status=tuple(dict.fromkeys(status)), attitude=attitude)
 
 
-def with_untold(estimate: Estimate, untold: tuple[Status, ...]) -> Estimate:
-    """The estimate with what planners have yet to hear; in a world that begins with it nothing is restored."""
-    status = tuple(dict.fromkeys((*estimate.status, *untold)))
+def with_unreported(estimate: Estimate, unreported: tuple[Status, ...]) -> Estimate:
+    """The estimate with statuses that were not reported yet; of GRAPH_RESET and GRAPH_RESTORED the former alone."""
+    status = tuple(dict.fromkeys((*estimate.status, *unreported)))
     if Status.GRAPH_RESET in status:
-        status = tuple(said for said in status if said != Status.GRAPH_RESTORED)
+        status = tuple(s for s in status if s != Status.GRAPH_RESTORED)
     return estimate if status == estimate.status else msgspec.structs.replace(estimate, status=status)

@@ -78,8 +78,8 @@ class Inference(Closing):
         self._ran_frame = -self._rate_divisor  # the last frame that networks were offered
         self._started: list[Future[Any]] = []  # for the frame at hand, and awaited
         self._threads = ThreadPoolExecutor(max(1, len(heads)), thread_name_prefix="network")
-        self._behind = ThreadPoolExecutor(max(1, len(heads)), "network-behind", initializer=realtime.give_way)
-        self._beside = ThreadPoolExecutor(1, "beside", initializer=realtime.give_way)
+        self._behind = ThreadPoolExecutor(max(1, len(heads)), "network-behind", initializer=realtime.lower_priority)
+        self._beside = ThreadPoolExecutor(1, "beside", initializer=realtime.lower_priority)
         self._frame_over = threading.Event()
         patience_s = None if self._deadline_ns is None else 0.0
         self.networks = Networks(
@@ -223,7 +223,7 @@ class _UntilDeadline:
     pending: Pending
     awaited: list[Future[Any]]
     deadline_ns: int  # CLOCK_MONOTONIC
-    resumed: Callable[[], None]  # told when the wait is over
+    resumed: Callable[[], None]  # called when the wait is over
 
     def result(self) -> Perception:
         wait(self.awaited, timeout=max(0.0, (self.deadline_ns - time.monotonic_ns()) / 1e9))

@@ -1,4 +1,4 @@
-"""What a node measures of itself, and says once a second (wire.Health)."""
+"""A node's own statistics, published once a second as its health (wire.Health)."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ class Meter:
         self._overruns = self._late = 0
         self._process = psutil.Process()
         self._process.cpu_percent()
-        self._heard_ns = self._said_ns = time.monotonic_ns()
-        self._frames_said = 0
+        self._received_ns = self._reported_ns = time.monotonic_ns()
+        self._frames_reported = 0
 
-    def heard(self, now_ns: int) -> None:
+    def received(self, now_ns: int) -> None:
         """Something came in."""
-        self._heard_ns = now_ns
+        self._received_ns = now_ns
 
     def frame(self, t_capture_ns: int, trace: Trace) -> None:
         """A frame is done; `trace` is what brought it, and this node's own stage.
 
-        That it waited in the queue is this node's doing, which was at another frame: its own budget bears it.
+        The wait in this node's queue counts against this node's budget: it was busy with another frame.
         """
         self.frames += 1
         own = trace.stages[-1]
@@ -52,12 +52,12 @@ class Meter:
 
     def due(self, now_ns: int) -> bool:
         """Whether a second has passed."""
-        return now_ns - self._said_ns >= PERIOD_NS
+        return now_ns - self._reported_ns >= PERIOD_NS
 
     def health(self, now_ns: int, mode: str, counters: dict[str, int]) -> Health:
-        """What to say now."""
-        rate_hz = (self.frames - self._frames_said) * 1e9 / (now_ns - self._said_ns)
-        self._said_ns, self._frames_said = now_ns, self.frames
+        """The health to publish now."""
+        rate_hz = (self.frames - self._frames_reported) * 1e9 / (now_ns - self._reported_ns)
+        self._reported_ns, self._frames_reported = now_ns, self.frames
         return Health(
             node=self.node,
             t_ns=now_ns,
@@ -73,6 +73,6 @@ class Meter:
             mode=mode,
             restarts=self._assignment.restarts,
             cause=self._assignment.cause[:200],
-            status=(Status.INPUT_STALE,) if now_ns - self._heard_ns > self._stale_ns else (),
+            status=(Status.INPUT_STALE,) if now_ns - self._received_ns > self._stale_ns else (),
             **counters,
         )

@@ -50,7 +50,7 @@ class Node(Protocol):
     def step(self, record: Any) -> Iterator[msgspec.Struct]: ...
 
     def drain(self) -> None:
-        """Told to let the source end here; only capture can."""
+        """Lets the source end here; only capture can."""
 
     def counters(self) -> dict[str, int]:
         """`dropped`, `malformed` and `torn` since the start (see wire.Health)."""
@@ -84,7 +84,7 @@ class PerceiveNode:
             budget_ms = configuration.budgets.perceived_ms
             self._degradation = Degradation(configuration.degradation, inference.roles, budget_ms)
         perceive = configuration.perceive
-        # A node begun anew is awaited: it looks at its networks for as short a time as it can
+        # A node restarted is awaited: it looks at its networks for as short a time as it can
         measured_s = 0.0 if assignment.restarts else perceive.looks.measured_s
         self._look_rate = inference.fit(configuration.camera, perceive, measured_s)
         self._last_frame: int | None = None  # that came

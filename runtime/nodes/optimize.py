@@ -16,13 +16,13 @@ from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.nodes.capture import stamps
 from birdslam.runtime.nodes.checkpoints import CheckpointFile, checkpoint_path
 from birdslam.runtime.nodes.coasting import (
-    ANNOUNCED_FRAMES,
-    TOLD_AGAIN,
-    Announced,
+    PENDING_FRAMES,
+    REPORTED_LATE,
     Overdue,
+    PendingFrames,
     deadline_ns,
     unmeasured,
-    with_untold,
+    with_unreported,
 )
 from birdslam.runtime.nodes.degradation import Mode
 from birdslam.runtime.process.restarts import FIRST, Assignment, EpochFile
@@ -37,7 +37,7 @@ class OptimizeNode:
     """Measurements -> Estimate, MapUpdate: the pose graph.
 
     Frame numbers never fall: measurements that come after their frame was given up correct the graph, and the newest
-    frame that was told of is told of again. After a restart the graph goes on from its last checkpoint, with what
+    frame that was reported is reported again. After a restart the graph goes on from its last checkpoint, with what
     perceive still has of the measurements since (GRAPH_RESTORED); or, where these do not reach back to it, in a new
     epoch (GRAPH_RESET).
     """
@@ -45,14 +45,14 @@ class OptimizeNode:
     def __init__(self, configuration: Configuration, bus: Bus, assignment: Assignment = FIRST) -> None:
         self.ended = False
         self._measurements = bus.subscriber("measurements")
-        self._announced = Announced(deadline_ns(configuration))
-        self._frames = None if configuration.lossless else bus.subscriber("frame", ANNOUNCED_FRAMES)
+        self._pending = PendingFrames(deadline_ns(configuration))
+        self._frames = None if configuration.lossless else bus.subscriber("frame", PENDING_FRAMES)
         self._coast_max_ns = round(configuration.degradation.coast_max_ms * 1e6)
         self._last: Estimate | None = None  # that rests on measurements
         self._coasted: FrameRef | None = None  # the newest frame that was given up
         self._coasted_frames = self._outrun = 0
-        self._told_frame = -1 if assignment.resume is None else assignment.resume.next_frame - 1
-        self._told_before = self._told_frame  # by the process before this one
+        self._reported_frame = -1 if assignment.resume is None else assignment.resume.next_frame - 1
+        self._reported_before = self._reported_frame  # by the process before this one
         self._missed: deque[Message] = deque()  # measurements since the checkpoint
         self._missed_frame = -1  # the last of them
         self._epochs: EpochFile | None = None
@@ -63,7 +63,7 @@ class OptimizeNode:
             self._epochs = EpochFile(directory / "epoch")
             self._checkpoints = CheckpointFile(checkpoint_path(configuration))
         epoch = 0 if self._epochs is None else self._epochs.last + 1
-        self._untold = (Status.GRAPH_RESET,) if epoch else ()  # planners may know an older world
+        self._unreported = (Status.GRAPH_RESET,) if epoch else ()  # planners may know an older world
         restored = self._restored(configuration, bus, assignment)
         self._graph = restored or PoseGraph(configuration.slam.graph, configuration.slam.weights, epoch)
 
@@ -71,22 +71,24 @@ class OptimizeNode:
         """The graph of the last checkpoint of this run, if its epoch is still the newest that planners know of."""
         if self._checkpoints is None or self._epochs is None:
             return None
-        for kept in self._checkpoints.take():
-            if not assignment.restarts or kept.epoch != self._epochs.last:
+        for checkpoint in self._checkpoints.take():
+            if not assignment.restarts or checkpoint.epoch != self._epochs.last:
                 continue
             try:
-                graph = PoseGraph.restore(kept.data, configuration.slam.graph, configuration.slam.weights)
+                graph = PoseGraph.restore(checkpoint.data, configuration.slam.graph, configuration.slam.weights)
             except CheckpointError as error:
-                log.warning("the checkpoint of frame %d is of no use: it %s", kept.frame_id, error)
+                log.warning("the checkpoint of frame %d is of no use: it %s", checkpoint.frame_id, error)
                 continue
             wait_s = configuration.runtime.catch_up_ms / 1e3
             if not bus.wait_alive({"perceive"}, wait_s):
-                missed = bus.kept("measurements", wait_s)
-                self._missed.extend(message for message in missed if message.record.frame_id > kept.frame_id)
+                missed = bus.retained("measurements", wait_s)
+                self._missed.extend(message for message in missed if message.record.frame_id > checkpoint.frame_id)
             if self._missed:
                 self._missed_frame = self._missed[-1].record.frame_id
-            log.warning("goes on from the checkpoint of frame %d, with %d since", kept.frame_id, len(self._missed))
-            self._untold = (Status.GRAPH_RESTORED,)
+            log.warning(
+                "goes on from the checkpoint of frame %d, with %d since", checkpoint.frame_id, len(self._missed)
+            )
+            self._unreported = (Status.GRAPH_RESTORED,)
             return graph
         return None
 
@@ -96,7 +98,7 @@ class OptimizeNode:
 
     @property
     def _coasts(self) -> bool:
-        return self._coasted is not None and self._coasted.frame_id == self._told_frame
+        return self._coasted is not None and self._coasted.frame_id == self._reported_frame
 
     def receive(self, timeout_s: float) -> Message | None:
         """The next measurements; or the frame whose measurements are overdue by now."""
@@ -104,43 +106,43 @@ class OptimizeNode:
             return self._missed.popleft()
         until_s = time.monotonic() + timeout_s
         while True:
-            self._hear_of_frames()
+            self._collect_frames()
             left_s = max(0.0, until_s - time.monotonic())
-            message = self._measurements.recv(min(left_s, self._announced.wait_s(time.monotonic_ns())))
+            message = self._measurements.recv(min(left_s, self._pending.wait_s(time.monotonic_ns())))
             if message is not None and message.record.frame_id <= self._missed_frame:
                 continue  # taken up already
             if message is not None:
-                self._announced.answered(message.record.frame_id)
+                self._pending.answered(message.record.frame_id)
                 return message
-            late = self._announced.overdue(time.monotonic_ns())
+            late = self._pending.overdue(time.monotonic_ns())
             if late is not None or time.monotonic() >= until_s:
                 return late
 
-    def _hear_of_frames(self) -> None:
+    def _collect_frames(self) -> None:
         while self._frames is not None and (message := self._frames.recv(0.0)) is not None:
-            self._announced.add(message)
+            self._pending.add(message)
 
     def step(self, record: Measurements | Overdue) -> Iterator[Estimate | MapUpdate]:
         if isinstance(record, Overdue):
             self._coasted = record.ref
             self._coasted_frames += 1
-            yield self._told(self._coast(record.ref))
+            yield self._report(self._coast(record.ref))
             return
         if Status.END_OF_SOURCE in record.status:
             self.ended = True
             yield from self._end(record)
             return
         estimate = self._last = self._graph.optimise(record)
-        if estimate.frame_id <= self._told_before:
-            self._graph.map_update()  # told as well
+        if estimate.frame_id <= self._reported_before:
+            self._graph.map_update()  # reported as well
             return
-        if estimate.frame_id >= self._told_frame:
-            yield self._told(estimate)
+        if estimate.frame_id >= self._reported_frame:
+            yield self._report(estimate)
         else:
             self._outrun += 1
-            self._untold = (*self._untold, *(s for s in estimate.status if s in TOLD_AGAIN))
+            self._unreported = (*self._unreported, *(s for s in estimate.status if s in REPORTED_LATE))
             if self._coasted is not None and self._coasts:
-                yield self._told(self._coast(self._coasted))
+                yield self._report(self._coast(self._coasted))
         gained = self._graph.map_update()
         if gained is not None:
             yield gained
@@ -157,10 +159,10 @@ class OptimizeNode:
         """Of a frame without measurements; the graph stays as it is."""
         return self._graph.optimise(unmeasured(ref, self._last, self._coast_max_ns))
 
-    def _told(self, estimate: Estimate) -> Estimate:
-        """What goes out, with what planners have yet to hear."""
-        estimate, self._untold = with_untold(estimate, self._untold), ()
-        self._told_frame = estimate.frame_id
+    def _report(self, estimate: Estimate) -> Estimate:
+        """The estimate to publish, with the statuses that planners were not sent yet."""
+        estimate, self._unreported = with_unreported(estimate, self._unreported), ()
+        self._reported_frame = estimate.frame_id
         if self._epochs is not None:
             self._epochs.store(estimate.epoch)
         return estimate
@@ -170,7 +172,7 @@ class OptimizeNode:
         epoch = self._graph.epoch
         gained = self._graph.map_update() or MapUpdate(epoch=epoch, frame_id=measurements.frame_id)
         yield msgspec.structs.replace(gained, frame_id=measurements.frame_id)
-        yield farewell(measurements, epoch, self._last)
+        yield end_estimate(measurements, epoch, self._last)
 
     def drain(self) -> None:
         """Ends with END_OF_SOURCE, as ever."""
@@ -184,7 +186,7 @@ class OptimizeNode:
         """Holds nothing open."""
 
 
-def farewell(measurements: Measurements, epoch: int, last: Estimate | None) -> Estimate:
+def end_estimate(measurements: Measurements, epoch: int, last: Estimate | None) -> Estimate:
     """The estimate that ends a run, after the last one."""
     return Estimate(
         **stamps(measurements),

@@ -1,10 +1,10 @@
-"""The recorder: one more process that listens, and writes a drive down (recording/recording.py); nobody waits for it.
+"""The recorder: one more process that listens, and records the drive (recording/recording.py); nobody waits for it.
 
 `python -m birdslam.runtime.nodes.recorder record VITALS_FD PARENT_PID`, on standard input the configuration as a line
-of JSON, then an `Order` as another. It ends by itself when the end of the source has come through, or in order on
-SIGTERM. Exit status: 0 when the recording is complete; 2 where the file can't be made, 3 where the disk failed it,
-each with one ERROR line; 1 for a bug. One that died or stalled is begun anew in a file of its own
-(recorder_station.py), which bears the optimizer's graph as it is then: it replays from there.
+of JSON, then a `RecorderAssignment` as another. It ends when the end of the source has come through, or on SIGTERM.
+Exit status: 0 when the recording is complete; 2 where the file can't be made, 3 where the disk failed it, each with
+one ERROR line; 1 for a bug. One that died or stalled is restarted in a file of its own, which begins with the
+optimizer's graph, so that it can be replayed.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ import psutil
 from birdslam.runtime.configuration import Configuration, dump, without_passwords
 from birdslam.runtime.environment import LIBRARIES, USER_ERROR_STATUS
 from birdslam.runtime.latency import stages
-from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest
+from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest_checkpoint
 from birdslam.runtime.process import realtime
-from birdslam.runtime.process.child import LOG_FORMAT, die_with
+from birdslam.runtime.process.child import LOG_FORMAT, end_with_parent
 from birdslam.runtime.process.restarts import FIRST, Assignment
 from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.recording import scene
@@ -55,8 +55,8 @@ INDEX_MIB = 8.0, 8.0  # of objects and of larger blocks: the index of an hour, a
 log = logging.getLogger(__name__)
 
 
-class Order(msgspec.Struct, frozen=True):
-    """What the recorder is told beside the configuration: the networks with their hashes, its file, who was before."""
+class RecorderAssignment(msgspec.Struct, frozen=True):
+    """Beside the configuration: the networks with their hashes, its file, and the recorder before it."""
 
     models: dict[str, Any]
     file: str
@@ -89,7 +89,7 @@ class Recorder:
         self.images = self.torn = 0
         self._process = psutil.Process()
         self._process.cpu_percent()
-        self._said_ns, self._frames, self._frames_said = time.monotonic_ns(), 0, 0
+        self._reported_ns, self._frames, self._frames_reported = time.monotonic_ns(), 0, 0
         self._end_frame: int | None = None  # of END_OF_SOURCE
         self._end_measured = False  # the measurements of it have come: another link, which may be the slower one
         self._map_frame = -1
@@ -118,8 +118,8 @@ class Recorder:
         for topic, message in received:
             self._take(topic, message)
         now_ns = time.monotonic_ns()
-        if now_ns - self._said_ns >= HEALTH_NS:
-            self._say(now_ns)
+        if now_ns - self._reported_ns >= HEALTH_NS:
+            self._report_health(now_ns)
         if self._checkpoints is not None and self._first_measured is not None:
             self._begin_from_checkpoint(self._checkpoints, self._first_measured, now_ns)
         self._vitals.count(frames=self._writer.messages, torn=self.torn, **self._counters())
@@ -132,9 +132,9 @@ class Recorder:
 
     def _begin_from_checkpoint(self, path: Path, first_frame: int, now_ns: int) -> None:
         """As soon as there is one from which on all measurements are in this file."""
-        kept = newest(path)
-        if kept is not None and kept.frame_id >= first_frame - 1:
-            checkpoint = GraphCheckpoint(frame_id=kept.frame_id, epoch=kept.epoch, data=kept.data)
+        found = newest_checkpoint(path)
+        if found is not None and found.frame_id >= first_frame - 1:
+            checkpoint = GraphCheckpoint(frame_id=found.frame_id, epoch=found.epoch, data=found.data)
             self._writer.begin_from(checkpoint, now_ns)
             self._checkpoints = None
 
@@ -207,9 +207,9 @@ class Recorder:
         for channel, message in drawn:
             self._writer.draw(channel, message, t_ns)
 
-    def _say(self, now_ns: int) -> None:
-        rate_hz = (self._frames - self._frames_said) * 1e9 / (now_ns - self._said_ns)
-        self._said_ns, self._frames_said = now_ns, self._frames
+    def _report_health(self, now_ns: int) -> None:
+        rate_hz = (self._frames - self._frames_reported) * 1e9 / (now_ns - self._reported_ns)
+        self._reported_ns, self._frames_reported = now_ns, self._frames
         counters = self._counters()
         health = Health(
             node=RECORDER.name,
@@ -228,7 +228,7 @@ class Recorder:
         self._writer.draw("/health/record", health, now_ns)
 
     def end(self) -> dict[str, str]:
-        """What the file says of its end."""
+        """Counts for the end of the file."""
         counts = {"estimates": self._frames, "images": self.images, "images_torn": self.torn, "missed": self._missed}
         counts |= self._counters()
         dropped = {f"dropped {topic}": n for topic, n in self.dropped().items()}
@@ -258,7 +258,7 @@ def about(configuration: Configuration, models: dict[str, Any], restarts: int = 
     )
 
 
-def record(configuration: Configuration, order: Order, vitals: Vitals, stop: list[int]) -> str:
+def record(configuration: Configuration, order: RecorderAssignment, vitals: Vitals, stop: list[int]) -> str:
     """A whole recording; why it ended early, or nothing. Raises OSError where the file can't be made."""
     config = configuration.recording
     described = about(configuration, order.models, order.assignment.restarts)
@@ -291,11 +291,11 @@ def main(arguments: list[str]) -> int:
         stop.append(number)
 
     signal.signal(signal.SIGTERM, ask)
-    die_with(int(parent_pid))
+    end_with_parent(int(parent_pid))
     os.nice(NICENESS)
     cv2.setNumThreads(1)
     configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
-    order = msgspec.json.decode(sys.stdin.buffer.readline(), type=Order)
+    order = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderAssignment)
     sys.setswitchinterval(configuration.runtime.switch_interval_s)
     realtime.reserve(*INDEX_MIB)
     vitals = Vitals(int(vitals_fd))

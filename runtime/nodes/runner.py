@@ -2,7 +2,7 @@
 
 `python -m birdslam.runtime.nodes.runner NODE VITALS_FD PARENT_PID`, on standard input the configuration as a line of
 JSON, and then, when its work is to begin, its assignment as another: until then it is a spare. Exit status: 0 at the
-end of the source or when told to end; 2 where what the user gave can't be used, with one ERROR line on stderr; 1
+end of the source or when asked to end; 2 where what the user gave can't be used, with one ERROR line on stderr; 1
 where the node fails at work: a camera that is gone, or a bug, with its traceback there.
 """
 
@@ -29,7 +29,7 @@ from birdslam.runtime.nodes.meter import Meter
 from birdslam.runtime.nodes.nodes import Node, prepare
 from birdslam.runtime.nodes.sources import SourceError
 from birdslam.runtime.process import realtime
-from birdslam.runtime.process.child import LOG_FORMAT, die_with, give_back_memory
+from birdslam.runtime.process.child import LOG_FORMAT, end_with_parent, give_back_memory
 from birdslam.runtime.process.restarts import Assignment
 from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.topology import NODES, RECORDER, TOPICS
@@ -41,7 +41,7 @@ from birdslam.types import Estimate, FrameRef, Measurements, Status
 log = logging.getLogger(__name__)
 
 USER_ERRORS = (ConfigurationError, DatasetError, ModelError, SourceError)
-RECORDER_PATIENCE_S = 0.2  # of a node begun anew: its first records are worth so much, no more
+RECORDER_PATIENCE_S = 0.2  # of a restarted node: longer than this its first records are not held back
 DOWNSTREAM = {"capture": "perceive", "perceive": "optimize", "optimize": "supervisor"}  # who must be there to receive
 
 
@@ -91,7 +91,7 @@ def run(
             if configuration.recording.file:
                 first_s = configuration.recording.ready_timeout_s
                 bus.wait_alive({RECORDER.name}, RECORDER_PATIENCE_S if assignment.restarts else first_s)
-            realtime.settle()
+            realtime.freeze_objects()
             stop.at_work = True
             vitals.beat()  # before it is ready: who is ready without a beat is stalled
             vitals.count(ready=1)
@@ -134,7 +134,7 @@ def _loop(
             taken_ns = now_ns
             overdue = isinstance(message.record, Overdue)
             if not overdue:
-                meter.heard(taken_ns)
+                meter.received(taken_ns)
             waits = message.trace.stages and not overdue  # in the queue of this node, which was at another record
             arrived_ns = message.t_received_ns if waits else 0
             for record in node.step(message.record):
@@ -161,7 +161,7 @@ def main(arguments: list[str]) -> int:
     name, vitals_fd, parent_pid = arguments
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=LOG_FORMAT)
     stop = Stop()
-    die_with(int(parent_pid))
+    end_with_parent(int(parent_pid))
     configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
     sys.setswitchinterval(configuration.runtime.switch_interval_s)
     cv2.setNumThreads(1)  # perceive sets its own

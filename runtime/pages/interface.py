@@ -129,7 +129,7 @@ def page() -> str:
 def _keys() -> Iterator[tuple[str, ...]]:
     yield "key", "record", "sent by", "when", "kind", "answers a query with"
     for topic in TOPICS.values():
-        kept = {0: "", 1: "the last one"}.get(topic.kept, f"the last {topic.kept}")
+        kept = {0: "", 1: "the last one"}.get(topic.retained, f"the last {topic.retained}")
         kept = "see Queries" if topic.name in QUERIES else kept
         yield f"`{topic.name}`", _link(topic.record), topic.producer, topic.pace, _kind(topic), kept
     for node in NODES:

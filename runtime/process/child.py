@@ -10,7 +10,7 @@ LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
 _PR_SET_PDEATHSIG = 1
 
 
-def die_with(parent_pid: int) -> None:
+def end_with_parent(parent_pid: int) -> None:
     """A supervisor that is killed takes its processes along: they are sent SIGTERM."""
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent_pid:

@@ -1,4 +1,4 @@
-"""What systemd is told (sd_notify(3)): ready, alive, what goes on, and that the end has begun."""
+"""Notifications to systemd (sd_notify(3)): ready, alive, the status line, stopping."""
 
 from __future__ import annotations
 

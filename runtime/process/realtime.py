@@ -1,4 +1,4 @@
-"""Scheduling and memory of a node's process, as far as the system permits; called when its work begins.
+"""Scheduling and memory of a node's process, as far as the system permits; set when its work begins.
 
 It holds for the threads that exist (the networks', OpenCV's), and later ones inherit it (zenoh's): a spare that still
 loads must not go before the nodes at work.
@@ -25,9 +25,9 @@ _MIB = 1 << 20
 
 # Nodes that compute for 2 ms of a frame and then wait: they take a core from networks, not networks from them. On two
 # cores, beside perceive alone, a step of the optimizer took p99 2.3 to 4.6 ms at SCHED_FIFO, 4.5 to 11.8 at nice -5
-_FIRST, _GOES_FIRST = ("capture", "optimize"), -5
+_FIRST, _FIRST_NICE = ("capture", "optimize"), -5
 _LEAST_PERIOD_MS = 10.0  # of frames, for SCHED_FIFO: at more than 100 Hz they would leave no core to the others
-_GIVES_WAY = 5  # nicer: a third of the time that one gets that wants the same core and is not
+_LOWER_NICE = 5  # nicer: a third of the time that one gets that wants the same core and is not
 _NICEST = 19
 
 NODE_IMAGES = {"capture": 8, "perceive": 40}  # of the camera's size, in colour, that a node has at once at its worst
@@ -58,8 +58,8 @@ def apply(node: str, configuration: Configuration) -> Iterator[str]:
     if first and not by_fifo:
         with contextlib.suppress(PermissionError):  # who may not: these wait for a core like the others
             for thread in _threads():
-                os.setpriority(os.PRIO_PROCESS, thread, _GOES_FIRST)
-            _weigh_session("self", _GOES_FIRST)
+                os.setpriority(os.PRIO_PROCESS, thread, _FIRST_NICE)
+            _set_session_nice("self", _FIRST_NICE)
     if realtime.lock_memory == "on" or (realtime.lock_memory == "auto" and live):
         if not may_lock_memory():
             yield "realtime.lock_memory: locking memory is not permitted (LimitMEMLOCK=infinity): it may be paged out"
@@ -77,25 +77,25 @@ def _by_fifo(priority: int) -> bool:
     return True
 
 
-def give_way() -> None:
-    """The calling thread runs where the others of its process, and the other nodes, leave a core."""
+def lower_priority() -> None:
+    """Lowers the calling thread's priority below the others of its process and the other nodes."""
     if os.sched_getscheduler(0) == os.SCHED_FIFO:
         priority = os.sched_getparam(0).sched_priority
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(max(priority - 1, 1)))
     else:
         thread = threading.get_native_id()
-        nice = min(os.getpriority(os.PRIO_PROCESS, thread) + _GIVES_WAY, _NICEST)
+        nice = min(os.getpriority(os.PRIO_PROCESS, thread) + _LOWER_NICE, _NICEST)
         os.setpriority(os.PRIO_PROCESS, thread, nice)
 
 
-def stand_by(pid: int) -> None:
+def lower_to_idle(pid: int) -> None:
     """The process `pid`, just started as a session of its own, loads where nobody else wants a core: loading a spare
     must not cost frames.
 
     What it could not come back from (RLIMIT_NICE, CAP_SYS_NICE) is left out. A session's nice value anybody may raise
     to 0 again; but it counts only outside of control groups (a desktop, not a service).
     """
-    _weigh_session(pid, _NICEST)
+    _set_session_nice(pid, _NICEST)
     limit = resource.getrlimit(resource.RLIMIT_NICE)[0]
     enough = 20 - os.getpriority(os.PRIO_PROCESS, 0)
     if limit >= enough or limit == resource.RLIM_INFINITY or _has(_CAP_SYS_NICE):
@@ -103,9 +103,9 @@ def stand_by(pid: int) -> None:
             os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
 
 
-def to_work(pid: int) -> None:
-    """Ends `stand_by`: all its threads, and those that they begin meanwhile, compute like this process does."""
-    _weigh_session(pid, 0)
+def raise_from_idle(pid: int) -> None:
+    """Ends `lower_to_idle`: all its threads, and those that they begin meanwhile, get this process's scheduling."""
+    _set_session_nice(pid, 0)
     policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
     done: set[int] = set()
     while new := {*_threads(pid)} - done:
@@ -116,7 +116,7 @@ def to_work(pid: int) -> None:
         done |= new
 
 
-def _weigh_session(pid: int | str, nice: int) -> None:
+def _set_session_nice(pid: int | str, nice: int) -> None:
     """Gives a process's session a nice value, where the kernel weighs sessions against each other (autogroup(7)).
 
     There a thread's own nice value and SCHED_IDLE count inside of its session alone.
@@ -140,7 +140,7 @@ def reserve_for(node: str, configuration: Configuration) -> None:
     reserve(NODE_OBJECTS_MIB, NODE_HEAP_MIB + NODE_IMAGES.get(node, 0) * image_mib)
 
 
-def one_heap() -> None:
+def use_one_heap() -> None:
     """All threads of this process take from one heap (glibc's), which keeps what is freed.
 
     Call it before the process has threads: a heap that one of them has begun goes on growing. The nodes have it from
@@ -157,10 +157,10 @@ def reserve(objects_mib: float, heap_mib: float) -> None:
     """Takes memory for so much of small objects and of larger blocks now, for this process to fill later.
 
     What grows up to a bound then grows into memory that is there, and its pages do not fault in the middle of a drive.
-    It serves every thread where `one_heap` went before the first of them; elsewhere than in glibc it reserves objects
+    It serves every thread where `use_one_heap` was called before the first of them; without glibc it reserves objects
     alone.
     """
-    one_heap()
+    use_one_heap()
     small = [bytes(_OBJECT_BYTES) for _ in range(round(objects_mib * _MIB / _OBJECT_BYTES))]
     _anchors.extend(small[::_ANCHORED])
     del small
@@ -168,8 +168,8 @@ def reserve(objects_mib: float, heap_mib: float) -> None:
     del blocks
 
 
-def settle() -> None:
-    """What was built lives to the end and is never walked again; and Python's store of freed tuples is full.
+def freeze_objects() -> None:
+    """Takes what was built out of garbage collection, and fills Python's store of freed tuples.
 
     CPython keeps freed tuples for later. A drive that fills this store alone, some 4 MiB, grows for half an hour.
     """

@@ -1,4 +1,4 @@
-"""When a node is begun anew, and what it is told of the one before it."""
+"""When a node is restarted, and from which frame it resumes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Resume(msgspec.Struct, frozen=True):
 
 
 class Assignment(msgspec.Struct, frozen=True):
-    """What a prepared process is told when its work begins."""
+    """What a prepared process is sent when its work begins."""
 
     restarts: int = 0  # of this node in this run
     cause: str = ""  # of the last one
@@ -34,7 +34,7 @@ FIRST = Assignment()
 
 
 class Restarts:
-    """The rule of one node: at once, then after a growing delay, and no more when it keeps dying.
+    """The rule of one node: at once, then after a growing delay, and no more when it keeps failing.
 
     Raises nothing: `died` says when the next process is due, or that there is none.
     """

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 
-from birdslam.runtime.process.child import die_with
+from birdslam.runtime.process.child import end_with_parent
 
 
 @contextmanager
@@ -19,7 +19,9 @@ def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
     have not begun are dropped, and it isn't waited for the others.
     """
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context, initializer=die_with, initargs=(os.getpid(),)) as pool:
+    with ProcessPoolExecutor(
+        processes, mp_context=context, initializer=end_with_parent, initargs=(os.getpid(),)
+    ) as pool:
         try:
             yield pool
         except BaseException:

@@ -1,19 +1,7 @@
 """A recorded drive, one MCAP file (https://mcap.dev): written while it goes on, whole or up to where it was cut off.
 
-| channel                     | encoding     | what                                                                   |
-|-----------------------------|--------------|------------------------------------------------------------------------|
-| v1/frame, v1/measurements,  | MessagePack  | the records, byte for byte as on the bus (runtime/wire.py)             |
-| v1/estimate, v1/map         |              |                                                                        |
-| v1/measurements/trace,      | MessagePack  | the trace of the record with the same sequence number: what replay     |
-| v1/estimate/trace           |              | learns from it is which message an estimate answers                    |
-| v1/checkpoint               | MessagePack  | once in a file that begins in the middle of a drive: the graph there   |
-| /estimate, /health/NODE,    | JSON, schema | for plots: the estimate again, the nodes' health, where the time went, |
-| /latency, /alive, /speed    |              | nodes that came and went, each reading of the car's speed once         |
-| /tf, /scene, ... (scene.py) | JSON, schema | what Foxglove draws; /camera/image where images were asked for         |
-
 Attachments: `about.json` (the whole configuration, the networks with their hashes, versions) and `camera.toml`. A
 replay needs nothing else. Times are UTC by one offset to CLOCK_MONOTONIC, taken at the start, so that they never jump.
-
 It is written in chunks, at least one in `flush_ms`: a kill or a full disk costs what came after the last. A file
 without its end is read up to there; a chunk that was damaged is left out and counted.
 """
@@ -42,6 +30,12 @@ from birdslam.runtime.topology import PROCESSES
 from birdslam.runtime.wire import Health, Trace, encode
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedReading
 
+# v1/frame, v1/measurements, v1/estimate, v1/map: MessagePack, the records byte for byte as on the bus (runtime/wire.py)
+# v1/measurements/trace, v1/estimate/trace: MessagePack, the trace of the record with the same sequence number, by which
+#     a replay knows which message an estimate answers
+# v1/checkpoint: MessagePack, once in a file that begins in the middle of a drive: the graph there
+# /estimate, /health/NODE, /latency, /alive, /speed: JSON with a schema, for plots
+# /tf, /scene, ... (scene.py): JSON with a schema, what Foxglove draws; /camera/image where images were asked for
 EXACT: dict[str, type[msgspec.Struct]] = {
     "frame": FrameRef,
     "measurements": Measurements,
@@ -233,7 +227,7 @@ class Recording:
     """
 
     def __init__(self, path: Path, on_read: Callable[[int], object] | None = None) -> None:
-        """`on_read` is told how many bytes of the file have been read, again and again, for who shows progress."""
+        """`on_read` is called with the bytes of the file that have been read, again and again, for progress."""
         self.path = path
         self._on_read = on_read
         self.complete = False

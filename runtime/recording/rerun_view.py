@@ -1,14 +1,7 @@
-"""A drive in rerun (https://rerun.io): the image with its boxes, the world, the road from above, the latencies.
+"""A drive in rerun (https://rerun.io): image with boxes, world, bird's-eye view, latencies; docs/recording.md.
 
-| entity                  | what                                                                          |
-|-------------------------|-------------------------------------------------------------------------------|
-| camera, camera/boxes    | the image as recorded or in shared memory, and the boxes of the tracks        |
-| world/ego, world/path   | where the ego is and was, with its 2-sigma ellipse                            |
-| world/vehicles          | the others as boxes, their velocities and ellipses                            |
-| world/map               | lane points and landmarks of the epoch                                        |
-| bev                     | all of it from above, in ego: x forward is up                                 |
-| latency/*, ego/*        | age and stages in ms; speed and 1-sigma of the pose                           |
-| status                  | the statuses of each frame that has any                                       |
+Entities: `camera` and `camera/boxes`; `world/ego`, `world/path`, `world/vehicles`, `world/map` with 2-sigma ellipses;
+`bev` from above, in ego, x forward is up; `latency/*` in ms; `ego/*` speed and 1-sigma of the pose; `status`.
 """
 
 from __future__ import annotations

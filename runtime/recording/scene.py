@@ -1,4 +1,4 @@
-"""What a drive looks like: its records as messages that Foxglove draws.
+"""The records of a drive as messages that Foxglove draws.
 
 Frames: `world` (of the epoch at hand), `ego`, `camera`; z is up in the first two, as everywhere in types.py.
 """

@@ -1,17 +1,10 @@
 """A recording's measurements through the back end alone, without a network or a camera.
 
-`compare` gives the recorded estimates bit for bit, or the first that differs. What the optimizer was given, and in
-which order, stands in the traces: each estimate bears the one of the message that it answers, so nothing is guessed
-from the clock. What a recording can leave open, it is held to one by one, and the next estimate decides, bit for bit:
-
-- measurements that no estimate answers: the optimizer never had them, or its estimate was lost on its way here;
-- a restart of the optimizer (the recording has it come alive again): in a new epoch, or from its last checkpoint, from
-  which on it was given all measurements, or none before those that begin a new epoch. Those of frames that had been
-  told of by coasting enter the restored graph without a word.
-
-Where measurements are missing that the optimizer had, its graph is not known any more: nothing is compared until a new
-epoch begins, and that is counted. A file that begins in the middle of a drive, since the recorder died, has in it the
-graph of one frame, from which on it is compared. `estimates` is the same with another configuration, as a new result.
+`compare` gives the recorded estimates bit for bit, or the first that differs: each estimate bears the trace of the
+message that it answers, so the order is known. Measurements that no estimate answers the optimizer never had, or its
+estimate was lost. After a restart it began a new epoch, or went on from its last checkpoint with the measurements
+since. Where measurements are missing that the optimizer had, nothing is compared until a new epoch begins. A file that
+begins in the middle of a drive has the graph of its first frame. `estimates` replays with another configuration.
 """
 
 from __future__ import annotations
@@ -29,8 +22,8 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.runtime.configuration import DegradationConfig
-from birdslam.runtime.nodes.coasting import TOLD_AGAIN, unmeasured, with_untold
-from birdslam.runtime.nodes.optimize import farewell
+from birdslam.runtime.nodes.coasting import REPORTED_LATE, unmeasured, with_unreported
+from birdslam.runtime.nodes.optimize import end_estimate
 from birdslam.runtime.recording.recording import CHECKPOINT, Alive, GraphCheckpoint, Recording, RecordingError
 from birdslam.runtime.replay.verdict import Difference, Verdict, differing
 from birdslam.runtime.wire import Trace, WireError, decode, encode
@@ -56,22 +49,22 @@ class _State:
 
     graph: PoseGraph
     last: Estimate | None = None  # that rests on measurements
-    untold: tuple[Status, ...] = ()
+    unreported: tuple[Status, ...] = ()
     maps: list[MapUpdate] = field(default_factory=list)
 
     def measure(self, measurements: Measurements) -> Estimate:
         """One frame's, as OptimizeNode.step."""
         if Status.END_OF_SOURCE in measurements.status:
-            return farewell(measurements, self.graph.epoch, self.last)
+            return end_estimate(measurements, self.graph.epoch, self.last)
         self.last = self.graph.optimise(measurements)
         gained = self.graph.map_update()
         self.maps = [gained] if gained else []
         return self.last
 
-    def tell(self, estimate: Estimate) -> Estimate:
-        """With what had yet to be told."""
-        told, self.untold = with_untold(estimate, self.untold), ()
-        return told
+    def report(self, estimate: Estimate) -> Estimate:
+        """With the statuses that had not been reported yet."""
+        reported, self.unreported = with_unreported(estimate, self.unreported), ()
+        return reported
 
 
 class Comparison:
@@ -91,7 +84,7 @@ class Comparison:
         self._checkpoint = _checkpoint(recording)
         self._since: list[Measurements] = []  # after it, for the first estimate that can be compared
         self._epoch: int | None = None
-        self._told_frame = -1
+        self._reported_frame = -1
 
     def run(self) -> Verdict:
         """Raises RecordingError where the recording holds something that is no record."""
@@ -117,12 +110,12 @@ class Comparison:
             if self.verdict.difference is not None:
                 return self.verdict
         if not self._recording.complete:
-            self._leave_open_end()
+            self._drop_open_end()
         self._answer(0)
         self.verdict.open_end += len(self._measurements)
         return self.verdict
 
-    def _leave_open_end(self) -> None:
+    def _drop_open_end(self) -> None:
         """A file that was cut off may have lost the measurements behind its last estimates, which came first."""
         recorded = [m.trace.stages for m in self._measurements]
         while self._estimates:
@@ -146,7 +139,7 @@ class Comparison:
             self.verdict.epochs += estimate.epoch != self._epoch
             self._epoch = estimate.epoch
             if not by_measurements:
-                taken = self._replay(estimate, message.data, self._told_before(estimate), None)
+                taken = self._replay(estimate, message.data, self._reported_before(estimate), None)
                 for _ in range(taken):
                     self._measurements.popleft()
                 self.verdict.unanswered += taken
@@ -157,7 +150,7 @@ class Comparison:
                 given = [_record(self._measurements.popleft().data, Measurements) for _ in range(place + 1)]
                 self.verdict.unanswered += place
                 self._replay(estimate, message.data, given[:-1], given[-1])
-            self._told_frame = max(self._told_frame, estimate.frame_id)
+            self._reported_frame = max(self._reported_frame, estimate.frame_id)
 
     def _replay(self, estimate: Estimate, data: bytes, open_: list[Measurements], answered: Measurements | None) -> int:
         """One estimate by each of the ways in which it may have come about; shown is the last, where none gives it.
@@ -165,8 +158,8 @@ class Comparison:
         Returns how many of the measurements `open_` it rests on.
         """
         likeliest: Estimate | None = None
-        for state, given, restarted in self._ways(estimate, open_, answered):
-            replayed = self._through(state, given, estimate)
+        for state, given, restarted in self._hypotheses(estimate, open_, answered):
+            replayed = self._replayed(state, given, estimate)
             if replayed is None:
                 continue
             likeliest = replayed
@@ -183,17 +176,17 @@ class Comparison:
             self.verdict.difference = Difference(estimate.frame_id, differing(estimate, likeliest))
         return 0
 
-    def _told_before(self, estimate: Estimate) -> list[Measurements]:
-        """The next measurements, of frames that were told of already: a restored graph may have them."""
+    def _reported_before(self, estimate: Estimate) -> list[Measurements]:
+        """The next measurements, of frames that were reported already: a restored graph may have them."""
         if self._state is None or Status.GRAPH_RESTORED not in estimate.status:
             return []
         waiting = (_record(message.data, Measurements) for message in self._measurements)
-        return list(itertools.takewhile(lambda m: m.frame_id <= self._told_frame, waiting))
+        return list(itertools.takewhile(lambda m: m.frame_id <= self._reported_frame, waiting))
 
-    def _ways(
+    def _hypotheses(
         self, estimate: Estimate, open_: list[Measurements], answered: Measurements | None
     ) -> Iterator[tuple[_State, list[Measurements], bool]]:
-        """(state before, measurements given to it, whether the optimizer was begun anew)."""
+        """(state before, measurements given to it, whether the optimizer was restarted)."""
         now = [] if answered is None else [answered]
         new_world = Status.GRAPH_RESET in estimate.status
         checkpoint = self._checkpoint
@@ -207,14 +200,14 @@ class Comparison:
             if new_world or at_first:
                 yield self._fresh(estimate), now, False
             return
-        came_again = self._alive - 1 > self.verdict.restarts
-        if came_again and new_world:
+        came_back = self._alive - 1 > self.verdict.restarts
+        if came_back and new_world:
             yield self._fresh(estimate), now, True
             yield self._copy(), now, True  # from its checkpoint, which nothing ties to what perceive still had
-        if came_again and Status.GRAPH_RESTORED in estimate.status:
+        if came_back and Status.GRAPH_RESTORED in estimate.status:
             for last, given in itertools.product((self._state.last, None), ([*open_, *now], now)):
                 restored = self._copy()
-                restored.last, restored.untold = last, (Status.GRAPH_RESTORED,)
+                restored.last, restored.unreported = last, (Status.GRAPH_RESTORED,)
                 yield restored, given, True
         if open_:
             yield self._copy(), now, False
@@ -224,20 +217,20 @@ class Comparison:
         """The state at hand, so that it can be gone on from in several ways."""
         assert self._state is not None
         graph = PoseGraph.restore(self._state.graph.checkpoint(), *self._back_end)
-        return _State(graph, self._state.last, self._state.untold)
+        return _State(graph, self._state.last, self._state.unreported)
 
     def _fresh(self, estimate: Estimate) -> _State:
-        """A new graph; planners are told where they may know an older one."""
-        untold = (Status.GRAPH_RESET,) if Status.GRAPH_RESET in estimate.status else ()
-        return _State(PoseGraph(*self._back_end, estimate.epoch), untold=untold)
+        """A new graph; its first estimate says so where planners may know an older one."""
+        unreported = (Status.GRAPH_RESET,) if Status.GRAPH_RESET in estimate.status else ()
+        return _State(PoseGraph(*self._back_end, estimate.epoch), unreported=unreported)
 
-    def _through(self, state: _State, given: list[Measurements], estimate: Estimate) -> Estimate | None:
+    def _replayed(self, state: _State, given: list[Measurements], estimate: Estimate) -> Estimate | None:
         """What comes out for the frame of `estimate`; None where it can't be known."""
         replayed = None
         for measurements in given:
             replayed = state.measure(measurements)
         if replayed is not None and replayed.frame_id < estimate.frame_id:  # late: a newer frame had been coasted over
-            state.untold = (*state.untold, *(s for s in replayed.status if s in TOLD_AGAIN))
+            state.unreported = (*state.unreported, *(s for s in replayed.status if s in REPORTED_LATE))
         if replayed is None or replayed.frame_id != estimate.frame_id:
             ref = self._frames.get(estimate.frame_id)
             if ref is None:
@@ -245,7 +238,7 @@ class Comparison:
             replayed = state.graph.optimise(unmeasured(ref, state.last, self._coast_max_ns))
         if Status.END_OF_SOURCE in replayed.status:
             return replayed
-        return state.tell(replayed)
+        return state.report(replayed)
 
     def _compare_map(self, recorded: MapUpdate) -> None:
         """What the map gained with a frame that was equal must be equal too; it is written after its estimate."""

@@ -1,4 +1,4 @@
-"""What a comparison of a recording with its replay comes to."""
+"""The outcome of comparing a recording with its replay."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Difference:
 
 @dataclass
 class Verdict:
-    """What a comparison came to."""
+    """Counts of what was equal, and the first difference."""
 
     equal: int = 0  # estimates, bit for bit
     coasted: int = 0  # of them, without measurements

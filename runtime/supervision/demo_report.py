@@ -1,6 +1,6 @@
-"""How good a run over the shipped drive was, whose truth is known.
+"""The errors of a run over the shipped drive, whose truth is known.
 
-All that was estimated is kept while the drive goes on, half a minute of it; comparing comes after the run.
+Estimates and map updates are retained during the drive, half a minute of it, and compared after the run.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from birdslam.types import Estimate, MapUpdate
 
 
 class DemoReport:
-    """Takes what planners are told, as birdslam.outputs.drive_files.Recorder does."""
+    """Takes the published estimates, as birdslam.outputs.drive_files.Recorder does."""
 
     def __init__(self, recording: DemoRecording) -> None:
         self._recording = recording
@@ -79,7 +79,7 @@ def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         (
             "  from the ego",
             f"{number(found.vehicle_centre_m, '.2f')} m, {number(found.vehicle_centre_rel, '.1%')} of the range, "
-            f"median; {number(found.told, '.0%')} of those in clear sight told of, "
+            f"median; {number(found.told, '.0%')} of those in clear sight reported, "
             f"{number(found.found, '.0%')} seen in that very frame",
         ),
     ]

@@ -1,4 +1,4 @@
-"""What is made of a run when it is over: the final trajectories, and the video. Nobody waits for it.
+"""Results that are made after a run: the final trajectories, and the video.
 
 Both are made of what the recorder wrote, so that they cost the vehicle no time and no memory: of the file of --record,
 else of a temporary one in the output directory, which is removed when the results are there (a supervisor that is
@@ -165,7 +165,7 @@ def recorded_frames(files: Sequence[Path]) -> tuple[Camera, float, Frames]:
         for path in files:
             try:
                 images = RecordedImages(path)
-            except DatasetError:  # of a recorder that was begun anew and ended before its second frame
+            except DatasetError:  # of a recorder that was restarted and ended before its second frame
                 continue
             for frame in images.frames():
                 yield images.first_frame + frame.index, frame.t_source_ns, frame.image

@@ -1,4 +1,4 @@
-"""The journal of systemd, spoken natively: lines with a priority and fields, so that they can be asked for.
+"""systemd's journal by its native protocol: lines with a priority and fields, to be searched by.
 
 journalctl -u birdslam BIRDSLAM_NODE=perceive PRIORITY=4 -o json
 """

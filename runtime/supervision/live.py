@@ -1,4 +1,4 @@
-"""What a person sees of a run: a refreshed line on a terminal, entries in systemd's journal, plain lines elsewhere."""
+"""The status of a run: a refreshed line on a terminal, entries in systemd's journal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ JOURNAL_PERIOD_S = 60.0  # of the status in the journal; `systemctl status` has 
 class LiveLine:
     """A status line that lines of text may interrupt. Where `stream` is no terminal, the status is a line a second.
 
-    In the journal it is an entry a minute, and what a node says is a warning with the field BIRDSLAM_NODE.
+    In the journal it is an entry a minute, and a warning of a node has the field BIRDSLAM_NODE.
     A line that can't be written (a full disk) is counted in `lost`, and the vehicle drives on; a closed pipe is
     BrokenPipeError.
     """
@@ -26,7 +26,7 @@ class LiveLine:
         self._journal = journal_behind(stream)
         self.period_s = 0.2 if self.terminal else JOURNAL_PERIOD_S if self._journal else 1.0
         self.lost = 0
-        self._shown = False
+        self._visible = False
         self._due_s = 0.0
 
     def update(self, status: str) -> None:
@@ -40,7 +40,7 @@ class LiveLine:
         elif self.terminal:
             width = shutil.get_terminal_size().columns - 1
             self._write(f"\r\x1b[K{status[:width]}")
-            self._shown = True
+            self._visible = True
         else:
             self._write(f"{status}\n")
 
@@ -58,9 +58,9 @@ class LiveLine:
 
     def clear(self) -> None:
         """Takes the status away."""
-        if self._shown:
+        if self._visible:
             self._write("\r\x1b[K")
-            self._shown = False
+            self._visible = False
 
     def _write(self, text: str) -> None:
         try:

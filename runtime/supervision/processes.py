@@ -1,4 +1,4 @@
-"""A node's process as the supervisor holds it: started, watched by a pidfd, its exit status and log in words."""
+"""A node's process: started, watched by a pidfd, with its log and the reason why it ended."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.environment import ENVIRONMENT, USER_ERROR_STATUS
 from birdslam.runtime.process.vitals import Vitals
 
-_SHOWN_LEVELS = (" WARNING ", " ERROR ", " CRITICAL ")
+_REPORTED_LEVELS = (" WARNING ", " ERROR ", " CRITICAL ")
 
 
 class NodeLog:
@@ -33,7 +33,7 @@ class NodeLog:
             whole, newline, _ = log.read().rpartition(b"\n")
         self._read += len(whole) + len(newline)
         lines = whole.decode(errors="replace").splitlines()
-        return [_message(line) for line in lines if any(level in line for level in _SHOWN_LEVELS)]
+        return [_message(line) for line in lines if any(level in line for level in _REPORTED_LEVELS)]
 
     def size(self) -> int:
         """In bytes, now."""
@@ -67,19 +67,19 @@ class NodeProcess:
                 start_new_session=True,  # Ctrl-C at the terminal goes to the supervisor alone, which relays it
             )
         self.pidfd = os.pidfd_open(self._process.pid)
-        self._tell(configuration)
+        self._send(configuration)
 
     def begin(self, assignment: msgspec.Struct) -> None:
-        """Its work begins, with nothing more to be told."""
+        """Its work begins; nothing more is sent to it."""
         self.begun_s = time.monotonic()
-        self._tell(assignment)
+        self._send(assignment)
         assert self._process.stdin is not None
         try:
             self._process.stdin.close()
         except BrokenPipeError:
             return  # it died at once: its pidfd says so
 
-    def _tell(self, what: msgspec.Struct) -> None:
+    def _send(self, what: msgspec.Struct) -> None:
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(msgspec.json.encode(what) + b"\n")
@@ -98,7 +98,7 @@ class NodeProcess:
 
     @property
     def ready(self) -> bool:
-        """It has said, once, that it is at work."""
+        """It is at work."""
         return bool(self.vitals["ready"])
 
     def silent_s(self) -> float:
@@ -138,7 +138,7 @@ class NodeProcess:
 
 def _message(line: str) -> str:
     """A log line without its date and level."""
-    for level in _SHOWN_LEVELS:
+    for level in _REPORTED_LEVELS:
         if level in line:
             return line.partition(level)[2]
     return line

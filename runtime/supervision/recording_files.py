@@ -1,6 +1,6 @@
-"""The files of a recorded run, and what is said of them.
+"""The files of a recorded run, their status and their figures.
 
-A recorder that died or stalled is begun anew in a file of its own beside the first: `drive.mcap`, `drive-2.mcap`, ...
+A recorder that died or stalled is restarted in a file of its own beside the first: `drive.mcap`, `drive-2.mcap`, ...
 A disk that fails ends the recording, and the drive goes on.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from birdslam.runtime.configuration import Configuration, ConfigurationError, RecordingConfig
 from birdslam.runtime.environment import USER_ERROR_STATUS
-from birdslam.runtime.nodes.recorder import DISK_STATUS, Order
+from birdslam.runtime.nodes.recorder import DISK_STATUS, RecorderAssignment
 from birdslam.runtime.process.restarts import Assignment
 from birdslam.runtime.supervision.stations import Duty, Station
 from birdslam.runtime.topology import RECORDER
@@ -49,15 +49,15 @@ class RecordingFiles:
         """The recorder at work. Nothing waits for it while the vehicle drives, and the run goes on without it."""
         duty = Duty(
             module="birdslam.runtime.nodes.recorder",
-            order=self._order,
+            first_message=self._assignment,
             final_statuses=(USER_ERROR_STATUS, DISK_STATUS),
             without="nothing is recorded any more",
         )
         return Station(RECORDER.name, configuration, logs, duty)
 
-    def _order(self, assignment: Assignment) -> Order:
+    def _assignment(self, assignment: Assignment) -> RecorderAssignment:
         self.paths.append(self._next_path() if self.paths else self._first)
-        return Order(self._models, str(self.paths[-1]), assignment)
+        return RecorderAssignment(self._models, str(self.paths[-1]), assignment)
 
     def _next_path(self) -> Path:
         number = len(self.paths) + 1

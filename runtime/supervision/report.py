@@ -1,4 +1,4 @@
-"""What is said of a run at its end: summary.json, and a table for a person."""
+"""The report of a run at its end: summary.json, and a table for a person."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def summarise(
 
 
 def _budget(configuration: Configuration, logbook: Logbook) -> dict[str, Any]:
-    """Whether the whole kept what was promised of it."""
+    """Whether the age of the estimates was within the budget end to end."""
     budgets = configuration.budgets
     age_ms = logbook.age.percentile(budgets.percentile)
     return {
@@ -94,7 +94,7 @@ def table(summary: dict[str, Any], output: Path) -> str:
         ("age at the planner", spread(summary["age_ms"])),
         ("  of its budget", budget),
         *((f"  {name}", spread(figures)) for name, figures in summary["stages_ms"].items()),
-        *((f"  {name} begun anew", f"{n} times") for name, n in summary["restarts"].items() if n),
+        *((f"  {name} restarted", f"{n} times") for name, n in summary["restarts"].items() if n),
         *((f"  {status}", f"{n} frames") for status, n in summary["statuses"].items()),
         *((f"  metres from {source}", f"{n} frames") for source, n in summary["speed_sources"].items()),
         *(("car's readings", _readings(speeds)) for speeds in [summary["car_speeds"]] if any(speeds.values())),
@@ -114,6 +114,6 @@ def _recorded(recording: dict[str, Any]) -> str:
     lost = recording["dropped"] + recording["images_torn"]
     state = "" if recording["complete"] else ", CUT OFF"
     if recording["restarts"]:
-        state = f", begun anew {recording['restarts']} times"
+        state = f", restarted {recording['restarts']} times"
     size = f"{recording['messages']} messages, {lost} lost, {recording['bytes'] / 1e6:.1f} MB"
     return f"{', '.join(recording['files'])}: {size}{state}"

@@ -44,7 +44,7 @@ DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come t
 
 def run(configuration: Configuration) -> int:
     """A whole run; gives the exit status. Raises what a user has to mend before anything is started."""
-    realtime.one_heap()  # before networks are looked at, which begins threads
+    realtime.use_one_heap()  # before networks are looked at, which begins threads
     configuration, models, frames = check(configuration)
     give_back_memory()  # the networks that were looked at
     output = Path(configuration.output)

@@ -1,4 +1,4 @@
-"""The place of a process in a run: the process at work, the spare beside it, and the rule by which it is begun anew."""
+"""One node of a run through all its processes: the one at work, the spare beside it, restarts and watchdog."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def _assignment_alone(assignment: Assignment) -> msgspec.Struct:
 
 @dataclass(frozen=True)
 class Duty:
-    """What the processes of a station do, and what the run is without them."""
+    """What the processes of a station run, and whether the run can go on without them."""
 
     module: str = "birdslam.runtime.nodes.runner"
-    order: Callable[[Assignment], msgspec.Struct] = _assignment_alone  # what a process is told when its work begins
-    final_statuses: tuple[int, ...] = ()  # exit statuses after which none is begun anew; the log says why
+    first_message: Callable[[Assignment], msgspec.Struct] = _assignment_alone  # sent when its work begins
+    final_statuses: tuple[int, ...] = ()  # exit statuses after which none is restarted; the log says why
     without: str = ""  # the run goes on without it, and this is said; "": the run fails with it
 
     @property
@@ -42,7 +42,7 @@ class Duty:
 
 
 class Intake:
-    """Whether a node takes in what is sent to it: a loop that beats may still have lost its input.
+    """Whether a node takes in what is sent to it: one whose heartbeat goes on may have lost its input.
 
     Stale input is another thing: nothing was sent then.
     """
@@ -87,7 +87,7 @@ class Station:
         return NodeProcess(self.name, self._config, self.log, self.duty.module)
 
     def _begin(self) -> None:
-        self.process.begin(self.duty.order(self.restarts.assignment()))
+        self.process.begin(self.duty.first_message(self.restarts.assignment()))
 
     @property
     def working(self) -> bool:
@@ -121,7 +121,7 @@ class Station:
         self.due_s = self.restarts.died(time.monotonic(), self.cause, self.process.vitals)
         return self.due_s is not None
 
-    def begin_again(self) -> None:
+    def restart(self) -> None:
         """The next process goes to work: the spare, or a new one."""
         self.due_s = self._kill_s = None
         self.stall, self.was_ready = "", False
@@ -134,7 +134,7 @@ class Station:
             spare.close()
             spare = None
         if spare is not None:
-            realtime.to_work(spare.pid)  # before it is told to begin: it may still be loading
+            realtime.raise_from_idle(spare.pid)  # before it is sent its assignment: it may still be loading
         self.process = spare or self._started()
         self._begin()
 
@@ -147,7 +147,7 @@ class Station:
             self._spare_due_s = now_s + self._config.runtime.restart_backoff_max_ms / 1e3
         if self._spare is None and now_s >= self._spare_due_s:
             self._spare = self._started()
-            realtime.stand_by(self._spare.pid)
+            realtime.lower_to_idle(self._spare.pid)
         return self._spare is not None and bool(self._spare.vitals["prepared"])
 
     # --- watchdog ---

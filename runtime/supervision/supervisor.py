@@ -1,7 +1,7 @@
 """Starts the three processes and the recorder of a run, watches them, and ends them.
 
-Everything here waits by events: pidfds, signals, the logbook. On SIGINT, SIGTERM and SIGHUP capture is told to let the
-source end there, so that the frames in flight are processed; asked twice, all are told to end at once.
+Everything here waits by events: pidfds, signals, the logbook. On SIGINT, SIGTERM and SIGHUP capture ends the source
+there, so that the frames in flight are processed; at a second signal all processes end at once.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ START_ORDER = ("optimize", "perceive", "capture")  # each awaits the one before 
 BEFORE = {"perceive": "capture", "optimize": "perceive"}  # who sends to whom
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CHECK_S = 0.1  # watchdogs are looked after at least so often
-WARNINGS_SHOWN = 5  # at a time; the log has all of them
+MOST_WARNINGS = 5  # at a time; the log has all of them
 
 
 class Supervisor:
@@ -118,7 +118,7 @@ class Supervisor:
     def _stop_by(self, timeout_s: float) -> None:
         self._deadline_s = time.monotonic() + timeout_s
         for station in self._stations:
-            station.due_s = None  # none is begun anew
+            station.due_s = None  # none is restarted
 
     def _logbook_event(self, event_fd: int) -> None:
         self._selector.unregister(event_fd)
@@ -128,7 +128,7 @@ class Supervisor:
             self._stop_by(self._config.runtime.stop_timeout_s)
 
     def _process_ended(self, pidfd: int) -> None:
-        """One rule for all: what has not finished is begun anew, where that may be; else the run fails with it, or goes
+        """One rule for all: what has not finished is restarted, where that may be; else the run fails with it, or goes
         on without it."""
         self._selector.unregister(pidfd)
         station = next(station for station in self._stations if station.process.pidfd == pidfd)
@@ -137,22 +137,22 @@ class Supervisor:
         status, at_first = process.exit_status, not process.ready and not station.restarts.count
         if station.finished or (stopping and essential and status in (0, None, -signal.SIGTERM)):
             return  # SIGTERM: before it could handle the signal
-        may_begin_again = self._config.restarts and not stopping and not (essential and at_first)
-        if may_begin_again and station.plan_restart():
-            self._live.say(process.failure(station.cause, "; it is begun anew"))
+        may_restart = self._config.restarts and not stopping and not (essential and at_first)
+        if may_restart and station.plan_restart():
+            self._live.say(process.failure(station.cause, "; it is restarted"))
             if station.due_s is not None and station.due_s <= time.monotonic():
-                self._begin_again(station)
+                self._restart(station)
         elif not essential:
             self._live.say(process.failure(station.cause, f"; {station.duty.without}, the run goes on"))
-        elif may_begin_again:
+        elif may_restart:
             window_s = self._config.runtime.restart_window_s
-            again = f"{self._config.runtime.restarts_max + 1} times in {window_s:g} s: it is not begun anew"
+            again = f"{self._config.runtime.restarts_max + 1} times in {window_s:g} s: it is not restarted"
             self.fail(f"{process.failure()}, {again}", 1)
         else:
             self.fail(process.failure(), USER_ERROR_STATUS if status == USER_ERROR_STATUS and not stopping else 1)
 
-    def _begin_again(self, station: Station) -> None:
-        station.begin_again()
+    def _restart(self, station: Station) -> None:
+        station.restart()
         self._selector.register(station.process.pidfd, selectors.EVENT_READ, self._process_ended)
 
     def _watch(self) -> None:
@@ -167,7 +167,7 @@ class Supervisor:
                 station.end(stall)
             station.enforce()
             if station.due_s is not None and station.due_s <= now_s:
-                self._begin_again(station)
+                self._restart(station)
         if self._deadline_s is None and all(node.process.ready for node in nodes):
             self._notifier.once("READY=1")
             if self._config.spares:  # one after the other, so that loading them takes one core at the most
@@ -176,7 +176,7 @@ class Supervisor:
             still = [node.name for node in nodes if node.process.exit_status is None]
             if still:
                 limit_s = self._config.runtime.stop_timeout_s
-                self.fail(f"{', '.join(still)} did not end within {limit_s:g} s of being told to", 1)
+                self.fail(f"{', '.join(still)} did not end within {limit_s:g} s of being asked to", 1)
             self._send_all(signal.SIGKILL)
 
     def fail(self, reason: str, exit_status: int) -> None:
@@ -195,10 +195,10 @@ class Supervisor:
     def _show(self) -> None:
         for station in self._stations:
             warnings = station.log.new_warnings()
-            for line in warnings[:WARNINGS_SHOWN]:
+            for line in warnings[:MOST_WARNINGS]:
                 self._live.say(f"{station.name}: {line}")
-            if len(warnings) > WARNINGS_SHOWN:
-                self._live.say(f"{station.name}: {len(warnings) - WARNINGS_SHOWN} more warnings in {station.log.path}")
+            if len(warnings) > MOST_WARNINGS:
+                self._live.say(f"{station.name}: {len(warnings) - MOST_WARNINGS} more warnings in {station.log.path}")
         if self._logbook.unwritten is not None and not self._disk_said:
             self._disk_said = True
             self._live.say(f"results are not written any more: {self._logbook.unwritten}")

@@ -1,15 +1,8 @@
 """The bus: one node's zenoh session, with typed publishers, bounded subscribers and liveliness.
 
-    with Bus("car", "perceive") as bus:
-        frames, out = bus.subscriber("frame"), bus.publisher("measurements")
-        bus.declare_alive()
-        message = frames.recv(timeout_s=0.5)                       # Message | None
-        out.put(record, message.trace.after("perceive", message.t_received_ns, done_ns))
-
 Everything stays on this machine: unix sockets in a directory of the vehicle (0700), no TCP, no multicast, no shared
 memory of zenoh's. The hub (the supervisor) listens on `hub.sock`, every node of the topology on a socket of its own,
 and they find each other by gossip through the hub; all others (planners) only connect. Nobody needs to be the first.
-
 Never fork after a Bus was opened (spawn instead), and always close it: zenoh's threads live until then.
 """
 
@@ -46,6 +39,12 @@ __all__ = ["Bus", "BusClosed", "BusError", "Message", "MessagesLost", "Publisher
 
 class Bus(Closing):
     """One node's session on its vehicle's bus. A context manager; `close` it always.
+
+        with Bus("car", "perceive") as bus:
+            frames, out = bus.subscriber("frame"), bus.publisher("measurements")
+            bus.declare_alive()
+            message = frames.recv(timeout_s=0.5)                       # Message | None
+            out.put(record, message.trace.after("perceive", message.t_received_ns, done_ns))
 
     `hub` is the supervisor's: the socket that everybody connects to. `lossless` sends with back pressure and queues
     deep, for runs in which every frame counts (`--rate max`): all nodes and readers of such a run must be lossless.
@@ -98,11 +97,11 @@ class Bus(Closing):
     def catch_up(self, topic: str, subscriber: Subscriber) -> None:
         """Gives a subscriber that came late the topic's last message, when it comes; waits for nothing."""
         self._check_open()
-        callback = zenoh.handlers.Callback(subscriber._receive_kept, indirect=False)
+        callback = zenoh.handlers.Callback(subscriber._receive_retained, indirect=False)
         self._session.get(key_of(self.vehicle, topic), callback, timeout=REPLY_S)
 
-    def kept(self, topic: str, timeout_s: float = REPLY_S) -> list[Message]:
-        """The topic's kept messages (Topic.kept), oldest first; empty where nobody answers in time.
+    def retained(self, topic: str, timeout_s: float = REPLY_S) -> list[Message]:
+        """The topic's retained messages (Topic.retained), oldest first; empty where nobody answers in time.
 
         Raises BusError where one is no such record.
         """
@@ -111,7 +110,7 @@ class Bus(Closing):
             self._check_open()
             return [message_of(sample, key, record) for sample in replies(self._session, key, timeout_s)]
         except WireError as error:
-            raise BusError(f"{topic}: a kept message is malformed: {error}") from error
+            raise BusError(f"{topic}: a retained message is malformed: {error}") from error
 
     def query(self, name: str, timeout_s: float = REPLY_S, **parameters: float) -> list[Any]:
         """The parts of the reply to one of topology.QUERIES, in order; empty where nobody answers in time.
@@ -135,7 +134,7 @@ class Bus(Closing):
 
     @property
     def alive(self) -> frozenset[str]:
-        """The nodes that are alive now, as far as this session has heard."""
+        """The nodes that are alive now, as far as this session knows."""
         with self._alive_changed:
             return frozenset(self._alive)
 

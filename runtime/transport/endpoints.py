@@ -13,7 +13,7 @@ import msgspec
 import zenoh
 
 from birdslam.runtime.topology import Topic
-from birdslam.runtime.transport.queries import KeptMessages
+from birdslam.runtime.transport.queries import RetainedMessages
 from birdslam.runtime.wire import MAX_TRACE_BYTES, Stage, Trace, WireError, decode, encode
 
 log = logging.getLogger(__name__)
@@ -69,14 +69,14 @@ class Publisher:
         self._changed = threading.Condition()
         self._closed = False
         self._sent = 0
-        self._matched: bool | None = None  # kept here: zenoh is never asked while the lock is held
+        self._matched: bool | None = None  # a copy: zenoh is never called while the lock is held
         self._publisher = session.declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.REAL_TIME if topic.urgent else zenoh.Priority.DATA_LOW,
             express=express,
         )
-        self._kept = KeptMessages(session, key, topic.kept) if topic.kept else None
+        self._retained = RetainedMessages(session, key, topic.retained) if topic.retained else None
         callback = zenoh.handlers.Callback(self._matching_changed, indirect=False)
         self._listener = self._publisher.declare_matching_listener(callback)
         at_first: zenoh.MatchingStatus = self._publisher.matching_status  # type: ignore[assignment]
@@ -115,8 +115,8 @@ class Publisher:
         self._sent += 1
         begun = trace if trace and trace.stages else Trace((Stage(self._node, now_ns, now_ns),))
         attachment = encode(begun.sent(now_ns, self._sent))
-        if self._kept is not None:
-            self._kept.add(data, attachment)
+        if self._retained is not None:
+            self._retained.add(data, attachment)
         try:
             self._publisher.put(data, attachment=attachment)
         except zenoh.ZError as error:
@@ -165,7 +165,7 @@ class Subscriber:
             self._queue.append(message)
             self._arrived.notify()
 
-    def _receive_kept(self, reply: zenoh.Reply) -> None:
+    def _receive_retained(self, reply: zenoh.Reply) -> None:
         """A message of before this subscription; it counts only where none came since."""
         if reply.ok is not None and self.newest is None:
             self._receive(reply.ok)

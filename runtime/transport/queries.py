@@ -1,8 +1,8 @@
 """Queries of the bus, by zenoh, each answered with records of one type.
 
-A publisher of a topic that keeps its last messages (`Topic.kept`) answers with them, from the bytes that it sent. What
-costs more to answer (`QueryResponder`) is made in a thread of its own, behind a short queue: who queries too much gets
-no reply, and nothing else notices.
+A publisher of a topic with retained messages (`Topic.retained`) answers with them, from the bytes that it sent. Other
+queries (`QueryResponder`) are answered in a thread of their own, behind a short queue: who queries too much gets no
+reply, and nothing else is slowed down.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class QueryRefused(ValueError):
     """A query that can't be answered: its sender gets the reason."""
 
 
-class KeptMessages:
+class RetainedMessages:
     """The last messages of one publisher, for those that come late. Answers on zenoh's own thread: nothing is made."""
 
     def __init__(self, session: zenoh.Session, key: str, count: int) -> None:

@@ -1,18 +1,9 @@
 """Images between processes: a ring of slots in shared memory, one writer, any number of readers.
 
-The writer never waits: it goes round the slots, so a reader that is slower than `slots - 1` frames finds its frame
-overwritten, and is told so. A slot is guarded by a sequence lock (odd while it is written), and by a checksum over the
-pixels, their shape and the sequence. `FrameReader.read` copies the pixels out first and believes them afterwards, so
-what it gives is one whole frame or nothing, wherever the writer was, or was killed, meanwhile.
-
-Why that is sound. On x86-64 stores are seen in their order and loads are made in theirs (memcpy fences the streaming
-stores that it uses for large blocks), each sequence is one aligned 8-byte store, and Python's separate calls keep the
-compiler from moving them: the sequence lock alone would do. On machines of weaker order (ARM) it would not, and Python
-has no fences; there the checksum decides, since it is taken from the very bytes that are handed out. It costs about
-20 us for a 1.4 MB image, so it is taken everywhere.
-
-The file is made whole under another name and then renamed, so that it appears complete or not at all. A writer that
-starts anew replaces it under a new `epoch`; readers see that in FrameRef.ring_epoch and reopen.
+The writer never waits: a reader that is slower than `slots - 1` frames finds its frame overwritten, and gets None. A
+slot is guarded by a sequence lock (odd while it is written) and by a checksum over the pixels, their shape and the
+sequence: `FrameReader.read` copies first and verifies afterwards. The file is made under another name and renamed; a
+writer that starts again replaces it under a new `epoch`, which readers see in FrameRef.ring_epoch.
 """
 
 from __future__ import annotations
@@ -49,6 +40,11 @@ def _slot_bytes(height_px: int, width_px: int, channels: int) -> int:
     return _WORD_BYTES * _SLOT_WORDS + -(-pixels_bytes // 64) * 64
 
 
+# Why a lock and a checksum. On x86-64 stores are seen in their order and loads are made in theirs (memcpy fences the
+# streaming stores that it uses for large blocks), each sequence is one aligned 8-byte store, and Python's separate
+# calls keep the compiler from moving them: the sequence lock alone would do. On machines of weaker order (ARM) it would
+# not, and Python has no fences; there the checksum decides, since it is taken from the very bytes that are handed out.
+# It costs about 20 us for a 1.4 MB image, so it is taken everywhere.
 def _checksum(pixels: Image, sequence: int, height_px: int, width_px: int, channels: int) -> int:
     """Of a flat, contiguous array of pixels and of the head that describes them."""
     whole = pixels.size // _WORD_BYTES * _WORD_BYTES

@@ -164,7 +164,7 @@ class Training:
                 sums[name] = sums.get(name, 0.0) + value / self.config.row_steps
             self.step += 1
             if self.rank > 0:
-                continue  # the first keeps the books
+                continue  # the first alone writes curves and checkpoints
             if self.step % self.config.row_steps == 0:
                 spent_s = time.monotonic() - begun_s
                 row = {"stage": number, "step": self.step, "seconds": spent_s, "waited": waited_s, **sums}

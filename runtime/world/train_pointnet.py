@@ -109,8 +109,8 @@ def learn(
             spent_s = time.monotonic() - begun_s
             rows.writerow([epoch, f"{spent_s:.0f}", *(f"{value:.4f}" for value in parts.values())])
             file.flush()
-            told = "  ".join(f"{name} {value:.3f}" for name, value in parts.items())
-            print(f"epoch {epoch}  {spent_s:.0f} s  {told}", flush=True)
+            losses = "  ".join(f"{name} {value:.3f}" for name, value in parts.items())
+            print(f"epoch {epoch}  {spent_s:.0f} s  {losses}", flush=True)
     return network
 
 

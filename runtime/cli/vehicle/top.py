@@ -88,7 +88,7 @@ class VehicleTable:
         head = _line_of([title for title, _ in COLUMNS], COLUMNS)
         rows = [self._row(name, now_ns) for name in PROCESSES if name in NODES or self._healths[name].newest]
         causes = [
-            f"{name} was begun anew {health.restarts} times, at last since it {health.cause}"
+            f"{name} was restarted {health.restarts} times, at last since it {health.cause}"
             for name in PROCESSES
             if (health := self._health(name)) is not None and health.restarts
         ]
