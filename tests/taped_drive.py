@@ -58,7 +58,7 @@ class Perceive:
         while len(self.sent) > but_last:
             self.sent.popleft()
 
-    def kept(self, topic: str, timeout_s: float = 0.0) -> list[Message]:
+    def retained(self, topic: str, timeout_s: float = 0.0) -> list[Message]:
         return list(self.sent)
 
 

@@ -19,7 +19,7 @@ from birdslam.bench.tracking.benchmark import Row
 from birdslam.perf.__main__ import benchmark_modules
 from birdslam.perf.reporting import results
 from birdslam.perf.robustness import faults
-from birdslam.perf.robustness.strikes import FAULTS
+from birdslam.perf.robustness.injection import FAULTS
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import Configuration, ConfigurationError, load
 from birdslam.runtime.pages import configuration as configuration_page
@@ -100,7 +100,7 @@ def test_the_page_of_faults_is_of_the_suite_as_it_is() -> None:
 
 
 def test_the_page_of_results_is_made_of_the_reports_that_are_kept() -> None:
-    found = results.retained()
+    found = results.kept()
     assert results.page(found) == (DOCS / "results.md").read_text(), "python -m perf results"
 
 
@@ -108,7 +108,7 @@ def test_the_readme_has_the_one_table_of_results_and_150_lines() -> None:
     lines = (ROOT / "README.md").read_text().splitlines()
     assert len(lines) <= 150
     assert max(len(line) for line in lines if not line.startswith("|")) <= 120
-    table = results.summary(results.retained()).splitlines()
+    table = results.summary(results.kept()).splitlines()
     begin = lines.index(table[0])
     assert lines[begin : begin + len(table) + 1] == [*table, ""]
 

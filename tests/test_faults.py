@@ -11,9 +11,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from birdslam.perf.robustness.faults import inflict, markdown, survived
+from birdslam.perf.robustness.faults import markdown, measure, survived
 from birdslam.perf.robustness.faulty_vehicle import Vehicle, model_options, record_options
-from birdslam.perf.robustness.strikes import FAULTS
+from birdslam.perf.robustness.injection import FAULTS
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.presence import ring_path
 
@@ -43,7 +43,7 @@ def test_faults_in_short(place: Path) -> None:
             if f"{fault.name} {fault.node}" not in SHORT:
                 continue
             vehicle.settle(0.5)
-            row = inflict(vehicle, fault)
+            row = measure(vehicle, fault)
             assert survived(row, BUSY_MACHINE), row
         vehicle.settle(0.5)
         assert vehicle.stop() == 0
@@ -64,7 +64,7 @@ def test_every_fault(place: Path, models_dir_if_any: Path | None, capsys: pytest
     with Vehicle(place, *model_options(models_dir_if_any), *record_options(place)) as vehicle:
         for fault in FAULTS:
             vehicle.settle()
-            rows.append(inflict(vehicle, fault))
+            rows.append(measure(vehicle, fault))
             with capsys.disabled():
                 print(markdown(rows[-1:]).splitlines()[-1], flush=True)
     assert [row for row in rows if not survived(row, SEVERE)] == []

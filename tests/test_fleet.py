@@ -28,13 +28,12 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.runtime.cli import fleet as commands
-from birdslam.runtime.cli.vehicle.top import FleetTable
+from birdslam.runtime.cli.vehicle.top import FleetTable, top_all
 from birdslam.runtime.configuration import ConfigurationError, FleetConfig, RouterConfig, load
 from birdslam.runtime.fleet.link import open_link
 from birdslam.runtime.fleet.listener import Fleet, FleetReading
 from birdslam.runtime.fleet.router import access_control, router_config
-from birdslam.runtime.fleet.uplink import TOPICS_SAID, Uplink
+from birdslam.runtime.fleet.uplink import FORWARDED, Uplink
 from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, every_key, key_of, vehicle_and_topic
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, Publisher
 from birdslam.runtime.wire import Health, encode
@@ -115,9 +114,9 @@ def test_by_the_routers_rules_a_vehicle_writes_its_own_keys_alone(names: list[st
         )
 
     own = f"vehicle {speaker}"
-    assert may(own, "put", key_of(named, topic)) == (named == speaker and topic in TOPICS_SAID)
+    assert may(own, "put", key_of(named, topic)) == (named == speaker and topic in FORWARDED)
     assert may(own, "liveliness_token", alive_key(named, "optimize")) == (named == speaker)
-    assert may(own, "reply", key_of(named, topic)) == (named == speaker and topic in {*TOPICS_SAID, *QUERIES})
+    assert may(own, "reply", key_of(named, topic)) == (named == speaker and topic in {*FORWARDED, *QUERIES})
     assert not any(may(own, message, key_of(named, topic)) for message in ("delete", "declare_subscriber", "query"))
     assert not any(may("operator", message, key_of(named, topic)) for message in writing)
     assert not any(may(speaker, message, key_of(named, topic)) for message in (*writing, "query"))  # a name alone
@@ -245,7 +244,7 @@ def test_one_listener_follows_three_vehicles(tmp_path_factory: pytest.TempPathFa
                     reading = say(vehicle, fleet)
                     assert reading.usable
                     assert reading.trace.stages[-1].node == "uplink"
-            assert [fleet.heard(name).lost for name in NAMES] == [0, 0, 0]
+            assert [fleet.received(name).lost for name in NAMES] == [0, 0, 0]
             red = vehicles[0]
             red.healths.put(Health(node="optimize", t_ns=1, frames=7))
             until(lambda: (h := fleet.health("red", "optimize")) is not None and h.frames == 7, "a health")
@@ -326,14 +325,14 @@ def test_each_certificate_may_do_its_own_and_no_more(tls: Path, port: int) -> No
                 liar.delete(key_of("red", "estimate"))
             red.put(key_of("red", "estimate"), truth)
             green.put(key_of("green", "estimate"), truth)
-            return {"red", "green"} <= set(fleet.vehicles) and fleet.heard("red").estimates >= 5
+            return {"red", "green"} <= set(fleet.vehicles) and fleet.received("red").estimates >= 5
 
         until(came, "true estimates")
         for name in ("red", "green"):
             found = fleet.latest(name).estimate
             assert found is not None
             assert found.frame_id == 1
-            assert fleet.heard(name).malformed == 0
+            assert fleet.received(name).malformed == 0
         assert "blue" not in fleet.vehicles
         assert fleet.refused == 0
         assert fleet.alive("red") == frozenset()  # nobody says that it lives but itself
@@ -367,7 +366,7 @@ def test_a_flood_and_a_death_cost_the_others_nothing(
         with opened(*vehicles), Fleet(link(tls, port, "operator")) as fleet:
             for vehicle in vehicles:
                 first(vehicle, fleet)
-            before = {name: fleet.heard(name) for name in NAMES}
+            before = {name: fleet.received(name) for name in NAMES}
             stop, sent = threading.Event(), [0]
             flood = Publisher(red.uplink._session, key_of("red", "estimate"), TOPICS["estimate"], "flood", False)
 
@@ -383,16 +382,16 @@ def test_a_flood_and_a_death_cost_the_others_nothing(
                 say(vehicle, fleet)
             stop.set()
             thread.join()
-            heard = fleet.heard("red").estimates - before["red"].estimates
+            heard = fleet.received("red").estimates - before["red"].estimates
             assert heard < sent[0] / 2  # the router has thinned it
             red.uplink._session.close()
             until(lambda: not fleet.latest("red").alive, "red is not alive")
             for vehicle in (green, blue) * 5:
                 say(vehicle, fleet)
             for name in ("green", "blue"):
-                assert fleet.heard(name).estimates - before[name].estimates == 25
-                assert fleet.heard(name).lost == before[name].lost
-                assert fleet.heard(name).malformed == 0
+                assert fleet.received(name).estimates - before[name].estimates == 25
+                assert fleet.received(name).lost == before[name].lost
+                assert fleet.received(name).malformed == 0
                 assert fleet.latest(name, 1e6).usable
             told = next(r for r in fleet.estimates(50.0) if r.vehicle == "red" and not r.on_time)
             assert not told.alive
@@ -468,7 +467,7 @@ def test_the_commands_find_each_other_again(tmp_path_factory: pytest.TempPathFac
 
         until(comes, "an estimate through the commands")
         out = io.StringIO()
-        assert commands.top_all(base / "operator.toml", once=True, out=out) == 0
+        assert top_all(base / "operator.toml", once=True, out=out) == 0
         assert re.search(r"^red +(alive|LATE) ", out.getvalue(), re.M)
 
         red = stack.enter_context(zenoh.open(raw_config(tls, port, "red.vehicle")))
@@ -513,8 +512,8 @@ def test_an_uplink_sends_no_more_than_it_was_told(
                 until(lambda n=number: heard.newest and heard.newest.record.frame_id == n, "it")  # type: ignore[misc]
             red.healths.put(Health(node="optimize", t_ns=1))
             until(lambda: fleet.health("red", "optimize") is not None, "what was said after them")
-            assert fleet.heard("red").estimates <= 2
-            assert fleet.heard("red").lost == 0
+            assert fleet.received("red").estimates <= 2
+            assert fleet.received("red").lost == 0
 
 
 @processes
@@ -555,4 +554,4 @@ def test_a_table_that_cannot_be_names_its_key(tls: Path) -> None:
 
 
 def test_what_leaves_a_vehicle_is_estimates_and_healths_alone() -> None:
-    assert set(TOPICS_SAID) == {"estimate", *(f"health/{node}" for node in PROCESSES)}
+    assert set(FORWARDED) == {"estimate", *(f"health/{node}" for node in PROCESSES)}

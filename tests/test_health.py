@@ -105,7 +105,7 @@ def test_a_node_s_health() -> None:
         done_ns = taken_ns + (7 if number % 4 == 0 else 2) * MS
         waited_ns = 4 * MS if number in (1, 2) else 0  # in the queue: this node's time, not the hop's
         trace = Trace((Stage("capture", 0, 0, 0), Stage("perceive", 0, 0, taken_ns - waited_ns - 3 * MS)))
-        meter.heard(taken_ns)
+        meter.received(taken_ns)
         meter.frame(taken_ns - 40 * MS, trace.after("optimize", taken_ns, done_ns, taken_ns - waited_ns))
     assert not meter.due(begun_ns)
     now_ns = begun_ns + PERIOD_NS + 50 * MS

@@ -15,8 +15,8 @@ from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner, RoadImage
 from birdslam.odometry.road.scale_search import best_correlation, far_changed_pixels
+from birdslam.perf.accuracy.drives import Task, mirrored_camera, read
 from birdslam.perf.accuracy.overlays import measure
-from birdslam.perf.accuracy.starts import Task, mirrored_camera, read
 from birdslam.sources.opening import open_recording
 from birdslam.trajectory import as_poses
 from birdslam.types import Status

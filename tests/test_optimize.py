@@ -22,7 +22,7 @@ from birdslam.runtime.configuration import (
     RuntimeConfig,
     SourceConfig,
 )
-from birdslam.runtime.nodes.checkpoints import MOST_BYTES, CheckpointFile, newest
+from birdslam.runtime.nodes.checkpoints import MOST_BYTES, CheckpointFile, newest_checkpoint
 from birdslam.runtime.nodes.coasting import Overdue, PendingFrames, deadline_ns, unmeasured
 from birdslam.runtime.nodes.optimize import OptimizeNode
 from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
@@ -58,7 +58,7 @@ class Bus:
     def wait_alive(self, nodes: set[str], timeout_s: float) -> set[str]:
         return set() if self._alive else set(nodes)
 
-    def kept(self, topic: str, timeout_s: float) -> list[Message]:
+    def retained(self, topic: str, timeout_s: float) -> list[Message]:
         return [Message(record, Trace(), 0) for record in self._past]
 
 
@@ -314,18 +314,18 @@ def test_whatever_a_kill_cuts_short_the_other_checkpoint_is_whole(tmp_path: Path
 
 def test_another_process_looks_at_the_newest_checkpoint_and_takes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "c"
-    assert newest(path) is None
+    assert newest_checkpoint(path) is None
     file = CheckpointFile(path)
-    assert newest(path) is None
+    assert newest_checkpoint(path) is None
     for frame_id in range(5):
         file.store(frame_id, 1, bytes([frame_id]) * (frame_id + 1))
-        found = newest(path)
+        found = newest_checkpoint(path)
         assert found is not None
         assert (found.frame_id, found.epoch, found.data) == (frame_id, 1, bytes([frame_id]) * (frame_id + 1))
     assert [kept.frame_id for kept in CheckpointFile(path).take()] == [4, 3]
-    assert newest(path) is None
+    assert newest_checkpoint(path) is None
     path.write_bytes(b"no such file")
-    assert newest(path) is None
+    assert newest_checkpoint(path) is None
 
 
 def test_a_torn_checkpoint_is_passed_over(tmp_path: Path) -> None:

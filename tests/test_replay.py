@@ -18,7 +18,7 @@ from birdslam.perf.latency import replay as perf_replay
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.cli.drives import replay as replay_command
 from birdslam.runtime.configuration import ConfigurationError
-from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest
+from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest_checkpoint
 from birdslam.runtime.nodes.recorder import about
 from birdslam.runtime.recording.recording import Alive, GraphCheckpoint, Recording, RecordingError, RecordingWriter
 from birdslam.runtime.replay import replay
@@ -236,7 +236,7 @@ def test_a_file_that_begins_in_the_middle_of_a_drive_replays_from_its_checkpoint
     tape, frames = Tape(tmp_path), measured(40)
     for measurements in frames[:15]:
         tape.step(measurements)
-    kept = newest(checkpoint_path(tape.configuration))
+    kept = newest_checkpoint(checkpoint_path(tape.configuration))
     assert kept is not None
     tape.writer.close({})
     path = tmp_path / "drive-2.mcap"

@@ -92,7 +92,7 @@ def test_standing_cars_told_as_driving_are_counted_and_the_other_way_round(seque
 
 @pytest.mark.parametrize(("sigma_mps", "sure"), [(0.2, 1), (0.3, 0)])
 def test_a_driving_car_told_as_standing_for_sure_is_counted_apart(sigma_mps: float, sure: int) -> None:
-    sight = Sight(7, 20.0, (5.0, 0.0), error_m=(0.0, 0.0), told_mps=(1.0, 0.0), told_sigma_mps=sigma_mps)
+    sight = Sight(7, 20.0, (5.0, 0.0), error_m=(0.0, 0.0), reported_mps=(1.0, 0.0), reported_sigma_mps=sigma_mps)
     row = motion_row("0002", [sight])
     assert (row.driving, row.missed_movers, row.missed_movers_sure) == (1, 1, sure)
 

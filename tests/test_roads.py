@@ -23,8 +23,8 @@ import pytest
 
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
+from birdslam.perf.accuracy.drives import SCALE_LIMIT, Drive, errors, follow
 from birdslam.perf.accuracy.roads import EFFECTS, measure, read
-from birdslam.perf.accuracy.starts import SCALE_LIMIT, Drive, errors, follow
 from birdslam.sources.shipped_drive import DIRECTORY, DemoRecording
 from birdslam.trajectory import inverse
 from birdslam.types import Status

@@ -1,19 +1,9 @@
-"""What a drive leaves on disk, written line by line as the estimates come.
+"""Results of a drive, written line by line as the estimates come.
 
-| file              | what                                                                                  |
-|-------------------|---------------------------------------------------------------------------------------|
-| ego.kitti.txt     | camera poses `T_first_i` as KITTI rows, row k is frame k (`trajectory.py`)            |
-| ego.tum.txt       | ego poses in world, TUM lines at the source's times                                   |
-| tracks/ID.tum.txt | footprint centres of one vehicle in world, a line for each frame in which it was seen |
-| map.csv           | road landmarks and lane points in world: epoch,kind,x_m,y_m,lane (-1: of none)        |
-| summary.json      | counts of this recording, and what the caller adds                                    |
-| bev.png           | all of it from above (`bev_picture.py`)                                                   |
-
-Final trajectories, where they are asked for, lie beside the live ones (`final_trajectories.py`).
-
-Where the optimizer began a new epoch, TUM files carry a comment line and begin in the new world frame. KITTI rows can't
-say that, and go on from the last pose, as the picture does; nothing is known of the motion in between. A frame without
-an estimate (dropped, unreadable) keeps the pose before it, so that row k is always frame k.
+`ego.kitti.txt`: camera poses `T_first_i`, row k is frame k (a frame without an estimate keeps the pose before it).
+`ego.tum.txt`, `tracks/ID.tum.txt`: the ego, and the footprint's centre of each vehicle seen, in world. `map.csv`: road
+landmarks and lane points in world, with their epoch and lane (-1: of none). `summary.json`: counts. `bev.png`: all of
+it from above. Where a new epoch begins TUM files carry a comment; KITTI rows go on from the last pose.
 """
 
 from __future__ import annotations
@@ -37,7 +27,7 @@ from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row
 from birdslam.types import Attitude, Estimate, MapUpdate, Status, VehicleEstimate
 
 FILLED_FRAMES = 10_000  # a longer gap in the frame numbers is a new source, not dropped frames
-KEPT_POSES, KEPT_TRACK_POSES, KEPT_POINTS, KEPT_TRACKS = 4000, 100, 20_000, 200  # in the picture; under 3 MB in all
+MOST_POSES, MOST_TRACK_POSES, MOST_POINTS, MOST_TRACKS = 4000, 100, 20_000, 200  # in the picture; under 3 MB in all
 
 
 class ResultsError(ValueError):
@@ -94,10 +84,10 @@ class Thinned:
         return self._rows[: self._kept].copy()
 
 
-class _KeptTrack:
+class _TrackHistory:
     def __init__(self) -> None:
-        self.poses = Thinned(3, KEPT_TRACK_POSES, begin=16)
-        self.speeds = Thinned(1, KEPT_TRACK_POSES, begin=16)
+        self.poses = Thinned(3, MOST_TRACK_POSES, begin=16)
+        self.speeds = Thinned(1, MOST_TRACK_POSES, begin=16)
         self.described = ""
         self.last: VehicleEstimate | None = None
         self.T_picture_vehicle = SE2()
@@ -139,9 +129,9 @@ class Recorder:
         self._epoch: int | None = None
         self._epoch_count = 0
         self._T_picture_world = SE2()
-        self._ego, self._breaks = Thinned(3, KEPT_POSES), Thinned(2, KEPT_POSES)
-        self._lanes, self._landmarks = Thinned(2, KEPT_POINTS), Thinned(2, KEPT_POINTS)
-        self._tracks: dict[int, _KeptTrack] = {}
+        self._ego, self._breaks = Thinned(3, MOST_POSES), Thinned(2, MOST_POSES)
+        self._lanes, self._landmarks = Thinned(2, MOST_POINTS), Thinned(2, MOST_POINTS)
+        self._tracks: dict[int, _TrackHistory] = {}
         self._track_count = 0
 
     def _open(self, name: str) -> TextIO:
@@ -233,7 +223,7 @@ class Recorder:
         track = self._tracks.pop(vehicle.vehicle, None)
         lines = []
         if track is None:
-            track = _KeptTrack()
+            track = _TrackHistory()
             if not path.exists():
                 self._track_count += 1
                 lines.append(
@@ -241,7 +231,7 @@ class Recorder:
                 )
                 lines.append("# z is the height of the road under the ego: a vehicle's own is not estimated")
         self._tracks[vehicle.vehicle] = track  # the one seen last stands last
-        if len(self._tracks) > KEPT_TRACKS:
+        if len(self._tracks) > MOST_TRACKS:
             del self._tracks[next(iter(self._tracks))]
         if track.epoch not in (-1, estimate.epoch):
             lines.append(f"# epoch {estimate.epoch}: a new world frame begins")

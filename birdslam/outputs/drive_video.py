@@ -41,7 +41,7 @@ MOST_SCALE, MOST_WIDTH_PX = 1.5, 1280  # of the camera's image, enlarged or redu
 STRIP_PX, PANEL_PX = 96, 368  # height of the strip of text below the image, width of the bird's-eye view
 AHEAD_M, BEHIND_M = 50.0, 10.0  # shown of the bird's-eye view
 BOX_HEIGHT_M = 1.5  # estimates have none
-KEPT_POINTS, KEPT_POSES = 12_000, 400
+MOST_POINTS, MOST_POSES = 12_000, 400
 SHIFT = 4  # OpenCV's fractional bits: outlines don't jump from pixel to pixel
 RING_M = 10.0
 FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -64,9 +64,9 @@ class SideBySide:
         self.size_px = self.size_px[0] // 2 * 2, self.size_px[1] // 2 * 2
         self._per_m = self.size_px[1] / (AHEAD_M + BEHIND_M)
         self._epoch: int | None = None
-        self._lanes: deque[tuple[float, float]] = deque(maxlen=KEPT_POINTS)
-        self._landmarks: deque[tuple[float, float]] = deque(maxlen=KEPT_POINTS)
-        self._way: deque[tuple[float, float]] = deque(maxlen=KEPT_POSES)
+        self._lanes: deque[tuple[float, float]] = deque(maxlen=MOST_POINTS)
+        self._landmarks: deque[tuple[float, float]] = deque(maxlen=MOST_POINTS)
+        self._way: deque[tuple[float, float]] = deque(maxlen=MOST_POSES)
 
     def add_map(self, update: MapUpdate) -> None:
         """Points in world of the update's epoch."""

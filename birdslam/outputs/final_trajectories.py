@@ -1,14 +1,9 @@
-"""The final trajectories of a drive: where everybody was, as known when the drive is over. Files beside the live ones:
+"""The final trajectories of a drive, beside the live ones: poses as they are known once the drive is over.
 
-| file                          | what                                                                             |
-|-------------------------------|----------------------------------------------------------------------------------|
-| tracks/ID.final.tum.txt       | one vehicle by the RTS smoother (vehicles/rts_smoother.py), as tracks/ID.tum.txt |
-| ego.final.tum.txt, .kitti.txt | the ego: the poses of ego.tum.txt and ego.kitti.txt again                        |
-
-The ego's final trajectory equals its live one, as in the evaluation: no loop is closed, so that hardly anything that
-is seen later speaks of a pose that has left the graph's window, and no smoother of the ego is built on the little.
-The vehicles' are other ones: their sizes are learned by and by, and where a vehicle stops or turns is known best from
-both sides.
+`tracks/ID.final.tum.txt`: one vehicle by the RTS smoother (vehicles/rts_smoother.py). `ego.final.*`:
+the ego's live poses again, as in the evaluation: no loop is closed, so that hardly anything seen later bears on a pose
+that has left the graph's window. Of vehicles the sizes are learned over time, and where one stops or turns is known
+best from both sides.
 """
 
 from __future__ import annotations

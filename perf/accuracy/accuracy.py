@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -27,8 +25,9 @@ from birdslam.bench.tracking.benchmark import EGO as EGO_BODY
 from birdslam.perf.errors import PerfError
 from birdslam.perf.latency.live import Ask, add_run_options, drive
 from birdslam.perf.latency.system import age_of
-from birdslam.perf.reporting.figures import Ledger, numbers, spread
-from birdslam.perf.reporting.machine import loaded
+from birdslam.perf.processes import loaded, run_birdslam
+from birdslam.perf.reporting.arguments import benchmark_parser, numbers
+from birdslam.perf.reporting.figures import Ledger, spread
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.trajectory import as_poses, read_kitti
@@ -45,12 +44,11 @@ Row = dict[str, Any]
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf accuracy", description=label)
+    parser = benchmark_parser("accuracy", label)
     add_run_options(parser.add_argument, many=True)
     parser.add_argument("--labels", type=Path, help="KITTI tracking's training folder")
     parser.add_argument("--rates", type=numbers, default=(33,), help="Hz of the live runs beside the source's own")
     parser.add_argument("--load", type=int, default=1, help="busy cores in one more run at the highest rate; 0: none")
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     sources = options.source or ["demo"]
     with Ledger(options.output, label, sources=sources, models=options.model, labels=str(options.labels)) as ledger:
@@ -109,16 +107,9 @@ def _offline(options: argparse.Namespace, source: str, recording: Recording) -> 
         given += [part for setting in options.set for part in ("--set", setting)]
         given += ["--set", f"runtime.runtime_dir={folder}/rt", "--vehicle", "perf", "--output", f"{folder}/out"]
         (Path(folder) / "rt").mkdir(mode=0o700)
-        _birdslam(*given)
+        run_birdslam(*given)
         out = Path(folder) / "out"
         return graded(recording, out, json.loads((out / "summary.json").read_text()))
-
-
-def _birdslam(*arguments: str) -> None:
-    command = [sys.executable, "-m", "birdslam.runtime.cli.main", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise PerfError(done.stderr.strip())
 
 
 def graded(recording: Recording, output: Path, summary: Row) -> Row:
@@ -153,7 +144,7 @@ def _labels(ledger: Ledger, labels: Path, name: str, measure: Callable[[Path, Pa
 def _localisation(labels: Path, folder: Path) -> dict[str, Row]:
     """Range -> medians of the centres' errors over all sequences."""
     given = ("evaluate", "localisation", str(labels), "--sequences", SEQUENCES, "--detections", "rrc")
-    _birdslam(*given, "--output", str(folder / "out"))
+    run_birdslam(*given, "--output", str(folder / "out"))
     rows = json.loads((folder / "out" / "report.json").read_text())
     return {
         f"{row['range']} m": {"frames": row["n"], "vehicle_centre_rel": row["depth_error_median_rel"]}
@@ -166,7 +157,7 @@ def _tracking(labels: Path, folder: Path) -> dict[str, Row]:
     """Method -> mean of the egos' errors, median of the vehicles', on simulated odometry."""
     methods = {"birdslam": "as configured", "paper": "as published"}
     given = ("evaluate", "tracking", str(labels), "--frames", "paper", "--seeds", str(SEEDS))
-    _birdslam(*given, "--methods", ",".join(methods), "--output", str(folder / "out"))
+    run_birdslam(*given, "--methods", ",".join(methods), "--output", str(folder / "out"))
     rows = json.loads((folder / "out" / "report.json").read_text())
     out: dict[str, Row] = {}
     for method, name in methods.items():

@@ -2,18 +2,15 @@
 
     python -m perf car_speed [SEQUENCE ...] [--output DIR] [--data DIR] [--networks] [--model ROLE=PATH ...]
 
-A sequence is a folder of `--data`, kitti:DIR, a folder with a `drive.npz` of the built-in world, or video:FILE with
-`--camera` and `--speed`, the speed that its truth is then made of: a straight road. Readings are made from the true
-poses: RATE_HZ, NOISE_REL, a scale factor that is FACTOR - 1 too high, DELAY_S late. Each sequence is driven without
-them, with them, with yaw rates as well, in the dark (its images darkened until they show nothing), and once for each
-fault. Rows: the error of the way, ATE, NEES, the share of valid frames, and valid frames whose length is wrong.
+A sequence: a folder of `--data`, kitti:DIR, a folder with a `drive.npz`, or video:FILE with `--camera` and `--speed`
+(of a straight road). Readings are made from the true poses: RATE_HZ, NOISE_REL, FACTOR, DELAY_S. Each is driven without
+them, with them, with yaw rates, in the dark, and once for each fault. Rows: error of the way, ATE, NEES, valid frames.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,8 +32,9 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import ModelError, Perception
-from birdslam.perf.accuracy.starts import SPEED_FLOOR_M, SPEED_LIMIT, networks_of, uri_of
+from birdslam.perf.accuracy.drives import SPEED_FLOOR_M, SPEED_LIMIT, networks_of, uri_of
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.arguments import add_data, add_networks, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.nodes.inference import Inference
@@ -88,16 +86,14 @@ class Known:
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf car_speed", description=label)
+    parser = benchmark_parser("car_speed", label, output="folder of car_speed.json")
     parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="folder of --data, kitti:DIR, video:FILE")
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BIRDSLAM_DATA", "../shared/data")))
+    add_data(parser)
     parser.add_argument("--camera", type=Path, help="camera file, where the recording has none")
     parser.add_argument("--speed", type=float, help="m/s all the way, where the recording has no true poses")
     parser.add_argument("--seeds", type=int, default=1, help="drives with readings, each with other noise")
     parser.add_argument("--no-faults", action="store_true", help="without the rows of faults")
-    parser.add_argument("--networks", action="store_true", help="with the configured networks")
-    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="with this network")
-    parser.add_argument("--output", type=Path, help="folder of car_speed.json")
+    add_networks(parser)
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
     path = None if options.output is None else options.output / "car_speed.json"
@@ -108,7 +104,7 @@ def run(arguments: list[str]) -> None:
                 drive = read(sequence, options, configuration)
                 for name, readings, dark in variants(drive, options.seeds, not options.no_faults):
                     figures = measure(drive, readings, dark)
-                    ledger.add(f"{drive.name} {name}", told(figures), **figures)
+                    ledger.add(f"{drive.name} {name}", row_text(figures), **figures)
     except (DatasetError, ModelError) as error:
         raise PerfError(str(error)) from error
 
@@ -284,13 +280,13 @@ def measure(drive: Drive, readings: Coming, dark: bool = False) -> dict[str, Any
     }
 
 
-def told(figures: dict[str, Any]) -> str:
+def row_text(figures: dict[str, Any]) -> str:
     """A row for a person."""
     nees = "-" if figures["nees"] is None else f"{figures['nees']:.1f}"
-    told_of = {str(Status.MOTION_IMPLAUSIBLE), *(name for name in figures["statuses"] if name.startswith("car_speed"))}
-    told_by = sorted(told_of & set(figures["statuses"]))
+    reported = {str(Status.MOTION_IMPLAUSIBLE), *(name for name in figures["statuses"] if name.startswith("car_speed"))}
+    names = sorted(reported & set(figures["statuses"]))
     return (
         f"way {figures['scale_error']:+.2%}  ATE {figures['ate_m']:.2f} m  NEES {nees}  sigma "
         f"{figures['scale_sigma_rel']:.1%}  valid {figures['valid']}/{figures['frames']}, of them wrong "
-        f"{figures['wrong_valid']}  " + ", ".join(f"{name} {figures['statuses'][name]}" for name in told_by)
+        f"{figures['wrong_valid']}  " + ", ".join(f"{name} {figures['statuses'][name]}" for name in names)
     )

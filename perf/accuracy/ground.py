@@ -1,22 +1,16 @@
-"""What the estimate of the ground does on a grade, after a knock of the camera, and with a wrong height.
+"""The estimate of the ground on a grade, after a knock of the camera, and with a wrong height.
 
     python -m perf ground --output DIR [--data DIR] [--model ROLE=PATH ...]
 
-- a grade of 6 %, up over a crest and down: a street drawn by `graded_road`, whose true ground is known exactly;
-- a pitch step of 1.5 degrees, down and up: KITTI 00 with each image from frame 40 on turned by K R K^-1, which is exact
-  for a rotation, so that the unedited drive is the truth;
-- a height stated 10 and 15 % too low and too high: KITTI 00 with another `height_m`. The scale follows it, since
-  nothing in the images can tell; the vehicles can (camera_height.py), where a detector is given.
-
-Writes ground.json and ground.png.
+A grade of 6 %, up over a crest and down: drawn by `graded_road`, whose true ground is known. A pitch step of 1.5
+degrees: KITTI 00 with each image from frame 40 on turned by K R K^-1, so that the unedited drive is the truth. A height
+10 and 15 % off: KITTI 00 with another `height_m`, which the scale follows. Writes ground.json and ground.png.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +32,7 @@ from birdslam.outputs.drive_files import claim_directory
 from birdslam.perception import Perception, Ready
 from birdslam.perf.accuracy.graded_road import GradedRoad, Stand
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.runtime.configuration import Configuration, SourceConfig, load
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.sources.opening import open_recording
@@ -84,9 +79,9 @@ class Drive:
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf ground", description=label)
+    parser = benchmark_parser("ground", label, output="")
     parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BIRDSLAM_DATA", "../shared/data")))
+    add_data(parser)
     parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH")
     options = parser.parse_args(arguments)
     claim_directory(options.output)

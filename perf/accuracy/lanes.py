@@ -7,7 +7,6 @@ the extra [train].
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig
 from birdslam.perception.completion import SHIPPED, GridCompletion
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.arguments import benchmark_parser
 
 label = "amodal lanes in bird's-eye view, with and without their completion"
 
@@ -63,10 +63,9 @@ def measure(drives: int, path: Path = SHIPPED) -> dict[str, Any]:
 
 def run(arguments: list[str]) -> int:
     """`python -m perf lanes`."""
-    parser = argparse.ArgumentParser(prog="python -m perf lanes", description=label)
+    parser = benchmark_parser("lanes", label)
     parser.add_argument("--drives", type=int, default=24, help="worlds to drive through")
     parser.add_argument("--model", type=Path, default=SHIPPED)
-    parser.add_argument("--output", type=Path, help="JSON")
     args = parser.parse_args(arguments)
     report = measure(args.drives, args.model)
     for key, value in report.items():

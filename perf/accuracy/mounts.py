@@ -1,19 +1,15 @@
-"""A camera file whose pitch or roll is wrong: how soon is it found and told, and what becomes of the lengths?
+"""A camera file whose pitch or roll is wrong: how soon that is found and reported, and what becomes of the lengths.
 
     python -m perf mounts [SEQUENCE ...] [--output FILE.json] [--data DIR] [--networks] [--model ROLE=PATH ...]
 
-Runs each sequence with the file's pitch, then its roll, off by each of `--off` degrees, beside the file as it is. A
-figure is the error of the length over the first `--way` metres, how much of the error of the file the filter has taken
-back by then (against the run with the file as it is, so that the road's own grade and crown do not count), and after
-how many metres `calibration_drift` was told, where it was. The files of KITTI are off themselves, by up to 1.5 degrees,
-so that the road stands against a wrong file by more or less than `--off`: that is told too, of the axis that has more.
+Each sequence with the file's pitch, then its roll, off by each of `--off` degrees. A row: the error of the length over
+the first `--way` metres, what is left of the error of the file by then (against the run with the file as it is, since
+KITTI's files are off themselves, by up to 1.5 degrees), and after how many metres `calibration_drift` was reported.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -24,27 +20,27 @@ from birdslam.geometry.camera import Camera
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.perception import ModelError
-from birdslam.perf.accuracy.starts import SEQUENCES, Drive, Task, add_drive_options, networks_of, read, uri_of
+from birdslam.perf.accuracy.drives import SEQUENCES, Drive, Task, add_drive_options, networks_of, read, uri_of
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.recording import DatasetError
 from birdslam.types import Status
 
-label = "camera files whose pitch or roll is wrong: found and told within how many metres"
+label = "camera files whose pitch or roll is wrong: found and reported within how many metres"
 
 OFF_DEG = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
 WAY_M = 20.0
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf mounts", description=label)
+    parser = benchmark_parser("mounts", label)
     add_drive_options(parser)
     parser.add_argument(
         "--off", type=float, nargs="+", default=OFF_DEG, metavar="DEG", help="of the file, 0 among them"
     )
     parser.add_argument("--way", type=float, default=WAY_M, metavar="M", help="by which the error is to be found")
     parser.add_argument("--images", type=int, default=100, help="of each sequence")
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     configuration = networks_of(options)
     cv2.setNumThreads(1)
@@ -56,7 +52,7 @@ def run(arguments: list[str]) -> None:
                 for axis in ("pitch", "roll"):
                     for off_deg in options.off:
                         row = judge(drive, axis, off_deg, right, options.images, options.way)
-                        ledger.add(f"{name} {axis} {off_deg:+.1f} deg", told(row), **row)
+                        ledger.add(f"{name} {axis} {off_deg:+.1f} deg", row_text(row), **row)
     except (DatasetError, ModelError) as error:
         raise PerfError(str(error)) from error
 
@@ -68,7 +64,7 @@ def with_tilt_off(camera: Camera, axis: str, off_deg: float) -> Camera:
 
 
 def follow(drive: Drive, camera: Camera, images: int, way_m: float) -> dict[str, Any]:
-    """What the odometry made of a drive with this camera file: at `way_m`, and when it told of a drift."""
+    """What the odometry made of a drive with this camera file: at `way_m`, and when it reported a drift."""
     odometry = Odometry(camera)
     true_m = own_m = 0.0
     at: tuple[float, Motion] | None = None
@@ -113,11 +109,11 @@ def judge(
     }
 
 
-def told(row: dict[str, Any]) -> str:
+def row_text(row: dict[str, Any]) -> str:
     """A row for a person."""
     drift = "never" if row["drift_m"] is None else f"after {row['drift_m']:.1f} m"
     return (
         f"road against the file {row['net_deg']:+.1f} deg  scale {row['scale_error']:+.1%}  "
         f"left of the error: pitch {row['pitch_left_deg']:+.2f} roll "
-        f"{row['roll_left_deg']:+.2f} deg  told {drift} of {row['way_m']:.0f} m"
+        f"{row['roll_left_deg']:+.2f} deg  reported {drift} of {row['way_m']:.0f} m"
     )

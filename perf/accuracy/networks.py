@@ -9,7 +9,6 @@ are no truth but a comparison.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import math
 import os
@@ -26,6 +25,7 @@ from birdslam.perception import Detections, Findings, ModelError, ModelSpec, Net
 from birdslam.perception.decoding.multitask import MultiTaskDecoder
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError
@@ -47,7 +47,7 @@ NEAREST_M = 2.0  # LiDAR returns nearer than this are the car's own
 
 def run(arguments: list[str]) -> None:
     shared = Path("../shared")
-    parser = argparse.ArgumentParser(prog="python -m perf networks", description=label)
+    parser = benchmark_parser("networks", label)
     parser.add_argument(
         "--network", type=Path, default=SHIPPED_NETWORKS / SHIPPED_MULTITASK, help="a multi-task network"
     )
@@ -55,7 +55,6 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("BIRDSLAM_DATA", shared / "data")))
     parser.add_argument("--models", type=Path, default=Path(os.environ.get("BIRDSLAM_MODELS", shared / "models")))
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     try:
         network = load_network("multitask", ModelSpec(path=str(options.network), threads=options.threads))

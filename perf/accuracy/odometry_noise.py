@@ -8,8 +8,6 @@ KITTI's true poses are interpolated over the first frames of a sequence (13 of 0
 from __future__ import annotations
 
 import argparse
-import os
-from pathlib import Path
 
 import cv2
 import msgspec
@@ -22,6 +20,7 @@ from birdslam.bench.simulation.odometry import OdometryNoise, fit_drift
 from birdslam.geometry import bev
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
+from birdslam.perf.reporting.arguments import add_data
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import Recording
 from birdslam.trajectory import Transform, as_poses, inverse
@@ -38,7 +37,7 @@ label = "the simulated odometry's noise, fitted to the real clips"
 
 def run(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m perf odometry_noise", description=__doc__)
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BIRDSLAM_DATA", "../shared/data")))
+    add_data(parser)
     data = parser.parse_args(arguments).data
     noise = fit([(open_recording(f"kitti:{data / clip}"), left_out) for clip, left_out in CLIPS.items()])
     print(msgspec.json.format(msgspec.json.encode(noise), indent=2).decode())

@@ -10,9 +10,7 @@ interpolated or accelerates as no car does), and those called standstill while t
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -21,8 +19,9 @@ import numpy as np
 from birdslam.bench.ego import truth_quality
 from birdslam.odometry.odometry import Odometry
 from birdslam.perception import ModelError
-from birdslam.perf.accuracy.starts import Drive, Task, add_drive_options, is_valid, is_wrong, networks_of, read, uri_of
+from birdslam.perf.accuracy.drives import Drive, Task, add_drive_options, is_valid, is_wrong, networks_of, read, uri_of
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.recording import DatasetError
 from birdslam.types import Status
@@ -43,10 +42,9 @@ DRIVES_M = 0.1  # in one image, by the truth: such a car does not stand
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf overlays", description=label)
+    parser = benchmark_parser("overlays", label)
     add_drive_options(parser)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     configuration = networks_of(options)
     cv2.setNumThreads(1)
@@ -58,7 +56,7 @@ def run(arguments: list[str]) -> None:
                     # The networks see the overlay as well
                     name, drive = read(replace(task, configuration=configuration), edit_of(kind, options.seed))
                     row = measure(drive)
-                    ledger.add(f"{name} {kind}", told(row), **row)
+                    ledger.add(f"{name} {kind}", row_text(row), **row)
     except (DatasetError, ModelError) as error:
         raise PerfError(str(error)) from error
 
@@ -100,7 +98,7 @@ def measure(drive: Drive) -> dict[str, Any]:
     return {**row, "scale_error": way_m / true_m - 1.0 if true_m else None}
 
 
-def told(row: dict[str, Any]) -> str:
+def row_text(row: dict[str, Any]) -> str:
     """A row for a person."""
     scale = "unknown" if row["scale_error"] is None else f"{row['scale_error']:+.1%}"
     return (

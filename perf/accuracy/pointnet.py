@@ -10,7 +10,6 @@ the ego's, as that of a new track is. Needs the extra [train].
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import math
 from collections.abc import Iterator, Sequence
@@ -28,6 +27,7 @@ from birdslam.perception.decoding.detection import EdgeSigma
 from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perception.pointnet import PointNet, load_pointnet
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
 from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes, place
@@ -90,12 +90,11 @@ class Sample:
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf pointnet", description=label)
+    parser = benchmark_parser("pointnet", label)
     parser.add_argument("--network", type=Path, default=SHIPPED_NETWORKS / "pointnet.onnx", help="a Frustum-PointNet")
     parser.add_argument("--multitask", type=Path, default=SHIPPED_NETWORKS / "multitask.onnx")
     parser.add_argument("--frames", type=int, default=300, help="each of a world of its own")
     parser.add_argument("--depth", choices=("noisy", "network"), default="noisy")
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     if any(importlib.util.find_spec(name) is None for name in ("numba", "torch")):
         raise PerfError("held-out worlds need the extra [train]: numba, torch")

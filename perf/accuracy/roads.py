@@ -2,15 +2,10 @@
 
     python -m perf roads [NAME ...] [--output DIR] [--keep DIR] [--drives DIR] [--frames N] [--width PX]
 
-A NAME is a road of `world/roads.py` or `demo`, the shipped drive's first 12 s in 11 images a second; with one
-of EFFECTS behind a plus (`motorway_30+drops`) that is drawn over its images. Without names: all roads, and the effects
-over two of them. Each road is rendered from its seed (extra `train`), `--keep DIR` writes it to DIR/NAME, so that
-`--source demo:DIR/NAME` plays it, and `--drives DIR` measures those that lie there instead of rendering them.
-
-The odometry runs without networks; the boxes of everybody of whom something is to be seen are the true ones. Each drive
-is followed from each image of `--begin-at` to its last (which image is the first decides much on such roads), and from
-every `--every`-th over `--images` anew. Writes roads.json, report.md, and roads.png, the errors of scale and rotation
-over the way.
+A NAME is a road of `world/roads.py` or `demo`, with one of EFFECTS behind a plus (`motorway_30+drops`); default: all,
+and the effects over two of them. Rendered from its seed (extra `train`), or from `--drives`. The odometry runs with the
+true boxes, from each image of `--begin-at` to the end, and cold from every `--every`-th. Writes roads.json, report.md
+and roads.png.
 """
 
 from __future__ import annotations
@@ -29,18 +24,19 @@ import numpy as np
 
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.motion import Motion, planar
-from birdslam.perf.accuracy.starts import (
+from birdslam.perf.accuracy.drives import (
     LEAST_IMAGES,
     SCALE_LIMIT,
     SPEED_LIMIT,
     Drive,
     cold_start,
-    draw,
     errors,
     follow,
     is_valid,
 )
+from birdslam.perf.accuracy.starts import draw
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.progress import with_progress
 from birdslam.runtime.world.demo_drive import SAMPLES, write
@@ -65,9 +61,8 @@ COLUMNS = ("road", "m/s", "Hz", "ways", "rotation", "valid", "of them wrong", "s
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf roads", description=label)
+    parser = benchmark_parser("roads", label, output="folder of roads.json, roads.png and report.md")
     parser.add_argument("names", nargs="*", metavar="NAME", help="of a road, or ROAD+EFFECT")
-    parser.add_argument("--output", type=Path, help="folder of roads.json, roads.png and report.md")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="write each drive that is rendered to DIR/NAME")
     parser.add_argument("--drives", type=Path, metavar="DIR", help="measure those that lie there; nothing is rendered")
     parser.add_argument("--frames", type=int, help="of each drive; else all that its road has")
@@ -94,7 +89,7 @@ def run(arguments: list[str]) -> None:
                 recording, edit = drives.open(name)
                 drive = read(recording, edit, drives.most(name))
                 row = measure(drive, options.begin_at, options.every, options.images)
-                ledger.add(name, told(row), hz=recording.rate_hz, **row)
+                ledger.add(name, row_text(row), hz=recording.rate_hz, **row)
     except DatasetError as error:
         raise PerfError(str(error)) from error
     rows = ledger.content["rows"]
@@ -217,7 +212,7 @@ def _nees(drive: Drive, motions: Sequence[Motion]) -> float | None:
     return round(float(np.mean(values)), 2) if values else None
 
 
-def told(row: dict[str, Any]) -> str:
+def row_text(row: dict[str, Any]) -> str:
     """A row for a person."""
     return "  ".join(f"{name} {cell}" for name, cell in zip(COLUMNS[3:], _cells(row), strict=True))
 

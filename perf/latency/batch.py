@@ -10,11 +10,8 @@ processor time and the memory of the plain engine's processes and from the bytes
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import os
 import resource
-import socket
 import subprocess
 import sys
 import tempfile
@@ -28,6 +25,8 @@ from typing import Any
 import psutil
 
 from birdslam.perf.errors import PerfError
+from birdslam.perf.processes import free_port
+from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.batch.drive import DRIVES
 from birdslam.runtime.batch.drives import Task, find_drives, tasks
@@ -50,13 +49,12 @@ DRIVE_S = 600.0  # of a drive of those hours, for what the start of a process co
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf batch", description=label)
+    parser = benchmark_parser("batch", label)
     parser.add_argument("drives", nargs="*", help=f"(default: {', '.join(REAL)})")
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("BIRDSLAM_DATA", "../shared/data")))
+    add_data(parser)
     parser.add_argument("--frames", type=int, default=30, help="of each drive (default: 30)")
     parser.add_argument("--workers", default="1,2", help="drives at once (default: 1,2)")
     parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     engines = ["plain", "ray"] if find_spec("ray") else ["plain"]
     if len(engines) == 1:
@@ -73,7 +71,7 @@ def run(arguments: list[str]) -> None:
                     for engine in engines if number % 2 == 0 else engines[::-1]:
                         row = measure(engine, workers, todo)
                         rows.append({"engine": engine, "workers": workers, "round": number, **row})
-                        ledger.add(f"{number}: {engine:5} {workers} at once", told(rows[-1]), **rows[-1])
+                        ledger.add(f"{number}: {engine:5} {workers} at once", row_text(rows[-1]), **rows[-1])
             for workers, ratio in ratios(rows).items():
                 ledger.add(f"Ray's cost, {workers} at once", f"{ratio:.3f} of the plain time", ratio=ratio)
             for rate_hz in RATES_HZ:
@@ -110,22 +108,20 @@ def measure(engine: str, workers: int, todo: list[Task]) -> dict[str, Any]:
 @contextlib.contextmanager
 def cluster(cpus: int) -> Iterator[str]:
     """A Ray cluster of one node; gives its address. Raises PerfError where it does not start."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     command = [str(Path(sys.executable).with_name("ray")), "start", "--head", "--block", f"--num-cpus={cpus}"]
     command += [f"--port={port}", "--node-ip-address=127.0.0.1", "--include-dashboard=false"]
     command += ["--disable-usage-stats", "--min-worker-port=0", "--max-worker-port=0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
     try:
-        said = ""
+        output = ""
         for line in process.stdout:
-            said += line
+            output += line
             if "Ray runtime started" in line:
                 break
         else:
-            raise PerfError(f"ray did not start: {said[-400:]}")
+            raise PerfError(f"ray did not start: {output[-400:]}")
         yield f"127.0.0.1:{port}"
     finally:
         children = psutil.Process(process.pid).children(recursive=True)
@@ -174,7 +170,7 @@ def need(rows: list[dict[str, Any]], start: dict[str, Any], frames: int, rate_hz
     }
 
 
-def told(row: dict[str, Any]) -> str:
+def row_text(row: dict[str, Any]) -> str:
     """A row for a person."""
     more = f"  {row['cpu_s']:.1f} s of processor  {row['peak_mb']:.0f} MB" if "cpu_s" in row else ""
     ray = f"  Ray itself {row['idle_mb']:.0f} MB" if "idle_mb" in row else ""

@@ -12,14 +12,14 @@ import argparse
 import contextlib
 import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from birdslam.perf.accuracy.accuracy import graded
 from birdslam.perf.latency.live import Ask, add_run_options, drive
 from birdslam.perf.latency.system import figures
-from birdslam.perf.reporting.figures import Ledger, numbers
-from birdslam.perf.reporting.machine import loaded
+from birdslam.perf.processes import loaded
+from birdslam.perf.reporting.arguments import benchmark_parser, numbers
+from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.opening import open_recording
 
 label = "rate, drops, age, vehicles found and the ego's error on 1, 2 and 4 cores, by affinity"
@@ -40,12 +40,11 @@ KEPT = (
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf cores", description=label)
+    parser = benchmark_parser("cores", label)
     add_run_options(parser.add_argument)
     parser.add_argument("--cores", type=numbers, default=(1, 2, 4), help="a list")
     parser.add_argument("--rate", type=float, default=33.0, help="Hz")
     parser.add_argument("--load", type=int, default=0, help="so many busy processes on the same cores")
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     there = len(os.sched_getaffinity(0))
     with Ledger(options.output, label, source=options.source, rate=options.rate, load=options.load) as ledger:

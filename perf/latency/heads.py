@@ -9,7 +9,6 @@ the median what this machine gave. `looks` says what a schedule costs a second a
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from birdslam.perception.decoding.multitask import OUTPUTS
 from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perception.onnx_files.unread_outputs import without_outputs
 from birdslam.perception.session import plain_session
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 
 label = "what each head of the shipped network costs a core"
@@ -45,9 +45,8 @@ SCHEDULES: dict[str, tuple[tuple[str, int], ...]] = {
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf heads", description=label)
+    parser = benchmark_parser("heads", label)
     parser.add_argument("--runs", type=int, default=60, help="of each variant")
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     with Ledger(options.output, label, runs=options.runs) as ledger:
         for file in FILES:

@@ -2,28 +2,16 @@
 
     python -m perf incremental [--frames 50,100,200,414] [--vehicles 3] [--seeds 8] [--output F.json]
 
-Time. The paper states 0.016 s for the incremental optimizer and 1.9 s for the batch "to solve the pose-graph
-optimization problem for a 414 frame long sequence". Both readings stand here: the whole sequence, all updates of the
-one against the one solve of the other; and an answer in the newest frame, one update (median) against one solve, which
-is what a planner waits for. The batches are of two kinds. With metric odometry dead reckoning is a start so good
-that a few iterations do; of unknown scale, as in the paper, it is not, and every edge bears the scale. A batch is
-solved until it has converged: its iterations stand beside its time, and one that has not (it stopped at its cap, or one
-more Gauss-Newton step would move a node by a centimetre) gets no ratio.
-
-Accuracy. Of each pose of sampled frames of the longest drive, on CC, CV and VV edges (Eq. 6): as the incremental
-optimizer has it when it is the newest; as gtsam's batch has it that sees the same edges, up to that frame; as
-it has it `--lag` frames later, when a fixed lag of that length would let go of it; and as the batch has it that knows
-the whole sequence. The first against the second is what linearising once and marginalising cost; the others are what
-waiting would bring. RMS over seeds and frames, in the frame of the first pose, no alignment.
+Time (the paper: 0.016 s against 1.9 s for 414 frames): all updates of the one against the one solve of the other, and
+one update against one solve. Accuracy of each pose, RMS over seeds and frames, no alignment: live; by gtsam's batch of
+the same edges; by it `--lag` frames later; by the batch of the whole sequence. perf/README.md says how it is read.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +25,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.slam import SlamConfig
 from birdslam.types import Measurements
 
@@ -51,13 +40,12 @@ WHO = ("incremental", "batch of the same edges", "batch after the lag", "batch o
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf incremental", description=label)
+    parser = benchmark_parser("incremental", label)
     parser.add_argument("--frames", default="50,100,200,414", help="a list")
     parser.add_argument("--vehicles", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0, help="of the drive that is timed")
     parser.add_argument("--seeds", type=int, default=8, help="drives over which accuracy is taken; 0: time alone")
     parser.add_argument("--lag", type=int, default=10, help="frames")
-    parser.add_argument("--output", type=Path)
     options = parser.parse_args(arguments)
     rows: list[dict[str, Any]] = []
     print(f"{'':40} {'frames':>6} {'sequence':>10} {'ratio':>8} {'newest pose':>12} {'ratio':>8}  iterations")

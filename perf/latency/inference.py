@@ -27,7 +27,8 @@ from birdslam.perception.completion import GridCompletion
 from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perf.errors import PerfError
 from birdslam.perf.latency.live import add_run_options
-from birdslam.perf.reporting.figures import Ledger, curve, noise, numbers, shown, spread
+from birdslam.perf.reporting.arguments import benchmark_parser, numbers
+from birdslam.perf.reporting.figures import Ledger, curve, noise, spread, spread_text
 from birdslam.runtime.configuration import Configuration, ConfigurationError, complete, load, parse_setting
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.nodes import front_end
@@ -43,12 +44,11 @@ Parts = dict[str, list[float]]
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf inference", description=label)
+    parser = benchmark_parser("inference", label)
     add_run_options(parser.add_argument)
     parser.add_argument("--rate", type=float, default=33.0, help="Hz")
     parser.add_argument("--threads", type=numbers, default=(1, 2, 3), help="a list")
     parser.add_argument("--seconds", type=float, default=5.0, help="of each row")
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     models = [tuple(text.partition("=")[::2]) for text in options.model]
     try:
@@ -187,4 +187,4 @@ def _row(parts: Parts) -> dict[str, Any]:
 
 def _summary(row: dict[str, Any]) -> str:
     parts = "  ".join(f"{name} {part['p50']:.2f}" for name, part in row["parts_ms"].items() if part["n"])
-    return f"{shown(row['total_ms'], 'ms')}  ({parts})"
+    return f"{spread_text(row['total_ms'], 'ms')}  ({parts})"

@@ -20,6 +20,7 @@ import msgspec
 import psutil
 
 from birdslam.perf.errors import PerfError
+from birdslam.perf.processes import birdslam_command, processes_of
 from birdslam.runtime.client import Planner
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Message
@@ -53,7 +54,7 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
             *self.settings,
         ]
         return [
-            *(sys.executable, "-m", "birdslam.runtime.cli.main", "run", *([self.config] if self.config else [])),
+            *birdslam_command("run", *([self.config] if self.config else [])),
             *("--source", self.source, "--rate", str(self.rate), "--vehicle", _VEHICLE, "--output", str(place / "out")),
             *(part for model in self.models for part in ("--model", model)),
             *(part for setting in settings for part in ("--set", setting)),
@@ -143,29 +144,10 @@ def _finish(process: subprocess.Popen[bytes], ended: bool) -> None:
         process.wait(END_S)
 
 
-def _commands(pid: int) -> list[tuple[psutil.Process, list[str]]]:
-    found = []
-    with contextlib.suppress(psutil.NoSuchProcess):
-        for child in psutil.Process(pid).children():
-            with contextlib.suppress(psutil.NoSuchProcess, psutil.ZombieProcess):
-                found.append((child, child.cmdline()))
-    return found
-
-
-def _named(pid: int) -> dict[str, psutil.Process]:
-    """The processes of a run: "supervisor", each node, and "NODE spare" for the one that stands by."""
-    found = {"supervisor": psutil.Process(pid)}
-    for child, command in sorted(_commands(pid), key=lambda pair: (pair[0].create_time(), pair[0].pid)):
-        for node in NODES:
-            if node in command:
-                found[f"{node} spare" if node in found else node] = child
-    return found
-
-
 def _sample(pid: int, now_s: float, with_pss: bool) -> Sample:
     sample = Sample(now_s, {}, {})
     with contextlib.suppress(psutil.NoSuchProcess):
-        for name, process in _named(pid).items():
+        for name, process in processes_of(pid, NODES).items():
             with contextlib.suppress(psutil.NoSuchProcess), process.oneshot():
                 times = process.cpu_times()
                 sample.cpu_s[name] = times.user + times.system
@@ -178,16 +160,7 @@ def _sample(pid: int, now_s: float, with_pss: bool) -> Sample:
 @contextlib.contextmanager
 def _planners(count: int, runtime_dir: Path) -> Iterator[None]:
     """Further planners in processes of their own, which take every estimate."""
-    command = [
-        sys.executable,
-        "-m",
-        "birdslam.runtime.cli.main",
-        "listen",
-        "--vehicle",
-        _VEHICLE,
-        "--runtime-dir",
-        str(runtime_dir),
-    ]
+    command = birdslam_command("listen", "--vehicle", _VEHICLE, "--runtime-dir", str(runtime_dir))
     others = [
         subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
         for _ in range(count)
@@ -211,11 +184,15 @@ def _profiled(folder: Path | None, process: subprocess.Popen[bytes]) -> Iterator
         raise PerfError("--profile needs py-spy: pip install py-spy")
     folder.mkdir(parents=True, exist_ok=True)
     until_s = time.monotonic() + START_S
-    while process.poll() is None and not set(NODES) <= set(_named(process.pid)) and time.monotonic() < until_s:
+    while (
+        process.poll() is None
+        and not set(NODES) <= set(processes_of(process.pid, NODES))
+        and time.monotonic() < until_s
+    ):
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(0.05)
     spies = []
-    for name, watched in _named(process.pid).items():
+    for name, watched in processes_of(process.pid, NODES).items():
         command = [tool, "record", "--native", "--threads", "--rate", "25", "--format", "flamegraph"]
         command += ["--output", str(folder / f"{name.replace(' ', '_')}.svg"), "--pid", str(watched.pid)]
         spies.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE))

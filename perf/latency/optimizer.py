@@ -1,24 +1,13 @@
 """The optimizer against gtsam's own: time, memory and exceptions over a long drive.
 
-Every contender takes the same log of `Measurements` in a fresh process with one BLAS thread, as the optimize node runs,
-and the same edges of it: CC, CV, VV and CP (Eqs. 6 and 7). "ours" is Eq. 8 on just these; "ours_live" is the graph as
-it is configured by default, with its constant-velocity factor in VV's place. The log has CP edges in one frame of
-four, on our keyframes, so that ours uses them all: as one edge between keyframes, where gtsam has a node for each
-landmark; "incremental_fixed_lag_summed" is gtsam's with that one edge, and with its settings: "_qr" in place of
-Cholesky, "_once" never linearised again. The lag is the shortest with which that edge has both of its ends.
-
-What is timed is one frame from decoded record to the poses and covariances of the newest ego and of every vehicle in
-Python: for ours the whole `PoseGraph.optimise`, with lanes, velocities and the finished `Estimate` besides.
-`BatchFixedLagSmoother` gives no covariances. A contender that takes longer than `--limit-s` is stopped; its `frames`
-say how far it got. One that raises begins anew on the next frame. `kinds_us` tells frames with CP edges, frames in
-which vehicles came or went, and the others apart. `steal_percent` is what the hypervisor took meanwhile, `preempted`
-the share of updates that the scheduler broke off for another process, and `undisturbed_p99_us` is of the rest: on a
-busy machine the tail is the other processes'.
+Every contender takes the same log of `Measurements` in a fresh process with one BLAS thread, and the same edges of it:
+CC, CV, VV and CP (Eqs. 6 and 7), CP in one frame of four. "ours" is Eq. 8 on just these, "ours_live" the graph as
+configured by default. Timed is one frame from decoded record to poses and covariances in Python (none of
+`BatchFixedLagSmoother`). One that takes longer than `--limit-s` is stopped; one that raises restarts on the next frame.
 """
 
 from __future__ import annotations
 
-import argparse
 import gc
 import json
 import os
@@ -41,6 +30,7 @@ from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import curve, noise, spread, write_json
 from birdslam.perf.reporting.machine import Steal
 from birdslam.types import Measurements
@@ -60,13 +50,12 @@ _LAG_FRAMES = GraphConfig().ego_nodes
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf optimizer", description=label)
+    parser = benchmark_parser("optimizer", label, output="JSON, a list of objects")
     parser.add_argument("--vehicles", default="0,1,3,6,10,15", help="in sight, a list")
     parser.add_argument("--frames", type=int, default=10_000)
     parser.add_argument("--contenders", default=",".join(CONTENDERS), help="a list")
     parser.add_argument("--limit-s", type=float, default=60.0, help="time for each contender's frames")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--output", type=Path, help="JSON, a list of objects")
     options = parser.parse_args(arguments)
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:

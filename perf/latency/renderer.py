@@ -8,16 +8,15 @@ caches are. Needs the extra [train].
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import cv2
 
 from birdslam.perf.errors import PerfError
-from birdslam.perf.reporting.figures import Ledger, noise, shown, spread
+from birdslam.perf.reporting.arguments import benchmark_parser
+from birdslam.perf.reporting.figures import Ledger, noise, spread, spread_text
 
 label = "the built-in world's renderer: frames a second a core (extra train)"
 
@@ -26,10 +25,9 @@ FIRST_SEED = 0
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf renderer", description=label)
+    parser = benchmark_parser("renderer", label)
     parser.add_argument("--samples", type=int, default=60, help="worlds of one frame each")
     parser.add_argument("--frames", type=int, default=60, help="of one drive")
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     if min(options.samples, options.frames) < 1:
         raise PerfError("--samples and --frames need at least 1")
@@ -46,7 +44,7 @@ def run(arguments: list[str]) -> None:
                 rate_hz = 1e3 * len(times_ms) / sum(times_ms)
                 ledger.add(
                     f"{kind} {width_px}x{height_px}",
-                    f"{shown(figures, 'ms')}  {rate_hz:.1f} frames/s",
+                    f"{spread_text(figures, 'ms')}  {rate_hz:.1f} frames/s",
                     frames_per_s=round(rate_hz, 2),
                     ms=figures,
                     noise=noise("ms", times_ms),

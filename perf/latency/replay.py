@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from birdslam.perf.latency.live import Ask, Run, add_run_options, drive
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.recording.recording import Recording
@@ -33,13 +34,12 @@ TURNS = 2  # without and with recording
 
 
 def run(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="python -m perf replay", description=label)
+    parser = benchmark_parser("replay", label)
     add_run_options(parser.add_argument)
     parser.add_argument("--rate", type=float, default=33.0, help="Hz")
     parser.add_argument("--minutes", type=float, default=10.0, help="of the recording")
     parser.add_argument("--images", action="store_true", help="record the frames too")
     parser.add_argument("--beside", type=float, default=30.0, metavar="S", help="of each turn of the cost; 0: none")
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     with (
         Ledger(options.output, label, minutes=options.minutes, rate=options.rate, images=options.images) as ledger,

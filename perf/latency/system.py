@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 
 from birdslam.perf.latency import convoy
 from birdslam.perf.latency.live import Ask, Run, add_run_options, drive
-from birdslam.perf.reporting.figures import BLOCKS, Ledger, curve, noise, numbers, shown, spread
-from birdslam.perf.reporting.machine import Steal, loaded
+from birdslam.perf.processes import loaded
+from birdslam.perf.reporting.arguments import benchmark_parser, numbers
+from birdslam.perf.reporting.figures import BLOCKS, Ledger, curve, noise, spread, spread_text
+from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.configuration import BudgetsConfig
 from birdslam.runtime.latency import key_of, queue_of, stages
 from birdslam.runtime.topology import NODES
@@ -35,7 +37,7 @@ TAIL_PERCENTILE = 99.0
 
 
 def run(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="python -m perf system", description=label)
+    parser = benchmark_parser("system", label)
     add_run_options(parser.add_argument)
     parser.add_argument("--rate", type=float, default=33.0, help="Hz")
     parser.add_argument("--seconds", type=float, default=60.0)
@@ -43,7 +45,6 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--vehicles", type=numbers, help="a list: the optimize process alone, with so many in sight")
     parser.add_argument("--planners", type=int, default=0, help="so many further planners")
     parser.add_argument("--profile", type=Path, metavar="DIR", help="py-spy's flame graph of each process goes there")
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     if options.vehicles is not None:
         _with_vehicles(options)
@@ -229,11 +230,11 @@ def table(content: dict[str, Any]) -> str:
             for name, mb in content["rss_mb_by"].items()
         ),
         f"{'steal':32}{content['steal_during_percent']:.2f} %",
-        f"{'age at the planner':32}{shown(content['age_ms'], 'ms')}  mean {content['age_ms']['mean']:.2f}",
+        f"{'age at the planner':32}{spread_text(content['age_ms'], 'ms')}  mean {content['age_ms']['mean']:.2f}",
     ]
     for name, stage in content["stages"].items():
         means = f"mean {stage['mean']:.2f}, in the slowest 1 % {stage['mean_in_tail']:.2f}"
-        lines.append(f"  {name:30}{shown(stage, 'ms')}  {means}")
+        lines.append(f"  {name:30}{spread_text(stage, 'ms')}  {means}")
     for row in content["budgets"]:
         verdict = "met" if row["met"] else "NOT MET"
         line = f"p{row['percentile']:g} {row['measured_ms']:.2f} of {row['limit_ms']:g} ms: {verdict}"

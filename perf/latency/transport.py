@@ -8,19 +8,19 @@ typed FrameRef over zenoh), `bus` what records take (typed and checked at both e
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from birdslam.perf.latency.carriers import CARRIERS
-from birdslam.perf.reporting.figures import Ledger, curve, noise, numbers, shown, spread
-from birdslam.perf.reporting.machine import Steal, loaded
+from birdslam.perf.processes import loaded
+from birdslam.perf.reporting.arguments import benchmark_parser, numbers
+from birdslam.perf.reporting.figures import Ledger, curve, noise, spread, spread_text
+from birdslam.perf.reporting.machine import Steal
 
 label = "pixels and messages across processes, by our ring and by its peers"
 
@@ -45,13 +45,12 @@ class Case:
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf transport", description=label)
+    parser = benchmark_parser("transport", label)
     parser.add_argument("--carriers", default=",".join(CARRIERS), help="a list")
     parser.add_argument("--bytes", type=numbers, default=tuple(SIZES_B), help="a list")
     parser.add_argument("--rates", type=numbers, default=(33, 200), help="Hz, a list")
     parser.add_argument("--loads", type=numbers, default=(0, 1), help="busy cores, a list")
     parser.add_argument("--seconds", type=float, default=3.0, help="of each case")
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     carriers = options.carriers.split(",")
     unknown = sorted(set(carriers) - set(CARRIERS))
@@ -63,7 +62,7 @@ def run(arguments: list[str]) -> None:
                 for case in cases(carriers, options.bytes, options.rates, load):
                     row = measure(case, options.seconds)
                     cpu = f"cpu {row['cpu_percent']['sender']:.1f} + {row['cpu_percent']['receiver']:.1f} %"
-                    line = f"{shown(row['latency_ms'], 'ms')}  {cpu}  dropped {row['dropped']} of {row['sent']}"
+                    line = f"{spread_text(row['latency_ms'], 'ms')}  {cpu}  dropped {row['dropped']} of {row['sent']}"
                     ledger.add(case.name, line, **row)
 
 

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from birdslam.perf.reporting import report
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import write_json
 from birdslam.perf.reporting.machine import ROOT, describe
 
@@ -66,7 +67,7 @@ STEPS = (
 
 
 def run(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="python -m perf all", description=label)
+    parser = benchmark_parser("all", label, output="")
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--source", default="demo", metavar="URI", help="default: demo, the shipped drive")
     parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="default: the shipped one")

@@ -1,12 +1,10 @@
 """Two reports, figure by figure, with the noise of both: better, worse or not distinguishable.
 
     python -m perf compare A.json B.json          # A is the old one; A1.json,A2.json: several runs of one side
-    python -m perf compare REPORT.json            # the scorecard against the last release (scorecard.py)
-    python -m perf compare REPORT.json --keep     # and these are the results of the version at hand from now on
+    python -m perf compare REPORT.json [--keep]   # the scorecard against the last release; with --keep it becomes it
 
-Each figure is compared by the blocks that its series was cut into (Mann-Whitney U, two-sided, with the false
-discoveries of all figures together held below 1 %), and only a shift of more than 5 % counts. Several runs of a side
-bring in what differs between runs. Exit status: 1 where something is worse, 2 where the reports can't be compared.
+Mann-Whitney U on the blocks of each series, two-sided, false discoveries of all figures together below 1 %; only a
+shift of more than 5 % counts. Exit status: 1 where something is worse, 2 where the reports can't be compared.
 """
 
 from __future__ import annotations
@@ -23,6 +21,7 @@ from scipy.stats import binomtest, false_discovery_control, mannwhitneyu
 
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting import scorecard
+from birdslam.perf.reporting.arguments import benchmark_parser
 
 label = "two reports: better, worse or not distinguishable"
 
@@ -43,7 +42,7 @@ class Verdicts:
 
 
 def run(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="python -m perf compare", description=label)
+    parser = benchmark_parser("compare", label, output="")
     parser.add_argument("old", metavar="A.json", help="a report, or one benchmark's JSON; a list of several runs")
     parser.add_argument("new", metavar="B.json", nargs="?", help="without it: A against the last release")
     parser.add_argument("--all", action="store_true", help="show what is not distinguishable, too")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -105,13 +104,8 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} has no place in a report")
 
 
-def shown(figures: dict[str, float], unit: str) -> str:
+def spread_text(figures: dict[str, float], unit: str) -> str:
     """A spread for a person."""
     if not figures.get("n"):
         return "nothing came"
     return "  ".join(f"{name} {figures[name]:.3g}" for name in ("p50", "p99", "max")) + f" {unit}"
-
-
-def numbers(text: str) -> Sequence[int]:
-    """A list of the command line: "1,2,3"."""
-    return tuple(int(part) for part in text.split(","))

@@ -9,7 +9,6 @@ have is an error.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 from base64 import b64decode
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.runtime.recording.recording import JSON_CHANNELS, Recording, RecordingError
 from birdslam.trajectory import inverse
 
@@ -60,7 +60,7 @@ class View(NamedTuple):
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf foxglove", description=label)
+    parser = benchmark_parser("foxglove", label, output="")
     parser.add_argument("recording", type=Path)
     parser.add_argument("--at", type=float, default=15.0, metavar="S", help="from its beginning (default: 15)")
     parser.add_argument("--layout", type=Path, default=LAYOUT, help=f"(default: {LAYOUT})")

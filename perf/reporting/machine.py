@@ -1,15 +1,12 @@
-"""The machine that is measured on: what it is, what the hypervisor takes from it, and load to put on it."""
+"""The machine that is measured on: what it is, and what the hypervisor takes from it."""
 
 from __future__ import annotations
 
-import contextlib
 import importlib.metadata
 import os
 import platform
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +17,6 @@ from birdslam.runtime.environment import LIBRARIES
 ROOT = Path(__file__).resolve().parent.parent.parent
 _STEAL = 7  # of /proc/stat's columns: user nice system idle iowait irq softirq steal guest guest_nice
 _TICKS = slice(0, 8)  # guest time is counted in user time already
-_SPIN = "while True: pass"
 
 
 def describe() -> dict[str, Any]:
@@ -70,15 +66,3 @@ class Steal:
 
 def _ticks() -> list[int]:
     return [int(n) for n in _lines("/proc/stat")[0].split()[1:]][_TICKS]
-
-
-@contextlib.contextmanager
-def loaded(cores: int) -> Iterator[None]:
-    """So many cores are kept busy meanwhile."""
-    hogs = [subprocess.Popen([sys.executable, "-c", _SPIN], start_new_session=True) for _ in range(cores)]
-    try:
-        yield
-    finally:
-        for hog in hogs:
-            hog.kill()
-            hog.wait()

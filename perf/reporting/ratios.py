@@ -9,7 +9,6 @@ measured, and the bounds.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
@@ -20,6 +19,7 @@ import numpy as np
 
 from birdslam.bench.simulation.drive import DriveConfig
 from birdslam.perf.latency import optimizer, transport
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 
 label = "ours over its peers in one run, against the reference"
@@ -44,9 +44,8 @@ def reference() -> dict[str, Bound]:
 
 
 def run(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="python -m perf ratios", description=label)
+    parser = benchmark_parser("ratios", label)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     bounds = reference()
     with Ledger(options.output, label, rounds=options.rounds) as ledger:

@@ -4,7 +4,7 @@
 
 Each row: how long until the planner has a valid estimate again (from the fault's beginning where a process is hit, from
 its end where the world is), the statuses meanwhile, how far the poses that were marked valid were off, and whether
-anything was marked valid that was not: by its own status, or by where the car really was (perf/robustness/witness.py).
+anything was marked valid that was not: by its own status, or by where the car really was (perf/robustness/judge.py).
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from birdslam.perf.robustness.faulty_vehicle import (
     model_options,
     record_options,
 )
-from birdslam.perf.robustness.strikes import FAULTS, Fault
-from birdslam.perf.robustness.witness import Witness
+from birdslam.perf.robustness.injection import FAULTS, Fault
+from birdslam.perf.robustness.judge import Judge
 from birdslam.types import Estimate
 
 label = "a running vehicle, one fault after the other, and what its planner sees of each"
@@ -34,7 +34,7 @@ PAGE = """\
 # Faults
 
 Made by `make faults`, which breaks a running vehicle in {faults} ways and looks on as its planner. A test holds the
-rows to the suite (`perf/robustness/strikes.py` has the faults, `perf/robustness/witness.py` the planner that judges).
+rows to the suite (`perf/robustness/injection.py` has the faults, `perf/robustness/judge.py` the planner that judges).
 
 {machine}
 
@@ -63,40 +63,40 @@ class Row:
     promise_s: float | None = None
 
 
-def inflict(vehicle: Vehicle, fault: Fault) -> Row:
+def measure(vehicle: Vehicle, fault: Fault) -> Row:
     """One fault, from before its beginning until the planner drives on."""
-    witness = Witness(vehicle.truth_m, FRAME_M)
+    judge = Judge(vehicle.truth_m, FRAME_M)
 
-    def look_on(estimate: Estimate | None) -> bool:
-        witness.see(estimate)
+    def observe(estimate: Estimate | None) -> bool:
+        judge.see(estimate)
         return False
 
-    vehicle.watch(look_on, BEFORE_S)
+    vehicle.watch(observe, BEFORE_S)
     begun_ns = time.monotonic_ns()
-    with fault.strike(vehicle):
+    with fault.inject(vehicle):
         if fault.lasts_s:
-            vehicle.watch(look_on, fault.lasts_s)
+            vehicle.watch(observe, fault.lasts_s)
         ended_ns = time.monotonic_ns()
     blind = (begun_ns + 3 * vehicle.period_ns, ended_ns - vehicle.period_ns) if fault.blind else None
 
     def well(estimate: Estimate | None) -> bool:
-        witness.see(estimate)
+        judge.see(estimate)
         return estimate is not None and estimate.valid and estimate.t_capture_ns >= ended_ns
 
-    # A fault of a process is over when it strikes: it counts from there; one of the world counts from its end
+    # A fault of a process is over when it begins: it counts from there; one of the world counts from its end
     back = vehicle.watch(well, PATIENCE_S)
-    after_ms = (witness.estimates[-1][0] - ended_ns) / 1e6 if back else None
-    seen = witness.story()
-    vehicle.watch(look_on, AFTER_S)
+    after_ms = (judge.estimates[-1][0] - ended_ns) / 1e6 if back else None
+    seen = judge.summary()
+    vehicle.watch(observe, AFTER_S)
     return Row(
         fault=fault.name,
         node=fault.node,
         valid_after_ms=after_ms,
         seen=seen,
-        error_m=witness.error_m,
-        wrong_poses=witness.wrong,
-        wrongly_valid=witness.wrongly_valid(blind),
-        backwards=witness.backwards,
+        error_m=judge.error_m,
+        wrong_poses=judge.wrong,
+        wrongly_valid=judge.wrongly_valid(blind),
+        backwards=judge.backwards,
         promise_s=fault.promise_s,
     )
 
@@ -143,7 +143,7 @@ def run(arguments: list[str]) -> int:
         for number, fault in enumerate(chosen):
             if number:
                 vehicle.settle()
-            rows.append(inflict(vehicle, fault))
+            rows.append(measure(vehicle, fault))
             print(markdown(rows[-1:]).splitlines()[-1], flush=True)
     print(f"\n{markdown(rows)}")
     if options.markdown:

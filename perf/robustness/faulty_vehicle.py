@@ -22,6 +22,7 @@ import numpy as np
 import psutil
 
 from birdslam.perf.accuracy.street import F_PX, FRAME_M, HEIGHT_M, HEIGHT_PX, WIDTH_PX, street_loop
+from birdslam.perf.processes import birdslam_command, processes_of
 from birdslam.runtime.client import Planner
 from birdslam.runtime.process.vitals import COUNTERS
 from birdslam.runtime.topology import NODES, PROCESSES
@@ -84,7 +85,7 @@ class Vehicle:
         with (self.place / "run.log").open("ab") as log:
             self.process = subprocess.Popen(
                 [
-                    *(sys.executable, "-P", "-m", "birdslam.runtime.cli.main", "run", *self._input),
+                    *birdslam_command("run", *self._input),
                     *("--vehicle", self.vehicle, "--output", str(self.output)),
                     *(part for key, value in settings.items() for part in ("--set", f"{key}={value}")),
                     *self._options,
@@ -106,11 +107,8 @@ class Vehicle:
         return math.floor(t_capture_ns * 1e-9 * self.rate_hz) * FRAME_M
 
     def node(self, name: str) -> psutil.Process:
-        """The process of a node that is at work: the spare beside it is younger."""
-        if name == "supervisor":
-            return psutil.Process(self.process.pid)
-        found = [child for child in psutil.Process(self.process.pid).children() if _is_node(child, name)]
-        return min(found, key=lambda child: (child.create_time(), child.pid))
+        """The process of a node that is at work."""
+        return self.processes()[name]
 
     def spares(self) -> int:
         """Processes that stand by, with all loaded."""
@@ -118,12 +116,7 @@ class Vehicle:
 
     def processes(self) -> dict[str, psutil.Process]:
         """All of them by name: the supervisor, the nodes, the spare of each, and the recorder where there is one."""
-        found = {"supervisor": psutil.Process(self.process.pid)}
-        for child in sorted(found["supervisor"].children(), key=lambda child: (child.create_time(), child.pid)):
-            for name in PROCESSES:
-                if _is_node(child, name):
-                    found[f"{name} spare" if name in found else name] = child
-        return found
+        return processes_of(self.process.pid, PROCESSES)
 
     def __enter__(self) -> Self:
         self.planner = Planner(self.vehicle, self.runtime_dir)
@@ -163,13 +156,6 @@ class Vehicle:
         if self.process.poll() is None:
             self.process.kill()
             self.process.wait()
-
-
-def _is_node(process: psutil.Process, name: str) -> bool:
-    try:
-        return name in process.cmdline()
-    except psutil.Error:  # it has just ended
-        return False
 
 
 def _is_prepared(process: psutil.Process) -> bool:

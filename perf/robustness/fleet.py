@@ -10,13 +10,11 @@ table of all twice a second. `--runs N` then does it with N real `birdslam run`s
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -32,7 +30,9 @@ import psutil
 
 from birdslam import BirdSLAM
 from birdslam.perf.errors import PerfError
-from birdslam.perf.reporting.figures import Ledger, curve, noise, numbers, shown, spread
+from birdslam.perf.processes import birdslam_command, free_port
+from birdslam.perf.reporting.arguments import benchmark_parser, numbers
+from birdslam.perf.reporting.figures import Ledger, curve, noise, spread, spread_text
 from birdslam.perf.reporting.machine import ROOT, Steal
 from birdslam.perf.robustness.fleet_sides import Plan
 from birdslam.runtime.wire import encode
@@ -77,9 +77,7 @@ class Place:
     def __init__(self, folder: Path, names: list[str], rate_hz: float) -> None:
         self.folder, self.names, self.rate_hz = folder, names, rate_hz
         self._number = itertools.count()
-        with socket.socket() as holder:
-            holder.bind(("127.0.0.1", 0))
-            self.router = f"tls/127.0.0.1:{holder.getsockname()[1]}"
+        self.router = f"tls/127.0.0.1:{free_port()}"
         script = ROOT / "deploy" / "certificates.sh"
         if not script.is_file() or shutil.which("openssl") is None:
             raise PerfError("needs the checkout's deploy/certificates.sh, and openssl")
@@ -94,7 +92,7 @@ class Place:
         )
         file = self.folder / f"plan-{next(self._number)}.json"
         file.write_bytes(msgspec.json.encode(plan))
-        return Process(_popen("-m", "birdslam.perf.robustness.fleet_sides", role, str(file)))
+        return Process(_popen([sys.executable, "-m", "birdslam.perf.robustness.fleet_sides", role, str(file)]))
 
     @contextmanager
     def routing(self) -> Iterator[psutil.Process]:
@@ -104,7 +102,7 @@ class Place:
             f'[router]\nlisten = "{self.router}"\nca = "ca.pem"\ncertificate = "router.pem"\nkey = "router.key"\n'
             f'listeners = ["operator"]\nvehicles = {json.dumps(self.names)}\n'
         )
-        router = Process(_popen("-m", "birdslam.runtime.cli.main", "router", str(file)))
+        router = Process(_popen(birdslam_command("router", str(file))))
         try:
             while "is open" not in router.read():
                 continue
@@ -114,14 +112,12 @@ class Place:
             router.end()
 
 
-def _popen(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
-    )
+def _popen(command: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf fleet", description=label)
+    parser = benchmark_parser("fleet", label)
     parser.add_argument("--source", default="demo", metavar="URI", help="whose estimates are replayed (demo)")
     parser.add_argument("--frames", type=int, default=150, metavar="N", help="of it")
     parser.add_argument("--vehicles", type=numbers, default=(1, 3, 10, 100), help="how many, a list")
@@ -129,7 +125,6 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--rate", type=float, default=33.0, metavar="HZ", help="of each vehicle")
     parser.add_argument("--seconds", type=float, default=5.0, help="of each row")
     parser.add_argument("--runs", type=int, default=0, metavar="N", help="then with N real runs of the source")
-    parser.add_argument("--output", type=Path, help="JSON")
     options = parser.parse_args(arguments)
     conditions = options.conditions.split(",")
     if unknown := set(conditions) - set(CONDITIONS):
@@ -138,23 +133,23 @@ def run(arguments: list[str]) -> None:
     with Ledger(options.output, label, **settings) as ledger, tempfile.TemporaryDirectory(prefix="fleet") as folder:
         names = [f"v{number}" for number in range(max(*options.vehicles, options.runs))]
         place = Place(Path(folder), [*names, FLOOD], options.rate)
-        sizes = keep_estimates(Path(folder) / "estimates.msgpack", options.source, options.frames)
+        sizes = write_estimates(Path(folder) / "estimates.msgpack", options.source, options.frames)
         ledger.set(estimate_bytes=spread(sizes))
-        print(f"{len(sizes)} estimates of {options.source}: {shown(spread(sizes), 'B')}", flush=True)
+        print(f"{len(sizes)} estimates of {options.source}: {spread_text(spread(sizes), 'B')}", flush=True)
         with place.routing() as router:
             for count in options.vehicles:
                 with vehicles(place, names[:count]) as senders:
                     for condition in conditions:
                         if condition != "death" or count > 1:
                             row = measure(place, router, names[:count], condition, options.seconds, senders)
-                            ledger.add(f"{count} vehicles, {condition}", told(row), **row)
+                            ledger.add(f"{count} vehicles, {condition}", row_text(row), **row)
             if options.runs:
                 with runs(place, names[: options.runs], options.source):
                     row = measure(place, router, names[: options.runs], "each", options.seconds, [])
-                    ledger.add(f"{options.runs} runs", told(row), **row)
+                    ledger.add(f"{options.runs} runs", row_text(row), **row)
 
 
-def keep_estimates(file: Path, source: str, frames: int) -> list[int]:
+def write_estimates(file: Path, source: str, frames: int) -> list[int]:
     """The estimates of a drive, encoded; gives their sizes in bytes."""
     recording = open_recording(source)
     slam = BirdSLAM.with_shipped_networks(recording.camera, rate_hz=recording.rate_hz)
@@ -195,7 +190,7 @@ def runs(place: Place, names: list[str], source: str) -> Iterator[None]:
             )
             for command in ("run", "uplink"):
                 process = subprocess.Popen(
-                    [sys.executable, "-m", "birdslam.runtime.cli.main", command, str(file)],
+                    birdslam_command(command, str(file)),
                     stdout=subprocess.DEVNULL,
                     start_new_session=True,
                 )
@@ -260,10 +255,10 @@ def _loopback_bytes() -> int:
     return int(psutil.net_io_counters(pernic=True)["lo"].bytes_sent)
 
 
-def told(row: dict[str, Any]) -> str:
+def row_text(row: dict[str, Any]) -> str:
     """A row for a person."""
     parts = [
-        f"age on arrival {shown(row['arrival_ms'], 'ms')}",
+        f"age on arrival {spread_text(row['arrival_ms'], 'ms')}",
         f"heard {row['heard_hz']:.1f} Hz each, read {100 * row['read_share']:.0f} %",
         f"lost {row['lost']}",
         f"CPU listener {row['listener_cpu_percent']:.0f} %, router {row['router_cpu_percent']:.0f} %",

@@ -1,12 +1,9 @@
 """The paper's own batch baseline: a pose graph in SE(3) over odometry of unknown scale (Sec. 4, its Tables 1, 2, 5).
 
-Kept: SE(3) nodes, one batch, CC, CV and VV edges with the paper's weights, odometry stripped of its scale (its unit is
-its mean step), which the CV edges pull to metres; lane constraints (Eq. 3) as the log's CP landmarks, or none.
-Not kept: ORB-SLAM2 gives the paper's odometry, shape priors its vehicles and amodal lanes its points; here all come
-from the log (`shape_prior.Initialised` fits a wireframe to its boxes). Its CP landmarks are corners of the road and, in
-a log of images, stations of lanes; in a log of simulated odometry there is no lane. Its VV edges are predictions in
-metres of a tracker that rides on metric odometry, so that they carry scale too. That ORB's scale drifts is only in as
-far as the log's odometry does.
+Kept: SE(3) nodes, one batch, CC, CV and VV edges with the paper's weights, odometry stripped of its scale, which the
+CV edges bring to metres; lane constraints (Eq. 3) as the log's CP landmarks, or none. Not kept: ORB-SLAM2's odometry,
+vehicles by shape priors, points of amodal lanes; here all come from the log. Its VV edges are predictions in metres of
+a tracker on metric odometry, so that they carry scale too. ORB's drift of scale is only in as far as the log's is.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """Yang and Scherer, "CubeSLAM" (T-RO 2019): cuboids from 2-D boxes, optimised over many views together with the camera.
 
-Kept: a vehicle is a cuboid of its class's size; each box gives cuboid proposals, one for each sampled heading, of which
-the one that fits the box best is taken; then one optimisation over all views, in which objects and camera correct each
-other: camera motions, cuboid sightings, and a motion model for objects (little change of velocity, hardly any sliding
-sideways). The scale is that of the camera's height over the road, as CubeSLAM's is on KITTI.
-Not kept: ORB features on the objects, edge alignment of proposals with line segments (a log has no images), and
-headings from vanishing points: proposals are scored by the box alone. CubeSLAM tells static objects from moving ones;
-here all may move.
+Kept: a cuboid of the class's size, proposals for sampled headings of which the best fitting is taken, one optimisation
+over all views of camera motions, cuboid sightings and a motion model of objects (nearly constant velocity, hardly any
+sideslip), scale from the camera's height. Not kept: ORB features on objects, alignment of proposals with line segments
+(a log has no images), headings from vanishing points, and telling static objects from moving ones.
 """
 
 from __future__ import annotations

@@ -1,13 +1,10 @@
 """Vehicles placed by a shape prior, with which the paper initialises its baselines in SE(3) (end of its Sec. 3.1.3).
 
 After Murthy et al., "Reconstructing vehicles from a single image: shape priors for road scene understanding" (ICRA
-2017): a wireframe of keypoints, whose shape may vary as cars do, is put where its projection meets the image's
-keypoints.
-Kept: wireframe, prior on the shape, one fit of pose and shape for each sight by what the image shows.
-Not kept: keypoints found by a network, of which none is at hand. The box stands in for them, whose edges are where the
-outermost keypoints are; so does the log's distance for the road under the keypoints, and its heading for what tells
-front from back. The shape varies in length, width and height alone. So the fit knows nothing that the log's own placing
-did not know, and uses distance, size and box twice; what it departs by is what the shape makes of the same box.
+2017). Kept: a wireframe of keypoints with a prior on its shape, one fit of pose and shape for each sight. Not kept:
+keypoints by a network: the edges of the box stand in for the outermost ones, the log's distance for those on the road,
+its heading for what tells front from back, so that the fit knows nothing that the log's own placing did not know. The
+shape varies in length, width and height alone.
 """
 
 from __future__ import annotations

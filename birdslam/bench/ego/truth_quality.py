@@ -1,4 +1,4 @@
-"""What a recording's true poses are worth, frame by frame, by nothing but themselves.
+"""The quality of a recording's true poses, frame by frame, judged by the poses alone.
 
 KITTI's poses have three weaknesses that an odometry's error must not be taken for: over the first images of a sequence
 they are interpolated (a constant twist: no road lets a camera turn so evenly), GPS/IMU samples lie up to 10 ms beside

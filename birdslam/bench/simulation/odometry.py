@@ -1,12 +1,9 @@
-"""Ego-motion without images: true camera poses, erring as our own image odometry errs on real clips.
+"""Ego-motion without images: true camera poses with the errors that our own image odometry has on real clips.
 
-It takes the place of `birdslam.odometry.odometry.Odometry` in the front end. Errors have a white part, new in every
-frame, and a slow part that lasts (AR(1)): a scale that is 3 % short stays so for a while. The numbers of
-`OdometryNoise` are fitted to KITTI odometry 00 and 06 and to a raw clip (`python -m perf odometry_noise`).
-
-The ground under the camera is not simulated: no pose says how the camera leans over the road. It is reported as
-calibrated, so that vehicles get no help from it, and landmarks are seen over the ground that the front end came to
-believe, less the error that our odometry's tilt has.
+It takes the place of `birdslam.odometry.odometry.Odometry` in the front end. Errors have a white part and a slow one
+(AR(1)): a scale that is 3 % short stays so for a while. `OdometryNoise` is fitted to KITTI odometry 00 and 06 and to a
+raw clip (`python -m perf odometry_noise`). The ground is reported as calibrated, since no pose says how the camera
+leans over the road; landmarks are seen over the front end's ground, with the error of our odometry's tilt.
 """
 
 from __future__ import annotations

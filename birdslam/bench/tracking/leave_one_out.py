@@ -1,6 +1,6 @@
-"""A constant chosen anew without each sequence in turn, and how that sequence fares by it.
+"""Leave-one-out choice of a constant: chosen without each sequence in turn, and judged on that sequence.
 
-What a constant is worth on data that did not choose it: for each sequence the value is taken that is best on all the
+For each sequence the value is taken that is best on all the
 others, and held to that sequence alone. *Best* is by the mean over sequences of a score that wants places both near
 and honest: the negative log likelihood of the cars' errors under their stated covariances, capped for each car so that
 a box of something else does not choose.

@@ -1,4 +1,4 @@
-"""Whether what is told of the ego's motion, of the scale and of vehicles is as sure as it says: NEES of relative poses.
+"""Consistency of the covariances of the ego's motion, of the scale and of vehicles: NEES of relative poses.
 
 A pose in the world is one sample a drive, and of KITTI it measures the first, interpolated poses. Relative ones are
 many: the ego's motion from frame to frame and over 10 m (motion_consistency.py), the part of it that is the scale's,

@@ -1,4 +1,4 @@
-"""What a planner was told of the labelled cars, live, in the ego's frame: found or not, how far off, moving or not.
+"""The live estimates of labelled cars in the ego's frame: found or not, how far off, moving or not.
 
 Unlike the paper's tables this needs no track to overlap a label in the image: a car is *found* where an estimate stands
 within 20 % of its distance ahead and 1.5 m across. Asked for are cars that KITTI would ask for as moderate: 25 px or
@@ -27,7 +27,7 @@ FOUND_AHEAD_REL, FOUND_ACROSS_M = 0.2, 1.5
 MOST_OCCLUDED = 1  # KITTI: partly
 HALF_SPAN = 5  # frames before and after, over which a label's speed is taken
 STANDS_MPS, DRIVES_MPS = 0.5, 2.0  # by its labels; between them neither is asked for
-TOLD_DRIVING_MPS = 1.5  # of an estimate, as in the pictures
+REPORTED_DRIVING_MPS = 1.5  # of an estimate, as in the pictures
 NEVER = 1e6  # cost of a pair that may not be
 
 
@@ -39,8 +39,8 @@ class Sight:
     x_m: float  # ahead of the ego
     velocity_mps: tuple[float, float] | None  # over the ground in the ego's axes; None at the ends of its labels
     error_m: tuple[float, float] | None = None  # ahead, across; None: not found
-    told_mps: tuple[float, float] | None = None
-    told_sigma_mps: float = 0.0  # 1-sigma of the speed that was told
+    reported_mps: tuple[float, float] | None = None
+    reported_sigma_mps: float = 0.0  # 1-sigma of the reported speed
 
 
 class RangeRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -56,7 +56,7 @@ class RangeRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MotionRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Velocities of the found cars, and how many sights of standing (driving) ones were told as driving (standing).
+    """Velocities of the found cars, and how many sights of standing (driving) ones were reported as driving (standing).
 
     `false_movers_sure` and `missed_movers_sure`: those whose speed is over or under the bar by twice its own sigma too.
     Of a vehicle just come into sight the covariance says that nothing is known of its speed yet.
@@ -74,7 +74,7 @@ class MotionRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def sights(sequence: TrackingSequence, estimates: Sequence[Estimate]) -> list[Sight]:
-    """Every car that is asked for in the frames of the estimates; an estimate is that of one car at the most."""
+    """Every car that counts in the frames of the estimates; an estimate is that of one car at the most."""
     places: dict[int, dict[int, tuple[float, float]]] = defaultdict(dict)  # label -> frame -> x, y in the first world
     for label in sequence.labels:
         if label.kind == MEASURED_KIND:
@@ -175,7 +175,7 @@ def _range_row(sequence: str, span: str, seen: Sequence[Sight]) -> RangeRow:
 
 def motion_row(sequence: str, seen: Sequence[Sight]) -> MotionRow:
     """Over all found cars whose label's speed is known."""
-    known = [(s.velocity_mps, s.told_mps, s.told_sigma_mps) for s in seen]
+    known = [(s.velocity_mps, s.reported_mps, s.reported_sigma_mps) for s in seen]
     pairs = [(truth, told, sigma) for truth, told, sigma in known if truth is not None and told is not None]
     errors = [math.dist(truth, told) for truth, told, _ in pairs]
     standing = [(math.hypot(*told), sigma) for truth, told, sigma in pairs if math.hypot(*truth) < STANDS_MPS]
@@ -185,9 +185,9 @@ def motion_row(sequence: str, seen: Sequence[Sight]) -> MotionRow:
         asked=len(pairs),
         velocity_error_median_mps=float(np.median(errors)) if errors else None,
         standing=len(standing),
-        false_movers=sum(speed > TOLD_DRIVING_MPS for speed, _ in standing),
-        false_movers_sure=sum(speed - 2.0 * sigma > TOLD_DRIVING_MPS for speed, sigma in standing),
+        false_movers=sum(speed > REPORTED_DRIVING_MPS for speed, _ in standing),
+        false_movers_sure=sum(speed - 2.0 * sigma > REPORTED_DRIVING_MPS for speed, sigma in standing),
         driving=len(driving),
-        missed_movers=sum(speed <= TOLD_DRIVING_MPS for speed, _ in driving),
-        missed_movers_sure=sum(speed + 2.0 * sigma <= TOLD_DRIVING_MPS for speed, sigma in driving),
+        missed_movers=sum(speed <= REPORTED_DRIVING_MPS for speed, _ in driving),
+        missed_movers_sure=sum(speed + 2.0 * sigma <= REPORTED_DRIVING_MPS for speed, sigma in driving),
     )

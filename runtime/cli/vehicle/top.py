@@ -231,6 +231,7 @@ def top(vehicle: str, runtime_dir: Path | None, once: bool, out: TextIO = sys.st
 def top_all(config: Path, once: bool, out: TextIO = sys.stdout) -> int:
     """A table of all vehicles once a second; with `once` a single one, and 1 where none is alive."""
     with Fleet(load(config).fleet) as fleet:
+        vehicles = FleetTable(fleet)
         time.sleep(PERIOD_S)  # rates are of this second
-        refresh(FleetTable(fleet).table, lambda: time.sleep(PERIOD_S), once, out)
+        refresh(vehicles.table, lambda: time.sleep(PERIOD_S), once, out)
         return int(not any(reading.alive for reading in fleet.readings()))

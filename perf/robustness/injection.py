@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 import psutil
 
+from birdslam.perf.processes import loaded
 from birdslam.perf.robustness.faulty_vehicle import ROOT, Vehicle
 from birdslam.runtime.topology import NODES, QUERIES, key_of
 from birdslam.runtime.transport.presence import ring_path
 
-Strike = Callable[[Vehicle], contextlib.AbstractContextManager[None]]
+Injection = Callable[[Vehicle], contextlib.AbstractContextManager[None]]
 
 PROMISE_S = {"capture": 1.0, "perceive": 2.0, "optimize": 1.0}  # to a valid estimate after kill -9
 READERS = {"frame": "perceive", "measurements": "optimize", "estimate": "planner"}
@@ -25,21 +26,21 @@ READERS = {"frame": "perceive", "measurements": "optimize", "estimate": "planner
 
 @dataclass(frozen=True)
 class Fault:
-    """`strike` is a context: the fault goes on inside it, for `lasts_s`."""
+    """`inject` is a context: the fault goes on inside it, for `lasts_s`."""
 
     name: str
     node: str
-    strike: Strike
+    inject: Injection
     lasts_s: float = 0.0
     blind: bool = False  # nothing captured meanwhile may be valid
     promise_s: float | None = None
 
 
-def signalled(node: str, number: signal.Signals, then: signal.Signals | None = None) -> Strike:
+def signalled(node: str, number: signal.Signals, then: signal.Signals | None = None) -> Injection:
     """A signal to the process of a node, and another one when it is over."""
 
     @contextlib.contextmanager
-    def strike(vehicle: Vehicle) -> Iterator[None]:
+    def inject(vehicle: Vehicle) -> Iterator[None]:
         process = vehicle.node(node)
         process.send_signal(number)
         yield
@@ -47,58 +48,53 @@ def signalled(node: str, number: signal.Signals, then: signal.Signals | None = N
             with contextlib.suppress(psutil.NoSuchProcess):
                 process.send_signal(then)
 
-    return strike
+    return inject
 
 
-def camera(name: str) -> Strike:
+def camera(name: str) -> Injection:
     """The camera does this meanwhile (perf/faulty_camera)."""
 
     @contextlib.contextmanager
-    def strike(vehicle: Vehicle) -> Iterator[None]:
+    def inject(vehicle: Vehicle) -> Iterator[None]:
         vehicle.fault(name)
         yield
         vehicle.fault("")
 
-    return strike
+    return inject
 
 
 @contextlib.contextmanager
 def cpu_hog(vehicle: Vehicle) -> Iterator[None]:
     """Two busy processes for each core."""
-    hogs = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 * (os.cpu_count() or 1))]
-    try:
+    with loaded(2 * (os.cpu_count() or 1)):
         yield
-    finally:
-        for hog in hogs:
-            hog.kill()
-            hog.wait()
 
 
-def no_memory(node: str) -> Strike:
+def no_memory(node: str) -> Injection:
     """No further page: the process has what it has."""
 
     @contextlib.contextmanager
-    def strike(vehicle: Vehicle) -> Iterator[None]:
+    def inject(vehicle: Vehicle) -> Iterator[None]:
         process = vehicle.node(node)
         limit = process.memory_info().vms
         resource.prlimit(process.pid, resource.RLIMIT_AS, (limit, limit))
         yield
 
-    return strike
+    return inject
 
 
-def full_disk(node: str) -> Strike:
+def full_disk(node: str) -> Injection:
     """No file of the process's grows any more."""
 
     @contextlib.contextmanager
-    def strike(vehicle: Vehicle) -> Iterator[None]:
+    def inject(vehicle: Vehicle) -> Iterator[None]:
         process = vehicle.node(node)
         resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1, resource.RLIM_INFINITY))
         yield
         with contextlib.suppress(ProcessLookupError):  # the recorder ends of it
             resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 
-    return strike
+    return inject
 
 
 @contextlib.contextmanager
@@ -137,16 +133,16 @@ with Bus("faults", "intruder", runtime_dir=Path(sys.argv[1])) as bus:
 """
 
 
-def intruder(topic: str, size: int, count: int) -> Strike:
+def intruder(topic: str, size: int, count: int) -> Injection:
     """Random bytes on a topic of the bus, as a program of the vehicle's own user could send them."""
 
     @contextlib.contextmanager
-    def strike(vehicle: Vehicle) -> Iterator[None]:
+    def inject(vehicle: Vehicle) -> Iterator[None]:
         key = key_of(vehicle.vehicle, topic)
         with _beside(_SENDER, str(vehicle.runtime_dir), key, str(size), str(count)):
             yield
 
-    return strike
+    return inject
 
 
 _ASKER = """

@@ -19,7 +19,7 @@ YAW_RAD = 0.05  # or turned by more, beside the same sigmas
 SEEN_STATUSES = 6
 
 
-class Witness:
+class Judge:
     """Takes what comes to the planner; `truth_m` says how far the car had come when a frame was captured."""
 
     def __init__(self, truth_m: Callable[[int], float], frame_m: float) -> None:
@@ -68,7 +68,7 @@ class Witness:
             wrong += estimate.valid and (contradicts or blinded or not np.isfinite(estimate.cov).all())
         return wrong
 
-    def story(self) -> str:
+    def summary(self) -> str:
         """For the table."""
         invalid = sum(not estimate.valid for _, estimate in self.estimates)
         statuses = Counter(status.value for _, estimate in self.estimates for status in estimate.status)

@@ -18,7 +18,7 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Perception, Ready
 from birdslam.perf.accuracy import street
 from birdslam.perf.robustness.faulty_vehicle import RATE_HZ
-from birdslam.perf.robustness.witness import Witness
+from birdslam.perf.robustness.judge import Judge
 from birdslam.types import Estimate, Frame
 
 FRAMES, SETTLED = 75, 4
@@ -44,11 +44,11 @@ def drive(loop: NDArray[np.uint8]) -> list[Estimate]:
     return estimates
 
 
-def judged(estimates: list[Estimate]) -> Witness:
-    witness = Witness(lambda t_ns: math.floor(t_ns * 1e-9 * RATE_HZ) * street.FRAME_M, street.FRAME_M)
+def judged(estimates: list[Estimate]) -> Judge:
+    judge = Judge(lambda t_ns: math.floor(t_ns * 1e-9 * RATE_HZ) * street.FRAME_M, street.FRAME_M)
     for estimate in estimates:
-        witness.see(estimate)
-    return witness
+        judge.see(estimate)
+    return judge
 
 
 def test_each_pixel_of_the_street_is_the_mean_of_what_it_covers() -> None:

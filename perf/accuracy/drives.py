@@ -1,0 +1,197 @@
+"""Recorded drives for benchmarks of the odometry: opened with their truth, followed, and compared with it."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from birdslam.bench.ego.trajectory_errors import from_first
+from birdslam.geometry.camera import Camera, Undistorter
+from birdslam.odometry.motion import Motion
+from birdslam.odometry.odometry import Odometry
+from birdslam.perf.reporting.arguments import add_data, add_networks
+from birdslam.runtime.configuration import Configuration, SourceConfig, load
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.sources.opening import open_recording
+from birdslam.sources.recording import DatasetError
+from birdslam.status import INVALIDATING
+from birdslam.trajectory import as_poses, inverse
+from birdslam.types import Frame, Status
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+Edit = Callable[[int, int, Image], Image]
+
+SEQUENCES = (
+    "kitti_odometry/sequences/00",
+    "kitti_odometry/sequences/01",
+    "kitti_odometry/sequences/06",
+    "kitti_tracking/training/image_03/0005",
+)
+LEAST_IMAGES = 13  # of a start near the end of a sequence, which has no more
+LEAST_WAY_M = 2.0  # of a start: a standing car has no scale
+SCALE_LIMIT, SPEED_LIMIT, SPEED_FLOOR_M = 0.05, 0.1, 0.05  # the floor: a true step is known to a few centimetres
+_MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The images of one variant of a sequence, and where its camera was, (N, 4, 4) from the first image."""
+
+    camera: Camera
+    images: list[Image]
+    t_ns: list[int]
+    poses: Floats
+    seen: list[tuple[Floats, Bools | None]]  # by networks: boxes (M, 4), the road
+
+
+@dataclass(frozen=True)
+class Task:
+    """One process's work: one variant of one sequence."""
+
+    uri: str
+    name: str
+    mirrored: bool
+    stride: int
+    every: int
+    images: int
+    configuration: Configuration | None  # None: without networks
+
+
+def add_drive_options(parser: argparse.ArgumentParser) -> None:
+    """Which drives, and which networks look at them."""
+    parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="kitti:DIR, or a folder of --data")
+    add_data(parser)
+    add_networks(parser)
+
+
+def networks_of(options: argparse.Namespace) -> Configuration | None:
+    """The configuration whose networks are to run; None: none are."""
+    if not options.networks and not options.model:
+        return None
+    configuration = load(None, {f"models.{m.partition('=')[0]}.path": m.partition("=")[2] for m in options.model})
+    return msgspec.structs.replace(configuration, source=SourceConfig(rate="max"))
+
+
+def uri_of(sequence: str, data: Path) -> str:
+    return sequence if ":" in sequence else f"kitti:{data / sequence}"
+
+
+def read(task: Task, edit: Edit | None = None) -> tuple[str, Drive]:
+    """The sequence, its images decoded once, undistorted and grey, and mirrored where that is asked for.
+
+    `edit` takes an image's index, the number of images, and the image.
+    """
+    recording = open_recording(task.uri, stride=task.stride)
+    truth = recording.truth_poses()
+    if truth is None:
+        raise DatasetError(f"{task.uri}: has no true poses to compare with")
+    T = recording.T_cam0_cam()
+    poses = from_first(inverse(T) @ as_poses(truth) @ T)
+    undistort, camera = Undistorter(recording.camera), recording.camera
+    if task.mirrored:
+        camera, poses = mirrored_camera(camera), _MIRROR @ poses @ _MIRROR
+    images: list[Image] = []
+    t_ns, seen = [], []
+    for frame, looked in zip(recording.frames(), _looks(task.configuration), strict=False):
+        if frame.image is None:
+            raise DatasetError(f"{task.uri}: image {frame.index}: {frame.error}")
+        image = undistort(frame.image)
+        if edit is not None:
+            image = edit(frame.index, len(recording), image)
+        if task.mirrored:
+            image = np.ascontiguousarray(image[:, ::-1])
+        seen.append(looked(Frame(frame.index, frame.t_source_ns, frame.index, frame.index, image)))
+        images.append(image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
+        t_ns.append(frame.t_source_ns)
+    return recording.name, Drive(camera, images, t_ns, poses, seen)
+
+
+def mirrored_camera(camera: Camera) -> Camera:
+    """Of images mirrored left to right."""
+    return msgspec.structs.replace(camera, cx_px=camera.width_px - 1 - camera.cx_px, roll_rad=-camera.roll_rad)
+
+
+def _looks(configuration: Configuration | None) -> Iterator[Any]:
+    """For each image in its order, what takes it and gives the networks' boxes and road."""
+    if configuration is None:
+        yield from itertools.repeat(lambda frame: (np.zeros((0, 4)), None))
+        return
+    with Inference(configuration) as inference:
+
+        def look(frame: Frame) -> tuple[Floats, Bools | None]:
+            found = inference.start(frame).result()
+            boxes = np.zeros((0, 4)) if found.detections is None else found.detections.boxes_px
+            return boxes, None if found.segmentation is None else found.segmentation.road
+
+        while True:
+            yield look
+
+
+def cold_start(drive: Drive, over: range) -> dict[str, Any] | None:
+    """The odometry from nothing over some images of a drive; None where the car does not move."""
+    return errors(drive, over, *follow(drive, over))
+
+
+def follow(drive: Drive, over: range) -> tuple[Floats, list[Motion]]:
+    """Where the odometry has the camera at each of the images, (N, 4, 4) from the first one, and all its motions."""
+    odometry = Odometry(drive.camera)
+    poses = {over[0]: np.eye(4)}
+    motions: list[Motion] = []
+    for k in over:
+        motion = odometry.estimate(odometry.track(drive.images[k]), k, drive.t_ns[k], *drive.seen[k])
+        poses[k] = poses.get(k - 1, np.eye(4))
+        if motion is not None:
+            step = np.eye(4)
+            step[:3, :3], step[:3, 3] = motion.R_prev_curr, motion.t_prev_curr_m
+            poses[k] = poses.get(motion.from_frame, poses[k]) @ step
+            motions.append(motion)
+    return np.stack([poses[k] for k in over]), motions
+
+
+def errors(drive: Drive, over: range, estimated: Floats, motions: Sequence[Motion]) -> dict[str, Any] | None:
+    """What `follow` gave against the truth; None where the car does not move."""
+    truth = drive.poses[over.start : over.stop]
+    way, true_way = (_way_m(track) for track in (estimated, truth))
+    if true_way[-1] < LEAST_WAY_M:
+        return None
+    turned = inverse(inverse(truth[0]) @ truth) @ estimated
+    rotation_deg = np.degrees(Rotation.from_matrix(turned[:, :3, :3]).magnitude())
+    moved = true_way >= 0.5
+    return {
+        "first": over[0],
+        "images": len(over),
+        "true_way_m": true_way[moved].round(3).tolist(),
+        "scale_error": (way[moved] / true_way[moved] - 1.0).round(4).tolist(),
+        "rotation_error_deg": rotation_deg[moved].round(3).tolist(),
+        "valid": sum(is_valid(motion) for motion in motions),
+        "wrong_valid": [motion.to_frame for motion in motions if is_valid(motion) and is_wrong(motion, drive.poses)],
+        "standstill": sum(Status.STANDSTILL in motion.status for motion in motions),
+    }
+
+
+def _way_m(poses: Floats) -> Floats:
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def is_valid(motion: Motion) -> bool:
+    return not INVALIDATING & set(motion.status)
+
+
+def is_wrong(motion: Motion, poses: Floats) -> bool:
+    """Whether its length is off by more than SPEED_LIMIT, and by more than the truth's own noise."""
+    true_m = float(np.linalg.norm(poses[motion.to_frame, :3, 3] - poses[motion.from_frame, :3, 3]))
+    off_m = abs(float(np.linalg.norm(motion.t_prev_curr_m)) - true_m)
+    return off_m > max(SPEED_LIMIT * true_m, SPEED_FLOOR_M)

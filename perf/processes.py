@@ -1,0 +1,62 @@
+"""Processes that benchmarks start: `birdslam` and its nodes, and busy cores beside them."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+import sys
+from collections.abc import Collection, Iterator
+
+import psutil
+
+from birdslam.perf.errors import PerfError
+
+_SPIN = "while True: pass"
+
+
+def birdslam_command(*arguments: str) -> list[str]:
+    """The command line of `birdslam`, by this interpreter."""
+    return [sys.executable, "-m", "birdslam.runtime.cli.main", *arguments]
+
+
+def run_birdslam(*arguments: str) -> None:
+    """Runs it to its end. Raises PerfError with what it says where it fails."""
+    done = subprocess.run(birdslam_command(*arguments), capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise PerfError(done.stderr.strip())
+
+
+def processes_of(pid: int, names: Collection[str]) -> dict[str, psutil.Process]:
+    """Those of a run by name: "supervisor", which has this pid, each node, and "NODE spare" for its spare."""
+    found = {"supervisor": psutil.Process(pid)}
+    children = []
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for child in found["supervisor"].children():
+            with contextlib.suppress(psutil.Error):  # it has just ended
+                children.append((child.create_time(), child.pid, child, child.cmdline()))
+    for _, _, child, command in sorted(children, key=lambda one: one[:2]):  # a spare is younger than its node
+        for name in names:
+            if name in command:
+                found[f"{name} spare" if name in found else name] = child
+    return found
+
+
+@contextlib.contextmanager
+def loaded(cores: int) -> Iterator[None]:
+    """So many cores are busy meanwhile."""
+    hogs = [subprocess.Popen([sys.executable, "-c", _SPIN], start_new_session=True) for _ in range(cores)]
+    try:
+        yield
+    finally:
+        for hog in hogs:
+            hog.kill()
+            hog.wait()
+
+
+def free_port() -> int:
+    """A TCP port of this computer that nobody listens at now."""
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        port: int = holder.getsockname()[1]
+        return port
