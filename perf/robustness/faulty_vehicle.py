@@ -15,7 +15,6 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -146,9 +145,7 @@ class Vehicle:
         self.process.terminate()
         return self.process.wait(6 * PATIENCE_S)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *failure: object) -> None:
         self.planner.close()
         if self.process.poll() is None:
             with contextlib.suppress(subprocess.TimeoutExpired):

@@ -1,4 +1,4 @@
-"""The processes of `python -m perf fleet`: vehicles that say recorded estimates, one that floods, and the listener.
+"""The processes of `python -m perf fleet`: vehicles that publish recorded estimates, one that floods, and the listener.
 
     python -m birdslam.perf.robustness.fleet_sides ROLE PLAN.json
 
@@ -126,7 +126,7 @@ def replayed(plan: Plan, ended: threading.Event) -> None:
 
 
 def flood(plan: Plan, ended: threading.Event) -> None:
-    """One vehicle that says far too much, under its own key."""
+    """One vehicle that publishes far too much, under its own key."""
     vehicle = _Replayed(plan, plan.vehicles[0], _payloads(plan))
     print("ready", flush=True)
 

@@ -3,7 +3,7 @@
     python -m perf soak [--minutes 30] [--rate 33] [--source demo] [--record] [--models DIR]
 
 Without `--source` the software camera of the fault suite drives down its street. The soak stands in systemd's place,
-and hears whether the supervisor misses its watchdog. Ends with status 1, and says why, where after the first minute a
+and notices where the supervisor misses its watchdog. Ends with status 1, and says why, where after the first minute a
 process grew by more than 1 % or held more descriptors, where a process was restarted, or a watchdog was missed.
 """
 
@@ -21,13 +21,13 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import psutil
 
 from birdslam.perf.robustness.faulty_vehicle import Vehicle, ends_with_its_vehicle, model_options, record_options
+from birdslam.runtime.transport.closing import Closing
 
 label = "memory, descriptors, watchdogs and drops of every process over a long drive"
 
@@ -37,7 +37,7 @@ GROWTH = 0.01
 WATCHDOG_S = 5.0  # of the supervisor, as in deploy/birdslam.service
 
 
-class Systemd:
+class Systemd(Closing):
     """Takes what the supervisor says of itself (sd_notify), and measures its silences; a context manager."""
 
     def __init__(self, place: Path) -> None:
@@ -65,12 +65,7 @@ class Systemd:
             if b"STOPPING=1" in message:
                 last_s = None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
             end.sendto(b"", self._address)
         self._thread.join()

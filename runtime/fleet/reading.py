@@ -87,7 +87,7 @@ class VehicleSlot:
             self._count_malformed(vehicle, error)
             return False
         if self.trace.number and trace.number:
-            self.lost += max(0, trace.number - self.trace.number - 1)  # a sender that began anew counts from 1 on
+            self.lost += max(0, trace.number - self.trace.number - 1)  # a restarted sender counts from 1 on
         self.waiting, self.trace, self.t_received_ns = payload, trace, t_received_ns
         self.estimates += 1
         return True

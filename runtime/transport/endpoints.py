@@ -195,7 +195,7 @@ class Subscriber:
 
 
 def _lost_between(earlier: Message | None, later: Message) -> int:
-    """How many of their publisher's messages lie between two; none where it began anew, or is another one."""
+    """How many of their publisher's messages lie between two; none where it was restarted, or is another one."""
     if earlier is None or not (earlier.trace.stages and later.trace.stages and earlier.trace.number):
         return 0
     if earlier.trace.stages[-1].node != later.trace.stages[-1].node:
