@@ -102,8 +102,14 @@ class FrontEnd:
         self._dead_reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
         self._plausibility = PlausibilityGate(config.plausibility)
         self.vehicles = OutOfSequenceTracker(
-            Tracker(camera, config.tracking, config.localisation, config.pseudolidar, frustum_network),
-            GroundSizeFilter(camera, config.ground_size),
+            Tracker(
+                camera,
+                config.tracking,
+                config.localisation,
+                GroundSizeFilter(camera, config.ground_size),
+                config.pseudolidar,
+                frustum_network,
+            ),
             config.out_of_sequence,
         )
         self.height = HeightWatch(camera, config.height, config.localisation)

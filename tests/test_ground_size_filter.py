@@ -31,6 +31,7 @@ class Road:
     def __init__(self, pitch_rad: float = 0.0, roll_rad: float = 0.0, config: GroundSizeConfig = CONFIG) -> None:
         self.truth = GroundPlane(CAMERA.height_m, pitch_rad, roll_rad)
         self.ground_size = GroundSizeFilter(CAMERA, config)
+        self.cars: list[int] = []  # in the order of the filter's rows
         self.rng = np.random.default_rng(3)
 
     def box(self, x_m: float, y_m: float, height_m: float, lift_m: float = 0.0) -> np.ndarray:
@@ -43,10 +44,15 @@ class Road:
         """Nearest depths in metres and the sigmas of their logarithms."""
         self.ground_size.predict(dt_s, 0.0, None, 0.0)
         seen: list[Observation] = []
-        for box in boxes.values():
+        for car, box in boxes.items():
             seen += observe_boxes(box[None], np.ones(1), ("car",), CAMERA, self.ground_size.ground, LOCALISATION)
+            if car not in self.cars:
+                self.cars.append(car)
+                self.ground_size.begin(seen[-1])
         extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
-        depths = self.ground_size.estimate_depths(list(boxes), seen, extents[:, 1], extents[:, 0], np.zeros(len(seen)))
+        depths = self.ground_size.estimate_depths(
+            [self.cars.index(car) for car in boxes], seen, extents[:, 1], extents[:, 0], np.zeros(len(seen))
+        )
         log_z, var = depths.log_depth, depths.variance
         return dict(zip(boxes, np.exp(log_z), strict=True)), dict(zip(boxes, np.sqrt(var), strict=True))
 
@@ -175,9 +181,9 @@ def test_forgotten_vehicles_leave_what_they_said_of_the_road() -> None:
     traffic(road, 12, [1.5, 1.55, 1.5])
     pitch_rad, sigma_rad = road.ground_size.ground.pitch_rad, road.ground_size.sigma_pitch_rad
     height = road.ground_size.size(1)
-    road.ground_size.keep_only([1])
+    road.ground_size.keep_rows([1])
     assert (road.ground_size.ground.pitch_rad, road.ground_size.sigma_pitch_rad) == (pitch_rad, sigma_rad)
-    assert road.ground_size.size(1) == height
+    assert road.ground_size.size(0) == height
 
 
 def test_nothing_seen_is_nothing_learned() -> None:
@@ -195,7 +201,8 @@ def test_parked_cars_are_seen_from_a_passing_ego_without_drift() -> None:
         first = k // 10
         boxes = {i: road.box(*(15.0 + 7.0 * (i - k / 10.0), 3.5), 1.5) for i in range(first, first + 5)}
         road.see(boxes)
-        road.ground_size.keep_only(boxes)
+        road.ground_size.keep_rows([row for row, car in enumerate(road.cars) if car in boxes])
+        road.cars = [car for car in road.cars if car in boxes]
     assert np.linalg.eigvalsh(road.ground_size._P).min() > 0.0
     assert road.ground_size.ground.pitch_rad == pytest.approx(0.005, abs=0.004)
 
@@ -244,6 +251,8 @@ def test_a_box_that_widens_is_of_a_car_that_turns_or_of_one_that_comes_nearer(sp
         box = cuboid + np.array([-half_px, 0.0, half_px, 0.0])
         road.ground_size.predict(0.1, 0.0, None, 0.0)
         seen = observe_boxes(box[None], np.ones(1), ("car",), CAMERA, road.ground_size.ground, LOCALISATION)
+        if not len(road.ground_size):
+            road.ground_size.begin(seen[0])
         extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen])
         depths = road.ground_size.estimate_depths([0], seen, extents[:, 1], extents[:, 0], np.zeros(1), motion)
     nearer_rel = 1.0 - float(np.exp(depths.log_depth[0])) / (30.0 - CAR.length_m / 2.0)

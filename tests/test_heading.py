@@ -12,7 +12,7 @@ from birdslam.bench.tracking.localisation import INSIDE_2_SIGMA
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera
 from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes, place
-from birdslam.vehicles.state.heading import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
+from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
 
 Floats = NDArray[np.float64]
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)

@@ -59,8 +59,9 @@ def detections(k: int, noise_px: float = 0.0, seed: int = 0, heights_m: tuple[fl
 
 
 def out_of_sequence(config: OutOfSequenceConfig | None = None) -> OutOfSequenceTracker:
-    tracker = Tracker(CAMERA, TrackingConfig(), LocalisationConfig())
-    return OutOfSequenceTracker(tracker, GroundSizeFilter(CAMERA, GroundSizeConfig()), config or OutOfSequenceConfig())
+    ground_size = GroundSizeFilter(CAMERA, GroundSizeConfig())
+    tracker = Tracker(CAMERA, TrackingConfig(), LocalisationConfig(), ground_size)
+    return OutOfSequenceTracker(tracker, config or OutOfSequenceConfig())
 
 
 def open_frame(k: int) -> OpenFrame:
@@ -76,7 +77,7 @@ def follow(used: list[int | None], noise_px: float = 0.5) -> tuple[list[tuple[fl
         tracks = vehicles.ingest_detections(
             None if source is None else detections(source, noise_px), -1 if source is None else source
         )
-        seen += [(t.seen_frame, t.vehicle, *t.state.tolist(), *t.cov.ravel().tolist()) for t in tracks]
+        seen += [(t.frame.frame_id, t.vehicle, *t.state.tolist(), *t.cov.ravel().tolist()) for t in tracks]
         roads.append(vehicles.road.ground)
     return seen, roads
 
@@ -118,7 +119,7 @@ def test_frames_that_nobody_looks_at_are_settled_before_the_next_detections_come
             tracks = vehicles.ingest_detections(
                 found, known, awaited_from=(look if known < look else k + 1) if told else 0
             )
-            seen += [[t.seen_frame, t.vehicle, *t.state.tolist(), *t.cov.ravel().tolist()] for t in tracks]
+            seen += [[t.frame.frame_id, t.vehicle, *t.state.tolist(), *t.cov.ravel().tolist()] for t in tracks]
             roads.append(vehicles.road.ground)
             settled.append(len(work))
         return seen, roads, settled
@@ -142,7 +143,7 @@ def test_a_result_is_used_once_and_none_after_the_latest() -> None:
     tracks: list[int] = []
     for k, source in enumerate([0, 1, 2, 2, 2, 2, 2, 2, 2, 2, 3, 8, 8]):  # 3 is 0.7 s old, 8 is 0.3 s old when it comes
         vehicles.open_frame(open_frame(k))
-        tracks += [t.seen_frame for t in vehicles.ingest_detections(detections(source), source)]
+        tracks += [t.frame.frame_id for t in vehicles.ingest_detections(detections(source), source)]
     assert sorted(set(tracks)) == [1, 2]
 
 

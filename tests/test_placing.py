@@ -13,10 +13,10 @@ from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes
+from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
 from birdslam.vehicles.placing import Assignment, Placing, no_farther_than_cut
 from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeConfig, GroundSizeFilter
-from birdslam.vehicles.state.heading import HeadingConfig
-from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from birdslam.vehicles.state.parallax import ParallaxConfig
 from tests.test_frontend import CAMERA
 
 Floats = NDArray[np.float64]
@@ -80,10 +80,11 @@ def test_cars_beside_the_ego_are_not_thought_far_ahead() -> None:
     for x_m in np.arange(3.5, 7.0, 0.5):
         for side in (-3.3, 3.3):
             for height_m in (1.4, 1.53, 1.66):
-                placing = Placing(CONFIG, ParallaxConfig(), PseudoLidarConfig(), HeadingConfig())
+                ground_size = GroundSizeFilter(CAMERA, GroundSizeConfig())
+                placing = Placing(ground_size, CONFIG, ParallaxConfig(), PseudoLidarConfig(), HeadingConfig())
                 assignment = Assignment(0, None, seen_at(float(x_m), side, height_m))
                 assert assignment.observation.sigma_cut is not None
-                (where,) = placing.locate([assignment], SE2(), GroundSizeFilter(CAMERA, GroundSizeConfig()))
+                (where,) = placing.locate([assignment], SE2())
                 errors.append(where.centre_m[0] - x_m)
                 assert abs(errors[-1]) < 2.0 * math.sqrt(where.cov[0, 0])
     assert abs(np.mean(errors)) < 1.0

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.state.parallax import Parallax
-from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from birdslam.vehicles.state.parallax import Parallax, ParallaxConfig
 from birdslam.vehicles.state.parallax_measurements import ParallaxMeasurements
 from birdslam.vehicles.state.side_outliers import update
 
@@ -94,7 +93,7 @@ def seen_at(x_m: float, y_m: float, hidden: float = 0.0) -> ParallaxMeasurements
 def drive_past(config: ParallaxConfig, hidden: float) -> tuple[float, Floats]:
     """A parked car 6 m aside, half of whose box a tree hides for half a second: whether it stands, the outliers."""
     parallax = Parallax(config)
-    parallax.begin(0, np.array([40.0, 6.0]), 0.0, SE2(), math.log(CAR_HEIGHT_M), (0.08, 0.2))
+    parallax.begin(np.array([40.0, 6.0]), 0.0, SE2(), math.log(CAR_HEIGHT_M), (0.08, 0.2))
     outlier = np.zeros(2)
     for frame in range(20):
         ego = SE2(x_m=0.8 * frame)

@@ -37,6 +37,8 @@ def see(
     ground_size.predict(PERIOD_S, 0.0, None, 0.0, travelled_m)
     n, ground = len(boxes), ground_size.ground
     seen = [observe_boxes(b[None], np.ones(1), ("car",), CAMERA, ground, LOCALISATION)[0] for b in boxes]
+    for new in seen[len(ground_size) :]:
+        ground_size.begin(new)
     extents = np.array([extent_m(CAR, 0.0, o.depth_by_height_m, o.bearing) for o in seen]).reshape(-1, 2)
     learned = LearnedSize(
         np.ones((n, 1)), np.zeros((n, 1)), np.full((n, 1), 1e6), np.full(n, speed_mps), np.zeros((n, 2))
@@ -56,7 +58,7 @@ def test_a_halted_car_keeps_the_road_that_it_halted_on() -> None:
     for _ in range(100):
         see(ground_size, boxes, 0.0)
     assert abs(ground_size.ground.pitch_rad - pitch_rad) < sigma_rad
-    ground_size.keep_only([])
+    ground_size.keep_rows([])
     held = ground_size.ground, ground_size.sigma_pitch_rad
     for _ in range(600):
         ground_size.predict(PERIOD_S, 0.0, None, 0.0, 0.0)

@@ -23,10 +23,10 @@ from birdslam.vehicles.placement.localisation import (
     observe_boxes,
 )
 from birdslam.vehicles.placement.tyre_contact import at_face
+from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
 from birdslam.vehicles.placing import Assignment, Placing
 from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
-from birdslam.vehicles.state.heading import HeadingConfig
-from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from birdslam.vehicles.state.parallax import ParallaxConfig
 from tests.test_frontend import CAMERA
 
 CONFIG = LocalisationConfig()
@@ -101,7 +101,7 @@ def test_a_car_is_placed_alike_whether_its_box_ends_at_the_body_or_at_the_tyres(
     face_m, found = 9.0, {}
     for lower_edge in ("body", "tyres"):
         ground_size = GroundSizeFilter(CAMERA, GroundSizeConfig())
-        placing = Placing(CONFIG, ParallaxConfig(), PseudoLidarConfig(), HeadingConfig())
+        placing = Placing(ground_size, CONFIG, ParallaxConfig(), PseudoLidarConfig(), HeadingConfig())
         height_m = CAMERA.height_m
         observation = seen(height_m / face_m, lower_edge="body")
         if lower_edge == "tyres":
@@ -112,6 +112,6 @@ def test_a_car_is_placed_alike_whether_its_box_ends_at_the_body_or_at_the_tyres(
             observation, slope_top=top, left=half, right=-half, sigma_bottom=0.002, sigma_top=0.002
         )
         assignment = Assignment(0, None, observation)
-        (found[lower_edge],) = placing.locate([assignment], SE2(), ground_size)
+        (found[lower_edge],) = placing.locate([assignment], SE2())
     assert found["tyres"].depth_m == pytest.approx(found["body"].depth_m, rel=0.005)
     assert found["body"].depth_m == pytest.approx(face_m, rel=0.02)

@@ -30,7 +30,7 @@ def predicted_boxes_px(
     if not tracks:
         return boxes
     centres = np.array([track.state[:2] for track in tracks])
-    then = np.array([in_ego(track.T_world_ego, track.state[:2]) for track in tracks])
+    then = np.array([in_ego(track.frame.T_world_ego, track.state[:2]) for track in tracks])
     now = T_world_ego.inverse() @ centres
     depth = np.array([track.place.depth_m for track in tracks])
     bearing = np.array([track.observation.bearing for track in tracks])

@@ -44,10 +44,10 @@ class OpenFrame:
 class OutOfSequenceTracker:
     """open_frame(), then ingest_detections(), once a frame; after both `road` is the one under the camera in it."""
 
-    def __init__(self, tracker: Tracker, ground_size: GroundSizeFilter, config: OutOfSequenceConfig) -> None:
+    def __init__(self, tracker: Tracker, config: OutOfSequenceConfig) -> None:
         self.tracker = tracker
-        self.ground_size = ground_size  # at the last settled frame
-        self.road = ground_size  # at the newest frame
+        self.ground_size = tracker.ground_size  # at the last settled frame
+        self.road = self.ground_size  # at the newest frame
         self.config = config
         self._open: deque[OpenFrame] = deque()
         self._newest_frame = -1
@@ -107,7 +107,7 @@ class OutOfSequenceTracker:
         frame = self._open.popleft()
         self.road = self.ground_size
         _predict(self.ground_size, frame)
-        return self.tracker.localise_vehicles(frame.ego, detections, self.ground_size, depth, road)
+        return self.tracker.localise_vehicles(frame.ego, detections, depth, road)
 
 
 def _predict(ground_size: GroundSizeFilter, frame: OpenFrame) -> None:

@@ -8,7 +8,7 @@ covariance belongs into `Placing.locate`, beside the last.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -29,10 +29,9 @@ from birdslam.vehicles.placement.localisation import (
     place,
 )
 from birdslam.vehicles.placement.tyre_contact import at_face
+from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
 from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeFilter
-from birdslam.vehicles.state.heading import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
-from birdslam.vehicles.state.parallax import LearnedSize, Parallax
-from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from birdslam.vehicles.state.parallax import LearnedSize, Parallax, ParallaxConfig
 from birdslam.vehicles.state.parallax_measurements import measure_boxes
 from birdslam.vehicles.track import Track
 
@@ -41,9 +40,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Assignment:
-    """An observation and the track that it is of, None for a vehicle that is new, with its place by depth."""
+    """An observation and the track that it is of, None for a vehicle that is new, with its place by depth.
 
-    serial: int
+    `row` is the vehicle's in `Tracker.tracks` and in each filter.
+    """
+
+    row: int
     track: Track | None
     observation: Observation
     by_depth: DepthPlace | None = None
@@ -76,7 +78,7 @@ class Assignment:
         """By how much the line of sight to it turned over the ground since it was last seen."""
         if self.track is None:
             return 0.0
-        before = math.atan(self.track.observation.bearing) + self.track.T_world_ego.yaw_rad
+        before = math.atan(self.track.observation.bearing) + self.track.frame.T_world_ego.yaw_rad
         return wrap(math.atan(self.observation.bearing) + T_world_ego.yaw_rad - before)
 
 
@@ -93,12 +95,13 @@ class _Expected:
 class Placing:
     """predict() once a frame, then locate() its vehicles.
 
-    It keeps no state but that of `parallax.Parallax`; the `GroundSizeFilter` is handed in. It measures nothing itself:
-    the tracker reads its places (m, with covariances), the smoother the sizes that they were placed with.
+    It keeps no state but that of its two filters, `Parallax` and `GroundSizeFilter`, and measures nothing itself: the
+    tracker reads its places (m, with covariances), the smoother the sizes that they were placed with.
     """
 
     def __init__(
         self,
+        ground_size: GroundSizeFilter,
         localisation: LocalisationConfig,
         parallax: ParallaxConfig,
         pseudolidar: PseudoLidarConfig,
@@ -106,6 +109,7 @@ class Placing:
     ) -> None:
         import scipy.special  # noqa: F401  # with the tracker, not with its first box that is cut
 
+        self.ground_size = ground_size
         self.localisation = localisation
         self.heading = heading
         self.pseudolidar = pseudolidar
@@ -115,29 +119,27 @@ class Placing:
         """To the next frame's ego pose, with the covariance (3, 3) of the step to it."""
         self.parallax.predict(dt_s, T_world_ego, step_cov)
 
-    def keep_only(self, serials: Iterable[int]) -> None:
-        """Forget the other vehicles."""
-        self.parallax.keep_only(serials)
-
-    def locate(self, assignments: Sequence[Assignment], T_world_ego: SE2, ground_size: GroundSizeFilter) -> list[Place]:
-        """In ego, one place for each assignment; `ground_size` learns the road's tilt and their sizes from all."""
-        assignments = self._with_faces(assignments, T_world_ego, ground_size.ground.height_m)
+    def locate(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> list[Place]:
+        """In ego, one place for each assignment; the road's tilt and their sizes are learned from all."""
+        assignments = self._with_faces(assignments, T_world_ego)
         expected = self._expected(assignments, T_world_ego)
-        sizes = self._sizes_by_parallax(assignments, expected, T_world_ego, ground_size)
+        self._begin(assignments, expected, T_world_ego)
+        sizes = self._sizes_by_parallax(assignments, expected, T_world_ego)
         assignments = self._with_doubtful_sides(assignments, sizes)
-        depths = _depths_by_eq_1(assignments, expected, sizes, ground_size)
+        depths = _depths_by_eq_1(assignments, expected, sizes, self.ground_size)
         by_eq_1 = self._places_at(depths, assignments, expected.yaw_rad)
         # The two sources of Fig. 2 become one
         fused = [fuse(where, a.by_depth, self.pseudolidar) for where, a in zip(by_eq_1, assignments, strict=True)]
         return [
             msgspec.structs.replace(
-                both, assumed=self._assumed(depths, k, a.serial, float(both.cov[0, 0] / one.cov[0, 0]))
+                both, assumed=self._assumed(depths, k, a.row, float(both.cov[0, 0] / one.cov[0, 0]))
             )
             for k, (both, one, a) in enumerate(zip(fused, by_eq_1, assignments, strict=True))
         ]
 
-    def _with_faces(self, assignments: Sequence[Assignment], T_world_ego: SE2, height_m: float) -> list[Assignment]:
+    def _with_faces(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> list[Assignment]:
         """Their boxes with the lower edges that the nearest faces have, where they end at the tyres."""
+        height_m = self.ground_size.ground.height_m
         return [
             replace(
                 a, observation=at_face(a.observation, a.yaw_rad(T_world_ego, self.heading), height_m, self.localisation)
@@ -156,23 +158,26 @@ class Placing:
             yaws, np.array(centres).reshape(-1, 2), np.array(extents).reshape(-1, 2), np.array(turned, dtype=np.float64)
         )
 
-    def _sizes_by_parallax(
-        self, assignments: Sequence[Assignment], expected: _Expected, T_world_ego: SE2, ground_size: GroundSizeFilter
-    ) -> LearnedSize:
-        """What the vehicles' growth in the image says of their heights."""
+    def _begin(self, assignments: Sequence[Assignment], expected: _Expected, T_world_ego: SE2) -> None:
+        """The vehicles that are new, each in the next row of every filter."""
         for assignment, centre_m, yaw_rad in zip(assignments, expected.centre_m, expected.yaw_rad, strict=True):
             if assignment.track is None:
                 d = assignment.observation.dimensions
                 sigmas = d.sigma_height_rel, d.sigma_width_rel
-                self.parallax.begin(assignment.serial, centre_m, yaw_rad, T_world_ego, math.log(d.height_m), sigmas)
-        seen, height_m = [a.observation for a in assignments], ground_size.ground.height_m
+                self.parallax.begin(centre_m, yaw_rad, T_world_ego, math.log(d.height_m), sigmas)
+                self.ground_size.begin(assignment.observation)
+
+    def _sizes_by_parallax(
+        self, assignments: Sequence[Assignment], expected: _Expected, T_world_ego: SE2
+    ) -> LearnedSize:
+        """What the vehicles' growth in the image says of their heights."""
+        seen, height_m = [a.observation for a in assignments], self.ground_size.ground.height_m
         over_roof_m = np.array([max(0.0, height_m - o.dimensions.height_m) for o in seen])
-        roof_m2 = over_roof_m * expected.extent_m[:, 0] * ground_size.config.roof_reach_rel
+        roof_m2 = over_roof_m * expected.extent_m[:, 0] * self.ground_size.config.roof_reach_rel
         boxes = measure_boxes(
             seen, expected.centre_m, expected.extent_m, expected.turned_rad, np.array(expected.yaw_rad), roof_m2
         )
-        serials = [a.serial for a in assignments]
-        return self.parallax.learn_sizes(serials, boxes, T_world_ego, height_m)
+        return self.parallax.learn_sizes([a.row for a in assignments], boxes, T_world_ego, height_m)
 
     def _with_doubtful_sides(self, assignments: Sequence[Assignment], sizes: LearnedSize) -> list[Assignment]:
         """Their boxes with wider sigmas of the sides that are off by far in all likelihood."""
@@ -205,13 +210,13 @@ class Placing:
             out.append(Place(where.depth_m, where.centre_m + d, where.cov + C))
         return out
 
-    def _assumed(self, depths: Depths, k: int, serial: int, share: float) -> AssumedSize:
+    def _assumed(self, depths: Depths, k: int, row: int, share: float) -> AssumedSize:
         """The size that the k-th place rests on; `share` is how much of the box's variance in depth fusion has left."""
         return AssumedSize(
             log_height=float(depths.log_height[k]),
             sigma_log_height=math.sqrt(float(depths.height_variance[k])),
             depth_per_height=float(depths.depth_per_height[k]) * min(share, 1.0),
-            standing=self.parallax.standing(serial),
+            standing=self.parallax.standing(row),
         )
 
 
@@ -219,10 +224,10 @@ def _depths_by_eq_1(
     assignments: Sequence[Assignment], expected: _Expected, sizes: LearnedSize, ground_size: GroundSizeFilter
 ) -> Depths:
     """The depths (N,) of the nearest faces, by all boxes against one road."""
-    seen, serials = [a.observation for a in assignments], [a.serial for a in assignments]
+    seen, rows = [a.observation for a in assignments], [a.row for a in assignments]
     pitch_rad = ground_size.ground.pitch_rad
     depths = ground_size.estimate_depths(
-        serials, seen, expected.extent_m[:, 1], expected.extent_m[:, 0], expected.turned_rad, sizes
+        rows, seen, expected.extent_m[:, 1], expected.extent_m[:, 0], expected.turned_rad, sizes
     )
     return no_farther_than_cut(depths, seen, ground_size, ground_size.ground.pitch_rad - pitch_rad)
 

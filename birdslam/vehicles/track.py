@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -13,8 +15,8 @@ from numpy.typing import NDArray
 from birdslam.geometry.se2 import SE2
 from birdslam.types import MotionEdge
 from birdslam.vehicles.placement.localisation import Observation, Place
-from birdslam.vehicles.state.heading import HeadingConfig
-from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
+from birdslam.vehicles.state.parallax import ParallaxConfig
 
 
 class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -75,6 +77,17 @@ class Shown:
     T_world_vehicle: SE2
 
 
+class VehicleFilter(Protocol):
+    """States of all followed vehicles: row k is of the tracker's k-th track, from its birth until it is forgotten.
+
+    `Placing` appends a row to each such filter for a new vehicle; the tracker drops rows, of all of them at once.
+    """
+
+    def __len__(self) -> int: ...
+
+    def keep_rows(self, rows: Sequence[int]) -> None: ...
+
+
 @dataclass
 class Track:
     """One vehicle; `state` is (x_m, y_m, vx_mps, vy_mps) of its centre in the odometry's world, `cov` (4, 4)."""
@@ -83,13 +96,10 @@ class Track:
     cov: NDArray[np.float64]
     yaw_rad: float
     observation: Observation  # the last one
-    place: Place  # and where it put the vehicle, in the ego of frame `seen_frame`
-    serial: int  # its number in the other filters: ground_size_filter.py, parallax.py
+    place: Place  # and where it put the vehicle, in the ego of `frame`
     first_m: NDArray[np.float64]  # (2,) where it was first seen, in the odometry's world
     first_offset_m: NDArray[np.float64]  # (2,) from the ego to there, along the world's axes
-    seen_frame: int
-    seen_ns: int
-    T_world_ego: SE2  # of frame `seen_frame`
+    frame: EgoFrame  # in which it was last seen
     shown: Shown | None = None  # None until it has an id, since edges name it
     vehicle: int = -1  # the persistent id, once confirmed
     hits: int = 1

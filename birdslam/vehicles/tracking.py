@@ -24,7 +24,7 @@ from birdslam.vehicles.placement.pseudolidar import FrustumNetwork, locate_by_de
 from birdslam.vehicles.placing import Assignment, Placing
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.state.yaw_filter import YawFilter
-from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig, turned_back
+from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig, VehicleFilter, turned_back
 
 Floats = NDArray[np.float64]
 
@@ -43,6 +43,7 @@ class Tracker:
         camera: Camera,
         config: TrackingConfig,
         localisation: LocalisationConfig,
+        ground_size: GroundSizeFilter,
         pseudolidar: PseudoLidarConfig | None = None,
         frustum_network: FrustumNetwork | None = None,
     ) -> None:
@@ -54,34 +55,34 @@ class Tracker:
         self.localisation = localisation
         self.pseudolidar = pseudolidar or PseudoLidarConfig()
         self.frustum_network = frustum_network
-        self.placing = Placing(localisation, config.parallax, self.pseudolidar, config.heading)
-        self.yaw = YawFilter(config, localisation)
+        self.ground_size = ground_size
+        self.placing = Placing(ground_size, localisation, config.parallax, self.pseudolidar, config.heading)
+        self.yaw = YawFilter(config, localisation, ground_size)
         self.tracks: list[Track] = []
+        self._filters: tuple[VehicleFilter, ...] = (self.placing.parallax, ground_size)  # with a row for each track
         self._next_id = 0
-        self._next_serial = 0
         self._last: EgoFrame | None = None
 
     def localise_vehicles(
         self,
         frame: EgoFrame,
         detections: Detections | None,
-        ground_size: GroundSizeFilter,
         depth: DepthMap | None = None,
         road: NDArray[np.bool_] | None = None,
     ) -> list[Track]:
         """Confirmed tracks that this frame's detections show, with their states corrected, ordered by id.
 
-        `ground_size` holds the road under the camera as predicted to this frame. `depth` and `road`, a mask (H, W), are
-        of this frame, None where there are none. Without detections (no detector looked) tracks are predicted only.
+        The ground and size filter is predicted to this frame. `depth` and `road`, a mask (H, W), are of this frame,
+        None where there are none. Without detections (no detector looked) tracks are predicted only.
         """
         if detections is None:
-            return self.follow(frame, None, ground_size)
+            return self.follow(frame, None)
         observations = observe_boxes(
             detections.boxes_px,
             detections.scores,
             detections.labels,
             self.camera,
-            ground_size.ground,
+            self.ground_size.ground,
             self.localisation,
             detections.edge_sigma,
             detections.lower_edge,
@@ -91,18 +92,17 @@ class Tracker:
             detections,
             depth,
             self.camera,
-            ground_size.ground,
+            self.ground_size.ground,
             self.pseudolidar,
             road,
             self.frustum_network,
         )
-        return self.follow(frame, observations, ground_size, by_depth)
+        return self.follow(frame, observations, by_depth)
 
     def follow(
         self,
         frame: EgoFrame,
         observations: list[Observation] | None,
-        ground_size: GroundSizeFilter,
         by_depth: Sequence[DepthPlace | None] = (),
     ) -> list[Track]:
         """Confirmed tracks that the observations show: associate, place by Eq. 1 and depth, correct, begin, forget.
@@ -113,13 +113,13 @@ class Tracker:
         self._predict(frame)
         for known in self.tracks:
             known.missed += observations is not None
-        assignments = self._assignments(frame, observations or [], by_depth, ground_size.ground)
-        places = self.placing.locate(assignments, frame.T_world_ego, ground_size)
-        self._correct(assignments, places, frame, ground_size)
+        assignments = self._assignments(frame, observations or [], by_depth, self.ground_size.ground)
+        places = self.placing.locate(assignments, frame.T_world_ego)
+        self._correct(assignments, places, frame)
         for assignment, where in zip(assignments, places, strict=True):
             if assignment.track is None:
                 self.tracks.append(self._begin(assignment, where, frame))
-        self._forget(frame, ground_size)
+        self._forget(frame)
         return self._confirmed(frame)
 
     def _predict(self, frame: EgoFrame) -> None:
@@ -146,24 +146,17 @@ class Tracker:
         ground: GroundPlane,
     ) -> list[Assignment]:
         """The observations of known tracks, then those that begin a new one, each with its place by depth."""
-        pairs: list[tuple[Track | None, int]] = [*self._associate(frame.T_world_ego, observations, ground)]
-        matched = {row for _, row in pairs}
-        pairs += [
-            (None, row)
-            for row, observation in enumerate(observations)
-            if row not in matched and observation.score >= self.config.birth_score
-        ]
-        out = []
-        for track, row in pairs:
-            serial = self._next_serial if track is None else track.serial
-            self._next_serial += track is None
-            out.append(Assignment(serial, track, observations[row], by_depth[row] if by_depth else None))
-        return out
+        known = self._associate(frame.T_world_ego, observations, ground)
+        matched = {k for _, k in known}
+        births = [k for k, o in enumerate(observations) if k not in matched and o.score >= self.config.birth_score]
+        tracks: list[Track | None] = [*self.tracks, *(None for _ in births)]
+        pairs = [*known, *enumerate(births, len(self.tracks))]
+        return [Assignment(row, tracks[row], observations[k], by_depth[k] if by_depth else None) for row, k in pairs]
 
     def _associate(
         self, T_world_ego: SE2, observations: list[Observation], ground: GroundPlane
-    ) -> list[tuple[Track, int]]:
-        """(track, row of its observation): least cost, 1 - IoU of the predicted and the seen box, within the gates."""
+    ) -> list[tuple[int, int]]:
+        """(row of a track, its observation): least cost, 1 - IoU of predicted and seen box, within the gates."""
         if not self.tracks or not observations:
             return []
         overlap = iou(
@@ -175,11 +168,9 @@ class Tracker:
             self.tracks, observations, T_world_ego, self.config.gate_sigma
         )
         rows, columns = self._assign(np.where(possible, 1.0 - overlap, 2.0))
-        return [(self.tracks[i], int(j)) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
+        return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if possible[i, j]]
 
-    def _correct(
-        self, assignments: Sequence[Assignment], places: Sequence[Place], frame: EgoFrame, ground_size: GroundSizeFilter
-    ) -> None:
+    def _correct(self, assignments: Sequence[Assignment], places: Sequence[Place], frame: EgoFrame) -> None:
         """The known tracks among the assignments, all at once, by the places of their observations in this frame."""
         known = [(a.track, a, place) for a, place in zip(assignments, places, strict=True) if a.track is not None]
         if not known:
@@ -195,7 +186,7 @@ class Tracker:
         gain = cov[:, :, :2] @ information
         corrected = state + (gain @ innovation[..., None])[..., 0]
         corrected_cov = cov - gain @ S @ gain.swapaxes(1, 2)
-        stands = np.array([self.placing.parallax.standing(track.serial) > self.config.stands for track, *_ in known])
+        stands = np.array([self.placing.parallax.standing(a.row) > self.config.stands for _, a, _ in known])
         self._bring_to_rest(corrected, corrected_cov, stands)
         for k, (track, assignment, seen) in enumerate(known):
             track.motion = self._predicted_motion(track, frame)
@@ -208,13 +199,12 @@ class Tracker:
                 track.cov[:2, :2] = R_seen[k]
             else:
                 track.state, track.cov = corrected[k], corrected_cov[k]
-            track.observation, track.place = assignment.observation, seen
-            track.seen_frame, track.seen_ns, track.T_world_ego = frame.frame_id, frame.t_source_ns, frame.T_world_ego
+            track.observation, track.place, track.frame = assignment.observation, seen, frame
             track.hits += 1
             track.missed = 0
             track.votes[assignment.observation.label] += 1
-            self.yaw.turn_to_motion(track, frame.T_world_ego, ground_size)
-            self.yaw.turn_to_body(track, assignment.by_depth, frame.T_world_ego, ground_size)
+            self.yaw.correct_by_motion(assignment.row, track)
+            self.yaw.correct_by_body(assignment.row, track, assignment.by_depth)
 
     def _bring_to_rest(self, states: Floats, covs: Floats, which: NDArray[np.bool_]) -> None:
         """Those of the states (N, 4) that stand, in place: looked for there, they take no neighbour's box."""
@@ -255,35 +245,34 @@ class Tracker:
             yaw_rad=wrap(T_world_ego.yaw_rad + assignment.yaw_rad(T_world_ego, self.config.heading)),
             observation=observation,
             place=seen,
-            serial=assignment.serial,
             first_m=T_world_ego @ seen.centre_m,
             first_offset_m=R @ seen.centre_m,
-            seen_frame=frame.frame_id,
-            seen_ns=frame.t_source_ns,
-            T_world_ego=T_world_ego,
+            frame=frame,
             votes=Counter({observation.label: 1}),
             sigma_yaw_rad=0.0 if by_depth is None else by_depth.sigma_yaw_rad,
             yaw_known=by_depth is not None,
             front_logit=0.0 if by_depth is None else by_depth.front_logit,
         )
 
-    def _forget(self, frame: EgoFrame, ground_size: GroundSizeFilter) -> None:
-        """Tracks that were not seen for too long, here and in the other filters."""
-        self.tracks = [track for track in self.tracks if not self._is_lost(track, frame.t_source_ns)]
-        ground_size.keep_only(track.serial for track in self.tracks)
-        self.placing.keep_only(track.serial for track in self.tracks)
+    def _forget(self, frame: EgoFrame) -> None:
+        """Tracks that were not seen for too long, with their rows in all filters."""
+        rows = [row for row, track in enumerate(self.tracks) if not self._is_lost(track, frame.t_source_ns)]
+        if len(rows) < len(self.tracks):
+            self.tracks = [self.tracks[row] for row in rows]
+            for states in self._filters:
+                states.keep_rows(rows)
 
     def _is_lost(self, track: Track, t_source_ns: int) -> bool:
         lasting = track.hits >= self.config.confirm_hits or not track.missed
         patience_s = self.config.forget_s if lasting else self.config.forget_unconfirmed_s
-        return (t_source_ns - track.seen_ns) * 1e-9 > patience_s
+        return (t_source_ns - track.frame.t_source_ns) * 1e-9 > patience_s
 
     def _confirmed(self, frame: EgoFrame) -> list[Track]:
         """The tracks that were seen in this frame and often enough; a new one of them gets its id."""
         seen_now = [
             track
             for track in self.tracks
-            if track.seen_frame == frame.frame_id and track.hits >= self.config.confirm_hits
+            if track.frame.frame_id == frame.frame_id and track.hits >= self.config.confirm_hits
         ]
         for track in seen_now:
             if track.vehicle < 0:

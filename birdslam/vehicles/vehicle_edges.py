@@ -28,11 +28,11 @@ def vehicle_edges(
     Edges end in `present`, over whose road `ground` the camera stands.
     """
     cv, vv = [], []
-    late = bool(tracks) and tracks[0].seen_frame != present.frame_id
+    late = bool(tracks) and tracks[0].frame.frame_id != present.frame_id
     for seen, track in zip(tracks, _moved_on(tracks, present, ground, camera, config) if late else tracks, strict=True):
         if track is None:
             continue
-        cv.append(_vehicle_edge(track, present.t_source_ns - seen.seen_ns, config))
+        cv.append(_vehicle_edge(track, present.t_source_ns - seen.frame.t_source_ns, config))
         if track.motion is not None:
             vv.append(track.motion)
         seen.shown = Shown(present.frame_id, present.t_source_ns, track.pose())
@@ -41,13 +41,13 @@ def vehicle_edges(
 
 def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> VehicleEdge:
     seen, place = track.observation, track.place
-    yaw_rad = wrap(wrap(-track.T_world_ego.yaw_rad) + track.yaw_rad)
+    yaw_rad = wrap(wrap(-track.frame.T_world_ego.yaw_rad) + track.yaw_rad)
     xx, xy, yy = turned_back(place.cov, yaw_rad)  # the tangent at the vehicle's pose
     sigma_yaw_rad = math.hypot(config.sigma_yaw_moving_rad, track.sigma_yaw_rad)
     var_yaw = (sigma_yaw_rad if track.yaw_known else config.sigma_yaw_unknown_rad) ** 2
     return VehicleEdge(
         vehicle=track.vehicle,
-        frame=track.seen_frame,
+        frame=track.frame.frame_id,
         T_ego_vehicle=SE2(float(place.centre_m[0]), float(place.centre_m[1]), yaw_rad),
         cov=(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, var_yaw),
         label=track.label,
@@ -67,7 +67,7 @@ def _moved_on(
 
     None where one has left the view, or its velocity is not known well enough to say where it is.
     """
-    dt_s, T_world_then = (present.t_source_ns - tracks[0].seen_ns) * 1e-9, tracks[0].T_world_ego
+    dt_s, T_world_then = (present.t_source_ns - tracks[0].frame.t_source_ns) * 1e-9, tracks[0].frame.T_world_ego
     state, cov = np.array([track.state for track in tracks]), np.array([track.cov for track in tracks])
     steps = state[:, 2:] * dt_s
     drift = cov[:, 2:, 2:] * dt_s**2 + np.eye(2) * (config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
@@ -85,7 +85,7 @@ def _moved_on(
     for k, (track, box) in enumerate(zip(moved, boxes.tolist(), strict=True)):
         track.place = msgspec.structs.replace(track.place, centre_m=centres[k], cov=places_cov[k])
         track.observation = msgspec.structs.replace(track.observation, box_px=tuple(box))
-        track.seen_frame, track.seen_ns, track.T_world_ego = present.frame_id, present.t_source_ns, present.T_world_ego
+        track.frame = present
         if track.motion is not None:
             track.motion = _motion_on(track.motion, track, present.frame_id, steps[k], drift[k], config, dt_s)
     return [track if shown else None for track, shown in zip(moved, known.tolist(), strict=True)]

@@ -33,8 +33,8 @@ from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConf
 from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes, place
 from birdslam.vehicles.placement.pseudolidar import localise_by_depth, places_of
 from birdslam.vehicles.placement.tyre_contact import at_face
+from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
 from birdslam.vehicles.placing import Assignment
-from birdslam.vehicles.state.heading import HeadingConfig
 
 if TYPE_CHECKING:
     from birdslam.world.truth import WorldFrame, WorldObject

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -101,12 +101,14 @@ class GroundSizeFilter:
     def __init__(self, camera: Camera, config: GroundSizeConfig) -> None:
         self.camera = camera
         self.config = config
-        self._vehicles: list[int] = []
-        self._unseen_s = np.zeros(0)  # of each of them
+        self._unseen_s = np.zeros(0)  # of each vehicle
         self._driven_s = np.zeros(0)  # and how much of that counts as driving of the ego
         self._x = np.array([camera.pitch_rad, camera.roll_rad])
         self._P = np.diag([config.sigma_pitch_rad**2, config.sigma_roll_rad**2])
         self._image_ground = camera.ground
+
+    def __len__(self) -> int:
+        return len(self._unseen_s)
 
     @property
     def ground(self) -> GroundPlane:
@@ -118,17 +120,30 @@ class GroundSizeFilter:
         """1-sigma of its pitch."""
         return math.sqrt(float(self._P[0, 0]))
 
-    def size(self, vehicle: int) -> tuple[float, float]:
+    def size(self, row: int) -> tuple[float, float]:
         """(height_m, factor of the outline's width) as learned of a vehicle."""
-        at = self._at(vehicle)
+        at = COMMON + OWN * row
         return math.exp(float(self._x[at])), math.exp(float(self._x[at + 1]))
 
     def ground_alone(self) -> GroundSizeFilter:
         """A copy without vehicles, to be predicted on while this one stays."""
         ground = copy.copy(self)
-        ground._vehicles, ground._unseen_s, ground._driven_s = [], np.zeros(0), np.zeros(0)
+        ground._unseen_s, ground._driven_s = np.zeros(0), np.zeros(0)
         ground._x, ground._P = self._x[:COMMON].copy(), self._P[:COMMON, :COMMON].copy()
         return ground
+
+    def begin(self, seen: Observation) -> None:
+        """A vehicle seen for the first time, in the next row: of its class's size until its boxes say more."""
+        config, dimensions = self.config, seen.dimensions
+        self._unseen_s, self._driven_s = (np.append(s, config.box_memory_s) for s in (self._unseen_s, self._driven_s))
+        sigma_road_m = math.hypot(config.sigma_kerb_m, config.sigma_crown_rad * seen.bearing * seen.depth_by_height_m)
+        self._x = np.append(self._x, [math.log(dimensions.height_m), 0.0, 0.0])
+        P = np.zeros((len(self._x), len(self._x)))
+        P[:-OWN, :-OWN] = self._P
+        P[range(-OWN, 0), range(-OWN, 0)] = np.square(
+            [dimensions.sigma_height_rel, dimensions.sigma_width_rel, sigma_road_m]
+        )
+        self._P = P
 
     def predict(
         self,
@@ -166,29 +181,22 @@ class GroundSizeFilter:
                 image_sigma_rad * math.sqrt(config.image_pitch_frames / max(share, _LEAST_SHARE)),
             )
 
-    def rescale_outline(self, vehicle: int, log_outline: float) -> None:
+    def rescale_outline(self, row: int, log_outline: float) -> None:
         """The vehicle's yaw was corrected, so that its class's outline grows by exp(log_outline); its box does not."""
-        at = self._at(vehicle) + 1
+        at = COMMON + OWN * row + 1
         self._x[at] -= log_outline
         self._P[at, at] += (self.config.width_turned_rel * log_outline) ** 2
 
-    def keep_only(self, vehicles: Iterable[int]) -> None:
-        """Forget the other vehicles; what was learned of the road from them stays."""
-        wanted = set(vehicles)
-        if wanted.issuperset(self._vehicles):
-            return
-        rows = [*range(COMMON)]
-        for k, vehicle in enumerate(self._vehicles):
-            if vehicle in wanted:
-                rows += range(COMMON + OWN * k, COMMON + OWN * (k + 1))
-        of_wanted = [vehicle in wanted for vehicle in self._vehicles]
-        self._unseen_s, self._driven_s = self._unseen_s[of_wanted], self._driven_s[of_wanted]
-        self._vehicles = [vehicle for vehicle in self._vehicles if vehicle in wanted]
-        self._x, self._P = self._x[rows], self._P[np.ix_(rows, rows)]
+    def keep_rows(self, rows: Sequence[int]) -> None:
+        """Forget the vehicles of all other rows; what was learned of the road from them stays."""
+        rows = list(rows)
+        at = [*range(COMMON), *(COMMON + OWN * row + k for row in rows for k in range(OWN))]
+        self._unseen_s, self._driven_s = self._unseen_s[rows], self._driven_s[rows]
+        self._x, self._P = self._x[at], self._P[np.ix_(at, at)]
 
     def estimate_depths(
         self,
-        vehicles: Sequence[int],
+        rows: Sequence[int],
         seen: Sequence[Observation],
         outlines_m: Floats,
         extents_m: Floats,
@@ -202,13 +210,10 @@ class GroundSizeFilter:
         `learned` (N, K), sizes by parallax, counts in the depths that are returned and is not kept: the parallax filter
         gives it anew in each frame.
         """
-        for vehicle, observation in zip(vehicles, seen, strict=True):
-            if vehicle not in self._vehicles:
-                self._begin(vehicle, observation)
         n = len(seen)
         if not n:
             return Depths(*np.zeros((5, 0)))
-        at = np.array([self._at(vehicle) for vehicle in vehicles])
+        at = COMMON + OWN * np.array(rows)
         self._P[at + 1, at + 1] += self._outline_drift(at, turned_rad, learned)
         tops = np.array([o.slope_top for o in seen])
         slopes = np.array([o.slope_bottom for o in seen])
@@ -324,24 +329,6 @@ class GroundSizeFilter:
         J[2 * n + rows, at + 1] = 1.0
         J[2 * n + rows, m + rows] = -1.0
         return expected, J
-
-    def _begin(self, vehicle: int, seen: Observation) -> None:
-        self._vehicles.append(vehicle)
-        self._unseen_s, self._driven_s = (
-            np.append(s, self.config.box_memory_s) for s in (self._unseen_s, self._driven_s)
-        )
-        dimensions, config = seen.dimensions, self.config
-        sigma_road_m = math.hypot(config.sigma_kerb_m, config.sigma_crown_rad * seen.bearing * seen.depth_by_height_m)
-        self._x = np.append(self._x, [math.log(dimensions.height_m), 0.0, 0.0])
-        P = np.zeros((len(self._x), len(self._x)))
-        P[:-OWN, :-OWN] = self._P
-        P[range(-OWN, 0), range(-OWN, 0)] = np.square(
-            [dimensions.sigma_height_rel, dimensions.sigma_width_rel, sigma_road_m]
-        )
-        self._P = P
-
-    def _at(self, vehicle: int) -> int:
-        return COMMON + OWN * self._vehicles.index(vehicle)
 
     def _correct_pitch(self, pitch_rad: float, sigma_rad: float) -> None:
         gain = self._P[:, 0] / (self._P[0, 0] + sigma_rad**2)

@@ -25,8 +25,9 @@ class YawFilter:
     `placing.Placing` and by the next frames' outlines in `ground_size_filter.GroundSizeFilter`.
     """
 
-    def __init__(self, config: TrackingConfig, localisation: LocalisationConfig) -> None:
+    def __init__(self, config: TrackingConfig, localisation: LocalisationConfig, ground_size: GroundSizeFilter) -> None:
         self.config = config
+        self.ground_size = ground_size
         self.localisation = localisation
         self._dt_s = 0.0
         self._ego_speed_mps = 0.0
@@ -37,7 +38,7 @@ class YawFilter:
             self._ego_speed_mps = math.hypot(step.x_m, step.y_m) / dt_s
         self._dt_s = dt_s
 
-    def turn_to_motion(self, track: Track, T_world_ego: SE2, ground_size: GroundSizeFilter) -> None:
+    def correct_by_motion(self, row: int, track: Track) -> None:
         """A vehicle that surely moves heads where it moves; one that may stand keeps its yaw."""
         if track.stands or track.observation.cut_side:
             return
@@ -52,15 +53,13 @@ class YawFilter:
         if track.yaw_known and abs(turn) > math.pi / 2.0:  # its rear was mistaken for its front
             track.yaw_rad, turn = wrap(track.yaw_rad + math.pi), wrap(turn - math.pi)
         track.front_logit = MOTION_LOGIT
-        self._correct(track, turn, (config.direction_inflation * sigma / speed) ** 2, T_world_ego, ground_size)
+        self._correct(row, track, turn, (config.direction_inflation * sigma / speed) ** 2)
 
-    def turn_to_body(
-        self, track: Track, by_depth: DepthPlace | None, T_world_ego: SE2, ground_size: GroundSizeFilter
-    ) -> None:
+    def correct_by_body(self, row: int, track: Track, by_depth: DepthPlace | None) -> None:
         """Towards the yaw that a network saw in the body: its axis each time, its front by all that was seen so far."""
         if by_depth is None or not by_depth.front_seen or track.observation.cut_side:
             return
-        turn = wrap(T_world_ego.yaw_rad + by_depth.yaw_rad - track.yaw_rad)
+        turn = wrap(track.frame.T_world_ego.yaw_rad + by_depth.yaw_rad - track.yaw_rad)
         opposed = abs(turn) > math.pi / 2.0
         logit = by_depth.front_logit / self.config.body_yaw_inflation**2
         track.front_logit = min(track.front_logit + (-logit if opposed else logit), MOTION_LOGIT)
@@ -68,12 +67,9 @@ class YawFilter:
             turn = wrap(turn - math.pi)
         if track.front_logit < 0.0:
             track.yaw_rad, track.front_logit = wrap(track.yaw_rad + math.pi), -track.front_logit
-        variance = (self.config.body_yaw_inflation * by_depth.sigma_yaw_rad) ** 2
-        self._correct(track, turn, variance, T_world_ego, ground_size)
+        self._correct(row, track, turn, (self.config.body_yaw_inflation * by_depth.sigma_yaw_rad) ** 2)
 
-    def _correct(
-        self, track: Track, turn: float, variance: float, T_world_ego: SE2, ground_size: GroundSizeFilter
-    ) -> None:
+    def _correct(self, row: int, track: Track, turn: float, variance: float) -> None:
         """The yaw by a measured turn (rad) with its variance, and with it what was derived from the old yaw.
 
         A vehicle turns about what was seen of it: that its centre lies elsewhere than was thought is no motion.
@@ -83,13 +79,13 @@ class YawFilter:
         track.sigma_yaw_rad = math.sqrt((1.0 - gain) * before if track.yaw_known else variance)
         track.yaw_rad = wrap(track.yaw_rad + gain * turn)
         track.yaw_known = True
-        seen, depth_m = track.observation, track.place.depth_m
-        yaw_ego_rad = wrap(track.yaw_rad - T_world_ego.yaw_rad)
+        seen, depth_m, ego_yaw_rad = track.observation, track.place.depth_m, track.frame.T_world_ego.yaw_rad
+        yaw_ego_rad = wrap(track.yaw_rad - ego_yaw_rad)
         yaws_rad = yaw_ego_rad, yaw_ego_rad - gain * turn
         after, before_it = (extent_m(seen.dimensions, yaw_rad, depth_m, seen.bearing)[1] for yaw_rad in yaws_rad)
-        ground_size.rescale_outline(track.serial, math.log(after / before_it))
+        self.ground_size.rescale_outline(row, math.log(after / before_it))
         (x, y, *_), (x0, y0, *_) = (centre_at(seen, depth_m, yaw_rad, self.localisation) for yaw_rad in yaws_rad)
-        shift_m = SE2(yaw_rad=T_world_ego.yaw_rad) @ SE2(x - x0, y - y0)
+        shift_m = SE2(yaw_rad=ego_yaw_rad) @ SE2(x - x0, y - y0)
         shift_world_m = np.array([shift_m.x_m, shift_m.y_m])
         track.state[:2] += shift_world_m
         track.first_m = track.first_m + shift_world_m
