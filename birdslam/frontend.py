@@ -32,7 +32,7 @@ from birdslam.types import (
     Status,
     VehicleEdge,
 )
-from birdslam.vehicles.camera_height import HeightWatch, HeightWatchConfig
+from birdslam.vehicles.camera_height import CameraHeightConfig, CameraHeightEstimator
 from birdslam.vehicles.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import LocalisationConfig
@@ -57,7 +57,7 @@ class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     static_map: StaticMapConfig = StaticMapConfig()
     lanes: LanesConfig = LanesConfig()
     lane_edges: LaneEdgesConfig = LaneEdgesConfig()
-    height: HeightWatchConfig = HeightWatchConfig()
+    height: CameraHeightConfig = CameraHeightConfig()
 
 
 class Pending(Protocol):
@@ -112,7 +112,7 @@ class FrontEnd:
             ),
             config.out_of_sequence,
         )
-        self.height = HeightWatch(camera, config.height, config.localisation)
+        self.height = CameraHeightEstimator(camera, config.height, config.localisation)
         self._lanes = LaneMapper(camera, config.static_map, config.lanes, config.lane_edges, lane_head)
         self._last_frame: int | None = None
         self._last = 0, 0.0, SE2()  # when, the camera's pitch against the level, and T_world_ego
@@ -131,7 +131,7 @@ class FrontEnd:
 
         motion, cc = self._move(frame, tracks, perception)  # scale-unambiguous ego-motion initialisation
         cv, vv = self._localise_vehicles(frame, motion, perception)  # dynamic object localisation
-        status += self.height.judge(cv, motion)
+        status += self.height.update(cv, motion)
         cp = self._map_road(frame)  # static map initialisation
         lanes = self._map_lanes(frame, perception)  # lanes (Sec. 3.2)
 

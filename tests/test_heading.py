@@ -12,7 +12,7 @@ from birdslam.bench.tracking.localisation import INSIDE_2_SIGMA
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera
 from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes, place
-from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
+from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, YawPrior, initial_yaw_rad, marginalise_yaw
 
 Floats = NDArray[np.float64]
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
@@ -35,7 +35,7 @@ def car_at(centre_m: Floats, yaw_rad: float, noise_px: Floats, stretch: float = 
 
 
 def placed(
-    seen: Observation, depth_m: float, headings: Headings, localisation: LocalisationConfig = LOCALISATION
+    seen: Observation, depth_m: float, headings: YawPrior, localisation: LocalisationConfig = LOCALISATION
 ) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
     """(centre, cov) without and with the uncertainty of the yaw."""
     log_depth = math.log(depth_m)
@@ -46,8 +46,8 @@ def placed(
     return (sharp.centre_m, sharp.cov), (sharp.centre_m + shift[0], sharp.cov + cov[0])
 
 
-def thought(yaw_rad: float, sigma_rad: float, outlier: float) -> Headings:
-    return Headings(np.array([yaw_rad]), np.array([sigma_rad]), np.array([outlier]))
+def thought(yaw_rad: float, sigma_rad: float, outlier: float) -> YawPrior:
+    return YawPrior(np.array([yaw_rad]), np.array([sigma_rad]), np.array([outlier]))
 
 
 @pytest.mark.parametrize("yaw_rad", [-1.0, 0.0, 0.5, 2.0])
@@ -100,13 +100,13 @@ def test_the_covariance_holds_cars_that_stand_as_they_like() -> None:
 @pytest.mark.parametrize("y_m", [-5.0, 0.0, 5.0])
 def test_a_box_shows_who_stands_across_the_road(yaw_rad: float, first: float, x_m: float, y_m: float) -> None:
     seen, _ = car_at(np.array([x_m, y_m]), yaw_rad, np.zeros(4))
-    assert first_yaw_rad(seen, CONFIG) == first
-    assert first_yaw_rad(seen, HeadingConfig(across=0.0)) == 0.0
+    assert initial_yaw_rad(seen, CONFIG) == first
+    assert initial_yaw_rad(seen, HeadingConfig(across=0.0)) == 0.0
 
 
 def test_a_wide_box_that_the_border_cuts_shows_nothing_of_the_yaw() -> None:
     box = np.array([[2.0, 150.0, 402.0, 300.0]])
     (cut,) = observe_boxes(box, np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION)
     (whole,) = observe_boxes(box + [400.0, 0.0] * 2, np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION)
-    assert first_yaw_rad(cut, CONFIG) == 0.0
-    assert first_yaw_rad(whole, CONFIG) == math.pi / 2.0
+    assert initial_yaw_rad(cut, CONFIG) == 0.0
+    assert initial_yaw_rad(whole, CONFIG) == math.pi / 2.0

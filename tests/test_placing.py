@@ -14,7 +14,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes
 from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
-from birdslam.vehicles.placing import Assignment, Placing, no_farther_than_cut
+from birdslam.vehicles.placing import Assignment, Placing, truncate_at_cut
 from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeConfig, GroundSizeFilter
 from birdslam.vehicles.state.parallax import ParallaxConfig
 from tests.test_frontend import CAMERA
@@ -48,13 +48,13 @@ def test_only_a_bottom_that_the_image_cuts_is_a_bound() -> None:
     assert cut.sigma_cut is not None
     assert cut.sigma_cut < 0.1 * cut.sigma_bottom
     ground_size, whole = GroundSizeFilter(CAMERA, GroundSizeConfig()), depths(math.log(18.0), 0.1)
-    assert no_farther_than_cut(whole, [seen_at(20.0, 2.0)], ground_size, 0.0) is whole
+    assert truncate_at_cut(whole, [seen_at(20.0, 2.0)], ground_size, 0.0) is whole
 
 
 @pytest.mark.parametrize(("depth_m", "sigma"), [(12.0, 0.5), (6.0, 0.3), (4.0, 0.2), (3.0, 1.5)])
 def test_the_moments_are_those_of_the_depth_given_the_bound(depth_m: float, sigma: float) -> None:
     ground_size, cut = GroundSizeFilter(CAMERA, GroundSizeConfig()), seen_at(5.0, 1.0)
-    found = no_farther_than_cut(depths(math.log(depth_m), sigma), [cut], ground_size, 0.0)
+    found = truncate_at_cut(depths(math.log(depth_m), sigma), [cut], ground_size, 0.0)
     assert cut.sigma_cut is not None
     sigma_bound = math.hypot(cut.sigma_cut, ground_size.sigma_pitch_rad) / cut.slope_bottom
     sigma_bound = math.hypot(sigma_bound, ground_size.config.sigma_kerb_m / CAMERA.height_m)
@@ -69,7 +69,7 @@ def test_the_moments_are_those_of_the_depth_given_the_bound(depth_m: float, sigm
 
 def test_a_depth_far_past_the_bound_gives_finite_numbers() -> None:
     ground_size, cut = GroundSizeFilter(CAMERA, GroundSizeConfig()), seen_at(5.0, 1.0)
-    found = no_farther_than_cut(depths(8.0, 0.01), [cut], ground_size, 0.0)
+    found = truncate_at_cut(depths(8.0, 0.01), [cut], ground_size, 0.0)
     assert np.isfinite(found.log_depth).all()
     assert found.log_depth[0] < 8.0
     assert 0.0 < found.variance[0] < 1e-4

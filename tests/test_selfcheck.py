@@ -26,12 +26,12 @@ from birdslam.perception import Perception, Ready, Segmentation
 from birdslam.sources.kitti_tracking import open_tracking, read_detections
 from birdslam.sources.opening import open_recording
 from birdslam.types import Estimate, Frame, Status, VehicleEdge
-from birdslam.vehicles.camera_height import HeightWatch, HeightWatchConfig
+from birdslam.vehicles.camera_height import CameraHeightConfig, CameraHeightEstimator
 from birdslam.vehicles.placement.localisation import LocalisationConfig
 
 Image = np.ndarray
 Edit = Callable[[int, Image], Image]
-HEIGHT = HeightWatchConfig()
+HEIGHT = CameraHeightConfig()
 PITCH_RAD, ROLL_RAD = 0.0165, 0.005  # of KITTI 06 as estimated from its frames: what its calibration would say
 
 
@@ -226,10 +226,10 @@ def _motion(frame: int, camera: Camera, tilt_error_rad: float, *status: Status) 
 
 
 def _watched(
-    true_height_m: float, *status: Status, tilt_error_rad: float = 0.0, config: HeightWatchConfig = HEIGHT
-) -> tuple[HeightWatch, list[bool]]:
+    true_height_m: float, *status: Status, tilt_error_rad: float = 0.0, config: CameraHeightConfig = HEIGHT
+) -> tuple[CameraHeightEstimator, list[bool]]:
     camera = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65, pitch_rad=0.012)
-    watch = HeightWatch(camera, config, LocalisationConfig())
+    watch = CameraHeightEstimator(camera, config, LocalisationConfig())
     rng = np.random.default_rng(11)
     told = []
     for vehicle in range(40):
@@ -245,7 +245,7 @@ def _watched(
             box = (columns[0] + noise[0], rows[0] + noise[1], columns[1] + noise[2], rows[1] + noise[3])
             frame = 6 * vehicle + k
             told.append(
-                bool(watch.judge([_edge(vehicle, frame, box)], _motion(frame, camera, tilt_error_rad, *status)))
+                bool(watch.update([_edge(vehicle, frame, box)], _motion(frame, camera, tilt_error_rad, *status)))
             )
     return watch, told
 
@@ -265,11 +265,11 @@ def test_the_height_by_the_vehicles(wrong: float) -> None:
 def test_an_error_of_the_tilt_is_not_taken_for_one_of_the_height(tilt_error_rad: float) -> None:
     """At 17 m it is worth 5 % of the slope of a vehicle's bottom."""
 
-    def moved(config: HeightWatchConfig) -> float:
+    def moved(config: CameraHeightConfig) -> float:
         watches = [_watched(1.65, tilt_error_rad=e, config=config)[0] for e in (0.0, tilt_error_rad)]
         return math.log(watches[1].estimate[0] / watches[0].estimate[0])
 
-    believed, doubted = moved(HeightWatchConfig(sigma_pitch_rad=1e-6)), moved(HeightWatchConfig())
+    believed, doubted = moved(CameraHeightConfig(sigma_pitch_rad=1e-6)), moved(CameraHeightConfig())
     assert abs(believed) > 0.04
     assert abs(doubted) < 0.75 * abs(believed)
 

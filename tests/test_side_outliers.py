@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.state.parallax import Parallax, ParallaxConfig
 from birdslam.vehicles.state.parallax_measurements import ParallaxMeasurements
-from birdslam.vehicles.state.side_outliers import update
+from birdslam.vehicles.state.side_outliers import update_with_side_outliers
 
 Floats = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ def kalman(P: Floats, J: Floats, noise: Floats, innovation: Floats) -> tuple[Flo
 def test_without_outliers_it_is_kalmans_update(seed: int) -> None:
     P, J, noise, innovation, off = problem(seed)
     PJt = P @ J.swapaxes(-1, -2)
-    after = update(P, PJt, J @ PJt + noise, innovation, off, np.zeros((2, N)))
+    after = update_with_side_outliers(P, PJt, J @ PJt + noise, innovation, off, np.zeros((2, N)))
     for n, f in np.ndindex(N, FILTERS):
         step, cov, log_likelihood = kalman(P[n, f], J[n, f], noise[n, f], innovation[n, f])
         np.testing.assert_allclose(after.step[n, f], step, rtol=1e-6, atol=1e-8)
@@ -53,7 +53,7 @@ def test_without_outliers_it_is_kalmans_update(seed: int) -> None:
 def test_it_is_the_mixture_of_its_three_cases(seed: int, share: float) -> None:
     P, J, noise, innovation, off = problem(seed)
     PJt = P @ J.swapaxes(-1, -2)
-    after = update(P, PJt, J @ PJt + noise, innovation, off, np.full((2, N), share))
+    after = update_with_side_outliers(P, PJt, J @ PJt + noise, innovation, off, np.full((2, N), share))
     for n, f in np.ndindex(N, FILTERS):
         more = [np.zeros((CUES, CUES)), *(np.outer(u, u) for u in off[:, n, f])]
         steps, covs, logs = zip(

@@ -1,4 +1,4 @@
-"""Boxes that end at the tyres: Eq. 1 on their lower edge gives the tyre, and `at_face` the nearest face."""
+"""Boxes that end at the tyres: Eq. 1 on their lower edge gives the tyre, and `bottom_at_face` the nearest face."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from birdslam.vehicles.placement.localisation import (
     corners_of,
     observe_boxes,
 )
-from birdslam.vehicles.placement.tyre_contact import at_face
+from birdslam.vehicles.placement.tyre_contact import bottom_at_face
 from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
 from birdslam.vehicles.placing import Assignment, Placing
 from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
@@ -58,7 +58,7 @@ def test_the_face_of_a_body_on_tyres_is_found_at_any_yaw(
 ) -> None:
     dimensions = DIMENSIONS[kind]
     slope = lowest_slope(face_m, yaw_rad, dimensions, height_m)
-    found = at_face(seen(slope, dimensions), yaw_rad, height_m, CONFIG)
+    found = bottom_at_face(seen(slope, dimensions), yaw_rad, height_m, CONFIG)
     assert bev.meet_road(np.ones(1), np.array([found.slope_bottom]), height_m)[0] == pytest.approx(face_m, rel=1e-9)
 
 
@@ -66,7 +66,7 @@ def test_the_face_of_a_body_on_tyres_is_found_at_any_yaw(
 def test_the_face_is_never_behind_the_tyre_and_never_more_than_the_overhang_before_it(
     face_m: float, yaw_rad: float, height_m: float
 ) -> None:
-    found = at_face(seen(height_m / face_m), yaw_rad, height_m, CONFIG)
+    found = bottom_at_face(seen(height_m / face_m), yaw_rad, height_m, CONFIG)
     nearer_m = face_m - height_m / found.slope_bottom
     assert -1e-9 <= nearer_m <= CONFIG.overhang_rel * CAR.length_m + 1e-9
 
@@ -74,7 +74,7 @@ def test_the_face_is_never_behind_the_tyre_and_never_more_than_the_overhang_befo
 @given(ends, yaws, heights)
 def test_the_sigma_goes_with_the_slope(face_m: float, yaw_rad: float, height_m: float) -> None:
     slope, step = height_m / face_m, 1e-7
-    low, here, high = (at_face(seen(s), yaw_rad, height_m, CONFIG) for s in (slope - step, slope, slope + step))
+    low, here, high = (bottom_at_face(seen(s), yaw_rad, height_m, CONFIG) for s in (slope - step, slope, slope + step))
     derivative = (high.slope_bottom - low.slope_bottom) / (2.0 * step)
     at_kink = abs(CONFIG.overhang_rel * CAR.length_m * abs(math.cos(yaw_rad)) * slope - CONFIG.clearance_m) < 1e-5
     assert at_kink or here.sigma_bottom == pytest.approx(0.01 * slope * derivative, rel=1e-4)
@@ -83,18 +83,18 @@ def test_the_sigma_goes_with_the_slope(face_m: float, yaw_rad: float, height_m: 
 @given(ends, yaws)
 def test_a_box_of_the_body_stays_as_it_is(face_m: float, yaw_rad: float) -> None:
     of_body = seen(CAMERA.height_m / face_m, lower_edge="body")
-    assert at_face(of_body, yaw_rad, CAMERA.height_m, CONFIG) is of_body
+    assert bottom_at_face(of_body, yaw_rad, CAMERA.height_m, CONFIG) is of_body
 
 
 @given(ends, yaws)
 def test_it_is_done_once(face_m: float, yaw_rad: float) -> None:
-    once = at_face(seen(CAMERA.height_m / face_m), yaw_rad, CAMERA.height_m, CONFIG)
-    assert at_face(once, yaw_rad, CAMERA.height_m, CONFIG) is once
+    once = bottom_at_face(seen(CAMERA.height_m / face_m), yaw_rad, CAMERA.height_m, CONFIG)
+    assert bottom_at_face(once, yaw_rad, CAMERA.height_m, CONFIG) is once
 
 
 def test_a_lower_edge_over_the_horizon_stays_as_it_is() -> None:
     above = seen(-0.01)
-    assert at_face(above, 0.0, CAMERA.height_m, CONFIG) is above
+    assert bottom_at_face(above, 0.0, CAMERA.height_m, CONFIG) is above
 
 
 def test_a_car_is_placed_alike_whether_its_box_ends_at_the_body_or_at_the_tyres() -> None:

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.localisation import Observation
+from birdslam.vehicles.placement.localisation import NEAREST_M, Observation
 from birdslam.vehicles.track import Track
 
-HEIGHT_SHOWS_REL = 0.2  # 1-sigma of a box's height, as a fraction; past it the box says nothing of a size
-LEAST_TAN = 1e-3  # of a box's height
-NEAREST_M, FAR_M = 1.0, 1e4  # a nearer box is out of the image; from there one looks at the horizon
+MAX_SIGMA_HEIGHT_REL = 0.2  # of a box's height, as a fraction; past it the box measures no size
+MIN_TAN_HEIGHT = 1e-3  # of a box's height at a depth of 1
+HORIZON_M = 1e4  # a point of the road so far ahead is imaged at the horizon
 
 
 def predicted_boxes_px(
@@ -37,7 +37,7 @@ def predicted_boxes_px(
     near = np.column_stack([depth, depth * bearing]) + now - then
     ahead = near[:, 0] >= NEAREST_M
     slopes = np.concatenate([bearing[ahead], near[ahead, 1] / near[ahead, 0]])
-    horizon = bev.ego_to_pixel(camera, ground, FAR_M * np.column_stack([np.ones(len(slopes)), slopes]))
+    horizon = bev.ego_to_pixel(camera, ground, HORIZON_M * np.column_stack([np.ones(len(slopes)), slopes]))
     horizon_then, horizon_now = horizon.reshape(2, -1, 2)
     last = np.array([track.observation.box_px for track in tracks])[ahead]
     scale = depth[ahead] / near[ahead, 0]
@@ -55,14 +55,15 @@ def within_gate(
     A vehicle whose height is known has the length of its own class, whatever a box is called: a box twice as high, of a
     bus behind it, is no box of a car.
     """
-    tan_height, sigma_box_rel, turned_share, bearing, sigma_sides = np.array([_of_box(o) for o in observations]).T
-    # A box is taken to be of the track's class where the track's height showed, else of its own
-    shows = np.array([_shows_height(track.observation) for track in tracks])[:, None]
-    of_tracks, of_boxes = (
-        np.array([(d.height_m, d.sigma_height_rel, d.length_m) for d in classes]).T
-        for classes in ([t.observation.dimensions for t in tracks], [o.dimensions for o in observations])
+    of_boxes = np.array([_box_measurements(o) for o in observations]).T
+    tan_height, sigma_box_rel, turned_share, bearing, sigma_sides = of_boxes
+    # A box is taken to be of the track's class where the track's height was measured, else of its own
+    measured = np.array([_height_is_measured(track.observation) for track in tracks])[:, None]
+    of_tracks, of_classes = (
+        np.array([(d.height_m, d.sigma_height_rel, d.length_m) for d in dimensions]).T
+        for dimensions in ([t.observation.dimensions for t in tracks], [o.dimensions for o in observations])
     )
-    height_m, sigma_class_rel, length_m = np.where(shows, of_tracks[..., None], of_boxes[:, None])
+    height_m, sigma_class_rel, length_m = np.where(measured, of_tracks[..., None], of_classes[:, None])
     depth = height_m / tan_height
     sigma_rel = np.hypot(sigma_box_rel, sigma_class_rel)
     turned_m = length_m * turned_share  # its yaw is not known here
@@ -84,24 +85,24 @@ def within_gate(
 
 
 def _learned_height_m(track: Track) -> float:
-    """The height of the vehicle by its last box at the depth where it was placed; NaN where its height did not show."""
+    """The height of the vehicle by its last box at the depth where it was placed; NaN if that measures none."""
     seen = track.observation
-    return track.place.depth_m * seen.tan_height if _shows_height(seen) else math.nan
+    return track.place.depth_m * seen.tan_height if _height_is_measured(seen) else math.nan
 
 
-def _shows_height(seen: Observation) -> bool:
-    return _sigma_height_rel(seen) < HEIGHT_SHOWS_REL
+def _height_is_measured(seen: Observation) -> bool:
+    return _sigma_height_rel(seen) < MAX_SIGMA_HEIGHT_REL
 
 
-def _of_box(seen: Observation) -> tuple[float, float, float, float, float]:
+def _box_measurements(seen: Observation) -> tuple[float, float, float, float, float]:
     """Height at a depth of 1, its 1-sigma (relative), the share of the length that the yaw may hide, bearing, sigma."""
     turned_share = 0.5 if seen.cut_side else 0.25
     sigma_sides = max(seen.sigma_left, seen.sigma_right)
-    return max(seen.tan_height, LEAST_TAN), _sigma_height_rel(seen), turned_share, seen.bearing, sigma_sides
+    return max(seen.tan_height, MIN_TAN_HEIGHT), _sigma_height_rel(seen), turned_share, seen.bearing, sigma_sides
 
 
 def _sigma_height_rel(seen: Observation) -> float:
-    return math.hypot(seen.sigma_top, seen.sigma_bottom) / max(seen.tan_height, LEAST_TAN)
+    return math.hypot(seen.sigma_top, seen.sigma_bottom) / max(seen.tan_height, MIN_TAN_HEIGHT)
 
 
 def in_ego(T_world_ego: SE2, point: NDArray[np.float64]) -> tuple[float, float]:

@@ -1,20 +1,11 @@
-"""The camera's height over the road by the boxes of vehicles, and the watch over whether it is still as calibrated.
+"""The camera's height over the road by the boxes of vehicles, and whether it is still as calibrated.
 
-The bottom edge of a box falls below the horizon by H / z (Eq. 1), its height is h / z: the vehicle's depth z drops out,
+The bottom of a box falls below the horizon by H / z (Eq. 1), its height is h / z: the vehicle's depth z drops out,
 
     slope of the bottom = (H / h) * height of the box - d_pitch + d_roll * bearing        (all at a depth of 1)
 
 which is linear in the camera's height H and in its tilt, with the vehicles' heights h known by class to some per cent.
-Apart from a known speed this is the only cue that one camera has of how high it stands. The watch lets slopes count
-from the plane of the road as the images show it (road/scale.py), whose tilt does not depend on H; the one by the boxes
-(ground_size_filter.py) would. What is left of its error, d_pitch and d_roll, is common to all vehicles and grows with
-their distance as H does not, so that near and far ones tell them apart. The calibration solves for the tilt as well
-(calibration/height_check.py).
-
-A vehicle is as wrong in all its boxes, so that it is one sample, however long it is followed, and as good as its class
-is alike; the height of all of them together is not known better than `sigma_class_rel`. So a camera that is wrong by
-15 % is found within some twenty vehicles, one that is wrong by 10 % sometimes, by 5 % never: `HeightWatch.estimate`
-says what is known.
+docs/vehicles.md has how well it is known.
 """
 
 from __future__ import annotations
@@ -36,26 +27,26 @@ from birdslam.vehicles.placement.localisation import LocalisationConfig, observe
 
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-LOST = {Status.ODOMETRY_COASTING, Status.SCALE_CARRIED, Status.SCALE_INVALID, Status.GROUND_VIOLATED}  # a guessed tilt
+UNRELIABLE_TILT = {Status.ODOMETRY_COASTING, Status.SCALE_CARRIED, Status.SCALE_INVALID, Status.GROUND_VIOLATED}
 ITERATIONS = 4
 _LEAST_RATIO = 0.1
 
 
-class HeightWatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What vehicles say of the camera's height."""
+class CameraHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Noise of the camera's height by vehicles, and when a difference is reported."""
 
-    sigma_height_rel: Positive = 0.5  # of the calibrated height, beforehand: the vehicles are to judge it
+    sigma_height_rel: Positive = 0.5  # prior, of the calibrated height
     sigma_pitch_rad: Positive = 0.004  # of the mean tilt by the images
     sigma_roll_rad: Positive = 0.01  # of the mean tilt by the images
     sigma_class_rel: Positive = 0.04  # of the mean height of a class on a country's roads, and of a detector's boxes
     sigma_kerb_m: Positive = 0.06  # how far the road under a vehicle lies off the ego's plane
-    frames_alike: Positive = 5.0  # for so many frames in a row a detector, and the tilt, err alike
-    gate_sigma: Positive = 1.5  # past it a vehicle counts the less the worse it fits
-    max_sigma_box_rel: Positive = 0.2  # a box that says less is left out
-    kept_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 60  # the last so many
-    min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 8  # fewer say nothing
-    drift_sigma: Positive = 2.5  # a height that is off by more is told as calibration_drift
-    drift_rel: Positive = 0.08  # a smaller difference is none, however sure
+    correlated_frames: Positive = 5.0  # so many frames in a row have the same error of detector and tilt
+    gate_sigma: Positive = 1.5  # past it a vehicle is down-weighted (Huber)
+    max_sigma_box_rel: Positive = 0.2  # a box that is known less well is left out
+    max_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 60  # the last so many
+    min_vehicles: Annotated[int, msgspec.Meta(ge=2)] = 8  # fewer report nothing
+    drift_sigma: Positive = 2.5  # a height that is off by more is reported as calibration_drift
+    drift_rel: Positive = 0.08  # a smaller difference is not reported, whatever its sigma
 
 
 @dataclass(frozen=True)
@@ -98,8 +89,8 @@ def measure_heights(edges: Sequence[VehicleEdge], camera: Camera, config: Locali
 
 
 @dataclass
-class _Known:
-    """The boxes of one vehicle as sums of normal equations, by (H, d_pitch, d_roll)."""
+class _NormalEquations:
+    """The boxes of one vehicle as sums of normal equations, in (H, d_pitch, d_roll)."""
 
     information: Floats  # (3, 3)
     right: Floats  # (3,)
@@ -107,16 +98,17 @@ class _Known:
     class_rel: float
 
 
-class HeightWatch:
-    """judge(): the CV edges of a frame and its motion; gives CALIBRATION_DRIFT when the height is another.
+class CameraHeightEstimator:
+    """update() with the CV edges of a frame and its motion; gives CALIBRATION_DRIFT when the height has changed.
 
-    Least squares over the vehicles seen last. State: H (m), d_pitch, d_roll (rad). Measurements: the slope of the
-    bottom and the height of each box. Read by the front end, as a status; `estimate` gives the height itself.
+    Robust least squares over the vehicles seen last, each of which is one sample: it is as wrong in all its boxes.
+    State: H (m), d_pitch, d_roll (rad). Measurements: the slope of the bottom and the height of each box. Read by the
+    front end, as a status; `estimate` gives the height itself.
     """
 
-    def __init__(self, camera: Camera, config: HeightWatchConfig, localisation: LocalisationConfig) -> None:
+    def __init__(self, camera: Camera, config: CameraHeightConfig, localisation: LocalisationConfig) -> None:
         self.camera, self.config, self._localisation = camera, config, localisation
-        self._vehicles: OrderedDict[int, _Known] = OrderedDict()
+        self._vehicles: OrderedDict[int, _NormalEquations] = OrderedDict()
         self._estimate = (1.0, math.inf, 0)
 
     @property
@@ -124,9 +116,9 @@ class HeightWatch:
         """(height over the calibrated one, its 1-sigma, vehicles)."""
         return self._estimate
 
-    def judge(self, edges: Sequence[VehicleEdge], motion: Motion | None) -> tuple[Status, ...]:
+    def update(self, edges: Sequence[VehicleEdge], motion: Motion | None) -> tuple[Status, ...]:
         """Edges of other frames than the motion's are passed over."""
-        if motion is not None and _sees_road(motion):
+        if motion is not None and _tilt_is_measured(motion):
             here = [edge for edge in edges if edge.frame == motion.to_frame]
             if sum(self._add(box, motion) for box in measure_heights(here, self.camera, self._localisation)):
                 self._estimate = self._solve()
@@ -146,22 +138,22 @@ class HeightWatch:
             return False
         J = np.array([box.tan_height / box.height_m, -1.0, box.bearing])
         weight = 1.0 / (sigma_slope**2 + (self.camera.height_m / box.height_m * box.sigma_height) ** 2)
-        known = self._vehicles.pop(box.vehicle, None) or _Known(np.zeros((3, 3)), np.zeros(3), 0, 0.0)
-        known.information += weight * np.outer(J, J)
-        known.right += weight * slope * J
-        known.boxes, known.class_rel = known.boxes + 1, box.sigma_height_rel
-        self._vehicles[box.vehicle] = known
-        while len(self._vehicles) > cfg.kept_vehicles:
+        sums = self._vehicles.pop(box.vehicle, None) or _NormalEquations(np.zeros((3, 3)), np.zeros(3), 0, 0.0)
+        sums.information += weight * np.outer(J, J)
+        sums.right += weight * slope * J
+        sums.boxes, sums.class_rel = sums.boxes + 1, box.sigma_height_rel
+        self._vehicles[box.vehicle] = sums
+        while len(self._vehicles) > cfg.max_vehicles:
             self._vehicles.popitem(last=False)
         return True
 
     def _solve(self) -> tuple[float, float, int]:
         """Least squares over all vehicles, of which each has an error of its own in proportion to J[0] (Huber)."""
         cfg, height_m, vehicles = self.config, self.camera.height_m, list(self._vehicles.values())
-        alike = np.array([min(cfg.frames_alike, known.boxes) for known in vehicles])
-        A = np.array([known.information for known in vehicles]) / alike[:, None, None]
-        b = np.array([known.right for known in vehicles]) / alike[:, None]
-        own = np.square(height_m * np.array([known.class_rel for known in vehicles])) + cfg.sigma_kerb_m**2
+        correlated = np.array([min(cfg.correlated_frames, sums.boxes) for sums in vehicles])
+        A = np.array([sums.information for sums in vehicles]) / correlated[:, None, None]
+        b = np.array([sums.right for sums in vehicles]) / correlated[:, None]
+        own = np.square(height_m * np.array([sums.class_rel for sums in vehicles])) + cfg.sigma_kerb_m**2
         share = own / (1.0 + own * A[:, 0, 0])  # Sherman-Morrison
         information = (A - share[:, None, None] * A[:, :, None, 0] * A[:, None, 0, :]).reshape(-1, 9)
         right = b - (share * b[:, 0])[:, None] * A[:, 0]
@@ -172,13 +164,13 @@ class HeightWatch:
         for _ in range(ITERATIONS):
             cov = np.asarray(np.linalg.inv(prior + (weight @ information).reshape(3, 3)), dtype=np.float64)
             x = cov @ (prior @ expected + weight @ right)
-            misfit = np.abs(b[:, 0] - A[:, 0] @ x) / spread
-            weight = 1.0 / np.maximum(1.0, misfit / cfg.gate_sigma)
+            residual = np.abs(b[:, 0] - A[:, 0] @ x) / spread
+            weight = 1.0 / np.maximum(1.0, residual / cfg.gate_sigma)
         ratio = max(float(x[0]) / height_m, _LEAST_RATIO)
         return ratio, math.hypot(math.sqrt(float(cov[0, 0])) / (ratio * height_m), cfg.sigma_class_rel), len(vehicles)
 
 
-def _sees_road(motion: Motion) -> bool:
+def _tilt_is_measured(motion: Motion) -> bool:
     """Whether its tilt is measured: metres may be the car's own where the road is not seen."""
     by_car_alone = SpeedSource.CAR in motion.speed_sources and SpeedSource.ROAD not in motion.speed_sources
-    return not by_car_alone and not LOST & set(motion.status)
+    return not by_car_alone and not UNRELIABLE_TILT & set(motion.status)

@@ -1,10 +1,9 @@
-"""Out-of-sequence measurements: detections that come late are used at their own frame, as if they had been in time.
+"""Out-of-sequence measurements: late detections are used at their own frame, as if they had come in time.
 
-The tracks and the ground and size filter stand at the last *settled* frame, whose detections are in or are no longer
-awaited. The frames after it are open: what is known of each (pose, time, how the camera pitched) is kept. Once the
-detections of one of them arrive, the open frames up to it are settled in their order. Frames of which none can come any
-more are settled before that, in a frame without detections: where few frames are looked at, the one whose detections
-arrive would bear the work of all. The road under the camera in the newest frame is predicted over the open ones.
+Tracks and filters stand at the last *settled* frame, whose detections are in or no longer awaited. Of the frames after
+it, which are open, the ego's pose, the time and the camera's pitching are kept. When detections arrive, the open frames
+up to theirs are settled in order; frames that can get none any more are settled at once, so that no later frame bears
+their work. The road under the camera in the newest frame is predicted over the open ones.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ class OutOfSequenceTracker:
         road: NDArray[np.bool_] | None = None,
         awaited_from: int = 0,
     ) -> list[Track]:
-        """The confirmed tracks that detections of `detected_frame` show, as they were in it, ordered by id.
+        """The confirmed tracks that detections of `detected_frame` are of, as they were in it, ordered by id.
 
         Each detections are used once. A detector works on one image at a time, so that none come after later ones.
         `depth` and `road`, a mask (H, W), are of the same frame, None where they are not. Of frames before
@@ -88,7 +87,7 @@ class OutOfSequenceTracker:
         else:
             self._settle_before(awaited_from)
         if self._open and self.road is self.ground_size:
-            self.road = self.ground_size.ground_alone()
+            self.road = self.ground_size.without_vehicles()
             for frame in self._open:
                 _predict(self.road, frame)
         return tracks

@@ -1,8 +1,8 @@
-"""The places of a frame's vehicles, all of them together, from everything that tells depth.
+"""The places of a frame's vehicles, all of them together, from everything that measures depth.
 
-Sizes learned as the ego drives by (parallax.py), Eq. 1 on all boxes against one road (ground_size_filter.py), the
-uncertain yaw (heading.py), and the depth where there is one (pseudolidar.py). A further source of a place with its
-covariance belongs into `Placing.locate`, beside the last.
+Sizes by parallax (parallax.py), Eq. 1 on all boxes against one road (ground_size_filter.py), the uncertain yaw
+(uncertain_yaw.py), and the depth where there is one (pseudolidar.py). A further source of a place with its covariance
+belongs into `Placing.locate`, beside the last; a further filter is begun in `Placing._begin`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2, wrap
-from birdslam.vehicles.association import NEAREST_M, in_ego
+from birdslam.vehicles.association import in_ego
 from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
 from birdslam.vehicles.placement.localisation import (
+    NEAREST_M,
     AssumedSize,
     LocalisationConfig,
     Observation,
@@ -28,8 +29,8 @@ from birdslam.vehicles.placement.localisation import (
     extent_m,
     place,
 )
-from birdslam.vehicles.placement.tyre_contact import at_face
-from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, Headings, first_yaw_rad, marginalise_yaw
+from birdslam.vehicles.placement.tyre_contact import bottom_at_face
+from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, YawPrior, initial_yaw_rad, marginalise_yaw
 from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeFilter
 from birdslam.vehicles.state.parallax import LearnedSize, Parallax, ParallaxConfig
 from birdslam.vehicles.state.parallax_measurements import measure_boxes
@@ -55,7 +56,7 @@ class Assignment:
         if self.track is None:
             if self.by_depth is not None and self.by_depth.front_seen:
                 return self.by_depth.yaw_rad
-            return first_yaw_rad(self.observation, config)
+            return initial_yaw_rad(self.observation, config)
         return wrap(self.track.yaw_rad - T_world_ego.yaw_rad)
 
     def yaw_uncertainty(self, config: HeadingConfig) -> tuple[float, float]:
@@ -83,8 +84,8 @@ class Assignment:
 
 
 @dataclass(frozen=True)
-class _Expected:
-    """What is known of a frame's vehicles (N) in ego before their boxes are used."""
+class _Prediction:
+    """A frame's vehicles (N) in ego as predicted, before their boxes are used."""
 
     yaw_rad: list[float]
     centre_m: Floats  # (N, 2)
@@ -121,44 +122,43 @@ class Placing:
 
     def locate(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> list[Place]:
         """In ego, one place for each assignment; the road's tilt and their sizes are learned from all."""
-        assignments = self._with_faces(assignments, T_world_ego)
+        assignments = self._with_face_bottoms(assignments, T_world_ego)
         expected = self._expected(assignments, T_world_ego)
         self._begin(assignments, expected, T_world_ego)
         sizes = self._sizes_by_parallax(assignments, expected, T_world_ego)
-        assignments = self._with_doubtful_sides(assignments, sizes)
+        assignments = self._with_side_outliers(assignments, sizes)
         depths = _depths_by_eq_1(assignments, expected, sizes, self.ground_size)
         by_eq_1 = self._places_at(depths, assignments, expected.yaw_rad)
         # The two sources of Fig. 2 become one
         fused = [fuse(where, a.by_depth, self.pseudolidar) for where, a in zip(by_eq_1, assignments, strict=True)]
         return [
             msgspec.structs.replace(
-                both, assumed=self._assumed(depths, k, a.row, float(both.cov[0, 0] / one.cov[0, 0]))
+                both, assumed=self._assumed_size(depths, k, a.row, float(both.cov[0, 0] / one.cov[0, 0]))
             )
             for k, (both, one, a) in enumerate(zip(fused, by_eq_1, assignments, strict=True))
         ]
 
-    def _with_faces(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> list[Assignment]:
+    def _with_face_bottoms(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> list[Assignment]:
         """Their boxes with the lower edges that the nearest faces have, where they end at the tyres."""
         height_m = self.ground_size.ground.height_m
-        return [
-            replace(
-                a, observation=at_face(a.observation, a.yaw_rad(T_world_ego, self.heading), height_m, self.localisation)
-            )
-            for a in assignments
-        ]
+        out = []
+        for a in assignments:
+            yaw_rad = a.yaw_rad(T_world_ego, self.heading)
+            out.append(replace(a, observation=bottom_at_face(a.observation, yaw_rad, height_m, self.localisation)))
+        return out
 
-    def _expected(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> _Expected:
+    def _expected(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> _Prediction:
         yaws = [a.yaw_rad(T_world_ego, self.heading) for a in assignments]
         depths = [a.expected_depth_m(T_world_ego) for a in assignments]
         turned = [a.turned_rad(T_world_ego) for a in assignments]
         each = [(a.observation, yaw, depth) for a, yaw, depth in zip(assignments, yaws, depths, strict=True)]
         centres = [centre_at(o, depth, yaw, self.localisation)[:2] for o, yaw, depth in each]
         extents = [extent_m(o.dimensions, yaw, depth, o.bearing) for o, yaw, depth in each]
-        return _Expected(
+        return _Prediction(
             yaws, np.array(centres).reshape(-1, 2), np.array(extents).reshape(-1, 2), np.array(turned, dtype=np.float64)
         )
 
-    def _begin(self, assignments: Sequence[Assignment], expected: _Expected, T_world_ego: SE2) -> None:
+    def _begin(self, assignments: Sequence[Assignment], expected: _Prediction, T_world_ego: SE2) -> None:
         """The vehicles that are new, each in the next row of every filter."""
         for assignment, centre_m, yaw_rad in zip(assignments, expected.centre_m, expected.yaw_rad, strict=True):
             if assignment.track is None:
@@ -168,27 +168,27 @@ class Placing:
                 self.ground_size.begin(assignment.observation)
 
     def _sizes_by_parallax(
-        self, assignments: Sequence[Assignment], expected: _Expected, T_world_ego: SE2
+        self, assignments: Sequence[Assignment], expected: _Prediction, T_world_ego: SE2
     ) -> LearnedSize:
-        """What the vehicles' growth in the image says of their heights."""
+        """The vehicles' heights by how they grow in the image."""
         seen, height_m = [a.observation for a in assignments], self.ground_size.ground.height_m
-        over_roof_m = np.array([max(0.0, height_m - o.dimensions.height_m) for o in seen])
-        roof_m2 = over_roof_m * expected.extent_m[:, 0] * self.ground_size.config.roof_reach_rel
+        above_roof_m = np.array([max(0.0, height_m - o.dimensions.height_m) for o in seen])
+        roof_m2 = above_roof_m * expected.extent_m[:, 0] * self.ground_size.config.roof_reach_rel
         boxes = measure_boxes(
             seen, expected.centre_m, expected.extent_m, expected.turned_rad, np.array(expected.yaw_rad), roof_m2
         )
         return self.parallax.learn_sizes([a.row for a in assignments], boxes, T_world_ego, height_m)
 
-    def _with_doubtful_sides(self, assignments: Sequence[Assignment], sizes: LearnedSize) -> list[Assignment]:
-        """Their boxes with wider sigmas of the sides that are off by far in all likelihood."""
-        off_rel = self.parallax.config.sigma_side_outlier_rel * np.sqrt(sizes.side_outlier)
+    def _with_side_outliers(self, assignments: Sequence[Assignment], sizes: LearnedSize) -> list[Assignment]:
+        """Their boxes, with the sigmas of probable outlying sides raised."""
+        sigma_rel = self.parallax.config.sigma_side_outlier_rel * np.sqrt(sizes.side_outlier)
         out = []
-        for a, (left_rel, right_rel) in zip(assignments, off_rel.tolist(), strict=True):
+        for a, (left_rel, right_rel) in zip(assignments, sigma_rel.tolist(), strict=True):
             seen = a.observation
             sigma_left = math.hypot(seen.sigma_left, left_rel * seen.tan_width)
             sigma_right = math.hypot(seen.sigma_right, right_rel * seen.tan_width)
-            doubtful = msgspec.structs.replace(seen, sigma_left=sigma_left, sigma_right=sigma_right)
-            out.append(replace(a, observation=doubtful))
+            widened = msgspec.structs.replace(seen, sigma_left=sigma_left, sigma_right=sigma_right)
+            out.append(replace(a, observation=widened))
         return out
 
     def _places_at(self, depths: Depths, assignments: Sequence[Assignment], yaws_rad: Sequence[float]) -> list[Place]:
@@ -199,7 +199,7 @@ class Placing:
             seen,
             depths.log_depth,
             depths.variance,
-            Headings(np.array(yaws_rad), sigma_rad, outlier),
+            YawPrior(np.array(yaws_rad), sigma_rad, outlier),
             self.localisation,
             self.heading,
         )
@@ -210,7 +210,7 @@ class Placing:
             out.append(Place(where.depth_m, where.centre_m + d, where.cov + C))
         return out
 
-    def _assumed(self, depths: Depths, k: int, row: int, share: float) -> AssumedSize:
+    def _assumed_size(self, depths: Depths, k: int, row: int, share: float) -> AssumedSize:
         """The size that the k-th place rests on; `share` is how much of the box's variance in depth fusion has left."""
         return AssumedSize(
             log_height=float(depths.log_height[k]),
@@ -221,7 +221,7 @@ class Placing:
 
 
 def _depths_by_eq_1(
-    assignments: Sequence[Assignment], expected: _Expected, sizes: LearnedSize, ground_size: GroundSizeFilter
+    assignments: Sequence[Assignment], expected: _Prediction, sizes: LearnedSize, ground_size: GroundSizeFilter
 ) -> Depths:
     """The depths (N,) of the nearest faces, by all boxes against one road."""
     seen, rows = [a.observation for a in assignments], [a.row for a in assignments]
@@ -229,10 +229,10 @@ def _depths_by_eq_1(
     depths = ground_size.estimate_depths(
         rows, seen, expected.extent_m[:, 1], expected.extent_m[:, 0], expected.turned_rad, sizes
     )
-    return no_farther_than_cut(depths, seen, ground_size, ground_size.ground.pitch_rad - pitch_rad)
+    return truncate_at_cut(depths, seen, ground_size, ground_size.ground.pitch_rad - pitch_rad)
 
 
-def no_farther_than_cut(
+def truncate_at_cut(
     depths: Depths, seen: Sequence[Observation], ground_size: GroundSizeFilter, tilted_rad: float
 ) -> Depths:
     """The depths (N,), given that a box that the image's border cuts reaches at least down to where it was drawn.

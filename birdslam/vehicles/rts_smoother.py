@@ -1,18 +1,11 @@
-"""Vehicles' trajectories after a drive: smoothed with their sizes as learned in the end, and with their later motion.
+"""Vehicles' trajectories after a drive: smoothed, with their sizes as known at the end, and with their later motion.
 
-The live estimate of a frame knows nothing of later ones. Its largest error is common to many frames: a car that is
-assumed taller than it is stands too far off in all of them. Each CV edge says what height the vehicle was placed with
-and how its depth goes with that; once the height is known better, every earlier measurement moves along its line of
-sight:
+Once a height is known better, every earlier measurement moves along its line of sight (the smoother of a state that
+does not change; Rauch, Tung and Striebel 1965):
 
     log z = log z_then + (d log z / d log h) (log h_now - log h_then)
 
-which is the smoother of a state that does not change (Rauch, Tung and Striebel 1965). The measurements, rid of that
-error, go through an RTS smoother of constant velocity. Where a vehicle stands in all likelihood, its velocity is nil.
-The probability that it stood is smoothed too: what drives now hardly stood a moment before. The trajectory with stops
-is kept only where it predicts the measurements as well as the one without.
-
-The ego's trajectory is the live one: CC edges alone determine it, and later ones add nothing to it.
+then all go through an RTS smoother of constant velocity with stops. The ego's trajectory is the live one.
 """
 
 from __future__ import annotations
@@ -33,21 +26,21 @@ from birdslam.vehicles.placement.localisation import Dimensions, corners_of
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
-STANDS = 0.5  # the probability from which on a vehicle is taken to stand
-LEAST_OF_COV = 0.1  # of a measurement's variance along the line of sight: not all of it is the size's
-LEAST_DEPTH_M = 1.0
-LEAST_PROBABILITY = 1e-3  # and 1 less it is the largest
+STANDING_PROBABILITY = 0.5  # the probability from which on a vehicle is taken to stand
+MIN_COV_SHARE = 0.1  # of a measurement's variance along the line of sight: not all of it is the size's
+MIN_DEPTH_M = 1.0
+MIN_PROBABILITY = 1e-3  # and 1 less it is the largest
 
 
 class SmootherConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How vehicles move and stop, and how long a detector errs alike."""
+    """How vehicles move and stop, and how long the error of a detector lasts."""
 
     change_mps: Positive = 2.0  # 1-sigma by which a velocity changes within a second
     birth_mps: Positive = 12.0  # 1-sigma of the velocity of a vehicle seen for the first time
     standing_mps: Positive = 0.05  # 1-sigma of that of one that stands
     stands_for_s: Positive = 60.0  # on average
     moves_for_s: Positive = 15.0
-    box_memory_s: Positive = 0.3  # a box errs in the next frame as in this
+    box_memory_s: Positive = 0.3  # for so long a box has the same error
     gate_sigma: Positive = 4.0  # past it a measurement is an outlier: its noise is raised
 
 
@@ -94,37 +87,37 @@ class RtsSmoother:
 def smooth_vehicle(seen: Sequence[VehicleMeasurement], config: SmootherConfig) -> dict[int, SE2]:
     """frame -> T_world_vehicle of one vehicle; its yaw is the live one."""
     t_s = np.array([one.t_s for one in seen])
-    places, covs = _resized(seen)
-    stood = _stood(np.array([one.edge.standing for one in seen]), np.diff(t_s), config)
+    places, covs = _size_corrected(seen)
+    stood = _smooth_standing(np.array([one.edge.standing for one in seen]), np.diff(t_s), config)
     gaps_s = np.maximum(np.diff(t_s, prepend=t_s[0] - config.box_memory_s), 1e-3)
     covs = covs * np.maximum(1.0, config.box_memory_s / gaps_s)[:, None, None]
-    found, log_likelihood = _smoothed(t_s, places, covs, np.zeros(len(t_s), np.bool_), config)
-    still = stood > STANDS
+    found, log_likelihood = _smooth(t_s, places, covs, np.zeros(len(t_s), np.bool_), config)
+    still = stood > STANDING_PROBABILITY
     if still.any():
-        stopping, stopping_log_likelihood = _smoothed(t_s, places, covs, still, config)
-        if stopping_log_likelihood + _logit(float(stood[still].mean())) > log_likelihood:
-            found = stopping
+        with_stops, with_stops_log_likelihood = _smooth(t_s, places, covs, still, config)
+        if with_stops_log_likelihood + _logit(float(stood[still].mean())) > log_likelihood:
+            found = with_stops
     return {
         one.frame_id: SE2(x_m, y_m, one.T_world_vehicle.yaw_rad)
         for one, (x_m, y_m) in zip(seen, found.tolist(), strict=True)
     }
 
 
-def _resized(seen: Sequence[VehicleMeasurement]) -> tuple[Floats, Floats]:
-    """Centres (N, 2) in world, had each been placed with the last height, and (N, 2, 2): how they err one by one."""
+def _size_corrected(seen: Sequence[VehicleMeasurement]) -> tuple[Floats, Floats]:
+    """Centres (N, 2) in world, had each been placed with the last height, and (N, 2, 2) without the height's error."""
     places, covs = np.zeros((len(seen), 2)), np.zeros((len(seen), 2, 2))
     log_height = seen[-1].edge.log_height
     for k, one in enumerate(seen):
         edge, T = one.edge, one.edge.T_ego_vehicle
         centre = np.array([T.x_m, T.y_m])
         reach_m = max(x for x, _ in corners_of(Dimensions(edge.length_m, edge.width_m, 1.0), T.yaw_rad))
-        depth_m = max(T.x_m - reach_m, LEAST_DEPTH_M)
-        sight_line = centre / max(T.x_m, LEAST_DEPTH_M) * depth_m  # how the centre moves with log z
+        depth_m = max(T.x_m - reach_m, MIN_DEPTH_M)
+        sight_line = centre / max(T.x_m, MIN_DEPTH_M) * depth_m  # how the centre moves with log z
         growth = math.exp(edge.depth_per_height * (log_height - edge.log_height)) - 1.0
         R = SE2(yaw_rad=T.yaw_rad).rotation()
         cov = R @ np.reshape(edge.cov, (3, 3))[:2, :2] @ R.T  # an edge has it in the vehicle's axes
         of_height = (edge.depth_per_height * edge.sigma_log_height) ** 2
-        most = (1.0 - LEAST_OF_COV) * float(cov[0, 0]) / max(sight_line[0] ** 2, 1e-9)
+        most = (1.0 - MIN_COV_SHARE) * float(cov[0, 0]) / max(sight_line[0] ** 2, 1e-9)
         cov = cov - min(of_height, most) * np.outer(sight_line, sight_line)
         R_world_ego = one.T_world_ego.rotation()
         places[k] = one.T_world_ego @ (centre + growth * sight_line)
@@ -132,7 +125,7 @@ def _resized(seen: Sequence[VehicleMeasurement]) -> tuple[Floats, Floats]:
     return places, covs
 
 
-def _stood(standing: Floats, gaps_s: Floats, config: SmootherConfig) -> Floats:
+def _smooth_standing(standing: Floats, gaps_s: Floats, config: SmootherConfig) -> Floats:
     """(N,) the probability that it stood, all measurements given, from what was known of it then (N,)."""
     out = standing.copy()
     for k in range(len(out) - 2, -1, -1):
@@ -143,7 +136,7 @@ def _stood(standing: Floats, gaps_s: Floats, config: SmootherConfig) -> Floats:
     return out
 
 
-def _smoothed(
+def _smooth(
     t_s: Floats, places: Floats, covs: Floats, still: NDArray[np.bool_], config: SmootherConfig
 ) -> tuple[Floats, float]:
     """Places (N, 2) by all the others, and the logarithm of how likely they are, each by those before it."""
@@ -175,5 +168,5 @@ def _smoothed(
 
 
 def _logit(probability: float) -> float:
-    p = min(max(probability, LEAST_PROBABILITY), 1.0 - LEAST_PROBABILITY)
+    p = min(max(probability, MIN_PROBABILITY), 1.0 - MIN_PROBABILITY)
     return math.log(p / (1.0 - p))

@@ -1,4 +1,4 @@
-"""One followed vehicle as the tracker keeps it, the frame that it is seen from, and how vehicles are followed."""
+"""One followed vehicle as the tracker has it, the frame that it is seen from, and how vehicles are followed."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     forget_s: float = 1.0  # without a detection, of a track with an id
     sigma_accel_mps2: float = 3.0  # 1-sigma of a vehicle's acceleration
     sigma_birth_mps: float = 8.0  # 1-sigma of the velocity of a new track
-    moving_mps: float = 2.0  # below it, or within moving_sigma of rest, a vehicle's motion says nothing of its yaw
+    moving_mps: float = 2.0  # a slower vehicle, or one within moving_sigma of rest, has no yaw by motion
     moving_sigma: float = 3.0  # see moving_mps
-    moving_of_ego: float = 0.3  # nor within this fraction of the ego's speed: an error of the ground plane moves all
-    moved_along_rel: float = 0.15  # nor until it has come so far from where it was first seen, as fractions of its
+    moving_of_ego: float = 0.3  # nor one below this fraction of the ego's speed: errors of the ground look like motion
+    moved_along_rel: float = 0.15  # nor one that has come less far from where it was first seen, as fractions of its
     moved_across_rel: float = 0.05  # distance then: along the line of sight, and across it
     sigma_yaw_rate_radps: float = 0.5  # 1-sigma of a vehicle's turning
-    direction_inflation: float = 3.0  # of the motion's direction: its errors last for many frames
-    body_yaw_inflation: float = 3.0  # of a yaw that a network sees in the body: so do its errors
-    sigma_yaw_unknown_rad: float = 0.2  # of a CV edge's yaw before motion or a network shows it
+    direction_inflation: float = 3.0  # of the sigma of the motion's direction: its errors last for many frames
+    body_yaw_inflation: float = 3.0  # of the sigma of a yaw that a network sees in the body: so do its errors
+    sigma_yaw_unknown_rad: float = 0.2  # of a CV edge's yaw before motion or a network measures it
     sigma_yaw_moving_rad: float = 0.1  # at least, of a CV edge's yaw that is known
     parallax: ParallaxConfig = ParallaxConfig()
     heading: HeadingConfig = HeadingConfig()
-    stands: float = 0.5  # the probability from which on a vehicle does, by its parallax: its yaw is kept
-    sigma_standing_mps: float = 2.0  # 1-sigma of the velocity of one that does: it is not sure, and may start
-    late_sigma_m: float = 3.0  # a late detection that the velocity puts so far off is not shown in the present frame
+    standing_probability: float = 0.5  # from it on, by parallax, a vehicle stands: motion does not correct its yaw
+    sigma_standing_mps: float = 2.0  # 1-sigma of the zero-velocity update of one that stands: it may start
+    late_sigma_m: float = 3.0  # a late detection whose place is less sure than that gives no edge in the present frame
 
 
-def turned_back(cov: NDArray[np.float64], yaw_rad: float) -> tuple[float, float, float]:
+def in_vehicle_axes(cov: NDArray[np.float64], yaw_rad: float) -> tuple[float, float, float]:
     """(xx, xy, yy) of a covariance (2, 2) in axes that are turned by `yaw_rad`, R' cov R, without arrays."""
     (xx, xy), (_, yy) = cov.tolist()
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -69,7 +69,7 @@ class EgoFrame:
 
 
 @dataclass(frozen=True)
-class Shown:
+class LastEdge:
     """Where a vehicle's last CV edge left it, in the odometry's world: its next VV edge starts there."""
 
     frame: int
@@ -100,16 +100,16 @@ class Track:
     first_m: NDArray[np.float64]  # (2,) where it was first seen, in the odometry's world
     first_offset_m: NDArray[np.float64]  # (2,) from the ego to there, along the world's axes
     frame: EgoFrame  # in which it was last seen
-    shown: Shown | None = None  # None until it has an id, since edges name it
+    last_edge: LastEdge | None = None  # None until it has an id
     vehicle: int = -1  # the persistent id, once confirmed
     hits: int = 1
     missed: int = 0  # times that the detector looked since and did not see it
     votes: Counter[str] = field(default_factory=Counter)
-    sigma_yaw_rad: float = 0.0  # of a yaw that motion or the body has shown
+    sigma_yaw_rad: float = 0.0  # of a yaw that motion or the body has measured
     yaw_known: bool = False
     front_logit: float = 0.0  # log odds that the yaw points to the front, not to the rear
-    stands: bool = False  # in all likelihood
-    motion: MotionEdge | None = None  # VV: from when it was last shown to now, as predicted before it was seen again
+    stands: bool = False  # probably, by parallax
+    motion: MotionEdge | None = None  # VV: from its last CV edge to now, as predicted before it was seen again
 
     @property
     def label(self) -> str:

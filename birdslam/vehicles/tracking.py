@@ -24,7 +24,7 @@ from birdslam.vehicles.placement.pseudolidar import FrustumNetwork, locate_by_de
 from birdslam.vehicles.placing import Assignment, Placing
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.state.yaw_filter import YawFilter
-from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig, VehicleFilter, turned_back
+from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig, VehicleFilter, in_vehicle_axes
 
 Floats = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ class Tracker:
         depth: DepthMap | None = None,
         road: NDArray[np.bool_] | None = None,
     ) -> list[Track]:
-        """Confirmed tracks that this frame's detections show, with their states corrected, ordered by id.
+        """Confirmed tracks that this frame's detections are of, with their states corrected, ordered by id.
 
         The ground and size filter is predicted to this frame. `depth` and `road`, a mask (H, W), are of this frame,
         None where there are none. Without detections (no detector looked) tracks are predicted only.
@@ -105,7 +105,7 @@ class Tracker:
         observations: list[Observation] | None,
         by_depth: Sequence[DepthPlace | None] = (),
     ) -> list[Track]:
-        """Confirmed tracks that the observations show: associate, place by Eq. 1 and depth, correct, begin, forget.
+        """Confirmed tracks that the observations are of: associate, place by Eq. 1 and depth, correct, begin, delete.
 
         `by_depth` has the place that depth gives each of the observations, or is empty. None for `observations`: no
         detector looked at this frame.
@@ -119,7 +119,7 @@ class Tracker:
         for assignment, where in zip(assignments, places, strict=True):
             if assignment.track is None:
                 self.tracks.append(self._begin(assignment, where, frame))
-        self._forget(frame)
+        self._delete_lost(frame)
         return self._confirmed(frame)
 
     def _predict(self, frame: EgoFrame) -> None:
@@ -182,17 +182,19 @@ class Tracker:
         S = cov[:, :2, :2] + R_seen
         innovation = frame.T_world_ego @ np.array([seen.centre_m for *_, seen in known]) - state[:, :2]
         information = np.linalg.inv(S)
-        misfit = np.einsum("na,nab,nb->n", innovation, information, innovation).tolist()
+        nis = np.einsum("na,nab,nb->n", innovation, information, innovation).tolist()
         gain = cov[:, :, :2] @ information
         corrected = state + (gain @ innovation[..., None])[..., 0]
         corrected_cov = cov - gain @ S @ gain.swapaxes(1, 2)
-        stands = np.array([self.placing.parallax.standing(a.row) > self.config.stands for _, a, _ in known])
-        self._bring_to_rest(corrected, corrected_cov, stands)
+        stands = np.array(
+            [self.placing.parallax.standing(a.row) > self.config.standing_probability for _, a, _ in known]
+        )
+        self._zero_velocity_update(corrected, corrected_cov, stands)
         for k, (track, assignment, seen) in enumerate(known):
             track.motion = self._predicted_motion(track, frame)
             track.stands = bool(stands[k])
-            if track.stands and misfit[k] > self.config.gate_sigma**2:
-                # Its size was estimated anew, which moves its place: that is no motion
+            if track.stands and nis[k] > self.config.gate_sigma**2:
+                # Its size was estimated anew, which moves its place without a motion
                 track.state[:2] += innovation[k]
                 track.first_m = track.first_m + innovation[k]
                 track.cov[:2, :], track.cov[2:, :2] = 0.0, 0.0
@@ -206,26 +208,26 @@ class Tracker:
             self.yaw.correct_by_motion(assignment.row, track)
             self.yaw.correct_by_body(assignment.row, track, assignment.by_depth)
 
-    def _bring_to_rest(self, states: Floats, covs: Floats, which: NDArray[np.bool_]) -> None:
-        """Those of the states (N, 4) that stand, in place: looked for there, they take no neighbour's box."""
-        of_velocity = covs[which, 2:, 2:] + np.eye(2) * self.config.sigma_standing_mps**2
-        gain = covs[which, :, 2:] @ np.linalg.inv(of_velocity)
+    def _zero_velocity_update(self, states: Floats, covs: Floats, which: NDArray[np.bool_]) -> None:
+        """Of `which` of the states (N, 4), in place: predicted where they stand, they take no neighbour's box."""
+        velocity_cov = covs[which, 2:, 2:] + np.eye(2) * self.config.sigma_standing_mps**2
+        gain = covs[which, :, 2:] @ np.linalg.inv(velocity_cov)
         states[which] -= (gain @ states[which, 2:, None])[..., 0]
         covs[which] -= gain @ covs[which, 2:]
 
     def _predicted_motion(self, track: Track, frame: EgoFrame) -> MotionEdge | None:
-        """VV by constant velocity; None for a track that no edge has shown yet."""
-        if track.shown is None:
+        """VV by constant velocity; None for a track without an edge yet."""
+        if track.last_edge is None:
             return None
-        dt_s = (frame.t_source_ns - track.shown.t_ns) * 1e-9
-        xx, xy, yy = turned_back(track.cov[2:, 2:], track.yaw_rad)
+        dt_s = (frame.t_source_ns - track.last_edge.t_ns) * 1e-9
+        xx, xy, yy = in_vehicle_axes(track.cov[2:, 2:], track.yaw_rad)
         by_acceleration = (self.config.sigma_accel_mps2 * dt_s**2 / 2.0) ** 2
         xx, xy, yy = xx * dt_s**2 + by_acceleration, xy * dt_s**2, yy * dt_s**2 + by_acceleration
         return MotionEdge(
             vehicle=track.vehicle,
-            from_frame=track.shown.frame,
+            from_frame=track.last_edge.frame,
             to_frame=frame.frame_id,
-            T_from_to=track.shown.T_world_vehicle.between(track.pose()),
+            T_from_to=track.last_edge.T_world_vehicle.between(track.pose()),
             cov=(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, (self.config.sigma_yaw_rate_radps * dt_s) ** 2),
         )
 
@@ -254,7 +256,7 @@ class Tracker:
             front_logit=0.0 if by_depth is None else by_depth.front_logit,
         )
 
-    def _forget(self, frame: EgoFrame) -> None:
+    def _delete_lost(self, frame: EgoFrame) -> None:
         """Tracks that were not seen for too long, with their rows in all filters."""
         rows = [row for row, track in enumerate(self.tracks) if not self._is_lost(track, frame.t_source_ns)]
         if len(rows) < len(self.tracks):

@@ -1,4 +1,4 @@
-"""The CV and VV edges of a frame (paper, Eq. 2), from the tracks that its detections, or late ones of before, show.
+"""The CV and VV edges of a frame (paper, Eq. 2), from the tracks that its detections, or late ones, are of.
 
 Edges end in the frame at hand. A vehicle that was seen in an earlier one is moved on by its velocity, and is the less
 certain for it.
@@ -17,7 +17,7 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.types import MotionEdge, VehicleEdge
 from birdslam.vehicles.association import predicted_boxes_px
-from birdslam.vehicles.track import EgoFrame, Shown, Track, TrackingConfig, turned_back
+from birdslam.vehicles.track import EgoFrame, LastEdge, Track, TrackingConfig, in_vehicle_axes
 
 
 def vehicle_edges(
@@ -29,20 +29,21 @@ def vehicle_edges(
     """
     cv, vv = [], []
     late = bool(tracks) and tracks[0].frame.frame_id != present.frame_id
-    for seen, track in zip(tracks, _moved_on(tracks, present, ground, camera, config) if late else tracks, strict=True):
+    now = _extrapolated(tracks, present, ground, camera, config) if late else tracks
+    for seen, track in zip(tracks, now, strict=True):
         if track is None:
             continue
         cv.append(_vehicle_edge(track, present.t_source_ns - seen.frame.t_source_ns, config))
         if track.motion is not None:
             vv.append(track.motion)
-        seen.shown = Shown(present.frame_id, present.t_source_ns, track.pose())
+        seen.last_edge = LastEdge(present.frame_id, present.t_source_ns, track.pose())
     return tuple(cv), tuple(vv)
 
 
 def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> VehicleEdge:
     seen, place = track.observation, track.place
     yaw_rad = wrap(wrap(-track.frame.T_world_ego.yaw_rad) + track.yaw_rad)
-    xx, xy, yy = turned_back(place.cov, yaw_rad)  # the tangent at the vehicle's pose
+    xx, xy, yy = in_vehicle_axes(place.cov, yaw_rad)  # the tangent at the vehicle's pose
     sigma_yaw_rad = math.hypot(config.sigma_yaw_moving_rad, track.sigma_yaw_rad)
     var_yaw = (sigma_yaw_rad if track.yaw_known else config.sigma_yaw_unknown_rad) ** 2
     return VehicleEdge(
@@ -60,12 +61,12 @@ def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> Vehicl
     )
 
 
-def _moved_on(
+def _extrapolated(
     tracks: list[Track], present: EgoFrame, ground: GroundPlane, camera: Camera, config: TrackingConfig
 ) -> list[Track | None]:
     """Tracks, all seen in one frame, as they would be had they been seen now where their velocities put them.
 
-    None where one has left the view, or its velocity is not known well enough to say where it is.
+    None where one has left the view, or its velocity is not known well enough.
     """
     dt_s, T_world_then = (present.t_source_ns - tracks[0].frame.t_source_ns) * 1e-9, tracks[0].frame.T_world_ego
     state, cov = np.array([track.state for track in tracks]), np.array([track.cov for track in tracks])
@@ -76,7 +77,7 @@ def _moved_on(
     boxes = predicted_boxes_px(moved, camera, present.T_world_ego, ground)
     known = (np.linalg.eigvalsh(drift)[:, -1] <= config.late_sigma_m**2) & np.isfinite(boxes).all(axis=1)
     R_world_then, R_now_world = T_world_then.rotation(), present.T_world_ego.rotation().T
-    # The velocity errs with the place that it was corrected by: K R of a Kalman filter is the posterior's block
+    # The velocity's error is correlated with that of the place that corrected it: K R is the posterior's block
     places_cov = R_world_then @ np.array([track.place.cov for track in tracks]) @ R_world_then.T + drift
     places_cov += dt_s * (cov[:, 2:, :2] + cov[:, :2, 2:])
     places_cov = R_now_world @ places_cov @ R_now_world.T
@@ -87,11 +88,11 @@ def _moved_on(
         track.observation = msgspec.structs.replace(track.observation, box_px=tuple(box))
         track.frame = present
         if track.motion is not None:
-            track.motion = _motion_on(track.motion, track, present.frame_id, steps[k], drift[k], config, dt_s)
-    return [track if shown else None for track, shown in zip(moved, known.tolist(), strict=True)]
+            track.motion = _extrapolated_motion(track.motion, track, present.frame_id, steps[k], drift[k], config, dt_s)
+    return [track if certain else None for track, certain in zip(moved, known.tolist(), strict=True)]
 
 
-def _motion_on(
+def _extrapolated_motion(
     motion: MotionEdge,
     track: Track,
     frame_id: int,

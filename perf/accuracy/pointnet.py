@@ -32,7 +32,7 @@ from birdslam.perf.reporting.figures import Ledger
 from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, fuse
 from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes, place
 from birdslam.vehicles.placement.pseudolidar import localise_by_depth, places_of
-from birdslam.vehicles.placement.tyre_contact import at_face
+from birdslam.vehicles.placement.tyre_contact import bottom_at_face
 from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
 from birdslam.vehicles.placing import Assignment
 
@@ -170,7 +170,7 @@ def _count(
 
 def by_bottom(seen: Observation, ground: GroundPlane, config: LocalisationConfig, yaw_rad: float = 0.0) -> Place:
     """Eq. 1 on the bottom edge of the box of a vehicle with a yaw in ego; the noise of its edge and of the pitch."""
-    seen = at_face(seen, yaw_rad, ground.height_m, config)
+    seen = bottom_at_face(seen, yaw_rad, ground.height_m, config)
     slope = max(seen.slope_bottom, 1e-3)
     sigma = math.hypot(seen.sigma_bottom, PITCH_ERROR_RAD) / slope
     return place(seen, math.log(ground.height_m / slope), sigma**2, yaw_rad, config)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import DepthMap
-from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, across_var, line_of_sight_cov
-from birdslam.vehicles.placement.localisation import CENTRE_STEPS, Observation
+from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, across_var
+from birdslam.vehicles.placement.localisation import CENTRE_STEPS, Observation, line_of_sight_cov
 
 Floats = NDArray[np.float64]
 
@@ -33,11 +33,11 @@ def fit_footprint(
         return None
     yaws: Floats = np.arange(config.yaws, dtype=np.float64) * (math.pi / config.yaws) - math.pi / 2.0
     corners = footprints(seen, yaws)
-    centres, misfit = _placed(seen, corners, bearings, x_m, middle_m, config)
+    centres, squared_error = _fit_centres(seen, corners, bearings, x_m, middle_m, config)
     # The probability of each yaw
     sigma_m = math.hypot(config.sigma_shape_rel * middle_m, config.sigma_shape_m)
-    log_weight = -0.5 * misfit / sigma_m**2 * min(config.independent_columns, len(x_m))
-    log_weight -= 0.5 * _width_misfit(seen, corners, centres, depth.sigma_rel)
+    log_weight = -0.5 * squared_error / sigma_m**2 * min(config.independent_columns, len(x_m))
+    log_weight -= 0.5 * _width_error(seen, corners, centres, depth.sigma_rel)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     centre = weight @ centres
@@ -45,7 +45,7 @@ def fit_footprint(
     axis = complex(weight @ np.exp(2j * yaws))
     return DepthPlace(
         centre,
-        spread + _own_cov(seen, centre, depth.sigma_rel, sigma_m),
+        spread + _centre_cov(seen, centre, depth.sigma_rel, sigma_m),
         math.atan2(axis.imag, axis.real) / 2.0,
         _sigma_of_axis(abs(axis), math.pi / config.yaws),
     )
@@ -94,7 +94,7 @@ def surface_m(corners: Floats, bearings: Floats) -> Floats:
     return out
 
 
-def _placed(
+def _fit_centres(
     seen: Observation,
     corners: Floats,
     bearings: Floats,
@@ -102,9 +102,9 @@ def _placed(
     middle_m: float,
     config: PseudoLidarConfig,
 ) -> tuple[Floats, Floats]:
-    """Centres (Y, 2) in m that fit box and surface best at each yaw, and the mean squared misfit there (Y,), m^2."""
+    """Centres (Y, 2) in m that fit box and surface best at each yaw, and the mean squared error there (Y,), m^2."""
     along = middle_m + np.abs(corners[:, :, 0]).max(axis=1) / 2.0
-    across = _between_edges(seen, corners, along)
+    across = _lateral_m(seen, corners, along)
     bound = config.outlier_sigma * math.hypot(config.sigma_shape_rel * middle_m, config.sigma_shape_m)
     error = np.zeros((len(corners), len(bearings)))
     for _ in range(CENTRE_STEPS):
@@ -113,13 +113,13 @@ def _placed(
         missed = np.isnan(model).all(axis=1, keepdims=True)
         shift = np.asarray(np.nanmedian(np.where(missed, 0.0, error), axis=1))
         along = np.maximum(along + shift, 1.0)
-        across = _between_edges(seen, corners, along)
+        across = _lateral_m(seen, corners, along)
         error = error - shift[:, None]
-    misfit = np.minimum(np.nan_to_num(error, nan=bound) ** 2, bound**2).mean(axis=1)
-    return np.stack([along, across], axis=-1), misfit
+    squared_error = np.minimum(np.nan_to_num(error, nan=bound) ** 2, bound**2).mean(axis=1)
+    return np.stack([along, across], axis=-1), squared_error
 
 
-def _between_edges(seen: Observation, corners: Floats, along_m: Floats) -> Floats:
+def _lateral_m(seen: Observation, corners: Floats, along_m: Floats) -> Floats:
     """(Y,) where sideways footprints at a depth look as wide and as far left as the box; as `localisation.place`."""
     of_left, of_right = seen.sigma_left**-2, seen.sigma_right**-2
     across = seen.bearing * along_m
@@ -130,7 +130,7 @@ def _between_edges(seen: Observation, corners: Floats, along_m: Floats) -> Float
     return across
 
 
-def _width_misfit(seen: Observation, corners: Floats, centres: Floats, sigma_rel: float) -> Floats:
+def _width_error(seen: Observation, corners: Floats, centres: Floats, sigma_rel: float) -> Floats:
     """(Y,) squares of how wide each footprint looks against the box, in sigmas of what edges, class and depth allow."""
     at = corners + centres[:, None, :]
     bearings = at[:, :, 1] / np.maximum(at[:, :, 0], 0.1)
@@ -141,7 +141,7 @@ def _width_misfit(seen: Observation, corners: Floats, centres: Floats, sigma_rel
     return out
 
 
-def _own_cov(seen: Observation, centre_m: Floats, sigma_rel: float, sigma_m: float) -> Floats:
+def _centre_cov(seen: Observation, centre_m: Floats, sigma_rel: float, sigma_m: float) -> Floats:
     """(2, 2) of a centre at one yaw: the map's depth along the line of sight, the box's edges across it."""
     x_m, y_m = centre_m.tolist()
     length_m = seen.dimensions.sigma_length_rel * seen.dimensions.length_m / 2.0

@@ -19,7 +19,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 
 class PseudoLidarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How depth becomes a place, and what it counts beside Eq. 1."""
+    """How depth becomes a place, and how it is weighted against Eq. 1."""
 
     rule: Literal["covariance", "paper", "off"] = "covariance"  # how the places by depth and by Eq. 1 become one
     near_m: Positive = 20.0  # by the paper's rule: nearer, the depth map alone; farther, Eq. 1 alone
@@ -30,7 +30,7 @@ class PseudoLidarConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     sigma_shape_rel: Positive = 0.03  # of a depth: how well the map keeps a vehicle's shape, columns apart
     sigma_shape_m: Positive = 0.25  # vehicles are no cuboids
     independent_columns: Positive = 4.0  # errors of neighbouring columns go together
-    outlier_sigma: Positive = 3.0  # past it a column is taken to show something else
+    outlier_sigma: Positive = 3.0  # past it a column is taken for something else
     least_columns: Annotated[int, msgspec.Meta(ge=2)] = 5  # with depth, to fit a body
     least_points: Annotated[int, msgspec.Meta(ge=1)] = 40  # of a frustum that the network is asked about
     max_range_m: Positive = 60.0  # farther vehicles are left to Eq. 1
@@ -96,9 +96,3 @@ def across_var(seen: Observation, x_m: float) -> float:
     lopsided = (of_left - of_right) / (of_left + of_right)
     half_m = lopsided * seen.dimensions.sigma_width_rel * seen.tan_width * x_m / 2.0
     return x_m**2 / (of_left + of_right) + half_m**2
-
-
-def line_of_sight_cov(x_m: float, y_m: float, along: float, across: float) -> Floats:
-    """(2, 2) of variances of x_m along the line of sight and of y_m at that x_m."""
-    slope = y_m / x_m
-    return np.array([[along, along * slope], [along * slope, along * slope**2 + across]])

@@ -27,7 +27,7 @@ class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     width_m: float  # mean of the class
     height_m: float  # mean of the class
     sigma_length_rel: float = 0.12  # of the length
-    sigma_width_rel: float = 0.2  # of the outline across the line of sight: the length shows too where it is oblique
+    sigma_width_rel: float = 0.2  # of the outline across the line of sight; where it is oblique that has the length
     sigma_height_rel: float = 0.08  # of the height
 
 
@@ -38,12 +38,13 @@ DIMENSIONS = {
     "bus": Dimensions(11.0, 2.5, 3.1, sigma_length_rel=0.2, sigma_height_rel=0.1),
     "motorcycle": Dimensions(2.1, 0.8, 1.6, sigma_height_rel=0.12),
 }
+NEAREST_M = 1.0  # a nearer vehicle is out of the image
 CENTRE_STEPS = 3  # each leaves about a tenth of the error
 HIDING_FRACTION = 0.1  # of a box's side: a nearer box that covers less hides nothing
 
 
 class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How boxes become places; the class table also says which labels are vehicles."""
+    """How boxes become places; the class table also lists which labels are vehicles."""
 
     vehicles: dict[str, Dimensions] = msgspec.field(default_factory=lambda: dict(DIMENSIONS))
     sigma_box_rel: float = 0.02  # 1-sigma of a box's edges as a fraction of its size, where its detector states none
@@ -54,7 +55,7 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     sigma_growth: float = 2.0
     sure_score: float = 0.9  # see sigma_growth
     reach_rel: float = 1.0  # of the way from the nearest face to the centre; the paper stays at the face (0)
-    sigma_cut_rel: float = 1.0  # an edge cut by the image says nothing within the whole box
+    sigma_cut_rel: float = 1.0  # an edge cut by the image is anywhere within the box
     sigma_hidden_rel: float = 0.025  # an edge behind a nearer vehicle is the detector's guess
     cut_margin_px: float = 4.0  # an edge so near to the image's border counts as cut
     # of the box's height, at the image's bottom: detectors draw a cut edge a little inside of it
@@ -63,7 +64,7 @@ class LocalisationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     overhang_rel: float = 0.2  # of the length: from a body's end to its next axle, by how vehicles are built
     clearance_m: float = 0.2  # from the road to the body's lower edge, by how cars are built
     shape_floor_m: float = 0.02  # across the line of sight: vehicles are no cuboids
-    max_above_road_rad: float = 0.06  # a box whose bottom lies so far above where its height puts it hangs in the air
+    max_above_road_rad: float = 0.06  # a box whose bottom lies farther above where its height puts it is left out
     same_vehicle_iou: float = 0.6  # boxes of different classes on one vehicle: the better score stays
     max_range_m: float = 100.0  # by the height of its class
 
@@ -221,9 +222,13 @@ def place(seen: Observation, log_depth: float, var_depth: float, yaw_rad: float,
     )
     sigma_reach_m = reach_m * (1.0 if seen.cut_side else seen.dimensions.sigma_length_rel)
     along = x_m**2 * var_depth + sigma_reach_m**2
-    across, slope = (x_m * sigma_across) ** 2, y_m / x_m
-    cov = np.array([[along, along * slope], [along * slope, along * slope**2 + across]])
-    return Place(depth_m, np.array([x_m, y_m]), cov)
+    return Place(depth_m, np.array([x_m, y_m]), line_of_sight_cov(x_m, y_m, along, (x_m * sigma_across) ** 2))
+
+
+def line_of_sight_cov(x_m: float, y_m: float, along: float, across: float) -> NDArray[np.float64]:
+    """(2, 2) of variances of x_m along the line of sight and of y_m at that x_m."""
+    slope = y_m / x_m
+    return np.array([[along, along * slope], [along * slope, along * slope**2 + across]])
 
 
 def observe_boxes(
@@ -238,8 +243,8 @@ def observe_boxes(
 ) -> list[Observation]:
     """Observations of the vehicles among the boxes (N, 4) with scores (N,), best score first.
 
-    A box that hangs over the road or lies past `max_range_m` is no vehicle on it and is left out. `edge_sigma` is what
-    the detector states, None the configuration's; `lower_edge` where its boxes end (`manifest.DetectorTable`).
+    A box that floats above the road or lies past `max_range_m` is left out. `edge_sigma` is what the detector states,
+    None the configuration's; `lower_edge` where its boxes end (`manifest.DetectorTable`).
     """
     vehicles = np.array([label in config.vehicles for label in labels], dtype=np.bool_).reshape(-1)
     sizes = boxes_px[:, 2:] - boxes_px[:, :2]
@@ -305,11 +310,11 @@ def _observe(
     hidden_left, hidden_right, hidden_bottom = hidden
 
     of_left, of_right, of_top, of_bottom = edge_sigma.rel
-    doubtful = 1.0 + config.sigma_growth * max(0.0, config.sure_score - score)
+    score_factor = 1.0 + config.sigma_growth * max(0.0, config.sure_score - score)
 
-    def sigma_px(size_px: float, edge_rel: float, cut: bool, covered: bool) -> float:
-        rel = cut_rel if cut else config.sigma_hidden_rel if covered else 0.0
-        return math.hypot(doubtful * size_px * edge_rel, doubtful * edge_sigma.px, size_px * rel)
+    def sigma_px(size_px: float, edge_rel: float, cut: bool, hidden: bool) -> float:
+        rel = cut_rel if cut else config.sigma_hidden_rel if hidden else 0.0
+        return math.hypot(score_factor * size_px * edge_rel, score_factor * edge_sigma.px, size_px * rel)
 
     return Observation(
         label=label,
@@ -333,8 +338,8 @@ def _observe(
 
 def _is_on_road(seen: Observation, ground: GroundPlane, config: LocalisationConfig) -> bool:
     depth_m = seen.depth_by_height_m
-    hangs = (
+    above_road = (
         seen.slope_bottom
         < bev.road_slope(depth_m, ground.height_m) - config.max_above_road_rad - 3.0 * seen.sigma_bottom
     )
-    return depth_m < config.max_range_m and not hangs
+    return depth_m < config.max_range_m and not above_road

@@ -21,12 +21,12 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import wrap
 from birdslam.perception import Boxes3d, DepthMap, Detections
 from birdslam.vehicles.placement.body_fit import fit_footprint
-from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, across_var, line_of_sight_cov
-from birdslam.vehicles.placement.localisation import Dimensions, Observation, corners_of
+from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig, across_var
+from birdslam.vehicles.placement.localisation import Dimensions, Observation, corners_of, line_of_sight_cov
 
 Floats = NDArray[np.float64]
 
-ROAD_CELLS_MIN = 50  # of the map on the road: fewer say nothing of its scale
+ROAD_CELLS_MIN = 50  # of the map on the road: fewer give it no scale
 
 
 class FrustumNetwork(Protocol):
@@ -47,7 +47,7 @@ def locate_by_depth(
 ) -> tuple[list[Observation], list[DepthPlace | None]]:
     """The second source of each observation's place, None where there is none, and the observations (N each).
 
-    Bodies that the detector itself finds need no depth map; they tell the observations' lengths as well. `depth` and
+    Bodies that the detector itself finds need no depth map; they measure the observations' lengths as well. `depth` and
     `road`, a mask (H, W), are of the same frame.
     """
     if detections.boxes3d is not None and network is None:
@@ -85,7 +85,7 @@ def localise_by_depth(
     road: NDArray[np.bool_] | None = None,
     network: FrustumNetwork | None = None,
 ) -> list[DepthPlace | None]:
-    """A place for each observation of the frame that `depth` is of, None where its depth says nothing.
+    """A place for each observation of the frame that `depth` is of, None where its depth gives none.
 
     `road` (H, W) is the mask of the image's road; a map without a scale of its own needs it. Where the network gives no
     usable numbers the bodies are fitted.
@@ -157,7 +157,7 @@ def in_metres(
     road: NDArray[np.bool_] | None,
     config: PseudoLidarConfig,
 ) -> DepthMap | None:
-    """The map in metres: its own, or by the median of what Eq. 1 says of the road; None where none is seen."""
+    """The map in metres: its own, or by the median of Eq. 1 on the road; None where none is seen."""
     depth = depth.in_metres(camera)
     if depth.metric:
         return depth

@@ -1,9 +1,8 @@
-"""The lower edge of a box that ends where a vehicle's outline does: at its tyres, behind its nearest face.
+"""The lower edge of a box that ends at a vehicle's tyres, moved to where the nearest face stands on the road.
 
-The lowest that one sees of a car is where its nearest tyre meets the road, an overhang behind the bumper, which hangs
-over the road. Eq. 1 on that edge gives the depth of the tyre. Taken for the depth of the nearest face it is too large,
-by 0.8 m of a car that is seen from its end and by nothing of one that is seen from its side: 8 % at 10 m. The cuboid of
-a label ends at the road under the bumper, and so do the boxes of detectors that learned from such labels.
+Eq. 1 on the edge gives the depth of the nearest tyre, an overhang behind the bumper: 0.8 m behind the nearest face of a
+car that is seen from its end, nothing of one from its side; 8 % at 10 m. Cuboid labels, and detectors that learned from
+them, end at the road under the bumper.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import msgspec
 from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation
 
 
-def at_face(seen: Observation, yaw_rad: float, height_m: float, config: LocalisationConfig) -> Observation:
+def bottom_at_face(seen: Observation, yaw_rad: float, height_m: float, config: LocalisationConfig) -> Observation:
     """The observation with the bottom that its nearest face has on the road, where its box ends at the tyres.
 
     `yaw_rad` is the vehicle's in ego, `height_m` the camera's (H) over the road. With the slope s of the lower edge the

@@ -1,11 +1,9 @@
 """A vehicle's place with the uncertainty of its yaw marginalised out.
 
-The width of a box, at a depth, shows how much a vehicle is turned, though not to which side. Each yaw of a fan puts the
-footprint's centre elsewhere. The posterior over the fan, from what is known of the yaw beforehand and from the width,
-gives the centre's mean and covariance.
-
-No filter: nothing is kept from frame to frame. Input are the yaws (rad) of `yaw_filter.YawFilter` and the log depths of
-`ground_size_filter.GroundSizeFilter`; `placing.Placing` reads the result.
+The width of a box, at a depth, measures how much a vehicle is turned, not to which side. Each yaw of a fan puts the
+footprint's centre elsewhere; the posterior over the fan, from the yaw's prior and the width, gives the centre's mean
+and covariance. Nothing is kept from frame to frame: the yaws (rad) are `yaw_filter.YawFilter`'s, the log depths
+`ground_size_filter.GroundSizeFilter`'s, and `placing.Placing` reads the result.
 """
 
 from __future__ import annotations
@@ -24,26 +22,26 @@ from birdslam.vehicles.placement.localisation import CENTRE_STEPS, LocalisationC
 Floats = NDArray[np.float64]
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
-_NEAR = np.array([0.0, math.sqrt(3.0), -math.sqrt(3.0)])  # Gauss-Hermite points of a normal distribution, in sigmas
-_NEAR_WEIGHT = np.array([2.0, 0.5, 0.5]) / 3.0
-_LEAST_WEIGHT = 1e-12
+_GAUSS_HERMITE = np.array([0.0, math.sqrt(3.0), -math.sqrt(3.0)])  # points of a normal distribution, in sigmas
+_GAUSS_HERMITE_WEIGHT = np.array([2.0, 0.5, 0.5]) / 3.0
+_MIN_WEIGHT = 1e-12
 
 
 class HeadingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How vehicles stand on roads, and what the width of a box says of it."""
+    """How vehicles stand on roads, and how well the width of a box measures it."""
 
-    outlier_unknown: Share = 0.25  # of the vehicles whose yaw nothing has shown yet: they are headed anywhere
-    outlier_known: Share = 0.1  # of those whose motion or body seemed to show it
+    outlier_unknown: Share = 0.25  # of the vehicles whose yaw was not measured yet: they are headed anywhere
+    outlier_known: Share = 0.1  # of those whose motion or body measured it: it may be wrong
     sigma_along_road_rad: float = 0.05  # of the others of the first kind: they are headed like the ego
     sigma_width_rel: float = 0.09  # of the outline of a footprint, among vehicles of a class
     # Of the vehicles, when first seen: they stand or drive across the ego's road. By the labels of KITTI tracking 0000
     # to 0020 43 of 343 do
     across: Share = 0.1
-    fan: Annotated[int, msgspec.Meta(ge=4, le=90)] = 12  # yaws over half a turn: a heading and its opposite look alike
+    fan: Annotated[int, msgspec.Meta(ge=4, le=90)] = 12  # yaws over half a turn: the opposite has the same outline
 
 
 @dataclass(frozen=True)
-class Headings:
+class YawPrior:
     """Of the yaws (N,) of a frame's vehicles against the ego: a normal distribution mixed with a uniform one.
 
     `outlier` (N,) is the weight of the uniform one.
@@ -54,8 +52,8 @@ class Headings:
     outlier: Floats
 
 
-def first_yaw_rad(seen: Observation, config: HeadingConfig) -> float:
-    """Against the ego, of a vehicle whose body and motion show nothing: along the road or, if it looks it, across.
+def initial_yaw_rad(seen: Observation, config: HeadingConfig) -> float:
+    """Against the ego, of a vehicle whose yaw nothing has measured: along the road or, by the shape of its box, across.
 
     A car from the side is 2.5 times as wide as high, one from behind as wide as high: the shape of its box needs no
     depth. One that the image's border cuts is taken to stand along the road.
@@ -82,7 +80,7 @@ def marginalise_yaw(
     seen: Sequence[Observation],
     log_depth: Floats,
     variance: Floats,
-    headings: Headings,
+    yaws_prior: YawPrior,
     localisation: LocalisationConfig,
     config: HeadingConfig,
 ) -> tuple[Floats, Floats]:
@@ -93,10 +91,10 @@ def marginalise_yaw(
     if not seen:
         return np.zeros((0, 2)), np.zeros((0, 2, 2))
     n, fan = len(seen), config.fan
-    anywhere = np.broadcast_to(np.arange(fan) * (math.pi / fan), (n, fan))
-    yaws = np.hstack([headings.yaw_rad[:, None] + headings.sigma_rad[:, None] * _NEAR, anywhere])  # (N, M)
-    outlier = headings.outlier[:, None]
-    prior = np.hstack([(1.0 - outlier) * _NEAR_WEIGHT, np.broadcast_to(outlier / fan, (n, fan))])
+    uniform = np.broadcast_to(np.arange(fan) * (math.pi / fan), (n, fan))
+    yaws = np.hstack([yaws_prior.yaw_rad[:, None] + yaws_prior.sigma_rad[:, None] * _GAUSS_HERMITE, uniform])  # (N, M)
+    outlier = yaws_prior.outlier[:, None]
+    prior = np.hstack([(1.0 - outlier) * _GAUSS_HERMITE_WEIGHT, np.broadcast_to(outlier / fan, (n, fan))])
     left, right, var_left, var_right, half_l, half_w = np.array(
         [
             (
@@ -126,9 +124,9 @@ def marginalise_yaw(
         widest, least = outline.max(axis=0), outline.min(axis=0)
         y_m = y_m + ((left - widest) * of_left + (right - least) * of_right) / (of_left + of_right) * x_m
 
-    misfit = np.log(np.maximum(left - right, 1e-3) / np.maximum(widest - least, 1e-3))
+    residual = np.log(np.maximum(left - right, 1e-3) / np.maximum(widest - least, 1e-3))
     noise = variance[:, None] + config.sigma_width_rel**2 + (var_left + var_right) / (left - right) ** 2
-    weight = prior * np.exp(-0.5 * misfit**2 / noise) + prior * _LEAST_WEIGHT
+    weight = prior * np.exp(-0.5 * residual**2 / noise) + prior * _MIN_WEIGHT
     weight /= weight.sum(axis=1, keepdims=True)
     centres = np.stack([x_m, y_m], axis=-1)
     mean = (weight[..., None] * centres).sum(axis=1)

@@ -1,25 +1,11 @@
 """The road's tilt and the vehicles' sizes, each from the other, by the boxes of the vehicles alone.
 
-The bottom of a box says how far below the horizon a vehicle stands, its height how tall it looks. Both follow from its
-depth, so that every box ties the tilt of the road to the height of one vehicle; many vehicles at many depths tell the
-two apart. One Kalman filter holds them all, with their correlations:
+    x = [pitch, roll, and of every vehicle: log h, log w, kerb]   and, for one frame only, of every box: log z
 
-    x = [pitch, roll, and of every vehicle: log h, log w, d]   and, for one frame only, of every box: log z
-
-pitch and roll (rad) are the camera's over the road, h (m) is the vehicle's height, w the width of its outline as a
-factor of what its class has at its yaw, d (m) how far the road under it lies below the ego's plane (kerb, crown), z (m)
-the depth of its nearest face, of which nothing is known before. With H the camera's height, y/x the bearing, and slopes
-that count downwards from the plane of the road, each box has three measurements:
-
-    bottom = (H + d) / z - pitch + roll y/x               (Eq. 1, solved for the slope)
-    top    = (H + d - h) / (z + r) - pitch + roll y/x     r: to the roof's far edge where the camera looks down on it
-    log width = log w + log(class's outline) - log z
-
-The pitch follows the camera's own rotation between frames, and decays to the calibrated one as the ego drives: where a
-rotation lasts, the road turned too. Under a car that stands the road stays as it is, and so does what is known of it.
-Of what stands before it, a box says nothing new there: it errs as in the frame before. Between frames a vehicle's size
-and kerb stay; its outline changes as it or the line of sight turns. The update is iterated once about its own result,
-with the noise of outliers raised (robust weights, Huber).
+One Kalman filter holds them all. With H the camera's height, d the kerb, y/x the bearing, r on to the roof's far edge
+where the camera looks down on it, and slopes that count downwards from the plane of the road, a box measures
+bottom = (H + d) / z - pitch + roll y/x (Eq. 1), top = (H + d - h) / (z + r) - pitch + roll y/x, and
+log width = log w + log(class's outline) - log z.
 """
 
 from __future__ import annotations
@@ -41,19 +27,19 @@ from birdslam.vehicles.state.parallax import LearnedSize
 
 Floats = NDArray[np.float64]
 
-COMMON, OWN = 2, 3  # states: pitch, roll; and of each vehicle log h, log w, d
+COMMON, OWN = 2, 3  # states: pitch, roll; and of each vehicle log h, log w, kerb
 Cue = Literal["bottom", "top", "width"]
 CUES: tuple[Cue, ...] = ("bottom", "top", "width")  # measurements of each box, in this order
 ITERATIONS = 2
 DEPTH_UNKNOWN = 2.0  # 1-sigma of log z before a frame is seen
-UNUSED = 1e3  # 1-sigma of a cue that is not to be used
-_LEAST = 1e-12  # variance of a height that its class knows exactly
-_SHORTEST_S = 1e-3
-_LEAST_SHARE = 1e-6  # of a second, that counts as driving
+UNUSED = 1e3  # 1-sigma of a cue that is not used
+_MIN_VARIANCE = 1e-12  # variance of a height that its class knows exactly
+_MIN_DT_S = 1e-3
+_MIN_SHARE = 1e-6  # of a second, that counts as driving
 
 
 class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is known of roads and vehicles before any was measured."""
+    """Priors of roads and vehicles, and how long the errors of a box last."""
 
     sigma_pitch_rad: float = 0.010  # of the camera over real roads against its calibration
     pitch_memory_s: float = 5.0  # of driving: how long the pitch's deviation from the calibration lasts
@@ -72,10 +58,10 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bend_per_m: float = 0.005
     width_turned_rel: float = 0.6  # of a change of the outline that comes of a yaw newly learned
     roof_reach_rel: float = 0.6  # of the vehicle's extent along the line of sight, to the edge of its roof
-    cues: tuple[Cue, ...] = ("bottom", "top", "width")  # what of a box is believed
-    gate_sigma: float = 2.0  # past it a cue is an outlier: its weight falls with its misfit
+    cues: tuple[Cue, ...] = ("bottom", "top", "width")  # which measurements of a box are used
+    gate_sigma: float = 2.0  # past it a measurement is an outlier: its weight falls with its residual (Huber)
     image_pitch_frames: float = 5.0  # for how long the error of a pitch from the images lasts
-    box_memory_s: float = 0.5  # a box errs in the next frame as in this: this time of driving counts as one box
+    box_memory_s: float = 0.5  # for so long a box has the same error: this time of driving counts as one box
 
 
 @dataclass(frozen=True)
@@ -125,15 +111,15 @@ class GroundSizeFilter:
         at = COMMON + OWN * row
         return math.exp(float(self._x[at])), math.exp(float(self._x[at + 1]))
 
-    def ground_alone(self) -> GroundSizeFilter:
-        """A copy without vehicles, to be predicted on while this one stays."""
+    def without_vehicles(self) -> GroundSizeFilter:
+        """A copy without vehicles, to predict the road further while this one stays."""
         ground = copy.copy(self)
         ground._unseen_s, ground._driven_s = np.zeros(0), np.zeros(0)
         ground._x, ground._P = self._x[:COMMON].copy(), self._P[:COMMON, :COMMON].copy()
         return ground
 
     def begin(self, seen: Observation) -> None:
-        """A vehicle seen for the first time, in the next row: of its class's size until its boxes say more."""
+        """A vehicle seen for the first time, in the next row: of its class's size until boxes correct it."""
         config, dimensions = self.config, seen.dimensions
         self._unseen_s, self._driven_s = (np.append(s, config.box_memory_s) for s in (self._unseen_s, self._driven_s))
         sigma_road_m = math.hypot(config.sigma_kerb_m, config.sigma_crown_rad * seen.bearing * seen.depth_by_height_m)
@@ -155,11 +141,11 @@ class GroundSizeFilter:
     ) -> None:
         """To the next frame: `turn_rad` the camera's own pitching (nose down > 0), None where it is not known.
 
-        `image_ground` is the road as the images show it, None where they don't. `travelled_m` is how far the ego went,
-        None where it is not known: it is taken to drive.
+        `image_ground` is the road by the images, None where they don't measure it. `travelled_m` is the ego's way, None
+        where it is not known: it is taken to drive.
         """
         config = self.config
-        share = 1.0 if travelled_m is None else self._driving(travelled_m / max(dt_s, _SHORTEST_S))
+        share = 1.0 if travelled_m is None else self._driving_share(travelled_m / max(dt_s, _MIN_DT_S))
         self._unseen_s = self._unseen_s + dt_s
         self._driven_s = self._driven_s + share * dt_s
         calibrated = np.array([self.camera.pitch_rad, self.camera.roll_rad])
@@ -178,7 +164,7 @@ class GroundSizeFilter:
             self._image_ground = image_ground
             self._correct_pitch(
                 image_ground.pitch_rad,
-                image_sigma_rad * math.sqrt(config.image_pitch_frames / max(share, _LEAST_SHARE)),
+                image_sigma_rad * math.sqrt(config.image_pitch_frames / max(share, _MIN_SHARE)),
             )
 
     def rescale_outline(self, row: int, log_outline: float) -> None:
@@ -189,7 +175,6 @@ class GroundSizeFilter:
 
     def keep_rows(self, rows: Sequence[int]) -> None:
         """Forget the vehicles of all other rows; what was learned of the road from them stays."""
-        rows = list(rows)
         at = [*range(COMMON), *(COMMON + OWN * row + k for row in rows for k in range(OWN))]
         self._unseen_s, self._driven_s = self._unseen_s[rows], self._driven_s[rows]
         self._x, self._P = self._x[at], self._P[np.ix_(at, at)]
@@ -214,7 +199,7 @@ class GroundSizeFilter:
         if not n:
             return Depths(*np.zeros((5, 0)))
         at = COMMON + OWN * np.array(rows)
-        self._P[at + 1, at + 1] += self._outline_drift(at, turned_rad, learned)
+        self._P[at + 1, at + 1] += self._outline_drift(rows, turned_rad, learned)
         tops = np.array([o.slope_top for o in seen])
         slopes = np.array([o.slope_bottom for o in seen])
         bearing = np.array([o.bearing for o in seen])
@@ -225,7 +210,7 @@ class GroundSizeFilter:
         R0 = np.concatenate([sigma_slope[:, 0] ** 2, sigma_slope[:, 1] ** 2, sigma_width**2])
         R0[np.repeat([cue not in self.config.cues for cue in CUES], n)] = UNUSED**2
         log_z, P_z, log_h, P_h, P_zh = self._iterate(
-            at, bearing, extents_m * self.config.roof_reach_rel, z, R0, self._frames_alike(at, learned)
+            at, bearing, extents_m * self.config.roof_reach_rel, z, R0, self._correlated_frames(rows, learned)
         )
         if learned is None:
             return Depths(log_z, P_z, log_h, P_h, P_zh / P_h)
@@ -237,7 +222,7 @@ class GroundSizeFilter:
             P_zh / P_h,
         )
 
-    def _outline_drift(self, at: NDArray[np.intp], turned_rad: Floats, learned: LearnedSize | None) -> Floats:
+    def _outline_drift(self, rows: Sequence[int], turned_rad: Floats, learned: LearnedSize | None) -> Floats:
         """(N,): by how much the variance of each log outline grew since it was last seen.
 
         The line of sight to what stands turns by what the ego drives; who drives turns by itself too, the more the
@@ -245,30 +230,29 @@ class GroundSizeFilter:
         """
         config = self.config
         own_turn = 0.0 if learned is None else config.bend_per_m * learned.speed_mps  # in a second
-        own_var = np.square(own_turn) * self._unseen_s[(at - COMMON) // OWN]
+        own_var = np.square(own_turn) * self._unseen_s[rows]
         out: Floats = config.width_drift_rel**2 + config.width_turn_rel**2 * (np.square(turned_rad) + own_var)
         return out
 
-    def _driving(self, speed_mps: float) -> float:
-        """What of a second counts as one of driving."""
+    def _driving_share(self, speed_mps: float) -> float:
+        """The share of a second that counts as driving."""
         return -math.expm1(-speed_mps / self.config.driving_mps)
 
-    def _frames_alike(self, at: NDArray[np.intp], learned: LearnedSize | None) -> Floats:
-        """(N,): how many frames in a row err alike, by how much changed in view since each vehicle was last seen.
+    def _correlated_frames(self, rows: Sequence[int], learned: LearnedSize | None) -> Floats:
+        """(N,): how many frames in a row have the same error, by how much changed in view since each was last seen.
 
         Errors of a box become others as the ego drives or as the vehicle does. Of what stands before an ego that stands
         all images are the same one, and it was counted.
         """
-        rows = (at - COMMON) // OWN
-        speed_mps = np.zeros(len(at)) if learned is None else learned.speed_mps
+        speed_mps = np.zeros(len(rows)) if learned is None else learned.speed_mps
         stood_s = (self._unseen_s - self._driven_s)[rows] * np.exp(-speed_mps / self.config.driving_mps)
-        changed_s = np.maximum(self._unseen_s[rows] - stood_s, _LEAST_SHARE)
-        alike: Floats = np.maximum(1.0, self.config.box_memory_s / changed_s)
+        changed_s = np.maximum(self._unseen_s[rows] - stood_s, _MIN_SHARE)
+        correlated: Floats = np.maximum(1.0, self.config.box_memory_s / changed_s)
         self._unseen_s[rows] = self._driven_s[rows] = 0.0
-        return alike
+        return correlated
 
     def _iterate(
-        self, at: NDArray[np.intp], bearing: Floats, reach: Floats, z: Floats, R: Floats, alike: Floats
+        self, at: NDArray[np.intp], bearing: Floats, reach: Floats, z: Floats, R: Floats, correlated: Floats
     ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """log z and its variances, log h and its variances, and their covariances, (N,) each.
 
@@ -292,11 +276,11 @@ class GroundSizeFilter:
             gain = PJt @ _robust_information(S + np.diag(R), innovation, len(CUES), gate_sigma)
             x = prior + gain @ innovation
         P = P - gain @ PJt.T
-        lasting = S + np.diag(R * np.tile(alike, len(CUES)))
+        lasting = S + np.diag(R * np.tile(correlated, len(CUES)))
         kept = PJt[:m] @ _robust_information(lasting, innovation, len(CUES), self.config.gate_sigma)
         kept_P = self._P - kept @ PJt[:m].T
         self._x, self._P = prior[:m] + kept @ innovation, (kept_P + kept_P.T) / 2.0
-        return x[m:], np.diag(P)[m:].copy(), x[at], np.maximum(P[at, at], _LEAST), P[range(m, m + n), at]
+        return x[m:], np.diag(P)[m:].copy(), x[at], np.maximum(P[at, at], _MIN_VARIANCE), P[range(m, m + n), at]
 
     def _expected_boxes(self, x: Floats, at: NDArray[np.intp], bearing: Floats, reach: Floats) -> tuple[Floats, Floats]:
         """The measurements (3 N,) expected of a state (M + N,), cue by cue, and their derivatives (3 N, M + N) by it.
@@ -339,20 +323,20 @@ class GroundSizeFilter:
 def _robust_information(S: Floats, innovation: Floats, cues: int, gate_sigma: float) -> Floats:
     """The inverse of the innovations' covariance S (M, M), with the worst cue of each box at a robust weight (Huber).
 
-    Innovations (M,) stand cue by cue, of all boxes each. What all the others say of one differs from it by
+    Innovations (M,) stand cue by cue, of all boxes each. One differs from its prediction by all the others by
     (S^-1 v)_i / (S^-1)_ii, with the variance 1 / (S^-1)_ii: past `gate_sigma` its noise is raised.
     """
     whole = np.asarray(np.linalg.inv(S), dtype=np.float64)
-    of_each = np.diag(whole)
-    misfit = np.abs(whole @ innovation) / np.sqrt(of_each)
-    by_box = misfit.reshape(cues, -1)
+    precision = np.diag(whole)
+    residual = np.abs(whole @ innovation) / np.sqrt(precision)
+    by_box = residual.reshape(cues, -1)
     n = by_box.shape[1]
     worst = by_box.argmax(axis=0) * n + np.arange(n)
-    worst = worst[misfit[worst] > gate_sigma]
+    worst = worst[residual[worst] > gate_sigma]
     if not len(worst):
         return whole
     # Woodbury: noise added to a few measurements
-    more = ((misfit[worst] / gate_sigma) ** 4 - 1.0) / of_each[worst]
+    more = ((residual[worst] / gate_sigma) ** 4 - 1.0) / precision[worst]
     columns = whole[:, worst]
     inner = np.diag(1.0 / more) + columns[worst]
     out: Floats = whole - columns @ np.linalg.solve(inner, columns.T)

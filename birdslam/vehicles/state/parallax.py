@@ -1,31 +1,10 @@
 """How large vehicles are and whether they stand, from how they grow in the image as the ego drives.
 
 A box that grows from 20 to 40 pixels while the ego comes 30 m nearer is of a car that is 30 m away, however large cars
-are, if it stands. If it drives, its growth says little of its size. Kalman filters, one for each way to move, are mixed
-by how well each predicts the measurements (interacting multiple model, Blom and Bar-Shalom 1988). Each has
+are, if it stands. Kalman filters, one for each mode of motion, are mixed by how well each predicts the measurements
+(interacting multiple model, Blom and Bar-Shalom 1988):
 
-    x = [x, y, vx, vy, log h, log w, tilt, d]
-
-in the odometry's world, m and m/s; h (m) is the vehicle's height, w its outline's width as a factor of its class's. The
-road at the vehicle is tilted against the ego's by `tilt` (rad), which lasts for seconds, and lies d (m) below it. The
-measurements of a box are made of its slopes (see localisation.Observation), with z the depth of the nearest face, r on
-to the roof's far edge, y/x the centre's bearing and H the camera's height:
-
-    log(bottom - top - (H - h) r / (z (z + r))) = log h - log z
-    log(left - right) = log w + log(class's outline) - log z
-    y / x
-    log(bottom) = log((H + d) / z - tilt)                                  (Eq. 1)
-
-So a queue in the next lane, which grows slower than what stands, is not taken for large cars that stand: their height
-has its class's prior, and the ground says how far they are. What moves has mostly the direction of its heading, so that
-keeping its lane is no sign of standing. One that started only now has a filter of its own: mixed into that of those
-which have driven all along, it would bring with it the size and the place of one that stands.
-
-The learned size is a measurement of log h that holds all that motion says, and nothing of what its class says. The
-ground is left out of it too, which the ground and size filter has: two more filters of what stands, with the weights
-of the first two, are never told where a box meets the road. There is none for a vehicle in the ego's own path: straight
-ahead there is no parallax. What stands there keeps its bearing, as does what drives on before the ego; growth alone
-gives how fast the gap closes as a share of itself, which any size fits.
+    x = [x, y, vx, vy, log h, log w, tilt, kerb]        parallax_measurements.py has the box's equations
 """
 
 from __future__ import annotations
@@ -41,13 +20,13 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.state.parallax_measurements import (
-    BELOW,
     BY_HEIGHT,
     BY_WIDTH,
     CUES,
     GROUND,
     HEIGHT,
-    LEAST_SLOPE,
+    KERB,
+    MIN_SLOPE,
     STATES,
     TILT,
     VX,
@@ -57,29 +36,25 @@ from birdslam.vehicles.state.parallax_measurements import (
     X,
     Y,
     linearised,
-    side_off,
+    side_outlier_shift,
 )
-from birdslam.vehicles.state.side_outliers import update
+from birdslam.vehicles.state.side_outliers import update_with_side_outliers
 
 Floats = NDArray[np.float64]
 
-# UNUSUAL stands too, and is of no usual size; STARTED stood when it was first seen
-WAYS = STANDING, UNUSUAL, STARTED, CREEPING, DRIVING, CROSSING = range(6)
-STILL, MOVING = [STANDING, UNUSUAL], [STARTED, CREEPING, DRIVING, CROSSING]
-BLIND = [6, 7]  # filters as STILL, and never told where the box meets the road
-FILTERS = len(WAYS) + len(BLIND)
-UNKNOWN = 1e6  # variance of a size on which motion says nothing, and of what is not measured
+# UNUSUAL stands too, and is of no usual size; STARTED stood when first seen, and has such a one's size and place
+MODES = STANDING, UNUSUAL, STARTED, CREEPING, DRIVING, CROSSING = range(6)
+STATIONARY, MOVING = [STANDING, UNUSUAL], [STARTED, CREEPING, DRIVING, CROSSING]
+WITHOUT_GROUND = [6, 7]  # STATIONARY again, without the cue GROUND
+FILTERS = len(MODES) + len(WITHOUT_GROUND)
+UNKNOWN = 1e6  # variance of a size that motion does not measure, and of what is not used
 DEPTH_UNKNOWN = 1.0  # 1-sigma at birth, as a fraction
-MOST_OUTLIERS = 0.45  # probability beforehand of one side
-LEAST_WEIGHT = 1e-9  # of a filter: one that was ruled out may come back
+MAX_SIDE_OUTLIER = 0.45  # prior probability of one side
+MIN_WEIGHT = 1e-9  # of a filter: one that was ruled out may come back
 
 
 class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How vehicles move and stop, and how long a detector errs alike.
-
-    What is said of their road (tilt, kerb, bank, its width) and of moving across was chosen among two to four values
-    each on KITTI tracking 0001, 0005 and 0020 by RRC's boxes, and on 0005's images by YOLOX-nano's.
-    """
+    """How vehicles move and stop, and how long the errors of a detector last; docs/constants.md has the data."""
 
     standing: float = 0.3  # of the vehicles, when first seen; those that drive are the rest
     unusual: float = 0.03  # that stand and are of no usual size
@@ -97,8 +72,8 @@ class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     change_mps: float = 2.0  # 1-sigma by which the velocity of a vehicle that moves changes within a second
     change_across_mps: float = 0.5  # the same across its heading
     outline_drift_rel: float = 0.03  # of the outline's width, in a second: the yaw is not known as well
-    box_memory_s: float = 0.5  # a box errs in the next frame as in this: this time counts as one box
-    view_memory_s: float = 1.5  # and so does, for longer, what is taken for the nearest face
+    box_memory_s: float = 0.5  # for so long a box has the same error: this time counts as one box
+    view_memory_s: float = 1.5  # the same of the face that its edges lie at
     sigma_scale_rel: float = 0.02  # of the odometry's metres
     sigma_tilt_rad: float = 0.004  # of the road at a vehicle against the ego's
     tilt_memory_s: float = 5.0  # how long that lasts
@@ -106,24 +81,20 @@ class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_crown_rad: float = 0.007  # and the more the farther it stands to the side
     sigma_bank_per_m: float = 0.001  # and more, by the square of that: what stands far aside is on another road
     sigma_face_m: float = 1.0  # edges of a box lie not all at its nearest face, and on others as it turns
-    path_half_width_m: float = 1.75  # of the ego's path: half a lane
-    # Of the left sides of boxes, and of the right: hidden, or a neighbour's (side_outliers.py). Of the sides of KITTI
-    # tracking 0005's cars by YOLOX-nano, vehicle-detection-adas-0002 and the shipped network 0.031, 0.025 and 0.055 lie
-    # 15 % of the width or more inside of the label's hull; by RRC 0.002 of those of 0000 to 0020
+    path_half_width_m: float = 1.75  # of the ego's path, half a lane: there growth is the closing gap's, of any size
+    # Of the left sides of boxes, and of the right: hidden, or a neighbour's (side_outliers.py)
     side_outlier: Annotated[float, msgspec.Meta(ge=0.0, le=0.3)] = 0.03
-    # How long one lasts: of those of YOLOX-nano, vehicle-detection-adas-0002 and the shipped network on KITTI tracking
-    # 0005's images 0.46, 0.53 and 0.69 are there 0.1 s later
-    side_outlier_memory_s: Annotated[float, msgspec.Meta(gt=0.0)] = 0.15
-    sigma_side_outlier_rel: float = 0.3  # of the box's width; those that lie so far off: 0.31, 0.21, 0.25 (RMS)
+    side_outlier_memory_s: Annotated[float, msgspec.Meta(gt=0.0)] = 0.15  # how long one lasts
+    sigma_side_outlier_rel: float = 0.3  # of the box's width
     gate_sigma: float = 3.0  # past it of all filters a measurement is an outlier: its noise is raised
 
 
 @dataclass(frozen=True)
 class LearnedSize:
-    """Measurements of log h that exclude each other, (N, K): each holds with its weight, and has its variance.
+    """Alternative measurements of log h, (N, K), each with the probability `weight` and its variance.
 
-    `speed_mps` (N,) is the root mean square of the speeds that the ways to move have, each with its probability.
-    `side_outlier` (N, 2): the probabilities that the left side of a vehicle's box is off by far, and the right.
+    `speed_mps` (N,) is the root mean square of the speeds in all modes, each with its probability.
+    `side_outlier` (N, 2): the probabilities that the left side of a vehicle's box is an outlier, and the right.
     """
 
     weight: Floats
@@ -136,8 +107,8 @@ class LearnedSize:
 class Parallax:
     """predict() once a frame, then learn_sizes() from its boxes.
 
-    State, of each vehicle and each way to move: x, y (m), vx, vy (m/s) in the odometry's world, log height (of metres),
-    log of the outline's width as a factor, tilt (rad) and depth below (m) of its road, and the probability of that way.
+    State, of each vehicle and each mode: x, y (m), vx, vy (m/s) in the odometry's world, log height (of metres),
+    log of the outline's width as a factor, tilt (rad) and kerb (m) of its road, and the mode's probability.
     Measurements: of each box the logs of its height, its width and its bottom as slopes, and the bearing of its centre
     (see the module). `placing.Placing` hands the learned sizes to `ground_size_filter.GroundSizeFilter`; the tracker
     and the smoother read `standing`.
@@ -147,10 +118,10 @@ class Parallax:
         self.config = config
         driving = 1.0 - config.standing - config.unusual - config.creeping - config.crossing
         birth = [config.standing, config.unusual, 0.0, config.creeping, driving, config.crossing]
-        self._birth = np.maximum(birth, LEAST_WEIGHT)
+        self._prior_weight = np.maximum(birth, MIN_WEIGHT)
         self._x = np.zeros((0, FILTERS, len(STATES)))
         self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
-        self._weight = np.zeros((0, len(WAYS)))
+        self._weight = np.zeros((0, len(MODES)))
         self._prior = np.zeros((0, 2))  # log h and its variance, as the class has it
         self._unseen_s = np.zeros(0)
         self._yaw_rad = np.zeros(0)  # in world
@@ -173,7 +144,7 @@ class Parallax:
         log_height: float,
         sigmas: tuple[float, float],
     ) -> None:
-        """A vehicle seen for the first time, at about `centre_m` (2,) and `yaw_rad` in ego; its first box says more.
+        """A vehicle seen for the first time, at about `centre_m` (2,) and `yaw_rad` in ego, corrected by its first box.
 
         `log_height` is that of its class, `sigmas` are those of log h and log w in it.
         """
@@ -188,16 +159,16 @@ class Parallax:
         for moving, along_mps in ((CREEPING, config.sigma_creep_mps), (DRIVING, config.sigma_drive_mps)):
             on_road_mps = math.hypot(config.sigma_across_mps, config.sigma_across_rel * along_mps)
             across_mps = on_road_mps if on_road else along_mps
-            P[:, moving, VX:HEIGHT, VX:HEIGHT] = _turned(np.square([along_mps, across_mps]), heading_rad)
+            P[:, moving, VX:HEIGHT, VX:HEIGHT] = _rotated(np.square([along_mps, across_mps]), heading_rad)
         P[:, CROSSING, [VX, VY], [VX, VY]] = config.sigma_drive_mps**2
         P[..., [HEIGHT, WIDTH], [HEIGHT, WIDTH]] = np.square(sigmas)
-        P[:, [UNUSUAL, BLIND[1]], HEIGHT, HEIGHT] = config.sigma_unusual_rel**2
+        P[:, [UNUSUAL, WITHOUT_GROUND[1]], HEIGHT, HEIGHT] = config.sigma_unusual_rel**2
         P[..., TILT, TILT] = config.sigma_tilt_rad**2
         aside_m = float(centre_m[1])
         below_m = config.sigma_kerb_m, config.sigma_crown_rad * aside_m, config.sigma_bank_per_m * aside_m**2
-        P[..., BELOW, BELOW] = math.hypot(*below_m) ** 2
+        P[..., KERB, KERB] = math.hypot(*below_m) ** 2
         self._x, self._P = np.concatenate([self._x, x]), np.concatenate([self._P, P])
-        self._weight = np.concatenate([self._weight, self._birth[None]])
+        self._weight = np.concatenate([self._weight, self._prior_weight[None]])
         self._prior = np.concatenate([self._prior, [[log_height, sigmas[0] ** 2]]])
         self._yaw_rad = np.append(self._yaw_rad, heading_rad)
         self._on_road = np.append(self._on_road, on_road)
@@ -230,9 +201,9 @@ class Parallax:
             self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
 
     def _process_noise(self, dt_s: float) -> Floats:
-        """(N, len(MOVING), 4, 4) of x, y, vx, vy: along and across the heading, or alike in any direction."""
+        """(N, len(MOVING), 4, 4) of x, y, vx, vy: along and across the heading, or the same in any direction."""
         config = self.config
-        along_across = _turned(np.square([config.change_mps, config.change_across_mps]), self._yaw_rad)
+        along_across = _rotated(np.square([config.change_mps, config.change_across_mps]), self._yaw_rad)
         of_velocity = np.stack([along_across] * len(MOVING), axis=1)
         of_velocity[~self._on_road] = of_velocity[:, MOVING.index(CROSSING)] = np.eye(2) * config.change_mps**2
         in_time = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
@@ -240,16 +211,11 @@ class Parallax:
         return out.reshape(*of_velocity.shape[:2], 4, 4)
 
     def learn_sizes(
-        self,
-        rows: Sequence[int],
-        boxes: ParallaxMeasurements,
-        T_world_ego: SE2,
-        height_m: float,
+        self, rows: Sequence[int], boxes: ParallaxMeasurements, T_world_ego: SE2, height_m: float
     ) -> LearnedSize:
-        """What motion says of each vehicle's size, of those in these rows; `height_m` is the camera's."""
-        rows = list(rows)
+        """Each vehicle's size by its motion in the image, for these rows; `height_m` is the camera's."""
         if not rows:
-            nothing = np.zeros((0, len(BLIND) + 1))
+            nothing = np.zeros((0, len(WITHOUT_GROUND) + 1))
             return LearnedSize(nothing, nothing, nothing, np.zeros(0), np.zeros((0, 2)))
         config = self.config
         x, P = self._x[rows], self._P[rows]
@@ -265,56 +231,55 @@ class Parallax:
         PJt = P @ J.swapaxes(-1, -2)
         S = J @ PJt
         S = S + self._noise(boxes, innovation, S, of_box, of_face * of_view)
-        off = side_off(boxes, innovation, config.sigma_side_outlier_rel * np.sqrt(of_box))
-        share = np.minimum(config.side_outlier + self._side_outlier[rows], MOST_OUTLIERS).T
-        after = update(P, PJt, S, innovation, off, share)
+        shift = side_outlier_shift(boxes, innovation, config.sigma_side_outlier_rel * np.sqrt(of_box))
+        share = np.minimum(config.side_outlier + self._side_outlier[rows], MAX_SIDE_OUTLIER).T
+        after = update_with_side_outliers(P, PJt, S, innovation, shift, share)
         self._x[rows] = x + after.step
         self._P[rows] = after.cov
 
-        log_likelihood = after.log_likelihood[:, : len(WAYS)]
+        log_likelihood = after.log_likelihood[:, : len(MODES)]
         weight = self._weight[rows] * np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
-        weight = np.maximum(weight / weight.sum(axis=1, keepdims=True), LEAST_WEIGHT)
+        weight = np.maximum(weight / weight.sum(axis=1, keepdims=True), MIN_WEIGHT)
         self._weight[rows] = weight
         self._unseen_s[rows] = 0.0
         self._yaw_rad[rows] = boxes.yaw_rad + T_world_ego.yaw_rad
         in_path = np.abs(boxes.bearing) * (boxes.depth_m + boxes.reach_m) < config.path_half_width_m
-        side_outlier = (after.outlier[..., : len(WAYS)] * weight).sum(axis=-1).T
+        side_outlier = (after.outlier[..., : len(MODES)] * weight).sum(axis=-1).T
         self._side_outlier[rows] = side_outlier
-        return self._learned(rows, of_face + config.sigma_scale_rel**2, in_path, side_outlier)
+        return self._size_measurements(rows, of_face + config.sigma_scale_rel**2, in_path, side_outlier)
 
     def _noise(
         self, boxes: ParallaxMeasurements, innovation: Floats, S: Floats, of_box: Floats, face_var: Floats
     ) -> Floats:
         """(N, FILTERS, 4, 4): measurement noise, raised for outliers; S is of the predicted measurements.
 
-        Errors that last get in each frame so little weight that they count right over their memory: `of_box` (N,) is by
-        how much a box's variance grows for that, `face_var` (N,) the variance of the nearest face, grown already.
+        Errors that last get so much more noise that they count once over their memory: `of_box` (N,) is the factor of a
+        box's variance, `face_var` (N,) the variance of the nearest face with its own.
         """
         variance = np.empty((len(of_box), FILTERS, len(CUES)))
         variance[..., :GROUND] = (np.square(boxes.sigma) * of_box[:, None])[:, None]
         variance[..., [BY_HEIGHT, BY_WIDTH]] += face_var[:, None, None]
-        sigma_rel = boxes.sigma_bottom / np.maximum(boxes.bottom, LEAST_SLOPE)
+        sigma_rel = boxes.sigma_bottom / np.maximum(boxes.bottom, MIN_SLOPE)
         variance[..., GROUND] = (np.square(sigma_rel) * of_box)[:, None]
-        variance[:, BLIND, GROUND] = UNKNOWN
+        variance[:, WITHOUT_GROUND, GROUND] = UNKNOWN
         noise = variance[..., None] * np.eye(len(CUES))
-        misfit = _squared(innovation, S + noise).min(axis=1)
-        noise *= np.maximum(1.0, misfit / self.config.gate_sigma**2)[:, None, None, None]
+        nis = _squared_mahalanobis(innovation, S + noise).min(axis=1)
+        noise *= np.maximum(1.0, nis / self.config.gate_sigma**2)[:, None, None, None]
         return noise
 
     def keep_rows(self, rows: Sequence[int]) -> None:
         """Forget the vehicles of all other rows."""
-        rows = list(rows)
         for name in ("_x", "_P", "_weight", "_prior", "_unseen_s", "_yaw_rad", "_on_road", "_side_outlier"):
             setattr(self, name, getattr(self, name)[rows])
 
     def _mix(self, dt_s: float) -> None:
-        """The filters' states and weights mixed by how often vehicles change their way to move within `dt_s`."""
+        """The filters' states and weights mixed by how often vehicles change their mode within `dt_s`."""
         config = self.config
         starts, changes, slows = (
             1.0 - math.exp(-dt_s / time_s) for time_s in (config.stands_for_s, config.creeps_for_s, config.drives_for_s)
         )
-        share = np.eye(len(WAYS))  # (from, to)
-        share[STILL, STILL], share[STILL, STARTED] = 1.0 - starts, starts
+        share = np.eye(len(MODES))  # (from, to)
+        share[STATIONARY, STATIONARY], share[STATIONARY, STARTED] = 1.0 - starts, starts
         for slow in (STARTED, CREEPING):
             share[slow, slow], share[slow, STANDING] = 1.0 - changes / 2.0, changes / 2.0
         share[CREEPING, CREEPING], share[CREEPING, DRIVING] = 1.0 - changes, changes / 2.0
@@ -323,34 +288,36 @@ class Parallax:
         joint = self._weight[:, :, None] * share
         self._weight = joint.sum(axis=1)
         share = joint / self._weight[:, None]
-        ways, blind = list(WAYS), BLIND + MOVING
+        modes, without_ground = list(MODES), WITHOUT_GROUND + MOVING
         x, P = self._x.copy(), self._P.copy()
-        self._x[:, ways], self._P[:, ways] = self._mixed(share, x[:, ways], P[:, ways])
-        self._x[:, BLIND], self._P[:, BLIND] = self._mixed(share[..., STILL], x[:, blind], P[:, blind])
+        self._x[:, modes], self._P[:, modes] = self._mixed(share, x[:, modes], P[:, modes])
+        self._x[:, WITHOUT_GROUND], self._P[:, WITHOUT_GROUND] = self._mixed(
+            share[..., STATIONARY], x[:, without_ground], P[:, without_ground]
+        )
 
     def _mixed(self, share: Floats, x: Floats, P: Floats) -> tuple[Floats, Floats]:
         """The moments of filters (N, 6) mixed by `share` (N, 6, K); of the six and of the K the first two stand."""
-        P[:, STILL, [[VX], [VY]], [[VX], [VY]]] = self.config.sigma_creep_mps**2  # it starts
+        P[:, STATIONARY, [[VX], [VY]], [[VX], [VY]]] = self.config.sigma_creep_mps**2  # when it starts
         to = share.swapaxes(1, 2)  # (N, to, from)
         mean = to @ x
         gap = x[:, None] - mean[:, :, None]  # (N, to, from, 8)
         cov = (to @ P.reshape(*P.shape[:2], -1)).reshape(*mean.shape, P.shape[-1])
         cov += (to[..., None] * gap).swapaxes(-1, -2) @ gap
         speed = slice(VX, VY + 1)
-        mean[:, STILL, speed] = 0.0
-        cov[:, STILL, speed] = 0.0
-        cov[:, STILL, :, speed] = 0.0
+        mean[:, STATIONARY, speed] = 0.0
+        cov[:, STATIONARY, speed] = 0.0
+        cov[:, STATIONARY, :, speed] = 0.0
         return mean, cov
 
-    def _learned(
-        self, rows: list[int], lasting: Floats, in_path: NDArray[np.bool_], side_outlier: Floats
+    def _size_measurements(
+        self, rows: Sequence[int], lasting: Floats, in_path: NDArray[np.bool_], side_outlier: Floats
     ) -> LearnedSize:
-        """Of each filter that stands, its log h less what the class says. Of the others nothing: they brake and turn
-        for seconds, and what looks like parallax there is none. `lasting` (N,) is a variance that time keeps.
+        """Of each stationary filter log h without the class's prior; of the moving ones, which brake and turn, none.
 
-        Vehicles `in_path` (N,) are left out here, not in the filters: once the ego passes beside one, all counts.
+        `lasting` (N,) is a variance that frames don't reduce. Vehicles `in_path` (N,) are left out here alone: once the
+        ego passes beside one, the filters have all that was seen of it.
         """
-        mean, var = self._x[rows][:, BLIND, HEIGHT], self._P[rows][:, BLIND, HEIGHT, HEIGHT]
+        mean, var = self._x[rows][:, WITHOUT_GROUND, HEIGHT], self._P[rows][:, WITHOUT_GROUND, HEIGHT, HEIGHT]
         prior, prior_var = self._prior[rows].T[..., None]
         information = 1.0 / var - 1.0 / prior_var
         informed = information > 1.0 / UNKNOWN
@@ -361,7 +328,7 @@ class Parallax:
         weight = self._weight[rows]
         square = np.square(self._x[rows][:, MOVING, VX:HEIGHT]).sum(axis=-1)
         return LearnedSize(
-            np.column_stack([weight[:, STILL], weight[:, MOVING].sum(axis=1)]),
+            np.column_stack([weight[:, STATIONARY], weight[:, MOVING].sum(axis=1)]),
             np.column_stack([log_height, prior]),
             np.column_stack([variance, np.full(len(rows), UNKNOWN)]),
             np.sqrt((weight[:, MOVING] * square).sum(axis=1)),
@@ -369,13 +336,13 @@ class Parallax:
         )
 
 
-def _squared(gap: Floats, S: Floats) -> Floats:
+def _squared_mahalanobis(gap: Floats, S: Floats) -> Floats:
     """(...): Mahalanobis distances squared of gaps (..., 4) with covariances (..., 4, 4)."""
     out: Floats = np.einsum("...a,...a->...", gap, np.linalg.solve(S, gap[..., None])[..., 0])
     return out
 
 
-def _turned(variances: Floats, yaw_rad: Floats) -> Floats:
+def _rotated(variances: Floats, yaw_rad: Floats) -> Floats:
     """(N, 2, 2) in world of `variances` (2,) along and across headings (N,)."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     R = np.stack([c, -s, s, c], axis=-1).reshape(-1, 2, 2)

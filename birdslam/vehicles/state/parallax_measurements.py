@@ -1,4 +1,11 @@
-"""What a box says of a vehicle's state in `parallax.Parallax`, and what such a state says that its box measures."""
+"""The measurements of a box in `parallax.Parallax`, from its slopes, and what a state expects of them.
+
+z is the depth of the nearest face, r on to the roof's far edge, y/x the centre's bearing, H the camera's height, d the
+kerb, by which the road at the vehicle lies lower than the ego's plane, and tilt by how much it is tilted against it:
+
+    log(bottom - top - (H - h) r / (z (z + r))) = log h - log z        y / x
+    log(left - right) = log w + log(class's outline) - log z           log(bottom) = log((H + d) / z - tilt)    (Eq. 1)
+"""
 
 from __future__ import annotations
 
@@ -11,14 +18,13 @@ from numpy.typing import NDArray
 
 from birdslam.geometry import bev
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.placement.localisation import Observation
+from birdslam.vehicles.placement.localisation import NEAREST_M, Observation
 
 Floats = NDArray[np.float64]
 
-STATES = X, Y, VX, VY, HEIGHT, WIDTH, TILT, BELOW = range(8)  # see parallax.py
+STATES = X, Y, VX, VY, HEIGHT, WIDTH, TILT, KERB = range(8)  # see parallax.py
 CUES = BY_HEIGHT, BY_WIDTH, BEARING, GROUND = range(4)  # measurements of each box, in this order
-NEAREST_M = 1.0
-LEAST_SLOPE = 0.01  # of a box's bottom: it is taken to lie no higher
+MIN_SLOPE = 0.01  # of a box's bottom: it is taken to lie no higher
 
 
 @dataclass(frozen=True)
@@ -33,7 +39,7 @@ class ParallaxMeasurements:
     bottom: Floats  # slope
     sigma_bottom: Floats
     reach_m: Floats
-    turned_rad: Floats  # by how much the line of sight turned since last seen: another side shows
+    turned_rad: Floats  # by how much the line of sight turned since last seen, so that another side is seen
     yaw_rad: Floats  # of the vehicle in ego, as known
     tan_width: Floats  # of the box, at a depth of 1
 
@@ -81,8 +87,8 @@ def linearised(x: Floats, boxes: ParallaxMeasurements, T_world_ego: SE2, height_
     at = (x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]) @ R_ego_world.T
     depth = np.maximum(at[..., 0] - boxes.reach_m[:, None], NEAREST_M)
     ahead = np.maximum(at[..., 0], NEAREST_M)
-    level = bev.road_slope(depth, height_m + x[..., BELOW])  # Eq. 1
-    slope = np.maximum(level - x[..., TILT], LEAST_SLOPE)
+    level = bev.road_slope(depth, height_m + x[..., KERB])  # Eq. 1
+    slope = np.maximum(level - x[..., TILT], MIN_SLOPE)
     J = np.zeros((*x.shape[:2], len(CUES), len(STATES)))
     J[..., BY_HEIGHT, HEIGHT] = J[..., BY_WIDTH, WIDTH] = 1.0
     by_place = -R_ego_world[0] / depth[..., None]
@@ -90,23 +96,23 @@ def linearised(x: Floats, boxes: ParallaxMeasurements, T_world_ego: SE2, height_
     J[..., BEARING, :2] = (R_ego_world[1] - (at[..., 1] / ahead)[..., None] * R_ego_world[0]) / ahead[..., None]
     J[..., GROUND, :2] = by_place * (level / slope)[..., None]
     J[..., GROUND, TILT] = -1.0 / slope
-    J[..., GROUND, BELOW] = 1.0 / (depth * slope)
-    log_bottom = np.log(np.maximum(boxes.bottom, LEAST_SLOPE))
+    J[..., GROUND, KERB] = 1.0 / (depth * slope)
+    log_bottom = np.log(np.maximum(boxes.bottom, MIN_SLOPE))
     seen = np.stack([boxes.log_height, boxes.log_width, boxes.bearing, log_bottom], axis=-1)[:, None]
     log_z = np.log(depth)
     expected = np.stack([x[..., HEIGHT] - log_z, x[..., WIDTH] - log_z, at[..., 1] / ahead, np.log(slope)], axis=-1)
     return seen - expected, J
 
 
-def side_off(boxes: ParallaxMeasurements, innovation: Floats, sigma_rel: Floats) -> Floats:
+def side_outlier_shift(boxes: ParallaxMeasurements, innovation: Floats, sigma_rel: Floats) -> Floats:
     """(2, N, K, 4): by how much an outlier of the left, the right side moves the measurements, 1-sigma.
 
     `innovation` (N, K, 4) is that of the boxes, `sigma_rel` (N,) the outlier's as a share of the width. A box that lost
     the share h of its width w has it in log less by -log(1 - h), and its centre moved by h w / 2: half of that times
     the geometric mean of both widths, seen and expected, which is right to h^3 / 24.
     """
-    off = np.zeros((2, *innovation.shape))
-    off[..., BY_WIDTH] = sigma_rel[:, None]
+    shift = np.zeros((2, *innovation.shape))
+    shift[..., BY_WIDTH] = sigma_rel[:, None]
     width = boxes.tan_width[:, None] * np.exp(-innovation[..., BY_WIDTH] / 2.0)
-    off[..., BEARING] = off[..., BY_WIDTH] * width / 2.0 * np.array([1.0, -1.0])[:, None, None]
-    return off
+    shift[..., BEARING] = shift[..., BY_WIDTH] * width / 2.0 * np.array([1.0, -1.0])[:, None, None]
+    return shift
