@@ -61,9 +61,10 @@ def in_the_code(row: dict[str, str]) -> list[str]:
     return [f"birdslam.{name}" for name in re.findall(r"`([\w.]+)`", row.get("in the code", ""))]
 
 
-def test_every_name_of_the_method_page_is_in_the_code() -> None:
-    found = [name for row in rows(DOCS / "method.md") for name in in_the_code(row)]
-    assert len(found) > 40
+@pytest.mark.parametrize(("page", "names"), [("method.md", 40), ("vehicles.md", 20)])
+def test_every_name_of_the_page_is_in_the_code(page: str, names: int) -> None:
+    found = [name for row in rows(DOCS / page) for name in in_the_code(row)]
+    assert len(found) > names
     for name in found:
         assert named(name) is not None, name
 
@@ -75,6 +76,18 @@ def test_each_equation_stands_where_the_page_says() -> None:
         assert names, equation
         for name in names:
             assert re.search(rf"{re.escape(equation)}\b", inspect.getsource(named(name))), f"{equation} in {name}"
+
+
+def test_every_estimate_of_a_vehicle_has_an_owner_an_equation_and_a_reader() -> None:
+    """And each filter that has rows of vehicles is on the page."""
+    estimates = [row for row in rows(DOCS / "vehicles.md") if "estimate" in row]
+    for row in estimates:
+        assert len(in_the_code(row)) == 1, row
+        assert all(row[column] for column in ("state and covariance", "measured by", "equation", "read by")), row
+    owners = " ".join(in_the_code(row)[0] for row in estimates)
+    with_rows = [path.stem for path in (ROOT / "birdslam").rglob("*.py") if "def keep_rows" in path.read_text()]
+    assert {"parallax", "ground_size_filter"} <= {*with_rows}
+    assert all(f".{name}." in owners for name in with_rows if name != "track")
 
 
 def test_the_method_page_has_every_table_and_section() -> None:
