@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 UNRELIABLE_TILT = {Status.ODOMETRY_COASTING, Status.SCALE_CARRIED, Status.SCALE_INVALID, Status.GROUND_VIOLATED}
 ITERATIONS = 4
-_LEAST_RATIO = 0.1
+_MIN_RATIO = 0.1
 
 
 class CameraHeightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -166,7 +166,7 @@ class CameraHeightEstimator:
             x = cov @ (prior @ expected + weight @ right)
             residual = np.abs(b[:, 0] - A[:, 0] @ x) / spread
             weight = 1.0 / np.maximum(1.0, residual / cfg.gate_sigma)
-        ratio = max(float(x[0]) / height_m, _LEAST_RATIO)
+        ratio = max(float(x[0]) / height_m, _MIN_RATIO)
         return ratio, math.hypot(math.sqrt(float(cov[0, 0])) / (ratio * height_m), cfg.sigma_class_rel), len(vehicles)
 
 

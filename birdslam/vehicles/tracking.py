@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.perception import DepthMap, Detections
 from birdslam.types import MotionEdge
@@ -113,7 +113,7 @@ class Tracker:
         self._predict(frame)
         for known in self.tracks:
             known.missed += observations is not None
-        assignments = self._assignments(frame, observations or [], by_depth, self.ground_size.ground)
+        assignments = self._assignments(frame, observations or [], by_depth)
         places = self.placing.locate(assignments, frame.T_world_ego)
         self._correct(assignments, places, frame)
         for assignment, where in zip(assignments, places, strict=True):
@@ -139,28 +139,22 @@ class Tracker:
         self._last = frame
 
     def _assignments(
-        self,
-        frame: EgoFrame,
-        observations: list[Observation],
-        by_depth: Sequence[DepthPlace | None],
-        ground: GroundPlane,
+        self, frame: EgoFrame, observations: list[Observation], by_depth: Sequence[DepthPlace | None]
     ) -> list[Assignment]:
         """The observations of known tracks, then those that begin a new one, each with its place by depth."""
-        known = self._associate(frame.T_world_ego, observations, ground)
+        known = self._associate(frame.T_world_ego, observations)
         matched = {k for _, k in known}
         births = [k for k, o in enumerate(observations) if k not in matched and o.score >= self.config.birth_score]
         tracks: list[Track | None] = [*self.tracks, *(None for _ in births)]
         pairs = [*known, *enumerate(births, len(self.tracks))]
         return [Assignment(row, tracks[row], observations[k], by_depth[k] if by_depth else None) for row, k in pairs]
 
-    def _associate(
-        self, T_world_ego: SE2, observations: list[Observation], ground: GroundPlane
-    ) -> list[tuple[int, int]]:
+    def _associate(self, T_world_ego: SE2, observations: list[Observation]) -> list[tuple[int, int]]:
         """(row of a track, its observation): least cost, 1 - IoU of predicted and seen box, within the gates."""
         if not self.tracks or not observations:
             return []
         overlap = iou(
-            predicted_boxes_px(self.tracks, self.camera, T_world_ego, ground),
+            predicted_boxes_px(self.tracks, self.camera, T_world_ego, self.ground_size.ground),
             np.array([o.box_px for o in observations]),
         )
         overlap = np.nan_to_num(overlap, nan=0.0)
