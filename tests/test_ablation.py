@@ -24,7 +24,7 @@ def known(method: Live) -> tuple[Floats, Floats]:
     """(frames, 3, 3) covariances of the ego, and of both vehicles against it as the window has them (2, 3, 3)."""
     graph = PoseGraph(method.graph, method.weights)
     estimates = [graph.optimise(method._reweighed(m)) for m in WORLD.measurements]
-    window = graph._window
+    window = graph.window
     assert window is not None
     vehicles = [window.P[np.ix_(rows, rows)] for rows in window.layout.poses]
     return np.array([np.reshape(e.cov, (3, 3)) for e in estimates]), np.array(vehicles)

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from birdslam.bench.simulation.drive import DriveConfig, drive
-from birdslam.graph.checkpoint import CheckpointError, pack, plain, unpack
+from birdslam.graph.checkpoint import CheckpointError, pack, packed, unpack, unpacked
+from birdslam.graph.factors.landmark_points import LandmarkPoints, LandmarksState
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
@@ -131,14 +132,19 @@ def test_other_settings_are_named() -> None:
 
 def test_parts_that_do_not_belong_together_are_refused() -> None:
     """Whole by its sum, but not what this code writes."""
-    whole = unpack(checkpoint(), plain(graph=GraphConfig(), weights=WeightsConfig()))
+    whole = unpack(checkpoint(), PoseGraph(*SETTINGS["measured"]).settings)
     begun = whole.begun
     assert begun is not None
+    landmarks: LandmarksState = unpacked(begun.factors[LandmarkPoints.name], LandmarksState)
+    torn = packed(replace(landmarks, frames=landmarks.frames[1:]))
     for broken in (
         replace(begun, vehicles=begun.vehicles[1:]),
         replace(begun, window=replace(begun.window, P=begun.window.P[1:])),
         replace(begun, window=replace(begun.window, next_node=99)),
-        replace(begun, landmarks=replace(begun.landmarks, frames=begun.landmarks.frames[1:])),
+        replace(begun, factors=begun.factors | {LandmarkPoints.name: torn}),
     ):
         with pytest.raises(CheckpointError, match="does not fit together"):
             PoseGraph.restore(pack(replace(whole, begun=broken)), *SETTINGS["measured"])
+    for lost in ({}, dict.fromkeys(begun.factors, b"")):
+        with pytest.raises(CheckpointError, match="can't be read"):
+            PoseGraph.restore(pack(replace(whole, begun=replace(begun, factors=lost))), *SETTINGS["measured"])

@@ -22,7 +22,8 @@ from birdslam.bench.baselines.posegraph3 import BatchConfig
 from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.factors import sum_of_points
+from birdslam.graph.factors.landmark_points import LandmarkPoints, sum_of_points
+from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
@@ -88,7 +89,7 @@ def test_velocity_is_the_motion_over_time() -> None:
 # --- an error of the scale lasts ---
 
 
-SCALE_ALONE = GraphConfig(lasting_direction_rad=0.0, lasting_turn_rel=0.0)
+SCALE_ALONE = GraphConfig(correlated_direction_rad=0.0, correlated_turn_rel=0.0)
 
 
 def chain(steps: Iterable[SE2], scale_sigma_rel: float) -> list[Measurements]:
@@ -109,7 +110,7 @@ def chain(steps: Iterable[SE2], scale_sigma_rel: float) -> list[Measurements]:
 
 
 def wander(steps: int, step_m: float, sigma: float, rng: np.random.Generator) -> list[float]:
-    keep = np.exp(-step_m / GraphConfig().scale_memory_m)
+    keep = np.exp(-step_m / GraphConfig().correlation_length_m)
     error = [sigma * rng.standard_normal()]
     for _ in range(steps - 1):
         error.append(keep * error[-1] + np.sqrt(1.0 - keep**2) * sigma * rng.standard_normal())
@@ -136,10 +137,10 @@ def test_errors_of_the_direction_and_the_turn_that_last_are_told_in_the_ego_pose
     rng = np.random.default_rng(4)
     aside, turned = [], []
     for _ in range(60):
-        direction = wander(frames, step_m, config.lasting_direction_rad, rng)
+        direction = wander(frames, step_m, config.correlated_direction_rad, rng)
         last = run(chain([SE2(step_m, step_m * e, 0.0) for e in direction], 1e-6), config)[-1]
         aside.append(last.T_world_ego.y_m**2 / last.cov[4])
-        turn = wander(frames, step_m, config.lasting_turn_rel, rng)
+        turn = wander(frames, step_m, config.correlated_turn_rel, rng)
         last = run(chain([SE2(step_m, 0.0, turn_rad * (1.0 + e)) for e in turn], 1e-6), config)[-1]
         turned.append((last.T_world_ego.yaw_rad - frames * turn_rad) ** 2 / last.cov[8])
     assert 0.6 < np.mean(aside) < 1.5  # as above
@@ -478,13 +479,15 @@ def test_lane_points_keep_their_lanes() -> None:
 def test_three_thousand_frames_grow_nothing() -> None:
     world = drive(DriveConfig(frames=3000, vehicles=4, landmarks=6, outliers=0.02, drop=0.02), seed=10)
     config = GraphConfig(max_pending_landmarks=200, max_pending_frames=100)
-    graph = PoseGraph(config, WeightsConfig())
+    factors = standard_factors(config, WeightsConfig())
+    graph, on_the_road = PoseGraph(config, WeightsConfig(), factors=factors), factors[-1]
+    assert isinstance(on_the_road, LandmarkPoints)
     rows, landmarks = [], []
     for m in world.measurements:
         estimate = graph.optimise(m)
         assert estimate.epoch == 0
-        rows.append(len(graph._window.P))  # type: ignore[union-attr]
-        landmarks.append(len(graph._landmarks))
+        rows.append(len(graph.window.P))  # type: ignore[union-attr]
+        landmarks.append(len(on_the_road))
     assert max(rows) <= 3 + 3 * config.ego_nodes + 6 * 4
     assert max(landmarks) <= 6
     gained = graph.map_update()

@@ -12,8 +12,10 @@ from birdslam.bench.baselines.batch_se2 import ego_key, solve, vehicle_key
 from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.bench.tracking.benchmark import PAPER
 from birdslam.geometry.se2 import SE2
-from birdslam.graph import pose_graph, vehicle_places
-from birdslam.graph.factors import CpEdge, CvEdge, VvEdge
+from birdslam.graph.edges import CvEdge
+from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
+from birdslam.graph.factors.standard import standard_factors
+from birdslam.graph.factors.vehicle_landmarks import VehicleLandmarks
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
@@ -43,38 +45,45 @@ def run(log: list[Measurements]) -> list[Estimate]:
     return [graph.optimise(m) for m in log]
 
 
-def added(log: list[Measurements], monkeypatch: pytest.MonkeyPatch) -> list[tuple[Window, list[CvEdge], Floats]]:
+class Probe(Factor):
+    """Says nothing itself: what the window knew of the newest frame before and after the others' steps."""
+
+    equation = ""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
+        self.before = window.P.copy()
+        return None
+
+    def conclude(self, frame: GraphFrame, window: Window) -> None:
+        self.frame, self.after = frame, window.P.copy()
+        self.at, self.world = list(window.at), window.world
+
+
+def added(log: list[Measurements]) -> list[tuple[Window, list[CvEdge], Floats]]:
     """What the edges of each frame add to the information about the state: the window, its CV edges, (n, n)."""
-    out = []
-    minimise = pose_graph.minimise
-
-    def seen(
-        window: Window,
-        cv: list[CvEdge],
-        vv: list[VvEdge],
-        cp: CpEdge | None,
-        gate: float,
-        hold: bool,
-        ends_alike: bool,
-    ) -> list[int]:
-        before = window.P.copy()
-        outliers = minimise(window, cv, vv, cp, gate, hold, ends_alike)
-        more = np.zeros_like(before)
-        if window.frame in FRAMES:
-            more = np.linalg.inv(window.P) - np.linalg.inv(before)
-        out.append((window, cv, more))
-        return outliers
-
-    monkeypatch.setattr(pose_graph, "minimise", seen)
-    run(log)
+    probe, out = Probe("probe"), []
+    without_vehicles_cp = replace(PAPER.weights, cp_vehicles=None)
+    graph = PoseGraph(
+        PAPER.graph, without_vehicles_cp, factors=[probe, *standard_factors(PAPER.graph, without_vehicles_cp)]
+    )
+    for m in log:
+        graph.optimise(m)
+        assert graph.window is not None
+        more = np.zeros_like(probe.after)
+        if m.frame_id in FRAMES:
+            more = np.linalg.inv(probe.after) - np.linalg.inv(probe.before)
+        out.append((graph.window, probe.frame.associations.cv, more))
     return out
 
 
-def test_each_edge_adds_its_lambda_and_nothing_adds_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_edge_adds_its_lambda_and_nothing_adds_more() -> None:
     log = told_of_more(drive(EXACT, 2))
     landmarks = [{e.landmark for e in m.cp if e.x_m <= THRESHOLD_M} for m in log]
     summed = 0
-    for m, (window, cv, more) in zip(log, added(log, monkeypatch), strict=True):
+    for m, (window, cv, more) in zip(log, added(log), strict=True):
         if m.frame_id not in FRAMES:
             continue
         expected = np.zeros_like(more)
@@ -149,7 +158,7 @@ def test_a_yaw_turned_about_is_a_yaw_that_errs() -> None:
         for one in (log[20], replace(log[20], cv=(about, *log[20].cv[1:])))
     )
     assert 2.9 < abs(before.between(after).yaw_rad) < 2.99  # CV outweighs VV, but does not silence it
-    default = PoseGraph(replace(PAPER.graph, ends_alike=True), PAPER.weights)
+    default = PoseGraph(replace(PAPER.graph, front_back_ambiguity=True), PAPER.weights)
     for m in log[:20]:
         default.optimise(m)
     turned = default.optimise(replace(log[20], cv=(about, *log[20].cv[1:])))
@@ -182,34 +191,32 @@ def test_no_edge_is_an_outlier(kind: str) -> None:
     assert moved_m(10.0) == pytest.approx(20.0 * moved_m(0.5), rel=0.05)
 
 
-def test_cp_of_vehicles_adds_its_lambda_to_their_place_in_the_world(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cp_of_vehicles_adds_its_lambda_to_their_place_in_the_world() -> None:
     """Eq. 7 with A a vehicle: one edge for each known landmark, to the place, of no agent the orientation."""
     log = drive(EXACT, 2).measurements
     landmarks = [{e.landmark for e in m.cp if e.x_m <= THRESHOLD_M} for m in log]
-    correct, checked = vehicle_places.correct, 0
-
-    def seen(window: Window, rows: NDArray[np.int64], residuals: NDArray[np.complex128], *more: float) -> None:
-        nonlocal checked
-        before = window.P.copy()
-        correct(window, rows, residuals, *more)
-        np.testing.assert_allclose(residuals, 0.0, atol=1e-6)  # nothing errs
-        frame = window.frame
-        if frame in FRAMES:
-            known = len(landmarks[frame] & landmarks[frame - 1])
-            added = np.linalg.inv(window.P) - np.linalg.inv(before)
-            expected = np.zeros_like(added)
-            for row in rows:
-                at = window.at[window.nodes + row]
-                H = np.zeros((2, len(added)))
-                H[:, [0, 1]] = H[:, window.layout.poses[row][:2]] = np.eye(2)
-                H[:, 2] = -at.imag, at.real
-                expected += LAMBDA_CP * known * H.T @ H
-            np.testing.assert_allclose(added, expected, rtol=2e-3, atol=1e-3 * expected.max())
-            checked += known
-
-    monkeypatch.setattr(vehicle_places, "correct", seen)
-    graph = PoseGraph(PAPER.graph, replace(PAPER.weights, cp_vehicles=LAMBDA_CP))
-    estimates = [graph.optimise(m) for m in log]
+    weights, checked = replace(PAPER.weights, cp_vehicles=LAMBDA_CP), 0
+    before, after, factors = Probe("before"), Probe("after"), standard_factors(PAPER.graph, weights)
+    (k,) = (k for k, factor in enumerate(factors) if isinstance(factor, VehicleLandmarks))
+    graph = PoseGraph(PAPER.graph, weights, factors=[*factors[:k], before, factors[k], after, *factors[k + 1 :]])
+    estimates = []
+    for m in log:
+        estimates.append(graph.optimise(m))
+        if m.frame_id not in FRAMES:
+            continue
+        assert graph.window is not None
+        np.testing.assert_allclose(after.at, before.at, atol=1e-6)  # nothing errs
+        known = len(landmarks[m.frame_id] & landmarks[m.frame_id - 1])
+        more = np.linalg.inv(after.after) - np.linalg.inv(before.after)
+        expected = np.zeros_like(more)
+        for row in graph.window.layout.poses if known else ():
+            at = before.at[graph.window.nodes + (row[0] - graph.window.layout.firsts[0]) // 6]
+            H = np.zeros((2, len(more)))
+            H[:, [0, 1]] = H[:, row[:2]] = np.eye(2)
+            H[:, 2] = -at.imag, at.real
+            expected += LAMBDA_CP * known * H.T @ H
+        np.testing.assert_allclose(more, expected, rtol=2e-3, atol=1e-3 * max(expected.max(), 1.0))
+        checked += known
     assert checked > 100
     for with_them, without in zip(estimates, run(log), strict=True):
         assert with_them.T_world_ego.between(without.T_world_ego).log() == pytest.approx(np.zeros(3), abs=1e-6)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
-from birdslam.graph.standing import DECIDED, GIVEN_UP, STANDING_MPS, decide, judge, told_velocity
+from birdslam.graph.standing import DECIDED, GIVEN_UP, STANDING_MPS, decide, judge, reported_velocity
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.weights import WeightsConfig
 from birdslam.types import EgoEdge, Measurements, Moves, VehicleEdge, VehicleEstimate
@@ -45,7 +45,7 @@ def test_the_covariance_is_the_mixtures_about_what_is_told(
     moves: Moves, p: float, v: tuple[float, float], sigmas: tuple[float, float]
 ) -> None:
     """Its moments, from points that have the two parts' moments exactly."""
-    u, cov = told_velocity(node(p, standing=p, moves=moves), v, (sigmas[0] ** 2, 0.0, 0.0, sigmas[1] ** 2))
+    u, cov = reported_velocity(node(p, standing=p, moves=moves), v, (sigmas[0] ** 2, 0.0, 0.0, sigmas[1] ** 2))
     C = np.reshape(cov, (2, 2))
     assert np.hypot(*u) <= np.hypot(*v) + 1e-9
     spread = math.sqrt(2.0) * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
@@ -59,7 +59,7 @@ def test_who_was_just_seen_is_not_decided_on_and_its_velocity_is_pulled_to_nil()
     assert new.moves is Moves.UNDECIDED
     assert new.standing is not None
     assert 0.2 < new.standing < 0.8
-    u, C = told_velocity(new, (6.0, 0.0), (36.0, 0.0, 0.0, 36.0))
+    u, C = reported_velocity(new, (6.0, 0.0), (36.0, 0.0, 0.0, 36.0))
     assert u[0] < 6.0 * (1.0 - new.standing) + 1e-9
     assert u[0] - 2.0 * math.sqrt(C[0]) < 0.0  # nor is it told to drive for sure
 
@@ -96,7 +96,7 @@ def test_who_is_not_seen_or_not_spoken_of_is_not_judged(vehicle: VehicleNode) ->
     judged(vehicle, (0.0, 0.0), 0.5)
     assert vehicle.moves is Moves.UNDECIDED
     assert vehicle.standing is None
-    assert told_velocity(vehicle, (3.0, 1.0), (1.0, 0.0, 0.0, 1.0)) == ((3.0, 1.0), (1.0, 0.0, 0.0, 1.0))
+    assert reported_velocity(vehicle, (3.0, 1.0), (1.0, 0.0, 0.0, 1.0)) == ((3.0, 1.0), (1.0, 0.0, 0.0, 1.0))
 
 
 def driven_past(

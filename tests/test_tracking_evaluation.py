@@ -259,7 +259,7 @@ def test_each_idea_alone_is_one_change_of_the_papers_settings() -> None:
         for f in getattr(PAPER, part).__struct_fields__
         if getattr(getattr(own, part), f) != getattr(getattr(PAPER, part), f)
     }
-    assert apart - changed == {"graph.scale_memory_m"}  # which moves no pose, but what is known of the ego's
+    assert apart - changed == {"graph.correlation_length_m"}  # which moves no pose, but what is known of the ego's
 
 
 def test_before_lanes_is_a_log_without_landmarks(sequence: TrackingSequence, noisy_log: list[Measurements]) -> None:

@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.landmarks import LandmarksState
 from birdslam.graph.pending_map import PendingState
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import WindowState
 
-VERSION = 6
+VERSION = 7
 _MAGIC = b"BirdSLAM graph\n"
 _SUM_BYTES = 16
 _KINDS = {"<f8": np.float64, "<c16": np.complex128, "<i8": np.int64}
@@ -33,12 +32,10 @@ class Epoch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     window: WindowState
     vehicles: list[VehicleNode]
-    landmarks: LandmarksState
+    factors: dict[str, bytes]  # `packed` states of those that keep something, by their names
     t_ns: int
     t_before_ns: int
     motion: SE2
-    lasting_m: float
-    lasting_turn_rad: float
 
 
 class Checkpoint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -75,6 +72,19 @@ def unpack(data: bytes, settings: dict[str, Any]) -> Checkpoint:
         if theirs != ours:
             raise CheckpointError(f"was made with {name} = {theirs}, here it is {ours}")
     return checkpoint
+
+
+def packed(state: object) -> bytes:
+    """A factor's state, for an `Epoch`."""
+    return _ENCODER.encode(state)
+
+
+def unpacked(data: bytes, kind: type) -> Any:
+    """A factor's state of this type. Raises CheckpointError."""
+    try:
+        return msgspec.msgpack.decode(data, type=kind, dec_hook=_decode_array)
+    except (ValueError, msgspec.DecodeError) as error:
+        raise CheckpointError(f"can't be read: {error}") from None
 
 
 def plain(**structs: msgspec.Struct) -> dict[str, Any]:

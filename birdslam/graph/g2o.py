@@ -13,7 +13,7 @@ import numpy as np
 
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.edges import pose_edges
-from birdslam.graph.landmarks import LandmarkKey, sightings
+from birdslam.graph.factors.landmark_points import LandmarkKey, sightings
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.types import Measurements
 

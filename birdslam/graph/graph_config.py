@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
-from birdslam.graph.landmarks import LandmarkAnchor
 from birdslam.graph.weights import WeightsConfig
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+LandmarkAnchor = Literal["key_frame", "first_sight"]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
@@ -31,7 +31,7 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_vehicles: Count = 32  # the longest out of sight go first
     detection_gate_sigma: Positive = 4.0  # Mahalanobis distance past which a detection weighs less; twice it: nothing
     detection_contradictions: Count = 5  # so many left out in a row begin the vehicle anew
-    ends_alike: bool = True  # a CV edge may take a vehicle's front for its back; False: its yaw counts as it is
+    front_back_ambiguity: bool = True  # a CV edge may take a vehicle's front for its back; False: its yaw is believed
     # Static map
     landmark_gate_sigma: Positive = 3.0  # Mahalanobis distance past which a landmark weighs less
     landmark_common_m: NotNegative = 0.15  # 1-sigma of what is common to all landmarks of a frame (scale, pitch)
@@ -44,12 +44,12 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_pending_frames: Count = 1_000  # whose lane points wait for `map_update`
     # What is common to many CC edges in a row, and so moves all that is in sight against the world's origin alone
     # The way over which the errors of the metric scale, direction and turn last; 0: they do not
-    scale_memory_m: NotNegative = 20.0
+    correlation_length_m: NotNegative = 20.0
     # The part of a camera's motion that lasts so: over 10 m the direction is off by 0.0033 to 0.0070 rad on KITTI 00,
     # 01, 06, 0005 and the shipped drive, and a turn by 0.8 % (01) and 1.8 % (00)
-    lasting_direction_rad: NotNegative = 0.005  # 1-sigma of the direction of travel
-    lasting_turn_rel: NotNegative = 0.01  # 1-sigma of a turn, as a fraction
-    hold_at_standstill: bool = True  # False: a car that stands has the CC edge of one that drives
+    correlated_direction_rad: NotNegative = 0.005  # 1-sigma of the direction of travel
+    correlated_turn_rel: NotNegative = 0.01  # 1-sigma of a turn, as a fraction
+    zero_velocity_update: bool = True  # a car that stands keeps its pose; False: it has the CC edge of one that drives
     # Frames without a picture
     blind_mps: Positive = 1.0  # 1-sigma by which the ego's velocity may differ from the last one measured
     blind_radps: Positive = 0.1  # the same of its yaw rate

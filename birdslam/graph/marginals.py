@@ -1,13 +1,8 @@
 """Marginal covariances in world: of the vehicles, with their poses and velocities, out of the window's P.
 
-P takes the errors of edges of different frames for independent, so that many frames average them away. That of a
-vehicle's size is the same in all of them: taken for 5 % taller than it is, it is 5 % farther off in each frame, and
-what the ego comes nearer to it in a second is 5 % more. As a bias that is considered and not estimated (Schmidt 1966)
-it is added here, to what is told and to what is judged by it:
-
-    C + s^2 g g',    g = (p, 0, v - v_ego)
-
-with s the edge's `depth_per_height` times `sigma_log_height`, p the vehicle's place from the ego and v its velocity.
+The error of a vehicle's size is the same in all frames, which P does not know. As a bias that is considered and not
+estimated (Schmidt 1966) it is added here: C + s^2 g g', g = (p, 0, v - v_ego), with s the edge's `depth_per_height`
+times `sigma_log_height`, p the vehicle's place from the ego and v its velocity; docs/method.md has the reasons.
 """
 
 from __future__ import annotations
@@ -19,8 +14,8 @@ import numpy as np
 
 from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.factors import Floats, Triple
-from birdslam.graph.standing import judge, told_velocity
+from birdslam.graph.costs import Floats, Triple
+from birdslam.graph.standing import judge, reported_velocity
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import Window
 from birdslam.types import VehicleEstimate
@@ -62,8 +57,8 @@ def vehicle_estimates(
         velocity_cov = cov[3][3], cov[3][4], cov[4][3], cov[4][4]
         if birth_det is not None:
             judge(v, velocity, velocity_cov, birth_det, t_ns)
-            velocity, velocity_cov = told_velocity(v, velocity, velocity_cov)
-        told = VehicleEstimate(
+            velocity, velocity_cov = reported_velocity(v, velocity, velocity_cov)
+        reported = VehicleEstimate(
             vehicle=v.vehicle,
             T_world_vehicle=pose,
             cov=(*cov[0][:3], *cov[1][:3], *cov[2][:3]),
@@ -78,7 +73,7 @@ def vehicle_estimates(
             moves=v.moves,
             standing=0.5 if v.standing is None else v.standing,
         )
-        out.append(told)
+        out.append(reported)
     return tuple(out)
 
 
@@ -93,7 +88,7 @@ def _of_sizes(
     ego, velocity_mps = complex(world.x_m, world.y_m), ego_mps * cmath.rect(1.0, world.yaw_rad)
     numbers: list[float] = []
     for v, pose, (x_mps, y_mps) in zip(vehicles, poses, velocities, strict=True):
-        s = v.lasting_rel
+        s = v.size_bias_rel
         away = s * (complex(pose.x_m, pose.y_m) - ego) * cmath.rect(1.0, -pose.yaw_rad)  # in the vehicle's axes
         numbers += (away.real, away.imag, 0.0, s * (x_mps - velocity_mps.real), s * (y_mps - velocity_mps.imag))
     g = np.array(numbers).reshape(-1, 5, 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -47,7 +48,7 @@ class PendingMap:
         self._lanes.extend(state.lanes)
 
     def add(
-        self, frame_id: int, landmarks_m: list[tuple[float, float]], T_world_ego: SE2, lanes: tuple[LanePoint, ...]
+        self, frame_id: int, landmarks_m: Sequence[tuple[float, float]], T_world_ego: SE2, lanes: tuple[LanePoint, ...]
     ) -> None:
         """`landmarks_m` in world, `lanes` in ego."""
         self._frame_id = frame_id

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from birdslam.graph.factors import Floats
+from birdslam.graph.costs import Floats
 
 EGO = slice(0, 3)
 
@@ -21,11 +21,12 @@ class StateLayout:
         self.ego_poses = slice(0, first)  # the newest and the nodes
         self.vehicles = slice(first, self.size)
         self.firsts = range(first, self.size, 6)  # rows of the vehicles: three of the pose, three of the twist
+        self.poses_firsts = (*range(3, first, 3), *self.firsts)  # of all poses but the newest ego's
         of_vehicles = first + np.arange(6 * vehicles, dtype=np.int64).reshape(vehicles, 6)
         self.poses, self.twists = of_vehicles[:, :3], of_vehicles[:, 3:]  # (M, 3) each
         self.of_vehicles = of_vehicles  # (M, 6)
         # Of all poses but the newest ego's, nodes and then vehicles: the rows of their places, and (n, 3) how they move
-        # when the ego does that they are told from, but for the lever of its turn
+        # when the ego does that they are relative to, but for the lever of its turn
         moved = np.concatenate([3 + np.arange(3 * nodes, dtype=np.int64).reshape(nodes, 3), self.poses])
         self.x_rows, self.y_rows = moved[:, 0], moved[:, 1]
         self.against = np.zeros((self.size, 3))
@@ -55,10 +56,11 @@ def diagonal(P: Floats) -> Floats:
     return P.reshape(-1)[:: len(P) + 1]
 
 
-def diagonal_blocks(A: Floats, count: int) -> Floats:
-    """(count, 3, 3) view of the first blocks on the diagonal of `A`.
+def diagonal_blocks(A: Floats, first: int, shape: tuple[int, ...]) -> Floats:
+    """(k, d, d) view of k blocks on the diagonal of `A`, from row `first` on; `shape` is (k, d, d).
 
     numpy's as_strided makes the same view, but takes several microseconds for it, this less than one.
     """
     row, column = A.strides
-    return np.ndarray((count, 3, 3), np.float64, A, 0, (3 * (row + column), row, column))
+    step = row + column
+    return np.ndarray(shape, np.float64, A, first * step, (shape[1] * step, row, column))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cmath
 from dataclasses import dataclass
 
-from birdslam.graph.edges import PoseEdges
-from birdslam.graph.factors import CvEdge, VvEdge, turned
+from birdslam.graph.costs import rotated
+from birdslam.graph.edges import CvEdge, PoseEdges, VvEdge
 from birdslam.types import Moves, VehicleEdge
 
 PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/state/parallax.py
@@ -32,14 +32,14 @@ class VehicleNode:
     standing_seen: float | None = None  # the probability that it stands, by its last edge; None: that did not say
     in_path: bool = False  # of the ego, by its last edge
     beside: bool = False  # on another road, or on none, by its first edge
-    lasting_rel: float = 0.0  # 1-sigma of its distance by what its size is off, as a fraction: more frames don't help
+    size_bias_rel: float = 0.0  # 1-sigma of its distance by its size's error, a fraction: the same in all frames
     standing: float | None = None  # the probability by all that is known; None: of that nothing
     moves: Moves = Moves.UNDECIDED
 
 
 @dataclass(slots=True)
-class Ties:
-    """The edges of a frame that tie vehicles of the window to it, and for how long each vehicle drives on."""
+class Associations:
+    """The edges of a frame to vehicles of the window, and for how long each vehicle drives on."""
 
     known: list[int]  # which of the frame's CV edges `cv` has
     cv: list[CvEdge]
@@ -51,7 +51,7 @@ def cv_edge(row: int, edge: VehicleEdge) -> CvEdge:
     """The edge to the vehicle in this row of the window, all in ego."""
     T = edge.T_ego_vehicle
     heading = cmath.rect(1.0, T.yaw_rad)
-    return CvEdge(row, complex(T.x_m, T.y_m), heading, turned(edge.cov, heading))
+    return CvEdge(row, complex(T.x_m, T.y_m), heading, rotated(edge.cov, heading))
 
 
 class VehicleNodes:
@@ -69,8 +69,8 @@ class VehicleNodes:
         self.nodes = nodes
         self._row = {v.vehicle: row for row, v in enumerate(nodes)}
 
-    def tie(self, edges: PoseEdges, frame: int, t_ns: int, constant_velocity: bool) -> Ties:
-        """Which edges of the frame have both ends in the window; each vehicle that they tie to it gets a pose there.
+    def associate(self, edges: PoseEdges, frame: int, t_ns: int, constant_velocity: bool) -> Associations:
+        """Which edges of the frame have both ends in the window; each vehicle that they reach gets a pose there.
 
         A VV edge has to start at the vehicle's newest pose. Without `constant_velocity` nothing but a VV edge ties a
         vehicle's new pose to the one before (Eq. 6).
@@ -82,27 +82,27 @@ class VehicleNodes:
             row = self._row.get(e.vehicle)
             if row is not None and self.nodes[row].node_frame == e.from_frame:
                 linked.append((row, e))
-        tied = {row for row, _ in linked}
+        reached = {row for row, _ in linked}
         if constant_velocity:
-            tied.update([rows[k] for k in known])
+            reached.update([rows[k] for k in known])
         else:
-            known = [k for k in known if rows[k] in tied]
+            known = [k for k in known if rows[k] in reached]
         dt_s = [0.0] * len(self.nodes)
-        for row in tied:
+        for row in reached:
             v = self.nodes[row]
             dt_s[row] = max((t_ns - v.node_ns) * 1e-9, SHORTEST_S)
             v.node_frame, v.node_ns = frame, t_ns
         cv = [cv_edge(rows[k], edges.cv[k]) for k in known]
-        return Ties(known, cv, [VvEdge(row, dt_s[row], e.T_from_to, e.cov) for row, e in linked], dt_s)
+        return Associations(known, cv, [VvEdge(row, dt_s[row], e.T_from_to, e.cov) for row, e in linked], dt_s)
 
     def row(self, vehicle: int) -> int:
         """Of a vehicle in the window; -1: it is not there."""
         return self._row.get(vehicle, -1)
 
-    def book(
+    def update(
         self, edges: list[VehicleEdge], known: list[int], outliers: list[int], t_ns: int
     ) -> tuple[list[int] | None, list[int]]:
-        """Books this frame's CV edges and forgets who is long out of sight.
+        """Takes up what this frame's CV edges say of vehicles, and forgets who is long out of sight.
 
         Of the edges, `known` are those that corrected a vehicle or, being `outliers`, contradicted it and were left
         out. Returns the rows that stay, in their new order, -1 for a vehicle that is new (None: all stay and none is
@@ -127,7 +127,7 @@ class VehicleNodes:
             v.seen_ns, v.frames, v.label = t_ns, v.frames + 1, edge.label
             v.length_m, v.width_m, v.delay_ns = edge.length_m, edge.width_m, edge.delay_ns
             v.standing_seen = edge.standing or None  # 0: nobody said
-            v.lasting_rel = abs(edge.depth_per_height) * edge.sigma_log_height
+            v.size_bias_rel = abs(edge.depth_per_height) * edge.sigma_log_height
             v.in_path = abs(edge.T_ego_vehicle.y_m) < PATH_HALF_WIDTH_M
         before = len(self.nodes)
         alive = [row for row, v in enumerate(self.nodes) if (t_ns - v.seen_ns) * 1e-9 <= self._forget_s]

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec.structs import replace
 
-from birdslam.graph.factors import effective_cov
 from birdslam.types import LandmarkKind, Measurements
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -50,6 +49,12 @@ class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The CV weight: `cv_near` at the camera, `cv_far` from `cv_far_m` on, linear in the logarithm between."""
         share = min(max(depth_m / self.cv_far_m, 0.0), 1.0)
         return float(self.cv_near * (self.cv_far / self.cv_near) ** share)
+
+
+def effective_cov(weight: float, dimensions: int) -> tuple[float, ...]:
+    """Row-major covariance of an edge whose information matrix is `weight` (lambda) times the unit matrix."""
+    variance = 1.0 / weight  # Eq. 4, inverted
+    return tuple(variance if i == j else 0.0 for i in range(dimensions) for j in range(dimensions))
 
 
 def weighted(measurements: Measurements, config: WeightsConfig) -> Measurements:

@@ -1,27 +1,10 @@
 """The window of the pose graph: the joint Gaussian of the newest poses, moved on once a frame.
 
-All that Eqs. 2-8 say of the present is in the joint distribution of the newest ego pose in the world, a few ego poses
-before it, each vehicle's newest pose and each vehicle's velocity. Poses that leave it are marginalised, which in
-covariance form means that their rows are dropped: exact, and nothing is factored that could turn out indefinite.
-
-Every pose but the first is kept *relative to the newest ego*, and so is its error: its place and yaw in the ego's axes.
-Then a CV edge is linear in the state, whatever the vehicle's yaw: a yaw that turns out to be another one does not turn
-what is known of the place, and nothing needs to be linearised again. A CC edge moves all poses by one known transform,
-and no Jacobian depends on where the world began: the conditioning does not change with the length of the drive.
-
-State vector (state_layout.py), in blocks of three: [ego in world | ego nodes | each vehicle's pose and twist]. The
-first block's error is xi in T_true = T o (xi as a pose), the tangent (x_m, y_m, yaw_rad) at the pose and gtsam's chart
-for Pose2. An edge's covariance is given in the axes of the measured pose, as gtsam's is: a measured yaw does not turn
-its own noise. A twist is (x_mps, y_mps, yaw_radps) in the vehicle's own frame, constant over the interval that led to
-its newest pose.
-
-Positions are complex numbers x + iy and headings unit complex numbers e^(i yaw): composing poses is then multiplying.
-A frame costs by the number of calls of numpy, not by the size of the arrays: P is an array and takes few operations,
-each on all of it; the mean, a dozen poses, is Python's own numbers.
-
-Why not gtsam: with ten vehicles, the same edges and the same lag its fixed-lag smoothers take several times as long
-(`python -m perf optimizer` measures both). Its Cholesky raises now and then, and plain ISAM2 grows
-without bound. Its answers on the same edges are what tests/test_consistency.py holds this module to.
+It has the newest ego pose in the world, a few ego poses before it, each vehicle's newest pose and its twist. Poses that
+leave it are marginalised: in covariance form their rows are dropped, which is exact. All poses but the first are
+*relative to the newest ego*, and so are their errors, in its axes; docs/method.md ("The window") has the state, its
+charts and the reasons. Positions are complex numbers x + iy in metres and headings unit complex numbers e^(i yaw);
+P is an array and takes few calls of numpy, the mean, a dozen poses, is Python's own numbers.
 """
 
 from __future__ import annotations
@@ -35,7 +18,7 @@ import numpy as np
 
 from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.factors import Complexes, Cov, Floats, Rows, chained
+from birdslam.graph.costs import Complexes, Cov, Floats, Rows
 from birdslam.graph.state_layout import EGO, StateLayout, diagonal
 
 KEY_NODE = 0  # the ego node that landmarks are tied to; it is renewed once in every round of the nodes
@@ -119,7 +102,7 @@ class Window:
         rows = StateLayout.node(KEY_NODE)
         return self.at[KEY_NODE], self.heading[KEY_NODE], self.P[rows, rows][:2, :2]
 
-    def knows(self, frame: int) -> bool:
+    def has_pose(self, frame: int) -> bool:
         """Whether a CC edge can start at `frame`: the newest, or a node that the newest will not take the place of."""
         return frame == self.frame or (frame in self.node_frames and frame != self.node_frames[self.next_node])
 
@@ -140,10 +123,10 @@ class Window:
         a second: the constant-velocity factor. A vehicle with `dt_s` 0 stays at the pose it was last seen at. Returns
         how far the ego went since the newest frame.
         """
-        node = self._ego_becomes_node()
+        node = self._replace_oldest_node()
         base = self.node_frames.index(from_frame)
         T_ego_next = motion if base == node else _se2(self.at[base], self.heading[base]) @ motion
-        self.world = chained(self.world, T_ego_next)
+        self.world = self.world @ T_ego_next  # Eq. 2, of a CC edge with the residual zero
         back = cmath.rect(1.0, -T_ego_next.yaw_rad)
         F = self._move_poses(T_ego_next, back, dt_s)
         if any(twist_growth):
@@ -158,17 +141,17 @@ class Window:
         self.frame, self.next_node = to_frame, (node + 1) % self.nodes
         return T_ego_next
 
-    def _ego_becomes_node(self) -> int:
+    def _replace_oldest_node(self) -> int:
         """The newest ego pose takes the place of the oldest node, which is marginalised; which node that is."""
         node = self.next_node
         rows = StateLayout.node(node)
-        self.at[node], self.heading[node] = 0j, 1.0 + 0j  # told from the newest ego pose, which it still is itself
+        self.at[node], self.heading[node] = 0j, 1.0 + 0j  # relative to the newest ego pose, which it still is itself
         self.P[rows] = self.P[:, rows] = 0.0  # and so without error
         self.node_frames[node] = self.frame
         return node
 
     def _move_poses(self, T_ego_next: SE2, back: complex, dt_s: Sequence[float]) -> Floats:
-        """All poses, told from the next ego pose, whose axes are turned by `back`; vehicles drive on.
+        """All poses, relative to the next ego pose, whose axes are turned by `back`; vehicles drive on.
 
         Returns (M, 3, 6) how the errors of a vehicle's pose and twist move its next pose.
         """
@@ -202,8 +185,10 @@ class Window:
         self.P = out
 
     def _add_motion_noise(self, cov: Floats, base: int | None) -> None:
-        """The noise of the ego's motion `cov` (3, 3) moves all that is told from the ego; so does, where the motion did
-        not start at the newest pose but at the node `base`, the error of that node."""
+        """The noise of the ego's motion `cov` (3, 3) moves all that is relative to the ego.
+
+        So does, where the motion did not start at the newest pose but at the node `base`, the error of that node.
+        """
         P, layout, at = self.P, self.layout, np.array(self.at)
         G = layout.against.copy()
         G[layout.x_rows, 2] = at.imag
@@ -216,7 +201,8 @@ class Window:
         self.P = P
 
     def drift(self, along: complex, variance: float, across_variance: float) -> None:
-        """The ego, and with it all that is told from it, may have come this much further in the world than was told.
+        """The ego, and with it all that is relative to it, may have come this much further in the world than its edge
+        says.
 
         `along` is the direction in ego, of length 1, the variances along it and across it are in m^2. Between what is
         in sight nothing changes.
@@ -225,28 +211,24 @@ class Window:
         self.P[:2, :2] += variance * np.outer((c, s), (c, s)) + across_variance * np.outer((-s, c), (-s, c))
 
     def turn_drift(self, variance: float) -> None:
-        """The ego, and with it all that is told from it, may have turned this much more in the world (rad^2)."""
+        """The ego, and with it all that is relative to it, may have turned this much more in the world (rad^2)."""
         self.P[2, 2] += variance
 
-    # --- what minimum.py does to it ---
+    # --- corrections ---
 
     def shift(self, dx: Sequence[float]) -> None:
         """Moves the mean by `dx` (n,)."""
         self.world = self.world @ SE2(*dx[:3])
-        n = self.nodes
-        for k, i in enumerate((*range(3, 3 + 3 * n, 3), *self.layout.firsts)):
-            self.at[k] += complex(dx[i], dx[i + 1])
-            self.heading[k] *= cmath.rect(1.0, dx[i + 2])
+        at, heading, velocity, turn_radps = self.at, self.heading, self.velocity, self.turn_radps
+        for k, i in enumerate(self.layout.poses_firsts):
+            at[k] += complex(dx[i], dx[i + 1])
+            heading[k] *= cmath.rect(1.0, dx[i + 2])
         for row, i in enumerate(self.layout.firsts):
-            self.velocity[row] += complex(dx[i + 3], dx[i + 4])
-            self.turn_radps[row] += dx[i + 5]
+            velocity[row] += complex(dx[i + 3], dx[i + 4])
+            turn_radps[row] += dx[i + 5]
 
-    def turn_about(self, rows: Sequence[int]) -> None:
-        """Vehicles `rows` (k,) have their front where their back was; they move as before.
-
-        Front and back of a car look alike: a CV edge that contradicts the heading by more than a right angle says
-        which end is the front, and leaves the motion as it is.
-        """
+    def flip_headings(self, rows: Sequence[int]) -> None:
+        """Vehicles `rows` (k,) have their front where their back was, and move as before: front and back look alike."""
         sign = np.ones(len(self.P))
         sign[self.layout.twists[rows, :2].ravel()] = -1.0
         self.P *= sign[:, None] * sign
@@ -256,14 +238,14 @@ class Window:
 
     # --- vehicles come and go ---
 
-    def place(self, row: int, at: complex, heading: complex, cov: Cov, twist_cov: Floats) -> None:
+    def place_vehicle(self, row: int, at: complex, heading: complex, cov: Cov, twist_cov: Floats) -> None:
         """The vehicle `row` begins anew in ego, with `cov` in the ego's axes, at rest give or take, independent of all
         else."""
         self.at[self.nodes + row], self.heading[self.nodes + row] = at, heading
         self._renew(self.layout.poses[[row]], np.reshape(cov, (3, 3)))
-        self.retwist([row], [(0j, 0.0)], twist_cov)
+        self.set_twists([row], [(0j, 0.0)], twist_cov)
 
-    def retwist(self, rows: Sequence[int], twists: Sequence[tuple[complex, float]], covs: Floats) -> None:
+    def set_twists(self, rows: Sequence[int], twists: Sequence[tuple[complex, float]], covs: Floats) -> None:
         """Vehicles `rows` (k,) get new twists with `covs` (k, 3, 3), independent of all else; their poses stay."""
         for row, (velocity, turn_radps) in zip(rows, twists, strict=True):
             self.velocity[row], self.turn_radps[row] = velocity, turn_radps

@@ -62,8 +62,8 @@ def idea_variants() -> dict[str, Method]:
         "gates on outliers": ("detection_gate_sigma", "landmark_gate_sigma"),
         "an error that all landmarks share": ("landmark_common_m",),
         "landmarks where the last key frame saw them": ("landmark_anchor",),
-        "standstill held": ("hold_at_standstill",),
-        "a front that may be a back": ("ends_alike",),
+        "standstill held": ("zero_velocity_update",),
+        "a front that may be a back": ("front_back_ambiguity",),
     }
     out: dict[str, Method] = {"nothing (the paper)": PAPER}
     for name, fields in alone.items():

@@ -109,9 +109,9 @@ PAPER = Live(
         landmark_gate_sigma=NO_GATE,
         landmark_common_m=0.0,
         landmark_anchor="first_sight",
-        scale_memory_m=0.0,
-        hold_at_standstill=False,
-        ends_alike=False,
+        correlation_length_m=0.0,
+        zero_velocity_update=False,
+        front_back_ambiguity=False,
     ),
 )
 

@@ -1,0 +1,69 @@
+"""Vehicles' CP edges: where a frame's landmarks say that the vehicles stand which it sees (Eqs. 3 and 7).
+
+Eq. 7 has a unary edge between "an agent A (ego-camera or vehicle in scene)" and each point. A camera sees the point and
+the vehicle, so that the edge is the difference of the two: what the CV edge says of the vehicle is said once more, with
+CP's weight, from landmarks instead of the ego. It is on the vehicle's place in the world, which the window has as ego
+pose and place in ego: both are corrected, after the other factors, so that new vehicles have it too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from birdslam.graph.costs import Complexes
+from birdslam.graph.factors.factor import Factor, GraphFrame
+from birdslam.graph.factors.landmark_points import LandmarkPoints, landmark_residual
+from birdslam.graph.state_layout import EGO
+from birdslam.graph.window import Window
+
+
+class VehicleLandmarks(Factor):
+    """CP edges of vehicles, each of information `weight` (Eq. 4). Stands before `landmarks` in the list."""
+
+    name = "CP of vehicles"
+    equation = "Eqs. 3 and 7"
+
+    def __init__(self, weight: float, landmarks: LandmarkPoints) -> None:
+        self._weight = weight
+        self._landmarks = landmarks
+
+    def conclude(self, frame: GraphFrame, window: Window) -> None:
+        """Corrects ego and vehicles by the edges of this frame."""
+        edges, known = frame.edges.cv, self._landmarks.known_in_ego(window)
+        if not edges or known is None:
+            return
+        place_of = {frame.vehicles.row(edge.vehicle): edge.T_ego_vehicle for edge in edges}
+        place_of.pop(-1, None)
+        if not place_of:
+            return
+        points, there, heading = known
+        ego = complex(landmark_residual(there, 0.0, heading, points).mean())  # Eq. 7: all landmarks weigh alike
+        places = [complex(T.x_m, T.y_m) for T in place_of.values()]
+        at = np.array([window.at[window.nodes + row] for row in place_of])
+        residuals = ego + heading * np.array(places) - at  # Eq. 3, of the vehicle
+        _correct(window, [*place_of], residuals, 1.0 / (self._weight * len(points)), frame.zero_velocity)
+
+
+def _correct(window: Window, rows: Sequence[int], residuals: Complexes, variance_m2: float, hold: bool) -> None:
+    """Adds edges that each say how much further on, in ego, a vehicle of `rows` (k,) stands: `residuals` (k,), metres.
+
+    `variance_m2` is each edge's, in either axis; `hold` keeps the ego where it is.
+    """
+    k, states = len(rows), window.layout.poses[rows]
+    at = np.array([window.at[window.nodes + row] for row in rows])
+    H = np.zeros((2 * k, len(window.P)))  # how the place in the world goes with the state
+    H[0::2, EGO.start] = H[1::2, EGO.start + 1] = 1.0
+    H[0::2, EGO.start + 2], H[1::2, EGO.start + 2] = -at.imag, at.real
+    H[2 * np.arange(k), states[:, 0]] = H[2 * np.arange(k) + 1, states[:, 1]] = 1.0
+    PHt = window.P @ H.T
+    K = np.linalg.solve(H @ PHt + variance_m2 * np.eye(2 * k), PHt.T).T
+    residual = np.column_stack([residuals.real, residuals.imag]).ravel()
+    dx, held = K @ residual, window.ego_cov.copy()
+    window.P -= K @ PHt.T
+    window.P = 0.5 * (window.P + window.P.T)
+    if hold:
+        dx[EGO] = 0.0
+        window.P[EGO, EGO] = held
+    window.shift(dx.tolist())

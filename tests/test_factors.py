@@ -1,0 +1,314 @@
+"""Factors of one's own, registered from here: a place by GNSS, a line of the lane, a loop; held to algebra."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from birdslam.bench.simulation.drive import DriveConfig, drive
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.checkpoint import CheckpointError
+from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
+from birdslam.graph.factors.odometry import Odometry
+from birdslam.graph.factors.standard import standard_factors
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.graph.state_layout import StateLayout
+from birdslam.graph.weights import WeightsConfig
+from birdslam.graph.window import Window
+from birdslam.types import Estimate
+
+Floats = NDArray[np.float64]
+
+SETTINGS = GraphConfig(), WeightsConfig()
+LOG = drive(DriveConfig(frames=60, vehicles=3, landmarks=8), 3).measurements
+LOG[-1] = replace(LOG[-1], cv=())  # so that nothing else corrects the last prediction
+
+
+@dataclass(frozen=True)
+class Fix:
+    """The ego's place in the world."""
+
+    x_m: float
+    y_m: float
+    sigma_m: float
+
+
+class GnssState(msgspec.Struct, frozen=True):
+    """When a fix counted last."""
+
+    used_ns: int | None
+
+
+class Gnss(Factor):
+    """A prior on the ego's place. Fixes err alike for a while: one in `every_ns` counts."""
+
+    name = "GNSS"
+    equation = "z - p"
+    state_type = GnssState
+
+    def __init__(self, gate_sigma: float = 4.0, every_ns: int = 0) -> None:
+        self._gate = gate_sigma**2
+        self._every_ns = every_ns
+        self.begin()
+
+    def begin(self) -> None:
+        self._used_ns: int | None = None
+
+    def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
+        t_ns, T = frame.measurements.t_source_ns, window.world
+        fixes = [record for record in frame.records if isinstance(record, Fix)]
+        if not fixes or (self._used_ns is not None and t_ns - self._used_ns < self._every_ns):
+            return None
+        self._used_ns = t_ns
+        gaps = np.array([(fix.x_m - T.x_m, fix.y_m - T.y_m) for fix in fixes]) @ T.rotation()  # in the ego's axes
+        covs = np.array([fix.sigma_m**2 * np.eye(2) for fix in fixes])
+        return Linearised(gaps.ravel().tolist(), [0, 1] * len(fixes), covs, self._gate)
+
+    def state(self) -> GnssState:
+        return GnssState(self._used_ns)
+
+    def resume(self, state: GnssState) -> None:
+        self._used_ns = state.used_ns
+
+
+@dataclass(frozen=True)
+class Line:
+    """A straight line along x of the world: the ego's distance to its left of it, and its heading against it."""
+
+    offset_m: float
+    heading_rad: float
+    sigmas: tuple[float, float]
+
+
+class LaneLine(Factor):
+    """Offset and heading, whose Jacobian is none of unit vectors."""
+
+    name = "lane line"
+    equation = "(d - y, psi - yaw)"
+
+    def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
+        T = window.world
+        lines = [record for record in frame.records if isinstance(record, Line)]
+        if not lines:
+            return None
+        J = np.zeros((2 * len(lines), len(window.P)))
+        J[0::2, :2] = np.sin(T.yaw_rad), np.cos(T.yaw_rad)
+        J[1::2, 2] = 1.0
+        residual = [number for line in lines for number in (line.offset_m - T.y_m, line.heading_rad - T.yaw_rad)]
+        return Linearised(residual, J, np.array([np.diag(np.square(line.sigmas)) for line in lines]))
+
+
+@dataclass(frozen=True)
+class Loop:
+    """The newest ego pose as an earlier one sees it, its error in the axes of that one's pose in ego."""
+
+    frame: int
+    T_frame_ego: SE2
+    sigma: float
+
+
+class LoopClosure(Factor):
+    """Between the newest pose and one of the window, a CC edge that closes a loop."""
+
+    name = "loop"
+    equation = "Eq. 2"
+
+    def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
+        loops = [r for r in frame.records if isinstance(r, Loop) and r.frame in window.node_frames]
+        if not loops:
+            return None
+        index: list[int] = []
+        residual: list[float] = []
+        for loop in loops:
+            node = window.node_frames.index(loop.frame)
+            rows, T = StateLayout.node(node), loop.T_frame_ego.inverse()
+            index += range(rows.start, rows.stop)
+            yaw_rad = float(np.angle(np.exp(1j * T.yaw_rad) / window.heading[node]))
+            residual += (T.x_m - window.at[node].real, T.y_m - window.at[node].imag, yaw_rad)
+        return Linearised(residual, index, np.array([loop.sigma**2 * np.eye(3) for loop in loops]))
+
+
+def graph_with(*more: Factor, epoch: int = 0) -> PoseGraph:
+    return PoseGraph(*SETTINGS, epoch, [*standard_factors(*SETTINGS), *more])
+
+
+def run(graph: PoseGraph, records: dict[int, tuple[object, ...]]) -> list[Estimate]:
+    return [graph.optimise(m, records.get(m.frame_id, ())) for m in LOG]
+
+
+def updated(before: Estimate, J: Floats, residual: Floats, R: Floats) -> tuple[SE2, Floats]:
+    """Pose and covariance of the ego after a measurement of it, by the textbook's Kalman update."""
+    P = np.reshape(before.cov, (3, 3))
+    K = P @ J.T @ np.linalg.inv(J @ P @ J.T + R + 1e-8 * np.eye(len(R)))  # 0.1 mm: no edge is believed to be surer
+    return before.T_world_ego @ SE2(*(K @ residual).tolist()), P - K @ J @ P
+
+
+def assert_is(after: Estimate, expected: tuple[SE2, Floats]) -> None:
+    assert after.T_world_ego.between(expected[0]).log() == pytest.approx(np.zeros(3), abs=1e-7)
+    np.testing.assert_allclose(np.reshape(after.cov, (3, 3)), expected[1], rtol=1e-4, atol=1e-10)
+
+
+# --- a place by GNSS ---
+
+
+def fix_at(estimate: Estimate, away_m: tuple[float, float], sigma_m: float) -> Fix:
+    T = estimate.T_world_ego
+    return Fix(T.x_m + away_m[0], T.y_m + away_m[1], sigma_m)
+
+
+@pytest.mark.parametrize("sigma_m", [1e-3, 0.05, 10.0])
+def test_a_fix_takes_the_ego_there_by_its_share_of_the_weights(sigma_m: float) -> None:
+    before = run(graph_with(), {})[-1]
+    away_m = (0.06, -0.03)
+    graph = graph_with(Gnss())
+    after = run(graph, {LOG[-1].frame_id: (fix_at(before, away_m, sigma_m),)})[-1]
+    J, residual = np.eye(2, 3), before.T_world_ego.rotation().T @ np.array(away_m)
+    assert_is(after, updated(before, J, residual, sigma_m**2 * np.eye(2)))
+    assert graph.outliers == {"GNSS": []}
+    assert np.trace(np.reshape(after.cov, (3, 3))[:2, :2]) < np.trace(np.reshape(before.cov, (3, 3))[:2, :2])
+    if sigma_m == 1e-3:
+        assert after.T_world_ego.x_m - before.T_world_ego.x_m == pytest.approx(away_m[0], abs=1e-3)
+        assert after.T_world_ego.y_m - before.T_world_ego.y_m == pytest.approx(away_m[1], abs=1e-3)
+
+
+def test_what_is_in_sight_goes_with_the_ego() -> None:
+    """A fix says nothing of where vehicles are from the ego, beyond what the landmarks' common past makes of it."""
+    before = run(graph_with(), {})[-1]
+    after = run(graph_with(Gnss()), {LOG[-1].frame_id: (fix_at(before, (0.2, 0.1), 0.05),)})[-1]
+    assert len(before.vehicles) == 3
+    for b, a in zip(before.vehicles, after.vehicles, strict=True):
+        gap = before.T_world_ego.between(b.T_world_vehicle).between(after.T_world_ego.between(a.T_world_vehicle))
+        assert np.abs(gap.log()).max() < 0.01
+        assert b.T_world_vehicle.between(a.T_world_vehicle).log()[0] != pytest.approx(0.0, abs=0.01)
+
+
+def test_a_wild_fix_is_an_outlier_and_the_others_of_its_frame_are_not() -> None:
+    before = run(graph_with(), {})[-1]
+    good, wild = fix_at(before, (0.05, 0.0), 0.05), fix_at(before, (9.0, 9.0), 0.05)
+    last = LOG[-1].frame_id
+    graph = graph_with(Gnss())
+    both, alone = run(graph, {last: (wild, good)})[-1], run(graph_with(Gnss()), {last: (good,)})[-1]
+    assert graph.outliers == {"GNSS": [0]}
+    assert both.T_world_ego.between(alone.T_world_ego).log() == pytest.approx(np.zeros(3), abs=1e-6)
+    np.testing.assert_allclose(both.cov, alone.cov, rtol=1e-6, atol=1e-10)
+
+
+def test_a_fix_past_the_gate_weighs_less() -> None:
+    before = run(graph_with(), {})[-1]
+    P = np.reshape(before.cov, (3, 3))[:2, :2]
+    sigma_m = 0.05
+    S = P + (sigma_m**2 + 1e-8) * np.eye(2)
+    away = before.T_world_ego.rotation() @ np.linalg.cholesky(S) @ np.array([6.0, 0.0])  # 6 sigma: the gate is at 4
+    after = run(graph_with(Gnss()), {LOG[-1].frame_id: (fix_at(before, (away[0], away[1]), sigma_m),)})[-1]
+    J, residual = np.eye(2, 3), before.T_world_ego.rotation().T @ away
+    assert_is(after, updated(before, J, residual, (36.0 / 16.0) ** 2 * sigma_m**2 * np.eye(2)))
+
+
+@pytest.mark.parametrize("cut", [1, 20, 41])
+def test_a_checkpoint_goes_on_with_the_factor(cut: int) -> None:
+    """With what it keeps: of a fix in each frame few count, and the next one that does is the same."""
+    factors = lambda: [*standard_factors(*SETTINGS), Gnss(every_ns=10**9)]  # noqa: E731
+    truth = run(graph_with(), {})
+    fixes = {e.frame_id: (fix_at(e, (0.3, 0.0), 0.1),) for e in truth}
+    graph = PoseGraph(*SETTINGS, factors=factors())
+    for m in LOG[:cut]:
+        graph.optimise(m, fixes[m.frame_id])
+    data = graph.checkpoint()
+    restored = PoseGraph.restore(data, *SETTINGS, factors())
+    assert restored.checkpoint() == data
+    late, forgetful = ([g.optimise(m, fixes[m.frame_id]) for m in LOG[cut:]] for g in (restored, graph_with(Gnss())))
+    assert [graph.optimise(m, fixes[m.frame_id]) for m in LOG[cut:]] == late
+    assert late != forgetful
+    with pytest.raises(CheckpointError, match=r"was made with factors = .*GNSS.*, here it is"):
+        PoseGraph.restore(data, *SETTINGS)
+
+
+def test_a_new_epoch_forgets_what_the_factor_kept() -> None:
+    log = [*LOG[:5], replace(LOG[5], cc=None, status=())]
+    graph = graph_with(Gnss(every_ns=10**12))
+    for m in log:
+        graph.optimise(m, (Fix(0.0, 0.0, 1.0),))
+        assert ("GNSS" in graph.outliers) == (m.frame_id in (LOG[0].frame_id, LOG[5].frame_id))
+
+
+def test_an_edge_that_is_no_number_is_left_out() -> None:
+    nowhere = Fix(float("nan"), 0.0, 1.0), Line(float("inf"), 0.0, (1.0, 1.0))
+    assert run(graph_with(Gnss(), LaneLine()), {m.frame_id: nowhere for m in LOG}) == run(graph_with(), {})
+
+
+# --- a line of the lane: a Jacobian of its own ---
+
+
+def test_a_line_holds_the_ego_across_it_and_its_heading() -> None:
+    before = run(graph_with(), {})[-1]
+    T = before.T_world_ego
+    assert abs(np.sin(T.yaw_rad)) > 0.05  # the line is not the ego's own x axis
+    line = Line(T.y_m + 0.2, T.yaw_rad - 0.02, (0.05, 0.01))
+    after = run(graph_with(LaneLine()), {LOG[-1].frame_id: (line,)})[-1]
+    J = np.array([[np.sin(T.yaw_rad), np.cos(T.yaw_rad), 0.0], [0.0, 0.0, 1.0]])
+    assert_is(after, updated(before, J, np.array([0.2, -0.02]), np.diag(np.square(line.sigmas))))
+
+
+def test_unit_vectors_may_be_given_as_a_jacobian() -> None:
+    """The way by rows of P, and that by products with H, are one."""
+
+    class Dense(Gnss):
+        def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
+            term = super().linearise(frame, window)
+            if term is not None:
+                term.jacobian = np.eye(len(window.P))[term.jacobian]
+            return term
+
+    records = {e.frame_id: (fix_at(e, (0.1, 0.1), 0.1),) for e in run(graph_with(), {})}
+    for a, b in zip(run(graph_with(Gnss()), records), run(graph_with(Dense()), records), strict=True):
+        assert a.T_world_ego.between(b.T_world_ego).log() == pytest.approx(np.zeros(3), abs=1e-9)
+        np.testing.assert_allclose(a.cov, b.cov, rtol=1e-6, atol=1e-12)
+
+
+# --- a loop between two poses of the window ---
+
+
+def test_a_loop_puts_the_ego_where_the_earlier_pose_sees_it() -> None:
+    back, sigma = LOG[-4].frame_id, 1e-3
+    plain, looped = graph_with(), graph_with(LoopClosure())
+    run(plain, {})
+    assert plain.window is not None
+    node = plain.window.node_frames.index(back)
+
+    def ego_from_node(graph: PoseGraph) -> SE2:
+        window = graph.window
+        assert window is not None
+        at = window.at[node]
+        return SE2(at.real, at.imag, float(np.angle(window.heading[node]))).inverse()
+
+    measured = ego_from_node(plain) @ SE2(0.05, -0.02, 0.004)
+    run(looped, {LOG[-1].frame_id: (Loop(back, measured, sigma),)})
+    gap = ego_from_node(looped).between(measured)
+    assert np.abs(gap.log()).max() < 0.2 * 0.05
+    rows = StateLayout.node(node)
+    P, R = plain.window.P[rows, rows], (sigma**2 + 1e-8) * np.eye(3)
+    assert looped.window is not None
+    np.testing.assert_allclose(looped.window.P[rows, rows], P - P @ np.linalg.inv(P + R) @ P, rtol=1e-4, atol=1e-10)
+
+
+# --- the list is data ---
+
+
+def test_a_graph_of_odometry_alone_is_dead_reckoning() -> None:
+    config = GraphConfig()
+    graph, pose = PoseGraph(config, WeightsConfig(), factors=[Odometry(config)]), SE2()
+    for m in LOG:
+        pose = pose if m.cc is None else pose @ m.cc.T_from_to
+        assert graph.optimise(m).T_world_ego.between(pose).log() == pytest.approx(np.zeros(3), abs=1e-12)
+        assert graph.outliers == {}
+
+
+def test_two_factors_of_one_name_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"two factors of one name.*GNSS, GNSS"):
+        graph_with(Gnss(), Gnss())
