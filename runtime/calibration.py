@@ -17,12 +17,11 @@ from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.ros.bag import BagTopics
-from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError
+from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.inference import Inference
-from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
+from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded, parsed, recording_uri
 from birdslam.runtime.progress import with_progress
 from birdslam.sources.camera_file import camera_text, load_camera
-from birdslam.sources.opening import frame_size, open_recording
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.sources.speed_file import read_speed_curve
 from birdslam.types import Frame
@@ -52,14 +51,14 @@ def calibrate_drive(
 
     Raises CalibrationError, ConfigurationError, DatasetError.
     """
-    uri = source if source.partition(":")[0] in FILE_SCHEMES else f"kitti:{source}"
+    uri = recording_uri(source)
     topics = configuration.source.topics
     lens, height_m = _lens(given, uri, topics)
-    size = frame_size(uri, topics)
+    size = _frame_size(uri, topics)
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
     recording = _open(uri, lens, height_m, stride, topics)
-    known_height = height_m is not None or lens is None  # KITTI's own cameras stand where sources/kitti.py says
+    known_height = height_m is not None or lens is None  # a recording with a calibration of its own says the height
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     rate_max = msgspec.structs.replace(configuration.source, rate="max")
     configuration = msgspec.structs.replace(configuration, source=rate_max)
@@ -101,25 +100,37 @@ def _lens(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | None,
         return read_intrinsics(given.intrinsics), height_m
     if given.chessboard is not None:
         return from_chessboard(given.chessboard, *given.board, given.square_m), height_m
-    scheme, _, path = uri.partition(":")
-    if scheme == "rosbag":  # its CameraInfo has no height, and /tf_static may lack it: one that has both is not needed
-        from birdslam.sources.rosbag import read_bag_camera
-
-        own = read_bag_camera(Path(path).expanduser(), topics)
-        height_m = height_m or (None if own.mount is None else own.mount.height_m)
-        return Intrinsics(**own.lens._asdict(), source=own.topic), height_m
+    kind, path = _class_and_path(uri)
+    own = kind.own_lens(path, topics)
+    if own is not None:
+        return Intrinsics(**own.lens._asdict(), source=own.source), height_m or own.height_m
     return None, height_m
+
+
+def _class_and_path(uri: str) -> tuple[type[Recording], Path]:
+    scheme, address = parsed(uri)
+    return scheme.load(), Path(address).expanduser()
+
+
+def _frame_size(uri: str, topics: BagTopics) -> tuple[int, int] | None:
+    """(width, height) in pixels of the recording's frames; None where nothing tells it."""
+    kind, path = _class_and_path(uri)
+    try:
+        return kind.frame_size(path, topics)
+    except DatasetError:  # opening it says what is wrong
+        return None
 
 
 def _open(uri: str, lens: Intrinsics | None, height_m: float | None, stride: int, topics: BagTopics) -> Recording:
     if lens is None:
-        recording = open_recording(uri, stride=stride)
+        recording = open_recorded(uri, stride=stride)
         if height_m is not None:
             recording.camera = msgspec.structs.replace(recording.camera, height_m=height_m)
         return recording
     width_px, height_px = lens.width_px, lens.height_px
     if width_px is None or height_px is None:
-        size = frame_size(uri, topics) if uri.startswith(("kitti:", "rosbag:")) else None
+        calibrated = parsed(uri)[0].camera in ("calibration", "intrinsics")  # of a film it could be any size
+        size = _frame_size(uri, topics) if calibrated else None
         if size is None:
             raise DatasetError(f"{lens.source}: does not say for which size of image it is")
         width_px, height_px = size
@@ -137,7 +148,7 @@ def _open(uri: str, lens: Intrinsics | None, height_m: float | None, stride: int
         )
     except ValueError as error:
         raise DatasetError(f"{lens.source}: {error}") from None
-    return open_recording(uri, camera, stride, topics=topics)
+    return open_recorded(uri, camera, stride, topics)
 
 
 def _lengths(recording: Recording, speed_file: Path | None) -> dict[str, KnownLength]:

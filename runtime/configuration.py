@@ -19,6 +19,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.mapping.atlas import AtlasConfig
 from birdslam.perception import ModelError, ModelSpec
 from birdslam.runtime.models import store as model_store
+from birdslam.runtime.schemes import all_schemes, is_live
 from birdslam.runtime.sections import (
     BudgetsConfig,
     DegradationConfig,
@@ -38,9 +39,9 @@ from birdslam.runtime.sections import (
 from birdslam.slam import SlamConfig
 from birdslam.sources.camera_file import load_camera
 from birdslam.sources.recording import DatasetError
+from birdslam.sources.schemes import scheme_of
 
 __all__ = [
-    "FILE_SCHEMES",
     "NO_MODEL",
     "BudgetsConfig",
     "Configuration",
@@ -65,9 +66,7 @@ __all__ = [
 ]
 
 NO_MODEL = "none"  # as --model: no network but those that are named beside it, not the shipped one either
-_USER = re.compile(r"(?<=://)[^/@]*@|(?<=rtsp:)[^/@]*@")
-# Sources that are no cameras; the address of each is a path, relative to the file that names it; `demo` has none
-FILE_SCHEMES = ("kitti", "video", "rosbag", "mcap", "demo")
+_USER = re.compile(r"(?<=://)[^/@]*@")
 
 
 class ConfigurationError(ValueError):
@@ -110,7 +109,7 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     @property
     def live(self) -> bool:
         """Frames come from a camera, not from a file."""
-        return self.source.uri.partition(":")[0] not in FILE_SCHEMES
+        return is_live(self.source.uri)
 
     @property
     def spares(self) -> bool:
@@ -189,8 +188,11 @@ def parse_setting(text: str) -> tuple[str, Any]:
 
 def without_passwords(configuration: Configuration) -> Configuration:
     """With nothing in it that lets anybody in: a camera's address may bear a password."""
-    source = configuration.source
-    return msgspec.structs.replace(configuration, source=msgspec.structs.replace(source, uri=_USER.sub("", source.uri)))
+    uri = _USER.sub("", configuration.source.uri)
+    scheme = scheme_of(uri, all_schemes())
+    if scheme is not None and scheme.address == "network":  # rtsp:NAME:PASSWORD@HOST works without the slashes too
+        uri = f"{scheme.name}:{re.sub(r'^[^/@]*@', '', uri.removeprefix(f'{scheme.name}:'))}"
+    return msgspec.structs.replace(configuration, source=msgspec.structs.replace(configuration.source, uri=uri))
 
 
 def dump(configuration: Configuration) -> dict[str, Any]:
@@ -230,9 +232,9 @@ def _anchor_paths(tree: dict[str, Any], base: Path) -> None:
     anchor(tree.get("source"), "speed", "odometry")
     source = tree.get("source")
     if isinstance(source, dict) and isinstance(source.get("uri"), str):
-        scheme, _, address = source["uri"].partition(":")
-        if address and scheme in FILE_SCHEMES:
-            source["uri"] = f"{scheme}:{base / Path(address).expanduser()}"
+        scheme, address = scheme_of(source["uri"], all_schemes()), source["uri"].partition(":")[2]
+        if scheme is not None and scheme.address == "path" and address:
+            source["uri"] = f"{scheme.name}:{base / Path(address).expanduser()}"
 
 
 def _put_models(tree: dict[str, Any], names: Iterable[str]) -> None:

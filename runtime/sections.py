@@ -20,7 +20,7 @@ Share = Annotated[float, msgspec.Meta(gt=0.0, le=1.0)]
 class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where frames come from, and how fast."""
 
-    uri: str = ""  # kitti:DIR, video:FILE, rosbag:PATH, v4l2:/dev/videoN, rtsp://...
+    uri: str = ""  # where frames come from, as docs/sources.md lists: video:FILE, v4l2:/dev/videoN, ...
     rate: Positive | Literal["max"] | None = None  # Hz; None: by the source's own time stamps; "max": lossless
     stride: PositiveInt = 1  # one frame of a recording in so many
     speed: str = ""  # FILE of the car's own speed over a recording: lines of time in s, speed in m/s; "": none

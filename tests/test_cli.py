@@ -89,7 +89,7 @@ def test_a_model_needs_a_role() -> None:
     [
         (["run"], "no source"),
         (["run", "--source", NOWHERE], "/nowhere/at/all: no such directory"),
-        (["run", "--source", "radar:1"], "source 'radar:1'"),
+        (["run", "--source", "radar:1"], "radar:1: no such source 'radar:'; there are demo"),
         (["run", "missing.toml"], "missing.toml: No such file"),
         (["run", "--source", NOWHERE, "--rate", "fast"], "source.rate"),
         (["run", "--source", NOWHERE, "--set", "slam.colour=1"], "slam.colour: there is no such key"),

@@ -188,8 +188,8 @@ def test_missing_directories_are_named(tmp_path: Path) -> None:
         (f"kitti:{tmp_path / 'none'}", "no such directory"),
         (f"kitti:{tmp_path}", "no KITTI recording"),
         ("kitti:", "expected kitti:DIR"),
-        ("gopher:x", "expected kitti:DIR"),
-        ("nothing", "expected kitti:DIR"),
+        ("gopher:x", "no such source 'gopher:'; there are .*kitti:DIR"),
+        ("nothing", "no such source 'nothing'; there are .*kitti:DIR"),
     ):
         with pytest.raises(DatasetError, match=what):
             open_recording(uri)

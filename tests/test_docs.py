@@ -259,6 +259,11 @@ def test_the_page_of_keys_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> N
     )
 
 
+def test_the_page_of_sources_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sources"]) == 0
+    assert capsys.readouterr().out == (DOCS / "sources.md").read_text(), "birdslam sources > docs/sources.md"
+
+
 def test_every_key_has_a_meaning() -> None:
     without = [key.key for table in configuration_page.sections() for key in table.keys if len(key.meaning.split()) < 2]
     assert without == [], "a comment beside the field says what it means"

@@ -24,9 +24,9 @@ from birdslam.ros.sensor import lens, pixels
 from birdslam.runtime import calibration
 from birdslam.runtime.configuration import load
 from birdslam.runtime.nodes.sources import open_source
-from birdslam.sources.opening import frame_size, open_recording
+from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, Recording
-from birdslam.sources.rosbag import read_bag_camera
+from birdslam.sources.rosbag import RosbagRecording
 from birdslam.sources.rosbag_truth import east_north_up
 from birdslam.trajectory import as_poses, mount_pose
 from birdslam.types import Estimate
@@ -67,7 +67,8 @@ def bag(path: Path, *more: ros.Written, storage: str = "sqlite3") -> str:
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap", "ros1"])
 def test_a_drive_comes_back_from_every_storage(tmp_path: Path, storage: str) -> None:
-    recording = open_recording(bag(tmp_path / ("drive.bag" if storage == "ros1" else "drive"), storage=storage))
+    place = tmp_path / ("drive.bag" if storage == "ros1" else "drive")
+    recording = open_recording(bag(place, storage=storage))
     assert (recording.name, len(recording), recording.rate_hz) == ("drive", 6, pytest.approx(10.0))
     own = recording.camera
     assert (own.fx_px, own.fy_px, own.cx_px, own.cy_px, own.distortion) == (50.0, 51.0, 31.0, 16.5, ())
@@ -78,7 +79,7 @@ def test_a_drive_comes_back_from_every_storage(tmp_path: Path, storage: str) -> 
     for frame, expected in zip(frames, GREYS, strict=True):
         assert np.array_equal(frame.image, expected)
     assert [frame.index for frame in recording.frames(4)] == [4, 5]
-    assert frame_size(f"rosbag:{tmp_path / recording._path.name}") == (WIDTH, HEIGHT)
+    assert RosbagRecording.frame_size(place, BagTopics()) == (WIDTH, HEIGHT)
 
 
 def test_a_single_file_is_a_bag_too(tmp_path: Path) -> None:
@@ -224,8 +225,8 @@ def test_a_camera_without_a_known_place_needs_a_file(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"how high the camera stands.*birdslam calibrate rosbag:.*--height M"):
         open_recording(f"rosbag:{path}")
     assert open_recording(f"rosbag:{path}", CAMERA).camera is CAMERA
-    own = read_bag_camera(path, BagTopics())
-    assert (own.topic, own.mount, own.lens.fx_px) == (CAMERA_INFO, None, 50.0)
+    own = RosbagRecording.own_lens(path, BagTopics())
+    assert (own.source, own.height_m, own.lens.fx_px) == (CAMERA_INFO, None, 50.0)
     wrong = msgspec.structs.replace(CAMERA, width_px=65)
     with pytest.raises(DatasetError, match="are 64x32, but the camera given is for 65x32"):
         open_recording(f"rosbag:{path}", wrong)

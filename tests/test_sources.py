@@ -188,7 +188,7 @@ def test_distortion_is_taken_out_on_the_way() -> None:
     ("overrides", "message"),
     [
         ({}, "no source: give --source"),
-        ({"source.uri": "lidar:x"}, "source 'lidar:x': expected kitti:DIR"),
+        ({"source.uri": "lidar:x"}, r"no such source 'lidar:'; there are demo, .*, v4l2:"),
         ({"source.uri": "v4l2:/dev/none"}, "needs a camera file"),
     ],
 )

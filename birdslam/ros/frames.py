@@ -1,4 +1,4 @@
-"""Static transforms of a bag (/tf_static, REP-105), and where they put the camera over the road."""
+"""Static transforms of a bag (/tf_static, REP-105), and the camera's mount over the road by them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ON_THE_ROAD = ("base_footprint", "base_link")
 
 
 class StaticFrames:
-    """Which frame stands where in another, for all time."""
+    """The static transforms between a bag's frames."""
 
     def __init__(self, bag: Bag) -> None:
         self._from_parent: dict[str, tuple[str, Transform]] = {}
@@ -50,7 +50,10 @@ class StaticFrames:
         return out
 
     def mount(self, camera: str) -> GroundPlane | None:
-        """The optical frame `camera` over the road; None where nothing says it. Raises ValueError for no such place."""
+        """The optical frame `camera` over the road; None where no transform reaches it.
+
+        Raises ValueError where no camera of a car is mounted so.
+        """
         found = ((base, self.find(base, camera)) for base in ON_THE_ROAD)
         base, T_base_cam = next(((base, pose) for base, pose in found if pose is not None), ("", None))
         if T_base_cam is None:
@@ -71,7 +74,7 @@ def _matrix(transform: Any) -> Transform:
     t, q = transform.translation, transform.rotation
     out = np.eye(4)
     if not np.isfinite([t.x, t.y, t.z, q.x, q.y, q.z, q.w]).all() or not any((q.x, q.y, q.z, q.w)):
-        out[:] = np.nan  # no turn: the place that rests on it is refused
+        out[:] = np.nan  # no rotation: `mount` refuses what rests on it
         return out
     out[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
     out[:3, 3] = t.x, t.y, t.z

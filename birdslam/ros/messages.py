@@ -1,19 +1,9 @@
-"""Our records as ROS messages, for whoever makes the messages: rosbags in an export, rclpy in a node.
+"""Our records as ROS messages, made by rosbags in an export or by rclpy in a node; docs/ros.md lists the topics.
 
-| topic                       | message                         | what                                                 |
-|-----------------------------|---------------------------------|-------------------------------------------------------|
-| /birdslam/odometry          | nav_msgs/Odometry               | the ego in `odom`; its motion since the last frame   |
-| /birdslam/path              | nav_msgs/Path                   | the whole way, at the end                            |
-| /birdslam/vehicles          | vision_msgs/Detection3DArray    | all vehicles that are followed: boxes, poses         |
-| /birdslam/vehicles/odometry | nav_msgs/Odometry               | each of them: pose and velocity with covariance      |
-| /birdslam/lanes             | visualization_msgs/MarkerArray  | points of lane lines that the map gained             |
-| /tf, /tf_static             | tf2_msgs/TFMessage              | odom -> base_link; base_link -> camera_optical_frame |
-| /diagnostics                | diagnostic_msgs/DiagnosticArray | the statuses of each estimate                        |
-
-Axes are REP-103's as everywhere in types.py. REP-105: `odom` is our world, which goes on where a new epoch begins (the
-car is put where the last one ended: nothing is known of the motion between); `base_link` is ego, the camera's foot on
-the road. Our covariances lie in the body's own axes, ROS has those of a pose in the axes of the frame that it is given
-in, those of a twist in the child's. What is not estimated has the variance UNKNOWN.
+Axes are REP-103's as everywhere in types.py. REP-105: `odom` is our world, continued where a new epoch begins (at the
+pose where the last one ended: the motion between is unknown); `base_link` is ego, the camera's foot on the road. Our
+covariances are in the body's own axes; ROS has those of a pose in the axes of the parent frame, those of a twist in
+the child's. What is not estimated has the variance UNKNOWN.
 """
 
 from __future__ import annotations
@@ -35,7 +25,7 @@ Floats = NDArray[np.float64]
 Sent = tuple[str, Any]  # topic, message
 
 ODOM, BASE, CAMERA = "odom", "base_link", "camera_optical_frame"
-UNKNOWN = 1e6  # variance of what nobody estimates
+UNKNOWN = 1e6  # variance of what is not estimated
 VEHICLE_HEIGHT_M = 1.5  # of boxes; no height is estimated
 LANE_WIDTH_M = 0.15  # drawn
 PLANE = (0, 1, 5)  # x, y and yaw among ROS' six: x, y, z, about x, about y, about z
@@ -48,20 +38,20 @@ class Make(Protocol):
 
 
 class RosMessages:
-    """Of one drive, in order: it remembers where the last epoch ended and, where `keeps_way`, all of the way."""
+    """Of one drive, in order: it remembers where the last epoch ended and, with `keep_path`, all poses."""
 
-    def __init__(self, make: Make, camera: Camera, name: str, keeps_way: bool = False) -> None:
+    def __init__(self, make: Make, camera: Camera, name: str, keep_path: bool = False) -> None:
         self._make, self._camera, self._name = make, camera, name
         self._T_odom_world = SE2()
         self._last: tuple[Estimate, SE2] | None = None  # and T_odom_ego
-        self._keeps_way = keeps_way
-        self._way: list[tuple[int, Transform]] = []
+        self._keep_path = keep_path
+        self._path: list[tuple[int, Transform]] = []
         self._markers: Counter[str] = Counter()
 
     def fixed(self, t_ns: int) -> Sent:
-        """Where the camera stands on the car."""
-        stands = self._transform(BASE, CAMERA, mount_pose(self._camera.ground), t_ns)
-        return "/tf_static", self._make("tf2_msgs/msg/TFMessage", transforms=[stands])
+        """The camera's mount on the car."""
+        mount = self._transform(BASE, CAMERA, mount_pose(self._camera.ground), t_ns)
+        return "/tf_static", self._make("tf2_msgs/msg/TFMessage", transforms=[mount])
 
     def of_estimate(self, estimate: Estimate, t_ns: int, motion: EgoEdge | None = None) -> Iterator[Sent]:
         """One frame; `motion` is the ego's since the frame before, as it was measured."""
@@ -71,10 +61,10 @@ class RosMessages:
         T_odom_ego = self._T_odom_world @ estimate.T_world_ego
         pose = ego_pose(T_odom_ego, estimate.attitude)
         self._last = estimate, T_odom_ego
-        if self._keeps_way:
-            self._way.append((t_ns, pose))
+        if self._keep_path:
+            self._path.append((t_ns, pose))
         yield "/tf", self._make("tf2_msgs/msg/TFMessage", transforms=[self._transform(ODOM, BASE, pose, t_ns)])
-        cov = _turned(np.reshape(estimate.cov, (3, 3)), T_odom_ego.yaw_rad)
+        cov = _rotated(np.reshape(estimate.cov, (3, 3)), T_odom_ego.yaw_rad)
         twist, twist_cov = _twist(estimate, before, T_odom_ego, motion)
         yield "/birdslam/odometry", self._odometry(BASE, pose, cov, twist, twist_cov, t_ns)
         yield "/birdslam/vehicles", self._detections(estimate, t_ns)
@@ -83,7 +73,7 @@ class RosMessages:
         yield "/diagnostics", self._diagnostics(estimate, t_ns)
 
     def of_map(self, update: MapUpdate, t_ns: int) -> Iterator[Sent]:
-        """The lane points that the map gained, one marker a lane; those of an epoch that is over have no place."""
+        """The lane points that the map gained, one marker a lane; none of an epoch that is over."""
         if not update.lanes_m or self._last is None or update.epoch != self._last[0].epoch:
             return
         lanes: dict[int, list[Any]] = {}
@@ -95,19 +85,19 @@ class RosMessages:
         yield "/birdslam/lanes", self._make("visualization_msgs/msg/MarkerArray", markers=markers)
 
     def path(self) -> Iterator[Sent]:
-        """The whole way, when the drive is over; nothing where it is not kept."""
-        if self._way:
+        """The whole path, when the drive is over; nothing without `keep_path`."""
+        if self._path:
             poses = [
                 self._make("geometry_msgs/msg/PoseStamped", header=self._header(ODOM, t_ns), pose=self._pose(pose))
-                for t_ns, pose in self._way
+                for t_ns, pose in self._path
             ]
-            header = self._header(ODOM, self._way[-1][0])
+            header = self._header(ODOM, self._path[-1][0])
             yield "/birdslam/path", self._make("nav_msgs/msg/Path", header=header, poses=poses)
 
     def _vehicle(self, vehicle: VehicleEstimate, z_m: float, t_ns: int) -> Any:
         T_odom_vehicle = self._T_odom_world @ vehicle.T_world_vehicle
         pose = ego_pose(T_odom_vehicle, Attitude(z_m=z_m))
-        cov = _turned(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
+        cov = _rotated(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
         c, s = math.cos(vehicle.T_world_vehicle.yaw_rad), math.sin(vehicle.T_world_vehicle.yaw_rad)
         R_vehicle_world = np.array([[c, s], [-s, c]])
         vx, vy = (R_vehicle_world @ vehicle.velocity_mps).tolist()
@@ -122,7 +112,7 @@ class RosMessages:
             z_m = estimate.attitude.z_m
             foot = self._pose(ego_pose(T_odom_vehicle, Attitude(z_m=z_m)))
             middle = self._pose(ego_pose(T_odom_vehicle, Attitude(z_m=z_m + VEHICLE_HEIGHT_M / 2.0)))
-            cov = _turned(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
+            cov = _rotated(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
             hypothesis = self._make(
                 "vision_msgs/msg/ObjectHypothesisWithPose",
                 hypothesis=self._make("vision_msgs/msg/ObjectHypothesis", class_id=vehicle.label, score=1.0),
@@ -139,7 +129,7 @@ class RosMessages:
         return self._make("vision_msgs/msg/Detection3DArray", header=header, detections=detections)
 
     def _diagnostics(self, estimate: Estimate, t_ns: int) -> Any:
-        said = ", ".join(status.value for status in estimate.status)
+        statuses = ", ".join(status.value for status in estimate.status)
         values = {
             "frame_id": estimate.frame_id,
             "epoch": estimate.epoch,
@@ -151,7 +141,7 @@ class RosMessages:
         status = self._make(
             "diagnostic_msgs/msg/DiagnosticStatus",
             name="birdslam: estimate",
-            message=said or "ok",
+            message=statuses or "ok",
             hardware_id=self._name,
             values=[self._make("diagnostic_msgs/msg/KeyValue", key=key, value=str(v)) for key, v in values.items()],
         )
@@ -226,7 +216,7 @@ def _twist(
     return (step.x_m / dt_s, step.y_m / dt_s, step.yaw_rad / dt_s), unknown
 
 
-def _turned(cov: Floats, yaw_rad: float) -> Floats:
+def _rotated(cov: Floats, yaw_rad: float) -> Floats:
     """A covariance (3, 3) of a body's own axes in those of the frame in which it has this yaw."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

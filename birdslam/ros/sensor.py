@@ -1,4 +1,4 @@
-"""ROS messages of sensors in our own terms: images, cameras, speeds.
+"""Images, camera calibrations and speeds of ROS messages as our own records.
 
 After the definitions of sensor_msgs and geometry_msgs, and sensor_msgs/image_encodings.hpp.
 """
@@ -77,7 +77,7 @@ def pixels(image: Any) -> NDArray[np.uint8]:
 def lens(info: Any, rectified: bool) -> Lens:
     """Of a sensor_msgs/CameraInfo: of the raw image (K, D), or of the rectified one (P). Raises ValueError.
 
-    CameraInfo speaks of the full sensor: binning and region of interest say which part of it the image is.
+    CameraInfo is of the full sensor: binning and region of interest say which part of it the image is.
     """
     P, K, D = (np.array(_field(info, name), dtype=np.float64) for name in ("p", "k", "d"))
     fx, fy, cx, cy = (P[0], P[5], P[2], P[6]) if rectified else (K[0], K[4], K[2], K[5])
@@ -113,12 +113,15 @@ def is_rectified(topic: str) -> bool:
     return any(part.startswith("image_rect") for part in topic.split("/"))
 
 
-def speed(message: Any, t_ns: int, sigma_mps: float, yaw_rate_sigma_radps: float, turns: bool) -> SpeedReading:
-    """Of a message of one of SPEEDS; the sigmas hold where it has no covariance; not `turns`: no yaw rate is told."""
+def speed(message: Any, t_ns: int, sigma_mps: float, yaw_rate_sigma_radps: float, has_yaw_rate: bool) -> SpeedReading:
+    """Of a message of one of SPEEDS. The sigmas hold where it has no covariance.
+
+    The yaw rate is None unless `has_yaw_rate`.
+    """
     twist, cov = message.twist, None
     if hasattr(twist, "covariance"):
         twist, cov = twist.twist, twist.covariance
-    yaw_rate = float(twist.angular.z) if turns else None
+    yaw_rate = float(twist.angular.z) if has_yaw_rate else None
     return SpeedReading(
         t_ns=t_ns,
         speed_mps=float(twist.linear.x),
@@ -135,7 +138,7 @@ def yaw_rate(message: Any) -> float:
 
 
 def _sigma(cov: Any, index: int, otherwise: float) -> float:
-    """Zero and negative variances are ROS's way to say that nobody knows."""
+    """A variance that is zero or negative means unknown in ROS."""
     variance = 0.0 if cov is None else float(cov[index])
     return math.sqrt(variance) if math.isfinite(variance) and variance > 0.0 else otherwise
 

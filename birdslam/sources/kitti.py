@@ -1,13 +1,4 @@
-"""KITTI recordings: where the parts of a recording lie, and how they are read (Geiger et al., 2012 and 2013).
-
-A layout is known by what stands in the directory DIR (N is the sequence, R the root of all):
-
-| layout   | DIR          | images        | calibration             | times                   | truth             |
-|----------|--------------|---------------|-------------------------|-------------------------|-------------------|
-| odometry | sequences/N  | image_0, or 2 | calib.txt               | times.txt               | ../../poses/N.txt |
-| tracking | R/image_02/N | in DIR        | R/calib/N.txt           | -                       | R/pose_cam0/N.txt |
-| raw      | DATE/DRIVE   | image_02/data | ../calib_cam_to_cam.txt | image_02/timestamps.txt | -                 |
-| clip     | any          | image_02      | calib.txt               | times.txt               | pose_cam0.txt     |
+"""KITTI recordings (Geiger et al., 2012 and 2013): `find_layout` says where their parts lie; how they are read.
 
 Everything here raises DatasetError, which names the path and what is wrong with it. Times, poses and images belong
 together by the image's number: a number missing in the middle is an unreadable frame, never a shift. Where no times
@@ -27,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
+from birdslam.ros.bag import BagTopics
 from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.trajectory import read_kitti
 from birdslam.types import NS_PER_S
@@ -51,7 +43,17 @@ class Layout:
 
 
 def find_layout(directory: Path) -> Layout:
-    """The layout of a recording, by what stands in its directory."""
+    """The layout of a recording, by what stands in its directory DIR (N is the sequence, R the root of all).
+
+    | layout   | DIR          | images        | calibration             | times                   | truth             |
+    |----------|--------------|---------------|-------------------------|-------------------------|-------------------|
+    | odometry | sequences/N  | image_0, or 2 | calib.txt               | times.txt               | ../../poses/N.txt |
+    | tracking | R/image_02/N | in DIR        | R/calib/N.txt           | -                       | R/pose_cam0/N.txt |
+    | raw      | DATE/DRIVE   | image_02/data | ../calib_cam_to_cam.txt | image_02/timestamps.txt | -                 |
+    | clip     | any          | image_02      | calib.txt               | times.txt               | pose_cam0.txt     |
+
+    Raises DatasetError.
+    """
     if not directory.is_dir():
         raise DatasetError(f"{directory}: {'is no directory' if directory.exists() else 'no such directory'}")
     directory = directory.resolve()
@@ -127,16 +129,17 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
     return image  # type: ignore[return-value]
 
 
-def image_size(directory: Path) -> tuple[int, int]:
-    """(width, height) in pixels of a recording's images. Raises DatasetError where none can be read."""
-    folder = find_layout(directory).images
-    for path in find_images(folder).values():
+def first_image_size(folder: Path, images: dict[int, Path]) -> tuple[Path, tuple[int, int]]:
+    """The first image that can be read, and its (width, height) in pixels. Raises DatasetError where none can be."""
+    reason = ""
+    for path in images.values():
         try:
             height_px, width_px = read_image(path).shape[:2]
-        except ValueError:
-            continue
-        return width_px, height_px
-    raise DatasetError(f"{folder}: none of its images can be read")
+        except ValueError as error:
+            reason = reason or f"{path.name}: {error}"
+        else:
+            return path, (width_px, height_px)
+    raise DatasetError(f"{folder}: none of its images can be read ({reason})")
 
 
 def _read_lines(path: Path) -> list[str]:
@@ -188,7 +191,7 @@ def read_times(path: Path) -> list[int]:
 
 
 class KittiRecording(Recording):
-    """A KITTI recording in one of the layouts of this module's table."""
+    """A KITTI recording in one of the layouts of `find_layout`."""
 
     def __init__(self, directory: Path, camera: Camera | None = None, stride: int = 1) -> None:
         layout = self._layout = find_layout(directory)
@@ -209,17 +212,15 @@ class KittiRecording(Recording):
             if len(self._t_ns) > 1:
                 self.rate_hz = NS_PER_S / float(np.median(np.diff(self._t_ns)))
 
+    @classmethod
+    def frame_size(cls, path: Path, topics: BagTopics) -> tuple[int, int]:
+        """Of the first image that can be read. Raises DatasetError."""
+        folder = find_layout(path).images
+        return first_image_size(folder, find_images(folder))[1]
+
     def _open_camera(self, camera: Camera | None) -> Camera:
         """The camera given, or the recording's own; either must fit the first image that can be read."""
-        reason = ""
-        for path in self._images.values():
-            try:
-                height_px, width_px = read_image(path).shape[:2]
-                break
-            except ValueError as error:
-                reason = reason or f"{path.name}: {error}"
-        else:
-            raise DatasetError(f"{self._layout.images}: none of its images can be read ({reason})")
+        path, (width_px, height_px) = first_image_size(self._layout.images, self._images)
         if camera is not None:
             if (camera.width_px, camera.height_px) != (width_px, height_px):
                 raise DatasetError(

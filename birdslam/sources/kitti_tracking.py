@@ -63,9 +63,9 @@ class TrackingSequence:
         return list(self.labels[first : bisect_right(self.labels, frame, lo=first, key=lambda label: label.frame)])
 
     def ego_truth(self, first: int) -> list[SE2]:
-        """`T_world_ego` of every frame; world is the ego at frame `first`, laid on its level plane."""
+        """`T_world_ego` of every frame; world is the ego at frame `first`, projected to its level plane."""
         poses = self.camera_poses
-        return [_laid_down(pose) for pose in inverse(poses[first]) @ poses]
+        return [_in_bird_view(pose) for pose in inverse(poses[first]) @ poses]
 
     def vehicle_truth(self, label: Label, first: int) -> SE2:
         """`T_world_vehicle` of a label in the same world."""
@@ -73,11 +73,11 @@ class TrackingSequence:
         T_cam0_vehicle[:3, :3] = Rotation.from_euler("y", label.rotation_y_rad + math.pi / 2.0).as_matrix()  # z ahead
         T_cam0_vehicle[:3, 3] = label.place_m
         poses = inverse(self.T_cam0_camera) @ inverse(self.poses[first]) @ self.poses[label.frame]
-        return _laid_down(poses @ T_cam0_vehicle)
+        return _in_bird_view(poses @ T_cam0_vehicle)
 
 
-def _laid_down(T_first_i: Transform) -> SE2:
-    """A pose in camera axes, seen from above."""
+def _in_bird_view(T_first_i: Transform) -> SE2:
+    """A pose in camera axes, projected to the ground plane."""
     forward = T_first_i[:3, 2]
     return SE2(float(T_first_i[2, 3]), float(-T_first_i[0, 3]), math.atan2(-forward[0], forward[2]))
 

@@ -1,4 +1,4 @@
-"""Somebody else's odometry beside a recording, as a text file: TUM lines with times, or KITTI rows, one a frame.
+"""Another odometry's trajectory of a recording, as a text file: TUM lines with times, or KITTI rows, one a frame.
 
 TUM lines are `t[s] x y z qx qy qz qw` by the recording's clock, what ORB-SLAM and evo write; KITTI rows are (3, 4)
 row-major. Both are metric: a monocular SLAM's has to be scaled before.
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from birdslam.geometry.timed_poses import TimedPoses
-from birdslam.sources.recording import DatasetError, Recording
+from birdslam.sources.recording import DatasetError, Recording, check_times
 from birdslam.trajectory import as_poses, read_kitti, read_tum
 from birdslam.types import NS_PER_S
 
@@ -53,20 +53,11 @@ def check_odometry(recording: Recording, path: Path, stride: int = 1) -> None:
         if len(trajectory.poses) != len(recording):
             raise DatasetError(f"{path}: {len(trajectory.poses)} poses for {len(recording)} frames of {recording.name}")
         return
-    first = next(iter(recording.frames()), None)
-    if first is None:
-        return
-    length_ns = round(len(recording) / recording.rate_hz * NS_PER_S) if len(recording) else int(trajectory.t_ns[-1])
-    begin, end = first.t_source_ns, first.t_source_ns + length_ns
-    if trajectory.t_ns[-1] < begin or trajectory.t_ns[0] > end:
-        told = " to ".join(f"{t / NS_PER_S:g}" for t in (trajectory.t_ns[0], trajectory.t_ns[-1]))
-        raise DatasetError(
-            f"{path}: its times {told} s lie outside the recording's, {begin / NS_PER_S:g} to {end / NS_PER_S:g} s"
-        )
+    check_times(recording, path, int(trajectory.t_ns[0]), int(trajectory.t_ns[-1]))
 
 
 def _width(path: Path) -> int:
-    """Numbers in the first line that holds any; 0: none does, or it can't be read (which the readers tell)."""
+    """Numbers in the first line that holds any; 0: none does, or it can't be read (which the readers report)."""
     try:
         lines = path.read_text(encoding="ascii").splitlines()
     except (OSError, UnicodeDecodeError):

@@ -1,4 +1,4 @@
-"""Recorded drives by their URI: KITTI's layouts, video files, ROS bags, and the drive that ships with birdslam."""
+"""Recorded drives by their URI, as the table in schemes.py says."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from pathlib import Path
 
 from birdslam.geometry.camera import Camera
 from birdslam.ros.bag import BagTopics
-from birdslam.sources.kitti import KittiRecording, image_size
+from birdslam.sources import schemes
 from birdslam.sources.recording import DatasetError, Recording
-from birdslam.sources.shipped_drive import DemoRecording
+from birdslam.sources.schemes import Scheme, parse
 from birdslam.sources.speed_file import with_speeds
-from birdslam.sources.video import VideoRecording, video_size
 
 
 def open_recording(
@@ -20,48 +19,30 @@ def open_recording(
     speeds: Path | None = None,
     topics: BagTopics = BagTopics(),  # noqa: B008
 ) -> Recording:
-    """Open `kitti:DIR`, `video:FILE`, `rosbag:PATH` or `demo`, the drive that ships with birdslam, every `stride`-th
-    frame of it; `demo:DIR` is another drive of the built-in world.
+    """Open every `stride`-th frame of a recording by its URI: `video:FILE`, or any other of `schemes.RECORDED`.
 
-    `camera` goes before the recording's own calibration. `speeds` is a file of the car's own speed over the drive
+    `camera` replaces the recording's own calibration. `speeds` is a file of the car's own speed over the drive
     (sources/speed_file.py). `topics` says which of a ROS bag are read.
 
     Raises DatasetError where it can't be used.
     """
+    try:
+        scheme, address = parse(uri, schemes.RECORDED)
+    except ValueError as error:
+        raise DatasetError(str(error)) from None
+    return open_address(scheme, address, camera, stride, speeds, topics)
+
+
+def open_address(
+    scheme: Scheme, address: str, camera: Camera | None, stride: int, speeds: Path | None, topics: BagTopics
+) -> Recording:
+    """`open_recording` of a URI that is parsed, for any scheme that is recorded."""
+    uri = f"{scheme.name}:{address}" if address else scheme.name
     if stride < 1:
         raise DatasetError(f"{uri}: the stride must be 1 or more, got {stride}")
-    recording = _open(uri, camera, stride, topics)
-    return recording if speeds is None else with_speeds(recording, speeds)
-
-
-def _open(uri: str, camera: Camera | None, stride: int, topics: BagTopics) -> Recording:
-    scheme, _, rest = uri.partition(":")
-    if scheme == "demo" and not rest:
-        return DemoRecording(camera, stride)
-    if not rest or scheme not in ("kitti", "video", "demo", "rosbag"):
-        raise DatasetError(f"{uri}: no recording; expected kitti:DIR, video:FILE, rosbag:PATH, demo or demo:DIR")
-    path = Path(rest).expanduser()
-    if scheme == "rosbag":
-        from birdslam.sources.rosbag import RosbagRecording  # only where it is needed: scipy's rotations come with it
-
-        return RosbagRecording(path, camera, stride, topics)
-    if topics != BagTopics():
+    if "topics" in scheme.refused and topics != BagTopics():
         raise DatasetError(f"{uri}: topics are of ROS bags (rosbag:PATH), and this is none")
-    if scheme == "demo":
-        return DemoRecording(camera, stride, path)
-    return KittiRecording(path, camera, stride) if scheme == "kitti" else VideoRecording(path, camera, stride)
-
-
-def frame_size(uri: str, topics: BagTopics = BagTopics()) -> tuple[int, int] | None:  # noqa: B008
-    """(width, height) in pixels of the frames of `kitti:DIR`, `video:FILE` or `rosbag:PATH`; None where they say
-    nothing of it."""
-    scheme, _, rest = uri.partition(":")
-    path = Path(rest).expanduser()
-    try:
-        if scheme == "rosbag":
-            from birdslam.sources.rosbag import bag_image_size
-
-            return bag_image_size(path, topics)
-        return image_size(path) if scheme == "kitti" else video_size(path) if scheme == "video" else None
-    except DatasetError:  # opening it says what is wrong
-        return None
+    more = {"topics": topics} if "topics" in scheme.options else {}
+    place = (Path(address).expanduser(),) if address else ()
+    recording: Recording = scheme.load()(*place, camera=camera, stride=stride, **more)
+    return recording if speeds is None else with_speeds(recording, speeds)

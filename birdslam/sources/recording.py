@@ -5,13 +5,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera, Undistorter
+from birdslam.ros.bag import BagTopics
+from birdslam.ros.sensor import Lens
 from birdslam.sources.speed_log import SpeedLog
-from birdslam.types import Frame, SpeedReading, Status
+from birdslam.types import NS_PER_S, Frame, SpeedReading, Status
 
 
 class DatasetError(ValueError):
@@ -29,6 +33,14 @@ class RecordedFrame:
     speeds: tuple[SpeedReading, ...] = ()  # as in `Frame`
 
 
+class OwnLens(NamedTuple):
+    """The intrinsics that a recording states; `height_m` is None where it does not say how high the camera stands."""
+
+    source: str  # what in it states them
+    lens: Lens
+    height_m: float | None
+
+
 class Recording(ABC):
     """A recorded drive of one camera: its name, its camera, and its frames a second (nominal, after the stride).
 
@@ -38,7 +50,20 @@ class Recording(ABC):
     name: str
     camera: Camera
     rate_hz: float
-    speeds: SpeedLog | None = None  # the car's own, of a file beside it: they go before those that it has itself
+    speeds: SpeedLog | None = None  # the car's own, of a file beside it: they replace the recording's own
+
+    @classmethod
+    def frame_size(cls, path: Path, topics: BagTopics) -> tuple[int, int] | None:
+        """(width, height) in pixels of the recording at `path`, found without a camera; None where it can't be.
+
+        Raises DatasetError.
+        """
+        return None
+
+    @classmethod
+    def own_lens(cls, path: Path, topics: BagTopics) -> OwnLens | None:
+        """The intrinsics of a recording that may lack the camera's height; None of any other. Raises DatasetError."""
+        return None
 
     @abstractmethod
     def __len__(self) -> int:
@@ -49,15 +74,15 @@ class Recording(ABC):
         """Every frame in order, from index `start` on; an unreadable one has no image, and the iteration goes on."""
 
     def frames_with_speeds(self, start: int = 0) -> Iterator[RecordedFrame]:
-        """`frames`, each with what the car had said of its speed by then."""
+        """`frames`, each with the speed readings that had arrived by then."""
         for frame in self.frames(start) if start else self.frames():
             yield frame if self.speeds is None else replace(frame, speeds=self.speeds.until(frame.t_source_ns))
 
     def undistorted_frames(self) -> Iterator[Frame]:
         """Every frame in order, numbered from 0, for a program of one process.
 
-        An unreadable one has no image and says so in its status. Captured, so to say, when the recording says:
-        `t_capture_ns` is `t_source_ns`, and UTC is not known (0).
+        An unreadable one has no image and says so in its status. `t_capture_ns` is `t_source_ns`, and UTC is
+        unknown (0).
         """
         undistort = Undistorter(self.camera)
         for frame_id, recorded in enumerate(self.frames_with_speeds()):
@@ -72,6 +97,20 @@ class Recording(ABC):
     def T_cam0_cam(self) -> NDArray[np.float64]:
         """(4, 4) this camera in the axes of camera 0, whose poses the truth gives: the lever arm between the two."""
         return np.eye(4)
+
+
+def check_times(recording: Recording, path: Path, first_ns: int, last_ns: int) -> None:
+    """Raises DatasetError where a file's times all lie outside the recording's: then they are of another clock."""
+    first = next(iter(recording.frames()), None)
+    if first is None:
+        return
+    length_ns = round(len(recording) / recording.rate_hz * NS_PER_S) if len(recording) else last_ns
+    begin_ns, end_ns = first.t_source_ns, first.t_source_ns + length_ns
+    if last_ns < begin_ns or first_ns > end_ns:
+        raise DatasetError(
+            f"{path}: its times {first_ns / NS_PER_S:g} to {last_ns / NS_PER_S:g} s lie outside the recording's, "
+            f"{begin_ns / NS_PER_S:g} to {end_ns / NS_PER_S:g} s"
+        )
 
 
 def undistorted(undistort: Undistorter, recorded: RecordedFrame) -> tuple[NDArray[np.uint8] | None, str | None]:

@@ -20,13 +20,13 @@ from birdslam.ros.bag import Bag, BagError, BagMessage, BagTopics, stamp_ns
 from birdslam.ros.frames import StaticFrames
 from birdslam.ros.sensor import CAMERA_INFO, IMAGES, SPEEDS, Lens, is_rectified, lens, pixels, speed, yaw_rate
 from birdslam.sources.kitti import decode_image
-from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
+from birdslam.sources.recording import DatasetError, OwnLens, RecordedFrame, Recording
 from birdslam.sources.rosbag_truth import truth_rows
 from birdslam.sources.speed_file import SIGMA_MPS, YAW_RATE_SIGMA_RADPS
 from birdslam.sources.speed_log import SpeedLog
 from birdslam.types import NS_PER_S, SpeedReading
 
-RATED_IMAGES = 30  # of the beginning: the frame rate is the median of their distances in time
+RATED_IMAGES = 30  # the first ones: the median of their intervals gives the frame rate
 
 
 class BagCamera(NamedTuple):
@@ -36,24 +36,6 @@ class BagCamera(NamedTuple):
     frame: str
     lens: Lens
     mount: GroundPlane | None
-
-
-def read_bag_camera(path: Path, topics: BagTopics) -> BagCamera:
-    """The camera of a bag's images. Raises DatasetError."""
-    try:
-        with Bag(path) as bag:
-            return _camera(bag, topics)
-    except BagError as error:
-        raise DatasetError(str(error)) from None
-
-
-def bag_image_size(path: Path, topics: BagTopics) -> tuple[int, int]:
-    """(width, height) in pixels of the first image that can be read. Raises DatasetError."""
-    try:
-        with Bag(path) as bag:
-            return _first_image(bag, _image_topic(bag, topics)).shape[1::-1]
-    except BagError as error:
-        raise DatasetError(str(error)) from None
 
 
 class RosbagRecording(Recording):
@@ -89,6 +71,25 @@ class RosbagRecording(Recording):
         except BagError as error:
             raise DatasetError(str(error)) from None
 
+    @classmethod
+    def frame_size(cls, path: Path, topics: BagTopics) -> tuple[int, int]:
+        """Of the first image that can be read. Raises DatasetError."""
+        try:
+            with Bag(path) as bag:
+                return _first_image(bag, _image_topic(bag, topics)).shape[1::-1]
+        except BagError as error:
+            raise DatasetError(str(error)) from None
+
+    @classmethod
+    def own_lens(cls, path: Path, topics: BagTopics) -> OwnLens:
+        """Of the CameraInfo, with the height of /tf_static. Raises DatasetError."""
+        try:
+            with Bag(path) as bag:
+                found = _camera(bag, topics)
+        except BagError as error:
+            raise DatasetError(str(error)) from None
+        return OwnLens(found.topic, found.lens, None if found.mount is None else found.mount.height_m)
+
     def _own_camera(self, bag: Bag) -> Camera:
         found = _camera(bag, self._topics)
         if found.mount is None:
@@ -120,9 +121,9 @@ class RosbagRecording(Recording):
     def _speeds(self, bag: Bag) -> list[SpeedReading]:
         topic = bag.find(self._topics.speed, *SPEEDS)
         messages = list(bag.messages(topic))
-        turns = any(yaw_rate(message.content) for message in messages)  # zero for ever: nothing measures it
+        has_yaw_rate = any(yaw_rate(message.content) for message in messages)  # all zero: not measured
         return [
-            speed(message.content, self._time_ns(message), SIGMA_MPS, YAW_RATE_SIGMA_RADPS, turns)
+            speed(message.content, self._time_ns(message), SIGMA_MPS, YAW_RATE_SIGMA_RADPS, has_yaw_rate)
             for message in messages
         ]
 

@@ -1,7 +1,7 @@
-"""Where the camera truly was at each frame, by what a bag has of it: nav_msgs/Odometry, or sensor_msgs/NavSatFix.
+"""Ground-truth poses of the camera at each frame, of a bag's nav_msgs/Odometry or sensor_msgs/NavSatFix.
 
-Odometry has whole poses. A satellite's fix is a place: the car is taken to look where it drives, so that of such a
-truth the positions count, after the motion that fits best (`ate_se3_m`), and no angle of a single frame.
+Odometry has whole poses. A GNSS fix is a position: the heading is taken from the course, so that of such a truth the
+positions count, after alignment in SE(3) (`ate_se3_m`), and no single frame's angle.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from birdslam.trajectory import Transform, inverse, mount_pose
 
 Floats = NDArray[np.float64]
 
-COURSE_M = 5.0  # a course is that between two places so far apart: GNSS is some 1 m off; chosen on no data
+COURSE_M = 5.0  # the course is taken between two fixes so far apart: GNSS is some 1 m off; chosen on no data
 WGS84_A_M, WGS84_E2 = 6378137.0, 6.69437999014e-3  # semi-major axis, first eccentricity squared
 
 
@@ -40,7 +40,7 @@ def truth_rows(
     T_world_body = _from_fixes(messages) if fixes else _from_odometry(messages)
     T_body_cam = frames.find(frame, camera_frame) if frame else None
     T_body_cam = mount_pose(mount) if T_body_cam is None else T_body_cam
-    if fixes:  # nothing says how an antenna is turned: it lies level, along the car
+    if fixes:  # the antenna's orientation is unknown: taken as level, along the car
         T_body_cam[:3, :3] = mount.R_ego_cam
     T_world_cam = T_world_body @ T_body_cam
     t_s, at_s = (t_ns - t_ns[0]) / 1e9, (np.array(times_ns) - t_ns[0]) / 1e9

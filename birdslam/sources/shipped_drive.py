@@ -44,7 +44,7 @@ class TrueBody:
     width_m: float
     height_m: float
     velocity_mps: tuple[float, float]  # over the ground, in ego's axes
-    visible: float  # share of its projection inside the image that nothing hides
+    visible: float  # share of its projection inside the image that nothing occludes
     truncated: float  # share of its box that lies outside the image
     box_px: tuple[float, float, float, float]  # of the whole body, clipped to the image
 
@@ -52,7 +52,7 @@ class TrueBody:
 class DemoRecording(Recording):
     """The shipped drive, or another of its kind in `directory`. Raises DatasetError where it can't be read."""
 
-    def __init__(self, camera: Camera | None = None, stride: int = 1, directory: Path = DIRECTORY) -> None:
+    def __init__(self, directory: Path = DIRECTORY, camera: Camera | None = None, stride: int = 1) -> None:
         self.name = NAME if directory == DIRECTORY else directory.name
         path = directory / "drive.npz"
         try:
@@ -91,7 +91,7 @@ class DemoRecording(Recording):
         return Ground(height_m=height_m, pitch_rad=pitch_rad, roll_rad=roll_rad)
 
     def truth_bodies(self, index: int) -> tuple[TrueBody, ...]:
-        """Everybody whose box reaches into the image of a frame, hidden ones too."""
+        """Every body whose box reaches into the image of a frame, occluded ones too."""
         out = []
         for row in self._bodies[self._bodies[:, 0] == index * self._stride].astype(np.float64).tolist():
             _, body, label, x, y, yaw, length, width, height, vx, vy, visible, truncated, *box = row

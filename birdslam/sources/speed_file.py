@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.sources.recording import DatasetError, Recording
+from birdslam.sources.recording import DatasetError, Recording, check_times
 from birdslam.sources.speed_log import SpeedLog
 from birdslam.types import NS_PER_S, SpeedReading
 
-# Where a file says nothing of its noise; chosen on no data: some steps of a wheel sensor's message (often 0.1 km/h),
-# and the offset that a gyroscope of a stability control may keep (0.6 degrees a second).
+# 1-sigma where a file states none; chosen on no data: some steps of a wheel sensor's message (often 0.1 km/h), and
+# the bias of a stability control's gyroscope (0.6 degrees a second).
 SIGMA_MPS = 0.1
 YAW_RATE_SIGMA_RADPS = 0.01
 
@@ -28,9 +28,10 @@ _MOST_S = 9e9  # a time in ns has 63 bits
 
 
 def read_speeds(path: Path) -> SpeedLog:
-    """The readings of a file in its order; those of a sensor that failed (nan, backwards in time) as they are.
+    """The readings of a file in its order, unchecked: the method rejects those of a faulty sensor (NaN, backwards in
+    time).
 
-    The method judges them. Raises DatasetError for a file that can't be read, a line that is none, and an empty file.
+    Raises DatasetError for a file that can't be read, a line that is none, and an empty file.
     """
     readings = [reading for _, reading in _lines(path)]
     if not readings:
@@ -54,26 +55,18 @@ def read_speed_curve(path: Path) -> NDArray[np.float64]:
 
 
 def of_sequence(path: Path, name: str) -> Path:
-    """The speed file of a sequence: in a directory the one of its name."""
+    """The file of a sequence: in a directory NAME.txt."""
     return path / f"{name}.txt" if path.is_dir() else path
 
 
 def with_speeds(recording: Recording, path: Path) -> Recording:
-    """The recording with the car's speeds of a file, which go before its own. Raises DatasetError.
+    """The recording with the car's speeds of a file in place of its own.
 
-    That is also where the file's times lie all outside the recording's: then they are of another clock.
+    Raises DatasetError, also where all the file's times lie outside the recording's: then they are of another clock.
     """
     log = read_speeds(path)
     times = [reading.t_ns for reading in log.readings]
-    first = next(iter(recording.frames()), None)
-    if first is not None:
-        length_ns = round(len(recording) / recording.rate_hz * NS_PER_S) if len(recording) else max(times)
-        begin_s, end_s = first.t_source_ns / NS_PER_S, (first.t_source_ns + length_ns) / NS_PER_S
-        if max(times) < first.t_source_ns or min(times) > first.t_source_ns + length_ns:
-            raise DatasetError(
-                f"{path}: its times {min(times) / NS_PER_S:g} to {max(times) / NS_PER_S:g} s lie outside the "
-                f"recording's, {begin_s:g} to {end_s:g} s"
-            )
+    check_times(recording, path, min(times), max(times))
     recording.speeds = log
     return recording
 

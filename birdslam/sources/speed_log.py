@@ -1,4 +1,4 @@
-"""What the car itself said of its motion over a whole drive, and what of it had come by a frame."""
+"""The car's own speed readings over a drive, and those that had arrived by a frame."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ import msgspec
 
 from birdslam.types import NS_PER_S, SpeedReading
 
-KEPT_NS = NS_PER_S  # a frame bears the readings of so long before it
+KEPT_NS = NS_PER_S  # a frame carries the readings of so long before it
 KEPT_READINGS = 200  # and no more of them: the newest
 _MOST_NS = (1 << 63) - 1
 
 
 class SpeedLog:
-    """The readings of a drive in the order in which they came.
+    """The readings of a drive in the order of their arrival.
 
-    One came at its own time; one that is older than a reading before it came together with that one. So the same
-    frames bear the same readings, whatever the load of the computer.
+    A reading arrives at its own time; one that is older than a reading before it arrives together with that one. So
+    the same frames carry the same readings, whatever the load of the computer.
     """
 
     def __init__(self, readings: Iterable[SpeedReading]) -> None:
         self.readings = tuple(readings)
-        self._come_ns = list(accumulate((reading.t_ns for reading in self.readings), max))
+        self._arrival_ns = list(accumulate((reading.t_ns for reading in self.readings), max))
 
     def until(self, t_ns: int) -> tuple[SpeedReading, ...]:
-        """Those of the last second that had come by `t_ns` (as t_source_ns of a frame), in order of coming."""
-        begin, end = bisect_right(self._come_ns, t_ns - KEPT_NS), bisect_right(self._come_ns, t_ns)
+        """Those of the last second that had arrived by `t_ns` (as t_source_ns of a frame), in order of arrival."""
+        begin, end = bisect_right(self._arrival_ns, t_ns - KEPT_NS), bisect_right(self._arrival_ns, t_ns)
         return self.readings[max(begin, end - KEPT_READINGS) : end]
 
 
 def shifted(reading: SpeedReading, by_ns: int) -> SpeedReading:
-    """By another clock. Whatever its computer may say, the time stays one of 63 bits."""
+    """On another clock, `by_ns` ahead; a time that its sender got wrong is clamped to 63 bits."""
     return msgspec.structs.replace(reading, t_ns=max(-_MOST_NS, min(reading.t_ns + by_ns, _MOST_NS)))
 
 
 def added(before: tuple[SpeedReading, ...], after: tuple[SpeedReading, ...]) -> tuple[SpeedReading, ...]:
-    """What a frame bears beyond the frame before it: of two such spans, those that came between the ends of the two."""
-    was, now = ([msgspec.msgpack.encode(one) for one in span] for span in (before, after))  # a NaN equals itself there
-    both = next(n for n in range(min(len(was), len(now)), -1, -1) if was[len(was) - n :] == now[:n])
-    return after[both:]
+    """The readings of a frame that the frame before it did not carry: `after` without what overlaps `before`."""
+    old, new = ([msgspec.msgpack.encode(one) for one in span] for span in (before, after))  # a NaN equals itself there
+    overlap = next(n for n in range(min(len(old), len(new)), -1, -1) if old[len(old) - n :] == new[:n])
+    return after[overlap:]

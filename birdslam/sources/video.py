@@ -9,21 +9,9 @@ from pathlib import Path
 import cv2
 
 from birdslam.geometry.camera import Camera
+from birdslam.ros.bag import BagTopics
 from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.types import NS_PER_S
-
-
-def video_size(path: Path) -> tuple[int, int]:
-    """(width, height) in pixels, as the container declares. Raises DatasetError where OpenCV can't open it."""
-    if not path.is_file():
-        raise DatasetError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
-    capture = cv2.VideoCapture(str(path))
-    try:
-        if not capture.isOpened():
-            raise DatasetError(f"{path}: is no video that OpenCV can open")
-        return round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-    finally:
-        capture.release()
 
 
 class VideoRecording(Recording):
@@ -32,12 +20,9 @@ class VideoRecording(Recording):
     def __init__(self, path: Path, camera: Camera | None, stride: int = 1) -> None:
         if camera is None:
             raise DatasetError(f"video:{path}: a video knows nothing of its camera: a camera file is needed")
-        if not path.is_file():
-            raise DatasetError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
         self._path, self.camera, self._stride, self.name = path, camera, stride, path.stem
-        capture = self._open()
-        fps, count = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        size = (round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+        capture = _capture(path)
+        fps, count, size = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT), _size(capture)
         capture.release()
         if not (math.isfinite(fps) and 0.0 < fps <= 1000.0):
             raise DatasetError(f"{path}: its container states no usable frame rate ({fps:g})")
@@ -49,18 +34,20 @@ class VideoRecording(Recording):
         self._declared = max(int(count), 0)
         self.rate_hz = fps / stride
 
-    def _open(self) -> cv2.VideoCapture:
-        capture = cv2.VideoCapture(str(self._path))
-        if not capture.isOpened():
-            raise DatasetError(f"{self._path}: is no video that OpenCV can open")
-        return capture
+    @classmethod
+    def frame_size(cls, path: Path, topics: BagTopics) -> tuple[int, int]:
+        """As the container declares. Raises DatasetError where OpenCV can't open it."""
+        capture = _capture(path)
+        size = _size(capture)
+        capture.release()
+        return size
 
     def __len__(self) -> int:
         return -(-self._declared // self._stride)
 
     def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
         """Every frame in order, its time from the container; a file cut off ends with one unreadable frame."""
-        capture = self._open()
+        capture = _capture(self._path)
         try:
             position, index, t_ns = 0, 0, -self._period_ns
             while capture.grab():
@@ -79,3 +66,17 @@ class VideoRecording(Recording):
                 yield RecordedFrame(index, t_ns + self._period_ns, None, error)
         finally:
             capture.release()
+
+
+def _capture(path: Path) -> cv2.VideoCapture:
+    """The film, opened. Raises DatasetError."""
+    if not path.is_file():
+        raise DatasetError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise DatasetError(f"{path}: is no video that OpenCV can open")
+    return capture
+
+
+def _size(capture: cv2.VideoCapture) -> tuple[int, int]:
+    return round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))

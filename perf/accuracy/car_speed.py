@@ -152,11 +152,11 @@ def _open(sequence: str, options: argparse.Namespace) -> Recording:
     camera = None if options.camera is None else load_camera(options.camera)
     rendered = Path(sequence)
     if (rendered / "drive.npz").is_file():
-        recording = DemoRecording(camera, directory=rendered)
+        recording = DemoRecording(rendered, camera)
         recording.name = rendered.resolve().name
         return recording
     if sequence == "demo":
-        return DemoRecording(camera)
+        return DemoRecording(camera=camera)
     return open_recording(uri_of(sequence, options.data), camera)
 
 

@@ -1,4 +1,4 @@
-"""Which drives: directories, bags, recordings, videos, lists of them; each by a name of its own, with its settings."""
+"""The drives of a batch, of paths, URIs, URLs and lists of them; each has a name of its own, and its settings."""
 
 from __future__ import annotations
 
@@ -15,14 +15,11 @@ from typing import Any
 import msgspec
 
 from birdslam.runtime.batch.fetch import is_url
-from birdslam.runtime.configuration import FILE_SCHEMES, ConfigurationError, dump, load, parse_setting
-from birdslam.sources.kitti import find_layout
-from birdslam.sources.recording import DatasetError
+from birdslam.runtime.configuration import ConfigurationError, dump, load, parse_setting
+from birdslam.runtime.schemes import MCAP, all_schemes
+from birdslam.sources.schemes import KITTI, ROSBAG, by_suffix, scheme_at, scheme_of
 
-VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm")
-BAGS = (".bag", ".db3")
 LISTS = (".txt", ".list")
-_MCAP_HEAD = 64  # the profile stands in the first record: ours is "", that of a bag "ros2"
 
 
 class Found(msgspec.Struct, frozen=True):
@@ -54,11 +51,13 @@ def find_drives(arguments: Sequence[str]) -> list[Found]:
 
 
 def _drives(argument: str, base: Path | None = None) -> Iterator[Found]:
-    scheme, colon, address = argument.partition(":")
-    if scheme in FILE_SCHEMES and (colon or scheme == "demo"):
-        if address and not is_url(address):
+    scheme, (_, colon, address) = scheme_of(argument, all_schemes()), argument.partition(":")
+    if scheme is not None and scheme.live and colon:
+        raise ConfigurationError(f"{argument}: is a live camera, and a batch takes recordings")
+    if scheme is not None and (colon or argument in scheme.written):
+        if scheme.address == "path" and address and not is_url(address):
             address = str(((base or Path()) / Path(address).expanduser()).absolute())
-        yield Found(f"{scheme}:{address}" if address else scheme)
+        yield Found(f"{scheme.name}:{address}" if address else scheme.name)
         return
     if is_url(argument):
         yield Found(_uri_of_url(argument))
@@ -73,7 +72,7 @@ def _drives(argument: str, base: Path | None = None) -> Iterator[Found]:
         if inside:
             yield from map(Found, inside)
             return
-    yield Found(uri or f"kitti:{path}")  # opening it says what is wrong
+    yield Found(uri or f"{KITTI.name}:{path}")  # opening it says what is wrong
 
 
 def _listed(path: Path) -> Iterator[Found]:
@@ -95,36 +94,17 @@ def _listed(path: Path) -> Iterator[Found]:
 
 
 def _uri(path: Path) -> str | None:
-    """Of a drive by what lies there; None where that is none."""
-    suffix = path.suffix.lower()
-    if path.is_dir():
-        if (path / "metadata.yaml").is_file():
-            return f"rosbag:{path}"
-        try:
-            find_layout(path)
-        except DatasetError:
-            return None
-        return f"kitti:{path}"
-    if suffix in BAGS or suffix in VIDEOS:
-        return f"{'rosbag' if suffix in BAGS else 'video'}:{path}"
-    if suffix == ".mcap":
-        try:
-            with path.open("rb") as file:
-                head = file.read(_MCAP_HEAD)
-        except OSError:
-            head = b""
-        return f"{'rosbag' if b'ros' in head else 'mcap'}:{path}"
-    return None
+    """Of the source that lies at a path; None where there is none."""
+    scheme = scheme_at(path, all_schemes())
+    return None if scheme is None else f"{scheme.name}:{path}"
 
 
 def _uri_of_url(url: str) -> str:
     """By its name alone. Raises ConfigurationError where that does not say it."""
-    suffix = Path(url).suffix.lower()
-    if suffix in VIDEOS:
-        return f"video:{url}"
-    if suffix in BAGS:
-        return f"rosbag:{url}"
-    raise ConfigurationError(f"{url}: say what it is, as in rosbag:{url} or mcap:{url}")
+    scheme = by_suffix(Path(url), all_schemes())
+    if scheme is None:
+        raise ConfigurationError(f"{url}: say what it is, as in {ROSBAG.name}:{url} or {MCAP.name}:{url}")
+    return f"{scheme.name}:{url}"
 
 
 def sweep(texts: Sequence[str]) -> list[dict[str, Any]]:

@@ -13,7 +13,10 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
 
-SOURCES_NOTE = "Sources: demo, kitti:DIR, video:FILE, rosbag:PATH, mcap:FILE, v4l2:/dev/videoN, rtsp://HOST/PATH."
+from birdslam.runtime.schemes import all_schemes
+from birdslam.sources.schemes import written
+
+SOURCES_NOTE = f"Sources: {written(all_schemes())}."
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,7 @@ COMMANDS = (
             "pages", "print_interface", ""),
     Command("configuration", "print every key with its default: docs/configuration.md",
             "pages", "print_configuration", ""),
+    Command("sources", "print where frames can come from: docs/sources.md", "pages", "print_sources", ""),
     Command("batch",
             "many drives, each through the whole pipeline offline, and one report of all; goes on where it was stopped",
             "drives.batch"),

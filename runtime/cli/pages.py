@@ -1,10 +1,10 @@
-"""`birdslam interface` and `birdslam configuration`: pages of docs/ that are made from the code."""
+"""`birdslam interface`, `birdslam configuration` and `birdslam sources`: pages of docs/ that are made from the code."""
 
 from __future__ import annotations
 
 import argparse
 
-from birdslam.runtime.pages import configuration, interface
+from birdslam.runtime.pages import configuration, interface, sources
 
 
 def print_interface(options: argparse.Namespace) -> int:
@@ -16,4 +16,10 @@ def print_interface(options: argparse.Namespace) -> int:
 def print_configuration(options: argparse.Namespace) -> int:
     """Every key with its default: docs/configuration.md."""
     print(configuration.page(), end="")
+    return 0
+
+
+def print_sources(options: argparse.Namespace) -> int:
+    """Where frames can come from: docs/sources.md."""
+    print(sources.page(), end="")
     return 0

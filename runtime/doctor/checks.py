@@ -21,7 +21,7 @@ from typing import Literal
 from birdslam.perception import ModelError, load_network
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.look_rate import threads_of_a_network
-from birdslam.runtime.nodes.sources import CameraSource, SourceError, open_source
+from birdslam.runtime.nodes.sources import SourceError, open_source
 from birdslam.runtime.process import realtime
 from birdslam.runtime.process.cores import usable_cores
 from birdslam.runtime.topology import NODES
@@ -244,8 +244,7 @@ def _source(configuration: Configuration) -> Iterator[Finding]:
     except StopIteration:
         yield Finding("camera", "error", f"{source.name}: has no frame", "record it anew, or name another source")
         return
-    if isinstance(source, CameraSource):
-        source.close()
+    source.close()
     size = "unreadable" if first.image is None else f"{first.image.shape[1]}x{first.image.shape[0]} px"
     verdict: Verdict = "error" if first.image is None else "ok"
     found = f"{source.name}: {size}, {source.rate_hz:g} Hz"

@@ -8,12 +8,11 @@ import msgspec
 
 from birdslam.outputs.drive_files import claim_directory
 from birdslam.outputs.lane_picture import draw_lanes
-from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, complete
+from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
 from birdslam.runtime.nodes.inference import Inference
-from birdslam.runtime.nodes.sources import RecordedSource, offline_frames
+from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded, recording_uri
 from birdslam.runtime.progress import Progress
 from birdslam.slam import BirdSLAM
-from birdslam.sources.opening import open_recording
 
 
 def draw_frame_lanes(configuration: Configuration, drive: str, frame_id: int | None) -> Path:
@@ -23,8 +22,7 @@ def draw_frame_lanes(configuration: Configuration, drive: str, frame_id: int | N
     """
     lossless = msgspec.structs.replace(configuration.source, rate="max")
     configuration = msgspec.structs.replace(configuration, source=lossless)
-    uri = drive if drive.partition(":")[0] in FILE_SCHEMES else f"kitti:{drive}"
-    recording = open_recording(uri, configuration.camera, configuration.source.stride)
+    recording = open_recorded(recording_uri(drive), configuration.camera, configuration.source.stride)
     frames = len(recording)
     asked = frame_id if frame_id is not None else max(frames - 1, 0)
     if not 0 <= asked < max(frames, 1):

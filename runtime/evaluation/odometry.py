@@ -8,18 +8,14 @@ from pathlib import Path
 
 from birdslam.bench.ego.trajectory_errors import OdometryReport, evaluate_recordings
 from birdslam.runtime.batch.offline import Drive, pipeline
-from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError
+from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.nodes.sources import open_recorded, recording_uri
 from birdslam.runtime.options import speeds_of
 from birdslam.runtime.progress import Progress
 from birdslam.sources.odometry_file import check_odometry
-from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import Recording
 from birdslam.sources.speed_file import of_sequence, with_speeds
 from birdslam.types import Estimate, MapUpdate, Measurements
-
-
-def _uri(text: str) -> str:
-    return text if text.partition(":")[0] in FILE_SCHEMES else f"kitti:{text}"
 
 
 def evaluate_odometry(configuration: Configuration, sequences: Sequence[str], compared: slice) -> list[OdometryReport]:
@@ -31,7 +27,7 @@ def evaluate_odometry(configuration: Configuration, sequences: Sequence[str], co
     if source.frames is not None or source.loop:
         raise ConfigurationError("source.frames, source.loop: evaluate takes whole recordings, once")
     recordings = [
-        open_recording(_uri(text), configuration.camera, source.stride, topics=source.topics) for text in sequences
+        open_recorded(recording_uri(text), configuration.camera, source.stride, source.topics) for text in sequences
     ]
     twice = [name for name, n in Counter(recording.name for recording in recordings).items() if n > 1]
     if twice:

@@ -1,32 +1,33 @@
-"""Frames from recordings and live cameras: opening, pacing, reading ahead, and the one way from pixels to a `Frame`."""
+"""Frames of any source: opening it by its URI, pacing, reading ahead, and the one way from pixels to a `Frame`."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import threading
-import time
 from collections import deque
 from collections.abc import Generator, Iterator
 from dataclasses import replace
-from itertools import count, islice
+from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
-import cv2
-import numpy as np
-
 from birdslam.geometry.camera import Camera, Undistorter
-from birdslam.runtime.configuration import FILE_SCHEMES, Configuration, ConfigurationError, SourceConfig
+from birdslam.ros.bag import BagTopics
+from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig
+from birdslam.runtime.schemes import all_schemes, recorded_schemes
 from birdslam.sources.odometry_file import check_odometry
-from birdslam.sources.opening import open_recording
+from birdslam.sources.opening import open_address
 from birdslam.sources.recording import RecordedFrame, Recording, undistorted
-from birdslam.sources.speed_file import of_sequence, with_speeds
+from birdslam.sources.schemes import KITTI, Scheme, parse, scheme_of, written
+from birdslam.sources.speed_file import of_sequence
 from birdslam.sources.speed_log import shifted
 from birdslam.types import Frame, Status
 
-SOURCES = "kitti:DIR, video:FILE, rosbag:PATH, mcap:FILE, demo, demo:DIR, v4l2:/dev/videoN or rtsp://HOST/PATH"
-LIVE_RATE_HZ = 30.0  # of a camera that does not say
+REFUSALS = {  # key -> why a live camera may refuse it
+    "speed": "a speed file is for recordings; live the car says it on the bus",
+    "odometry": "an odometry file is for recordings",
+}
 
 log = logging.getLogger(__name__)
 
@@ -46,42 +47,72 @@ class Source(Protocol):
     def frames(self) -> Generator[RecordedFrame]: ...
 
     def resume(self, frame_id: int, t_source_ns: int) -> None:
-        """Told before `frames` is asked for: a capture before this one died, and the next frame is `frame_id`."""
+        """Called before `frames` where capture was restarted: the next frame is `frame_id`."""
+
+    def close(self) -> None:
+        """Lets the camera go."""
 
 
 def open_source(configuration: Configuration, must_open: bool = True) -> Source:
     """The source that the configuration names; without `must_open` a camera may be gone for now.
 
-    Raises ConfigurationError or datasets.DatasetError where it can't be one, SourceError where a camera does not open.
+    Raises ConfigurationError or DatasetError where it can't be one, SourceError where a camera does not open.
     """
     source = configuration.source
-    scheme, colon, address = source.uri.partition(":")
-    speeds = Path(source.speed).expanduser() if source.speed else None
-    if colon and scheme == "mcap" and address:
-        from birdslam.runtime.recording.recorded_images import (
-            RecordedImages,  # only where it is needed: Foxglove's types and mcap
-        )
-
-        images = RecordedImages(Path(address).expanduser(), configuration.camera, source.stride)
-        _check_odometry(images, source)
-        return RecordedSource(with_speeds(images, speeds) if speeds else images, source)
-    if scheme in FILE_SCHEMES and (colon or scheme == "demo"):
-        recording = open_recording(source.uri, configuration.camera, source.stride, speeds, source.topics)
-        _check_odometry(recording, source)
-        return RecordedSource(recording, source)
-    if colon and scheme in ("v4l2", "rtsp") and address:
-        if configuration.camera is None:
-            raise ConfigurationError(f"{source.uri}: a live camera needs a camera file (--camera FILE)")
-        if speeds is not None:
-            raise ConfigurationError(f"{source.uri}: a speed file is for recordings; live the car says it on the bus")
-        if source.odometry:
-            raise ConfigurationError(f"{source.uri}: an odometry file is for recordings")
-        if source.rate == "max":
-            raise ConfigurationError(f'{source.uri}: rate "max" is for recordings; a live camera has its own')
-        return CameraSource(source, configuration.camera, must_open)
     if not source.uri:
-        raise ConfigurationError(f"no source: give --source {SOURCES}")
-    raise ConfigurationError(f"source {source.uri!r}: expected {SOURCES}")
+        raise ConfigurationError(f"no source: give --source {written(all_schemes())}")
+    scheme, address = parsed(source.uri)
+    if scheme.live:
+        return _open_camera(scheme, configuration, must_open)
+    speeds = Path(source.speed).expanduser() if source.speed else None
+    recording = open_address(scheme, address, configuration.camera, source.stride, speeds, source.topics)
+    _check_odometry(recording, source)
+    return RecordedSource(recording, source)
+
+
+def recording_uri(text: str) -> str:
+    """What `evaluate` and `calibrate` take: the URI of a recording, or the path of a KITTI directory.
+
+    Raises ConfigurationError for a live camera and for a scheme that there is not.
+    """
+    if scheme_of(text, all_schemes()) is None and (":" not in text or Path(text).expanduser().exists()):
+        return f"{KITTI.name}:{text}"
+    scheme, _ = parsed(text)
+    if scheme.live:
+        raise ConfigurationError(f"{text}: is a live camera; expected one of {written(recorded_schemes())}")
+    return text
+
+
+def open_recorded(
+    uri: str,
+    camera: Camera | None = None,
+    stride: int = 1,
+    topics: BagTopics = BagTopics(),  # noqa: B008
+) -> Recording:
+    """The recording of a `recording_uri`, without the car's speed. Raises ConfigurationError or DatasetError."""
+    scheme, address = parsed(uri)
+    return open_address(scheme, address, camera, stride, None, topics)
+
+
+def parsed(uri: str) -> tuple[Scheme, str]:
+    """The scheme of any source, and its address. Raises ConfigurationError, which says what there is."""
+    try:
+        return parse(uri, all_schemes())
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from None
+
+
+def _open_camera(scheme: Scheme, configuration: Configuration, must_open: bool) -> Source:
+    source = configuration.source
+    if configuration.camera is None:
+        raise ConfigurationError(f"{source.uri}: a live camera needs a camera file (--camera FILE)")
+    for key, reason in REFUSALS.items():
+        if key in scheme.refused and getattr(source, key):
+            raise ConfigurationError(f"{source.uri}: {reason}")
+    if source.rate == "max":
+        raise ConfigurationError(f'{source.uri}: rate "max" is for recordings; a live camera has its own')
+    camera: Source = scheme.load()(source, configuration.camera, must_open)
+    return camera
 
 
 def _check_odometry(recording: Recording, source: SourceConfig) -> None:
@@ -108,6 +139,9 @@ class RecordedSource:
     def resume(self, frame_id: int, t_source_ns: int) -> None:
         """A recording goes on at its frame of that number; in a loop its time goes on too."""
         self._start, self._resume_ns = frame_id, t_source_ns
+
+    def close(self) -> None:
+        """Its files are open only while frames are read."""
 
     def frames(self) -> Generator[RecordedFrame]:
         """Every frame in order, with growing time stamps."""
@@ -136,90 +170,6 @@ class RecordedSource:
             shift_ns += last_ns - first_ns + round(1e9 / self.rate_hz)
 
 
-class CameraSource:
-    """A camera of this computer (v4l2) or of the network (rtsp), through OpenCV."""
-
-    live = True
-
-    def __init__(self, config: SourceConfig, camera: Camera, must_open: bool = True) -> None:
-        """Raises SourceError where it does not open; without `must_open` that is a camera that is gone for now."""
-        self.name = self._uri = config.uri
-        self.camera = camera
-        self.rate_hz = config.rate if isinstance(config.rate, float) else LIVE_RATE_HZ
-        self._config = config
-        self._closing = threading.Event()
-        self._capture: cv2.VideoCapture | None = None
-        try:
-            self._capture = self._open()
-        except SourceError:
-            if must_open:
-                raise
-
-    def _open(self) -> cv2.VideoCapture:
-        scheme, _, address = self._uri.partition(":")
-        timeout_ms = round(self._config.camera_timeout_s * 1e3)
-        if scheme == "v4l2":
-            if not Path(address).exists():
-                raise SourceError(f"{self._uri}: there is no device {address}")
-            capture = cv2.VideoCapture(address, cv2.CAP_V4L2)
-            if capture.isOpened():
-                capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.camera.width_px)
-                capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.camera.height_px)
-                if isinstance(self._config.rate, float):
-                    capture.set(cv2.CAP_PROP_FPS, self._config.rate)
-                capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an older image is worth less than a lost one
-        else:
-            limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms]
-            capture = cv2.VideoCapture(self._uri, cv2.CAP_FFMPEG, limits)
-        if not capture.isOpened():
-            raise SourceError(f"{self._uri}: does not open as a camera or video stream")
-        size = tuple(int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        if size != (self.camera.width_px, self.camera.height_px):
-            capture.release()
-            raise SourceError(
-                f"{self._uri}: delivers {size[0]}x{size[1]} px, the camera file is for "
-                f"{self.camera.width_px}x{self.camera.height_px}"
-            )
-        self.rate_hz = capture.get(cv2.CAP_PROP_FPS) or self.rate_hz
-        return capture
-
-    def frames(self) -> Generator[RecordedFrame]:
-        """Frames by CLOCK_MONOTONIC; while the camera is gone, frames without an image, until it opens again."""
-        try:
-            for index in islice(count(), self._config.frames):
-                if self._capture is None or not self._capture.grab():
-                    self._reopen()
-                    yield RecordedFrame(index, time.monotonic_ns(), None, f"{self._uri}: delivers no frame")
-                    continue
-                t_ns = time.monotonic_ns()
-                ok, image = self._capture.retrieve()
-                if ok:
-                    yield RecordedFrame(index, t_ns, np.asarray(image, dtype=np.uint8), None)
-                else:
-                    yield RecordedFrame(index, t_ns, None, f"{self._uri}: frame {index} does not decode")
-        finally:
-            self.close()
-
-    def _reopen(self) -> None:
-        """One try; where it fails, a pause, so that planners hear of the loss at a fitting rate."""
-        if self._capture is not None:
-            self._capture.release()
-            self._capture = None
-        try:
-            self._capture = self._open()
-        except SourceError:
-            self._closing.wait(self._config.reopen_ms / 1e3)
-
-    def resume(self, frame_id: int, t_source_ns: int) -> None:
-        """A camera just goes on."""
-
-    def close(self) -> None:
-        """Lets the camera go."""
-        self._closing.set()
-        if self._capture is not None:
-            self._capture.release()
-
-
 def to_frame(
     undistort: Undistorter, frame_id: int, recorded: RecordedFrame, t_capture_ns: int, t_utc_ns: int = 0
 ) -> Frame:
@@ -232,7 +182,7 @@ def to_frame(
 
 
 def offline_frames(source: Source) -> Iterator[Frame]:
-    """All frames of a recording for one process; captured, so to say, when the source says."""
+    """All frames of a recording for one process; the capture time is the source's."""
     undistort = Undistorter(source.camera)
     for frame_id, recorded in enumerate(source.frames()):
         yield to_frame(undistort, frame_id, recorded, recorded.t_source_ns)

@@ -6,9 +6,10 @@ from pathlib import Path
 
 from birdslam.ros.bag_writer import BagWriter, Storage
 from birdslam.ros.messages import RosMessages, t_of
-from birdslam.runtime.configuration import FILE_SCHEMES, SourceConfig
+from birdslam.runtime.configuration import SourceConfig
 from birdslam.runtime.recording.recorded_drive import recorded_drive
 from birdslam.runtime.recording.recording import Recording, RecordingError
+from birdslam.runtime.schemes import is_live
 from birdslam.types import EgoEdge, Estimate, MapUpdate
 
 
@@ -19,11 +20,11 @@ def write_bag(recording: Recording, directory: Path, storage: Storage) -> int:
     """
     if recording.camera is None:
         raise RecordingError(f"{recording.path}: has no camera")
-    live = recording.part("source", SourceConfig).uri.partition(":")[0] not in FILE_SCHEMES
+    live = is_live(recording.part("source", SourceConfig).uri)
     frames, t_ns = 0, 0
     with BagWriter(directory, storage) as bag:
         vehicle = str(recording.about.configuration.get("vehicle", ""))
-        messages = RosMessages(bag.make, recording.camera, vehicle, keeps_way=True)
+        messages = RosMessages(bag.make, recording.camera, vehicle, keep_path=True)
         motion: EgoEdge | None = None
         for record in recorded_drive([recording]):
             if isinstance(record, Estimate):

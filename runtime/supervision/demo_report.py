@@ -13,7 +13,8 @@ from birdslam.bench.tracking.shipped_drive import VEHICLES, DemoGrade, grade
 from birdslam.outputs.drive_video import Floats, outline
 from birdslam.runtime.configuration import Configuration
 from birdslam.sources.opening import open_recording
-from birdslam.sources.shipped_drive import NAME, DemoRecording
+from birdslam.sources.schemes import DEMO, scheme_of
+from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.types import Estimate, MapUpdate
 
 
@@ -28,7 +29,7 @@ class DemoReport:
     def of(cls, configuration: Configuration) -> DemoReport | None:
         """None where the drive has no truth of vehicles, or no end."""
         source = configuration.source
-        if source.uri.partition(":")[0] != NAME or source.loop:
+        if scheme_of(source.uri, [DEMO]) is None or source.loop:
             return None
         recording = open_recording(source.uri, configuration.camera, source.stride)
         assert isinstance(recording, DemoRecording)

@@ -21,7 +21,7 @@ from birdslam.perception import ModelError, load_network
 from birdslam.perception.pointnet import load_pointnet
 from birdslam.runtime.configuration import Configuration, ConfigurationError, ModelsConfig, complete
 from birdslam.runtime.environment import INTERRUPTED_STATUS
-from birdslam.runtime.nodes.sources import CameraSource, RecordedSource, open_source
+from birdslam.runtime.nodes.sources import RecordedSource, open_source
 from birdslam.runtime.process import realtime
 from birdslam.runtime.process.child import give_back_memory
 from birdslam.runtime.recording.recording import RecordingError
@@ -122,9 +122,8 @@ def check(configuration: Configuration) -> tuple[Configuration, dict[str, Any], 
     source = open_source(configuration)
     configuration = complete(configuration, source.camera, source.rate_hz)
     frames: int | None = None
-    if isinstance(source, CameraSource):
-        source.close()  # capture opens it for itself
-    elif isinstance(source, RecordedSource) and not configuration.source.loop:
+    source.close()  # capture opens it for itself
+    if isinstance(source, RecordedSource) and not configuration.source.loop:
         frames = min(len(source.recording), configuration.source.frames or len(source.recording)) or None
     check_results(configuration, source)
     recording = configuration.recording

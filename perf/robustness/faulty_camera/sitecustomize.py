@@ -21,7 +21,7 @@ if FOLDER:
         return (_folder / "fault").read_text().strip()
 
     class FaultyCapture:
-        """As much of cv2.VideoCapture as a CameraSource uses."""
+        """As much of cv2.VideoCapture as a LiveCamera uses."""
 
         def __init__(self, address: str, *arguments: object) -> None:
             self._frames = np.load(_folder / "frames.npy", mmap_mode="r")

@@ -10,11 +10,13 @@ from birdslam.runtime.calibration import Given, calibrate_drive, write_camera_fi
 from birdslam.runtime.cli.arguments import add_config, add_settings, add_topics
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.options import configuration_of
+from birdslam.runtime.schemes import recorded_schemes
+from birdslam.sources.schemes import written
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The drive, and what is known of its camera."""
-    parser.add_argument("source", metavar="SOURCE", help="a KITTI directory, or kitti:DIR, video:FILE, rosbag:PATH")
+    parser.add_argument("source", metavar="SOURCE", help=f"a KITTI directory, or {written(recorded_schemes())}")
     parser.add_argument("--output", required=True, metavar="CAMERA.toml", help="the camera file to write")
     lens = parser.add_mutually_exclusive_group()
     lens.add_argument("--camera", metavar="FILE", help="an older camera file: its intrinsics and height")

@@ -1,0 +1,140 @@
+"""The table of sources: what each scheme (`kitti:DIR`) is, what it knows of its camera and clock, which class opens it.
+
+Every command, page and message that speaks of sources reads this table; a new one is a class (`Recording`) in a file of
+its own and an entry here. The classes are named, not imported, so that a help text loads neither OpenCV nor rosbags.
+runtime/schemes.py adds the sources of the runtime: live cameras and our own recordings.
+"""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+OF_A_RECORDING = ("stride", "speed", "odometry", "loop", "prefetch_frames")
+MCAP_HEAD_BYTES = 64  # the profile stands in the first record: "ros2" in a bag, "" in a recording of ours
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scheme:
+    """A kind of source. Its addresses begin with `name:`."""
+
+    name: str
+    written: tuple[str, ...]  # as a user writes it; a name without a colon needs no address
+    what: str
+    opener: str  # module:class; called with (path, camera=, stride=), or as runtime/nodes/cameras.py says if `live`
+    camera: Literal["calibration", "intrinsics", "frame size", "nothing"]  # intrinsics: the height may be missing
+    clock: Literal["recorded times", "frame rate", "this computer's"]
+    address: Literal["path", "device", "network"] = "path"
+    live: bool = False
+    options: tuple[str, ...] = OF_A_RECORDING  # keys of [source] that it takes; uri, rate and frames hold for all
+    refused: tuple[str, ...] = ()  # keys that are an error beside it; others that it does not take are ignored
+    suffixes: tuple[str, ...] = ()  # by which a file's name alone says what it is
+    is_at: Callable[[Path], bool] = lambda path: False  # whether one lies there whose name does not say it
+    recognised: str = ""  # that in words
+
+    def load(self) -> Any:
+        """The class that opens it, imported only now."""
+        return pkgutil.resolve_name(self.opener)
+
+
+def _is_bag(path: Path) -> bool:
+    """A directory of `ros2 bag record`, or an MCAP file that ROS wrote."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    if path.suffix.lower() != ".mcap":
+        return False
+    try:
+        with path.open("rb") as file:
+            return b"ros" in file.read(MCAP_HEAD_BYTES)
+    except OSError:
+        return False
+
+
+def _is_kitti(path: Path) -> bool:
+    from birdslam.sources.kitti import find_layout
+    from birdslam.sources.recording import DatasetError
+
+    try:
+        return bool(find_layout(path))
+    except DatasetError:
+        return False
+
+
+DEMO = Scheme(
+    name="demo",
+    written=("demo", "demo:DIR"),
+    what="the drive that ships with birdslam; DIR: another drive of the built-in world",
+    opener="birdslam.sources.shipped_drive:DemoRecording",
+    camera="calibration",
+    clock="frame rate",
+)
+VIDEO = Scheme(
+    name="video",
+    written=("video:FILE",),
+    what="a film, as OpenCV reads it",
+    opener="birdslam.sources.video:VideoRecording",
+    camera="frame size",
+    clock="recorded times",
+    refused=("topics",),
+    suffixes=(".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm"),
+)
+ROSBAG = Scheme(
+    name="rosbag",
+    written=("rosbag:PATH",),
+    what="a ROS bag, of ROS 2 (directory, .mcap, .db3) or ROS 1 (.bag): [ros.md](ros.md)",
+    opener="birdslam.sources.rosbag:RosbagRecording",
+    camera="intrinsics",
+    clock="recorded times",
+    options=(*OF_A_RECORDING, "topics"),
+    suffixes=(".bag", ".db3"),
+    is_at=_is_bag,
+    recognised="a directory with metadata.yaml, an .mcap file that ROS wrote",
+)
+KITTI = Scheme(
+    name="kitti",
+    written=("kitti:DIR",),
+    what="a KITTI directory: odometry sequence, tracking sequence, raw drive or clip",
+    opener="birdslam.sources.kitti:KittiRecording",
+    camera="calibration",
+    clock="recorded times",
+    refused=("topics",),
+    is_at=_is_kitti,
+    recognised="a directory with its folders of images",
+)
+# A path that several recognise is the first one's
+RECORDED = (DEMO, VIDEO, ROSBAG, KITTI)
+
+
+def written(schemes: Sequence[Scheme]) -> str:
+    """All of them as a user writes them, for help and messages."""
+    return ", ".join(text for scheme in schemes for text in scheme.written)
+
+
+def scheme_of(uri: str, schemes: Sequence[Scheme]) -> Scheme | None:
+    """By what stands before the colon; None where it is none of these."""
+    name = uri.partition(":")[0]
+    return next((scheme for scheme in schemes if scheme.name == name), None)
+
+
+def parse(uri: str, schemes: Sequence[Scheme]) -> tuple[Scheme, str]:
+    """The scheme and the address of a URI. Raises ValueError, which says what there is."""
+    scheme, (name, colon, address) = scheme_of(uri, schemes), uri.partition(":")
+    if scheme is None:
+        raise ValueError(f"{uri}: no such source {name + colon!r}; there are {written(schemes)}")
+    if not address and scheme.name not in scheme.written:
+        raise ValueError(f"{uri}: names none; expected {' or '.join(scheme.written)}")
+    return scheme, address
+
+
+def scheme_at(path: Path, schemes: Sequence[Scheme]) -> Scheme | None:
+    """By what lies at a path; None where it is no source."""
+    by_name = None if path.is_dir() else by_suffix(path, schemes)
+    return by_name or next((scheme for scheme in schemes if scheme.is_at(path)), None)
+
+
+def by_suffix(path: Path, schemes: Sequence[Scheme]) -> Scheme | None:
+    """By a file's name alone."""
+    return next((scheme for scheme in schemes if path.suffix.lower() in scheme.suffixes), None)

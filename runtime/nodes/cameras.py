@@ -1,0 +1,119 @@
+"""Live cameras through OpenCV: of this computer (V4L2) and of the network (RTSP)."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Generator
+from itertools import count, islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from birdslam.geometry.camera import Camera
+from birdslam.runtime.configuration import SourceConfig
+from birdslam.runtime.nodes.sources import SourceError
+from birdslam.sources.recording import RecordedFrame
+
+LIVE_RATE_HZ = 30.0  # of a camera that does not say
+
+
+class LiveCamera:
+    """A source (nodes/sources.py) whose frames are stamped with CLOCK_MONOTONIC as they come."""
+
+    live = True
+
+    def __init__(self, config: SourceConfig, camera: Camera, must_open: bool = True) -> None:
+        """Raises SourceError where it does not open; without `must_open` that is a camera that is gone for now."""
+        self.name = self._uri = config.uri
+        self.camera = camera
+        self.rate_hz = config.rate if isinstance(config.rate, float) else LIVE_RATE_HZ
+        self._config = config
+        self._closing = threading.Event()
+        self._capture: cv2.VideoCapture | None = None
+        try:
+            self._capture = self._open()
+        except SourceError:
+            if must_open:
+                raise
+
+    def _connect(self) -> cv2.VideoCapture:
+        """The camera, asked for its image size and rate; `_open` checks whether it opened."""
+        raise NotImplementedError
+
+    def _open(self) -> cv2.VideoCapture:
+        capture = self._connect()
+        if not capture.isOpened():
+            raise SourceError(f"{self._uri}: does not open as a camera or video stream")
+        size = tuple(int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if size != (self.camera.width_px, self.camera.height_px):
+            capture.release()
+            raise SourceError(
+                f"{self._uri}: delivers {size[0]}x{size[1]} px, the camera file is for "
+                f"{self.camera.width_px}x{self.camera.height_px}"
+            )
+        self.rate_hz = capture.get(cv2.CAP_PROP_FPS) or self.rate_hz
+        return capture
+
+    def frames(self) -> Generator[RecordedFrame]:
+        """Frames by CLOCK_MONOTONIC; while the camera is gone, frames without an image, until it opens again."""
+        try:
+            for index in islice(count(), self._config.frames):
+                if self._capture is None or not self._capture.grab():
+                    self._reopen()
+                    yield RecordedFrame(index, time.monotonic_ns(), None, f"{self._uri}: delivers no frame")
+                    continue
+                t_ns = time.monotonic_ns()
+                ok, image = self._capture.retrieve()
+                if ok:
+                    yield RecordedFrame(index, t_ns, np.asarray(image, dtype=np.uint8), None)
+                else:
+                    yield RecordedFrame(index, t_ns, None, f"{self._uri}: frame {index} does not decode")
+        finally:
+            self.close()
+
+    def _reopen(self) -> None:
+        """One try; where it fails, a pause, so that planners hear of the loss at a fitting rate."""
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+        try:
+            self._capture = self._open()
+        except SourceError:
+            self._closing.wait(self._config.reopen_ms / 1e3)
+
+    def resume(self, frame_id: int, t_source_ns: int) -> None:
+        """A camera just goes on."""
+
+    def close(self) -> None:
+        """Lets the camera go."""
+        self._closing.set()
+        if self._capture is not None:
+            self._capture.release()
+
+
+class DeviceCamera(LiveCamera):
+    """`v4l2:/dev/videoN`."""
+
+    def _connect(self) -> cv2.VideoCapture:
+        address = self._uri.partition(":")[2]
+        if not Path(address).exists():
+            raise SourceError(f"{self._uri}: there is no device {address}")
+        capture = cv2.VideoCapture(address, cv2.CAP_V4L2)
+        if capture.isOpened():
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.camera.width_px)
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.camera.height_px)
+            if isinstance(self._config.rate, float):
+                capture.set(cv2.CAP_PROP_FPS, self._config.rate)
+            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an older image is worth less than a lost one
+        return capture
+
+
+class NetworkCamera(LiveCamera):
+    """`rtsp://HOST/PATH`, by FFmpeg."""
+
+    def _connect(self) -> cv2.VideoCapture:
+        timeout_ms = round(self._config.camera_timeout_s * 1e3)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms]
+        return cv2.VideoCapture(self._uri, cv2.CAP_FFMPEG, limits)
