@@ -11,7 +11,7 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: setup test test-slow wheel-test wheels fuzz faults onroad perf lint train demo demo-kitti clean
+.PHONY: setup test test-slow wheel-test pages wheels fuzz faults onroad perf lint train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -37,9 +37,13 @@ test-slow: setup
 wheel-test: setup
 	$(BIN)/python -m tests.installed_wheel
 
+# Which written pages are older than what they measure; WRITE=1 measures those anew, WRITE="NAME ..." these
+pages: setup
+	$(BIN)/python -m perf pages $(if $(WRITE),--write $(filter-out 1,$(WRITE)))
+
 # Which wheels there are of what is needed, by architecture and Python: docs/wheels.csv; it asks pip's index
 wheels: setup
-	$(BIN)/python -m tests.wheels
+	$(BIN)/python -m perf pages --write wheels
 
 # A million mutated messages, references and files; FUZZ_SEED=N gives others.
 fuzz: setup
@@ -47,7 +51,7 @@ fuzz: setup
 
 # Every fault on a running vehicle: docs/faults.md
 faults: setup
-	$(BIN)/python -m perf faults --models $(MODELS) --markdown docs/faults.md
+	$(BIN)/python -m perf pages --write faults
 
 # The budgets of the running system, on a machine that does nothing else
 onroad: setup

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from birdslam.bench.tracking.benchmark import Row
 from birdslam.perf.__main__ import benchmark_modules
-from birdslam.perf.reporting import results
+from birdslam.perf.reporting import measured, results
 from birdslam.perf.robustness import faults
 from birdslam.perf.robustness.injection import FAULTS
 from birdslam.runtime.cli.main import main
@@ -113,8 +113,8 @@ def test_the_page_of_faults_is_of_the_suite_as_it_is() -> None:
 
 
 def test_the_page_of_results_is_made_of_the_reports_that_are_kept() -> None:
-    found = results.kept()
-    assert results.page(found) == (DOCS / "results.md").read_text(), "python -m perf results"
+    page = results.page(results.kept(), measured.load())
+    assert page == (DOCS / "results.md").read_text(), "python -m perf results"
 
 
 def test_the_readme_has_the_one_table_of_results_and_150_lines() -> None:
@@ -124,6 +124,17 @@ def test_the_readme_has_the_one_table_of_results_and_150_lines() -> None:
     table = results.summary(results.kept()).splitlines()
     begin = lines.index(table[0])
     assert lines[begin : begin + len(table) + 1] == [*table, ""]
+    under = "\n".join(lines[begin + len(table) + 1 :])
+    assert under.startswith(f"{measured.line(measured.load(), results.README_PARTS)}\n\n"), "python -m perf results"
+
+
+def test_figures_in_prose_say_of_which_day_they_are() -> None:
+    """A section of docs/ablations.md with figures is dated, with the code; the present figures are in written pages."""
+    _, *sections = re.split(r"^## ", (DOCS / "ablations.md").read_text(), flags=re.MULTILINE)
+    dated = r"\*Measured on \d{4}-\d\d-\d\d, commits? [0-9a-f]{7}"
+    for section in sections:
+        title, _, text = section.partition("\n\n")
+        assert re.match(dated, text) or not re.search(r"\d\.\d", text), f"{title}: which day's figures are these?"
 
 
 def test_what_a_report_is_reduced_to() -> None:

@@ -1,10 +1,9 @@
-"""docs/results.md, made from the reports of the evaluations; README.md has its first table.
+"""docs/results.md and README.md's table, made of what is kept of the evaluations' reports in docs/results/NAME.json.
 
-    python -m perf results                          # the page anew, from docs/results/*.json
-    python -m perf results --measure [NAME ...]     # runs the evaluations (all, or these) before that
+    python -m perf results                          # both anew
+    python -m perf pages --write [NAME ...]         # runs the evaluations that are old (or these) before that
 
-What the page needs of each report is kept in docs/results/NAME.json, so that a test can hold the page to it;
-its words are in docs/results/page.md.
+The page's words are in docs/results/page.md.
 """
 
 from __future__ import annotations
@@ -12,13 +11,8 @@ from __future__ import annotations
 import argparse
 import json
 import re
-import shlex
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -26,24 +20,25 @@ import msgspec
 from birdslam.bench.tracking.benchmark import EGO, Row, mean_ate_m
 from birdslam.bench.tracking.tables import METHOD_TITLES, read_published
 from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting import measured
+from birdslam.perf.reporting.machine import ROOT
 from birdslam.runtime.pages.tables import table
 
 label = "docs/results.md and the README's table, from the reports of the evaluations"
 
-ROOT = Path(__file__).resolve().parent.parent.parent
 KEPT = ROOT / "docs" / "results"
 TEXT = KEPT / "page.md"  # the page without its figures
 PAGE = ROOT / "docs" / "results.md"
+README = ROOT / "README.md"
 REAL = "--model detector={models}/yolox_nano_416.onnx --model segmenter={models}/twinlitenet_640x360.onnx"
 SEQUENCES = "{data}/kitti_odometry/sequences"
 TRACKING = "{data}/kitti_tracking/training"
-LABELLED = "--sequences 0000,0001,0002,0003,0004,0005,0006,0008 --detections rrc"
+PLACES = f"localisation {TRACKING} --sequences 0000,0001,0002,0003,0004,0005,0006,0008 --detections rrc"
 ODOMETRY_FIELDS = (
     *("sequence", "frames", "path_m", "ate_m", "ate_pct", "ate_se3_m", "scale_error", "rpe_t_m", "rpe_r_deg"),
     *("segment_t_pct", "standing_drift_m"),
 )
 MOTION_FIELDS = {"motion_nees": "frames", "stretch_nees": "stretches"}
-TABLES = ROOT / "docs" / "tables.md"  # the whole report of `tracking`
 CARS = {  # of the paper
     "0002": ("1",),
     "0003": ("0", "1"),
@@ -72,6 +67,10 @@ class Evaluation:
 
     command: str  # of `birdslam evaluate`
     keep: Callable[[Any], Kept]
+
+    def kept(self, report: str) -> str:
+        """The text of docs/results/NAME.json, of the report's."""
+        return json.dumps(self.keep(json.loads(report)), indent=1) + "\n"
 
 
 def _odometry(report: Sequence[Mapping[str, Any]]) -> Kept:
@@ -145,8 +144,8 @@ EVALUATIONS = {
     ),
     "odometry_demo": Evaluation("odometry demo", _odometry),
     "odometry_shipped": Evaluation(f"odometry {SEQUENCES}/00 {SEQUENCES}/06 {{data}}/kitti_raw_clip", _odometry),
-    "localisation": Evaluation(f"localisation {TRACKING} {LABELLED}", _localisation),
-    "localisation_paper": Evaluation(f"localisation {TRACKING} {LABELLED} --mode paper", _localisation),
+    "localisation": Evaluation(PLACES, _localisation),
+    "localisation_paper": Evaluation(f"{PLACES} --mode paper", _localisation),
     "tracking": Evaluation(f"tracking {TRACKING} --frames paper {REAL}", _tracking),
 }
 
@@ -172,47 +171,50 @@ DRIVES = {
     "odometry_moving_median": ", the paper's moving median of the scale",
     "odometry_demo": " (shipped drive and network)",
 }
+README_PARTS = {  # evaluation, or page, -> the rows of the summary that are of it
+    "odometry": "ego motion, the car ahead",
+    "odometry_demo": "the shipped drive",
+    "localisation": "places",
+    "tracking": "trajectories",
+    "report": "age",
+}
 
 
 def run(arguments: list[str]) -> None:
-    """Measures what is asked for, and writes the page. Raises PerfError."""
-    parser = argparse.ArgumentParser(prog="python -m perf results", description=__doc__)
-    parser.add_argument("--measure", nargs="*", metavar="NAME", choices=tuple(EVALUATIONS), help="all, or these")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="where recordings lie")
-    parser.add_argument("--models", type=Path, default=Path("../shared/models"), help="where networks lie")
-    parser.add_argument("--reports", type=Path, default=Path("out/results"), help="where evaluations write; kept there")
-    options = parser.parse_args(arguments)
-    for name in (options.measure or EVALUATIONS) if options.measure is not None else ():
-        measure(name, options.data, options.models, options.reports)
-    PAGE.write_text(page(kept()))
-    print(f"{PAGE.relative_to(ROOT)}; README.md's table is to be:\n\n{summary(kept())}")
+    """Writes the page and the README's table. Raises PerfError."""
+    argparse.ArgumentParser(prog="python -m perf results", description=__doc__).parse_args(arguments)
+    for file, text in texts().items():
+        (ROOT / file).write_text(text, encoding="utf-8")
+        print(file)
 
 
-def measure(name: str, data: Path, models: Path, reports: Path) -> None:
-    """Runs an evaluation and keeps what the page needs of it."""
-    evaluation, output = EVALUATIONS[name], reports / name
-    command = shlex.split(evaluation.command.format(data=data, models=models))
-    print(f"birdslam evaluate {shlex.join(command)}", flush=True)
-    program = [sys.executable, "-m", "birdslam.runtime.cli.main", "evaluate", *command, "--output", str(output)]
-    begun_s = time.monotonic()
-    if subprocess.run(program).returncode:
-        raise PerfError(f"{name}: the evaluation failed")
-    if name == "tracking":
-        took = (time.monotonic() - begun_s) / 60.0
-        TABLES.write_text(tables_page((output / "report.md").read_text(), took))
-    few = evaluation.keep(json.loads((output / "report.json").read_text()))
-    (KEPT / f"{name}.json").write_text(json.dumps(few, indent=1) + "\n")
+def texts() -> dict[str, str]:
+    """What is to stand in the page and in the README. Raises PerfError."""
+    found, when = kept(), measured.load()
+    return {
+        "docs/results.md": page(found, when),
+        "README.md": readme(README.read_text(encoding="utf-8"), found, when),
+    }
 
 
-def tables_page(report: str, minutes: float) -> str:
+def readme(text: str, found: Mapping[str, Kept], when: Mapping[str, measured.Measured]) -> str:
+    """With the one table, and what it was measured with under it."""
+    there = rf"\| what \| how good \| command \|\n(?:\|.*\n)+\n(?:{measured.BEGINNING}(?:.+\n)+\n)?"
+    made = f"{summary(found)}\n\n{measured.line(when, README_PARTS)}\n\n"
+    new, tables = re.subn(there, lambda _: made, text)
+    if tables != 1:
+        raise PerfError(f"{README} has {tables} tables of what, how good, command, not one")
+    return new
+
+
+def tables_page(report: str) -> str:
     """docs/tables.md: the report of the evaluation as it is, and what wrote it."""
     title, _, rest = report.partition("\n")
     about = (
-        "Written by `python -m perf results --measure tracking`, which runs\n\n"
+        "Written by `python -m perf pages --write tracking`, which runs\n\n"
         f"    {_command('tracking')}\n\n"
-        f"and took {minutes:.0f} minutes on two cores beside other work. [results.md](results.md) has the means, "
-        "[ablations.md](ablations.md)\nwhat the ablations say. DATA and MODELS are the folders of recordings and "
-        "networks.\n"
+        "[results.md](results.md) has the means, [ablations.md](ablations.md) what the ablations say. DATA and MODELS "
+        "are the\nfolders of recordings and networks.\n"
     )
     return f"{title}\n\n{about}{rest}"
 
@@ -224,11 +226,12 @@ def kept() -> dict[str, Kept]:
     return {name: json.loads((KEPT / f"{name}.json").read_text()) for name in EVALUATIONS}
 
 
-def page(found: Mapping[str, Kept]) -> str:
+def page(found: Mapping[str, Kept], when: Mapping[str, measured.Measured]) -> str:
     """The whole of docs/results.md."""
     ahead = _ahead(found["odometry"])
     return TEXT.read_text().format(
         summary=summary(found),
+        measured=measured.line(when, {name: f"`{name}`" for name in (*EVALUATIONS, "report")}),
         **{name: _command(name) for name in EVALUATIONS},
         odometry_table=_odometry_table(found),
         shipped=", ".join(f"{row['ate_pct']:.1f} %" for row in found["odometry_shipped"]),
