@@ -49,6 +49,17 @@ class Reading:
         return self.alive and self.on_time and self.valid
 
 
+def reading_of(message: Message | None, alive: bool, max_age_ms: float) -> Reading:
+    """What a planner is told now of the newest message (None: none has come) while the optimizer is alive or is not."""
+    if message is None:
+        return Reading(None, alive, on_time=False, valid=False, age_ms=float("inf"))
+    estimate: Estimate = message.record
+    age_ms = (time.monotonic_ns() - estimate.t_capture_ns) / 1e6
+    valid = estimate.valid and INVALIDATING.isdisjoint(estimate.status)
+    left_ms = None if message.trace.left_ns is None else message.trace.left_ns / 1e6
+    return Reading(estimate, alive, 0.0 <= age_ms <= max_age_ms, valid, age_ms, left_ms, message.trace)
+
+
 class Planner(Closing):
     """A subscriber of one vehicle's estimates; a context manager.
 
@@ -77,14 +88,7 @@ class Planner(Closing):
         return self._reading(self._subscriber.newest, max_age_ms)
 
     def _reading(self, message: Message | None, max_age_ms: float) -> Reading:
-        alive = "optimize" in self._bus.alive
-        if message is None:
-            return Reading(None, alive, on_time=False, valid=False, age_ms=float("inf"))
-        estimate: Estimate = message.record
-        age_ms = (time.monotonic_ns() - estimate.t_capture_ns) / 1e6
-        valid = estimate.valid and INVALIDATING.isdisjoint(estimate.status)
-        left_ms = None if message.trace.left_ns is None else message.trace.left_ns / 1e6
-        return Reading(estimate, alive, 0.0 <= age_ms <= max_age_ms, valid, age_ms, left_ms, message.trace)
+        return reading_of(message, "optimize" in self._bus.alive, max_age_ms)
 
     def wait(self, timeout_s: float | None = None) -> Estimate | None:
         """The next estimate, as soon as there is one; None where none came in time. Raises BusClosed once closed.

@@ -30,7 +30,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.perception.manifest import Manifest, ModelError
 from birdslam.perception.manifest_file import read_manifest, shipped_manifests
-from birdslam.runtime.client import Planner
+from birdslam.runtime.client import reading_of
 from birdslam.runtime.configuration import Configuration, ConfigurationError, dump, load
 from birdslam.runtime.topology import TOPICS, key_of
 from birdslam.runtime.transport.bus import Subscriber
@@ -94,9 +94,13 @@ class Sample:
 
 
 class Undeclared:
-    """A session without a network: the samples are handed to the subscriber by hand, on this thread."""
+    """A session without a network: the samples are handed to what was subscribed by hand, on this thread."""
 
-    def declare_subscriber(self, key: str, callback: object) -> Undeclared:
+    def __init__(self) -> None:
+        self.callbacks: dict[str, Callable[[object], object]] = {}
+
+    def declare_subscriber(self, key: str, callback: zenoh.handlers.Callback) -> Undeclared:
+        self.callbacks[key] = callback.callback
         return self
 
     def undeclare(self) -> None:
@@ -105,15 +109,11 @@ class Undeclared:
 
 @contextmanager
 def subscribers() -> Iterator[Target]:
-    """bus.Subscriber of every topic on mutated payloads, attachments, keys and kinds; a planner reads the estimates."""
-    session, ends, readings = Undeclared(), {}, {}
+    """bus.Subscriber of every topic on mutated payloads, attachments, keys, kinds; estimates as planners read them."""
+    session, ends = Undeclared(), {}
     goods = {type(example): encode(example) for example in EXAMPLES}
     for name, topic in TOPICS.items():
         ends[name] = Subscriber(session, key_of("car", name), topic, 2, False)  # type: ignore[arg-type]
-    planner = object.__new__(Planner)  # without a bus of its own
-    planner._subscriber = ends["estimate"]
-    planner._bus = type("Bus", (), {"alive": frozenset({"optimize"}), "close": lambda self: None})()
-    readings["planner"] = planner
 
     def target(chance: Chance) -> bool:
         name = chance.choice(sorted(TOPICS))
@@ -125,7 +125,8 @@ def subscribers() -> Iterator[Target]:
             key = chance.choice(("birdslam/**", "**", "birdslam/car/v1/*", "x"))
         kind = zenoh.SampleKind.DELETE if chance.random() < 0.05 else zenoh.SampleKind.PUT
         before = subscriber.malformed, subscriber.newest
-        subscriber._receive(Sample(key, payload, attachment if chance.random() < 0.9 else None, kind))  # type: ignore[arg-type]
+        sent = Sample(key, payload, attachment if chance.random() < 0.9 else None, kind)
+        session.callbacks[key_of("car", name)](sent)
         if subscriber.malformed > before[0]:
             assert subscriber.newest is before[1], "a refused message was kept"
             return False
@@ -133,7 +134,7 @@ def subscribers() -> Iterator[Target]:
         record = subscriber.newest.record
         encode(record)
         if name == "estimate":
-            reading = planner.latest(max_age_ms=1e9)
+            reading = reading_of(subscriber.newest, alive=True, max_age_ms=1e9)
             assert reading.estimate is record
             assert not reading.valid or (record.valid and INVALIDATING.isdisjoint(record.status))
         return True

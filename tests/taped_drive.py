@@ -79,20 +79,20 @@ class Tape:
         self._begin(FIRST)
 
     def _begin(self, assignment: Assignment) -> None:
-        self.writer.draw("/alive", Alive(node="optimize", alive=True), self._tick())
+        self.writer.draw("/alive", Alive(node="optimize", alive=True), self.tick())
         self.node = OptimizeNode(self.configuration, self.perceive, assignment)  # type: ignore[arg-type]
 
-    def _tick(self) -> int:
+    def tick(self) -> int:
         self._now_ns += 1_000_000
         return self._now_ns
 
     def _trace(self, *nodes: str) -> Trace:
-        return Trace(tuple(Stage(node, self._tick(), self._tick(), self._tick()) for node in nodes))
+        return Trace(tuple(Stage(node, self.tick(), self.tick(), self.tick()) for node in nodes))
 
     def frame(self, measurements: Measurements) -> FrameRef:
         """Capture announces it."""
         ref = FrameRef(**stamps(measurements))
-        self.writer.add("frame", ref, self._tick())
+        self.writer.add("frame", ref, self.tick())
         return ref
 
     def send(self, measurements: Measurements, recorded: bool = True) -> Message:
@@ -100,21 +100,21 @@ class Tape:
         message = Message(measurements, self._trace("capture", "perceive"), self._now_ns)
         self.perceive.sent.append(message)
         if recorded:
-            self.writer.add("measurements", measurements, self._tick(), message.trace)
+            self.writer.add("measurements", measurements, self.tick(), message.trace)
         return message
 
     def take(self, message: Message, recorded: bool = True) -> None:
         """The optimizer takes something up."""
         for out in self.node.step(message.record):
-            trace = message.trace.after("optimize", self._tick(), self._tick())
-            trace = trace.sent(self._tick(), number=0)
+            trace = message.trace.after("optimize", self.tick(), self.tick())
+            trace = trace.sent(self.tick(), number=0)
             if isinstance(out, Estimate):
                 self._told = message.record
                 self.estimates.append(out)
             if recorded:
-                self.writer.add("estimate" if isinstance(out, Estimate) else "map", out, self._tick(), trace)
+                self.writer.add("estimate" if isinstance(out, Estimate) else "map", out, self.tick(), trace)
             assert isinstance(out, Estimate | MapUpdate)
-        self.writer.flush_if_due(self._tick())
+        self.writer.flush_if_due(self.tick())
 
     def coast(self, ref: FrameRef) -> None:
         """A frame is overdue."""
@@ -131,7 +131,7 @@ class Tape:
         if not with_checkpoint:
             CheckpointFile(runtime_dir_of("tape", self.configuration.runtime_dir) / "checkpoint").take()
         if noticed:
-            self.writer.draw("/alive", Alive(node="optimize", alive=False), self._tick())
+            self.writer.draw("/alive", Alive(node="optimize", alive=False), self.tick())
         last = self.estimates[-1]
         resume = Resume(last.frame_id + 1, last.t_source_ns, last.t_capture_ns)
         assignment = Assignment(self._restarts, "was killed by a test", resume)

@@ -23,7 +23,7 @@ of_both_graphs = pytest.mark.parametrize("base", [PAPER, ours(SlamConfig())], id
 def known(method: Live) -> tuple[Floats, Floats]:
     """(frames, 3, 3) covariances of the ego, and of both vehicles against it as the window has them (2, 3, 3)."""
     graph = PoseGraph(method.graph, method.weights)
-    estimates = [graph.optimise(method._reweighed(m)) for m in WORLD.measurements]
+    estimates = [graph.optimise(method.reweighed(m)) for m in WORLD.measurements]
     window = graph.window
     assert window is not None
     vehicles = [window.P[np.ix_(rows, rows)] for rows in window.layout.poses]

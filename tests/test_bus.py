@@ -27,6 +27,7 @@ from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, MessagesLos
 from birdslam.runtime.transport.presence import VehicleBusy, VehicleLock, ring_path, runtime_dir_of, socket_path
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES, Stage, Trace, encode
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
+from tests.foreign_sender import foreign_session, matched
 
 pytestmark = pytest.mark.processes
 
@@ -150,31 +151,33 @@ def test_a_bounded_queue_keeps_the_last_and_counts_the_rest(join: Any) -> None:
     assert (queue.dropped, short.dropped) == (12, 18)
 
 
-def test_malformed_messages_are_counted_and_survived(join: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_malformed_messages_are_counted_and_survived(join: Any, base: Path, caplog: pytest.LogCaptureFixture) -> None:
     hub = join("supervisor", hub=True)
     estimates = hub.subscriber("estimate", depth=16)
-    optimize = join("optimize", lossless=True)
-    out = optimize.publisher("estimate")
+    out = join("optimize", lossless=True).publisher("estimate")
     assert out.wait_matched(LIMIT_S)
     key, good = key_of("car", "estimate"), encode(estimate(1))
+    with foreign_session(base) as foreign:
 
-    def put(key: str, data: bytes, attachment: bytes | None = None) -> None:
-        block, urgent = zenoh.CongestionControl.BLOCK, zenoh.Priority.REAL_TIME
-        optimize._session.put(key, data, attachment=attachment, congestion_control=block, priority=urgent)
+        def put(key: str, data: bytes, attachment: bytes | None = None) -> None:
+            block, urgent = zenoh.CongestionControl.BLOCK, zenoh.Priority.REAL_TIME
+            foreign.put(key, data, attachment=attachment, congestion_control=block, priority=urgent)
 
-    put(key, b"\xc1")
-    put(key, b"\x91" * 1_000)
-    put(key, good[:-3])
-    put(key, bytes(MAX_MESSAGE_BYTES + 1))
-    put(key, good, attachment=b"\x91" * 500)  # a good record with a bad trace
-    put(key, good, attachment=bytes(900 + 1))
-    put("birdslam/car/**", good)  # sent to everything at once
-    put("birdslam/*/v1/estimate", good)
-    optimize._session.delete(key, priority=zenoh.Priority.REAL_TIME)
-    put(key, bytes(1 << 16))  # this one zenoh itself filters out
-    put(key, good)  # without a trace, as a foreign sender may
+        publisher = foreign.declare_publisher(key)
+        until(lambda: matched(publisher), "somebody who subscribes")
+        put(key, b"\xc1")
+        put(key, b"\x91" * 1_000)
+        put(key, good[:-3])
+        put(key, bytes(MAX_MESSAGE_BYTES + 1))
+        put(key, good, attachment=b"\x91" * 500)  # a good record with a bad trace
+        put(key, good, attachment=bytes(900 + 1))
+        put("birdslam/car/**", good)  # sent to everything at once
+        put("birdslam/*/v1/estimate", good)
+        foreign.delete(key, priority=zenoh.Priority.REAL_TIME)
+        put(key, bytes(1 << 16))  # this one zenoh itself filters out
+        put(key, good)  # without a trace, as a foreign sender may
+        assert received(estimates).trace == Trace()
     out.put(estimate(2))
-    assert received(estimates).trace == Trace()
     assert received(estimates).record.frame_id == 2
     assert estimates.recv(0.0) is None
     assert estimates.malformed == 9
@@ -182,19 +185,19 @@ def test_malformed_messages_are_counted_and_survived(join: Any, caplog: pytest.L
     assert sum("malformed" in record.message for record in caplog.records) == 1
 
 
-def test_messages_that_were_lost_on_the_way_are_counted(join: Any) -> None:
+def test_messages_that_were_lost_on_the_way_are_counted(join: Any, base: Path) -> None:
     hub = join("supervisor", hub=True)
     estimates = hub.subscriber("estimate", depth=16)
-    optimize = join("optimize", lossless=True)
-    out = optimize.publisher("estimate")
+    out = join("optimize", lossless=True).publisher("estimate")
     assert out.wait_matched(LIMIT_S)
-    key, data = key_of("car", "estimate"), encode(estimate(1))
     numbers = [("optimize", n) for n in (4, 5, 9, 1, 2)]  # 6 to 8 are lost; then it begins anew
-    for node, number in [*numbers, ("another", 7), ("optimize", 3)]:
-        trace = Trace((Stage(node, 1, 2, 3),), number=number)
+    with foreign_session(base) as foreign:
         block, urgent = zenoh.CongestionControl.BLOCK, zenoh.Priority.REAL_TIME
-        optimize._session.put(key, data, attachment=encode(trace), congestion_control=block, priority=urgent)
-    assert [received(estimates).trace.number for _ in range(7)] == [4, 5, 9, 1, 2, 7, 3]
+        publisher = foreign.declare_publisher(key_of("car", "estimate"), congestion_control=block, priority=urgent)
+        until(lambda: matched(publisher), "somebody who subscribes")
+        for node, number in [*numbers, ("another", 7), ("optimize", 3)]:
+            publisher.put(encode(estimate(1)), attachment=encode(Trace((Stage(node, 1, 2, 3),), number=number)))
+        assert [received(estimates).trace.number for _ in range(7)] == [4, 5, 9, 1, 2, 7, 3]
     assert estimates.dropped == 3
     for frame_id in range(3):
         out.put(estimate(frame_id))
@@ -581,11 +584,39 @@ def test_the_default_directory_is_private(base: Path, monkeypatch: pytest.Monkey
     assert ring_path("car") == ring_path("car")
 
 
-def test_nothing_listens_beyond_the_machine(join: Any) -> None:
-    hub, node, guest = join("supervisor", hub=True), join("capture"), join("planner-1")
+@pytest.mark.parametrize("end", ["", "raise KeyboardInterrupt", "planner.wait()"], ids=["ends", "interrupted", "later"])
+def test_a_process_that_leaves_its_bus_open_ends_in_silence(join: Any, base: Path, end: str) -> None:
+    """zenoh's threads never call into an interpreter that has ended, which panics, or is a segmentation fault."""
+    join("supervisor", hub=True)
+    optimize = join("optimize")
+    out, over = optimize.publisher("estimate"), threading.Event()
+    optimize.declare_alive()
+
+    def flood() -> None:
+        while not over.wait(0.0005):
+            out.put(estimate(1))
+
+    thread = threading.Thread(target=flood)
+    thread.start()
+    try:
+        code = f"from birdslam.runtime.client import *; planner = Planner('car', Path({str(base)!r})); {end}"
+        for _ in range(3):
+            done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+            interrupted = "Interrupt" in end
+            assert done.returncode == (-signal.SIGINT if interrupted else 0), done.stderr
+            assert done.stderr.splitlines()[-1:] == (["KeyboardInterrupt"] if interrupted else [])
+            assert "panicked" not in done.stderr
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_nothing_listens_beyond_the_machine(join: Any, base: Path) -> None:
+    join("supervisor", hub=True)
+    node, guest = join("capture"), join("planner-1")
     node.declare_alive()
     assert guest.wait_alive({"capture"}, LIMIT_S) == set()
-    links = [str(link) for bus in (hub, node, guest) for link in bus._session.info.links()]
-    assert len(links) == 6
-    assert all("src: unixsock-stream/" in link for link in links)
-    assert psutil.Process().net_connections(kind="inet") == []
+    with foreign_session(base) as foreign:
+        until(lambda: len(foreign.info.links()) == 2, "links to the hub, and to the node that the hub told of")
+        assert all("src: unixsock-stream/" in str(link) for link in foreign.info.links())
+        assert psutil.Process().net_connections(kind="inet") == []

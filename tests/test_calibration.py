@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.calibration.calibration import CalibrationConfig, CalibrationError, _by_road, _Seen, calibrate
+from birdslam.calibration.calibration import CalibrationConfig, CalibrationError, Observations, by_road, calibrate
 from birdslam.calibration.height_check import VehicleHeightConfig, solve_mounting
 from birdslam.calibration.intrinsics import from_chessboard, read_intrinsics
 from birdslam.frontend import FrontEndConfig
@@ -221,8 +221,8 @@ def test_an_error_of_the_running_scale_is_in_what_the_road_says_however_many_com
     pitch_rad = 0.01 + off_log / by_pitch
     sigmas = []
     for count in (40, 400):
-        seen = _Seen(fits=[(RoadFit(np.array([0.0, pitch_rad, 0.0, 0.0]), cov, 0.9, 1000), 3.0)] * count)
-        road = _by_road(seen, CAMERA, CalibrationConfig())
+        seen = Observations(fits=[(RoadFit(np.array([0.0, pitch_rad, 0.0, 0.0]), cov, 0.9, 1000), 3.0)] * count)
+        road = by_road(seen, CAMERA, CalibrationConfig())
         assert road is not None
         sigmas.append(math.sqrt(road.cov[0]))
         assert abs(road.pitch_rad - 0.01) < 1.5 * sigmas[-1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,13 +15,22 @@ from birdslam.frontend import FrontEnd
 from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections, Findings, ModelSpec, Segmentation
 from birdslam.perception.manifest import Schedule
-from birdslam.runtime.configuration import Configuration, DegradationConfig, ModelsConfig, SourceConfig, complete
+from birdslam.runtime.configuration import (
+    Configuration,
+    DegradationConfig,
+    ModelsConfig,
+    RuntimeConfig,
+    SourceConfig,
+    complete,
+)
 from birdslam.runtime.nodes import inference
 from birdslam.runtime.nodes.degradation import Degradation, Mode, modes
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.nodes import PerceiveNode
 from birdslam.runtime.process.restarts import FIRST
 from birdslam.runtime.transport.bus import Message
+from birdslam.runtime.transport.presence import ring_path
+from birdslam.runtime.transport.ring import FrameRing
 from birdslam.runtime.wire import Trace
 from birdslam.types import INVALIDATING, Frame, FrameRef, Measurements, Status
 
@@ -127,25 +138,29 @@ class Blind(FrontEnd):
         return Measurements(frame_id=frame.frame_id, t_source_ns=frame.t_source_ns, t_capture_ns=0, t_utc_ns=0)
 
 
-class Ring:
-    def read(self, ref: FrameRef) -> np.ndarray:
-        return np.zeros((4, 4), dtype=np.uint8)
+@pytest.fixture
+def pixels(tmp_path: Path) -> Iterator[dict[str, int]]:
+    """Where a small black image lies in the ring of the vehicle `test`, as references name it."""
+    with FrameRing(ring_path("test", tmp_path), 4, 4, channels=1) as ring:
+        slot, sequence = ring.write(np.zeros((4, 4), dtype=np.uint8))
+        place = {"slot": slot, "sequence": sequence, "ring_epoch": ring.epoch}
+        yield {**place, "height_px": 4, "width_px": 4, "channels": 1}
 
 
-def test_coasting_looks_at_few_frames_and_says_so() -> None:
+def test_coasting_looks_at_few_frames_and_says_so(tmp_path: Path, pixels: dict[str, int]) -> None:
     configuration = Configuration(
         vehicle="test",
+        runtime=RuntimeConfig(runtime_dir=str(tmp_path)),
         models=ModelsConfig(shipped=False),
         degradation=DegradationConfig(window_frames=1, late_share=1.0, coast_divisor=5, coast_max_ms=250.0),
     )
     frontend = Blind()
     with Inference(configuration) as networks:
         node = PerceiveNode(configuration, networks, frontend, Bus(), FIRST)  # type: ignore[arg-type]
-        node._ring = Ring()  # type: ignore[assignment]
         records: list[Measurements] = []
         for number in range(12):  # each a second old when it is done
             stamps = {"t_source_ns": number * 100_000_000, "t_capture_ns": 0, "t_utc_ns": 0}
-            records += node.step(FrameRef(frame_id=number, slot=0, **stamps))
+            records += node.step(FrameRef(frame_id=number, **pixels, **stamps))
         assert node.mode == Mode.COASTING
     assert frontend.shown == [0, 5, 10]
     coasted = [r for r in records if Status.COASTING in r.status]
@@ -156,35 +171,37 @@ def test_coasting_looks_at_few_frames_and_says_so() -> None:
     assert all(Status.INPUT_STALE in r.status for r in records if r.frame_id in frontend.shown)
 
 
-def test_a_frame_that_a_newer_one_overtakes_is_predicted() -> None:
-    configuration = Configuration(vehicle="test", models=ModelsConfig(shipped=False))
+def test_a_frame_that_a_newer_one_overtakes_is_predicted(tmp_path: Path, pixels: dict[str, int]) -> None:
+    runtime = RuntimeConfig(runtime_dir=str(tmp_path))
+    configuration = Configuration(vehicle="test", models=ModelsConfig(shipped=False), runtime=runtime)
     stamps = {"t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0}
-    came = [FrameRef(frame_id=number, slot=0, **stamps) for number in range(3)]
+    came = [FrameRef(frame_id=number, **pixels, **stamps) for number in range(3)]
     end = FrameRef(frame_id=5, slot=-1, **stamps, status=(Status.END_OF_SOURCE,))
     bus, frontend = Bus(*came), Blind()
     records: list[Measurements] = []
     with Inference(configuration) as networks:
         node = PerceiveNode(configuration, networks, frontend, bus, FIRST)  # type: ignore[arg-type]
-        node._ring = Ring()  # type: ignore[assignment]
         while (message := node.receive(0.0)) is not None:
             records += node.step(message.record)
             if message.record.frame_id == 2:
-                bus.frames += [FrameRef(frame_id=3, slot=0, **stamps), FrameRef(frame_id=4, slot=0, **stamps), end]
+                bus.frames += [*(FrameRef(frame_id=number, **pixels, **stamps) for number in (3, 4)), end]
     assert [record.frame_id for record in records] == [0, 1, 2, 3, 4, 5]  # none is left out
     assert [record.frame_id for record in records if Status.COASTING in record.status] == [0, 1, 3]
     assert frontend.shown == [2, 4]  # the newest, and the last: the end overtakes nothing
     assert node.ended
 
 
-def test_what_runs_aside_runs_where_nothing_is_to_be_left_out() -> None:
+def test_what_runs_aside_runs_where_nothing_is_to_be_left_out(tmp_path: Path, pixels: dict[str, int]) -> None:
     configuration = Configuration(
-        vehicle="test", models=ModelsConfig(shipped=False), degradation=DegradationConfig(enabled=False)
+        vehicle="test",
+        models=ModelsConfig(shipped=False),
+        degradation=DegradationConfig(enabled=False),
+        runtime=RuntimeConfig(runtime_dir=str(tmp_path)),
     )
     configuration = complete(configuration, Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5), 33.0)
     with Inference(configuration) as networks:
         node = PerceiveNode(configuration, networks, Blind(), Bus(), FIRST)  # type: ignore[arg-type]
-        node._ring = Ring()  # type: ignore[assignment]
         assert networks.aside is not None
         done = networks.aside(lambda: "lanes")
-        assert len(list(node.step(FrameRef(frame_id=0, slot=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0)))) == 1
+        assert len(list(node.step(FrameRef(frame_id=0, **pixels, t_source_ns=0, t_capture_ns=0, t_utc_ns=0)))) == 1
         assert done.result(timeout=60.0) == "lanes"

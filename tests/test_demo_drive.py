@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -116,15 +117,15 @@ def test_a_drive_written_is_the_drive_read(tmp_path: Path, demo: DemoRecording) 
     assert image is not None
     camera = (DIRECTORY / "camera.toml").read_text()
     (tmp_path / "camera.toml").write_text(camera)
-    data = demo._images[: demo._ends[0]].tobytes()
+    data = cv2.imencode(".jpg", image)[1]
     poses = np.tile(np.eye(4)[:3], (2, 1, 1))
     row = [1, 7, 3, 12.0, -2.0, 0.1, 11.0, 2.5, 3.0, 5.0, 0.5, 0.25, 0.5, 1.0, 2.0, 30.0, 40.0]
     assert len(row) == len(COLUMNS)
-    write_drive(tmp_path, [data, b"torn"], 20.0, poses, np.array([[1.5, 0.01, 0.0]] * 2), np.array([row]))
+    write_drive(tmp_path, [data.tobytes(), b"torn"], 20.0, poses, np.array([[1.5, 0.01, 0.0]] * 2), np.array([row]))
     drive = DemoRecording(directory=tmp_path)
     first, second = drive.frames()
     assert first.image is not None
-    assert first.image.tobytes() == image.tobytes()
+    assert first.image.tobytes() == cv2.imdecode(data, cv2.IMREAD_COLOR).tobytes()
     assert second.image is None
     assert second.error is not None
     assert "image 1 can't be decoded" in second.error

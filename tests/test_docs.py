@@ -163,7 +163,7 @@ def test_what_a_report_is_reduced_to() -> None:
     with_images = results.EVALUATIONS["tracking"].keep(msgspec.to_builtins(rows + seen))
     assert with_images["birdslam, images"] == {"5/31": 9.0, "5/ego": 9.0}
     assert {name: with_images[name] for name in kept} == kept  # the simulated ones are not mixed with them
-    made = results._tracking_table(with_images)
+    made = results.tracking_table(with_images)
     of_5 = made.splitlines()[0].strip("| ").split(" | ").index("5/31")
     (line,) = (line.strip("| ").split(" | ") for line in made.splitlines() if line.startswith("| **ours, final**, im"))
     assert {k for k, cell in enumerate(line) if cell == "9.00"} == {of_5, len(line) - 1}

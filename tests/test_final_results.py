@@ -71,7 +71,7 @@ def taped(directory: Path, frames: list[Measurements], end: bool = True) -> Tape
         tape.step(measurements)
         if number != 7:
             image = np.full((CAMERA.height_px, CAMERA.width_px), number, np.uint8)
-            tape.writer.draw(*scene.from_image(image, 90, measurements.t_utc_ns), t_ns=tape._tick())
+            tape.writer.draw(*scene.from_image(image, 90, measurements.t_utc_ns), t_ns=tape.tick())
     if end:
         tape.end(frames[-1])
     return tape
@@ -272,7 +272,7 @@ def test_the_images_of_a_recording_are_drawn_by_their_numbers_in_the_run(tmp_pat
     for number, measurements in enumerate(frames):
         tape.step(measurements)
         image = np.full((CAMERA.height_px, CAMERA.width_px), number, np.uint8)
-        tape.writer.draw(*scene.from_image(image, 90, measurements.t_utc_ns), t_ns=tape._tick())
+        tape.writer.draw(*scene.from_image(image, 90, measurements.t_utc_ns), t_ns=tape.tick())
     tape.end(frames[-1])
     camera, rate_hz, images = recorded_frames([tape.path])
     assert camera == CAMERA

@@ -22,7 +22,7 @@ PATHS = sorted({path for panel in LAYOUT["configById"].values() for path in foxg
 
 
 def test_every_panel_has_its_place() -> None:
-    placed = [name for name, _ in foxglove._boxes(LAYOUT["layout"], (0.0, 0.0, 1.0, 1.0))]
+    placed = [name for name, _ in foxglove.boxes_of(LAYOUT["layout"], (0.0, 0.0, 1.0, 1.0))]
     assert sorted(placed) == sorted(LAYOUT["configById"])
     assert {name.partition("!")[0] for name in placed} == {"3D", "Image", "Plot", "StateTransitions"}
     (drive,) = (panel for name, panel in LAYOUT["configById"].items() if name.startswith("3D"))

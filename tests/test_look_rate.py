@@ -15,7 +15,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.perception import Findings
 from birdslam.perception.manifest import Schedule
 from birdslam.perception.schedule import Networks
-from birdslam.perception.shipped import _at_once
+from birdslam.perception.shipped import run_at_once
 from birdslam.runtime.configuration import LooksConfig
 from birdslam.runtime.nodes.look_rate import Cost, LookRate, load, measure, threads_of_a_network
 from birdslam.runtime.process import realtime
@@ -130,7 +130,7 @@ class Head:
 
 def test_networks_that_are_spared_run_on_fewer_frames() -> None:
     head = Head()
-    networks = Networks([head], _at_once)
+    networks = Networks([head], run_at_once)
     for frame_id in range(24):
         networks.sparing = 1 if frame_id < 12 else 3
         networks.start(frame_id, np.full((2, 2), frame_id, np.uint8)).result()

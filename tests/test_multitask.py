@@ -583,7 +583,7 @@ def test_of_several_networks_one_begins_with_the_mean_of_their_weights() -> None
 def test_of_two_depths_that_an_outline_leaves_open_the_nearer_costs_less() -> None:
     import torch
 
-    from birdslam.world.training.losses import Batch, LossConfig, _depth
+    from birdslam.world.training.losses import Batch, LossConfig, depth_loss
 
     near_m, far_m, share_near = 5.0, 20.0, 0.4
     truth = torch.full((1, 10, 10), far_m).log()
@@ -592,7 +592,7 @@ def test_of_two_depths_that_an_outline_leaves_open_the_nearer_costs_less() -> No
 
     def cost(said_m: float, relative: float) -> float:
         said = torch.full((1, 10, 10), said_m).log()
-        return float(_depth(said, batch, LossConfig(relative=relative, shape=0.0))["depth"])
+        return float(depth_loss(said, batch, LossConfig(relative=relative, shape=0.0))["depth"])
 
     assert cost(near_m, 1.0) < cost(far_m, 1.0)
     assert cost(near_m, 0.0) > cost(far_m, 0.0)

@@ -366,7 +366,7 @@ def test_interrupting_the_suite_keeps_what_it_has(tmp_path: Path, monkeypatch: p
         (options.output / f"{step.file}.json").write_text(json.dumps({"rows": [], "label": step.file}))
         return "complete"
 
-    monkeypatch.setattr(everything, "_run", interrupted)
+    monkeypatch.setattr(everything, "run_step", interrupted)
     assert everything.run(["--output", str(tmp_path), "--model", "detector=none.onnx"]) == 130
     kept = json.loads((tmp_path / "report.json").read_text())
     assert kept["outcome"]["optimizer"] == "interrupted"

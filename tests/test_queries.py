@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,16 +17,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
+from birdslam.mapping.atlas import Atlas
 from birdslam.queries import MapSnapshot, TimedPose, Trajectory, VehiclePath
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import Configuration, SourceConfig
 from birdslam.runtime.supervision.query_server import QueryServer
 from birdslam.runtime.topology import QUERIES, TOPICS, key_of
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError
-from birdslam.runtime.transport.queries import WAITING_QUERIES, QueryRefused, QueryResponder, positive
+from birdslam.runtime.transport.queries import WAITING_QUERIES, QueryRefused, positive
 from birdslam.runtime.transport.reply_parts import map_parts, trajectory_parts, whole_map, whole_trajectory
 from birdslam.runtime.wire import Health, Part, encode
 from birdslam.types import MapUpdate
+from tests.foreign_sender import foreign_session
 from tests.test_bus import LIMIT_S, estimate, measurements, until
 
 pytestmark = pytest.mark.processes
@@ -89,7 +92,7 @@ def test_what_planners_ask_for(join: Any, base: Path) -> None:
     server = QueryServer(CONFIGURATION, hub := join("supervisor", hub=True))
     with Planner("car", base) as planner:
         hub.declare_alive()
-        until(lambda: "supervisor" in planner._bus.alive, "the supervisor")
+        until(lambda: planner.configuration() is not None, "an answer of the supervisor")
         with pytest.raises(BusError, match="there is no map yet"):
             planner.map()
         for number in range(50):
@@ -119,16 +122,19 @@ def test_a_long_drive_is_answered_in_parts_that_fit(join: Any, base: Path) -> No
     server = QueryServer(Configuration(), hub := join("supervisor", hub=True))
     with Planner("car", base) as planner:
         hub.declare_alive()
-        until(lambda: "supervisor" in planner._bus.alive, "the supervisor")
+        until(lambda: planner.configuration() is not None, "an answer of the supervisor")
+        atlas = Atlas(Configuration().atlas)
         for number in range(3000):
-            server.add(at(number, float(number)))
+            server.add(here := at(number, float(number)))
             points = tuple((number + 0.3 * k, float(k)) for k in range(4))
-            server.add_map(MapUpdate(epoch=3, frame_id=number, lanes_m=points, landmarks_m=points))
+            server.add_map(gained := MapUpdate(epoch=3, frame_id=number, lanes_m=points, landmarks_m=points))
+            atlas.add(here)
+            atlas.add(here, gained)
         way, chart = planner.trajectory(timeout_s=LIMIT_S), planner.map(timeout_s=LIMIT_S)
         assert way is not None
         assert chart is not None
-        assert way == server._atlas.trajectory()
-        assert chart == server._atlas.map()
+        assert way == atlas.trajectory()
+        assert chart == atlas.map()
         assert len(encode_all(map_parts(chart))) > 5
 
 
@@ -170,19 +176,22 @@ def test_a_trajectory_is_whole_again(ego: int, vehicles: list[int]) -> None:
     assert encode_all(parts)
 
 
-def test_who_asks_for_everything_gets_nothing(join: Any) -> None:
+def test_who_asks_for_everything_gets_nothing(join: Any, base: Path) -> None:
     server = QueryServer(Configuration(), hub := join("supervisor", hub=True))
     server.add(at(1, 0.0))
-    guest = join("guest")
     hub.declare_alive()
-    assert not guest.wait_alive({"supervisor"}, LIMIT_S)
-    assert guest.query("map")
-    for selector in ("birdslam/car/v1/*", "birdslam/**", "**"):
-        assert [r for r in guest._session.get(selector, timeout=0.3) if r.ok is not None] == []
+    with foreign_session(base) as guest:
+
+        def answers(selector: str, limit_s: float) -> list[zenoh.Reply]:
+            return [reply for reply in guest.get(selector, timeout=limit_s) if reply.ok is not None]
+
+        until(lambda: answers(key_of("car", "map"), 2.0), "the map")
+        for selector in ("birdslam/car/v1/*", "birdslam/**", "**"):
+            assert answers(selector, 0.3) == []
 
 
-def test_a_part_that_is_lost_is_told(join: Any) -> None:
-    hub, guest = join("supervisor", hub=True), join("guest")
+def test_a_part_that_is_lost_is_told(join: Any, base: Path) -> None:
+    hub = join("supervisor", hub=True)
     key, answers = key_of("car", "map"), [(encode(MapSnapshot(epoch=1, frame_id=2)), encode(Part(1, 3)))]
 
     def answer(query: zenoh.Query) -> None:
@@ -190,44 +199,48 @@ def test_a_part_that_is_lost_is_told(join: Any) -> None:
             query.reply(key, data, attachment=attachment)
         query.drop()
 
-    queryable = hub._session.declare_queryable(key, answer)
-    hub.declare_alive()
-    assert not guest.wait_alive({"supervisor"}, LIMIT_S)
-    with pytest.raises(BusError, match="map: 1 of the reply's 3 parts came"):
-        guest.query("map")
-    for data, attachment in ((b"\xc1", encode(Part())), (answers[0][0], b"\x92\x00\x00")):
-        answers[:] = [(data, attachment)]
-        with pytest.raises(BusError, match="map: the reply is malformed"):
-            guest.query("map")
-    answers.clear()
-    assert guest.query("map") == []
-    queryable.undeclare()
+    def answered() -> bool:
+        try:
+            return hub.query("map") != []
+        except BusError:
+            return True
+
+    with foreign_session(base) as foreign:
+        queryable = foreign.declare_queryable(key, answer)
+        until(answered, "an answer")
+        with pytest.raises(BusError, match="map: 1 of the reply's 3 parts came"):
+            hub.query("map")
+        for data, attachment in ((b"\xc1", encode(Part())), (answers[0][0], b"\x92\x00\x00")):
+            answers[:] = [(data, attachment)]
+            with pytest.raises(BusError, match="map: the reply is malformed"):
+                hub.query("map")
+        answers.clear()
+        assert hub.query("map") == []
+        queryable.undeclare()
 
 
-def test_a_flood_of_queries_is_answered_in_part_and_harms_nothing(
-    join: Any, base: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    came, receive = [0], QueryResponder._enqueue
+def test_a_flood_of_queries_is_answered_in_part_and_harms_nothing(join: Any, base: Path) -> None:
+    hub, may_answer = join("supervisor", hub=True), threading.Event()
+    way = Trajectory(epoch=1, frame_id=2, t_source_ns=3)
 
-    def count(responder: QueryResponder, query: zenoh.Query) -> None:
-        receive(responder, query)
-        came[0] += 1
+    def answer(parameters: Any) -> list[Trajectory]:
+        assert may_answer.wait(LIMIT_S)
+        return trajectory_parts(way)
 
-    monkeypatch.setattr(QueryResponder, "_enqueue", count)
-    server = QueryServer(Configuration(), hub := join("supervisor", hub=True))
-    server.add(at(1, 0.0))
-    with Planner("car", base) as planner:
-        hub.declare_alive()
-        until(lambda: "supervisor" in planner._bus.alive, "the supervisor")
-        with server._turn:  # no query can be answered now
-            handlers = [
-                planner._bus._session.get(key_of("car", "trajectory"), zenoh.handlers.FifoChannel(8), timeout=LIMIT_S)
-                for _ in range(10 * WAITING_QUERIES)
-            ]
-            until(lambda: came[0] == len(handlers), "all queries have come")
+    hub.answer_queries({"trajectory": answer})
+    hub.publisher("estimate").put(estimate(1))  # is kept, and told on the thread on which queries come
+    with foreign_session(base) as foreign, Planner("car", base) as planner:
+
+        def ask(topic: str) -> Any:
+            return foreign.get(key_of("car", topic), zenoh.handlers.FifoChannel(8), timeout=LIMIT_S)
+
+        until(lambda: any(reply.ok is not None for reply in ask("estimate")), "the hub's answer")
+        handlers = [ask("trajectory") for _ in range(10 * WAITING_QUERIES)]
+        assert any(reply.ok is not None for reply in ask("estimate"))  # so those before it have come
+        may_answer.set()
         answered = sum(any(reply.ok is not None for reply in handler) for handler in handlers)
         assert 1 <= answered <= 2 * WAITING_QUERIES
-        assert planner.trajectory() is not None
+        assert planner.trajectory(timeout_s=LIMIT_S) == way
 
 
 def test_a_refusal_names_the_parameter() -> None:

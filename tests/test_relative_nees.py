@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from test_tracking_evaluation import log_of
 
-from birdslam.bench.ego.motion_consistency import _of_length
+from birdslam.bench.ego.motion_consistency import nees_of_length
 from birdslam.bench.simulation.odometry import EXACT
 from birdslam.bench.tracking.benchmark import ours
 from birdslam.bench.tracking.relative_nees import NeesRow, nees_rows, over_seeds
@@ -37,7 +37,7 @@ def test_a_length_that_errs_by_its_sigma_has_1(length_m: float, course_rad: floa
     across = np.array([-here[1], here[0]])
     cov = np.eye(3)
     cov[:2, :2] = (rel * length_m) ** 2 * np.outer(here, here) + 100.0 * np.outer(across, across)
-    assert _of_length(told, cov, length_m) == pytest.approx(1.0, rel=1e-6)
+    assert nees_of_length(told, cov, length_m) == pytest.approx(1.0, rel=1e-6)
 
 
 @pytest.fixture(scope="module")

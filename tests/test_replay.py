@@ -241,8 +241,8 @@ def test_a_file_that_begins_in_the_middle_of_a_drive_replays_from_its_checkpoint
     tape.writer.close({})
     path = tmp_path / "drive-2.mcap"
     tape.writer = RecordingWriter(path, about(tape.configuration, {}, restarts=1), CAMERA, 1e-3, sync=False)
-    tape.writer.draw("/alive", Alive(node="optimize", alive=True), tape._tick())
-    tape.writer.begin_from(GraphCheckpoint(frame_id=kept.frame_id, epoch=kept.epoch, data=kept.data), tape._tick())
+    tape.writer.draw("/alive", Alive(node="optimize", alive=True), tape.tick())
+    tape.writer.begin_from(GraphCheckpoint(frame_id=kept.frame_id, epoch=kept.epoch, data=kept.data), tape.tick())
     if late:  # the first frame of the file is answered when the next one has been coasted over
         tape.frame(frames[15])
         coasted = tape.frame(frames[16])

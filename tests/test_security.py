@@ -32,6 +32,7 @@ from birdslam.runtime.transport.bus import Bus, Publisher, Subscriber
 from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
 from birdslam.runtime.wire import MAX_TRACE_BYTES, Health, Trace, WireError, decode, encode
 from birdslam.types import Estimate, MapUpdate, SpeedReading
+from tests.foreign_sender import foreign_session
 from tests.mutations import Chance, mutated
 from tests.test_bus import estimate, measurements, until
 
@@ -241,9 +242,7 @@ def test_a_planner_asks_what_it_may_and_no_more(vehicle: Vehicle, certificates: 
         hear(vehicle, session, keys(READABLE))  # each node has said something, which it keeps
         for topic in ASKABLE:
             until(lambda topic=topic: answers(session, topic) == 1, f"an answer about {topic}")  # type: ignore[misc]
-        assert (
-            answers(vehicle.nodes["optimize"]._session, "measurements", LIMIT_S) >= 1
-        )  # inside, they are there to be had
+        assert vehicle.nodes["optimize"].kept("measurements", LIMIT_S)  # inside, they are there to be had
         assert answers(session, "measurements", 0.5) == 0
         assert answers(session, "frame", 0.5) == 0
         for topic in (*ASKABLE, "measurements"):
@@ -282,11 +281,11 @@ def test_nobody_outside_writes(vehicle: Vehicle, certificates: Path) -> None:
         assert all(listener.malformed == 0 for listener in vehicle.listeners.values())
         assert "impostor" not in vehicle.nodes["capture"].alive
         assert alive_key("car", "impostor") not in heard.alive
-        for topic in (*ASKABLE, "measurements", "frame"):
-            asked = vehicle.nodes["capture"]._session.get(
-                key_of("car", topic), timeout=1.0, target=zenoh.QueryTarget.ALL
-            )
-            assert b"lie" not in [bytes(reply.ok.payload) for reply in asked if reply.ok], topic
+        with foreign_session(vehicle.base) as inside:
+            until(lambda: answers(inside, "estimate"), "an answer")
+            for topic in (*ASKABLE, "measurements", "frame"):
+                asked = inside.get(key_of("car", topic), timeout=1.0, target=zenoh.QueryTarget.ALL)
+                assert b"lie" not in [bytes(reply.ok.payload) for reply in asked if reply.ok], topic
         queryable.undeclare()
         token.undeclare()
 
@@ -607,29 +606,31 @@ def test_a_flood_of_mutants_reaches_no_planner(tmp_path_factory: pytest.TempPath
     base, chance = tmp_path_factory.mktemp("run"), Chance(6)
     good = encode(estimate(3))
     refused = 0
-    with Bus("car", "optimize", hub=True, runtime_dir=base) as bus, Planner("car", base) as planner:
-        publisher = bus.publisher("estimate")
-        assert publisher.wait_matched(LIMIT_S)
-        rough = bus._session.declare_publisher(
-            key_of("car", "estimate"),
-            congestion_control=zenoh.CongestionControl.BLOCK,  # each one arrives, however busy the machine is
-            priority=zenoh.Priority.REAL_TIME,  # and in order with the publisher's own
-            express=True,
-        )
+    with (
+        foreign_session(base, as_hub=True) as foreign,
+        Bus("car", "planner-0", runtime_dir=base) as another,
+        Planner("car", base) as planner,
+    ):
+        counting = another.subscriber("estimate")
+        block = zenoh.CongestionControl.BLOCK  # each one arrives, however busy the machine is
+        publisher = foreign.declare_publisher(key_of("car", "estimate"), congestion_control=block, express=True)
+
+        def come(frame_id: int) -> bool:
+            """Whether both that subscribe have an estimate of that number."""
+            publisher.put(encode(estimate(frame_id)))
+            found = planner.latest().estimate
+            assert found is None or encode(found)
+            newest = counting.newest
+            return bool(found and newest and found.frame_id == newest.record.frame_id == frame_id)
+
+        until(lambda: come(76), "an estimate before the flood")
         for _ in range(3_000):
             attachment = mutated(chance, good, good) if chance.random() < 0.5 else None
             payload = mutated(chance, good, good)
             refused += is_refused(payload, attachment)
-            rough.put(payload, attachment=attachment)
-
-        def comes() -> bool:
-            publisher.put(estimate(77))
-            found = planner.wait(0.1)
-            assert found is None or encode(found)
-            return found is not None and found.frame_id == 77
-
-        until(comes, "an estimate after the flood")
-        assert planner._subscriber.malformed == refused > 1_000
+            publisher.put(payload, attachment=attachment)
+        until(lambda: come(77), "an estimate after the flood")
+        assert counting.malformed == refused > 1_000
         assert planner.latest(1e6).estimate is not None
 
 

@@ -41,6 +41,8 @@ from birdslam.runtime.wire import Trace, decode, encode
 from birdslam.sources.recording import RecordedFrame
 from birdslam.sources.speed_log import KEPT_READINGS, added
 from birdslam.types import EgoEdge, FrameRef, Measurements, SpeedReading, SpeedSource, Status
+from tests.foreign_sender import foreign_session, matched
+from tests.test_bus import until
 
 CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
 MS = 1_000_000
@@ -176,7 +178,9 @@ def test_frames_bear_what_a_car_says_at_50_hz_malformed_and_flooding(
         speed = car.publisher("speed")
         assert speed.wait_matched(LIMIT_S)
         block = zenoh.CongestionControl.BLOCK  # each one arrives, however busy the machine is
-        plain = car._session.declare_publisher(key_of("car", "speed"), congestion_control=block)
+        foreign = stack.enter_context(foreign_session(place))
+        plain = foreign.declare_publisher(key_of("car", "speed"), congestion_control=block)
+        until(lambda: matched(plain), "capture, which subscribes")
 
         def until_taken(count: int) -> FrameRef:
             """The frame that bears what has been said."""

@@ -106,7 +106,7 @@ class _RecordingOdometry(Odometry):
 
 
 @dataclass
-class _Observations:
+class Observations:
     """The measurements of one drive."""
 
     fits: list[tuple[RoadFit, float]] = field(default_factory=list)  # and the distance since the one before
@@ -170,8 +170,8 @@ def calibrate(
     )
 
 
-def _observe(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: CalibrationConfig) -> _Observations:
-    odometry, seen = _RecordingOdometry(camera, frontend.odometry), _Observations()
+def _observe(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: CalibrationConfig) -> Observations:
+    odometry, seen = _RecordingOdometry(camera, frontend.odometry), Observations()
     front = FrontEnd(camera, frontend, odometry)
     since_m = 0.0
     for frame, pending in drive():
@@ -200,8 +200,8 @@ def _observe(drive: Drive, camera: Camera, frontend: FrontEndConfig, config: Cal
 # --- pitch and roll ---
 
 
-def _cue_estimates(seen: _Observations, camera: Camera, config: CalibrationConfig) -> list[CueEstimate]:
-    found = [by(seen, camera, config) for by in (_by_road, _by_travel, _by_lines, _by_vehicles)]
+def _cue_estimates(seen: Observations, camera: Camera, config: CalibrationConfig) -> list[CueEstimate]:
+    found = [by(seen, camera, config) for by in (by_road, _by_travel, _by_lines, _by_vehicles)]
     estimates = [estimate for estimate in found if estimate is not None]
     if not estimates:
         raise CalibrationError(
@@ -210,7 +210,7 @@ def _cue_estimates(seen: _Observations, camera: Camera, config: CalibrationConfi
     return estimates
 
 
-def _by_road(seen: _Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
+def by_road(seen: Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
     """The mean over the alignments of the road; those within one bounce of the car count as one sample."""
     if len(seen.fits) < config.min_fits:
         return None
@@ -238,7 +238,7 @@ def _by_road(seen: _Observations, camera: Camera, config: CalibrationConfig) -> 
     return _cue_estimate("road", mean, of_mean, len(tilt))
 
 
-def _by_travel(seen: _Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
+def _by_travel(seen: Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
     """A car travels along the road: normal . direction = 0, solved for the pitch at the roll known so far."""
     length = np.array([length for _, length in seen.directions])
     if length.sum() < config.min_path_m:
@@ -256,7 +256,7 @@ def _by_travel(seen: _Observations, camera: Camera, config: CalibrationConfig) -
     )
 
 
-def _by_lines(seen: _Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
+def _by_lines(seen: Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
     """The road's lines lie in it: normal . direction = 0, solved for the pitch at the roll known so far."""
     if len(seen.lines) < config.min_looks:
         return None
@@ -273,7 +273,7 @@ def _by_lines(seen: _Observations, camera: Camera, config: CalibrationConfig) ->
     )
 
 
-def _by_vehicles(seen: _Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
+def _by_vehicles(seen: Observations, camera: Camera, config: CalibrationConfig) -> CueEstimate | None:
     prior = np.array([camera.height_m, camera.pitch_rad, camera.roll_rad])
     mounting = solve_mounting(
         seen.boxes, prior, np.diag([(0.3 * camera.height_m) ** 2, 0.1**2, 0.1**2]), config.vehicles
@@ -306,7 +306,7 @@ def _mean(estimates: list[CueEstimate]) -> tuple[Floats, Floats, tuple[CueEstima
     return mean, cov, tuple(msgspec.structs.replace(w, chi2=c) for w, c in zip(estimates, chi2, strict=True))
 
 
-def _yaw_rad(seen: _Observations) -> float | None:
+def _yaw_rad(seen: Observations) -> float | None:
     if not seen.directions:
         return None
     return float(np.median([np.arctan2(d[0], d[2]) for d, _ in seen.directions]))

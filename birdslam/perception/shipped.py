@@ -25,10 +25,11 @@ def load_networks(specs: Mapping[Role, ModelSpec]) -> Networks:
     So what is found depends on the images alone. Each ONNX file has its manifest, FILE.toml, beside it
     (docs/networks.md). Raises ModelError, which names the file and what is wrong with it.
     """
-    return Networks([load_network(role, spec) for role, spec in specs.items()], _at_once)
+    return Networks([load_network(role, spec) for role, spec in specs.items()], run_at_once)
 
 
-def _at_once(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
+def run_at_once(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    """An executor for `Networks` that runs what it is given before it returns; an exception is the future's."""
     done: Future[Any] = Future()
     try:
         done.set_result(run(*arguments))

@@ -86,7 +86,7 @@ def run(arguments: list[str]) -> int:
     for number, step in enumerate(chosen, 1):
         print(f"\n[{number}/{len(chosen)}] {step.file}", flush=True)
         begun_s = time.monotonic()
-        outcome[step.file] = _run(step, options)
+        outcome[step.file] = run_step(step, options)
         print(f"[{number}/{len(chosen)}] {step.file}: {outcome[step.file]} in {time.monotonic() - begun_s:.0f} s")
         _write(options.output, head, outcome)
         if outcome[step.file] == "interrupted":
@@ -106,7 +106,7 @@ def _data() -> list[str]:
     return [*given, f"--labels={data / 'kitti_tracking' / 'training'}"]
 
 
-def _run(step: Step, options: argparse.Namespace) -> str:
+def run_step(step: Step, options: argparse.Namespace) -> str:
     """How it ended. What it prints goes to the terminal as it comes."""
     file = options.output / f"{step.file}.json"
     file.unlink(missing_ok=True)

@@ -117,7 +117,7 @@ def draw(layout: dict[str, Any], recording: Recording, at_s: float, output: Path
         series[message.channel].append(((message.t_utc_ns - first_ns) / 1e9, msgspec.json.decode(message.data)))
     figure = Figure(figsize=SIZE_IN, dpi=100, facecolor=BACKGROUND)
     FigureCanvasAgg(figure)
-    for name, (left, bottom, width, height) in _boxes(layout["layout"], (0.0, 0.03, 1.0, 0.97)):
+    for name, (left, bottom, width, height) in boxes_of(layout["layout"], (0.0, 0.03, 1.0, 0.97)):
         panel, kind = layout["configById"][name], name.partition("!")[0]
         inset = 0.03 if kind in ("Plot", "StateTransitions") else 0.0
         box = (left + GAP[0] + inset, bottom + 0.7 * inset, width - 2 * GAP[0] - inset, height - GAP[1] - 0.7 * inset)
@@ -130,7 +130,7 @@ def draw(layout: dict[str, Any], recording: Recording, at_s: float, output: Path
     figure.savefig(output)
 
 
-def _boxes(part: Any, box: Box) -> Iterator[tuple[str, Box]]:
+def boxes_of(part: Any, box: Box) -> Iterator[tuple[str, Box]]:
     """Every panel with its place; the first of two is the left or the upper one."""
     if isinstance(part, str):
         yield part, box
@@ -138,11 +138,11 @@ def _boxes(part: Any, box: Box) -> Iterator[tuple[str, Box]]:
     left, bottom, width, height = box
     share = part["splitPercentage"] / 100.0
     if part["direction"] == "row":
-        yield from _boxes(part["first"], (left, bottom, share * width, height))
-        yield from _boxes(part["second"], (left + share * width, bottom, (1.0 - share) * width, height))
+        yield from boxes_of(part["first"], (left, bottom, share * width, height))
+        yield from boxes_of(part["second"], (left + share * width, bottom, (1.0 - share) * width, height))
     else:
-        yield from _boxes(part["first"], (left, bottom + (1.0 - share) * height, width, share * height))
-        yield from _boxes(part["second"], (left, bottom, width, (1.0 - share) * height))
+        yield from boxes_of(part["first"], (left, bottom + (1.0 - share) * height, width, share * height))
+        yield from boxes_of(part["second"], (left, bottom, width, (1.0 - share) * height))
 
 
 def _last(messages: list[tuple[float, Any]], at_s: float) -> Any:

@@ -242,7 +242,7 @@ def page(found: Mapping[str, Kept], when: Mapping[str, measured.Measured]) -> st
         ahead_shipped=_percent(_ahead(found["odometry_shipped"])["error_median_rel"], ".0"),
         localisation_table=_localisation_table(found),
         seeds=found["tracking"]["seeds"],
-        tracking_table=_tracking_table(found["tracking"]),
+        tracking_table=tracking_table(found["tracking"]),
     )
 
 
@@ -337,7 +337,8 @@ def _published() -> dict[str, float]:
     return out | {"mean, ego": sum(egos[sequence][EGO] for sequence in CARS) / len(CARS)}
 
 
-def _tracking_table(kept: Mapping[str, Any]) -> str:
+def tracking_table(kept: Mapping[str, Any]) -> str:
+    """The rows of docs/tables.md's first table, as Markdown: the errors of each method, and the published ones."""
     lines = {f"published {METHOD_TITLES['paper']}": _published()}
     lines |= {title: kept[method] for method, title in METHODS.items() if method in kept}
     lines |= {

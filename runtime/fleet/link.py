@@ -10,6 +10,7 @@ import zenoh
 
 from birdslam.runtime.configuration import ConfigurationError, FleetConfig, RouterConfig
 from birdslam.runtime.transport.bus import BusError
+from birdslam.runtime.transport.session import open_session
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES
 
 LEASE_MS = 1_000  # who has said nothing for so long is gone
@@ -77,7 +78,7 @@ def open_link(config: FleetConfig, timeout_s: float) -> zenoh.Session:
         },
     }
     try:
-        return zenoh.open(zenoh_config(settings))
+        return open_session(zenoh_config(settings))
     except zenoh.ZError as error:
         reason = "is the router there, and is this certificate of its authority?"
         raise BusError(f"fleet.router {config.router}: no connection within {timeout_s:g} s: {reason}") from error

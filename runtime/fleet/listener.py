@@ -22,8 +22,9 @@ from birdslam.runtime.fleet.reading import FleetReading, Received, VehicleSlot
 from birdslam.runtime.topology import TOPICS, check_name, every_key, key_of, vehicle_and_topic
 from birdslam.runtime.transport.bus import BusClosed
 from birdslam.runtime.transport.closing import Closing
-from birdslam.runtime.transport.replies import REPLY_S, whole_reply
+from birdslam.runtime.transport.replies import REPLY_S, ask_aside, whole_reply
 from birdslam.runtime.transport.reply_parts import whole_map, whole_trajectory
+from birdslam.runtime.transport.session import close_session
 from birdslam.runtime.wire import Health, WireError, decode
 
 MOST_VEHICLES = 1_000  # of those that are not expected: what more says something is counted, not kept
@@ -115,8 +116,7 @@ class Fleet(Closing):
             asks = alive and node == "optimize" and not slot.t_received_ns
             self._changed.notify_all()
         if asks:
-            callback = zenoh.handlers.Callback(self._receive_retained, indirect=False)
-            self._session.get(key_of(vehicle, "estimate"), callback, timeout=REPLY_S)
+            ask_aside(self._session, key_of(vehicle, "estimate"), self._receive_retained)
 
     # --- what the user calls ---
 
@@ -229,4 +229,4 @@ class Fleet(Closing):
                 return
             self._closed = True
             self._changed.notify_all()
-        self._session.close()
+        close_session(self._session)

@@ -27,6 +27,7 @@ from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, key
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, Publisher, Subscriber
 from birdslam.runtime.transport.closing import Closing
 from birdslam.runtime.transport.queries import QueryRefused, QueryResponder, positive
+from birdslam.runtime.transport.session import close_session
 from birdslam.runtime.wire import Stage, Trace, WireError
 
 FORWARDED = ("estimate", *(f"health/{node}" for node in PROCESSES))
@@ -125,7 +126,7 @@ class Uplink(Closing):
         for thread in self._threads:
             thread.join()
         self._responder.close()
-        self._session.close()
+        close_session(self._session)
 
 
 def _lengthened(trace: Trace, received_ns: int, done_ns: int) -> Trace:

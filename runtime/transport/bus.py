@@ -3,7 +3,7 @@
 Everything stays on this machine: unix sockets in a directory of the vehicle (0700), no TCP, no multicast, no shared
 memory of zenoh's. The hub (the supervisor) listens on `hub.sock`, every node of the topology on a socket of its own,
 and they find each other by gossip through the hub; all others (planners) only connect. Nobody needs to be the first.
-Never fork after a Bus was opened (spawn instead), and always close it: zenoh's threads live until then.
+Never fork after a Bus was opened (spawn instead), and always close it: zenoh's threads call until then.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from birdslam.runtime.transport.endpoints import (
 )
 from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
 from birdslam.runtime.transport.queries import QueryHandler, QueryResponder
-from birdslam.runtime.transport.replies import REPLY_S, replies, whole_reply
-from birdslam.runtime.transport.session import session_config
+from birdslam.runtime.transport.replies import REPLY_S, ask_aside, replies, whole_reply
+from birdslam.runtime.transport.session import close_session, open_session, session_config
 from birdslam.runtime.wire import WireError
 
 _LOSSLESS_DEPTH = 4_096
@@ -68,7 +68,7 @@ class Bus(Closing):
         hub_socket, own_socket = socket_path(directory, "hub"), socket_path(directory, node)
         listen = [hub_socket] if hub else [own_socket] if node in PROCESSES else []
         try:
-            self._session = zenoh.open(session_config(listen, [] if hub else [hub_socket], lossless))
+            self._session = open_session(session_config(listen, [] if hub else [hub_socket], lossless))
         except zenoh.ZError as error:
             where = ", ".join(map(str, listen)) or hub_socket
             raise BusError(f"{node} can't join the bus of vehicle {vehicle!r} ({where}): {error}") from error
@@ -96,9 +96,7 @@ class Bus(Closing):
 
     def catch_up(self, topic: str, subscriber: Subscriber) -> None:
         """Gives a subscriber that came late the topic's last message, when it comes; waits for nothing."""
-        self._check_open()
-        callback = zenoh.handlers.Callback(subscriber._receive_retained, indirect=False)
-        self._session.get(key_of(self.vehicle, topic), callback, timeout=REPLY_S)
+        ask_aside(self._session, key_of(self.vehicle, topic), subscriber._receive_retained)
 
     def retained(self, topic: str, timeout_s: float = REPLY_S) -> list[Message]:
         """The topic's retained messages (Topic.retained), oldest first; empty where nobody answers in time.
@@ -182,4 +180,4 @@ class Bus(Closing):
             subscriber.close()
         for responder in self._responders:
             responder.close()
-        self._session.close()
+        close_session(self._session)

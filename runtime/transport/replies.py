@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import zenoh
@@ -27,6 +27,18 @@ def replies(session: zenoh.Session, selector: str | zenoh.Selector, timeout_s: f
             yield reply.ok
         elif reply.err is not None:
             raise BusError(f"{selector}: {bytes(reply.err.payload).decode(errors='replace')}")
+
+
+def ask_aside(session: zenoh.Session, key: str, callback: Callable[[zenoh.Reply], None]) -> None:
+    """Hands what answers a query to `callback`, on zenoh's thread, as it comes; waits for nothing.
+
+    It may itself be called on zenoh's thread while another one closes the session: then there is nothing to be had.
+    """
+    try:
+        session.get(key, zenoh.handlers.Callback(callback, indirect=False), timeout=REPLY_S)
+    except zenoh.ZError:
+        if not session.is_closed():
+            raise
 
 
 def whole_reply(

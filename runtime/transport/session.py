@@ -1,7 +1,11 @@
-"""How a session of the bus is set up: local and bounded; nothing of zenoh's defaults that opens or grows."""
+"""How a session of the bus is set up: local and bounded; nothing of zenoh's defaults that opens or grows.
+
+And how sessions end: before Python does.
+"""
 
 from __future__ import annotations
 
+import atexit
 import json
 from pathlib import Path
 from typing import Any
@@ -51,3 +55,21 @@ def session_config(listen: list[Path], connect: list[Path], lossless: bool) -> z
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
     return config
+
+
+def open_session(config: zenoh.Config) -> zenoh.Session:
+    """A session that is closed before Python ends, however that comes about. Raises ZError.
+
+    A callback that zenoh's threads make into an interpreter that is ending, or has ended, panics or ends the process
+    with a segmentation fault. An exception or a signal may come between the opening of a session and the `with` or
+    the `try` that closes it.
+    """
+    session = zenoh.open(config)
+    atexit.register(session.close)
+    return session
+
+
+def close_session(session: zenoh.Session) -> None:
+    """Closes a session of `open_session`; when this returns, no callback of it runs. A second call does nothing."""
+    session.close()
+    atexit.unregister(session.close)

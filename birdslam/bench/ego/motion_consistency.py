@@ -152,7 +152,7 @@ class Motions:
             if not interpolated[first + 1 : last + 1].any():
                 measured.append(float(error @ np.linalg.solve(cov + noise, error)))
                 if (length_m := np.hypot(goal.x_m, goal.y_m)) > LEAST_M:
-                    lengths.append(_of_length(T_first_last, cov + noise, float(length_m)))
+                    lengths.append(nees_of_length(T_first_last, cov + noise, float(length_m)))
         return MotionConsistency(
             n=len(plain),
             nees=float(np.mean(plain)) / DIMENSIONS,
@@ -164,7 +164,7 @@ class Motions:
         )
 
 
-def _of_length(T_first_last: SE2, cov: Floats, truth_m: float) -> float:
+def nees_of_length(T_first_last: SE2, cov: Floats, truth_m: float) -> float:
     """Squared error of a motion's length over its variance; `cov` (3, 3) is of the tangent at its end."""
     length_m = np.hypot(T_first_last.x_m, T_first_last.y_m)
     along = T_first_last.rotation().T @ np.array([T_first_last.x_m, T_first_last.y_m]) / max(length_m, 1e-9)

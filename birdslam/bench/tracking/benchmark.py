@@ -60,10 +60,11 @@ class Live:
         """One update for each record."""
         graph, live = PoseGraph(self.graph, self.weights), LiveTrajectories()
         for measurements in log:
-            live.add(graph.optimise(self._reweighed(measurements)))
+            live.add(graph.optimise(self.reweighed(measurements)))
         return live.result
 
-    def _reweighed(self, m: Measurements) -> Measurements:
+    def reweighed(self, m: Measurements) -> Measurements:
+        """The record with the variances of its CV and CP edges inflated."""
         if self.cv_inflation == self.cp_inflation == 1.0:
             return m
         cv = [replace(e, cov=tuple(self.cv_inflation * v for v in e.cov)) for e in m.cv]

@@ -55,14 +55,15 @@ def loss(outputs: tuple[Tensor, ...], batch: Batch, config: LossConfig) -> dict[
     segmentation, log_depth, heat, body = (output.float() for output in outputs)
     cells = _Cells(batch, heat.shape[2], heat.shape[3], config)
     return {
-        **_depth(log_depth[:, 0], batch, config),
+        **depth_loss(log_depth[:, 0], batch, config),
         **_masks(segmentation, batch.masks, config),
         "heat": config.heat * _focal(heat, cells),
         **_bodies(body, cells, config),
     }
 
 
-def _depth(log_depth: Tensor, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
+def depth_loss(log_depth: Tensor, batch: Batch, config: LossConfig) -> dict[str, Tensor]:
+    """Of the log of the depth (images, rows, columns), by the names under which the curves show its parts."""
     weight = torch.where(batch.sky, config.sky, 1.0)
     error = log_depth - batch.log_depth
     total = weight.sum(dim=(1, 2))

@@ -1,0 +1,26 @@
+"""Somebody else's session on a vehicle's bus, who sends and asks by zenoh alone and keeps to none of our rules."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import zenoh
+
+from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
+from birdslam.runtime.transport.session import session_config
+
+
+@contextmanager
+def foreign_session(base: Path, vehicle: str = "car", as_hub: bool = False) -> Iterator[zenoh.Session]:
+    """A session that only connects to the hub, as a planner's does; or the one that all connect to."""
+    hub = [socket_path(runtime_dir_of(vehicle, base), "hub")]
+    with zenoh.open(session_config(hub if as_hub else [], [] if as_hub else hub, False)) as session:
+        yield session
+
+
+def matched(publisher: zenoh.Publisher) -> bool:
+    """Whether somebody subscribes to what it sends; before that, all is lost."""
+    status: zenoh.MatchingStatus = publisher.matching_status  # type: ignore[assignment]
+    return status.matching
