@@ -53,7 +53,7 @@ def calibrate_drive(
     """
     uri = recording_uri(source)
     topics = configuration.source.topics
-    lens, height_m = _lens(given, uri, topics)
+    lens, height_m = lens_of(given, uri, topics)
     size = _frame_size(uri, topics)
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
@@ -86,7 +86,7 @@ def calibrate_drive(
 # --- what is given ---
 
 
-def _lens(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | None, float | None]:
+def lens_of(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | None, float | None]:
     """Intrinsics from elsewhere than the recording, and the height that the user states."""
     height_m = given.height_m
     if height_m is not None and not 0.2 < height_m < 5.0:

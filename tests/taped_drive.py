@@ -22,8 +22,8 @@ from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.transport.presence import runtime_dir_of
 from birdslam.runtime.wire import Stage, Trace
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
+from tests.test_bus import until
 
-DISK_S = 20.0
 CAMERA = Camera(640, 192, 360.0, 360.0, 320.0, 96.0, 1.65)
 
 
@@ -156,9 +156,7 @@ class Tape:
 
     def killed(self, path: Path) -> None:
         """Copies what a recorder that is killed now leaves, the disk having caught up with what it was handed."""
-        file = self.writer._file
-        with file._changed:
-            assert file._changed.wait_for(lambda: not file._waiting_bytes, DISK_S), "the disk does not catch up"
+        until(lambda: self.writer.written_bytes == self.writer.handed_bytes, "the disk, which catches up")
         path.write_bytes(self.path.read_bytes())
 
     def close(self) -> None:

@@ -136,3 +136,65 @@ def test_no_machine_path_or_secret_host_in_the_tree() -> None:
                 text = path.read_text()
                 assert "/home/" not in text, path
                 assert "/root/" not in text, path
+
+
+# --- tests go through public doors ---
+
+NAMEDTUPLES = {"_replace", "_asdict", "_fields", "_make"}  # public, though they look otherwise
+
+
+def is_private(name: str) -> bool:
+    return name.startswith("_") and not name.startswith("__") and name != "_" and name not in NAMEDTUPLES
+
+
+def own_names(tree: ast.AST) -> set[str]:
+    """What the classes of a file define of themselves."""
+    methods = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)}
+    stored = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)}
+    fields = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+    return methods | stored | fields
+
+
+def private_touches(text: str) -> dict[int, str]:
+    """Line -> what it touches: another's private attribute, a private import, a private name that is patched or asked.
+
+    `# private: reason` on the line makes it right. What a class says of itself by `self` and `cls` is its own.
+    """
+    tree, lines = ast.parse(text), text.splitlines()
+    own, found = own_names(tree), []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and is_private(node.attr):
+            of_itself = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls") and node.attr in own
+            found += [] if of_itself else [(node.end_lineno or 0, ast.unparse(node))]
+        elif isinstance(node, ast.ImportFrom):
+            found += [(alias.lineno, alias.name) for alias in node.names if is_private(alias.name)]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in PATCHES:
+            names = [a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+            found += [(node.lineno, name) for name in names if is_private(name.rpartition(".")[2])]
+    return {line: what for line, what in found if not re.search(r"# private: \S", lines[line - 1])}
+
+
+PATCHES = {"setattr", "getattr", "hasattr", "delattr", "patch", "object"}
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("import a\na._b", 2),
+        ("import a\na._b  # private: because", 0),
+        ("import a\na._b  # private:", 2),
+        ("from a import (\n    b,\n    _c,\n)", 3),
+        ("monkeypatch.setattr(a, '_b', 1)", 1),
+        ("monkeypatch.setattr('a.b._c', 1)", 1),
+        ("class A:\n    def f(self):\n        self._b = 1\n        return self._b", 0),
+        ("class A(B):\n    def f(self):\n        return self._b", 3),
+        ("a._replace(b=1).__dict__", 0),
+    ],
+)
+def test_a_private_touch_is_found(text: str, line: int) -> None:
+    assert [*private_touches(text)] == ([line] if line else [])
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "tests").rglob("*.py")), ids=lambda path: path.stem)
+def test_a_test_touches_nothing_private_without_a_reason(path: Path) -> None:
+    assert private_touches(path.read_text()) == {}

@@ -234,7 +234,7 @@ def test_lossless_messages_all_arrive_at_a_slow_reader(join: Any) -> None:
 
 
 def test_a_lossless_queue_that_overflows_says_so(join: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("birdslam.runtime.transport.bus._LOSSLESS_DEPTH", 4)
+    monkeypatch.setattr("birdslam.runtime.transport.bus.LOSSLESS_DEPTH", 4)
     hub = join("supervisor", hub=True, lossless=True)
     frames = hub.subscriber("frame")
     out = join("capture", lossless=True).publisher("frame")

@@ -124,8 +124,8 @@ def test_what_was_seen_for_the_last_time_is_let_go(tmp_path: Path) -> None:
     for measurements in frames:
         final.add(measurements, graph.optimise(measurements))
         known = {vehicle for vehicle, frame in last_seen(frames).items() if frame > measurements.frame_id}
-        assert set(final._open) <= known
-        assert {vehicle for _, vehicle in final._smoother._measurements} <= known
+        assert set(final._open) <= known  # private: what is held in memory shows nowhere else
+        assert {vehicle for _, vehicle in final._smoother._measurements} <= known  # private: likewise
     assert final.vehicles == len(list(tmp_path.glob("*.final.tum.txt")))
 
 

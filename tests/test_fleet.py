@@ -186,7 +186,8 @@ class Vehicle:
         self.estimates, self.healths = self.bus.publisher("estimate"), self.bus.publisher("health/optimize")
         self.bus.declare_alive()
         config = link(tls, port, f"{name}.vehicle", **changes)
-        self.uplink = Uplink(name, config, open_link(config, LIMIT_S), base)
+        self.session = open_link(config, LIMIT_S)
+        self.uplink = Uplink(name, config, self.session, base)
         assert self.estimates.wait_matched(LIMIT_S)
 
     def close(self) -> None:
@@ -368,7 +369,7 @@ def test_a_flood_and_a_death_cost_the_others_nothing(
                 first(vehicle, fleet)
             before = {name: fleet.received(name) for name in NAMES}
             stop, sent = threading.Event(), [0]
-            flood = Publisher(red.uplink._session, key_of("red", "estimate"), TOPICS["estimate"], "flood", False)
+            flood = Publisher(red.session, key_of("red", "estimate"), TOPICS["estimate"], "flood", False)
 
             def flooding() -> None:
                 while not stop.is_set():
@@ -384,7 +385,7 @@ def test_a_flood_and_a_death_cost_the_others_nothing(
             thread.join()
             heard = fleet.received("red").estimates - before["red"].estimates
             assert heard < sent[0] / 2  # the router has thinned it
-            red.uplink._session.close()
+            red.session.close()
             until(lambda: not fleet.latest("red").alive, "red is not alive")
             for vehicle in (green, blue) * 5:
                 say(vehicle, fleet)

@@ -124,7 +124,7 @@ def test_a_faster_camera_learns_no_more_of_a_size_in_the_same_time() -> None:
         road = Road()
         for _ in range(round(2.0 * hz)):
             road.see({0: road.box(20.0, 0.0, 1.5), 1: road.box(30.0, 4.0, 1.55)}, 1.0 / hz)
-        sigmas.append(math.sqrt(road.ground_size._P[2, 2]))
+        sigmas.append(math.sqrt(road.ground_size._P[2, 2]))  # private: a height's sigma alone; out comes a depth's
     assert sigmas[0] == pytest.approx(sigmas[1], rel=0.1)
 
 
@@ -203,7 +203,7 @@ def test_parked_cars_are_seen_from_a_passing_ego_without_drift() -> None:
         road.see(boxes)
         road.ground_size.keep_rows([row for row, car in enumerate(road.cars) if car in boxes])
         road.cars = [car for car in road.cars if car in boxes]
-    assert np.linalg.eigvalsh(road.ground_size._P).min() > 0.0
+    assert np.linalg.eigvalsh(road.ground_size._P).min() > 0.0  # private: the law is of the whole covariance
     assert road.ground_size.ground.pitch_rad == pytest.approx(0.005, abs=0.004)
 
 

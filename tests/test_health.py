@@ -225,7 +225,7 @@ def test_a_spare_loads_below_all_others_and_comes_back() -> None:
 
 def test_who_may_not_come_back_is_not_sent_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda which: (0, 0))
-    monkeypatch.setattr(realtime, "_has", lambda bit: False)
+    monkeypatch.setattr(realtime, "has_capability", lambda capability: False)
     monkeypatch.setattr(os, "sched_setscheduler", lambda *of: pytest.fail("it was"))
     with subprocess.Popen(["sleep", "600"], start_new_session=True) as process:
         realtime.lower_to_idle(process.pid)

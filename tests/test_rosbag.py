@@ -327,13 +327,13 @@ def test_frames_without_truth_are_named_and_left_out(tmp_path: Path) -> None:
 
 def test_calibrate_takes_the_lens_of_the_bag_and_the_height_where_it_is_known(tmp_path: Path) -> None:
     none = calibration.Given()
-    found, height_m = calibration._lens(none, bag(tmp_path / "drive"), BagTopics())
+    found, height_m = calibration.lens_of(none, bag(tmp_path / "drive"), BagTopics())
     assert found is not None
     assert (found.fx_px, found.width_px, found.source, height_m) == (50.0, WIDTH, CAMERA_INFO, pytest.approx(1.4))
     without = ros.write_bag(tmp_path / "without", [message for message in drive() if message[0] != "/tf_static"])
-    assert calibration._lens(none, f"rosbag:{without}", BagTopics())[1] is None
+    assert calibration.lens_of(none, f"rosbag:{without}", BagTopics())[1] is None
     stated = calibration.Given(height_m=1.2)
-    assert calibration._lens(stated, f"rosbag:{without}", BagTopics())[1] == 1.2
+    assert calibration.lens_of(stated, f"rosbag:{without}", BagTopics())[1] == 1.2
 
 
 def test_the_truth_of_a_satellites_fixes(tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def lower_to_idle(pid: int) -> None:
     _set_session_nice(pid, _NICEST)
     limit = resource.getrlimit(resource.RLIMIT_NICE)[0]
     enough = 20 - os.getpriority(os.PRIO_PROCESS, 0)
-    if limit >= enough or limit == resource.RLIM_INFINITY or _has(_CAP_SYS_NICE):
+    if limit >= enough or limit == resource.RLIM_INFINITY or has_capability(_CAP_SYS_NICE):
         with contextlib.suppress(PermissionError, ProcessLookupError):
             os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
 
@@ -187,10 +187,11 @@ def _threads(pid: int | str = "self") -> list[int]:
 
 def may_lock_memory() -> bool:
     """Without a limit: under one, a locked process would fail where it first needs more."""
-    return resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or _has(_CAP_IPC_LOCK)
+    return resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or has_capability(_CAP_IPC_LOCK)
 
 
-def _has(capability: int) -> bool:
+def has_capability(capability: int) -> bool:
+    """Whether this process has one of the kernel's capabilities now, by its number."""
     with open("/proc/self/status") as status:
         for line in status:
             if line.startswith("CapEff:"):

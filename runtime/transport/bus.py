@@ -32,7 +32,7 @@ from birdslam.runtime.transport.replies import REPLY_S, ask_aside, replies, whol
 from birdslam.runtime.transport.session import close_session, open_session, session_config
 from birdslam.runtime.wire import WireError
 
-_LOSSLESS_DEPTH = 4_096
+LOSSLESS_DEPTH = 4_096
 
 __all__ = ["Bus", "BusClosed", "BusError", "Message", "MessagesLost", "Publisher", "Subscriber"]
 
@@ -88,7 +88,7 @@ class Bus(Closing):
         self._check_open()
         key, spec = key_of(self.vehicle, topic), TOPICS[topic]
         depth = spec.depth if depth is None else depth
-        depth = max(depth, _LOSSLESS_DEPTH) if self._lossless else depth
+        depth = max(depth, LOSSLESS_DEPTH) if self._lossless else depth
         if depth < 1:
             raise ValueError(f"{topic}: a queue needs a depth of at least 1, got {depth}")
         self._subscribers.append(Subscriber(self._session, key, spec, depth, self._lossless))
