@@ -75,11 +75,13 @@ class Tape:
         self.estimates: list[Estimate] = []
         self._told: FrameRef | Measurements | None = None
         self._restarts = 0
+        self._sent = 0  # estimates, by the optimizer at hand
         self._now_ns = 0
         self._begin(FIRST)
 
     def _begin(self, assignment: Assignment) -> None:
         self.writer.draw("/alive", Alive(node="optimize", alive=True), self.tick())
+        self._sent = 0
         self.node = OptimizeNode(self.configuration, self.perceive, assignment)  # type: ignore[arg-type]
 
     def tick(self) -> int:
@@ -107,7 +109,8 @@ class Tape:
         """The optimizer takes something up."""
         for out in self.node.step(message.record):
             trace = message.trace.after("optimize", self.tick(), self.tick())
-            trace = trace.sent(self.tick(), number=0)
+            self._sent += isinstance(out, Estimate)
+            trace = trace.sent(self.tick(), number=self._sent if isinstance(out, Estimate) else 0)
             if isinstance(out, Estimate):
                 self._told = message.record
                 self.estimates.append(out)

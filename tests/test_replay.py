@@ -25,7 +25,7 @@ from birdslam.runtime.replay import replay
 from birdslam.runtime.replay.replay import compare
 from birdslam.runtime.replay.report import report
 from birdslam.runtime.replay.verdict import Verdict
-from birdslam.types import Estimate, Status
+from birdslam.types import Estimate, FrameRef, Status
 from tests.taped_drive import CAMERA, Tape, measured
 
 
@@ -193,7 +193,49 @@ def test_measurements_that_the_recorder_never_had_end_the_comparison_until_a_new
     assert "were not recorded: 10" in report(verdict, Recording(tape.path))
 
 
-EVENTS = ("well", "well", "well", "dropped", "estimate lost", "late", "restored", "new world")
+@pytest.mark.parametrize("missing", ["estimate", "measurements too"])
+@pytest.mark.parametrize("restart", [False, True])
+def test_a_new_epoch_whose_first_estimate_was_lost_is_no_difference(
+    tmp_path: Path, missing: str, restart: bool
+) -> None:
+    tape, frames = Tape(tmp_path), measured(40)
+    for measurements in frames[:10]:
+        tape.step(measurements)
+    tape.frame(frames[10])
+    tape.send(frames[10])  # never comes to the optimizer, which begins anew with the next
+    if restart:
+        tape.restart(with_checkpoint=False)
+    tape.take(tape.send(frames[11], recorded=missing == "estimate"), recorded=False)
+    for measurements in frames[12:]:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    assert tape.estimates[-1].epoch == 1
+    verdict = verdict_of(tape)
+    assert verdict.difference is None, (verdict.difference, verdict)
+    if missing == "estimate":
+        assert (verdict.equal, verdict.unknown) == (len(tape.estimates) - 1, 0)
+    else:
+        assert (verdict.equal, verdict.unknown) == (10, len(tape.estimates) - 11)
+
+
+def test_what_an_estimate_told_that_cannot_be_compared_is_not_told_again(tmp_path: Path) -> None:
+    """The frame that was coasted over as the world began anew is not in the recording."""
+    tape, frames = Tape(tmp_path), measured(40)
+    for measurements in frames[:10]:
+        tape.step(measurements)
+    tape.coast(FrameRef(frame_id=frames[12].frame_id, t_source_ns=0, t_capture_ns=0, t_utc_ns=0))
+    tape.take(tape.send(frames[11]))  # the one before it was dropped on its way
+    assert Status.GRAPH_RESET in tape.estimates[-1].status
+    tape.take(tape.send(frames[12]))
+    for measurements in frames[13:]:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    verdict = verdict_of(tape)
+    assert verdict.difference is None, (verdict.difference, verdict)
+    assert (verdict.equal, verdict.unknown) == (len(tape.estimates) - 2, 2)
+
+
+EVENTS = ("well", "well", "well", "dropped", "estimate lost", "late", "restored", "new world", "new world lost")
 
 
 @settings(max_examples=25)
@@ -209,7 +251,9 @@ def test_whatever_happens_nothing_differs(events: list[str], seed: int) -> None:
             if event == "dropped":  # by the optimizer's queue
                 tape.frame(last)
                 tape.send(last)
-            elif event == "estimate lost":  # on its way to the recorder
+            elif event in ("estimate lost", "new world lost"):  # on its way to the recorder
+                if event == "new world lost":
+                    tape.restart(with_checkpoint=False)
                 tape.frame(last)
                 tape.take(tape.send(last), recorded=False)
             elif event == "late":
@@ -226,8 +270,8 @@ def test_whatever_happens_nothing_differs(events: list[str], seed: int) -> None:
         tape.end(last)
         verdict = verdict_of(tape)
         assert verdict.difference is None, (verdict.difference, verdict)
-        assert verdict.equal + events.count("estimate lost") == len(tape.estimates)
-        assert verdict.restarts == sum(event in ("restored", "new world") for event in events)
+        assert verdict.equal + sum("lost" in event for event in events) == len(tape.estimates)
+        assert verdict.restarts == sum(event in ("restored", "new world", "new world lost") for event in events)
         assert verdict.unknown == 0
 
 

@@ -2,9 +2,9 @@
 
 `compare` gives the recorded estimates bit for bit, or the first that differs: each estimate bears the trace of the
 message that it answers, so the order is known. Measurements that no estimate answers the optimizer never had, or its
-estimate was lost. After a restart it began a new epoch, or went on from its last checkpoint with the measurements
-since. Where measurements are missing that the optimizer had, nothing is compared until a new epoch begins. A file that
-begins in the middle of a drive has the graph of its first frame. `estimates` replays with another configuration.
+estimate was lost, and an epoch may have begun with it. After a restart it began a new epoch, or went on from its last
+checkpoint with the measurements since. Where measurements are missing that it had, nothing is compared until a new
+epoch begins. A file that begins in the middle of a drive has the graph of its first frame.
 """
 
 from __future__ import annotations
@@ -84,6 +84,9 @@ class Comparison:
         self._checkpoint = _checkpoint(recording)
         self._since: list[Measurements] = []  # after it, for the first estimate that can be compared
         self._epoch: int | None = None
+        self._number = 0  # of the last estimate among its process's
+        self._alive_before = 0  # and how often the optimizer had come then
+        self._lost = False  # estimates between the last one and this
         self._reported_frame = -1
 
     def run(self) -> Verdict:
@@ -138,6 +141,10 @@ class Comparison:
             estimate = _record(message.data, Estimate)
             self.verdict.epochs += estimate.epoch != self._epoch
             self._epoch = estimate.epoch
+            number = message.trace.number
+            anew = self._alive > self._alive_before or number <= self._number
+            self._lost = number > (1 if anew else self._number + 1)
+            self._number, self._alive_before = number, self._alive
             if not by_measurements:
                 taken = self._replay(estimate, message.data, self._reported_before(estimate), None)
                 for _ in range(taken):
@@ -158,6 +165,7 @@ class Comparison:
         Returns how many of the measurements `open_` it rests on.
         """
         likeliest: Estimate | None = None
+        unseen = self._began_unseen(estimate)
         for state, given, restarted in self._hypotheses(estimate, open_, answered):
             replayed = self._replayed(state, given, estimate)
             if replayed is None:
@@ -170,11 +178,21 @@ class Comparison:
                 self.verdict.coasted += answered is None
                 self.verdict.restarts += restarted
                 return len(given) - (answered is not None)
-        if likeliest is None:
+        now = self._state
+        if unseen or (now is not None and (open_ or now.graph.epoch != estimate.epoch)):
+            self._state = None
+        elif now is not None:
+            now.unreported = ()  # this estimate has reported it
+        if likeliest is None or unseen:
             self.verdict.unknown += 1
         else:
             self.verdict.difference = Difference(estimate.frame_id, differing(estimate, likeliest))
         return 0
+
+    def _began_unseen(self, estimate: Estimate) -> bool:
+        """Whether this estimate is of an epoch that began with one that was lost on its way to the recorder."""
+        began = self._state is not None and estimate.epoch > self._state.graph.epoch
+        return self._lost and began and Status.GRAPH_RESET not in estimate.status
 
     def _reported_before(self, estimate: Estimate) -> list[Measurements]:
         """The next measurements, of frames that were reported already: a restored graph may have them."""
@@ -209,6 +227,9 @@ class Comparison:
                 restored = self._copy()
                 restored.last, restored.unreported = last, (Status.GRAPH_RESTORED,)
                 yield restored, given, True
+        if self._began_unseen(estimate):
+            for start in range(len(open_)):
+                yield _State(PoseGraph(*self._back_end, estimate.epoch)), [*open_[start:], *now], came_back
         if open_:
             yield self._copy(), now, False
         yield self._state, [*open_, *now], False
