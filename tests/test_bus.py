@@ -584,7 +584,7 @@ def test_the_default_directory_is_private(base: Path, monkeypatch: pytest.Monkey
     assert ring_path("car") == ring_path("car")
 
 
-@pytest.mark.parametrize("end", ["", "raise KeyboardInterrupt", "planner.wait()"], ids=["ends", "interrupted", "later"])
+@pytest.mark.parametrize("end", ["", "raise KeyboardInterrupt"], ids=["ends", "interrupted"])
 def test_a_process_that_leaves_its_bus_open_ends_in_silence(join: Any, base: Path, end: str) -> None:
     """zenoh's threads never call into an interpreter that has ended, which panics, or is a segmentation fault."""
     join("supervisor", hub=True)
@@ -600,7 +600,7 @@ def test_a_process_that_leaves_its_bus_open_ends_in_silence(join: Any, base: Pat
     thread.start()
     try:
         code = f"from birdslam.runtime.client import *; planner = Planner('car', Path({str(base)!r})); {end}"
-        for _ in range(3):
+        for _ in range(2):
             done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
             interrupted = "Interrupt" in end
             assert done.returncode == (-signal.SIGINT if interrupted else 0), done.stderr
