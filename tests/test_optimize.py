@@ -341,7 +341,7 @@ def test_another_process_looks_at_the_newest_checkpoint_and_takes_nothing(tmp_pa
 def test_a_torn_checkpoint_is_passed_over(tmp_path: Path) -> None:
     killed_at(tmp_path, 20)
     path = tmp_path / "test" / "checkpoint"
-    kept = newest(path)
+    kept = newest_checkpoint(path)
     assert kept is not None
     overwrite(path, path.read_bytes().index(kept.data) + 200, bytes([77]) * 30)
     node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[10:23]), after(19))  # type: ignore[arg-type]

@@ -242,7 +242,7 @@ def test_a_planner_asks_what_it_may_and_no_more(vehicle: Vehicle, certificates: 
         hear(vehicle, session, keys(READABLE))  # each node has said something, which it keeps
         for topic in ASKABLE:
             until(lambda topic=topic: answers(session, topic) == 1, f"an answer about {topic}")  # type: ignore[misc]
-        assert vehicle.nodes["optimize"].kept("measurements", LIMIT_S)  # inside, they are there to be had
+        assert vehicle.nodes["optimize"].retained("measurements", LIMIT_S)  # inside, they are there to be had
         assert answers(session, "measurements", 0.5) == 0
         assert answers(session, "frame", 0.5) == 0
         for topic in (*ASKABLE, "measurements"):

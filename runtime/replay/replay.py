@@ -4,7 +4,8 @@
 message that it answers, so the order is known. Measurements that no estimate answers the optimizer never had, or its
 estimate was lost, and an epoch may have begun with it. After a restart it began a new epoch, or went on from its last
 checkpoint with the measurements since. Where measurements are missing that it had, nothing is compared until a new
-epoch begins. A file that begins in the middle of a drive has the graph of its first frame.
+epoch begins. A file that begins in the middle of a drive has the graph of its first frame. `estimates` replays with
+another configuration.
 """
 
 from __future__ import annotations
