@@ -49,8 +49,9 @@ def session_config(listen: list[Path], connect: list[Path], lossless: bool) -> z
             }
         ],
     }
-    if lossless:
+    if lossless:  # who gets no processor for seconds loses no message by it; who dies is still noticed at once
         settings["transport/link/tx/queue/congestion_control/block/wait_before_close"] = _LOSSLESS_PATIENCE_US
+        settings["transport/link/tx/lease"] = _LOSSLESS_PATIENCE_US // 1_000
     config = zenoh.Config()
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
