@@ -21,8 +21,8 @@ LANES_HZ = 5.0  # default rate of lane detection (`[perceive.schedule]`)
 class SlamConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """All parameters of the method; one setting serves all roads.
 
-    docs/configuration.md has every key. `SlamConfig(weights=WeightsConfig(mode="paper"))` is the paper's graph;
-    `msgspec.structs.replace` changes single fields; `msgspec.convert(tree, SlamConfig)` reads a TOML's tables.
+    A few are keys of users (docs/configuration.md), the others constants. `birdslam.paper.PAPER` has the paper's
+    choices; `msgspec.structs.replace` changes single fields.
     """
 
     frontend: FrontEndConfig = FrontEndConfig()

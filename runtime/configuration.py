@@ -1,7 +1,8 @@
 """One typed configuration for the whole system: the defaults live here and in the structs it holds.
 
-A TOML file holds differences only. An unknown key or a wrong type is a `ConfigurationError` that names the file (or the
-command-line option) and the key. Paths in a file are relative to that file.
+A TOML file holds differences only, of the keys in `runtime/keys.py` alone; the other fields are constants, which
+programs and `--constant` vary. An unknown key, a constant or a wrong type is a `ConfigurationError` that names the file
+(or the command-line option) and the key. Paths in a file are relative to that file.
 """
 
 from __future__ import annotations
@@ -11,13 +12,15 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
 from birdslam.geometry.camera import Camera
 from birdslam.mapping.atlas import AtlasConfig
+from birdslam.paper import PAPER
 from birdslam.perception import ModelError, ModelSpec
+from birdslam.runtime.fields import differences, laid_over, leaves, why_no_key
 from birdslam.runtime.models import store as model_store
 from birdslam.runtime.schemes import all_schemes, is_live
 from birdslam.runtime.sections import (
@@ -62,6 +65,7 @@ __all__ = [
     "dump",
     "load",
     "parse_setting",
+    "refuse_constant",
     "without_passwords",
 ]
 
@@ -83,6 +87,7 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     camera_sha256: Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")] = ""
     models: ModelsConfig = ModelsConfig()
     perceive: PerceiveConfig = PerceiveConfig()
+    method: Literal["birdslam", "paper"] = "birdslam"  # what `load` began `slam` from: the defaults, or birdslam.paper
     slam: SlamConfig = SlamConfig()
     runtime: RuntimeConfig = RuntimeConfig()
     budgets: BudgetsConfig = BudgetsConfig()
@@ -128,10 +133,16 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return None if self.lossless or deadline_ms is None else round(deadline_ms * 1e6)
 
 
-def load(path: Path | None, overrides: Mapping[str, Any] | None = None, models: Iterable[str] = ()) -> Configuration:
-    """The configuration of a TOML file, then `overrides` ({"slam.graph.ego_nodes": 8}) on top of it.
+def load(
+    path: Path | None,
+    overrides: Mapping[str, Any] | None = None,
+    models: Iterable[str] = (),
+    constants: Mapping[str, Any] | None = None,
+) -> Configuration:
+    """The configuration of a TOML file, then `overrides` ({"source.stride": 2}) on top of it.
 
-    `models` are names of networks at hand, each for the role that its manifest states. Raises ConfigurationError.
+    Both name keys of users alone. `models` are names of networks at hand, each for the role that its manifest states;
+    `constants` may name any field ({"slam.graph.ego_nodes": 8}). Raises ConfigurationError.
     """
     tree: dict[str, Any] = {}
     if path is not None:
@@ -145,6 +156,14 @@ def load(path: Path | None, overrides: Mapping[str, Any] | None = None, models: 
     overrides = overrides or {}
     for key, value in overrides.items():
         _put(tree, key, value)
+    for key in leaves(tree):
+        refuse_constant(key, _origin(key, path, overrides))
+    if tree.get("method") == "paper":
+        preset = differences(msgspec.to_builtins(PAPER), msgspec.to_builtins(SlamConfig()))
+        tree["slam"] = laid_over(preset, tree.get("slam", {}))
+    for key, value in (constants or {}).items():
+        _put(tree, key, value)
+    overrides = {**overrides, **(constants or {})}
     _read_camera_file(tree)
     _put_models(tree, models)
     try:
@@ -175,11 +194,18 @@ def complete(configuration: Configuration, camera: Camera, rate_hz: float) -> Co
     return msgspec.structs.replace(configuration, camera=camera, perceive=perceive)
 
 
-def parse_setting(text: str) -> tuple[str, Any]:
+def refuse_constant(key: str, origin: str) -> None:
+    """Raises ConfigurationError where a file or `--set` names what is a field of the configuration, but no key."""
+    reason = why_no_key(key, Configuration)
+    if reason:
+        raise ConfigurationError(f"{origin}: {key}: {reason}")
+
+
+def parse_setting(text: str, option: str = "--set") -> tuple[str, Any]:
     """KEY=VALUE of the command line; the value is TOML, or a plain string where it is none."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
-        raise ConfigurationError(f"--set {text}: expected KEY=VALUE")
+        raise ConfigurationError(f"{option} {text}: expected KEY=VALUE")
     try:
         return key.strip(), tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:

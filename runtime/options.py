@@ -13,7 +13,12 @@ from birdslam.runtime.models import store as model_store
 def configuration_of(options: argparse.Namespace) -> Configuration:
     """The configuration file with the options of the command line on top. Raises ConfigurationError."""
     overrides, named = overrides_of(options)
-    return load(options.config, overrides, named)
+    return load(options.config, overrides, named, constants_of(options))
+
+
+def constants_of(options: argparse.Namespace) -> dict[str, Any]:
+    """What `--constant` says: fields of the typed configuration with their values."""
+    return dict(parse_setting(text, "--constant") for text in options.constant)
 
 
 def overrides_of(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:

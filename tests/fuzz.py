@@ -294,7 +294,7 @@ def images(folder: Path) -> Iterator[Target]:
 
 def _configurations() -> list[str]:
     texts = [path.read_text() for path in sorted((ROOT / "configs").glob("*.toml"))]
-    return [*texts, "[runtime]\nring_slots = 8\n[perceive]\ndeadline_ms = 20.0\n[source]\nrate = 33\nloop = true\n"]
+    return [*texts, "[runtime]\nwatchdog_ms = 800\n[perceive]\ndeadline_ms = 20.0\n[source]\nrate = 33\nloop = true\n"]
 
 
 def _cameras() -> list[str]:

@@ -11,8 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.paper import PAPER
 from birdslam.perception import ModelSpec
 from birdslam.runtime.configuration import Configuration, ConfigurationError, complete, dump, load, parse_setting
+from birdslam.runtime.fields import fields, is_key, parted, stands_for, why_no_key
+from birdslam.runtime.keys import GROUPS, KEYS
 
 ROOT = Path(__file__).resolve().parent.parent
 CAMERA = "width_px = 64\nheight_px = 32\nfx_px = 50\nfy_px = 50\ncx_px = 32\ncy_px = 16\nheight_m = 1.5\n"
@@ -161,7 +165,7 @@ def test_a_setting_needs_a_key_and_a_value() -> None:
 
 
 def test_a_dump_is_the_configuration() -> None:
-    configuration = load(None, {"source.rate": 12.5, "models.detector.path": "n.onnx", "slam.graph.ego_nodes": 7})
+    configuration = load(None, {"source.rate": 12.5, "models.detector.path": "n.onnx", "slam.graph.forget_s": 0.7})
     assert msgspec.convert(dump(configuration), Configuration) == configuration
     assert msgspec.json.decode(msgspec.json.encode(configuration), type=Configuration) == configuration
 
@@ -181,3 +185,72 @@ def test_the_deadline_follows_the_frame_rate() -> None:
 @pytest.mark.parametrize("name", ["kitti", "vehicle", "paper"])
 def test_the_examples_load(name: str) -> None:
     assert load(ROOT / "configs" / f"{name}.toml") != Configuration()
+
+
+def test_every_key_is_a_field_and_answers_a_question() -> None:
+    known = [field.key for field in fields(Configuration)]
+    for key, question in KEYS.items():
+        assert any(stands_for(key, name) for name in known), key
+        assert "?" in question, key
+    assert len(KEYS) == sum(len(group.questions) for group in GROUPS) <= 120
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "place"),
+    [
+        ("[slam.graph]\nego_nodes = 8\n", "slam.graph.ego_nodes", "GraphConfig in birdslam/graph/graph_config.py"),
+        ("[perceive.looks]\nslight_load = 1.0\n", "perceive.looks.slight_load", "LooksConfig in birdslam/runtime/"),
+        ("[slam.weights]\nmode = 'paper'\n", "slam.weights.mode", "WeightsConfig in birdslam/graph/weights.py"),
+    ],
+)
+def test_a_constant_in_a_file_is_refused_and_told_where_it_stands(
+    tmp_path: Path, text: str, key: str, place: str
+) -> None:
+    path = write(tmp_path / "old.toml", text)
+    with pytest.raises(ConfigurationError) as error:
+        load(path)
+    message = str(error.value)
+    assert message.startswith(f"{path}: {key}: is a constant now and no key any more: field {key.split('.')[-1]} of ")
+    assert place in message
+    assert f"--constant {key}=VALUE" in message
+
+
+def test_every_field_is_a_key_or_a_constant() -> None:
+    for field in fields(Configuration):
+        name = field.key.replace("NAME", "car")
+        assert is_key(name) == (why_no_key(name, Configuration) == "")
+    assert not is_key("slam.nothing")
+    assert why_no_key("slam.nothing", Configuration) == ""
+
+
+def test_a_constant_goes_over_all_else() -> None:
+    made = load(None, {"slam.graph.forget_s": 2.0}, constants={"slam.graph.forget_s": 3.0, "slam.graph.ego_nodes": 6})
+    assert (made.slam.graph.forget_s, made.slam.graph.ego_nodes) == (3.0, 6)
+    with pytest.raises(ConfigurationError, match=r"^command line: slam\.graph\.ego_nodes: .*<= 64"):
+        load(None, constants={"slam.graph.ego_nodes": 65})
+    with pytest.raises(ConfigurationError, match="there is no such key"):
+        load(None, constants={"slam.graph.egos": 6})
+
+
+def test_settings_part_into_keys_and_constants() -> None:
+    assert parted({"source.stride": 2, "slam.graph.ego_nodes": 6}) == (
+        {"source.stride": 2},
+        {"slam.graph.ego_nodes": 6},
+    )
+
+
+def test_the_papers_method_is_one_key(tmp_path: Path) -> None:
+    assert load(ROOT / "configs" / "paper.toml").slam == PAPER
+    path = write(tmp_path / "a.toml", 'method = "paper"\n[slam.graph]\nforget_s = 2.0\n')
+    graph = msgspec.structs.replace(PAPER.graph, forget_s=2.0)
+    assert load(path).slam == msgspec.structs.replace(PAPER, graph=graph)
+    assert load(path, {"method": "birdslam"}).slam.graph == GraphConfig(forget_s=2.0)
+    varied = load(path, constants={"slam.graph.forget_s": 1.0, "slam.graph.constant_velocity": True}).slam.graph
+    assert varied == msgspec.structs.replace(PAPER.graph, constant_velocity=True)
+    one_class = "[slam.frontend.localisation.vehicles.car]\nlength_m = 4.5\nwidth_m = 1.8\nheight_m = 1.5\n"
+    for method in ("birdslam", "paper"):
+        slam = load(write(path, f'method = "{method}"\n{one_class}')).slam
+        assert {name: size.length_m for name, size in slam.frontend.localisation.vehicles.items()} == {"car": 4.5}
+    for wrong in ("nobody's", 3, ["paper"]):
+        with pytest.raises(ConfigurationError, match="command line: method: "):
+            load(None, {"method": wrong})

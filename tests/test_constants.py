@@ -16,7 +16,8 @@ from birdslam.bench.tracking.localisation import CarError
 from birdslam.frontend import FrontEndConfig
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.evaluation.localisation import read_sweep
-from birdslam.runtime.pages import configuration as configuration_page
+from birdslam.runtime.fields import fields
+from birdslam.runtime.pages.tables import comments
 from birdslam.slam import SlamConfig
 
 PAGE = Path(__file__).parent.parent / "docs" / "constants.md"
@@ -53,8 +54,8 @@ def test_a_constant_is_what_the_page_says(name: str, stated: str) -> None:
 def test_every_key_that_names_a_recording_is_on_the_page() -> None:
     names = {name for name, *_ in ROWS}
     assert len(names) == len(ROWS) > 20
-    keys = [key for table in configuration_page.sections() for key in table.keys if key.key.startswith("slam.")]
-    assert {key.key for key in keys if RECORDINGS.search(key.meaning)} <= names
+    found = list(fields(SlamConfig, SlamConfig(), "slam."))
+    assert {f.key for f in found if RECORDINGS.search(comments(f.struct).get(f.name, ""))} <= names
 
 
 # --- leaving one sequence out ---

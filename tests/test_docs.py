@@ -22,6 +22,8 @@ from birdslam.perf.robustness import faults
 from birdslam.perf.robustness.injection import FAULTS
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import Configuration, ConfigurationError, load
+from birdslam.runtime.fields import fields, is_key, leaves, stands_for
+from birdslam.runtime.keys import GROUPS, KEYS
 from birdslam.runtime.pages import configuration as configuration_page
 from birdslam.runtime.pages.tables import comments
 
@@ -190,9 +192,9 @@ def test_every_module_that_a_page_names_by_its_file_is_there() -> None:
 
 
 def test_every_key_that_a_page_names_is_one() -> None:
-    keys = {key.key for table in configuration_page.sections() for key in table.keys}
-    tables = {table.name for table in configuration_page.sections()}
-    tops = {name.partition(".")[0] for name in tables if name}
+    keys = {field.key for field in fields(Configuration)} | set(KEYS)
+    tables = {".".join(words[:end]) for key in keys for words in [key.split(".")] for end in range(1, len(words))}
+    tops = {name.partition(".")[0] for name in tables}
     for page in PAGES:
         for name in re.findall(r"(?:`|--set )((?:\w+\.)+\w+)(?:`| =|=)", page.read_text()):
             if (
@@ -275,37 +277,41 @@ def test_the_page_of_sources_is_up_to_date(capsys: pytest.CaptureFixture[str]) -
     assert capsys.readouterr().out == (DOCS / "sources.md").read_text(), "birdslam sources > docs/sources.md"
 
 
-def test_every_key_has_a_meaning() -> None:
-    without = [key.key for table in configuration_page.sections() for key in table.keys if len(key.meaning.split()) < 2]
+def test_every_setting_that_a_page_shows_is_a_users_key() -> None:
+    known = {field.key for field in fields(Configuration)}
+    for page in PAGES:
+        text = page.read_text()
+        for name in re.findall(r"--set ([a-z_.]+)=", text):
+            assert is_key(name), f"{page.name}: {name}"
+        for name in re.findall(r"--(?:constant|sweep|leave-one-out) ([a-z_.]+)=", text):
+            assert name in known, f"{page.name}: {name}"
+
+
+def test_every_field_has_a_meaning() -> None:
+    without = [
+        field.key for field in fields(Configuration) if len(comments(field.struct).get(field.name, "").split()) < 2
+    ]
     assert without == [], "a comment beside the field says what it means"
 
 
-def test_every_key_of_the_code_is_on_the_page() -> None:
-    """By another way than the page's: the default configuration as plain data."""
-
-    def keys(tree: object, prefix: str) -> set[str]:
-        if not isinstance(tree, dict):
-            return {prefix}
-        return {key for name, value in tree.items() for key in keys(value, f"{prefix}.{name}".lstrip("."))}
-
-    told = {key.key for table in configuration_page.sections() for key in table.keys}
-    tables = {table.name for table in configuration_page.sections()}
-    there = keys(msgspec.to_builtins(Configuration()), "")
-    for name in Configuration().slam.frontend.localisation.vehicles:
-        told |= {key.replace(".NAME.", f".{name}.") for key in told}
-    assert there - told - tables == set()
-    assert "camera.height_m" in told
-    assert "models.depth.path" in told
+def test_the_fields_are_those_of_the_default_configuration() -> None:
+    """By another way: the default configuration as plain data."""
+    there = set(leaves(msgspec.to_builtins(Configuration())))
+    told = {field.key for field in fields(Configuration)}
+    empty = {"camera", *(f"models.{role}" for role in ("detector", "segmenter", "depth", "multitask", "pointnet"))}
+    assert {key for key in there if not any(stands_for(name, key) for name in told)} == empty
+    assert {"camera.height_m", "models.depth.path"} <= told
 
 
 def test_the_page_states_limits_that_hold() -> None:
-    rows = {key.key: key for table in configuration_page.sections() for key in table.keys}
+    rows = {row.key: row for group in GROUPS for row in configuration_page.rows(group)}
     assert rows["recording.jpeg_quality"].may_be == "integer >= 1 and <= 100"
     with pytest.raises(ConfigurationError, match="jpeg_quality"):
         load(None, {"recording.jpeg_quality": 101})
-    assert rows["slam.weights.mode"].may_be == '`"measured"`, `"paper"`'
-    assert rows["runtime.beat_s"].unit == "s"
-    assert rows["realtime.optimize.priority"].default == "`20`"
+    assert rows["method"].may_be == '`"birdslam"`, `"paper"`'
+    assert rows["source.camera_timeout_s"].unit == "s"
+    assert rows["realtime.NODE.priority"].default == "capture `30`, perceive `10`, optimize `20`"
+    assert rows["perceive.schedule.ROLE.hz"].default == "none"
 
 
 class Base(msgspec.Struct):

@@ -9,7 +9,6 @@ import pytest
 from birdslam.bench.tracking.localisation import (
     INSIDE_1_SIGMA,
     INSIDE_2_SIGMA,
-    PAPER,
     CarError,
     LocalisationRow,
     match_cars,
@@ -18,6 +17,7 @@ from birdslam.bench.tracking.localisation import (
 )
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
+from birdslam.paper import PAPER
 from birdslam.perception import Detections
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.sources.label_projection import Label
@@ -60,7 +60,7 @@ def depth_error(errors: list[CarError], span: str) -> float:
 def test_untruncated_cars_are_compared_and_a_tilted_road_is_found_out() -> None:
     sequence, detections = world(12)
     errors, paper = (
-        match_cars(sequence, measure(sequence, detections, config)) for config in (FrontEndConfig(), PAPER)
+        match_cars(sequence, measure(sequence, detections, config)) for config in (FrontEndConfig(), PAPER.frontend)
     )
     assert {error.label for error in errors} == {1, 2}  # the first is truncated
     assert {error.frame for error in errors} == set(range(1, 12))  # a track is confirmed in its second frame
@@ -97,6 +97,8 @@ def test_real_boxes_of_cars_beat_the_level_ground(data_dir: Path) -> None:
     root = data_dir / "kitti_tracking" / "training"
     sequence = open_tracking(root, "0003")
     detections = read_detections(root / "det_02_rrc", "0003", len(sequence))
-    ours, paper = (match_cars(sequence, measure(sequence, detections, config)) for config in (FrontEndConfig(), PAPER))
+    ours, paper = (
+        match_cars(sequence, measure(sequence, detections, config)) for config in (FrontEndConfig(), PAPER.frontend)
+    )
     for span in ("15-30", "30-50"):
         assert depth_error(ours, span) < min(0.08, 0.5 * depth_error(paper, span))

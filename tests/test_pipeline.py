@@ -499,7 +499,7 @@ def test_short_of_time_the_planner_is_told_and_never_deceived(drive: Path, place
     run = Run(
         *(place, "--source", f"kitti:{drive}", "--set", "source.loop=true", *WITH_NETWORKS),
         *(part for name in budgets for part in ("--set", f"budgets.{name}=0.001")),
-        *("--set", "degradation.window_frames=2", "--set", "degradation.coast_divisor=6"),
+        *("--constant", "degradation.window_frames=2", "--constant", "degradation.coast_divisor=6"),
         *("--set", "degradation.coast_max_ms=250", "--set", "budgets.end_to_end_ms=60000"),  # optimize has time
     )
     try:

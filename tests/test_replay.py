@@ -30,7 +30,7 @@ from tests.taped_drive import CAMERA, Tape, measured
 
 
 def options(recording: Path, values: Sequence[str] = (), output: Path | None = None) -> argparse.Namespace:
-    settings = [word for value in values for word in ("--set", value)]
+    settings = [word for value in values for word in ("--set" if value.startswith("method") else "--constant", value)]
     return parse(["replay", str(recording), *settings, *(("--output", str(output)) if output else ())])
 
 
@@ -346,7 +346,7 @@ def test_another_back_end_writes_results(tmp_path: Path, capsys: pytest.CaptureF
     for measurements in frames:
         tape.step(measurements)
     tape.end(frames[-1])
-    for name, values in (("same", ()), ("paper", ("slam.weights.mode=paper",))):
+    for name, values in (("same", ()), ("paper", ("method=paper",))):
         assert replay_command.run(options(tape.path, values, tmp_path / name)) == 0
         assert "results in" in capsys.readouterr().out
     same, paper = ((tmp_path / name / "ego.tum.txt").read_text() for name in ("same", "paper"))

@@ -23,7 +23,7 @@ import numpy as np
 from birdslam.bench.ego.trajectory_errors import OdometryReport, compare, from_first, in_camera0
 from birdslam.bench.tracking.benchmark import EGO as EGO_BODY
 from birdslam.perf.errors import PerfError
-from birdslam.perf.latency.live import Ask, add_run_options, drive
+from birdslam.perf.latency.live import Ask, add_run_options, drive, setting_options
 from birdslam.perf.latency.system import age_of
 from birdslam.perf.processes import loaded, run_birdslam
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
@@ -104,7 +104,7 @@ def _offline(options: argparse.Namespace, source: str, recording: Recording) -> 
     with tempfile.TemporaryDirectory(prefix="perf") as folder:
         given = ["run", *([options.config] if options.config else []), "--source", source, "--rate", "max"]
         given += [part for model in options.model for part in ("--model", model)]
-        given += [part for setting in options.set for part in ("--set", setting)]
+        given += setting_options(options.set)
         given += ["--set", f"runtime.runtime_dir={folder}/rt", "--vehicle", "perf", "--output", f"{folder}/out"]
         (Path(folder) / "rt").mkdir(mode=0o700)
         run_birdslam(*given)

@@ -26,6 +26,7 @@ from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.figures import curve, noise, spread
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.configuration import Configuration, complete, load, parse_setting
+from birdslam.runtime.fields import parted
 from birdslam.runtime.latency import stages
 from birdslam.runtime.nodes.capture import stamps
 from birdslam.runtime.nodes.sources import open_source
@@ -66,10 +67,10 @@ def measure(
 
 
 def _configuration(runtime_dir: Path, rate_hz: float, settings: tuple[str, ...]) -> Configuration:
-    overrides: dict[str, Any] = dict(parse_setting(text) for text in settings)
+    overrides, constants = parted(dict(parse_setting(text) for text in settings))
     overrides |= {"vehicle": _VEHICLE, "runtime.runtime_dir": str(runtime_dir)}
     overrides |= {"source.uri": "demo", "source.rate": rate_hz}
-    configuration = load(None, overrides)
+    configuration = load(None, overrides, constants=constants)
     source = open_source(configuration)
     return complete(configuration, source.camera, source.rate_hz)
 

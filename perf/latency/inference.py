@@ -30,6 +30,7 @@ from birdslam.perf.latency.live import add_run_options
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
 from birdslam.perf.reporting.figures import Ledger, curve, noise, spread, spread_text
 from birdslam.runtime.configuration import Configuration, ConfigurationError, complete, load, parse_setting
+from birdslam.runtime.fields import parted
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.nodes import front_end
 from birdslam.runtime.nodes.sources import SourceError, offline_frames, open_source
@@ -97,10 +98,10 @@ def _completion(configuration: Configuration, seconds: float) -> Parts:
 
 
 def _frames(options: argparse.Namespace, models: list[tuple[str, str]]) -> tuple[Configuration, list[Frame]]:
-    overrides: dict[str, Any] = dict(parse_setting(text) for text in options.set)
+    overrides, constants = parted(dict(parse_setting(text) for text in options.set))
     overrides |= {f"models.{role}.path": path for role, path in reversed(models)}  # the first of a role
     overrides |= {"source.uri": options.source, "source.rate": options.rate}
-    configuration = load(Path(options.config) if options.config else None, overrides)
+    configuration = load(Path(options.config) if options.config else None, overrides, constants=constants)
     source = open_source(configuration)
     configuration = complete(configuration, source.camera, source.rate_hz)
     frames = [frame for frame in itertools.islice(offline_frames(source), FRAMES_HELD) if frame.image is not None]

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -22,6 +22,7 @@ import psutil
 from birdslam.perf.errors import PerfError
 from birdslam.perf.processes import birdslam_command, processes_of
 from birdslam.runtime.client import Planner
+from birdslam.runtime.fields import is_key
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Message
 from birdslam.types import Status
@@ -57,7 +58,7 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
             *birdslam_command("run", *([self.config] if self.config else [])),
             *("--source", self.source, "--rate", str(self.rate), "--vehicle", _VEHICLE, "--output", str(place / "out")),
             *(part for model in self.models for part in ("--model", model)),
-            *(part for setting in settings for part in ("--set", setting)),
+            *setting_options(settings),
         ]
 
 
@@ -207,6 +208,11 @@ def _profiled(folder: Path | None, process: subprocess.Popen[bytes]) -> Iterator
                 print(f"py-spy: {errors.decode(errors='replace').strip()}", file=sys.stderr)
 
 
+def setting_options(settings: Iterable[str]) -> list[str]:
+    """The options of `birdslam run` for KEY=VALUE of any field, a user's key or a constant."""
+    return [part for text in settings for part in ("--set" if is_key(text.partition("=")[0]) else "--constant", text)]
+
+
 def add_run_options(add: Any, many: bool = False) -> None:
     """The options of a parser that make an Ask; `add` is its add_argument. `many`: a list of sources."""
     sources = "demo (the default: the shipped drive), kitti:DIR or video:FILE"
@@ -216,4 +222,4 @@ def add_run_options(add: Any, many: bool = False) -> None:
         add("--source", default="demo", metavar="URI", help=sources)
     add("--config", default="", metavar="CONFIG.toml", help="of the product")
     add("--model", action="append", default=[], metavar="ROLE=PATH")
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help="any key of the configuration")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="any field of the configuration")

@@ -139,7 +139,7 @@ EVALUATIONS = {
     "odometry_stride_2": Evaluation(f"odometry {SEQUENCES}/00 {SEQUENCES}/06 --stride 2 {REAL}", _odometry),
     "odometry_moving_median": Evaluation(
         f"odometry {SEQUENCES}/00 {SEQUENCES}/06 {{data}}/kitti_raw_clip {REAL} "
-        "--set slam.frontend.odometry.road.mode=paper",
+        "--constant slam.frontend.odometry.road.mode=paper",
         _odometry,
     ),
     "odometry_demo": Evaluation("odometry demo", _odometry),

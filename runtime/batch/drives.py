@@ -16,6 +16,7 @@ import msgspec
 
 from birdslam.runtime.batch.fetch import is_url
 from birdslam.runtime.configuration import ConfigurationError, dump, load, parse_setting
+from birdslam.runtime.fields import parted
 from birdslam.runtime.schemes import MCAP, all_schemes
 from birdslam.sources.schemes import KITTI, ROSBAG, by_suffix, scheme_at, scheme_of
 
@@ -114,15 +115,15 @@ def sweep(texts: Sequence[str]) -> list[dict[str, Any]]:
         key, equals, values = text.partition("=")
         if not equals or not key.strip() or not all(value.strip() for value in values.split(",")):
             raise ConfigurationError(f"--sweep {text}: expected KEY=V1,V2")
-        axes.append([parse_setting(f"{key}={value.strip()}") for value in values.split(",")])
+        axes.append([parse_setting(f"{key}={value.strip()}", "--sweep") for value in values.split(",")])
     return [dict(settings) for settings in itertools.product(*axes)]
 
 
 def tasks(
     drives: Sequence[Found], settings: Sequence[Mapping[str, Any]], config: Path | None, overrides: Mapping[str, Any],
-    models: Sequence[str],
+    models: Sequence[str], constants: Mapping[str, Any],
 ) -> list[Task]:  # fmt: skip
-    """Each drive by each of the settings, drives first. Raises ConfigurationError for what can be none.
+    """Each drive by each of the settings, drives first; a setting may be a constant. Raises ConfigurationError.
 
     Drives of the same settings share one configuration, without the source's URI: there may be many.
     """
@@ -130,10 +131,12 @@ def tasks(
     known: dict[bytes, tuple[dict[str, Any], bytes]] = {}
     for drive, name in zip(drives, _names(drives), strict=True):
         for swept in settings:
-            own = {**drive.settings, **swept}
-            key = msgspec.json.encode(own, order="deterministic")
+            swept_keys, swept_constants = parted(swept)
+            own = {**drive.settings, **swept_keys}
+            key = msgspec.json.encode((own, swept_constants), order="deterministic")
             if key not in known:
-                configuration = load(config, {**overrides, **own, "source.uri": "", "source.rate": "max"}, models)
+                given = {**overrides, **own, "source.uri": "", "source.rate": "max"}
+                configuration = load(config, given, models, {**constants, **swept_constants})
                 if configuration.source.loop:
                     raise ConfigurationError("source.loop: a batch takes each drive once")
                 tree = dump(configuration)

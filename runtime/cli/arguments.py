@@ -21,7 +21,7 @@ def add_pipeline(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--camera", metavar="FILE", help="a camera file (TOML) instead of the recording's calibration")
     parser.add_argument("--stride", type=int, metavar="N", help="every N-th frame of a recording")
     parser.add_argument("--output", metavar="DIR", help="where results go")
-    add_settings(parser, "any key, e.g. perceive.deadline_ms=25")
+    add_settings(parser, "a key of docs/configuration.md, e.g. perceive.deadline_ms=25")
 
 
 def add_other_odometry(parser: argparse.ArgumentParser, metavar: str) -> None:
@@ -73,9 +73,11 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
 
 
-def add_settings(parser: argparse.ArgumentParser, text: str = "any key") -> None:
-    """Single keys of the configuration."""
+def add_settings(parser: argparse.ArgumentParser, text: str = "a key of docs/configuration.md") -> None:
+    """Single keys of the configuration, and for developers the constants beside them."""
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=text)
+    text = "for developers: any field of the typed configuration, e.g. slam.graph.ego_nodes=8"
+    parser.add_argument("--constant", action="append", default=[], metavar="KEY=VALUE", help=text)
 
 
 def add_tracking_root(parser: argparse.ArgumentParser) -> None:

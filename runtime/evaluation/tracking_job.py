@@ -31,7 +31,6 @@ from birdslam.bench.tracking.benchmark import (
     summarise,
 )
 from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
-from birdslam.bench.tracking.localisation import PAPER as PAPER_FRONT_END
 from birdslam.bench.tracking.picture import draw_sequence
 from birdslam.bench.tracking.relative_nees import nees_rows, over_seeds
 from birdslam.bench.tracking.report import BatchTiming, Outcome, Timing
@@ -39,6 +38,7 @@ from birdslam.bench.tracking.reported import motion_row, range_rows, sights
 from birdslam.bench.tracking.tables import Published
 from birdslam.frontend import EgoMotion, FrontEndConfig, Pending
 from birdslam.graph.pose_graph import PoseGraph
+from birdslam.paper import PAPER as AS_PUBLISHED
 from birdslam.perception import Perception, Ready
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.inference import Inference
@@ -132,9 +132,9 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
                 ablations.append(run_trial(sequence, far_log, variants, named))
             if ideas:
                 placing = (
-                    PAPER_FRONT_END
+                    AS_PUBLISHED.frontend
                     if job.odometry != "images"
-                    else msgspec.structs.replace(PAPER_FRONT_END, odometry=slam.frontend.odometry)
+                    else msgspec.structs.replace(AS_PUBLISHED.frontend, odometry=slam.frontend.odometry)
                 )
                 theirs = run_trial(sequence, make(seed, placing), ideas, named)
                 placed = {f"ideas/{name}": m for name, m in ablation.placed_variants(ours(slam)).items()}

@@ -1,8 +1,7 @@
-"""The page of all keys (docs/configuration.md), made from the typed structs: `birdslam configuration` prints it."""
+"""The page of all keys (docs/configuration.md), from their questions and the typed fields: `birdslam configuration`."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -11,23 +10,30 @@ import msgspec
 from msgspec import inspect as kinds
 
 from birdslam.runtime.configuration import Configuration
-from birdslam.runtime.pages.tables import comments, table, unit
+from birdslam.runtime.fields import ByName, Field, fields, stands_for
+from birdslam.runtime.keys import GROUPS, KEYS, Group
+from birdslam.runtime.pages.tables import table, unit
 
 _PAGE = """\
-# Every key of the configuration
+# The keys of the configuration
 
-Made by `birdslam configuration > docs/configuration.md` from the typed code; a test holds it to the code.
+Made by `birdslam configuration > docs/configuration.md` from `runtime/keys.py` and the typed code; a test holds it.
 
 Every key has a default: one setting serves all roads and cameras. A TOML file holds differences only
 (`birdslam run FILE.toml`; [configs/vehicle.toml](../configs/vehicle.toml) is an example), and `--set KEY=VALUE` changes
 one key for one run: `birdslam run --set perceive.deadline_ms=25`. In a file the parts of a key before its last point
-name the table: `[perceive]`, then `deadline_ms = 25`. An unknown key or a wrong type is an error that names the key.
-Paths in a file are relative to the file.
+name the table: `[perceive]`, then `deadline_ms = 25`. A word in capitals stands for any name: `models.detector.path`.
+An unknown key or a wrong type is an error that names the key. Paths in a file are relative to the file.
 
-Units: m, s, rad, px as their keys end; *fraction* is 1 for the whole; *sigma* counts standard deviations. A default of
-*none* is what the meaning says of None; *required* holds within its table alone, which may be left out.
+These are {count} keys. The other numbers are constants of the method and its processes, and stand typed beside their
+formulas (`birdslam.slam.SlamConfig` has the method's): a file that sets one gets an error that says where it is.
+Programs vary them from Python, and ablations by `--constant KEY=VALUE`. [constants.md](constants.md) says which of them
+data chose.
 
-{sections}
+Units: m, s, rad, px as their keys end; *fraction* is 1 for the whole. *Required* holds within its table alone, which
+may be left out.
+
+{groups}
 """
 _NAMES: dict[type[kinds.Type], str] = {
     kinds.IntType: "integer",
@@ -43,95 +49,46 @@ class Key:
     """One row: a key of the configuration."""
 
     key: str
+    question: str
     unit: str
     default: str
     may_be: str
-    meaning: str
-
-
-@dataclass(frozen=True)
-class Section:
-    """One table of the configuration: its name ("" for the top), what it is about, and its own keys."""
-
-    name: str
-    about: str
-    keys: tuple[Key, ...]
 
 
 def page() -> str:
     """The whole page, in Markdown."""
-    return _PAGE.format(sections="\n\n".join(_markdown(section) for section in sections()))
+    return _PAGE.format(count=len(KEYS), groups="\n\n".join(map(_markdown, GROUPS)))
 
 
-def sections() -> list[Section]:
-    """Every table of the configuration, outer ones first."""
-    return list(_sections(Configuration, "", Configuration(), ""))
+def rows(group: Group) -> Iterator[Key]:
+    """Those of a group's keys."""
+    known = list(fields(Configuration, Configuration()))
+    for key, question in group.questions.items():
+        alike = [field for field in known if field.key == key or (field.key not in KEYS and stands_for(key, field.key))]
+        field = alike[0]
+        yield Key(key, question, unit(f"_{field.name}"), _default(alike), _may_be(field.kind))
 
 
-def _markdown(section: Section) -> str:
-    head = f"## {section.name or 'The top'}\n\n{section.about}".rstrip()
-    if not section.keys:
-        return head
-    rows = [(f"`{key.key}`", key.unit, key.default, key.may_be, key.meaning) for key in section.keys]
-    return f"{head}\n\n{table([('key', 'unit', 'default', 'may be', 'meaning'), *rows])}"
+def _markdown(group: Group) -> str:
+    cells = [(f"`{row.key}`", row.question, row.unit, row.default, row.may_be) for row in rows(group)]
+    head = f"## {group.title}\n\n" + (f"{group.about}\n\n" if group.about else "")
+    return head + table([("key", "question", "unit", "default", "may be"), *cells])
 
 
-def _sections(kind: type[msgspec.Struct], name: str, values: Any, said: str) -> Iterator[Section]:
-    """The table of a struct, then those within it. `values` is its default: a struct, structs by name, or None."""
-    about = " ".join(inspect.cleandoc(kind.__doc__ or "").split("\n\n")[0].split())
-    keys, inner = [], []
-    meanings = comments(kind)
-    info = kinds.type_info(kind)
-    assert isinstance(info, kinds.StructType)
-    for field in info.fields:
-        key = f"{name}.{field.name}".lstrip(".")
-        nested = _struct_in(field.type)
-        default = _default(values, field)
-        if nested is None:
-            told = _told(default) if isinstance(default, _ByName) else _value(default)
-            keys.append(Key(key, unit(field.name), told, _may_be(field.type), meanings.get(field.name, "")))
-        elif isinstance(field.type, kinds.DictType):
-            inner.append((nested, f"{key}.NAME", _ByName(default), meanings.get(field.name, "")))
-        else:
-            inner.append((nested, key, default, meanings.get(field.name, "")))
-    yield Section(name, f"{about} {_sentence(said)}".strip(), tuple(keys))
-    for found in inner:
-        yield from _sections(*found)
-
-
-class _ByName(dict[str, Any]):
-    """Defaults that differ from name to name."""
-
-
-def _default(values: Any, field: kinds.Field) -> Any:
-    if isinstance(values, _ByName):
-        return _ByName({name: getattr(value, field.name) for name, value in values.items()})
-    if values is not None:
-        return getattr(values, field.name)
-    if field.default is not msgspec.NODEFAULT:
-        return field.default
-    return msgspec.NODEFAULT if field.required else field.default_factory()
-
-
-def _told(by_name: _ByName) -> str:
-    return ", ".join(f"{name} {_value(value)}" for name, value in by_name.items())
+def _default(alike: list[Field]) -> str:
+    """Of a key, or of each that a pattern stands for where they differ: "detector 5.0, depth 2.0"."""
+    values = {field.key: _value(field.default) for field in alike}
+    if isinstance(alike[0].default, ByName):
+        return ", ".join(f"{name} {_value(value)}" for name, value in alike[0].default.items())
+    if len(set(values.values())) == 1:
+        return values[alike[0].key]
+    return ", ".join(f"{key.split('.')[-2]} {value}" for key, value in values.items())
 
 
 def _value(value: Any) -> str:
     if value is msgspec.NODEFAULT:
         return "required"
     return "none" if value is None else f"`{msgspec.json.encode(value).decode()}`"
-
-
-def _struct_in(kind: kinds.Type) -> type[msgspec.Struct] | None:
-    """The struct that a field holds: itself, or None, or one for each name."""
-    if isinstance(kind, kinds.StructType):
-        return kind.cls
-    if isinstance(kind, kinds.DictType):
-        return _struct_in(kind.value_type)
-    if isinstance(kind, kinds.UnionType):
-        return next((found for inner in kind.types if (found := _struct_in(inner))), None)
-    return None
 
 
 def _may_be(kind: kinds.Type) -> str:
@@ -147,7 +104,3 @@ def _may_be(kind: kinds.Type) -> str:
     if pattern := getattr(kind, "pattern", None):
         said.append(f"`{pattern}`")
     return f"{_NAMES[type(kind)]} {' and '.join(said)}".strip()
-
-
-def _sentence(text: str) -> str:
-    return f"{text[0].upper()}{text[1:]}." if text else ""

@@ -13,7 +13,7 @@ from birdslam.graph.g2o import g2o_lines
 from birdslam.outputs.drive_files import Recorder, claim_directory
 from birdslam.outputs.drive_video import DriveVideo, check_video
 from birdslam.outputs.final_trajectories import FinalTracks, last_seen, write_final_ego
-from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.configuration import ConfigurationError, load, refuse_constant
 from birdslam.runtime.recording.recorded_drive import measurements_of
 from birdslam.runtime.recording.recording import Recording, RecordingError
 from birdslam.runtime.replay.replay import BackEnd, estimates
@@ -66,16 +66,23 @@ def write_results(recording: Recording, config: BackEnd, output: Path, smooth: b
             video.finish()
 
 
-def changed_back_end(config: BackEnd, settings: Mapping[str, Any]) -> BackEnd:
-    """The back end with other values, by key. Raises ConfigurationError for a key that is not the back end's."""
+def changed_back_end(config: BackEnd, settings: Mapping[str, Any], constants: Mapping[str, Any]) -> BackEnd:
+    """The back end with other values: keys of users, and constants. Raises ConfigurationError for others."""
+    for key in settings:
+        refuse_constant(key, "command line")
+    if "method" in settings:
+        slam = load(None, {"method": settings["method"]}).slam
+        config = slam.graph, slam.weights
     parts = {"slam.graph": config[0], "slam.weights": config[1]}
-    for key, value in settings.items():
+    for key, value in {**settings, **constants}.items():
         name, _, field = key.rpartition(".")
+        if key == "method":
+            continue
         if name not in parts:
-            raise ConfigurationError(f"--set {key}: replay runs the back end alone: {' or '.join(parts)}.KEY=VALUE")
+            raise ConfigurationError(f"{key}: replay runs the back end alone: method, {', '.join(parts)}.KEY=VALUE")
         try:
             tree = {**msgspec.to_builtins(parts[name]), field: value}
             parts[name] = msgspec.convert(tree, type(parts[name]))
         except msgspec.ValidationError as error:
-            raise ConfigurationError(f"--set {key}: {error}") from None
+            raise ConfigurationError(f"{key}: {error}") from None
     return parts["slam.graph"], parts["slam.weights"]  # type: ignore[return-value]

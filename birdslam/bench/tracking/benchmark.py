@@ -33,6 +33,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
+from birdslam.paper import PAPER as AS_PUBLISHED
 from birdslam.slam import SlamConfig
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
@@ -98,23 +99,7 @@ class Final:
         return out
 
 
-NO_GATE = 1e6  # sigmas: nothing is an outlier
-
-PAPER = Live(
-    "BirdSLAM as published",
-    WeightsConfig(mode="paper", cp_vehicles=10_000.0),
-    # CC, CP, CV and VV edges by Eqs. 5-8 and nothing else
-    GraphConfig(
-        constant_velocity=False,
-        detection_gate_sigma=NO_GATE,
-        landmark_gate_sigma=NO_GATE,
-        landmark_common_m=0.0,
-        landmark_anchor="first_sight",
-        correlation_length_m=0.0,
-        zero_velocity_update=False,
-        front_back_ambiguity=False,
-    ),
-)
+PAPER = Live("BirdSLAM as published", AS_PUBLISHED.weights, AS_PUBLISHED.graph)
 
 
 def ours(config: SlamConfig) -> Live:

@@ -26,31 +26,11 @@ from birdslam.perception import Detections, Perception, Ready
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import Label
 from birdslam.types import Measurements, VehicleEdge
-from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
-from birdslam.vehicles.placement.localisation import LocalisationConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig
 
 CAMERA_OF_BOXES = 2  # labels and RRC detections were drawn in its images
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0))
 INSIDE_1_SIGMA, INSIDE_2_SIGMA = (float(chi2.ppf(chi2.cdf(k**2, 1), 2)) for k in (1, 2))  # 2.30, 6.18
 MEASURED_KIND = "Car"
-
-# The paper's: Eq. 1 on the bottom of the box alone, on level ground as calibrated, and the point that it gives; within
-# 20 m the depth, where there is a network for it
-PAPER = FrontEndConfig(
-    localisation=LocalisationConfig(reach_rel=0.0, overhang_rel=0.0),
-    ground_size=GroundSizeConfig(
-        sigma_pitch_rad=1e-6,
-        pitch_memory_s=1e-3,
-        sigma_pitch_step_rad=1e-6,
-        sigma_pitch_blind_rad=1e-6,
-        sigma_roll_rad=1e-6,
-        sigma_kerb_m=1e-3,
-        sigma_crown_rad=0.0,
-        cues=("bottom",),
-    ),
-    pseudolidar=PseudoLidarConfig(rule="paper"),
-)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from birdslam.runtime.batch.drives import find_drives, sweep, tasks
 from birdslam.runtime.cli.arguments import add_config, add_pipeline, add_topics
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.environment import INTERRUPTED_STATUS
-from birdslam.runtime.options import overrides_of
+from birdslam.runtime.options import constants_of, overrides_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +37,8 @@ def run(options: argparse.Namespace) -> int:
     overrides.pop("output", None)
     if options.jobs is not None and options.jobs < 1:
         raise ConfigurationError(f"--jobs {options.jobs}: one or more")
-    todo = tasks(find_drives(options.drives), sweep(options.sweep), options.config, overrides, models)
+    constants = constants_of(options)
+    todo = tasks(find_drives(options.drives), sweep(options.sweep), options.config, overrides, models, constants)
     if before := sum(done(output, task) for task in todo):
         print(f"{before} of {len(todo)} drives are done already")
     outcome = run_batch(todo, output, options.jobs, options.address if options.engine == "ray" else None)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from birdslam.runtime.cli.arguments import RECORDING, add_final_results, add_settings
 from birdslam.runtime.configuration import parse_setting
+from birdslam.runtime.options import constants_of
 from birdslam.runtime.progress import file_progress
 from birdslam.runtime.recording.recording import Recording
 from birdslam.runtime.replay.replay import back_end, compare
@@ -17,7 +18,7 @@ from birdslam.runtime.replay.results import changed_back_end, write_g2o, write_r
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The recording, and what is made of it; nothing: a comparison."""
     parser.add_argument("recording", type=Path, metavar=RECORDING)
-    text = "with another back end (slam.graph.*, slam.weights.*): nothing is compared, results are written"
+    text = "with another back end (method, slam.graph.*, slam.weights.*): nothing is compared, results are written"
     add_settings(parser, text)
     parser.add_argument("--output", type=Path, metavar="DIR", help="where results go; with it they are always written")
     add_final_results(parser)
@@ -28,8 +29,9 @@ def run(options: argparse.Namespace) -> int:
     """0 where the back end gives the recorded estimates, 1 where not; or new results."""
     with file_progress("replay", options.recording) as progress:
         recording = Recording(options.recording, progress.reach)
-        if options.g2o or options.set or options.output or options.smooth or options.video:
-            config = changed_back_end(back_end(recording), dict(parse_setting(text) for text in options.set))
+        if options.g2o or options.set or options.constant or options.output or options.smooth or options.video:
+            settings = dict(parse_setting(text) for text in options.set)
+            config = changed_back_end(back_end(recording), settings, constants_of(options))
             if options.g2o:
                 write_g2o(recording, config, options.g2o)
                 text, status = f"graph in {options.g2o}", 0

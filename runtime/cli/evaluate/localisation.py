@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from birdslam.bench.tracking.leave_one_out import LeftOut
-from birdslam.bench.tracking.localisation import PAPER, LocalisationRow
+from birdslam.bench.tracking.localisation import LocalisationRow
 from birdslam.outputs.drive_files import claim_directory, write_json
+from birdslam.paper import PAPER
 from birdslam.runtime.cli.arguments import add_config, add_settings, add_tracking_root
 from birdslam.runtime.evaluation.localisation import evaluate_left_out, evaluate_localisation, read_sweep, sequences_of
 from birdslam.runtime.options import configuration_of
@@ -41,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
         print(_table_of_left_out(left))
     else:
         rows = evaluate_localisation(
-            options.root, names, options.detections, PAPER if options.mode == "paper" else config
+            options.root, names, options.detections, PAPER.frontend if options.mode == "paper" else config
         )
         write_json(output / "report.json", rows)
         print(_table(rows))
