@@ -128,15 +128,9 @@ def test_a_hidden_road_carries_the_scale_and_a_new_window_forgets_it() -> None:
 
 def test_the_key_chooses_the_strategy_and_is_validated(tmp_path: Path) -> None:
     key = "slam.frontend.odometry.road.mode"
-<<<<<<< HEAD
     assert isinstance(Odometry(CAMERA)._scale, RoadScale)  # private: else a drive for each
-    paper = load(None, {key: "paper"}).slam.frontend.odometry
-    assert isinstance(Odometry(CAMERA, paper)._scale, MovingMedianScale)  # private: likewise
-=======
-    assert isinstance(Odometry(CAMERA)._scale, RoadScale)
     paper = load(None, constants={key: "paper"}).slam.frontend.odometry
-    assert isinstance(Odometry(CAMERA, paper)._scale, MovingMedianScale)
->>>>>>> 4b7bc78 (A file sets 108 keys, each a question; the rest are constants)
+    assert isinstance(Odometry(CAMERA, paper)._scale, MovingMedianScale)  # private: likewise
     with pytest.raises(ConfigurationError, match=key):
         load(None, constants={key: "median"})
     with pytest.raises(msgspec.ValidationError, match="median_frames"):
