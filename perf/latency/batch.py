@@ -63,9 +63,7 @@ def run(arguments: list[str]) -> None:
     rows: list[dict[str, Any]] = []
     try:
         drives = find_drives(places)
-        todo, start = (
-            [*tasks(drives, [{"source.frames": n}], None, {}, [], {})] for n in (options.frames, START_FRAMES)
-        )
+        todo, start = (tasks(drives, [{"source.frames": n}], None, {}, [], {}) for n in (options.frames, START_FRAMES))
         with Ledger(options.output, label, drives=places, frames=options.frames) as ledger:
             ledger.add("start of a process", f"{START_FRAMES} frames a drive", **(first := measure("plain", 1, start)))
             for number in range(options.rounds):
