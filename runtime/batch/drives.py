@@ -149,7 +149,7 @@ def tasks(
                 Task(
                     name=re.sub(r"[^\w.@=+-]", "_", name + at),
                     uri=drive.uri,
-                    settings=own,
+                    settings={**drive.settings, **swept},
                     configuration=tree,
                     identity=hashlib.sha256(encoded + drive.uri.encode()).hexdigest(),
                 )
