@@ -132,7 +132,7 @@ def test_networks_that_are_spared_run_on_fewer_frames() -> None:
     head = Head()
     networks = Networks([head], run_at_once)
     for frame_id in range(24):
-        networks.sparing = 1 if frame_id < 12 else 3
+        networks.slowdown = 1 if frame_id < 12 else 3
         networks.start(frame_id, np.full((2, 2), frame_id, np.uint8)).result()
     assert head.frames == [0, 2, 4, 6, 8, 10, 16, 22]
 

@@ -43,7 +43,7 @@ def test_what_hours_need() -> None:
 
 @pytest.mark.processes
 def test_a_cell_is_measured(tmp_path: Path) -> None:
-    todo = tasks(find_drives([str(kitti(tmp_path / "00"))]), [{}], None, PLAIN, [])
+    todo = tasks(find_drives([str(kitti(tmp_path / "00"))]), [{}], None, PLAIN, [], {})
     measured = batch.measure("plain", 1, todo)
     assert measured["drives"] == 1
     assert measured["cpu_s"] > 0.0

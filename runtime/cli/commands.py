@@ -16,8 +16,6 @@ from importlib.metadata import version
 from birdslam.runtime.schemes import all_schemes
 from birdslam.sources.schemes import written
 
-SOURCES_NOTE = f"Sources: {written(all_schemes())}."
-
 
 @dataclass(frozen=True)
 class Command:
@@ -90,13 +88,18 @@ COMMANDS = (
 )  # fmt: skip
 
 
+def sources_note() -> str:
+    """Where frames can come from, for the foot of a help."""
+    return f"Sources: {written(all_schemes())}."
+
+
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """The options that the arguments give; `call` among them is the function that takes them.
 
     Ends the process as argparse does: after help and version, and where an argument is wrong.
     """
     parser = argparse.ArgumentParser(
-        prog="birdslam", description="Monocular multibody SLAM in bird's-eye view.", epilog=SOURCES_NOTE
+        prog="birdslam", description="Monocular multibody SLAM in bird's-eye view.", epilog=sources_note()
     )
     parser.add_argument("--version", action="version", version=f"birdslam {version('birdslam')}")
     groups = {"": parser.add_subparsers(required=True, metavar="COMMAND")}

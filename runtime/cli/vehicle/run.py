@@ -6,14 +6,14 @@ import argparse
 from pathlib import Path
 
 from birdslam.runtime.cli.arguments import add_final_results, add_other_odometry, add_pipeline, add_topics
-from birdslam.runtime.cli.commands import SOURCES_NOTE
+from birdslam.runtime.cli.commands import sources_note
 from birdslam.runtime.options import configuration_of
 from birdslam.runtime.supervision.run import run as run_processes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Source, rate, recording and results, and the pipeline."""
-    parser.epilog = SOURCES_NOTE
+    parser.epilog = sources_note()
     parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help="differences from the defaults")
     parser.add_argument("--source", metavar="URI", help="where frames come from")
     parser.add_argument("--rate", metavar="HZ|max", help='frames a second, or "max": every frame, as fast as can be')
