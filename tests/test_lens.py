@@ -1,0 +1,103 @@
+"""A lens from the drive alone: what a drive shows of focal length and distortion, and what it does not."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from birdslam.calibration.lens import CornersOfImage, Lens, self_calibrate
+
+SIZE_PX = 1280, 720
+FOCAL_PX = 1000.0
+NOISE_PX = 0.3
+
+
+def drive(
+    k1: float, turn_rad: float, images: int = 90, step_m: float = 0.8, seed: int = 0, focal_px: float = FOCAL_PX
+) -> list[CornersOfImage]:
+    """Corners of a street's facades and ground, by a camera that turns to both sides, `turn_rad` together."""
+    rng = np.random.default_rng(seed)
+    # x right, y down, z forward from the first camera; enough for the whole way
+    n = 12 * images
+    side = rng.choice([-1.0, 1.0], n)
+    places = np.column_stack([side * rng.uniform(4.0, 25.0, n), rng.uniform(-8.0, 1.3, n), rng.uniform(3.0, 150.0, n)])
+    middle = 0.5 * (np.array(SIZE_PX) - 1.0)
+    heading, at = 0.0, np.zeros(3)
+    out = []
+    for k in range(images):
+        if k:
+            heading += turn_rad / images * (1.0 if (k // (images // 3)) % 2 == 0 else -1.0)
+            at = at + step_m * np.array([math.sin(heading), 0.0, math.cos(heading)])
+        R = cv2.Rodrigues(np.array([0.0, heading, 0.0]))[0]
+        q = (places - at) @ R
+        ahead = (q[:, 2] > 2.0) & (q[:, 2] < 90.0)
+        u = q[:, :2] / np.where(ahead, q[:, 2], 1.0)[:, None]
+        r2 = np.square(u).sum(axis=1, keepdims=True)
+        px = focal_px * u * (1.0 + k1 * r2) + middle + rng.normal(0.0, NOISE_PX, u.shape)
+        one_to_one = (1.0 + 3.0 * k1 * r2[:, 0]) > 0.2
+        seen = ahead & one_to_one & (px > 5.0).all(axis=1) & (px < np.array(SIZE_PX) - 5.0).all(axis=1)
+        ids = np.flatnonzero(seen)
+        out.append(CornersOfImage(ids, px[ids]))
+    return out
+
+
+def calibrated(images: list[CornersOfImage], focal_px: float = FOCAL_PX, sigma_rel: float = 0.15) -> Lens:
+    lens = self_calibrate(images, SIZE_PX, focal_px, sigma_rel)
+    assert lens is not None
+    return lens
+
+
+@pytest.mark.parametrize("k1", [-0.3, -0.1, 0.0])
+def test_a_turning_drive_shows_focal_length_and_distortion(k1: float) -> None:
+    lens = calibrated(drive(k1, math.radians(120.0)), 1.1 * FOCAL_PX)
+    assert lens.focal_shown
+    assert abs(math.log(lens.focal_px / FOCAL_PX)) < 2.0 * lens.focal_sigma_rel
+    assert lens.focal_sigma_rel < 0.06
+    assert abs(lens.k1 - k1) < 3.0 * lens.k1_sigma
+    assert lens.k1_sigma < 0.05
+
+
+def test_a_straight_drive_shows_the_distortion_and_no_focal_length() -> None:
+    lens = calibrated(drive(-0.3, 0.0))
+    assert not lens.focal_shown
+    assert lens.focal_sigma_rel > 0.075
+    assert abs(math.log(lens.focal_px / FOCAL_PX)) < 2.0 * lens.focal_sigma_rel
+    assert abs(lens.k1 + 0.3) < 3.0 * lens.k1_sigma
+
+
+def test_what_is_known_beforehand_is_kept_where_the_drive_shows_no_more() -> None:
+    lens = calibrated(drive(-0.2, 0.0), FOCAL_PX, 0.02)
+    assert lens.focal_px == pytest.approx(FOCAL_PX, rel=0.03)
+    assert lens.focal_sigma_rel == pytest.approx(0.02)
+    assert lens.k1 == pytest.approx(-0.2, abs=3.0 * lens.k1_sigma)
+
+
+def test_a_car_that_stands_shows_no_lens() -> None:
+    standing = drive(-0.2, 0.0, images=40, step_m=0.0)
+    assert self_calibrate(standing, SIZE_PX, FOCAL_PX, 0.15) is None
+    assert self_calibrate([], SIZE_PX, FOCAL_PX, 0.15) is None
+
+
+def test_corners_that_move_by_themselves_do_not_bend_the_lens() -> None:
+    images = drive(-0.25, math.radians(100.0))
+    rng = np.random.default_rng(3)
+    wrong = set(rng.choice(2700, 300, replace=False).tolist())  # one corner in nine drifts on its own
+    drift = {k: rng.normal(0.0, 4.0, 2) for k in wrong}
+    moved = []
+    for number, image in enumerate(images):
+        px = image.px.copy()
+        for row, k in enumerate(image.ids.tolist()):
+            if k in drift:
+                px[row] += number * drift[k] / 3.0
+        moved.append(CornersOfImage(image.ids, px))
+    lens = calibrated(moved)
+    assert abs(lens.k1 + 0.25) < 3.0 * lens.k1_sigma
+    assert abs(math.log(lens.focal_px / FOCAL_PX)) < 2.0 * lens.focal_sigma_rel
+
+
+def test_it_is_the_same_each_time() -> None:
+    images = drive(-0.15, math.radians(60.0), images=60)
+    assert calibrated(images) == calibrated(images)
