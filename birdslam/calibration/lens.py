@@ -10,19 +10,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.pose import rotation_exp, rotation_log
+from birdslam.calibration.lens_adjustment import (
+    IMAGES,
+    SIGMA_K1,
+    LensProblem,
+    adjust,
+    at_focal_length,
+    costs,
+    some_windows,
+)
+from birdslam.geometry.pose import rotation_log
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-IMAGES = 6  # of a window
-_STEP_RAD = 0.016  # so far corners have moved from one image of a window to the next: most of them, by _MOVED
+# So far most corners, _MOVED of them, have moved from one image of a window to the next; of short drives less
+_STEPS_RAD = 0.016, 0.012
 _MOVED = 0.6
 _MOST_WINDOWS = 40
 _LEAST_WINDOWS = 4
@@ -31,17 +40,14 @@ _MOST_CORNERS = 160
 _TWO_VIEW_PX = 1.5  # outliers' limit of the first poses, by pixels of a lens of _FOCAL_PX
 _FOCAL_PX = 720.0
 _SIGMA_PX = 0.5  # of a corner, by the same pixels
-_HUBER = 1.5  # sigmas
+_MOST_TURN_RAD = 0.8  # of a window
+_LEAST_TURN_RAD = math.radians(30.0)  # a drive that turns less shows no focal length: of 19 real ones eleven did not
 _FARTHEST = 80.0  # of a corner that begins the adjustment, in baselines of its window
-_ITERATIONS = 20
-_CONVERGED = 1e-6  # relative change of the cost
 # Focal lengths that are tried, as the log of their ratio to the best one so far; after the first round finer ones
 _TRIED_LOG = (np.linspace(-0.4, 0.4, 9), np.linspace(-0.12, 0.12, 7))
 _FOLDS = 5  # of the windows, for the sigma
-SIGMA_K1 = 0.3  # beforehand: dashboard cameras have -0.4 to 0
 LEAST_SIGMA_REL = 0.03  # of the focal length: on 19 real drives the fit's own was up to 26 times too small
 LEAST_SIGMA_K1 = 0.01
-_NEAREST, _BEHIND_COST = 1e-3, 1e3  # a corner is no nearer; what one behind the camera costs
 
 
 @dataclass(frozen=True)
@@ -77,20 +83,6 @@ class _Window:
     px: Floats
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """What is adjusted: P corners, each of a window w; observed at px (P, IMAGES, 2), from the image's middle."""
-
-    px: Floats
-    of: Ints  # (P,) window of each corner
-    R: Floats  # (W, IMAGES, 3, 3) from the window's first camera to each
-    t: Floats  # (W, IMAGES, 3)
-    corner: Floats  # (P, 3) x / z, y / z, 1 / z in the window's first camera
-    log_focal: float
-    k1: float
-    sigma_px: float  # of a corner: a larger image has it in more pixels, whatever its lens turns out to be
-
-
 def self_calibrate(
     images: Sequence[CornersOfImage], size_px: tuple[int, int], focal_px: float, focal_sigma_rel: float
 ) -> Lens | None:
@@ -100,40 +92,60 @@ def self_calibrate(
     length trades against turns and lateral motion in a narrow valley: so it is tried, and the rest adjusted for each.
     """
     middle = 0.5 * (np.array(size_px, dtype=np.float64) - 1.0)
-    windows = _windows(images, middle, focal_px)
+    windows: list[_Window] = []
+    for step_rad in _STEPS_RAD:
+        if len(windows) < 2 * _LEAST_WINDOWS:
+            windows = _windows(images, middle, step_rad * focal_px)
     sigma_px = _SIGMA_PX * focal_px / _FOCAL_PX
-    log_focal, k1 = math.log(focal_px), 0.0
-    fitted: _Problem | None = None
+    begun = _begin(windows, focal_px, 0.0, sigma_px)
+    if begun is None:
+        return None
+    fitted = adjust(begun)
+    again = _begin(windows, focal_px, fitted.k1, sigma_px)
+    fitted = fitted if again is None else adjust(again)
+    turned_rad, sigma_rel = _turned_rad(fitted), focal_sigma_rel
+    if turned_rad > _LEAST_TURN_RAD:
+        fitted, sigma_rel = _with_focal_length(windows, fitted, focal_px, focal_sigma_rel)
+    k1s = [adjust(some_windows(fitted, some)).k1 for some in _folds(fitted)]
+    return Lens(
+        focal_px=math.exp(fitted.log_focal),
+        k1=fitted.k1,
+        focal_sigma_rel=sigma_rel,
+        k1_sigma=min(max(LEAST_SIGMA_K1, _jackknife(k1s)), SIGMA_K1),
+        windows=len(fitted.R),
+        corners=len(fitted.px),
+        turned_rad=turned_rad,
+        focal_shown=sigma_rel < 0.7 * focal_sigma_rel,
+    )
+
+
+def _turned_rad(problem: LensProblem) -> float:
+    """How far the camera turned; windows overlap by half."""
+    return sum(float(np.linalg.norm(rotation_log(R[IMAGES // 2]))) for R in problem.R)
+
+
+def _with_focal_length(
+    windows: Sequence[_Window], fitted: LensProblem, focal_px: float, focal_sigma_rel: float
+) -> tuple[LensProblem, float]:
+    """The problem with the focal length that costs least, and its 1-sigma as a fraction."""
     for tried in _TRIED_LOG:
-        begun = _begin(windows, math.exp(log_focal), k1, sigma_px)
+        begun = _begin(windows, math.exp(fitted.log_focal), fitted.k1, fitted.sigma_px)
         if begun is None:
-            return None
-        at = log_focal + tried
+            return fitted, focal_sigma_rel
+        at = fitted.log_focal + tried
         profile = _profile(begun, at)
         prior = 0.5 * np.square((at - math.log(focal_px)) / focal_sigma_rel)
-        log_focal = _lowest(at, profile.sum(axis=1) + prior)
-        fitted = _adjust(_at_focal(begun, log_focal))[0]
-        k1 = fitted.k1
-    assert fitted is not None
-    W = len(fitted.R)
-    folds = np.arange(W) % min(_FOLDS, W)
-    without = [folds != fold for fold in range(min(_FOLDS, W))]
-    logs = [_lowest(at, profile[:, some].sum(axis=1) + prior) for some in without]
-    k1s = [_adjust(_some_windows(fitted, some))[0].k1 for some in without]
-    curvature = _curvature(at, profile.sum(axis=1) + prior)
-    sigma_rel = min(max(LEAST_SIGMA_REL, _jackknife(logs), curvature**-0.5), focal_sigma_rel)
-    # What the distortion owes to the focal length: to first order it stays the same in pixels, k1 / focal^2
-    k1_sigma = math.hypot(max(LEAST_SIGMA_K1, _jackknife(k1s)), 2.0 * k1 * sigma_rel)
-    return Lens(
-        focal_px=math.exp(log_focal),
-        k1=k1,
-        focal_sigma_rel=sigma_rel,
-        k1_sigma=min(k1_sigma, SIGMA_K1),
-        windows=W,
-        corners=len(fitted.px),
-        turned_rad=sum(float(np.linalg.norm(rotation_log(R[-1]))) for R in fitted.R),
-        focal_shown=sigma_rel < 0.5 * focal_sigma_rel,
-    )
+        fitted = adjust(at_focal_length(begun, _lowest(at, profile.sum(axis=1) + prior)))
+    without = [_lowest(at, profile[:, some].sum(axis=1) + prior) for some in _folds(fitted)]
+    own = _curvature(at, profile.sum(axis=1) + prior) ** -0.5
+    return fitted, min(max(LEAST_SIGMA_REL, _jackknife(without), own), focal_sigma_rel)
+
+
+def _folds(problem: LensProblem) -> list[NDArray[np.bool_]]:
+    """Which windows (W,) stay where each fold of them is left out."""
+    W = len(problem.R)
+    folds = min(_FOLDS, W)
+    return [np.arange(W) % folds != fold for fold in range(folds)]
 
 
 def _lowest(at: Floats, cost: Floats) -> float:
@@ -155,54 +167,24 @@ def _jackknife(values: Sequence[float]) -> float:
     return math.sqrt((n - 1) / n * float(np.square(np.array(values) - np.mean(values)).sum()))
 
 
-def _profile(problem: _Problem, log_focals: Floats) -> Floats:
+def _profile(problem: LensProblem, log_focals: Floats) -> Floats:
     """(F, W) what each window costs at each focal length, the rest adjusted; from the middle outwards."""
     out = np.zeros((len(log_focals), len(problem.R)))
     middle = len(log_focals) // 2
     for ways in (range(middle, len(log_focals)), range(middle - 1, -1, -1)):
         there = problem
         for k in ways:
-            there = _adjust(_at_focal(there, float(log_focals[k])))[0]
+            there = adjust(at_focal_length(there, float(log_focals[k])))
             if k == middle:
                 problem = there
-            out[k] = _costs(there)
+            out[k] = costs(there)
     return out
-
-
-def _at_focal(problem: _Problem, log_focal: float) -> _Problem:
-    """The same images by another focal length: lateral lengths and turns are the smaller, depths stay."""
-    by = math.exp(problem.log_focal - log_focal)
-    R = problem.R.copy()
-    for window in R:
-        for k in range(1, IMAGES):
-            window[k] = rotation_exp(rotation_log(window[k]) * [by, by, 1.0])
-    return replace(
-        problem,
-        R=R,
-        t=problem.t * [by, by, 1.0],
-        corner=problem.corner * [by, by, 1.0],
-        k1=problem.k1 / by**2,
-        log_focal=log_focal,
-    )
-
-
-def _some_windows(problem: _Problem, some: NDArray[np.bool_]) -> _Problem:
-    """The problem of some of the windows (W,) alone."""
-    corners, number = some[problem.of], np.cumsum(some) - 1
-    return replace(
-        problem,
-        px=problem.px[corners],
-        of=number[problem.of[corners]],
-        R=problem.R[some],
-        t=problem.t[some],
-        corner=problem.corner[corners],
-    )
 
 
 # --- windows ---
 
 
-def _windows(images: Sequence[CornersOfImage], middle: Floats, focal_px: float) -> list[_Window]:
+def _windows(images: Sequence[CornersOfImage], middle: Floats, step_px: float) -> list[_Window]:
     """Windows of the drive, each of images between which corners have moved by a step."""
     found, first = [], 0
     while first < len(images) - IMAGES:
@@ -211,7 +193,7 @@ def _windows(images: Sequence[CornersOfImage], middle: Floats, focal_px: float) 
             moved = _flow_px(images[at[-1]], images[k])
             if len(moved) < _LEAST_CORNERS:
                 break
-            if np.quantile(moved, 1.0 - _MOVED) > _STEP_RAD * focal_px:
+            if np.quantile(moved, 1.0 - _MOVED) > step_px:
                 at.append(k)
             if len(at) == IMAGES:
                 break
@@ -253,9 +235,11 @@ def _undistorted(px: Floats, focal_px: float, k1: float) -> Floats:
     return out
 
 
-def _begin(windows: Sequence[_Window], focal_px: float, k1: float, sigma_px: float) -> _Problem | None:
+def _begin(windows: Sequence[_Window], focal_px: float, k1: float, sigma_px: float) -> LensProblem | None:
     """Poses and corners of each window, by its first and last image and by resection of those between."""
-    px, of, R, t, corner = [], [], [], [], []
+    px, of, corner = [], [], []
+    R: list[Floats] = []
+    t: list[Floats] = []
     for window in windows:
         begun = _begin_window(_undistorted(window.px, focal_px, k1))
         if begun is None:
@@ -268,7 +252,7 @@ def _begin(windows: Sequence[_Window], focal_px: float, k1: float, sigma_px: flo
         corner.append(corner_w)
     if len(R) < _LEAST_WINDOWS:
         return None
-    return _Problem(
+    return LensProblem(
         np.concatenate(px),
         np.concatenate(of),
         np.array(R),
@@ -288,8 +272,9 @@ def _begin_window(xy: Floats) -> tuple[NDArray[np.bool_], Floats, Floats, Floats
     if E is None or E.shape != (3, 3) or inliers is None:
         return None
     _, R, t, _, _ = cv2.recoverPose(E, first, last, cameraMatrix=np.eye(3), distanceThresh=1e5, mask=inliers.copy())
-    R, t = np.asarray(R, np.float64), np.asarray(t, np.float64).ravel()
-    if abs(t[2]) < 0.5:  # no car's
+    turn: Floats = np.asarray(R, np.float64)
+    R, t = turn, np.asarray(t, np.float64).ravel()
+    if abs(t[2]) < 0.5 or np.linalg.norm(rotation_log(turn)) > _MOST_TURN_RAD:  # no car's
         return None
     P = np.hstack([R, t[:, None]])
     X = cv2.triangulatePoints(np.eye(3, 4), P, first.T, last.T)
@@ -301,157 +286,14 @@ def _begin_window(xy: Floats) -> tuple[NDArray[np.bool_], Floats, Floats, Floats
         return None
     poses_R, poses_t = [np.eye(3)], [np.zeros(3)]
     for seen in xy[1:-1]:
-        found, turn, place, _ = cv2.solvePnPRansac(
+        found, turned, place, _ = cv2.solvePnPRansac(
             X[keep], seen[keep], np.eye(3), np.zeros(4), reprojectionError=2.0 * _TWO_VIEW_PX / _FOCAL_PX,
             iterationsCount=50,
         )  # fmt: skip
         if not found:
             return None
-        poses_R.append(np.asarray(cv2.Rodrigues(turn)[0], np.float64))
+        poses_R.append(np.asarray(cv2.Rodrigues(turned)[0], np.float64))
         poses_t.append(np.asarray(place, np.float64).ravel())
     by_z = 1.0 / X[keep, 2]
     corner = np.column_stack([X[keep, 0] * by_z, X[keep, 1] * by_z, by_z])
     return keep, np.array([*poses_R, R]), np.array([*poses_t, t]), corner
-
-
-# --- bundle adjustment ---
-
-
-def _adjust(problem: _Problem) -> tuple[_Problem, float]:
-    """Levenberg-Marquardt on robust reprojection errors, the focal length held; and the cost."""
-    damping = 1e-4
-    cost, system = _linearise(problem)
-    for _ in range(_ITERATIONS):
-        tried = _moved(problem, *_solve(system, damping, len(problem.R)))
-        new_cost, new_system = _linearise(tried)
-        if not new_cost < cost:
-            damping *= 10.0
-            if damping > 1e3:
-                break
-            continue
-        settled = cost - new_cost < _CONVERGED * cost
-        problem, cost, system, damping = tried, new_cost, new_system, max(0.2 * damping, 1e-9)
-        if settled:
-            break
-    return problem, cost
-
-
-@dataclass(frozen=True)
-class _System:
-    """Normal equations of the corners, and of each window's poses with k1 last, V = 6 (IMAGES - 1) + 1."""
-
-    of: Ints  # (P,) window of each corner
-    corner: Floats  # (P, 3, 3)
-    corner_by_view: Floats  # (P, 3, V)
-    view: Floats  # (W, V, V)
-    corner_gradient: Floats  # (P, 3)
-    view_gradient: Floats  # (W, V)
-    k1_gradient: float  # of what is known of k1 beforehand
-
-
-def _project(problem: _Problem) -> tuple[Floats, Floats, Floats, Floats]:
-    """Rays turned into each image (P, I, 3), places q (P, I, 3), normalised coordinates u and distorted d (P, I, 2)."""
-    rays = np.concatenate([problem.corner[:, :2], np.ones((len(problem.corner), 1))], axis=1)
-    turned = np.einsum("pikl,pl->pik", problem.R[problem.of], rays)
-    q = turned + problem.corner[:, 2, None, None] * problem.t[problem.of]
-    u = q[..., :2] / np.maximum(q[..., 2:], _NEAREST)
-    return turned, q, u, u * (1.0 + problem.k1 * np.square(u).sum(axis=-1, keepdims=True))
-
-
-def _huber(problem: _Problem, q: Floats, d: Floats) -> tuple[Floats, Floats, Floats]:
-    """Residuals in sigma (P, I, 2), their weights and costs (P, I)."""
-    r = (math.exp(problem.log_focal) * d - problem.px) / problem.sigma_px
-    norm = np.sqrt(np.square(r).sum(axis=-1))
-    ahead = q[..., 2] > _NEAREST
-    weight = np.where(ahead, 1.0 / np.maximum(1.0, norm / _HUBER), 0.0)
-    cost = np.where(norm < _HUBER, 0.5 * norm**2, _HUBER * norm - 0.5 * _HUBER**2)
-    return r, weight, np.where(ahead, cost, _BEHIND_COST)
-
-
-def _costs(problem: _Problem) -> Floats:
-    """(W,) what each window costs."""
-    _, q, _, d = _project(problem)
-    return np.bincount(problem.of, _huber(problem, q, d)[2].sum(axis=1), len(problem.R))
-
-
-def _linearise(problem: _Problem) -> tuple[float, _System]:
-    """The cost and the normal equations at the present values."""
-    turned, q, u, d = _project(problem)
-    r, weight, costs = _huber(problem, q, d)
-    focal_px, sigma_px = math.exp(problem.log_focal), problem.sigma_px
-    cost = float(costs.sum()) + 0.5 * (problem.k1 / SIGMA_K1) ** 2
-
-    r2 = np.square(u).sum(axis=-1)[..., None, None]
-    d_u = (1.0 + problem.k1 * r2) * np.eye(2) + 2.0 * problem.k1 * u[..., :, None] * u[..., None, :]
-    u_q = np.concatenate([np.broadcast_to(np.eye(2), (*u.shape, 2)), -u[..., None]], axis=-1)
-    J_q = (focal_px / sigma_px) * (d_u @ u_q) / np.maximum(q[..., 2], _NEAREST)[..., None, None]  # (P, I, 2, 3)
-    J_corner = np.concatenate(
-        [
-            np.einsum("pick,pikl->picl", J_q, problem.R[problem.of][..., :2]),
-            np.einsum("pick,pik->pic", J_q, problem.t[problem.of])[..., None],
-        ],
-        axis=-1,
-    )
-    J_turn = np.cross(turned[:, :, None, :], J_q)  # d q / d w = -[turned]x
-    J_pose = np.concatenate([J_turn, J_q * problem.corner[:, 2, None, None, None]], axis=-1)[:, 1:]
-    J_k1 = focal_px / sigma_px * u * r2[..., 0]
-
-    P, poses = len(r), 6 * (IMAGES - 1)
-    J_view = np.zeros((P, IMAGES, 2, poses + 1))
-    for k in range(1, IMAGES):
-        J_view[:, k, :, 6 * (k - 1) : 6 * k] = J_pose[:, k - 1]
-    J_view[..., poses] = J_k1
-    J_view, J_corner, r = (x.reshape(P, 2 * IMAGES, -1) for x in (J_view, J_corner, r))
-    w = np.repeat(weight, 2, axis=1)[..., None]
-    by_view = (J_view * w).transpose(0, 2, 1) @ J_view
-    begin = np.flatnonzero(np.diff(problem.of, prepend=-1))  # corners of one window stand together
-    view = np.add.reduceat(by_view, begin, axis=0)
-    gradient = np.add.reduceat(np.einsum("pni,pn->pi", J_view * w, r[..., 0]), begin, axis=0)
-    # A window's unit of length is its own: the way to its last image is held where it is
-    last = slice(poses - 3, poses)
-    for k, way in enumerate(problem.t[:, -1]):
-        view[k, last, last] += 1e4 * np.outer(way, way) / float(way @ way)
-    corner = (J_corner * w).transpose(0, 2, 1) @ J_corner + 1e-6 * np.eye(3)
-    return cost, _System(
-        of=problem.of,
-        corner=corner,
-        corner_by_view=(J_corner * w).transpose(0, 2, 1) @ J_view,
-        view=view,
-        corner_gradient=np.einsum("pni,pn->pi", J_corner * w, r[..., 0]),
-        view_gradient=gradient,
-        k1_gradient=problem.k1 / SIGMA_K1**2,
-    )
-
-
-def _solve(system: _System, damping: float, windows: int) -> tuple[Floats, float, Floats]:
-    """Steps of the poses (W, IMAGES - 1, 6), of k1 and of the corners (P, 3), which are eliminated first (Schur)."""
-    inverse = np.linalg.inv(system.corner * (1.0 + damping * np.eye(3)))
-    part = inverse @ system.corner_by_view
-    begin = np.flatnonzero(np.diff(system.of, prepend=-1))
-    view = system.view * (1.0 + damping * np.eye(system.view.shape[-1]))
-    view = view - np.add.reduceat(system.corner_by_view.transpose(0, 2, 1) @ part, begin, axis=0)
-    taken = np.einsum("pij,pi->pj", part, system.corner_gradient)
-    gradient = system.view_gradient - np.add.reduceat(taken, begin, axis=0)
-    # Windows share k1 alone, so their poses go next, each window's by itself
-    solved = np.linalg.solve(view[:, :-1, :-1], np.concatenate([view[:, :-1, -1:], gradient[:, :-1, None]], axis=2))
-    by_k1, by_gradient = solved[..., 0], solved[..., 1]
-    information = float((view[:, -1, -1] - (view[:, -1, :-1] * by_k1).sum(axis=1)).sum()) + SIGMA_K1**-2.0
-    slope = float((gradient[:, -1] - (view[:, -1, :-1] * by_gradient).sum(axis=1)).sum()) + system.k1_gradient
-    k1 = -slope / information
-    poses = -by_gradient - by_k1 * k1
-    steps = np.concatenate([poses, np.full((windows, 1), k1)], axis=1)[system.of]
-    corner = -np.einsum(
-        "pij,pj->pi", inverse, system.corner_gradient + np.einsum("pij,pj->pi", system.corner_by_view, steps)
-    )
-    return poses.reshape(windows, IMAGES - 1, 6), k1, corner
-
-
-def _moved(problem: _Problem, poses: Floats, k1: float, corner: Floats) -> _Problem:
-    R, t = problem.R.copy(), problem.t.copy()
-    t[:, 1:] += poses[..., 3:]
-    for window, steps in zip(R, poses, strict=True):
-        for k, step in enumerate(steps, start=1):
-            window[k] = rotation_exp(step[:3]) @ window[k]
-    moved = problem.corner + corner
-    moved[:, 2] = np.maximum(moved[:, 2], 0.0)
-    return replace(problem, R=R, t=t, corner=moved, k1=problem.k1 + float(np.clip(k1, -0.2, 0.2)))
