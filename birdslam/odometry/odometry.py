@@ -38,6 +38,7 @@ from birdslam.odometry.road.vanishing_point import VanishingPoint
 from birdslam.odometry.speed.constant_velocity import ConstantVelocityPrior, largest_sigma_m
 from birdslam.odometry.speed.scale import MOVING_M, CarMotion
 from birdslam.odometry.speed.zero_velocity import is_stationary, near_road_flow_px
+from birdslam.odometry.working_resolution import WorkingResolution
 from birdslam.types import SpeedReading, Status
 
 __all__ = ["Motion", "Odometry", "OdometryConfig", "Tracks"]
@@ -62,7 +63,8 @@ class Odometry:
     """
 
     def __init__(self, camera: Camera, config: OdometryConfig | None = None) -> None:
-        self.camera = camera
+        self._resolution = WorkingResolution(camera)
+        self.camera = camera = self._resolution.camera
         self.config = config if config is not None else OdometryConfig()
         self._focal_px = 0.5 * (camera.fx_px + camera.fy_px)
         self._tracker = FeatureTracker(camera.width_px, camera.height_px, self.config.features)
@@ -90,7 +92,8 @@ class Odometry:
     @property
     def road_tracks(self) -> tuple[Ints, Floats]:
         """(ids (N,), px (N, 2)): tracked corners of the present image that lie on the road (paper, Sec. 3.1)."""
-        return self._road_tracks
+        ids, px = self._road_tracks
+        return ids, self._resolution.given_px(px)
 
     @property
     def road_fit(self) -> RoadFit | None:
@@ -107,6 +110,7 @@ class Odometry:
     def track(self, image: NDArray[np.uint8]) -> Tracks:
         """Tracks the corners into an image, (H, W) grey or (H, W, 3) BGR uint8, undistorted."""
         self._searched = None
+        image = self._resolution.image(image)
         return self._tracker.track(image, self._predict_px if self._model.known else None, self._search_px)
 
     def _search_px(self, past: NDArray[np.uint8], present: NDArray[np.uint8], reference: Tracks) -> list[Floats]:
@@ -136,7 +140,8 @@ class Odometry:
         own that had come by this image, in any order, those of earlier images again or not.
         """
         self._scale.add_readings(speeds, t_source_ns)
-        boxes_px = np.asarray(vehicle_boxes_px, dtype=np.float64).reshape(-1, 4)
+        boxes_px = self._resolution.boxes_px(np.asarray(vehicle_boxes_px, dtype=np.float64).reshape(-1, 4))
+        road_mask = self._resolution.mask(road_mask)
         no_image = [Status.CAMERA_DARK] * tracks.dark + [Status.CAMERA_FROZEN] * tracks.frozen
         if self._reference_frame is None:
             if not no_image:
