@@ -4,20 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import cv2
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from birdslam.calibration.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
 from birdslam.calibration.height_check import HeightCheck, KnownLength
 from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
+from birdslam.calibration.lens import (
+    FIELD_OF_VIEW_DEG,
+    STATED_SIGMA_REL,
+    focal_by_field_of_view,
+    followed_corners,
+    self_calibrate,
+)
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.ros.bag import BagTopics
-from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded, parsed, recording_uri
 from birdslam.runtime.progress import with_progress
@@ -29,6 +38,7 @@ from birdslam.types import Frame
 UNKNOWN_HEIGHT_M = 1.5  # where none was given: all lengths are in proportion to it, and it is replaced
 MAX_SIGMA_HEIGHT_REL = 0.1
 AGREES_SIGMA = 2.0
+_LENS_S = 120.0  # of a film, from which its lens is found
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,8 @@ class Given:
     board: tuple[int, int] = (9, 6)  # the chessboard's inner corners: columns, rows
     square_m: float = 0.025
     height_m: float | None = None
+    fov_deg: float | None = None  # across the image, of a lens that nothing else tells
+    kind: str = "dashcam"  # of the camera, where not even that is known
     speed: Path | None = None  # lines of time in s, speed in m/s
 
 
@@ -55,13 +67,14 @@ def calibrate_drive(
     topics = configuration.source.topics
     lens, height_m = lens_of(given, uri, topics)
     size = _frame_size(uri, topics)
+    if lens is None and size is not None and parsed(uri)[0].camera in ("frame size", "nothing"):
+        lens = lens_of_drive(configuration, uri, given, size, stride)
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
     recording = _open(uri, lens, height_m, stride, topics)
     known_height = height_m is not None or lens is None  # a recording with a calibration of its own says the height
     cv2.setNumThreads(configuration.perceive.opencv_threads)
-    rate_max = msgspec.structs.replace(configuration.source, rate="max")
-    configuration = msgspec.structs.replace(configuration, source=rate_max)
+    configuration = _lossless(configuration)
     with Inference(configuration) as inference:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
@@ -105,6 +118,60 @@ def lens_of(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | Non
     if own is not None:
         return Intrinsics(**own.lens._asdict(), source=own.source), height_m or own.height_m
     return None, height_m
+
+
+def lens_of_drive(
+    configuration: Configuration, uri: str, given: Given, size_px: tuple[int, int], stride: int
+) -> Intrinsics:
+    """The lens of a film that says nothing of its camera, by what its images show. Raises CalibrationError."""
+    fov_deg, sigma_rel = FIELD_OF_VIEW_DEG[given.kind]
+    by = f"that of a {given.kind}, {fov_deg:g} deg across"
+    if given.fov_deg is not None:
+        if not 10.0 <= given.fov_deg <= 150.0:
+            raise ConfigurationError(f"--fov {given.fov_deg:g}: is no field of view of a camera here (10 to 150 deg)")
+        fov_deg, sigma_rel, by = given.fov_deg, STATED_SIGMA_REL, f"as stated, {given.fov_deg:g} deg across"
+    width_px, height_px = size_px
+    focal_px = focal_by_field_of_view(width_px, fov_deg)
+    middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
+    camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
+    recording = open_recorded(uri, camera, stride, configuration.source.topics)
+    configuration = _lossless(configuration)
+    frames = max(1, round(_LENS_S * recording.rate_hz))
+    with Inference(complete(configuration, camera, recording.rate_hz)) as inference:
+
+        def images() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float64]]]:
+            seen = islice(offline_frames(RecordedSource(recording, configuration.source)), frames)
+            for frame in with_progress(seen, "lens", min(frames, len(recording)) or None):
+                if frame.image is not None:
+                    found = inference.start(frame).result().detections
+                    yield frame.image, np.zeros((0, 4)) if found is None else found.boxes_px
+
+        lens = self_calibrate(followed_corners(images(), camera), size_px, focal_px, sigma_rel)
+    if lens is None:
+        raise CalibrationError(
+            f"{uri}: its images do not show its lens: the car hardly drives in its first {_LENS_S:g} s, or little is "
+            "to be seen; --intrinsics, --chessboard or --camera name a lens"
+        )
+    focal = f"focal length {lens.focal_px:.0f} px +- {lens.focal_sigma_rel:.0%}"
+    shown = "by the drive" if lens.focal_shown else f"{by}; the drive turns too little to show it"
+    return Intrinsics(
+        fx_px=lens.focal_px,
+        fy_px=lens.focal_px,
+        cx_px=middle[0],
+        cy_px=middle[1],
+        distortion=(lens.k1, 0.0, 0.0, 0.0),
+        width_px=width_px,
+        height_px=height_px,
+        source=(
+            f"the drive: {focal}, {shown}; k1 {lens.k1:+.3f} +- {lens.k1_sigma:.3f} "
+            f"(of {lens.windows} windows, {np.degrees(lens.turned_rad):.0f} deg turned)"
+        ),
+        sigma_focal_px=lens.focal_px * lens.focal_sigma_rel,
+    )
+
+
+def _lossless(configuration: Configuration) -> Configuration:
+    return msgspec.structs.replace(configuration, source=msgspec.structs.replace(configuration.source, rate="max"))
 
 
 def _class_and_path(uri: str) -> tuple[type[Recording], Path]:

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from birdslam.perception import ModelSpec
@@ -126,3 +128,34 @@ def test_frames_that_cannot_be_compared_are_one_line(
     arguments = ["evaluate", "odometry", "demo", "--model", "none", "--frames", text, "--output", str(tmp_path)]
     assert main(arguments if text != "999:" else [*arguments, "--stride", "50"]) == 2
     assert complaint in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--source", "demo", "--camera", "CAMERA", "--height", "1.4"), "a camera is given"),
+        (("--source", "v4l2:/dev/video9", "--height", "1.4"), "can't be seen twice"),
+        (("--source", "video:FILM", "--height", "1.4", "--fov", "3"), "--fov 3: is no field of view"),
+    ],
+)
+def test_a_first_pass_that_can_not_be_is_refused(
+    options: tuple[str, ...], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera, film = tmp_path / "camera.toml", tmp_path / "film.avi"
+    numbers = {
+        "width_px": 64,
+        "height_px": 48,
+        "fx_px": 50.0,
+        "fy_px": 50.0,
+        "cx_px": 32.0,
+        "cy_px": 24.0,
+        "height_m": 1.4,
+    }
+    camera.write_text("".join(f"{key} = {value}\n" for key, value in numbers.items()))
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
+    writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    places = {"CAMERA": str(camera), "video:FILM": f"video:{film}"}
+    given = [places.get(word, word) for word in options]
+    assert main(["run", *given, "--output", str(tmp_path / "out")]) == 2
+    assert reason in capsys.readouterr().err

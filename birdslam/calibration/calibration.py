@@ -62,7 +62,8 @@ class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     sigma_travel_rad: Positive = 0.003  # of its mean: a car squats on its springs, and climbs a little
     crest_m: Positive = 30.0  # correlation length of crests and sags
     min_looks: Annotated[int, msgspec.Meta(ge=3)] = 5  # at the vanishing point
-    max_sigma_rad: Positive = 0.02  # of the result
+    max_sigma_rad: Positive = 0.02  # of the result's pitch, which all lengths along the road rest on
+    max_sigma_roll_rad: Positive = 0.03  # of its roll: at the side of the own lane that is 6 cm of height
     restart_rad: Positive = 0.01  # farther than this from the start's tilt, the drive is repeated from the result
     max_drives: Annotated[int, msgspec.Meta(ge=1)] = 3
 
@@ -151,10 +152,10 @@ def calibrate(
         )
         if moved < config.restart_rad:
             break
-    if sigma.max() > config.max_sigma_rad:
+    if sigma[0] > config.max_sigma_rad or sigma[1] > config.max_sigma_roll_rad:
         raise CalibrationError(
-            f"pitch and roll are known to {sigma[0]:.3f} and {sigma[1]:.3f} rad only, {config.max_sigma_rad:g} is the "
-            "limit: too little of the road was seen"
+            f"pitch and roll are known to {sigma[0]:.3f} and {sigma[1]:.3f} rad only, {config.max_sigma_rad:g} and "
+            f"{config.max_sigma_roll_rad:g} are the limits: too little of the road was seen"
         )
     return Calibration(
         camera=camera,

@@ -9,7 +9,7 @@ lens is common to all. The principal point is the image's centre, the pixels are
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -25,14 +25,19 @@ from birdslam.calibration.lens_adjustment import (
     costs,
     some_windows,
 )
+from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_log
+from birdslam.odometry.corners.feature_tracks import FeatureConfig, FeatureTracker
+from birdslam.odometry.road.points import outside
+from birdslam.odometry.working_resolution import WorkingResolution
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# So far most corners, _MOVED of them, have moved from one image of a window to the next; of short drives less
+# So far _MOVED of the corners have moved from one image of a window to the next; of short drives less
 _STEPS_RAD = 0.016, 0.012
-_MOVED = 0.6
+_MOVED = 0.4
+_FIXED_RAD = 0.003  # a corner that moves by less over a window is far off, or on the windscreen or bonnet
 _MOST_WINDOWS = 40
 _LEAST_WINDOWS = 4
 _LEAST_CORNERS = 20  # of a window
@@ -46,6 +51,9 @@ _FARTHEST = 80.0  # of a corner that begins the adjustment, in baselines of its 
 # Focal lengths that are tried, as the log of their ratio to the best one so far; after the first round finer ones
 _TRIED_LOG = (np.linspace(-0.4, 0.4, 9), np.linspace(-0.12, 0.12, 7))
 _FOLDS = 5  # of the windows, for the sigma
+# How wide cameras see, across, and 1-sigma of their focal length as a fraction: by judgement
+FIELD_OF_VIEW_DEG = {"dashcam": (75.0, 0.25), "phone": (65.0, 0.1)}
+STATED_SIGMA_REL = 0.03  # of a focal length by a field of view that somebody states
 LEAST_SIGMA_REL = 0.03  # of the focal length: on 19 real drives the fit's own was up to 26 times too small
 LEAST_SIGMA_K1 = 0.01
 
@@ -74,6 +82,27 @@ class CornersOfImage:
 
     ids: Ints
     px: Floats
+
+
+def focal_by_field_of_view(width_px: int, degrees: float) -> float:
+    """The focal length in pixels of a lens without distortion that sees so far across."""
+    return 0.5 * width_px / math.tan(0.5 * math.radians(degrees))
+
+
+def followed_corners(images: Iterable[tuple[NDArray[np.uint8], Floats]], camera: Camera) -> list[CornersOfImage]:
+    """Corners of a camera's raw images, followed from each to the next, outside the boxes (B, 4) of vehicles in each.
+
+    Of the camera only its size and about its focal length count.
+    """
+    out: list[CornersOfImage] = []
+    resolution = WorkingResolution(camera)
+    tracker = FeatureTracker(resolution.camera.width_px, resolution.camera.height_px, FeatureConfig())
+    for image, boxes_px in images:
+        tracks = tracker.track(resolution.image(image))
+        tracker.accept(tracks)
+        static = outside(tracks.px, resolution.boxes_px(boxes_px))
+        out.append(CornersOfImage(tracks.ids[static], resolution.given_px(tracks.px[static])))
+    return out
 
 
 @dataclass(frozen=True)
@@ -200,7 +229,7 @@ def _windows(images: Sequence[CornersOfImage], middle: Floats, step_px: float) -
         if len(at) < IMAGES:
             first += 1
             continue
-        window = _common(images, at, middle)
+        window = _common(images, at, middle, step_px / _STEPS_RAD[0] * _FIXED_RAD)
         if window is not None:
             found.append(window)
         first = at[IMAGES // 2]
@@ -215,10 +244,12 @@ def _flow_px(a: CornersOfImage, b: CornersOfImage) -> Floats:
     return out
 
 
-def _common(images: Sequence[CornersOfImage], at: Sequence[int], middle: Floats) -> _Window | None:
+def _common(images: Sequence[CornersOfImage], at: Sequence[int], middle: Floats, fixed_px: float) -> _Window | None:
     ids = images[at[0]].ids
     for k in at[1:]:
         ids = np.intersect1d(ids, images[k].ids, assume_unique=True)
+    first, last = (images[k].px[np.searchsorted(images[k].ids, ids)] for k in (at[0], at[-1]))
+    ids = ids[np.linalg.norm(last - first, axis=1) > fixed_px]
     if len(ids) < _LEAST_CORNERS:
         return None
     if len(ids) > _MOST_CORNERS:  # evenly over their ids, which are those of all parts of the image

@@ -84,3 +84,10 @@ def add_tracking_root(parser: argparse.ArgumentParser) -> None:
     """A KITTI tracking folder and its sequences."""
     parser.add_argument("root", type=Path, metavar="ROOT", help="KITTI tracking: calib, label_02, oxts, ...")
     parser.add_argument("--sequences", metavar="N,N", help="e.g. 0002,0003; default: all at hand")
+
+
+def add_lens(parser: argparse.ArgumentParser) -> None:
+    """What is known of the lens of a film that says nothing of its camera."""
+    text = "how wide the camera sees, across, where nothing tells its lens"
+    parser.add_argument("--fov", type=float, metavar="DEG", help=text)
+    parser.add_argument("--kind", choices=("dashcam", "phone"), default="dashcam", help="which, where --fov is unknown")

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from birdslam.runtime.calibration import Given, calibrate_drive, write_camera_file
-from birdslam.runtime.cli.arguments import add_config, add_settings, add_topics
+from birdslam.runtime.cli.arguments import add_config, add_lens, add_settings, add_topics
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.options import configuration_of
 from birdslam.runtime.schemes import recorded_schemes
@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--board", default="9x6", metavar="COLSxROWS", help="its inner corners (default 9x6)")
     parser.add_argument("--square-mm", type=float, default=25.0, metavar="MM", help="a square's side (default 25)")
     parser.add_argument("--height", type=float, metavar="M", help="the camera's height over the road, as measured")
+    add_lens(parser)
     text = "lines of time in s, speed in m/s"
     parser.add_argument("--speed", dest="known_speed", type=Path, metavar="FILE", help=text)
     add_topics(parser)
@@ -46,6 +47,8 @@ def run(options: argparse.Namespace) -> int:
         board=(int(board[1]), int(board[2])),
         square_m=options.square_mm / 1000.0,
         height_m=options.height,
+        fov_deg=options.fov,
+        kind=options.kind,
         speed=options.known_speed,
     )
     camera, report = calibrate_drive(configuration_of(options), options.source, given, options.stride or 1)

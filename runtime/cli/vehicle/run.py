@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from birdslam.runtime.cli.arguments import add_final_results, add_other_odometry, add_pipeline, add_topics
+import msgspec
+
+from birdslam.runtime.cli.arguments import add_final_results, add_lens, add_other_odometry, add_pipeline, add_topics
 from birdslam.runtime.cli.commands import sources_note
+from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.options import configuration_of
+from birdslam.runtime.schemes import is_live
 from birdslam.runtime.supervision.run import run as run_processes
 
 
@@ -24,9 +28,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--speed", metavar="FILE", help="the car's own speed over a recording: time in s, speed in m/s")
     add_other_odometry(parser, "FILE")
     add_topics(parser, "speed")
+    text = "the camera's height over the road: without --camera a first pass over a film finds the rest"
+    parser.add_argument("--height", type=float, metavar="M", help=text)
+    add_lens(parser)
     add_pipeline(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Runs until the source ends; gives the exit status."""
-    return run_processes(configuration_of(options))
+    configuration = configuration_of(options)
+    if options.height is not None:
+        configuration = _calibrated(configuration, options)
+    return run_processes(configuration)
+
+
+def _calibrated(configuration: Configuration, options: argparse.Namespace) -> Configuration:
+    """With the camera that a first pass over the film finds; its file lies with the results."""
+    # Only where it is asked for: the whole front end comes with it
+    from birdslam.runtime.calibration import Given, calibrate_drive, write_camera_file
+
+    uri = configuration.source.uri
+    if configuration.camera is not None:
+        raise ConfigurationError("--height: a camera is given, which has a height of its own")
+    if is_live(uri):
+        raise ConfigurationError(f"--height: {uri} can't be seen twice: `birdslam calibrate` a film of this camera")
+    given = Given(height_m=options.height, fov_deg=options.fov, kind=options.kind)
+    camera, report = calibrate_drive(configuration, uri, given)
+    path = Path(configuration.output) / "camera.toml"
+    write_camera_file(path, camera, report)
+    print("\n".join((*report, f"camera file: {path}")), flush=True)
+    return msgspec.structs.replace(configuration, camera=camera)
