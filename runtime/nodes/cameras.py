@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Generator
 from itertools import count, islice
 from pathlib import Path
@@ -19,7 +20,7 @@ from birdslam.sources.recording import RecordedFrame
 LIVE_RATE_HZ = 30.0  # of a camera that does not say
 
 
-class LiveCamera:
+class LiveCamera(ABC):
     """A source (nodes/sources.py) whose frames are stamped with CLOCK_MONOTONIC as they come."""
 
     live = True
@@ -38,9 +39,9 @@ class LiveCamera:
             if must_open:
                 raise
 
+    @abstractmethod
     def _connect(self) -> cv2.VideoCapture:
         """The camera, asked for its image size and rate; `_open` checks whether it opened."""
-        raise NotImplementedError
 
     def _open(self) -> cv2.VideoCapture:
         capture = self._connect()
@@ -83,7 +84,7 @@ class LiveCamera:
         except SourceError:
             self._closing.wait(self._config.reopen_ms / 1e3)
 
-    def resume(self, frame_id: int, t_source_ns: int) -> None:
+    def resume(self, frame_id: int, t_source_ns: int) -> None:  # noqa: B027  # nothing is to be done
         """A camera just goes on."""
 
     def close(self) -> None:
