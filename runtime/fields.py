@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -44,10 +45,8 @@ class ByName(dict[str, Any]):
 
 def fields(struct: type[msgspec.Struct], default: Any = None, prefix: str = "") -> Iterator[Field]:
     """Those of a struct and of the structs within it, outer ones first. `default` is an instance, or None."""
-    info = kinds.type_info(struct)
-    assert isinstance(info, kinds.StructType)
     inner = []
-    for field in info.fields:
+    for field in _own(struct):
         key, value = f"{prefix}{field.name}", _default(default, field)
         nested = _struct_in(field.type)
         if nested is None:
@@ -58,6 +57,14 @@ def fields(struct: type[msgspec.Struct], default: Any = None, prefix: str = "") 
             inner.append((nested, value, f"{key}."))
     for found in inner:
         yield from fields(*found)
+
+
+@cache
+def _own(struct: type[msgspec.Struct]) -> tuple[kinds.Field, ...]:
+    """A struct's fields without those of the structs within it; msgspec translates its annotations anew each time."""
+    info = kinds.type_info(struct)
+    assert isinstance(info, kinds.StructType)
+    return info.fields
 
 
 def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import msgspec
 import pytest
 from hypothesis import given, settings
@@ -94,7 +96,9 @@ def test_it_can_be_taken_after_an_edge_from_an_older_frame() -> None:
     assert PoseGraph.restore(data, *SETTINGS["measured"]).checkpoint() == data
 
 
+@cache
 def checkpoint() -> bytes:
+    """Of a graph that has taken in 30 frames."""
     graph = PoseGraph(*SETTINGS["measured"])
     for m in WORLDS[0][:30]:
         graph.optimise(m)

@@ -8,6 +8,7 @@ import io
 import textwrap
 import tokenize
 from collections.abc import Iterable
+from functools import cache
 
 UNITS = {  # by the end of a field's name; the longer ends first
     "_rad_per_sqrt_m": "rad/m^0.5",
@@ -57,6 +58,7 @@ def table(rows: Iterable[tuple[str, ...]]) -> str:
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines)
 
 
+@cache
 def _own_comments(kind: type) -> dict[str, str]:
     source = textwrap.dedent(inspect.getsource(kind))
     said, alone = {}, set()
