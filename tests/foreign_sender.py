@@ -1,4 +1,4 @@
-"""Somebody else's session on a vehicle's bus, who sends and asks by zenoh alone and keeps to none of our rules."""
+"""A foreign zenoh session on a vehicle's bus, without any of the bus's checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How good bytes go bad: mutated messages, records with other contents, text files with other values."""
+"""Mutations of valid input: messages, records with other contents, text files with other values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording that is made frame by frame, with an optimizer that a test holds in its hand."""
+"""A recording made frame by frame, with an optimizer that the test steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The walls of the house: who may import what. The table stands in CONTRIBUTING.md; there is no list of exceptions."""
+"""Which package may import which: the table in CONTRIBUTING.md, without exceptions."""
 
 import ast
 import re

@@ -1,4 +1,4 @@
-"""The atlas: the whole drive in bounded memory, fine where it is recent."""
+"""The atlas: a whole drive in bounded memory, at full resolution where it is recent."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def test_a_solver_at_its_cap_says_so_and_one_that_converged_stays() -> None:
     assert solve_batch([], batch_se3.CONFIG)[1].iterations == 0
 
 
-def test_no_ratio_is_told_of_a_batch_at_its_cap(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_stopped_at_its_cap_gets_no_ratio(monkeypatch: pytest.MonkeyPatch) -> None:
     log = drive(msgspec.structs.replace(QUIET, noise=1.0), seed=4).measurements
     monkeypatch.setattr(batch_se3, "CONFIG", msgspec.structs.replace(batch_se3.CONFIG, iterations=2))
     monkeypatch.setattr(incremental, "REPEATS", 1)

@@ -1,4 +1,4 @@
-"""Many drives: which there are, one report of all, and going on after whatever ended the batch."""
+"""`birdslam batch`: finding drives, one report of all, and resuming after an abort."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def result(task: Task, number: int) -> DriveResult:
 
 
 @pytest.mark.parametrize("count", [3, MOST_BARS + 1])
-def test_the_report_tells_of_every_drive(tmp_path: Path, count: int) -> None:
+def test_the_report_lists_every_drive(tmp_path: Path, count: int) -> None:
     drive = kitti(tmp_path / "00", 1)
     (one,) = made([drive])
     todo = [msgspec.structs.replace(one, name=f"<{n}>", settings={"a": n}) for n in range(count)]
@@ -253,7 +253,7 @@ def test_a_process_that_is_killed_is_a_failure_of_its_drive_alone(
 
 @pytest.mark.slow
 @pytest.mark.processes
-def test_a_batch_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_killed_batch_resumes(tmp_path: Path) -> None:
     """Killed while its second drive is on the way: its process ends with it, and the next batch does the rest."""
     drives = [kitti(tmp_path / "00", 3), kitti(tmp_path / "01", 400)]
     output, alone = tmp_path / "out", tmp_path / "alone"

@@ -282,7 +282,7 @@ def test_liveliness_comes_and_goes(join: Any, base: Path) -> None:
     until(lambda: ("capture", False) in known, "the late one was called too")
 
 
-def test_vehicles_do_not_hear_each_other(base: Path) -> None:
+def test_vehicles_do_not_receive_each_others_messages(base: Path) -> None:
     with (
         Bus("one", "supervisor", hub=True, runtime_dir=base) as one,
         Bus("two", "supervisor", hub=True, runtime_dir=base) as two,
@@ -411,7 +411,7 @@ def kill(process: subprocess.Popen[str]) -> None:
     assert process.wait(LIMIT_S) == -signal.SIGKILL
 
 
-def test_a_killed_sender_is_noticed_and_its_successor_is_heard(join: Any, spawn: Any, base: Path) -> None:
+def test_a_killed_sender_is_noticed_and_its_successor_is_received(join: Any, spawn: Any, base: Path) -> None:
     hub = join("supervisor", hub=True)
     estimates = hub.subscriber("estimate")
     planner = join("planner-1")

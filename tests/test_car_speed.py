@@ -326,7 +326,7 @@ def test_a_car_that_begins_in_the_dark_is_followed_by_its_speed_and_yaw_rate() -
     assert driven(street([(0.5, 0.0)] * 3), [], lambda k: True)[1] == []
 
 
-def test_a_camera_that_hangs_is_told_of_for_as_long_as_it_does() -> None:
+def test_a_hanging_camera_is_reported_until_it_recovers() -> None:
     odometry, image = Odometry(CAMERA), render(street([])[0])
     for k in range(30):
         now_ns = k * NS_PER_S // 10

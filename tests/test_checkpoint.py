@@ -1,4 +1,4 @@
-"""A pose graph taken up from its bytes goes on as if nothing had happened, or says why it can't."""
+"""A pose graph restored from a checkpoint continues bit for bit, or raises an error that says why not."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def test_a_mistake_is_one_line(arguments: list[str], said: str, capsys: pytest.C
     assert out == ""
 
 
-def test_listening_to_nobody_ends_when_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_listen_without_a_vehicle_ends_on_a_signal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["listen", "--vehicle", "nobody", "--runtime-dir", str(tmp_path), "--timeout", "0.2"]) == 1
     assert "no estimate of vehicle 'nobody' in 0.2 s" in capsys.readouterr().err
 

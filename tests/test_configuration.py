@@ -203,9 +203,7 @@ def test_every_key_is_a_field_and_answers_a_question() -> None:
         ("[slam.weights]\nmode = 'paper'\n", "slam.weights.mode", "WeightsConfig in birdslam/graph/weights.py"),
     ],
 )
-def test_a_constant_in_a_file_is_refused_and_told_where_it_stands(
-    tmp_path: Path, text: str, key: str, place: str
-) -> None:
+def test_a_constant_in_a_file_is_refused_and_its_place_named(tmp_path: Path, text: str, key: str, place: str) -> None:
     path = write(tmp_path / "old.toml", text)
     with pytest.raises(ConfigurationError) as error:
         load(path)

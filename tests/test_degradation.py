@@ -1,4 +1,4 @@
-"""Short of time: what is left out, and that it comes back only when there is time to spare."""
+"""Degraded modes: what is left out when time is short, and that it returns only with time to spare."""
 
 from __future__ import annotations
 

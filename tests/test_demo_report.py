@@ -1,4 +1,4 @@
-"""What is said of a run over the shipped drive: the truth itself is graded faultless, an error as large as it is."""
+"""The report of a run over the shipped drive: the truth has no error, and a known error is reported with its size."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_new_epoch_goes_on_where_the_last_one_ended(demo: DemoRecording, truth
     assert found.vehicle_centre_m == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_vehicle_out_of_reach_or_out_of_sight_matches_nobody(demo: DemoRecording, truthful: list[Estimate]) -> None:
+def test_a_vehicle_out_of_range_or_hidden_matches_no_track(demo: DemoRecording, truthful: list[Estimate]) -> None:
     estimate, body = truthful[0], next(b for b in demo.truth_bodies(0) if b.label in VEHICLES)
     (vehicle,) = (v for v in estimate.vehicles if v.vehicle == body.body)
     assert [v.vehicle for _, v in match(estimate, [body], [vehicle])] == [body.body]
@@ -115,7 +115,7 @@ def test_a_vehicle_out_of_reach_or_out_of_sight_matches_nobody(demo: DemoRecordi
     assert match(estimate, [body], [msgspec.structs.replace(vehicle, T_world_vehicle=away)]) == []
 
 
-def test_who_is_predicted_between_two_looks_is_told_of_and_not_found(
+def test_a_vehicle_predicted_between_two_detections_counts_as_reported_not_as_found(
     demo: DemoRecording, truthful: list[Estimate]
 ) -> None:
     def aged(age_ns: int) -> DemoGrade:

@@ -1,4 +1,4 @@
-"""deploy/ as it is: the units' rules, the scripts, and the service in a real systemd on a machine of its own."""
+"""The files of deploy/: the units, the scripts, and the service under a real systemd in namespaces of its own."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def install(machine: Machine, *arguments: str, script: str = "/srv/birdslam/depl
     return machine(script, *arguments, env=package)
 
 
-def test_the_package_bears_what_installs_it(
+def test_the_package_contains_its_installer(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     package, target = tmp_path / "birdslam", tmp_path / "service"

@@ -1,4 +1,4 @@
-"""What an ego's covariance is worth: errors drawn from it are honest; of others it is told by how much they are not."""
+"""Consistency of the ego's covariance: errors drawn from it have NEES 1, others the ratio of the variances."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def test_between_two_poses_it_is_interpolated(times_s: list[float]) -> None:
     assert np.hypot(way.x_m, way.y_m) == pytest.approx(float(np.linalg.norm(last.p - first.p)), abs=1e-6)
 
 
-def test_where_the_file_tells_nothing_nothing_is_made_up() -> None:
+def test_no_pose_is_made_up_where_the_file_has_none() -> None:
     """A hole is coasted through with a covariance that grows, and the next pose is one from the last that was told."""
     told = trajectory(40)
     assert told.t_ns is not None
@@ -176,7 +176,7 @@ def test_both_kinds_of_file_are_read(tmp_path: Path) -> None:
         ("time,x,y\n", "line 1 is no TUM pose"),
     ],
 )
-def test_a_file_that_is_none_is_told_with_its_line(tmp_path: Path, text: str, says: str) -> None:
+def test_a_malformed_file_is_an_error_with_its_line(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "odometry.txt"
     path.write_text(text)
     with pytest.raises(DatasetError, match=says) as told:
@@ -184,7 +184,7 @@ def test_a_file_that_is_none_is_told_with_its_line(tmp_path: Path, text: str, sa
     assert str(path) in str(told.value)
 
 
-def test_a_file_that_is_missing_is_told(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="can't be read"):
         read_odometry(tmp_path / "none.txt")
 

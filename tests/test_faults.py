@@ -1,4 +1,4 @@
-"""A vehicle under faults: perf/robustness/faults.py has them; a short form here, the whole by `make faults`."""
+"""A short form of the fault suite (perf/robustness/faults.py); `make faults` runs the whole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is made of a drive when it is over: final trajectories, bit for bit those that are evaluated, and a video."""
+"""Final results of a drive: the trajectories, bit for bit those that `evaluate` gives, and the video."""
 
 from __future__ import annotations
 

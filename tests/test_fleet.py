@@ -1,4 +1,4 @@
-"""Many vehicles at one router, over real sessions with mutual TLS: who may say what, who floods, who dies.
+"""Many vehicles at one router, over real sessions with mutual TLS: access, floods, lost vehicles.
 
 Certificates come from deploy/certificates.sh. No test asserts how fast something is: what is sent next is sent when
 what was sent before has come.
@@ -73,7 +73,7 @@ def test_a_vehicles_name_reaches_no_key_but_its_own(name: str, topic: str) -> No
         st.text(_LETTERS, max_size=60), st.builds("birdslam/{}/v1/{}".format, *[st.text(_LETTERS, max_size=34)] * 2)
     )
 )
-def test_a_key_from_outside_names_a_vehicle_or_nobody(key: str) -> None:
+def test_a_received_key_names_one_vehicle_or_none(key: str) -> None:
     found = vehicle_and_topic(key)
     if found is not None:
         vehicle, topic = found
@@ -498,9 +498,7 @@ def test_the_commands_find_each_other_again(tmp_path_factory: pytest.TempPathFac
 
 @processes
 @needs_openssl
-def test_an_uplink_sends_no_more_than_it_was_told(
-    tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int
-) -> None:
+def test_an_uplink_keeps_its_configured_rate(tmp_path_factory: pytest.TempPathFactory, tls: Path, port: int) -> None:
     """An hour apart at the most: of ten estimates two leave the vehicle, and none counts as lost."""
     base = tmp_path_factory.mktemp("f")
     with zenoh.open(router_config(router_table(tls, port))):

@@ -63,7 +63,7 @@ def test_a_recorded_drive_has_all_that_the_layout_shows(tmp_path_factory: pytest
     assert picture[40:230, 790:1380].std() > 20.0  # the camera's image
 
 
-def test_a_name_that_is_none_is_told(tmp_path: Path) -> None:
+def test_an_unknown_name_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(PerfError, match=r"/latency\.: no path"):
         foxglove.topic_and_keys("/latency.")
     with pytest.raises(PerfError, match=r"none\.json"):

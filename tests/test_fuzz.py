@@ -1,4 +1,4 @@
-"""A short run of `make fuzz`, and what no file of a user's may do: run code."""
+"""A short run of `make fuzz`; and no file that is read can run code."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def wander(steps: int, step_m: float, sigma: float, rng: np.random.Generator) ->
     return error
 
 
-def test_an_error_of_the_scale_that_lasts_is_told_in_the_ego_pose() -> None:
+def test_a_lasting_scale_error_is_within_the_ego_covariance() -> None:
     config, step_m, sigma, frames = SCALE_ALONE, 1.6, 0.02, 100
     rng = np.random.default_rng(3)
     ends = []
@@ -132,7 +132,7 @@ def test_an_error_of_the_scale_that_lasts_is_told_in_the_ego_pose() -> None:
     assert last.cov[4] < 1e-3 * last.cov[0]  # to the side it does nothing
 
 
-def test_errors_of_the_direction_and_the_turn_that_last_are_told_in_the_ego_pose() -> None:
+def test_lasting_errors_of_direction_and_turn_are_within_the_ego_covariance() -> None:
     config, step_m, turn_rad, frames = GraphConfig(), 1.6, 0.016, 40
     rng = np.random.default_rng(4)
     aside, turned = [], []

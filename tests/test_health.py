@@ -196,7 +196,7 @@ def test_a_flood_of_frames_takes_no_core_for_good(
     assert nice
 
 
-def test_at_rate_max_nobody_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_at_rate_max_no_real_time_priority_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[object] = []
     monkeypatch.setattr(os, "sched_setscheduler", lambda *of: asked.append(of))
     monkeypatch.setattr(os, "setpriority", lambda *of: asked.append(of))
@@ -338,7 +338,7 @@ def test_a_full_disk_costs_lines_not_the_drive() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())  # what is buffered goes there when it is closed
 
 
-def test_a_logbook_goes_on_without_its_disk(tmp_path: Path) -> None:
+def test_a_logbook_survives_a_disk_failure(tmp_path: Path) -> None:
     class Full:
         def add(self, estimate: Estimate) -> None:
             raise OSError(28, "No space left on device")

@@ -1,4 +1,4 @@
-"""Networks on threads: what is awaited, until when, and what goes on in the background."""
+"""Networks on threads: which are awaited, until which deadline, and which run in the background."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_a_frame_waits_until_its_deadline_and_no_longer(made: Made) -> None:
         assert networks.start(late).result().status[0] == Status.DETECTIONS_CARRIED
 
 
-def test_a_frame_goes_on_as_soon_as_what_it_awaits_is_there(made: Made) -> None:
+def test_a_frame_continues_once_its_awaited_networks_have_answered(made: Made) -> None:
     detector, segmenter = Head("detector"), Head("segmenter", awaited=False)
     with made(detector, segmenter, deadline_ms=60_000.0) as networks:
         detector.go.release()

@@ -1,4 +1,4 @@
-"""What goes into systemd's journal, read back from a socket in its place."""
+"""Entries for systemd's journal, read back from a socket in its place."""
 
 from __future__ import annotations
 

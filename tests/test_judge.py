@@ -1,4 +1,4 @@
-"""The judge of the fault suite: its street, and that an undisturbed drive passes where a wrong pose does not."""
+"""The judge of the fault suite: an undisturbed drive passes, a wrong pose does not."""
 
 from __future__ import annotations
 

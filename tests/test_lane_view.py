@@ -78,7 +78,7 @@ def test_the_picture_has_image_cells_and_lanes(tmp_path: Path, shape: tuple[int,
     assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 50
 
 
-def test_a_frame_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_frame_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "lanes", "demo", "--frame", "100000", "--output", str(tmp_path / "out")]) != 0
     assert "--frame 100000" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

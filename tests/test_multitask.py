@@ -459,7 +459,7 @@ def test_the_shipped_network_takes_any_image(shipped: Any, size: tuple[int, int]
     assert set(found.detections.labels) <= {*KINDS, "person"}
 
 
-def test_what_nobody_reads_is_not_computed_and_the_rest_is_the_same_to_the_bit(shipped: Any) -> None:
+def test_unread_outputs_are_not_computed_and_the_rest_is_bit_identical(shipped: Any) -> None:
     image = np.random.default_rng(5).integers(0, 256, (192, 640, 3), dtype=np.uint8)
     cut = load_network("multitask", ModelSpec(path=str(shipped.path)), unread=("depth",))
     assert cut.run(image).depth is None

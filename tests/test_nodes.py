@@ -1,4 +1,4 @@
-"""Capture and optimize on their own, on a bus that a test holds in its hand."""
+"""The capture and optimize nodes alone, on a fake bus."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def test_the_end_does_not_wait_for_ever_for_a_lost_frame(monkeypatch: pytest.Mon
     reader.close()
 
 
-def test_draining_ends_a_source_that_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_draining_ends_an_endless_source(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     source = Source(1, live=True)
     node, inbox, reader = make_capture(monkeypatch, tmp_path, source, rate=None)
     ref = next(node.step(receive(node).record))
@@ -177,7 +177,7 @@ def test_a_camera_that_falls_silent_is_named(monkeypatch: pytest.MonkeyPatch, tm
     reader.close()
 
 
-def test_a_resumed_capture_leaves_a_gap_and_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_resumed_capture_leaves_a_gap(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     source = Source(3, live=True)
     resumed: list[tuple[int, int]] = []
     monkeypatch.setattr(source, "resume", lambda *told: resumed.append(told), raising=False)

@@ -1,4 +1,4 @@
-"""The budgets of the running system, in the manner of openpilot's test_onroad: start it, wait, hold it to its word.
+"""The budgets of the running system, as openpilot's test_onroad has them.
 
 `make onroad`, on a machine that does nothing else: figures are absolute here, so the factors are generous, and CI
 leaves it out. It prints the table that `python -m perf system` prints.

@@ -1,4 +1,4 @@
-"""The optimizer's process on its own: frames that perceive does not answer, and what a restart takes up."""
+"""The optimize node alone: frames that perceive does not answer, and the state after a restart."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_at_rate_max_every_frame_is_waited_for() -> None:
     assert set(bus.inboxes) == {"measurements"}
 
 
-def test_late_measurements_correct_what_was_told(tmp_path: Path) -> None:
+def test_late_measurements_correct_the_published_estimate(tmp_path: Path) -> None:
     node = OptimizeNode(configuration(tmp_path), Bus())  # type: ignore[arg-type]
     for record in DRIVE[:10]:
         estimates(node, record)
@@ -228,7 +228,7 @@ def killed_at(place: Path, frames: int) -> list[Estimate]:
     return [made for record in DRIVE[:frames] for made in estimates(node, record)]
 
 
-def test_a_killed_optimizer_goes_on_as_if_nothing_had_been(tmp_path: Path) -> None:
+def test_a_killed_optimizer_resumes_from_its_checkpoint(tmp_path: Path) -> None:
     before = killed_at(tmp_path, 20)
     bus = Bus(past=DRIVE[5:23])
     node = OptimizeNode(configuration(tmp_path), bus, after(19))  # type: ignore[arg-type]
@@ -241,7 +241,7 @@ def test_a_killed_optimizer_goes_on_as_if_nothing_had_been(tmp_path: Path) -> No
     assert before + told == alone(list(DRIVE[:30]))
 
 
-def test_measurements_since_an_older_checkpoint_are_taken_up_and_not_told_twice(tmp_path: Path) -> None:
+def test_measurements_since_an_older_checkpoint_are_added_and_not_published_twice(tmp_path: Path) -> None:
     killed_at(tmp_path, 15)
     node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[:23]), after(19))  # type: ignore[arg-type]
     told = []
@@ -286,7 +286,7 @@ def test_a_first_process_and_another_configuration_begin_anew(tmp_path: Path) ->
     assert estimates(node, DRIVE[20])[0].epoch > 1
 
 
-def test_a_checkpoint_brings_nobody_down_twice(tmp_path: Path) -> None:
+def test_a_checkpoint_that_crashes_the_optimizer_is_used_once(tmp_path: Path) -> None:
     killed_at(tmp_path, 20)
     for restored in (True, False):  # the first of them dies before it has kept another
         node = OptimizeNode(configuration(tmp_path), Bus(past=DRIVE[15:23]), after(19))  # type: ignore[arg-type]

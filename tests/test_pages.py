@@ -1,4 +1,4 @@
-"""Pages that commands write: old once what they measure is another, and only then; docs/pages.json is theirs."""
+"""Written pages: old exactly when the code or data that they measure has changed (docs/pages.json)."""
 
 from __future__ import annotations
 

@@ -510,7 +510,7 @@ def test_a_source_that_begins_anew_forgets_the_old_frames() -> None:
 
 
 @given(st.integers(1, 3), st.integers(1, 4), st.lists(st.integers(1, 3), min_size=1, max_size=20))
-def test_masks_come_with_one_run_in_so_many_and_are_carried_between(slowdown: int, masks: int, gaps: list[int]) -> None:
+def test_masks_come_every_nth_run_and_are_predicted_between(slowdown: int, masks: int, gaps: list[int]) -> None:
     executor, alone = Executor(), object()
     head = FakeHead("multitask", "multitask")
     networks = Networks([head], executor.submit, boxes_alone=alone)  # type: ignore[arg-type]

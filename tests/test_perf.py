@@ -1,4 +1,4 @@
-"""The suite measures right and judges fairly; and ours over its peers has not got worse than the reference's bounds."""
+"""The perf suite: its statistics on known data, and ratios to peers within the bounds of the reference."""
 
 from __future__ import annotations
 
@@ -217,7 +217,7 @@ def test_a_coasted_estimate_has_other_parts_and_they_add_up_too() -> None:
     }
 
 
-def test_an_estimate_that_is_told_again_is_of_no_stage() -> None:
+def test_a_republished_estimate_counts_for_no_stage() -> None:
     message = _message(5)
     newer = msgspec.structs.replace(message.record, t_capture_ns=message.record.t_capture_ns + 4 * MS)
     again = Message(newer, message.trace, message.t_received_ns)

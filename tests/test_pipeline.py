@@ -506,7 +506,7 @@ def test_a_killed_capture_goes_on_in_its_recording(drive: Path, place: Path) -> 
         run.kill()
 
 
-def test_short_of_time_the_planner_is_told_and_never_deceived(drive: Path, place: Path) -> None:
+def test_degraded_modes_are_reported_and_no_wrong_pose_is_valid(drive: Path, place: Path) -> None:
     """With a budget that nothing can keep, perceive goes down to coasting, and that grows old."""
     budgets = ("capture_ms", "capture_to_perceive_ms", "perceive_ms")
     run = Run(

@@ -1,4 +1,4 @@
-"""Progress: a refreshed line on a terminal, a line a minute elsewhere, and a time to go that is not made up."""
+"""Progress: a refreshed line on a terminal, a line a minute elsewhere, and a time to go only once it is known."""
 
 from __future__ import annotations
 

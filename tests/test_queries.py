@@ -1,4 +1,4 @@
-"""What comes late and asks: kept messages, the planner's queries, and that silence is told as such."""
+"""Queries of the bus: retained messages, the planner's queries, and no reply reported as none."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def test_who_asks_for_everything_gets_nothing(join: Any, base: Path) -> None:
             assert answers(selector, 0.3) == []
 
 
-def test_a_part_that_is_lost_is_told(join: Any, base: Path) -> None:
+def test_a_lost_part_of_a_reply_is_an_error(join: Any, base: Path) -> None:
     hub = join("supervisor", hub=True)
     key, answers = key_of("car", "map"), [(encode(MapSnapshot(epoch=1, frame_id=2)), encode(Part(1, 3)))]
 
@@ -262,7 +262,7 @@ def test_every_query_has_a_reply(join: Any) -> None:
     assert set(asked) == set(QUERIES)
 
 
-def test_silence_is_told_as_such(join: Any, base: Path) -> None:
+def test_no_reply_is_reported_as_none(join: Any, base: Path) -> None:
     """Fresh, then nothing, then fresh again: each is a reading."""
     join("supervisor", hub=True)
     optimize = join("optimize")

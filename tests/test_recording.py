@@ -1,4 +1,4 @@
-"""A drive on disk: whole, cut off anywhere, damaged, on a full disk, and written beside a vehicle that goes on."""
+"""A recorded drive: whole, cut off anywhere, damaged, on a full disk, and its recorder killed during a drive."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_records_come_back_byte_for_byte(tape: Tape) -> None:
     assert recording.damaged == 0
 
 
-def test_it_bears_all_that_a_replay_needs(tape: Tape, tmp_path: Path) -> None:
+def test_a_recording_holds_all_that_a_replay_needs(tape: Tape, tmp_path: Path) -> None:
     recording = Recording(tape.path)
     assert msgspec.convert(recording.about.configuration, Configuration) == tape.configuration
     assert recording.camera == CAMERA
@@ -366,7 +366,7 @@ def test_kills_and_restarts_cost_no_bit_and_a_kill_of_everything_leaves_a_file_t
     ],
     ids=["dies", "stalls"],
 )
-def test_a_recorder_that_dies_or_stalls_is_begun_anew_in_a_file_of_its_own(
+def test_a_recorder_that_dies_or_stalls_is_restarted_with_a_new_file(
     fault: Callable[[Run], None], cause: str, tmp_path_factory: pytest.TempPathFactory, road: Path
 ) -> None:
     place = tmp_path_factory.mktemp("r")
@@ -406,7 +406,7 @@ def test_a_recorder_that_dies_or_stalls_is_begun_anew_in_a_file_of_its_own(
 
 
 @pytest.mark.processes
-def test_a_recorder_that_keeps_dying_is_given_up_and_the_drive_goes_on(
+def test_a_recorder_that_keeps_dying_is_not_restarted_and_the_drive_continues(
     tmp_path_factory: pytest.TempPathFactory, road: Path
 ) -> None:
     place = tmp_path_factory.mktemp("g")
@@ -432,7 +432,7 @@ def test_a_recorder_that_keeps_dying_is_given_up_and_the_drive_goes_on(
 
 
 @pytest.mark.processes
-def test_a_full_disk_ends_the_recording_and_the_drive_goes_on(
+def test_a_full_disk_ends_the_recording_and_the_drive_continues(
     tmp_path_factory: pytest.TempPathFactory, road: Path
 ) -> None:
     place = tmp_path_factory.mktemp("f")

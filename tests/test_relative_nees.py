@@ -1,4 +1,4 @@
-"""Relative NEES: an honest covariance has 1, one that is too sure has more."""
+"""Relative NEES: a consistent covariance has 1, an overconfident one more."""
 
 from __future__ import annotations
 

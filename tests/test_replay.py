@@ -1,4 +1,4 @@
-"""A recording's measurements give its estimates bit for bit, whatever happened to the vehicle and to the recorder."""
+"""A replay gives the recorded estimates bit for bit, after restarts of the nodes and of the recorder too."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_restarts_of_the_optimizer(tmp_path: Path, with_checkpoint: bool) -> Non
     assert verdict.epochs == (1 if with_checkpoint else 2)
 
 
-def test_measurements_of_a_frame_that_was_told_before_the_restart_enter_the_restored_graph_without_a_word(
+def test_measurements_of_a_frame_published_before_the_restart_enter_the_restored_graph_unpublished(
     tmp_path: Path,
 ) -> None:
     """Its frame was coasted over, and the measurements came as the optimizer was dead."""
@@ -218,7 +218,7 @@ def test_a_new_epoch_whose_first_estimate_was_lost_is_no_difference(
         assert (verdict.equal, verdict.unknown) == (10, len(tape.estimates) - 11)
 
 
-def test_what_an_estimate_told_that_cannot_be_compared_is_not_told_again(tmp_path: Path) -> None:
+def test_an_estimate_that_cannot_be_compared_is_not_replayed_twice(tmp_path: Path) -> None:
     """The frame that was coasted over as the world began anew is not in the recording."""
     tape, frames = Tape(tmp_path), measured(40)
     for measurements in frames[:10]:

@@ -1,4 +1,4 @@
-"""What a planner was told of labelled cars: each figure on made estimates whose errors are known."""
+"""Reported estimates of labelled cars: each figure on synthetic estimates with known errors."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_errors_are_told_with_their_sign_until_a_car_is_lost(sequence: TrackingS
     assert {found for found, *_ in of(aside_m=1.6)} == {0}
 
 
-def test_standing_cars_told_as_driving_are_counted_and_the_other_way_round(sequence: TrackingSequence) -> None:
+def test_standing_cars_reported_as_driving_are_counted_and_the_reverse(sequence: TrackingSequence) -> None:
     for speed_up_mps, false_movers, missed_movers in ((1.4, 0, 0), (1.6, 1, 0), (-8.0, 1, 1), (-10.0, 1, 2)):
         row = motion_row("0002", sights(sequence, [told(sequence, 10, speed_up_mps=speed_up_mps)]))
         assert (row.standing, row.driving) == (1, 2)
@@ -91,7 +91,7 @@ def test_standing_cars_told_as_driving_are_counted_and_the_other_way_round(seque
 
 
 @pytest.mark.parametrize(("sigma_mps", "sure"), [(0.2, 1), (0.3, 0)])
-def test_a_driving_car_told_as_standing_for_sure_is_counted_apart(sigma_mps: float, sure: int) -> None:
+def test_a_driving_car_reported_as_surely_standing_is_counted_apart(sigma_mps: float, sure: int) -> None:
     sight = Sight(7, 20.0, (5.0, 0.0), error_m=(0.0, 0.0), reported_mps=(1.0, 0.0), reported_sigma_mps=sigma_mps)
     row = motion_row("0002", [sight])
     assert (row.driving, row.missed_movers, row.missed_movers_sure) == (1, 1, sure)

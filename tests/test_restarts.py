@@ -1,4 +1,4 @@
-"""Restarts: when, how often, and what a node is told of the one before it."""
+"""Restarts: when, how often, and what a new process takes over from the one before it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_what_lies_behind_the_window_is_forgiven(vitals: Vitals) -> None:
     assert restarts.count == 20
 
 
-def test_the_next_one_goes_on_where_the_last_frame_was(vitals: Vitals) -> None:
+def test_a_restarted_node_resumes_after_the_last_frame(vitals: Vitals) -> None:
     restarts = Restarts(CONFIG)
     restarts.died(0.0, "first", vitals)
     assert restarts.assignment().resume is None
@@ -113,7 +113,7 @@ def systemd(tmp_path: Path) -> socket.socket:
     listener.close()
 
 
-def test_systemd_is_told(systemd: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_systemd_is_notified(systemd: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
     clock_s = [100.0]
     monkeypatch.setattr("birdslam.runtime.process.notify.time", SimpleNamespace(monotonic=lambda: clock_s[0]))
     notifier = Notifier({"NOTIFY_SOCKET": systemd.getsockname(), "WATCHDOG_USEC": "300000"})
@@ -144,5 +144,5 @@ def test_another_process_s_watchdog_is_not_ours(systemd: socket.socket) -> None:
     assert systemd.recv(4096) == b"STATUS=x"
 
 
-def test_a_systemd_that_is_gone_stops_nobody(tmp_path: Path) -> None:
+def test_a_lost_systemd_socket_does_not_stop_the_run(tmp_path: Path) -> None:
     Notifier({"NOTIFY_SOCKET": str(tmp_path / "nobody")}).once("READY=1")

@@ -1,4 +1,4 @@
-"""What the recorder leaves on disk, whatever comes: gaps, new epochs, long drives, places it can't write to."""
+"""Results on disk: with gaps, new epochs, long drives, and folders that can't be written."""
 
 from __future__ import annotations
 

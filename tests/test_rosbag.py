@@ -89,7 +89,7 @@ def test_a_single_file_is_a_bag_too(tmp_path: Path) -> None:
         assert len(list(open_recording(f"rosbag:{file}").frames())) == 6
 
 
-def test_a_stride_takes_every_so_manieth(tmp_path: Path) -> None:
+def test_a_stride_takes_every_nth_frame(tmp_path: Path) -> None:
     recording = open_recording(bag(tmp_path / "drive"), stride=4)
     assert (len(recording), recording.rate_hz) == (2, pytest.approx(2.5))
     assert [(f.index, f.t_source_ns) for f in recording.frames()] == [(0, FIRST_NS), (1, FIRST_NS + 4 * PERIOD_NS)]

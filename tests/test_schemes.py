@@ -1,4 +1,4 @@
-"""The table of sources: its facts hold, everybody reads it, and a new source is one file and one entry."""
+"""The table of sources: its facts hold, all commands use it, and a new source is one file and one entry."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_an_entry_is_written_as_it_is_read(scheme: Scheme) -> None:
 
 
 @EVERY
-def test_what_a_scheme_knows_of_its_camera_is_what_its_class_tells(scheme: Scheme) -> None:
+def test_a_schemes_camera_facts_are_those_of_its_class(scheme: Scheme) -> None:
     kind = scheme.load()
     assert issubclass(kind, LiveCamera if scheme.live else Recording)
     if scheme.live:
@@ -74,7 +74,7 @@ def compared_with(node: ast.AST) -> set[str]:
     return {text.rstrip(":") for text in constants if isinstance(text, str)}
 
 
-def test_schemes_are_told_apart_in_the_table_alone() -> None:
+def test_only_the_table_compares_scheme_names() -> None:
     names = {scheme.name for scheme in table.all_schemes()}
     found = [
         f"{path.relative_to(ROOT)}: {ast.unparse(node)}"

@@ -1,4 +1,4 @@
-"""What the soak calls well and what it does not; the drive itself is `python -m perf.soak`."""
+"""The verdicts of the soak test; the drive itself is `python -m perf soak`."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_what_grows_is_named(one: Series, said: str, systemd: Systemd) -> None:
     assert list(faults({"perceive": one}, WELL, systemd)) == [said]
 
 
-def test_what_was_begun_anew_is_named(systemd: Systemd) -> None:
+def test_restarted_nodes_are_named(systemd: Systemd) -> None:
     restarted = {**WELL, "restarts": {"capture": 2, "perceive": 0}, "recording": {"restarts": 1, "dropped": 0}}
     assert list(faults({}, restarted, systemd)) == [
         "capture was restarted 2 times",

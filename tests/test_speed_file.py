@@ -105,14 +105,14 @@ def test_what_a_failing_sensor_says_is_passed_on_but_calibrates_nothing(tmp_path
 
 
 @given(st.lists(st.integers(-(10**10), 10**10), max_size=30), st.integers(-(10**10), 10**10))
-def test_a_frame_bears_what_had_come_in_the_second_before_it(times_ns: list[int], t_ns: int) -> None:
+def test_a_frame_carries_the_readings_of_the_second_before_it(times_ns: list[int], t_ns: int) -> None:
     readings = [reading(one, float(number)) for number, one in enumerate(times_ns)]
     come_ns = [max(times_ns[: number + 1]) for number in range(len(times_ns))]
     expected = [one for one, come in zip(readings, come_ns, strict=True) if t_ns - KEPT_NS < come <= t_ns]
     assert list(SpeedLog(readings).until(t_ns)) == expected
 
 
-def test_a_frame_bears_so_many_and_the_newest() -> None:
+def test_a_frame_carries_at_most_the_newest_readings() -> None:
     log = SpeedLog(reading(number * 1_000_000) for number in range(3_000))
     borne = log.until(2_000_500_000)
     assert len(borne) == KEPT_READINGS

@@ -1,4 +1,4 @@
-"""What the car says of its own speed on the bus: which frames bear it, what a flood costs, and who hears of it."""
+"""The car's own speed on the bus: which frames carry it, what a flood costs, and which statuses report faults."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Inbox:
         return self._messages.popleft() if self._messages else None
 
 
-def test_a_frame_bears_the_last_second_in_order_of_coming() -> None:
+def test_a_frame_carries_the_last_second_in_order_of_arrival() -> None:
     inbox = Inbox()
     speeds = CarSpeeds(inbox)
     said = [reading(1), reading(2_000 * MS), reading(3, math.nan), reading(3)]  # whatever times the car may say
@@ -83,7 +83,7 @@ def test_a_frame_bears_the_last_second_in_order_of_coming() -> None:
     assert speeds.counters() == {"speeds": 4, "speeds_dropped": 0, "malformed": 0}
 
 
-def test_a_reading_without_a_time_bears_the_one_when_it_came() -> None:
+def test_a_reading_without_a_time_gets_its_time_of_arrival() -> None:
     """By the source's clock: for a camera that is CLOCK_MONOTONIC, a recording that is paced has one of its own."""
     said = (reading(0), reading(6_990 * MS), reading(-(1 << 63)), reading((1 << 64) - 1))
     inbox = Inbox()
@@ -241,7 +241,7 @@ def test_a_recordings_own_readings_go_before_those_of_the_bus(monkeypatch: pytes
 
 
 @pytest.mark.parametrize("settings", [{"rate": "max"}, {"speed": "speed.csv"}])
-def test_a_run_that_repeats_hears_nothing_on_the_bus(
+def test_a_repeatable_run_ignores_the_bus(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, settings: dict[str, object]
 ) -> None:
     bus = FakeBus()

@@ -120,7 +120,7 @@ def driven_past(
     return told
 
 
-def test_planners_are_told() -> None:
+def test_planners_see_the_status() -> None:
     config, weights = GraphConfig(), WeightsConfig()
     parked = driven_past(0.0, 0.97, config, weights)
     assert max(math.hypot(*v.velocity_mps) for v in parked) < 1.0

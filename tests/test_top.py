@@ -1,4 +1,4 @@
-"""The live table: nodes that are there, that fell silent, that are gone; on a terminal and in a pipe."""
+"""`birdslam top`: nodes that run, that are silent, that are gone; on a terminal and in a pipe."""
 
 from __future__ import annotations
 

@@ -502,7 +502,7 @@ def test_a_speed_file_is_for_the_images_alone(tmp_path: Path) -> None:
         evaluate(asked, beside)
 
 
-def test_the_log_bears_the_cars_speed(sequence: TrackingSequence, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_log_holds_the_cars_speed(sequence: TrackingSequence, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[SpeedReading, ...]] = []
 
     def measure(self: FrontEnd, frame: Frame, pending: object) -> Measurements:

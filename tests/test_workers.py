@@ -1,4 +1,4 @@
-"""The pool of worker processes: they do not outlive who began them, however that ends."""
+"""The pool of worker processes: workers end with their parent, however that ends."""
 
 from __future__ import annotations
 
