@@ -50,7 +50,7 @@ class Reading:
 
 
 def reading_of(message: Message | None, alive: bool, max_age_ms: float) -> Reading:
-    """What a planner is told now of the newest message (None: none has come) while the optimizer is alive or is not."""
+    """The newest message (None: none has come) with its age and validity; `alive`: whether the optimizer runs."""
     if message is None:
         return Reading(None, alive, on_time=False, valid=False, age_ms=float("inf"))
     estimate: Estimate = message.record

@@ -78,7 +78,7 @@ class ConfigurationError(ValueError):
 
 
 class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All that a run can be told."""
+    """The whole configuration of a run."""
 
     vehicle: VehicleName = "car"  # its name on the bus
     source: SourceConfig = SourceConfig()

@@ -213,7 +213,7 @@ GROUPS = (
             "fleet.certificate": "Which is this computer's certificate? FILE.pem",
             "fleet.key": "Which file is the private key?",
             "fleet.estimates_hz": "How many estimates a second are sent at the most? none: all",
-            "fleet.vehicles": "Whom does a listener expect, and tells of also where they were never heard?",
+            "fleet.vehicles": "Which vehicles does a listener expect, and lists before their first message?",
             "router.listen": "Where do vehicles and listeners connect to?",
             "router.ca": "Which file is the fleet's authority? FILE.pem",
             "router.certificate": "Which is the router's certificate? FILE.pem",

@@ -62,10 +62,10 @@ class ModelsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class Turn(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """When a head of perceive runs: on every so-manieth frame, or so often a second at the source's frame rate."""
+    """When a head of perceive runs: on each n-th frame, or at a rate that the source's frame rate makes n."""
 
-    every: PositiveInt | None = None  # on one frame in so many
-    hz: Positive | None = None  # so often a second; not beside `every`
+    every: PositiveInt | None = None  # on each n-th frame
+    hz: Positive | None = None  # runs a second; not beside `every`
 
     def __post_init__(self) -> None:
         if self.every is not None and self.hz is not None:

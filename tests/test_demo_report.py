@@ -122,9 +122,9 @@ def test_a_vehicle_predicted_between_two_detections_counts_as_reported_not_as_fo
         vehicles = tuple(msgspec.structs.replace(v, age_ns=age_ns) for v in truthful[0].vehicles)
         return grade(demo, [msgspec.structs.replace(truthful[0], vehicles=vehicles)])
 
-    assert (aged(0).found, aged(0).told) == (1.0, 1.0)
-    assert (aged(1).found, aged(1).told) == (0.0, 1.0)
-    assert (aged(IN_SIGHT_NS + 1).found, aged(IN_SIGHT_NS + 1).told) == (0.0, 0.0)
+    assert (aged(0).found, aged(0).reported) == (1.0, 1.0)
+    assert (aged(1).found, aged(1).reported) == (0.0, 1.0)
+    assert (aged(IN_SIGHT_NS + 1).found, aged(IN_SIGHT_NS + 1).reported) == (0.0, 0.0)
 
 
 def test_nothing_is_known_of_the_vehicles_of_a_drive_without_any(demo: DemoRecording, truthful: list[Estimate]) -> None:

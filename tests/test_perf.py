@@ -221,7 +221,7 @@ def test_a_republished_estimate_counts_for_no_stage() -> None:
     message = _message(5)
     newer = msgspec.structs.replace(message.record, t_capture_ns=message.record.t_capture_ns + 4 * MS)
     again = Message(newer, message.trace, message.t_received_ns)
-    assert dict(system.parts(again)) == {"told again": pytest.approx(system.age_of(again))}
+    assert dict(system.parts(again)) == {"published again": pytest.approx(system.age_of(again))}
 
 
 def test_lateness_is_against_the_frame_that_kept_the_pace_best() -> None:
@@ -322,9 +322,9 @@ def test_a_fleet_is_followed_also_when_one_of_it_dies(tmp_path: Path) -> None:
     assert main(["fleet", *what, "--output", str(path)]) == 0
     rows = {row["condition"]: row for row in json.loads(path.read_text())["rows"]}
     assert set(rows) == {"each", "newest", "flood", "death"}
-    assert all(row["heard"] > 0 for row in rows.values())
-    assert rows["death"]["told_dead_after_ms"] > 0
-    assert rows["flood"]["flood_heard_hz"] < rows["flood"]["flood_sent_hz"]
+    assert all(row["received"] > 0 for row in rows.values())
+    assert rows["death"]["reported_dead_after_ms"] > 0
+    assert rows["flood"]["flood_received_hz"] < rows["flood"]["flood_sent_hz"]
 
 
 @pytest.mark.processes

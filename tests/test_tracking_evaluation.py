@@ -452,7 +452,7 @@ def test_a_sequence_with_images_is_driven_by_them_too(tmp_path: Path) -> None:
     report = (out / "report.md").read_text()
     assert "| 0002 | ego | images | 6 of 6 |" in report
     assert "| 0002 | ego | simulated odometry | 6 of 6 |" in report
-    asked_for = [row["asked"] for row in json.loads((out / "told.json").read_text()) if "range" in row]
+    asked_for = [row["asked"] for row in json.loads((out / "reported.json").read_text()) if "range" in row]
     assert sum(asked_for) == 6 * 3
     assert "| 0002 | 15-30 |" in report
     with pytest.raises(ConfigurationError, match="no image_02, whose boxes these are, but image_03"):

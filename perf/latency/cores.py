@@ -103,7 +103,7 @@ def summary(row: dict[str, Any]) -> str:
         f"{row['rss_mb']:.0f} MB, shared once {row['pss_mb'] or 0:.0f}",
     ]
     if "found" in row:
-        parts.append(f"vehicles seen in the very frame {row['found']:.0%}, told of {row['told']:.0%}")
+        parts.append(f"vehicles seen in the very frame {row['found']:.0%}, reported {row['reported']:.0%}")
     if "ate_m" in row:
         parts.append(f"ATE {row['ate_m']:.2f} m")
     return "  ".join(parts)

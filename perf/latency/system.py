@@ -138,7 +138,7 @@ def parts(message: Message) -> Iterator[tuple[str, float]]:
     """
     first = message.trace.stages[0]
     if first.received_ns < message.record.t_capture_ns:
-        yield "told again", age_of(message)
+        yield "published again", age_of(message)
         return
     yield f"due -> {first.node}", (first.received_ns - message.record.t_capture_ns) / 1e6
     yield from stages(message.trace, message.t_received_ns)

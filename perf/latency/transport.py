@@ -90,7 +90,7 @@ def measure(case: Case, seconds: float) -> dict[str, Any]:
                 _tell(listener)
                 _tell(sender)
                 _expect(sender, "sent")
-                heard = json.loads(listener.communicate("\n", PATIENCE_S)[0])
+                received = json.loads(listener.communicate("\n", PATIENCE_S)[0])
                 sent = json.loads(sender.communicate("\n", PATIENCE_S)[0])
             finally:
                 sender.kill()
@@ -98,7 +98,7 @@ def measure(case: Case, seconds: float) -> dict[str, Any]:
         finally:
             listener.kill()
             listener.wait()
-    latency_ms = [ms for _, ms in sorted(heard["arrivals"])]
+    latency_ms = [ms for _, ms in sorted(received["arrivals"])]
     return {
         "carrier": case.carrier,
         "bytes": case.size,
@@ -108,7 +108,7 @@ def measure(case: Case, seconds: float) -> dict[str, Any]:
         "curve_ms": curve(latency_ms),
         "cpu_percent": {
             "sender": round(100.0 * sent["cpu_s"] / sent["took_s"], 2),
-            "receiver": round(100.0 * heard["cpu_s"] / sent["took_s"], 2),
+            "receiver": round(100.0 * received["cpu_s"] / sent["took_s"], 2),
         },
         "sent": messages,
         "dropped": messages - len(latency_ms),

@@ -246,8 +246,8 @@ def _states(axes: Axes, panel: dict[str, Any], series: Series, at_s: float) -> N
     end_s = max((messages[-1][0] for messages in series.values() if messages), default=1.0)
     for row, path in enumerate(panel["paths"]):
         topic, keys = topic_and_keys(path["value"])
-        told = [(t_s, str(value_at(message, keys))) for t_s, message in series[topic]]
-        changes = [(t, v) for (t, v), (_, before) in zip(told, [(0.0, ""), *told], strict=False) if v != before]
+        states = [(t_s, str(value_at(message, keys))) for t_s, message in series[topic]]
+        changes = [(t, v) for (t, v), (_, before) in zip(states, [(0.0, ""), *states], strict=False) if v != before]
         for (t_s, state), (until_s, _) in zip(changes, [*changes[1:], (end_s, "")], strict=True):
             colour = colours.setdefault(state, f"C{len(colours) % 10}")
             axes.broken_barh(

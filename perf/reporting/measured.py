@@ -65,8 +65,8 @@ def stamp(name: str, page: Measured) -> str:
     """The last line of a page in Markdown."""
     where = f" on {page.machine}" if page.machine else ""
     after = f", in {duration(page.takes_s)}" if page.takes_s is not None else ""
-    told = f"{BEGINNING}`{page.code}` at commit `{page.commit}` on {page.date}{where}{after}"
-    return f"{told}: `python -m perf pages --write {name}`."
+    text = f"{BEGINNING}`{page.code}` at commit `{page.commit}` on {page.date}{where}{after}"
+    return f"{text}: `python -m perf pages --write {name}`."
 
 
 def stamped(text: str, name: str, page: Measured) -> str:

@@ -158,7 +158,7 @@ def _cores(benchmarks: Benchmarks) -> Iterator[str]:
             "MB",
             "MB shared once",
             "seen in the frame",
-            "told",
+            "reported",
             "ego ATE m",
         )
         there = [row for row in rows if "missing" not in row]
@@ -171,7 +171,7 @@ def _cores(benchmarks: Benchmarks) -> Iterator[str]:
                     f"{row['dropped']} of {row['frames']}",
                     row.get("predicted"),
                     *_percentiles(row["age_ms"], ("p50", "p99")),
-                    *(row.get(name) for name in ("cpu_cores", "rss_mb", "pss_mb", "found", "told", "ate_m")),
+                    *(row.get(name) for name in ("cpu_cores", "rss_mb", "pss_mb", "found", "reported", "ate_m")),
                 ]
                 for row in there
             ),
@@ -211,7 +211,7 @@ def _accuracy(benchmarks: Benchmarks) -> Iterator[str]:
                 "vehicle_ate_m": "vehicles' ATE m",
                 "vehicle_centre_rel": "place, of the range",
                 "found": "seen in the frame",
-                "told": "told",
+                "reported": "reported",
             },
         }
         there = [row for row in rows if "missing" not in row]

@@ -57,7 +57,7 @@ def _figures(benchmarks: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
                 yield f"{row['contender']}, {row['vehicles']} vehicles: {level} us", row[f"{level}_us"]
     for name in ("accuracy", "accuracy-data"):
         for row in benchmarks.get(name, {}).get("rows", []):
-            keys = ("ate_m", "scale_error", "vehicle_centre_rel", "found", "told")
+            keys = ("ate_m", "scale_error", "vehicle_centre_rel", "found", "reported")
             yield from ((f"{row['name']}: {key}", row[key]) for key in keys if row.get(key) is not None)
     for row in benchmarks.get("inference", {}).get("rows", []):
         yield f"{row['name']}: p50 ms", row["total_ms"]["p50"]
@@ -81,7 +81,7 @@ def better_when(figure: str) -> Better:
     what = figure.rpartition(": ")[2]
     if what == "scale_error":
         return "nearer to 0"
-    return "more" if what in ("found", "told", "rate Hz") else "less"
+    return "more" if what in ("found", "reported", "rate Hz") else "less"
 
 
 def keep(new: Card, folder: Path = RESULTS) -> Path:

@@ -231,10 +231,10 @@ def measure(
         "read_ms": spread(said["read_ms"]),
         "curve_ms": curve(said["arrival_ms"]),
         "noise": noise("arrival_ms", said["arrival_ms"]),
-        "heard_hz": said["heard"] / said["took_s"] / counted,
-        "read_share": len(said["read_ms"]) / max(1, said["heard"]),
+        "received_hz": said["received"] / said["took_s"] / counted,
+        "read_share": len(said["read_ms"]) / max(1, said["received"]),
         "lost": said["lost"],
-        "heard": said["heard"],
+        "received": said["received"],
         "listener_cpu_percent": 100.0 * said["cpu_s"] / said["took_s"],
         "router_cpu_percent": 100.0 * router_s / took_s,
         "payload_bytes_s": said["bytes"] / said["took_s"] / counted,
@@ -245,9 +245,9 @@ def measure(
         row["wire_bytes_s"] = wire_bytes / took_s / counted / 2  # each byte goes to the router, and from it
     if condition == "flood":
         row["flood_sent_hz"] = FLOOD_TIMES * place.rate_hz
-        row["flood_heard_hz"] = said["heard_left_out"] / said["took_s"]
+        row["flood_received_hz"] = said["received_left_out"] / said["took_s"]
     if killed_ns and names[0] in said["not_alive_ns"]:
-        row["told_dead_after_ms"] = (said["not_alive_ns"][names[0]] - killed_ns) / 1e6
+        row["reported_dead_after_ms"] = (said["not_alive_ns"][names[0]] - killed_ns) / 1e6
     return row
 
 
@@ -259,15 +259,15 @@ def row_text(row: dict[str, Any]) -> str:
     """A row for a person."""
     parts = [
         f"age on arrival {spread_text(row['arrival_ms'], 'ms')}",
-        f"heard {row['heard_hz']:.1f} Hz each, read {100 * row['read_share']:.0f} %",
+        f"received {row['received_hz']:.1f} Hz each, read {100 * row['read_share']:.0f} %",
         f"lost {row['lost']}",
         f"CPU listener {row['listener_cpu_percent']:.0f} %, router {row['router_cpu_percent']:.0f} %",
         f"{row['payload_bytes_s'] / 1e3:.1f} kB/s each"
         + (f" ({row['wire_bytes_s'] / 1e3:.1f} on the wire)" if "wire_bytes_s" in row else ""),
         f"load {row['load']:.1f}",
     ]
-    if "flood_heard_hz" in row:
-        parts.append(f"of the flood's {row['flood_sent_hz']:.0f} Hz {row['flood_heard_hz']:.0f} heard")
-    if "told_dead_after_ms" in row:
-        parts.append(f"told dead after {row['told_dead_after_ms']:.0f} ms")
+    if "flood_received_hz" in row:
+        parts.append(f"of the flood's {row['flood_sent_hz']:.0f} Hz {row['flood_received_hz']:.0f} received")
+    if "reported_dead_after_ms" in row:
+        parts.append(f"reported dead after {row['reported_dead_after_ms']:.0f} ms")
     return "  ".join(parts)

@@ -177,10 +177,10 @@ def listener(plan: Plan, ended: threading.Event) -> None:
         "read_ms": reads,
         "cpu_s": cpu_s,
         "took_s": took_s,
-        "heard": sum(after[name].estimates - before[name].estimates for name in counted),
+        "received": sum(after[name].estimates - before[name].estimates for name in counted),
         "lost": sum(after[name].lost - before[name].lost for name in counted),
         "bytes": sum(after[name].received_bytes - before[name].received_bytes for name in counted),
-        "heard_left_out": sum(
+        "received_left_out": sum(
             after[name].estimates - (before[name].estimates if name in before else 0)
             for name in plan.left_out
             if name in after

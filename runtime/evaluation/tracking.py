@@ -147,7 +147,7 @@ def write_report(jobs: Sequence[Job], outcomes: Sequence[Outcome], output: Path)
     if job.methods and variants:
         write_json(output / "ablation.json", variants)
     if reported:
-        write_json(output / "told.json", reported)
+        write_json(output / "reported.json", reported)
     longest = max(outcomes, key=lambda outcome: len(outcome.frames))
     draw_runtime(longest.updates_ms, output / "runtime.png")
     report = render_report(Setting(job.frames, job.methods, max(job.seeds for job in jobs)), job.published, outcomes)

@@ -75,7 +75,7 @@ class LiveCamera(ABC):
             self.close()
 
     def _reopen(self) -> None:
-        """One try; where it fails, a pause, so that planners hear of the loss at a fitting rate."""
+        """One attempt; after a failure a pause, which limits how often the loss is reported."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None

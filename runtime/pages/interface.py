@@ -73,15 +73,16 @@ rest on. [speed.md](speed.md) has files, recordings and the rest.
 
 ## What may be driven by
 
-Three things are told apart. **Alive**: the liveliness token `alive/optimize` is there. **On time**: `t_capture_ns` is
+Three answers are separate. **Alive**: the liveliness token `alive/optimize` is there. **On time**: `t_capture_ns` is
 young enough on this computer's CLOCK_MONOTONIC (elsewhere `t_utc_ns`, with synchronised clocks); estimates come
 within {budget_ms:g} ms at the {percentile:g}th percentile unless the configuration's `budgets` say otherwise.
-**Valid**: the field `valid`. An estimate that is all three may be driven by. Silence is never good news: past its
-limit a reader itself says that what it has is stale, as `Planner.estimates` does.
+**Valid**: the field `valid`. An estimate that is all three may be driven by. No message never means that all is well:
+past its limit a reader itself reports that its estimate is stale, as `Planner.estimates` does.
 
 `epoch` names the world frame. Where it rises, poses, map and trajectory began anew and must not be compared with
-older ones. `frame_id` never falls within a run. Frames that perceive does not answer in time are told as `coasting`
-with a growing covariance, then as invalid; the last of them is told again when more is known of it.
+older ones. `frame_id` never falls within a run. Frames that perceive does not answer in time are published as
+`coasting` with a growing covariance, then as invalid; the last of them is published again, corrected, once its
+measurements are there.
 
 ## Statuses
 

@@ -80,7 +80,7 @@ def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         (
             "  from the ego",
             f"{number(found.vehicle_centre_m, '.2f')} m, {number(found.vehicle_centre_rel, '.1%')} of the range, "
-            f"median; {number(found.told, '.0%')} of those in clear sight reported, "
+            f"median; {number(found.reported, '.0%')} of those in clear sight reported, "
             f"{number(found.found, '.0%')} seen in that very frame",
         ),
     ]

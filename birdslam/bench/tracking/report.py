@@ -14,10 +14,10 @@ from birdslam.bench.tracking.relative_nees import NeesRow
 from birdslam.bench.tracking.reported import MotionRow, RangeRow
 from birdslam.bench.tracking.tables import ODOMETRIES, Published
 
-ABOUT_TOLD = (
+ABOUT_REPORTED = (
     "Live, in the ego's frame: cars labelled 25 px or more high, hardly occluded and not truncated; found is an "
     "estimate within 20 % of the distance ahead and 1.5 m across. A car stands under 0.5 m/s and drives over 2 m/s by "
-    "its labels; it is told as driving over 1.5 m/s, surely where it is over or under that by twice its own sigma."
+    "its labels; it is reported as driving over 1.5 m/s, surely where it is over or under that by twice its own sigma."
 )
 
 ABOUT_LANES = (
@@ -124,11 +124,11 @@ def render_report(setting: Setting, published: Published, outcomes: Sequence[Out
             f"## Tracks and relative errors of {name}\n\nHOTA and IDF1 of cars in the image by KITTI's rules; the rest "
             f"are means over vehicles seen in 5 frames or more. {note}\n\n{tables.tracks_table(rows, name)}"
         )
-    told = [row for outcome in outcomes for row in outcome.ranges]
-    if told:
+    ranges = [row for outcome in outcomes for row in outcome.ranges]
+    if ranges:
         parts.append(
-            f"## What a planner was told of the cars that our own networks saw\n\n{ABOUT_TOLD}\n\n"
-            f"{tables.ranges_table(told)}\n"
+            f"## Cars that our own networks saw, as reported to a planner\n\n{ABOUT_REPORTED}\n\n"
+            f"{tables.ranges_table(ranges)}\n"
             f"{tables.motion_table([row for outcome in outcomes for row in outcome.motion])}"
         )
     nees = [row for outcome in outcomes for row in outcome.nees]

@@ -42,7 +42,7 @@ class DemoGrade(msgspec.Struct, frozen=True, kw_only=True):
     vehicle_centre_m: float | None  # median distance from the true centre, both as seen from the ego
     vehicle_centre_rel: float | None  # the same over the body's range
     found: float | None  # share of the bodies in clear sight (ASKED_...), frame by frame, that were matched
-    told: float | None = None  # the same with vehicles that the last looks showed, predicted to the frame
+    reported: float | None = None  # the same with vehicles that the last looks showed, predicted to the frame
 
 
 class GlobalFrame:
@@ -86,7 +86,7 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
     true_paths: dict[int, dict[int, SE2]] = {}
     paths: dict[int, dict[int, SE2]] = {}
     errors: list[tuple[float, float]] = []  # distance, range
-    asked = found = told = 0
+    asked = found = reported = 0
     for estimate in estimates:
         k = estimate.frame_id
         cameras.append(trajectory.add(estimate.epoch, ego_pose(estimate.T_world_ego, estimate.attitude)))
@@ -102,7 +102,7 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
         asked += len(clear)
         found += len(clear & {body.body for body, _ in matched})
         in_sight = match(estimate, bodies, [v for v in estimate.vehicles if v.in_sight])
-        told += len(clear & {body.body for body, _ in in_sight})
+        reported += len(clear & {body.body for body, _ in in_sight})
     ego = compare(recording.name, truth[[e.frame_id for e in estimates]], np.array(cameras), {})
     ates = [
         errors_of.ate_m
@@ -121,7 +121,7 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
         vehicle_centre_m=float(np.median(distance)) if errors else None,
         vehicle_centre_rel=float(np.median(distance / reach)) if errors else None,
         found=found / asked if asked else None,
-        told=told / asked if asked else None,
+        reported=reported / asked if asked else None,
     )
 
 
