@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +51,21 @@ def data_dir() -> Path:
 def models_dir() -> Path:
     """The folder of real networks; the test skips with its reason where there is none."""
     return _folder("BIRDSLAM_MODELS", "models")
+
+
+@pytest.fixture
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A runtime directory with a short path, as sockets need it."""
+    return tmp_path_factory.mktemp("run")
+
+
+@pytest.fixture
+def join(base: Path) -> Iterator[Any]:
+    """join(node, ...) opens a Bus that is closed after the test; the first one is the hub."""
+    from birdslam.runtime.transport.bus import Bus  # not before a test needs it: it loads zenoh
+
+    with ExitStack() as stack:
+        yield lambda node, **options: stack.enter_context(Bus("car", node, runtime_dir=base, **options))
 
 
 _may_start_processes = True

@@ -35,22 +35,6 @@ ROOT = Path(__file__).parent.parent
 LIMIT_S = 60.0
 
 
-@pytest.fixture
-def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("run")
-
-
-@pytest.fixture
-def join(base: Path) -> Iterator[Any]:
-    """join(node, ...) opens a Bus that is closed after the test; the first one is the hub."""
-    with ExitStack() as stack:
-
-        def join(node: str, **options: Any) -> Bus:
-            return stack.enter_context(Bus("car", node, runtime_dir=base, **options))
-
-        yield join
-
-
 def frame_ref(frame_id: int) -> FrameRef:
     return FrameRef(frame_id=frame_id, t_source_ns=1, t_capture_ns=2, t_utc_ns=3, slot=1, sequence=2)
 

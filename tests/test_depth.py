@@ -16,16 +16,7 @@ from birdslam.perception import ModelError, ModelSpec, load_network
 from birdslam.perception.decoding.depth import DepthMap
 from birdslam.perception.manifest import Disparity, MetricDepth
 
-INPUT = """
-role = "depth"
-[input]
-name = "images"
-width_px = 32
-height_px = 16
-layout = "NCHW"
-colour = "RGB"
-resize = { mode = "stretch" }
-"""
+INPUT = tiny.SEGMENTER.partition("[segmenter]")[0].replace("segmenter", "depth")
 DISPARITY = INPUT + '[depth]\ndecoding = "disparity"\noutput = "disp"\n'
 METRIC = INPUT + '[depth]\ndecoding = "metric"\noutput = "disp"\n'
 CAMERA = Camera(width_px=64, height_px=32, fx_px=40.0, fy_px=42.0, cx_px=31.0, cy_px=14.0, height_m=1.5)

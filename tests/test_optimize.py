@@ -29,21 +29,12 @@ from birdslam.runtime.process.restarts import FIRST, Assignment, Resume
 from birdslam.runtime.transport.bus import Message
 from birdslam.runtime.wire import Trace
 from birdslam.types import INVALIDATING, Attitude, Estimate, FrameRef, Measurements, Status
+from tests.test_nodes import Inbox
 
 MS = 1_000_000
 HEAD_BYTES = 64  # of a checkpoint in its file, before its data; first its number, which is written last
 DRIVE = drive(DriveConfig(frames=60, vehicles=3, traffic="convoy"), 1).measurements
 CALM = Configuration().slam
-
-
-class Inbox:
-    dropped = malformed = 0
-
-    def __init__(self) -> None:
-        self.messages: deque[Message] = deque()
-
-    def recv(self, timeout_s: float | None = None) -> Message | None:
-        return self.messages.popleft() if self.messages else None
 
 
 class Bus:

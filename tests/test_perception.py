@@ -269,25 +269,7 @@ def test_a_cut_box_does_not_survive_beside_the_whole_one_though_it_scores_better
 
 # --- networks made here
 
-DETECTOR = f"""
-role = "detector"
-[input]
-name = "images"
-width_px = {SIZE_PX}
-height_px = {SIZE_PX}
-layout = "NCHW"
-colour = "BGR"
-resize = {{ mode = "fit_pad" }}
-[detector]
-decoding = "yolox"
-output = "output"
-strides = [8, 16, 32]
-classes = 4
-score_threshold = 0.3
-nms_iou = 0.5
-[detector.labels]
-0 = "car"
-"""
+DETECTOR = tiny.DETECTOR.replace("_px = 64", f"_px = {SIZE_PX}").replace("classes = 2", "classes = 4")
 
 SEGMENTER = """
 role = "segmenter"

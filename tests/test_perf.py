@@ -375,17 +375,8 @@ def test_interrupting_the_suite_keeps_what_it_has(tmp_path: Path, monkeypatch: p
     assert "optimizer: interrupted" in (tmp_path / "report.md").read_text()
 
 
-@pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba is not installed (extra `train`)")
-def test_the_renderer_is_timed_on_worlds_and_on_a_drive(tmp_path: Path) -> None:
-    assert main(["renderer", "--samples", "2", "--frames", "3", "--output", str(tmp_path / "r.json")]) == 0
-    rows = {row["name"]: row for row in json.loads((tmp_path / "r.json").read_text())["rows"]}
-    assert [row["ms"]["n"] for row in rows.values()] == [2, 3, 2, 3]
-    for kind in ("samples", "drive"):  # four times the pixels
-        assert rows[f"{kind} 640x192"]["frames_per_s"] > rows[f"{kind} 1242x375"]["frames_per_s"]
-
-
 @pytest.mark.skipif(importlib.util.find_spec("numba") is not None, reason="numba is installed")
-@pytest.mark.parametrize("name", ["renderer", "pointnet"])
+@pytest.mark.parametrize("name", ["lanes", "pointnet"])
 def test_what_is_rendered_names_the_extra_that_it_needs(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([name]) == 2
     assert "[train]" in capsys.readouterr().err

@@ -5,8 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import Configuration, SourceConfig
 from birdslam.runtime.supervision.query_server import QueryServer
 from birdslam.runtime.topology import QUERIES, TOPICS, key_of
-from birdslam.runtime.transport.bus import Bus, BusClosed, BusError
+from birdslam.runtime.transport.bus import BusClosed, BusError
 from birdslam.runtime.transport.queries import WAITING_QUERIES, QueryRefused, positive
 from birdslam.runtime.transport.reply_parts import map_parts, trajectory_parts, whole_map, whole_trajectory
 from birdslam.runtime.wire import Health, Part, encode
@@ -34,17 +32,6 @@ from tests.test_bus import LIMIT_S, estimate, measurements, until
 pytestmark = pytest.mark.processes
 
 CONFIGURATION = Configuration(source=SourceConfig(uri="rtsp://driver:secret@10.0.0.7/front"))
-
-
-@pytest.fixture
-def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("run")
-
-
-@pytest.fixture
-def join(base: Path) -> Iterator[Any]:
-    with ExitStack() as stack:
-        yield lambda node, **options: stack.enter_context(Bus("car", node, runtime_dir=base, **options))
 
 
 def at(number: int, x_m: float, y_m: float = 0.0) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,23 +11,12 @@ import tiny_networks as tiny
 
 from birdslam.perception import ModelError, ModelSpec, Segmentation, load_network
 
-MANIFEST = """
-role = "segmenter"
-[input]
-name = "images"
-width_px = 8
-height_px = 8
-layout = "NCHW"
-colour = "RGB"
-resize = { mode = "stretch" }
-[segmenter]
-decoding = "class_maps"
-[[segmenter.maps]]
-meaning = "road"
-output = "classes"
-channel = CHANNEL
-channels = 4
-"""
+MANIFEST = (
+    re.sub(r"(width|height)_px = \d+", r"\1_px = 8", tiny.SEGMENTER)
+    .replace('"output"', '"classes"')
+    .replace("channel = 1", "channel = CHANNEL")
+    .replace("channels = 3", "channels = 4")
+)
 
 
 def run(tmp_path: Path, text: str, scores: np.ndarray) -> Segmentation:
