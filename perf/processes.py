@@ -55,7 +55,7 @@ def loaded(cores: int) -> Iterator[None]:
 
 
 def free_port() -> int:
-    """A TCP port of this computer that nobody listens at now."""
+    """A free TCP port of this computer."""
     with socket.socket() as holder:
         holder.bind(("127.0.0.1", 0))
         port: int = holder.getsockname()[1]

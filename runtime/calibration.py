@@ -180,7 +180,7 @@ def _class_and_path(uri: str) -> tuple[type[Recording], Path]:
 
 
 def _frame_size(uri: str, topics: BagTopics) -> tuple[int, int] | None:
-    """(width, height) in pixels of the recording's frames; None where nothing tells it."""
+    """(width, height) in pixels of the recording's frames; None where it is unknown."""
     kind, path = _class_and_path(uri)
     try:
         return kind.frame_size(path, topics)

@@ -121,7 +121,7 @@ class Planner(Closing):
                 yield reading
 
     def map(self, timeout_s: float = 2.0) -> MapSnapshot | None:
-        """The whole map of the newest epoch; None where nobody answers.
+        """The whole map of the newest epoch; None where no reply comes.
 
         Raises BusError with the reason where it is refused, or where a part of it was lost.
         """

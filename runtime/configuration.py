@@ -195,7 +195,7 @@ def complete(configuration: Configuration, camera: Camera, rate_hz: float) -> Co
 
 
 def refuse_constant(key: str, origin: str) -> None:
-    """Raises ConfigurationError where a file or `--set` names what is a field of the configuration, but no key."""
+    """Raises ConfigurationError where a file or `--set` names a constant."""
     reason = why_no_key(key, Configuration)
     if reason:
         raise ConfigurationError(f"{origin}: {key}: {reason}")

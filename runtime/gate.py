@@ -96,7 +96,7 @@ def _check_endpoints(path: Path, config: zenoh.Config) -> None:
 
 
 def _check_rules(path: Path, config: zenoh.Config) -> None:
-    """No policy for others than the vehicle's own sockets lets something be written, but by the car what is its own."""
+    """Refuses a policy by which others than the vehicle's own sockets may write, except the car its speed."""
     access = _get(config, "access_control")
     rules = {rule["id"]: rule for rule in access["rules"] or ()}
     inside = {s["id"] for s in access["subjects"] or () if s.get("link_protocols") == ["unixsock-stream"]}

@@ -49,7 +49,7 @@ def overrides_of(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]
 
 
 def speeds_of(configuration: Configuration, drives: int) -> Path:
-    """The car's own speed in so many drives: a file of one, or a directory. Raises ConfigurationError."""
+    """The car's own speed in drives: a file for one, or a directory with one for each. Raises ConfigurationError."""
     path = Path(configuration.source.speed).expanduser()
     if drives > 1 and not path.is_dir():
         raise ConfigurationError(f"{path}: is the speed of one drive: for {drives} give a directory of their NAME.txt")

@@ -26,7 +26,7 @@ def time_to_go(seconds: float) -> str:
 
 
 class Progress:
-    """A context: `advance` for each piece of work, or `reach` a count. `total` is None where nobody knows it.
+    """A context: `advance` for each piece of work, or `reach` a count. `total` is None where it is unknown.
 
     `scale` and `unit` say what is counted: ("frames", 1) or ("MB", 1e6). The time to go is that of the mean speed since
     the first piece, so that loading is no part of it.

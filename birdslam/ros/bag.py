@@ -108,7 +108,7 @@ def stamp_ns(content: Any) -> int:
 
 @cache
 def _types_of_humble() -> Any:
-    """For bags of ROS 2 before Iron, which do not say what their types are: what is read here is alike in all."""
+    """Types for bags of ROS 2 before Iron, which do not carry them; the types read here are equal in all releases."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE)

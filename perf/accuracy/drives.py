@@ -124,7 +124,7 @@ def mirrored_camera(camera: Camera) -> Camera:
 
 
 def _looks(configuration: Configuration | None) -> Iterator[Any]:
-    """For each image in its order, what takes it and gives the networks' boxes and road."""
+    """For each image in order, a function of it that gives the networks' boxes and road."""
     if configuration is None:
         yield from itertools.repeat(lambda frame: (np.zeros((0, 4)), None))
         return

@@ -183,7 +183,7 @@ def _observed(
     truth: Sequence[WorldObject],
     edge_sigma: EdgeSigma | None = None,
 ) -> tuple[list[Observation], list[WorldObject], list[int]]:
-    """What `observe_boxes` makes of boxes, with truth and rows that go with it."""
+    """The observations that `observe_boxes` makes of boxes, with their truth and rows."""
     seen = observe_boxes(
         boxes_px,
         np.full(len(boxes_px), 0.9),

@@ -84,7 +84,7 @@ def run(arguments: list[str]) -> None:
 
 
 def measure(task: Task) -> tuple[str, list[dict[str, Any]]]:
-    """The sequence's name, and what each start of one variant of it came to."""
+    """The sequence's name, and the result of each start of one variant of it."""
     cv2.setNumThreads(1)
     name, drive = read(task)
     count = len(drive.images)
@@ -102,7 +102,7 @@ def measure(task: Task) -> tuple[str, list[dict[str, Any]]]:
 
 
 def summary(starts: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What the starts of one variant came to, at the end of each."""
+    """The result of each start of one variant, at its end."""
     scale = np.array([start["scale_error"][-1] for start in starts])
     rotation_deg = np.array([start["rotation_error_deg"][-1] for start in starts])
     if not len(scale):

@@ -63,7 +63,7 @@ def run(arguments: list[str]) -> None:
 
 @contextlib.contextmanager
 def on_first(cores: int) -> Iterator[None]:
-    """This process, and those that it starts meanwhile, run on the first so many of its cores."""
+    """A context: this process and its children run on the first `cores` of its cores."""
     all_of_them = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(all_of_them)[:cores])
     try:

@@ -93,7 +93,7 @@ class Code:
         return [effect for name in names if name in self._files for effect in self._module(name).effects]
 
     def _split(self, full: str) -> tuple[str, str]:
-        """The module and the name in it, "" for all of it; ("", "") for what is no code of ours."""
+        """The module and the name in it, "" for all of it; ("", "") for code that is not ours."""
         parts = full.split(".")
         for end in range(len(parts), 0, -1):
             if (module := ".".join(parts[:end])) in self._files:
@@ -204,7 +204,7 @@ def _own_names(node: ast.AST) -> set[str]:
 
 
 def _form(value: object) -> str:
-    """The syntax tree as text, without what is empty or bears no meaning: so every version of Python says the same."""
+    """The syntax tree as text, without empty fields, so that every version of Python gives the same."""
     if isinstance(value, ast.JoinedStr):
         return f"JoinedStr({_form([part for part in value.values if not _is_empty(part)])})"
     if isinstance(value, ast.AST):

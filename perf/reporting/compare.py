@@ -32,7 +32,7 @@ Verdict = Literal["better", "worse", "not distinguishable"]
 
 @dataclass(frozen=True)
 class Verdicts:
-    """One line: medians of the old and the new blocks (or counts, or exact values), and what is to be said."""
+    """One line: medians of the old and the new blocks (or counts, or exact values), and the verdict."""
 
     name: str
     old: float

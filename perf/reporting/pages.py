@@ -196,7 +196,7 @@ def _chosen(names: list[str] | None, kept: Mapping[str, Measured]) -> list[Deriv
 
 
 def _takes_s(page: Derived | Page, kept: Mapping[str, Measured]) -> float:
-    """When it was last written; infinite where nobody knows."""
+    """When it was last written; infinite where that is unknown."""
     if isinstance(page, Derived):
         return 0.0
     last = kept[page.name].takes_s if page.name in kept else None
@@ -221,7 +221,7 @@ def digests(page: Page, code: Code) -> tuple[str, str | None]:
 
 
 def _folders(page: Page) -> dict[str, str]:
-    """What a command is run with, from the checkout's root: no page tells where that lies."""
+    """What a command is run with, from the checkout's root: no page may contain that path."""
     data, models = (os.environ.get(f"BIRDSLAM_{name.upper()}") or f"../shared/{name}" for name in ("data", "models"))
     return {"data": data, "models": models, "out": f"out/pages/{page.name}"}
 

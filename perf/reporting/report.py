@@ -83,7 +83,7 @@ def _head(content: Mapping[str, Any]) -> str:
 
 
 def _configuration(benchmarks: Benchmarks) -> str:
-    """What of the product's configuration bears on times; all of it is in report.json."""
+    """The part of the configuration that affects times; report.json has all of it."""
     whole: Mapping[str, Any] = next((run["configuration"] for run in benchmarks.values() if "configuration" in run), {})
     parts = [text for key in ("source", "perceive", "models") for text in _set(key, whole.get(key))]
     networks = [network for run in benchmarks.values() for network in run.get("networks", {}).values()]

@@ -208,7 +208,7 @@ def readme(text: str, found: Mapping[str, Kept], when: Mapping[str, measured.Mea
 
 
 def tables_page(report: str) -> str:
-    """docs/tables.md: the report of the evaluation as it is, and what wrote it."""
+    """docs/tables.md: the evaluation's report unchanged, and the command that wrote it."""
     title, _, rest = report.partition("\n")
     about = (
         "Written by `python -m perf pages --write tracking`, which runs\n\n"

@@ -211,7 +211,7 @@ def slow_planner(vehicle: Vehicle) -> Iterator[None]:
 
 @contextlib.contextmanager
 def kill_everything(vehicle: Vehicle) -> Iterator[None]:
-    """And a second start over what is left."""
+    """Then a second start over the files that the first left."""
     everybody = [psutil.Process(vehicle.process.pid), *psutil.Process(vehicle.process.pid).children()]
     for process in everybody:
         process.kill()

@@ -62,7 +62,7 @@ def _exclusive(output: Path) -> Iterator[None]:
 
 
 def _run(left: list[Task], output: Path, events: Generator[Event]) -> tuple[int, int]:
-    """Runs what is left; gives how many failed, and how many were not ended when Ctrl-C came."""
+    """Runs the drives that are left; gives how many failed, and how many Ctrl-C left unfinished."""
     shares: dict[str, float] = {}
     failed = ended = 0
     with Progress("batch", len(left) * THOUSANDTHS, "drives", THOUSANDTHS) as progress:

@@ -140,7 +140,7 @@ def _run(task: Task, output: Path, uri: str, on_frame: OnFrame) -> None:
 
 
 def _known(recording: Recording, frames: int) -> slice:
-    """Of the truth of so many frames, those from the first to the last at which it is known; all: slice(None)."""
+    """The frames from the first to the last with known truth; slice(None) where all have it."""
     truth = recording.truth_poses()
     every = slice(None) if frames == len(recording) else slice(0, frames)
     if truth is None or np.isfinite(truth[:frames]).all():

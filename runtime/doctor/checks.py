@@ -207,7 +207,7 @@ def _utc(configuration: Configuration) -> Iterator[Finding]:
 
 
 def _synchronised() -> bool:
-    """As the kernel has it from whoever steers the clock: adjtimex(2) gives TIME_ERROR where nobody does."""
+    """Whether a time daemon disciplines the clock: adjtimex(2) gives TIME_ERROR where none does."""
     libc, timex = ctypes.CDLL(None), ctypes.create_string_buffer(_TIMEX_BYTES)  # all zero: it only asks
     return 0 <= libc.adjtimex(timex) < _TIME_ERROR
 

@@ -26,7 +26,7 @@ _SPIN = "while True: pass"
 
 
 def lateness_ms(fifo: bool = False) -> list[float]:
-    """By how much each of the wakes came too late; `fifo`: at SCHED_FIFO. Raises PermissionError where that is not."""
+    """How late each wake-up was; `fifo`: at SCHED_FIFO. Raises PermissionError where that is not permitted."""
     before, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
     if fifo:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))

@@ -25,7 +25,7 @@ from birdslam.sources.recording import DatasetError
 
 
 class Sweep(NamedTuple):
-    """A constant of the front end, its value as it is, and the front ends with each of its values."""
+    """A constant of the front end, its present value, and a front end for each value of the sweep."""
 
     key: str
     as_it_is: str

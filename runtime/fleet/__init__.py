@@ -1,4 +1,4 @@
-"""Many vehicles on one network: each says its estimates at a router, and whoever is let in listens to all of them.
+"""Many vehicles on one network: each publishes its estimates at a router, and authorised listeners receive them all.
 
     vehicle's bus --> [uplink] --mutual TLS--> [router] --mutual TLS--> listeners: `birdslam top --all`, Fleet
 

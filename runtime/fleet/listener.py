@@ -204,7 +204,7 @@ class Fleet(Closing):
             return None
 
     def map(self, vehicle: str, timeout_s: float = REPLY_S) -> MapSnapshot | None:
-        """A vehicle's whole map of its newest epoch; None where nobody answers.
+        """A vehicle's whole map of its newest epoch; None where no reply comes.
 
         Raises BusError with the reason where it is refused, or where a part of it was lost.
         """

@@ -53,7 +53,7 @@ def router_config(config: RouterConfig) -> zenoh.Config:
 
 
 def access_control(vehicles: tuple[str, ...], listeners: tuple[str, ...]) -> dict[str, Any]:
-    """zenoh's access control: what is not allowed here is denied."""
+    """zenoh's access control; the default is to deny."""
     rules = [
         _rule("vehicles are queried", "egress", ["declare_subscriber", "query"], map(every_key, QUERYABLE)),
         _rule(

@@ -218,7 +218,7 @@ class _BoxesOnly:
 
 @dataclass(frozen=True)
 class _UntilDeadline:
-    """A pending perception that is awaited to a point in time, and then taken as it is."""
+    """A pending perception that is awaited until a deadline; what is ready then is used."""
 
     pending: Pending
     awaited: list[Future[Any]]

@@ -99,7 +99,7 @@ class LookRate:
 
     @property
     def masks_every(self) -> int:
-        """Of so many looks of a network that can do without its masks one makes them."""
+        """A network that can leave its masks out computes them on every n-th run."""
         return 1 if self.sparing == 1 else MASKS_SPARING
 
     def judge(self, step_ms: float, dropped: bool) -> bool:

@@ -168,7 +168,7 @@ class OptimizeNode:
         return estimate
 
     def _end(self, measurements: Measurements) -> Iterator[Estimate | MapUpdate]:
-        """The map is complete before the estimate that ends the run; its update bears the number of the end."""
+        """The map is complete before the estimate that ends the run; its update has the frame id of the end."""
         epoch = self._graph.epoch
         gained = self._graph.map_update() or MapUpdate(epoch=epoch, frame_id=measurements.frame_id)
         yield msgspec.structs.replace(gained, frame_id=measurements.frame_id)

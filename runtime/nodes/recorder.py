@@ -1,4 +1,4 @@
-"""The recorder: one more process that listens, and records the drive (recording/recording.py); nobody waits for it.
+"""The recorder: a process that subscribes and records the drive (recording/recording.py); no node waits for it.
 
 `python -m birdslam.runtime.nodes.recorder record VITALS_FD PARENT_PID`, on standard input the configuration as a line
 of JSON, then a `RecorderAssignment` as another. It ends when the end of the source has come through, or on SIGTERM.

@@ -35,7 +35,7 @@ UNITS = {  # by the end of a field's name; the longer ends first
 
 
 def unit(name: str) -> str:
-    """The unit that the end of a field's name tells; "" where it has none."""
+    """The unit by the suffix of a field's name; "" where it has none."""
     return next((said for end, said in UNITS.items() if name.endswith(end)), "")
 
 

@@ -1,4 +1,4 @@
-"""What every process of a vehicle has: scheduling, signs of life, restarts, and what it tells systemd.
+"""What every process of a vehicle has: scheduling, heartbeat, restarts, notifications to systemd.
 
 Read `child` first: what a process does before its work begins.
 """

@@ -39,7 +39,7 @@ _anchors: list[bytes] = []  # for ever: memory that holds one of these is not gi
 
 
 def apply(node: str, configuration: Configuration) -> Iterator[str]:
-    """Sets what is configured, and gives a line for each thing that was not to be had."""
+    """Sets what is configured; gives a line for each setting that the system refused."""
     realtime, live = configuration.realtime, configuration.live
     scheduling = realtime.of(node)
     if scheduling.cpus:
@@ -141,7 +141,7 @@ def reserve_for(node: str, configuration: Configuration) -> None:
 
 
 def use_one_heap() -> None:
-    """All threads of this process take from one heap (glibc's), which keeps what is freed.
+    """All threads allocate from one heap (glibc's), which keeps freed memory.
 
     Call it before the process has threads: a heap that one of them has begun goes on growing. The nodes have it from
     their environment (`cli.ENVIRONMENT`), which the process that sets it has read too early.

@@ -13,7 +13,7 @@ from birdslam.runtime.process.child import end_with_parent
 
 @contextmanager
 def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of so many processes, each started afresh (no lock of this one's threads goes along).
+    """A pool of `processes` processes, spawned and not forked, so that no lock of this process's threads is inherited.
 
     They end with this process, also where it is killed and can't shut them down. Where the block raises, tasks that
     have not begun are dropped, and it isn't waited for the others.

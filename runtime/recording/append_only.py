@@ -1,4 +1,4 @@
-"""A file that only grows, from a thread of its own: whoever writes never waits for the disk."""
+"""An append-only file, written by a thread of its own: the caller never waits for the disk."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class AppendOnlyFile:
         self._thread.start()
 
     def write(self, piece: bytes) -> None:
-        """One piece more, as soon as the disk takes it."""
+        """Queues one piece for the disk."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting_bytes < WAITING_BYTES or self.error is not None)
             if self.error is None:

@@ -19,7 +19,7 @@ _Record = TypeVar("_Record", bound=msgspec.Struct)
 
 
 def measurements_of(recordings: Iterable[Recording]) -> Iterator[Measurements]:
-    """All measurements in the order in which they were written. Raises RecordingError for what is no record."""
+    """All measurements in the order in which they were written. Raises RecordingError where one does not decode."""
     for recording in recordings:
         for message in recording.messages(READ[:1]):
             yield _record(recording, message, Measurements)
@@ -29,7 +29,7 @@ def recorded_drive(recordings: Iterable[Recording]) -> Iterator[Measurements | E
     """Every estimate that rests on measurements, after its Measurements where the recording has them.
 
     The files of one run in their order. Estimates of frames that nobody measured in time (PERCEPTION_LATE) are left
-    out, as in a run's results. Raises RecordingError for what is no record.
+    out, as in a run's results. Raises RecordingError where one does not decode.
     """
     for recording in recordings:
         waiting: deque[Estimate | MapUpdate] = deque()

@@ -52,7 +52,7 @@ _Part = TypeVar("_Part", bound=msgspec.Struct)
 
 
 class RecordingError(ValueError):
-    """A file that is no recording, or lacks what is asked of it; names the file and says why."""
+    """A file that is not a recording, or lacks what is asked for; the message names the file and the reason."""
 
 
 class Latency(msgspec.Struct, frozen=True, kw_only=True):

@@ -299,7 +299,7 @@ def back_end(recording: Recording) -> BackEnd:
 
 
 def estimates(recording: Recording, config: BackEnd) -> Iterator[Measurements | Estimate | MapUpdate]:
-    """What the back end makes of the recorded measurements with another configuration: each after its measurements."""
+    """The estimates of the recorded measurements by another configuration, each after its measurements."""
     graph = PoseGraph(*config)
     for message in recording.messages(("v1/measurements",)):
         measurements = _record(message.data, Measurements)
@@ -313,7 +313,7 @@ def estimates(recording: Recording, config: BackEnd) -> Iterator[Measurements | 
 
 
 def _canonical(record: msgspec.Struct) -> bytes:
-    """The bytes of the record as whoever received it would send it on."""
+    """The record's bytes as its receiver would encode them again."""
     return encode(decode(encode(record), type(record)))
 
 

@@ -31,7 +31,7 @@ def write_g2o(recording: Recording, config: BackEnd, path: Path) -> None:
 
 
 def write_results(recording: Recording, config: BackEnd, output: Path, smooth: bool, video_file: Path | None) -> None:
-    """Writes what the back end makes of the recorded measurements into the folder `output`.
+    """Writes the results of the recorded measurements into the folder `output`.
 
     `smooth`: the final trajectories too. Raises RecordingError, ResultsError.
     """

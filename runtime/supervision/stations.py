@@ -42,7 +42,7 @@ class Duty:
 
 
 class Intake:
-    """Whether a node takes in what is sent to it: one whose heartbeat goes on may have lost its input.
+    """Whether a node takes in what is sent to it: with its heartbeat intact it may have lost its input.
 
     Stale input is another thing: nothing was sent then.
     """

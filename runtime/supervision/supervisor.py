@@ -42,7 +42,7 @@ class Supervisor:
         files: RecordingFiles | None = None,
         frames: int | None = None,
     ) -> None:
-        """`frames` is how many the source has, for the time to go; None where nobody knows."""
+        """`frames` is how many the source has, for the time to go; None where it is unknown."""
         self.failure = ""
         self.exit_status = 0
         self._config = configuration

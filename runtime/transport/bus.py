@@ -99,7 +99,7 @@ class Bus(Closing):
         ask_aside(self._session, key_of(self.vehicle, topic), subscriber._receive_retained)
 
     def retained(self, topic: str, timeout_s: float = REPLY_S) -> list[Message]:
-        """The topic's retained messages (Topic.retained), oldest first; empty where nobody answers in time.
+        """The topic's retained messages (Topic.retained), oldest first; empty where no reply comes in time.
 
         Raises BusError where one is no such record.
         """
@@ -111,7 +111,7 @@ class Bus(Closing):
             raise BusError(f"{topic}: a retained message is malformed: {error}") from error
 
     def query(self, name: str, timeout_s: float = REPLY_S, **parameters: float) -> list[Any]:
-        """The parts of the reply to one of topology.QUERIES, in order; empty where nobody answers in time.
+        """The parts of the reply to one of topology.QUERIES, in order; empty where no reply comes in time.
 
         Raises BusError with the reason where the query is refused, or where the reply is incomplete or malformed.
         """
@@ -168,7 +168,7 @@ class Bus(Closing):
             raise BusClosed(f"the bus of vehicle {self.vehicle!r} is closed")
 
     def close(self) -> None:
-        """Leaves the bus and wakes whoever waits on it, with BusClosed; a second call does nothing."""
+        """Leaves the bus; waiting calls raise BusClosed. A second call does nothing."""
         with self._alive_changed:
             if self._closed:
                 return

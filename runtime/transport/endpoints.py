@@ -95,7 +95,7 @@ class Publisher:
         return bool(self._matched) and not self._closed
 
     def wait_matched(self, timeout_s: float) -> bool:
-        """Waits until somebody subscribes; False where nobody did in time. Raises BusClosed."""
+        """Waits for a first subscriber; False where none came in time. Raises BusClosed."""
         with self._changed:
             matched = self._changed.wait_for(lambda: self._closed or self.matched, timeout_s)
         if self._closed:
@@ -185,7 +185,7 @@ class Subscriber:
             return self._queue.popleft() if self._queue else None
 
     def close(self) -> None:
-        """Ends the subscription; whoever waits in recv gets BusClosed. A second call does nothing."""
+        """Ends the subscription; a waiting recv raises BusClosed. A second call does nothing."""
         with self._arrived:
             if self._closed:
                 return

@@ -107,7 +107,7 @@ class VehicleLock(Closing):
 
 
 def _remove_dead_sockets(directory: Path) -> None:
-    """Removes the sockets on which nobody listens any more; a process that outlived its supervisor keeps its own."""
+    """Removes sockets without a listener; a process that outlived its supervisor keeps its own."""
     for path in directory.glob("*.sock"):
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
             try:

@@ -44,7 +44,7 @@ def ask_aside(session: zenoh.Session, key: str, callback: Callable[[zenoh.Reply]
 def whole_reply(
     session: zenoh.Session, vehicle: str, name: str, timeout_s: float, parameters: Mapping[str, float]
 ) -> list[Any]:
-    """The parts of a vehicle's reply to one of topology.QUERIES, in order; empty where nobody answers in time.
+    """The parts of a vehicle's reply to one of topology.QUERIES, in order; empty where no reply comes in time.
 
     Raises BusError with the reason where the query is refused, or where the reply is incomplete or malformed.
     """

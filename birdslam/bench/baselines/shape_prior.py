@@ -59,7 +59,7 @@ class Initialised:
 
 
 def fitted(log: Sequence[Measurements], camera: Camera, config: ShapePriorConfig | None = None) -> list[Measurements]:
-    """The log with each CV edge's pose, sizes and covariance by the wireframe; one that fits nowhere stays as it is."""
+    """The log with each CV edge's pose, sizes and covariance by the wireframe; one without a fit is kept as it is."""
     edges = [edge for m in log for edge in m.cv]
     if not edges:
         return list(log)

@@ -122,7 +122,7 @@ class Motions:
         return found
 
     def _chain(self, first: int, last: int) -> Estimate | None:
-        """What the pose graph makes of the motions alone between two frames; None where one has no motion."""
+        """The motion between two frames by the edges' motions alone; None where one has none."""
         moved = [self._moved.get(frame) for frame in range(first + 1, last + 1)]
         graph, end = PoseGraph(GraphConfig(), WeightsConfig()), None
         for frame, link in enumerate(moved, first):

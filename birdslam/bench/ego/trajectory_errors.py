@@ -103,7 +103,7 @@ def scale_error(truth: Transform, estimated: Transform) -> float | None:
 
 
 def standing_drift_m(truth: Transform, estimated: Transform) -> float | None:
-    """The farthest that the estimate strays from where it was when the car came to stand; None: it never does."""
+    """The largest distance of the estimate from its place when the car stopped; None: it never stops."""
     goal, points = truth[:, :3, 3], estimated[:, :3, 3]
     drift, first = None, 0
     while first < len(goal):

@@ -196,7 +196,7 @@ class _Camera:
         return EgoEdge(from_frame=before, to_frame=frame, T_from_to=T, cov=cov)
 
     def _vehicle_edge(self, vehicle: int, frame: int, seen: Floats) -> VehicleEdge:
-        """Noise is longest along the line of sight; its axes are those of the pose as it is measured."""
+        """Noise is largest along the line of sight; its axes are those of the measured pose."""
         config, rng = self.config, self._rng
         far_m = float(np.hypot(seen[0], seen[1]))
         sigmas = np.array([config.sigma_cv_m + config.sigma_cv_rel * far_m, config.sigma_cv_m, config.sigma_cv_rad])

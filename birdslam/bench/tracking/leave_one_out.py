@@ -19,7 +19,7 @@ MOST = 25.0  # squared Mahalanobis distance of a car, at the most: five sigma
 
 
 class LeftOut(msgspec.Struct, frozen=True, kw_only=True):
-    """One constant and one sequence: what the others chose, and the depth error (median) by it and as it is."""
+    """One constant and one sequence: the others' choice, and the median depth error by it and by the present value."""
 
     key: str
     sequence: str

@@ -60,7 +60,7 @@ class BatchTiming:
 
 @dataclass(frozen=True)
 class Timing:
-    """The live graph over so many frames, and the batches of odometry of unknown scale and of metric odometry."""
+    """The live graph over `frames` frames, and the batches of odometry of unknown scale and of metric odometry."""
 
     frames: int
     incremental_s: float

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Runs what is not done yet, and says where the report is."""
+    """Runs the drives that are not done yet, and prints where the report is."""
     output = Path(options.output)
     overrides, models = overrides_of(options)
     overrides.pop("output", None)

@@ -15,7 +15,7 @@ from birdslam.sources.schemes import written
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The drive, and what is known of its camera."""
+    """The drive, and its camera where one is known."""
     parser.add_argument("source", metavar="SOURCE", help=f"a KITTI directory, or {written(recorded_schemes())}")
     parser.add_argument("--output", required=True, metavar="CAMERA.toml", help="the camera file to write")
     lens = parser.add_mutually_exclusive_group()

@@ -16,7 +16,7 @@ from birdslam.runtime.replay.results import changed_back_end, write_g2o, write_r
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The recording, and what is made of it; nothing: a comparison."""
+    """The recording, and the results to make of it; without any, it is compared."""
     parser.add_argument("recording", type=Path, metavar=RECORDING)
     text = "with another back end (method, slam.graph.*, slam.weights.*): nothing is compared, results are written"
     add_settings(parser, text)
