@@ -136,6 +136,12 @@ class Run:
         ring = ring_path(self.vehicle, self.runtime_dir)
         return [*(self.runtime_dir / self.vehicle).glob("*.sock*"), *ring.parent.glob(f"{ring.name}*")]
 
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self.kill()
+
     def kill(self) -> None:
         if self.process.poll() is None:
             self.process.kill()
@@ -315,8 +321,7 @@ def test_a_slow_reader_costs_dropped_frames_that_are_counted(drive: Path, place:
 
 
 def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None:
-    run = Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true")
-    try:
+    with Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true") as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             first, second = planner.wait(LIMIT_S), planner.wait(LIMIT_S)
             assert first is not None
@@ -362,13 +367,10 @@ def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None
         summary = run.summary()
         assert summary["ended"] == "SIGINT"
         assert len((run.output / "ego.kitti.txt").read_text().splitlines()) == summary["frames_in"]
-    finally:
-        run.kill()
 
 
 def test_without_restarts_a_killed_node_ends_the_run_with_its_name(drive: Path, place: Path) -> None:
-    run = Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true", "--set", "runtime.restart=never")
-    try:
+    with Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true", "--set", "runtime.restart=never") as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             assert planner.wait(LIMIT_S) is not None
         os.kill(run.node_pid("perceive"), signal.SIGKILL)
@@ -377,13 +379,10 @@ def test_without_restarts_a_killed_node_ends_the_run_with_its_name(drive: Path, 
         assert err.startswith("birdslam: perceive was killed by SIGKILL")
         assert err.count("\n") == 1
         assert run.summary()["frames_processed"] > 0
-    finally:
-        run.kill()
 
 
 def test_a_service_is_stopped_in_order(drive: Path, place: Path) -> None:
-    run = Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true")
-    try:
+    with Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true") as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             assert planner.wait(LIMIT_S) is not None
         run.process.send_signal(signal.SIGTERM)
@@ -393,8 +392,6 @@ def test_a_service_is_stopped_in_order(drive: Path, place: Path) -> None:
         assert summary["ended"] == "SIGTERM"
         assert summary["frames_processed"] + summary["frames_dropped"] == summary["frames_in"]
         assert run.left_behind() == []
-    finally:
-        run.kill()
 
 
 def test_a_stalled_node_and_then_a_killed_supervisor(drive: Path, place: Path) -> None:
@@ -402,26 +399,20 @@ def test_a_stalled_node_and_then_a_killed_supervisor(drive: Path, place: Path) -
         *("--source", f"kitti:{drive}", "--set", "source.loop=true"),
         *("--set", "runtime.restart=never"),
     )
-    run = Run(place, *arguments)
-    try:
+    with Run(place, *arguments) as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             assert planner.wait(LIMIT_S) is not None
         run.stall("optimize")
         status, _, err = run.end()
         assert status == 1
         assert err.startswith(f"birdslam: optimize is stalled: its loop has shown no life for {1e3 * LIMIT_S:g} ms")
-    finally:
-        run.kill()
 
-    run = Run(place, *arguments)  # over what the killed node left behind
-    try:
+    with Run(place, *arguments) as run:  # over what the killed node left behind
         with Planner(run.vehicle, run.runtime_dir) as planner:
             assert planner.wait(LIMIT_S) is not None
         nodes = [run.node_pid(name) for name in ("capture", "perceive", "optimize")]
         run.kill()
         wait_gone(nodes)
-    finally:
-        run.kill()
     again = run_all(place, drive, "--rate", "max")
     assert again.summary()["frames_processed"] == FRAMES
     assert again.left_behind() == []
@@ -480,10 +471,9 @@ def test_a_recording_keeps_its_own_time(drive: Path, place: Path) -> None:
 
 
 def test_a_killed_capture_goes_on_in_its_recording(drive: Path, place: Path) -> None:
-    run = Run(
+    with Run(
         place, "--source", f"kitti:{drive}", "--set", "source.loop=true", *UNHURRIED, "--set", "runtime.spares=true"
-    )
-    try:
+    ) as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             before = planner.wait(LIMIT_S)
             while before is None or before.frame_id < 5:
@@ -502,45 +492,40 @@ def test_a_killed_capture_goes_on_in_its_recording(drive: Path, place: Path) -> 
         assert "capture was killed by SIGKILL" in out
         assert run.summary()["restarts"] == {"optimize": 0, "perceive": 0, "capture": 1}
         assert run.left_behind() == []
-    finally:
-        run.kill()
 
 
 def test_degraded_modes_are_reported_and_no_wrong_pose_is_valid(drive: Path, place: Path) -> None:
     """With a budget that nothing can keep, perceive goes down to coasting, and that grows old."""
     budgets = ("capture_ms", "capture_to_perceive_ms", "perceive_ms")
-    run = Run(
-        *(place, "--source", f"kitti:{drive}", "--set", "source.loop=true", *WITH_NETWORKS),
-        *(part for name in budgets for part in ("--set", f"budgets.{name}=0.001")),
-        *("--constant", "degradation.window_frames=2", "--constant", "degradation.coast_divisor=6"),
-        *("--set", "degradation.coast_max_ms=250", "--set", "budgets.end_to_end_ms=60000"),  # optimize has time
-    )
-    try:
-        with (
-            Planner(run.vehicle, run.runtime_dir) as planner,
-            Bus(run.vehicle, "reader", runtime_dir=run.runtime_dir) as bus,
-        ):
-            health = bus.subscriber("health/perceive")
-            seen = []
-            while not seen or Status.COASTED_TOO_LONG not in seen[-1].status:
-                message = planner.wait_message(LIMIT_S)
-                assert message is not None
-                assert message.trace.left_ns is not None
-                assert [stage.node for stage in message.trace.stages] == ["capture", "perceive", "optimize"]
-                seen.append(message.record)
-            assert not seen[-1].valid
-            coasted = [e for e in seen if Status.COASTING in e.status and Status.COASTED_TOO_LONG not in e.status]
-            assert coasted
-            assert seen[-1].cov[0] > coasted[-1].cov[0]
-            assert all(e.valid == INVALIDATING.isdisjoint(e.status) for e in seen)
-            reading = planner.latest(max_age_ms=1e9)
-            assert reading.left_ms is not None
-            assert not reading.usable or reading.estimate != seen[-1]
+    with (
+        Run(
+            *(place, "--source", f"kitti:{drive}", "--set", "source.loop=true", *WITH_NETWORKS),
+            *(part for name in budgets for part in ("--set", f"budgets.{name}=0.001")),
+            *("--constant", "degradation.window_frames=2", "--constant", "degradation.coast_divisor=6"),
+            *("--set", "degradation.coast_max_ms=250", "--set", "budgets.end_to_end_ms=60000"),  # optimize has time
+        ) as run,
+        Planner(run.vehicle, run.runtime_dir) as planner,
+        Bus(run.vehicle, "reader", runtime_dir=run.runtime_dir) as bus,
+    ):
+        health = bus.subscriber("health/perceive")
+        seen = []
+        while not seen or Status.COASTED_TOO_LONG not in seen[-1].status:
+            message = planner.wait_message(LIMIT_S)
+            assert message is not None
+            assert message.trace.left_ns is not None
+            assert [stage.node for stage in message.trace.stages] == ["capture", "perceive", "optimize"]
+            seen.append(message.record)
+        assert not seen[-1].valid
+        coasted = [e for e in seen if Status.COASTING in e.status and Status.COASTED_TOO_LONG not in e.status]
+        assert coasted
+        assert seen[-1].cov[0] > coasted[-1].cov[0]
+        assert all(e.valid == INVALIDATING.isdisjoint(e.status) for e in seen)
+        reading = planner.latest(max_age_ms=1e9)
+        assert reading.left_ms is not None
+        assert not reading.usable or reading.estimate != seen[-1]
+        said = health.recv(LIMIT_S)
+        while said is None or said.record.mode != "coasting":
             said = health.recv(LIMIT_S)
-            while said is None or said.record.mode != "coasting":
-                said = health.recv(LIMIT_S)
-            assert said.record.overruns > 0
-            assert said.record.step.p50_ms > 0.0
-            assert said.record.rss_bytes > 0
-    finally:
-        run.kill()
+        assert said.record.overruns > 0
+        assert said.record.step.p50_ms > 0.0
+        assert said.record.rss_bytes > 0

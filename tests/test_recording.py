@@ -42,7 +42,9 @@ from birdslam.sources.recording import DatasetError
 from birdslam.types import Estimate, Measurements, Status
 from tests.taped_drive import CAMERA, Tape, measured
 from tests.test_bus import until
-from tests.test_pipeline import F_PX, HEIGHT, LIMIT_S, UNHURRIED, WIDTH, Run, call, road_image
+from tests.test_pipeline import HEIGHT, LIMIT_S, UNHURRIED, WIDTH, Run, call, drive
+
+__all__ = ["drive"]  # a fixture
 
 
 @pytest.fixture
@@ -295,19 +297,6 @@ def test_its_images_are_a_source_of_frames(tape: Tape, tmp_path: Path) -> None:
 # --- beside a vehicle: real processes ---
 
 
-@pytest.fixture(scope="module")
-def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small KITTI drive to go round and round."""
-    sequence = tmp_path_factory.mktemp("road") / "sequences" / "78"
-    (sequence / "image_0").mkdir(parents=True)
-    for number in range(12):
-        assert cv2.imwrite(str(sequence / "image_0" / f"{number:06d}.png"), road_image(0.8 * number))
-    row = f"{F_PX} 0 {WIDTH / 2} 0 0 {F_PX} {HEIGHT / 2} 0 0 0 1 0"
-    (sequence / "calib.txt").write_text(f"P0: {row}\n")
-    (sequence / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(12)))
-    return sequence
-
-
 def estimated(recording: Recording) -> list[int]:
     """The frames whose estimates are in it."""
     return [decode(message.data, Estimate).frame_id for message in recording.messages(("v1/estimate",))]
@@ -327,24 +316,23 @@ def drive_on(planner: Planner, frames: int) -> set[int]:
 
 @pytest.mark.processes
 def test_kills_and_restarts_cost_no_bit_and_a_kill_of_everything_leaves_a_file_that_opens(
-    tmp_path_factory: pytest.TempPathFactory, road: Path
+    tmp_path_factory: pytest.TempPathFactory, drive: Path
 ) -> None:
     place = tmp_path_factory.mktemp("k")
     file = place / "k.mcap"
-    run = Run(
-        *(place, "--source", f"kitti:{road}", "--rate", "25", "--set", "source.loop=true"),
-        *("--record", str(file), "--record-images"),
-    )
-    try:
-        with Planner(run.vehicle, run.runtime_dir) as planner:
-            drive_on(planner, 25)
-            os.kill(run.node_pid("optimize"), signal.SIGKILL)
-            heard = drive_on(planner, 60)
-            until(lambda: max(heard) in estimated(Recording(file)), "the disk has what was heard")
-            for pid in (run.node_pid("record"), run.process.pid):
-                os.kill(pid, signal.SIGKILL)
-    finally:
-        run.kill()
+    with (
+        Run(
+            *(place, "--source", f"kitti:{drive}", "--rate", "25", "--set", "source.loop=true"),
+            *("--record", str(file), "--record-images"),
+        ) as run,
+        Planner(run.vehicle, run.runtime_dir) as planner,
+    ):
+        drive_on(planner, 25)
+        os.kill(run.node_pid("optimize"), signal.SIGKILL)
+        heard = drive_on(planner, 60)
+        until(lambda: max(heard) in estimated(Recording(file)), "the disk has what was heard")
+        for pid in (run.node_pid("record"), run.process.pid):
+            os.kill(pid, signal.SIGKILL)
     recording = Recording(file)
     verdict = compare(recording)
     assert verdict.same, verdict.difference
@@ -367,25 +355,24 @@ def test_kills_and_restarts_cost_no_bit_and_a_kill_of_everything_leaves_a_file_t
     ids=["dies", "stalls"],
 )
 def test_a_recorder_that_dies_or_stalls_is_restarted_with_a_new_file(
-    fault: Callable[[Run], None], cause: str, tmp_path_factory: pytest.TempPathFactory, road: Path
+    fault: Callable[[Run], None], cause: str, tmp_path_factory: pytest.TempPathFactory, drive: Path
 ) -> None:
     place = tmp_path_factory.mktemp("r")
     files = [place / "r.mcap", place / "r-2.mcap"]
-    run = Run(
-        *(place, "--source", f"kitti:{road}", "--rate", "25", "--set", "source.loop=true"),
-        *("--record", str(files[0])),
-    )
-    try:
-        with Planner(run.vehicle, run.runtime_dir) as planner:
-            drive_on(planner, 20)
-            fault(run)
-            drive_on(planner, 20)  # it goes on meanwhile
-            until(lambda: files[1].is_file() and files[1].stat().st_size > 0, "its successor writes")
-            drive_on(planner, 40)
-            run.process.send_signal(signal.SIGTERM)
-            status, out, err = run.end()
-    finally:
-        run.kill()
+    with (
+        Run(
+            *(place, "--source", f"kitti:{drive}", "--rate", "25", "--set", "source.loop=true"),
+            *("--record", str(files[0])),
+        ) as run,
+        Planner(run.vehicle, run.runtime_dir) as planner,
+    ):
+        drive_on(planner, 20)
+        fault(run)
+        drive_on(planner, 20)  # it goes on meanwhile
+        until(lambda: files[1].is_file() and files[1].stat().st_size > 0, "its successor writes")
+        drive_on(planner, 40)
+        run.process.send_signal(signal.SIGTERM)
+        status, out, err = run.end()
     assert status == 0, err
     assert f"record {cause}; it is restarted" in out
     assert set(run.summary()["restarts"].values()) == {0}
@@ -407,25 +394,24 @@ def test_a_recorder_that_dies_or_stalls_is_restarted_with_a_new_file(
 
 @pytest.mark.processes
 def test_a_recorder_that_keeps_dying_is_not_restarted_and_the_drive_continues(
-    tmp_path_factory: pytest.TempPathFactory, road: Path
+    tmp_path_factory: pytest.TempPathFactory, drive: Path
 ) -> None:
     place = tmp_path_factory.mktemp("g")
-    run = Run(
-        *(place, "--source", f"kitti:{road}", "--rate", "25", "--set", "source.loop=true"),
-        *("--set", "runtime.restarts_max=1"),
-        *("--record", str(place / "g.mcap")),
-    )
-    try:
-        with Planner(run.vehicle, run.runtime_dir) as planner:
-            for file in ("g.mcap", "g-2.mcap"):
-                until((place / file).is_file, f"{file} is written")
-                drive_on(planner, 15)
-                os.kill(run.node_pid("record"), signal.SIGKILL)
-            drive_on(planner, 40)
-            run.process.send_signal(signal.SIGTERM)
-            status, out, err = run.end()
-    finally:
-        run.kill()
+    with (
+        Run(
+            *(place, "--source", f"kitti:{drive}", "--rate", "25", "--set", "source.loop=true"),
+            *("--set", "runtime.restarts_max=1"),
+            *("--record", str(place / "g.mcap")),
+        ) as run,
+        Planner(run.vehicle, run.runtime_dir) as planner,
+    ):
+        for file in ("g.mcap", "g-2.mcap"):
+            until((place / file).is_file, f"{file} is written")
+            drive_on(planner, 15)
+            os.kill(run.node_pid("record"), signal.SIGKILL)
+        drive_on(planner, 40)
+        run.process.send_signal(signal.SIGTERM)
+        status, out, err = run.end()
     assert status == 0, err
     assert "nothing is recorded any more, the run goes on" in out
     assert run.summary()["recording"]["restarts"] == 1
@@ -433,24 +419,23 @@ def test_a_recorder_that_keeps_dying_is_not_restarted_and_the_drive_continues(
 
 @pytest.mark.processes
 def test_a_full_disk_ends_the_recording_and_the_drive_continues(
-    tmp_path_factory: pytest.TempPathFactory, road: Path
+    tmp_path_factory: pytest.TempPathFactory, drive: Path
 ) -> None:
     place = tmp_path_factory.mktemp("f")
     file = place / "f.mcap"
-    run = Run(
-        *(place, "--source", f"kitti:{road}", "--rate", "25", "--set", "source.loop=true"),
-        *("--record", str(file), *UNHURRIED),
-    )
-    try:
-        with Planner(run.vehicle, run.runtime_dir) as planner:
-            drive_on(planner, 20)
-            limit = file.stat().st_size + 20_000  # no file of its process may grow past it: the write fails
-            resource.prlimit(run.node_pid("record"), resource.RLIMIT_FSIZE, (limit, limit))
-            drive_on(planner, 60)
-            run.process.send_signal(signal.SIGTERM)
-            status, out, err = run.end()
-    finally:
-        run.kill()
+    with (
+        Run(
+            *(place, "--source", f"kitti:{drive}", "--rate", "25", "--set", "source.loop=true"),
+            *("--record", str(file), *UNHURRIED),
+        ) as run,
+        Planner(run.vehicle, run.runtime_dir) as planner,
+    ):
+        drive_on(planner, 20)
+        limit = file.stat().st_size + 20_000  # no file of its process may grow past it: the write fails
+        resource.prlimit(run.node_pid("record"), resource.RLIMIT_FSIZE, (limit, limit))
+        drive_on(planner, 60)
+        run.process.send_signal(signal.SIGTERM)
+        status, out, err = run.end()
     assert status == 0, err
     assert "the recording has ended: File too large" in out
     assert "CUT OFF" in out
@@ -464,6 +449,6 @@ def test_a_full_disk_ends_the_recording_and_the_drive_continues(
     answer = call("replay", str(file))
     assert answer.returncode == 0
     assert "cut off" in answer.stdout
-    answer = call("run", "--source", f"kitti:{road}", "--record", str(file))
+    answer = call("run", "--source", f"kitti:{drive}", "--record", str(file))
     assert answer.returncode == 2
     assert "exists" in answer.stderr
