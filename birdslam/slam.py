@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import overload
+
 import msgspec
 
 from birdslam.frontend import EgoMotion, FrontEnd, FrontEndConfig
@@ -12,7 +14,9 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.mapping.lane_mapper import LaneHead
 from birdslam.perception import Networks, shipped_networks
 from birdslam.perception.completion import shipped_completion
+from birdslam.perception.decoding.detection import Detections
 from birdslam.types import Estimate, Frame, MapUpdate, Measurements
+from birdslam.vehicles.placed_boxes import PlacedBox, place_boxes
 from birdslam.vehicles.placement.pseudolidar import FrustumNetwork
 
 LANES_HZ = 5.0  # default rate of lane detection (`[perceive.schedule]`)
@@ -70,16 +74,31 @@ class BirdSLAM:
         lane_head = LaneHead(completion, every=max(1, round(rate_hz / LANES_HZ)))
         return BirdSLAM(camera, shipped_networks(), config, lane_head=lane_head)
 
-    def step(self, frame: Frame) -> tuple[Measurements, Estimate]:
+    @overload
+    def step(self, frame: Frame) -> tuple[Measurements, Estimate]: ...
+    @overload
+    def step(
+        self, frame: Frame, detections: Detections
+    ) -> tuple[Measurements, Estimate, tuple[PlacedBox | None, ...]]: ...
+    def step(
+        self, frame: Frame, detections: Detections | None = None
+    ) -> tuple[Measurements, Estimate] | tuple[Measurements, Estimate, tuple[PlacedBox | None, ...]]:
         """One undistorted frame: the networks run beside the feature tracking, then the back end.
 
         Frames come in the order of their `frame_id` and `t_source_ns`; motion is computed from the latter. Poses are
         in metres and rad, in the world of `Estimate.epoch` (`types.py` has every frame and unit). Trouble with a frame
-        is a `Status` in both records, and `Estimate.valid` says whether it may be driven by. Raises ValueError for an
-        image of another size than the camera's, never for what it shows.
+        is a `Status` in both records, and `Estimate.valid` says whether it may be driven by. `detections` of another
+        detector (`perception.external.external_detections`) stand in for the network's; then the third of what is
+        returned says where each box is, in their order. Raises ValueError for an image of another size than the
+        camera's, never for what it shows.
         """
-        measurements = self.frontend.measure(frame, self.networks.start(frame.frame_id, frame.image))
-        return measurements, self.graph.optimise(measurements)
+        pending = self.networks.start(frame.frame_id, frame.image, detections=detections)
+        measurements = self.frontend.measure(frame, pending)
+        estimate = self.graph.optimise(measurements)
+        if detections is None:
+            return measurements, estimate
+        tracks = self.frontend.vehicles.tracker.tracks
+        return measurements, estimate, place_boxes(len(detections), frame.frame_id, tracks, estimate)
 
     def map_update(self) -> MapUpdate | None:
         """The map's new points since the last call, in world: landmarks that left the window, and points of lanes.

@@ -255,7 +255,7 @@ def _anchor_paths(tree: dict[str, Any], base: Path) -> None:
             anchor(spec, "path")
         if isinstance(spec, dict) and str(spec.get("manifest", "")).endswith(".toml"):  # else a shipped one's name
             anchor(spec, "manifest")
-    anchor(tree.get("source"), "speed", "odometry")
+    anchor(tree.get("source"), "speed", "odometry", "detections")
     source = tree.get("source")
     if isinstance(source, dict) and isinstance(source.get("uri"), str):
         scheme, address = scheme_of(source["uri"], all_schemes()), source["uri"].partition(":")[2]

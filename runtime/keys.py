@@ -78,6 +78,8 @@ GROUPS = (
             "models.bodies": "Does the multi-task network look beside another detector, for the depth, length and yaw "
             "of the vehicles that this one finds?",
             "models.completion": "Are lanes completed where something hid the road (ENet)?",
+            "source.detections": "Which file has another detector's boxes, in place of a network's? MOT, KITTI "
+            'tracking or COCO results; "": none',
             "runtime.models_dir": 'Where do installed networks lie? "": in the user\'s own folder',
         },
     ),

@@ -6,7 +6,7 @@ from birdslam.sources import schemes as recorded
 from birdslam.sources.schemes import Scheme
 
 OF_A_CAMERA = ("reopen_ms", "camera_timeout_s")
-OF_RECORDINGS = ("speed", "odometry")  # files beside one, which no live camera has
+OF_RECORDINGS = ("speed", "odometry", "detections")  # files beside one, which no live camera has
 
 MCAP = Scheme(
     name="mcap",

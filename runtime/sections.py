@@ -26,6 +26,7 @@ class SourceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     speed: str = ""  # FILE of the car's own speed over a recording: lines of time in s, speed in m/s; "": none
     # FILE of another odometry over a recording, in place of the images': TUM lines or KITTI rows, metric; "": none
     odometry: str = ""
+    detections: str = ""  # FILE of another detector's boxes over a recording: MOT, KITTI tracking or COCO; "": none
     topics: BagTopics = BagTopics()  # of a ROS bag
     frames: PositiveInt | None = None  # end after so many; None: all
     loop: bool = False  # a recording begins anew at its end

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -23,7 +23,9 @@ CARRIED: dict[Role, Status] = {
     "depth": Status.DEPTH_CARRIED,
 }
 FIELDS: dict[Role, str] = {"detector": "detections", "segmenter": "segmentation", "depth": "depth"}  # of `Perception`
+BESIDE_BOXES: tuple[Role, ...] = ("segmenter", "depth")  # what networks look for where the boxes are another detector's
 ROLES: dict[Role, tuple[Role, ...]] = {"multitask": ("detector", "segmenter", "depth")}  # others fill their own
+NO_DETECTIONS = Detections(np.zeros((0, 4)), np.zeros(0), ())
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,28 @@ class Ready:
 
     def result(self) -> Perception:
         return self.perception
+
+
+@dataclass(frozen=True)
+class WithDetections:
+    """A pending perception whose boxes are another detector's, of the frame itself.
+
+    Without `depth` no depth map is used: that of a network of several roles is its detector's (`Networks.bodies`).
+    """
+
+    pending: Pending
+    detections: Detections
+    frame_id: int
+    depth: bool
+
+    def result(self) -> Perception:
+        perception = self.pending.result()
+        status = tuple(each for each in perception.status if each is not CARRIED["detector"])
+        found = replace(perception, detections=self.detections, status=status, awaited_from=self.frame_id + 1)
+        if self.depth:
+            return replace(found, ages=perception.ages | {"detector": 0})
+        ages = {name: age for name, age in perception.ages.items() if name != "depth"}
+        return replace(found, depth=None, ages=ages | {"detector": 0})
 
 
 class Head(Protocol):
@@ -126,6 +150,7 @@ class Networks:
         patience_s: float | None = None,
         bodies: bool = False,
         boxes_alone: Callable[[NDArray[np.uint8]], Findings | None] | None = None,
+        detections: Mapping[int, Detections] | None = None,
     ) -> None:
         for key in ("name", "role"):
             values = [getattr(head, key) for head in heads]
@@ -138,6 +163,7 @@ class Networks:
         self._patience_s = patience_s
         self._bodies = bodies
         self._boxes_alone = boxes_alone
+        self._detections = detections
         own = {head.role for head in heads}
         self._slots = [
             _Slot(
@@ -149,8 +175,14 @@ class Networks:
         self.slowdown = self.masks_every = 1
         self.looks = 0  # frames on which a head was begun
 
-    def start(self, frame_id: int, image: NDArray[np.uint8] | None, only: Collection[Role] | None = None) -> Pending:
-        """Starts the heads that are due, of the roles in `only` (None: all).
+    def start(
+        self,
+        frame_id: int,
+        image: NDArray[np.uint8] | None,
+        only: Collection[Role] | None = None,
+        detections: Detections | None = None,
+    ) -> Pending:
+        """Starts the heads that are due, of the roles in `only` (None: all). `detections` are another detector's.
 
         `result()` of what is returned is to be asked for once, before the next start. The image must stay as it is
         while a head may read it. None (no pixels in this frame) starts nothing. A frame_id that doesn't grow is a
@@ -159,6 +191,10 @@ class Networks:
         if frame_id <= self._last_frame:
             self._slots = [_Slot(s.head, s.fills, s.running, outdated=s.running is not None) for s in self._slots]
         self._last_frame = frame_id
+        if detections is None and self._detections is not None:
+            detections = self._detections.get(frame_id, NO_DETECTIONS)
+        if detections is not None:
+            only = BESIDE_BOXES if only is None else tuple(role for role in only if role in BESIDE_BOXES)
         begun = False
         for slot in self._slots:
             every = slot.head.schedule.every * self.slowdown
@@ -169,7 +205,10 @@ class Networks:
                 slot.running = self._submit(self._begin(slot, frame_id), image)
                 begun = True
         self.looks += begun
-        return _Started(self, frame_id)
+        pending = _Started(self, frame_id)
+        if detections is None:
+            return pending
+        return WithDetections(pending, detections, frame_id, depth=any(head.role == "depth" for head in self.heads))
 
     def _begin(self, slot: _Slot, frame_id: int) -> Callable[[NDArray[np.uint8]], Findings | None]:
         """What is to run for a slot."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,6 +46,21 @@ def predicted_boxes_px(
     rows = horizon_now[:, 1, None] + (last[:, [1, 3]] - horizon_then[:, 1, None]) * scale[:, None]
     boxes[ahead] = np.column_stack([horizon_now[:, 0] - half_px, rows[:, 0], horizon_now[:, 0] + half_px, rows[:, 1]])
     return boxes
+
+
+def with_track_ids(observations: Sequence[Observation], track_ids: NDArray[np.int64]) -> list[Observation]:
+    """Those that another tracker follows, with its ids; `track_ids` has one for each box, negative: of no track."""
+    return [
+        msgspec.structs.replace(seen, track_id=int(track_ids[seen.row]))
+        for seen in observations
+        if track_ids[seen.row] >= 0
+    ]
+
+
+def by_track_id(tracks: Sequence[Track], observations: Sequence[Observation]) -> list[tuple[int, int]]:
+    """(row of a track, its observation) as another tracker has associated them."""
+    rows = {track.observation.track_id: row for row, track in enumerate(tracks)}
+    return [(rows[seen.track_id], k) for k, seen in enumerate(observations) if seen.track_id in rows]
 
 
 def within_gate(

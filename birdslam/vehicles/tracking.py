@@ -17,7 +17,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.perception import DepthMap, Detections
 from birdslam.types import MotionEdge
-from birdslam.vehicles.association import predicted_boxes_px, within_gate
+from birdslam.vehicles.association import by_track_id, predicted_boxes_px, with_track_ids, within_gate
 from birdslam.vehicles.placement.depth_fusion import DepthPlace, PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import LocalisationConfig, Observation, Place, iou, observe_boxes
 from birdslam.vehicles.placement.pseudolidar import FrustumNetwork, locate_by_depth
@@ -87,6 +87,8 @@ class Tracker:
             detections.edge_sigma,
             detections.lower_edge,
         )
+        if detections.track_ids is not None:
+            observations = with_track_ids(observations, detections.track_ids)
         observations, by_depth = locate_by_depth(
             observations,
             detections,
@@ -153,6 +155,8 @@ class Tracker:
         """(row of a track, its observation): least cost, 1 - IoU of predicted and seen box, within the gates."""
         if not self.tracks or not observations:
             return []
+        if observations[0].track_id is not None:
+            return by_track_id(self.tracks, observations)
         overlap = iou(
             predicted_boxes_px(self.tracks, self.camera, T_world_ego, self.ground_size.ground),
             np.array([o.box_px for o in observations]),
@@ -271,6 +275,8 @@ class Tracker:
             if track.frame.frame_id == frame.frame_id and track.hits >= self.config.confirm_hits
         ]
         for track in seen_now:
-            if track.vehicle < 0:
+            if track.vehicle < 0 and track.observation.track_id is not None:
+                track.vehicle = track.observation.track_id
+            elif track.vehicle < 0:
                 track.vehicle, self._next_id = self._next_id, self._next_id + 1
         return sorted(seen_now, key=lambda track: track.vehicle)

@@ -31,6 +31,12 @@ def add_other_odometry(parser: argparse.ArgumentParser, metavar: str) -> None:
     parser.add_argument("--odometry", dest="other_odometry", metavar=metavar, help=text)
 
 
+def add_detections(parser: argparse.ArgumentParser) -> None:
+    """Boxes of another detector in place of a network's."""
+    text = "another detector's boxes over a recording: MOT challenge text, KITTI tracking text, or COCO results"
+    parser.add_argument("--detections", metavar="FILE", help=text)
+
+
 def add_speeds(parser: argparse.ArgumentParser) -> None:
     """The car's own speed, of one drive or of several."""
     parser.add_argument("--speed", metavar="FILE|DIR", help="the car's own speed; DIR: NAME.txt of each sequence")

@@ -10,12 +10,13 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.mapping.lane_mapper import LaneHead
-from birdslam.perception import Networks, Perception, Ready, load_network
+from birdslam.perception import Detections, Networks, Perception, Ready, load_network
 from birdslam.perception.completion import GridCompletion, shipped_completion
 from birdslam.perception.manifest import Role
 from birdslam.perception.pointnet import PointNet, load_pointnet
@@ -26,6 +27,7 @@ from birdslam.runtime.nodes.look_rate import Cost, LookRate, measure, threads_of
 from birdslam.runtime.process import realtime
 from birdslam.runtime.process.cores import usable_cores
 from birdslam.runtime.transport.closing import Closing
+from birdslam.sources.detection_file import read_detection_file
 from birdslam.types import Frame
 
 Run = Callable[..., Any]
@@ -37,6 +39,12 @@ BOXES = "boxes alone"  # such a look, among what is measured
 LANES_SPARING = 2  # lanes are found half as often at the least: a run takes the interpreter 20 ms from the frames
 
 log = logging.getLogger(__name__)
+
+
+def source_detections(configuration: Configuration) -> dict[int, Detections] | None:
+    """Frame -> another detector's boxes of the file that is configured; None: there is none. Raises DatasetError."""
+    file = configuration.source.detections
+    return read_detection_file(Path(file).expanduser()) if file else None
 
 
 class Inference(Closing):
@@ -56,7 +64,11 @@ class Inference(Closing):
         pointnet = configuration.models.pointnet
         unread = UNREAD_WITH_BODIES if pointnet is None else ()
         chosen = any(spec.every is not None for spec in specs.values())  # by the user: nothing is to be adapted
-        apart = APART if self._adapts and not chosen and not {"detector", "segmenter"} & specs.keys() else ()
+        boxes = source_detections(configuration)
+        if boxes is not None:
+            specs.pop("detector", None)
+        whole = boxes is not None or chosen or bool({"detector", "segmenter"} & specs.keys())
+        apart = APART if self._adapts and not whole else ()
         heads = [load_network(role, spec, most_threads, unread, apart) for role, spec in specs.items()]
         self._specs = specs
         self._lanes_every = schedule.lanes.every or 1
@@ -83,7 +95,12 @@ class Inference(Closing):
         self._frame_over = threading.Event()
         patience_s = None if self._deadline_ns is None else 0.0
         self.networks = Networks(
-            heads, self._submit, patience_s, bodies=configuration.models.bodies, boxes_alone=self._boxes_alone
+            heads,
+            self._submit,
+            patience_s,
+            bodies=configuration.models.bodies,
+            boxes_alone=self._boxes_alone,
+            detections=boxes,
         )
 
     def _submit(self, run: Run, *arguments: Any) -> Future[Any]:

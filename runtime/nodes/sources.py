@@ -16,6 +16,7 @@ from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.ros.bag import BagTopics
 from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig
 from birdslam.runtime.schemes import all_schemes, recorded_schemes
+from birdslam.sources.detection_file import check_detections
 from birdslam.sources.odometry_file import check_odometry
 from birdslam.sources.opening import open_address
 from birdslam.sources.recording import RecordedFrame, Recording, undistorted
@@ -27,6 +28,7 @@ from birdslam.types import Frame, Status
 REFUSALS = {  # key -> why a live camera may refuse it
     "speed": "a speed file is for recordings; live the car says it on the bus",
     "odometry": "an odometry file is for recordings",
+    "detections": "a file of boxes is for recordings",
 }
 
 log = logging.getLogger(__name__)
@@ -66,7 +68,7 @@ def open_source(configuration: Configuration, must_open: bool = True) -> Source:
         return _open_camera(scheme, configuration, must_open)
     speeds = Path(source.speed).expanduser() if source.speed else None
     recording = open_address(scheme, address, configuration.camera, source.stride, speeds, source.topics)
-    _check_odometry(recording, source)
+    _check_beside(recording, source)
     return RecordedSource(recording, source)
 
 
@@ -115,11 +117,13 @@ def _open_camera(scheme: Scheme, configuration: Configuration, must_open: bool) 
     return camera
 
 
-def _check_odometry(recording: Recording, source: SourceConfig) -> None:
-    if source.odometry and source.loop:
-        raise ConfigurationError(f"{source.odometry}: an odometry file is of one way through the recording: no loop")
-    if source.odometry:
-        check_odometry(recording, of_sequence(Path(source.odometry).expanduser(), recording.name), source.stride)
+def _check_beside(recording: Recording, source: SourceConfig) -> None:
+    """Raises ConfigurationError or DatasetError where odometry or boxes of a file can't be of this recording."""
+    for file, check in ((source.odometry, check_odometry), (source.detections, check_detections)):
+        if file and source.loop:
+            raise ConfigurationError(f"{file}: is of one way through the recording: no loop")
+        if file:
+            check(recording, of_sequence(Path(file).expanduser(), recording.name), source.stride)
 
 
 class RecordedSource:

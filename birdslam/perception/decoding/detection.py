@@ -32,7 +32,8 @@ class Detections:
     """Boxes (N, 4) x1, y1, x2, y2 in pixels of the undistorted image, scores (N,) in [0, 1] falling, labels.
 
     `boxes3d` holds a body for each box, where the network knows of bodies. `edge_sigma` says how sure their edges are;
-    None: the network does not say. `lower_edge` is as of `manifest.DetectorTable`.
+    None: the network does not say. `lower_edge` is as of `manifest.DetectorTable`. `track_ids` (N,) are another
+    tracker's, negative where it follows none; None: tracks are ours.
     """
 
     boxes_px: NDArray[np.float64]
@@ -41,6 +42,7 @@ class Detections:
     boxes3d: Boxes3d | None = None
     edge_sigma: EdgeSigma | None = None
     lower_edge: LowerEdge = "body"
+    track_ids: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -50,7 +52,15 @@ class Detections:
         keep = [i for i, label in enumerate(self.labels) if label in labels]
         bodies = None if self.boxes3d is None else self.boxes3d.take(keep)
         labels_kept = tuple(self.labels[i] for i in keep)
-        return replace(self, boxes_px=self.boxes_px[keep], scores=self.scores[keep], labels=labels_kept, boxes3d=bodies)
+        ids = None if self.track_ids is None else self.track_ids[keep]
+        return replace(
+            self,
+            boxes_px=self.boxes_px[keep],
+            scores=self.scores[keep],
+            labels=labels_kept,
+            boxes3d=bodies,
+            track_ids=ids,
+        )
 
 
 @dataclass(frozen=True)

@@ -98,6 +98,7 @@ class Observation(msgspec.Struct, frozen=True):
     sigma_cut: float | None = None  # of slope_bottom where the image cuts the bottom off: the true one is no less
     row: int = 0  # of its box among those that it was observed in
     on_tyres: bool = False  # the bottom is that of the tyres, and not of the nearest face (tyre_contact.py)
+    track_id: int | None = None  # of another tracker's track, whose associations are kept
 
     @property
     def bearing(self) -> float:

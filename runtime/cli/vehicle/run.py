@@ -7,7 +7,14 @@ from pathlib import Path
 
 import msgspec
 
-from birdslam.runtime.cli.arguments import add_final_results, add_lens, add_other_odometry, add_pipeline, add_topics
+from birdslam.runtime.cli.arguments import (
+    add_detections,
+    add_final_results,
+    add_lens,
+    add_other_odometry,
+    add_pipeline,
+    add_topics,
+)
 from birdslam.runtime.cli.commands import sources_note
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.options import configuration_of
@@ -27,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_final_results(parser)
     parser.add_argument("--speed", metavar="FILE", help="the car's own speed over a recording: time in s, speed in m/s")
     add_other_odometry(parser, "FILE")
+    add_detections(parser)
     add_topics(parser, "speed")
     text = "the camera's height over the road: without --camera a first pass over a film finds the rest"
     parser.add_argument("--height", type=float, metavar="M", help=text)

@@ -1,0 +1,50 @@
+"""Norfair's `Detection` and `TrackedObject` in, and our metres in their `.data`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from birdslam.geometry.camera import Camera
+from birdslam.perception.decoding.detection import Detections
+from birdslam.perception.external import external_detections
+from birdslam.vehicles.placed_boxes import PlacedBox
+
+KEY = "birdslam"  # in a detection's data
+
+
+def from_norfair(objects: Sequence[Any], distorted: Camera | None = None) -> Detections:
+    """Boxes of `norfair.Detection` (points (2, 2): two corners), or of `norfair.TrackedObject`, whose ids are kept.
+
+    In the same order. `distorted` is as of `external_detections`. Raises ValueError for what is no box.
+    """
+    boxes, scores, ids = [], [], []
+    for each in objects:
+        detection = getattr(each, "last_detection", each)
+        points = np.asarray(detection.points, np.float64)
+        if points.shape != (2, 2):
+            raise ValueError(f"norfair: a box has two corners (2, 2), this has points {points.shape}")
+        boxes.append(np.concatenate([points.min(axis=0), points.max(axis=0)]))
+        scores.append(1.0 if detection.scores is None else float(np.mean(detection.scores)))
+        number = getattr(each, "id", None)
+        ids.append(-1 if number is None else int(number))
+    labels = [str(each.label) for each in objects]
+    return external_detections(boxes, labels, scores, ids if any(i >= 0 for i in ids) else None, distorted=distorted)
+
+
+def add_metres(objects: Sequence[Any], placed: Sequence[PlacedBox | None]) -> None:
+    """Puts the `PlacedBox` of each, or None, into `data["birdslam"]` of its detection.
+
+    Raises ValueError for other boxes than these, and where the data is something else than a dict.
+    """
+    if len(placed) != len(objects):
+        raise ValueError(f"norfair: {len(placed)} places for {len(objects)} boxes")
+    for each, place in zip(objects, placed, strict=True):
+        detection = getattr(each, "last_detection", each)
+        if detection.data is None:
+            detection.data = {}
+        if not isinstance(detection.data, dict):
+            raise ValueError(f"norfair: data is a {type(detection.data).__name__}; a dict takes the places")
+        detection.data[KEY] = place

@@ -1,0 +1,65 @@
+"""Detections of somebody else's detector or tracker, in place of a network's."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.perception.decoding.detection import Detections, EdgeSigma
+from birdslam.perception.manifest import LowerEdge
+
+
+def external_detections(
+    boxes_px: ArrayLike,
+    labels: tuple[str, ...] | list[str],
+    scores: ArrayLike | None = None,
+    track_ids: ArrayLike | None = None,
+    *,
+    distorted: Camera | None = None,
+    edge_sigma: EdgeSigma | None = None,
+    lower_edge: LowerEdge = "body",
+) -> Detections:
+    """Boxes (N, 4) x1, y1, x2, y2 in px with a label each, for `BirdSLAM.step`; they keep their order.
+
+    `scores` (N,) in [0, 1], 1 where left out. `track_ids` (N,) are another tracker's, which are kept; a negative one is
+    of no track yet. `distorted`: the boxes were drawn on this camera's images as they come, not on undistorted ones.
+    `edge_sigma` is the 1-sigma of their edges, where it was measured. Raises ValueError for numbers that are none.
+    """
+    boxes = np.asarray(boxes_px, np.float64).reshape(-1, 4) if np.size(boxes_px) else np.zeros((0, 4))
+    count = len(boxes)
+    sure = np.ones(count) if scores is None else np.asarray(scores, np.float64).reshape(-1)
+    ids = None if track_ids is None else np.asarray(track_ids).reshape(-1)
+    for name, found in (
+        ("labels", len(labels)),
+        ("scores", len(sure)),
+        ("track_ids", count if ids is None else len(ids)),
+    ):
+        if found != count:
+            raise ValueError(f"{name}: {found} for {count} boxes")
+    if not (np.isfinite(boxes).all() and (boxes[:, :2] <= boxes[:, 2:]).all()):
+        raise ValueError("boxes need to be finite, with x1 <= x2 and y1 <= y2")
+    if not ((sure >= 0.0) & (sure <= 1.0)).all():
+        raise ValueError("scores need to be in [0, 1]")
+    if ids is not None:
+        known = ids[ids >= 0]
+        if not np.issubdtype(ids.dtype, np.integer) or len(np.unique(known)) < len(known):
+            raise ValueError("track_ids need to be integers, each once in an image")
+        ids = ids.astype(np.int64)
+    if distorted is not None:
+        boxes = undistort_boxes(distorted, boxes)
+    return Detections(boxes, sure, tuple(labels), None, edge_sigma, lower_edge, ids)
+
+
+def undistort_boxes(camera: Camera, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Boxes (N, 4) of the camera's own images as they are in undistorted ones: by the middles of their sides."""
+    if not (camera.distortion and len(boxes_px)):
+        return boxes_px
+    x1, y1, x2, y2 = boxes_px.T
+    x, y = (x1 + x2) / 2.0, (y1 + y2) / 2.0
+    middles = np.stack([np.column_stack(side) for side in ((x1, y), (x, y1), (x2, y), (x, y2))], axis=1)
+    undistort = cv2.fisheye.undistortPoints if camera.fisheye else cv2.undistortPoints
+    K, lens = camera.K, np.array(camera.distortion)
+    straight = undistort(middles.reshape(-1, 1, 2), K, lens, P=K).reshape(-1, 4, 2)
+    return np.stack([straight[:, 0, 0], straight[:, 1, 1], straight[:, 2, 0], straight[:, 3, 1]], axis=1)

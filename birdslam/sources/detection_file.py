@@ -1,0 +1,157 @@
+"""Boxes of another detector or tracker over a recording, as a file: MOT challenge, KITTI tracking, or COCO results.
+
+- MOT challenge text: `frame,id,left,top,width,height,score,...`, frames from 1, id -1 where nothing was tracked. It
+  says no class: all are cars.
+- KITTI tracking text: `frame id type truncated occluded alpha x1 y1 x2 y2 ...` by blanks, frames from 0; a score in the
+  18th column.
+- COCO results: a JSON list of {"image_id", "category_id", "bbox": [left, top, width, height], "score"}, and "track_id"
+  where something was tracked; `image_id` is the frame, from 0, `category_id` that of COCO's 2017 set.
+
+Boxes are in px of the undistorted images. Errors are DatasetError and name the file and the first line that is wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from birdslam.perception.decoding.detection import Detections
+from birdslam.perception.external import external_detections
+from birdslam.sources.recording import DatasetError, Recording
+
+# COCO's category ids of who is on a road; others are boxes without a meaning here
+COCO = {1: "person", 2: "bicycle", 3: "car", 4: "motorcycle", 6: "bus", 8: "truck"}
+KITTI = {"Car": "car", "Van": "van", "Truck": "truck", "Pedestrian": "person", "Person": "person", "Cyclist": "cyclist"}
+_MOST_BYTES = 1 << 30
+_MOT_COLUMNS, _KITTI_COLUMNS, _KITTI_SCORE = 7, 10, 17
+
+
+class _Box(NamedTuple):
+    frame: int
+    track: int  # -1: none
+    label: str
+    box_px: tuple[float, float, float, float]  # x1, y1, x2, y2
+    score: float
+
+
+def read_detection_file(path: Path) -> dict[int, Detections]:
+    """Frame -> its boxes, in the order of the file; a frame without an entry has none. Raises DatasetError."""
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise DatasetError(f"{path}: is larger than {_MOST_BYTES >> 30} GiB")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: can't be read: {getattr(error, 'strerror', None) or 'not UTF-8'}") from None
+    frames: dict[int, list[tuple[str, _Box]]] = {}
+    for where, box in _coco(path, text) if text.lstrip()[:1] in ("[", "{") else _lines(path, text):
+        frames.setdefault(box.frame, []).append((where, box))
+    if not frames:
+        raise DatasetError(f"{path}: holds no boxes")
+    return {frame: _of_frame(path, boxes) for frame, boxes in frames.items()}
+
+
+def check_detections(recording: Recording, path: Path, stride: int = 1) -> None:
+    """Raises DatasetError where the file can't be of this recording: boxes after its end or outside its images."""
+    found = read_detection_file(path)
+    if stride != 1:
+        raise DatasetError(f"{path}: has the boxes of each frame, and every {stride}th is driven")
+    last = max(found)
+    if last >= len(recording):
+        raise DatasetError(f"{path}: has boxes of frame {last}, {recording.name} ends at {len(recording) - 1}")
+    width_px, height_px = recording.camera.width_px, recording.camera.height_px
+    for frame, boxes in found.items():
+        corners = boxes.boxes_px
+        outside = (corners[:, :2] >= (width_px, height_px)).any(axis=1) | (corners[:, 2:] <= 0.0).any(axis=1)
+        if outside.any():
+            box = corners[outside.argmax()].tolist()
+            raise DatasetError(f"{path}: frame {frame} has {box} outside of the image of {width_px}x{height_px} px")
+
+
+def _of_frame(path: Path, boxes: list[tuple[str, _Box]]) -> Detections:
+    found = [box for _, box in boxes]
+    ids = [box.track for box in found]
+    try:
+        return external_detections(
+            [box.box_px for box in found],
+            [box.label for box in found],
+            [box.score for box in found],
+            ids if max(ids) >= 0 else None,
+        )
+    except ValueError as error:
+        raise DatasetError(f"{path}: {boxes[0][0]} to {boxes[-1][0]}: {error}") from None
+
+
+def _lines(path: Path, text: str) -> Iterator[tuple[str, _Box]]:
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            yield f"line {number}", _mot(line.split(",")) if "," in line else _kitti(line.split())
+        except ValueError as error:
+            raise DatasetError(f"{path}: line {number}: {error or 'is no box'}: {line.strip()[:60]!r}") from None
+
+
+def _mot(words: list[str]) -> _Box:
+    if len(words) < _MOT_COLUMNS:
+        raise ValueError(f"has {len(words)} columns, MOT's text has {_MOT_COLUMNS} at the least")
+    frame, track = (_whole(word) for word in words[:2])
+    left, top, width, height, score = (float(word) for word in words[2:_MOT_COLUMNS])
+    if frame < 1:
+        raise ValueError("MOT's frames begin at 1")
+    return _checked(_Box(frame - 1, max(track, -1), "car", (left, top, left + width, top + height), score))
+
+
+def _kitti(words: list[str]) -> _Box:
+    if len(words) < _KITTI_COLUMNS:
+        raise ValueError(f"has {len(words)} columns, KITTI's text has {_KITTI_COLUMNS} at the least")
+    frame, track = _whole(words[0]), _whole(words[1])
+    x1, y1, x2, y2 = (float(word) for word in words[6:_KITTI_COLUMNS])
+    score = float(words[_KITTI_SCORE]) if len(words) > _KITTI_SCORE else 1.0
+    return _checked(_Box(frame, max(track, -1), KITTI.get(words[2], words[2].lower()), (x1, y1, x2, y2), score))
+
+
+def _coco(path: Path, text: str) -> Iterator[tuple[str, _Box]]:
+    try:
+        entries = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{path}: is no JSON: {error}") from None
+    if not isinstance(entries, list):
+        raise DatasetError(f"{path}: COCO's results are a list of boxes")
+    for number, entry in enumerate(entries):
+        try:
+            yield f"entry {number}", _coco_box(entry)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DatasetError(f"{path}: entry {number} is no box of COCO's results: {error}") from None
+
+
+def _coco_box(entry: dict[str, Any]) -> _Box:
+    left, top, width, height = (float(number) for number in entry["bbox"])
+    category = _whole(entry["category_id"])
+    box_px = left, top, left + width, top + height
+    track = _whole(entry.get("track_id", -1))
+    label = COCO.get(category, f"coco {category}")
+    return _checked(_Box(_whole(entry["image_id"]), max(track, -1), label, box_px, float(entry.get("score", 1.0))))
+
+
+def _checked(box: _Box) -> _Box:
+    if box.frame < 0:
+        raise ValueError(f"frame {box.frame} is none")
+    if not all(map(math.isfinite, (*box.box_px, box.score))):
+        raise ValueError("needs finite numbers")
+    if not 0.0 <= box.score <= 1.0:
+        raise ValueError(f"score {box.score:g} is not in [0, 1]")
+    x1, y1, x2, y2 = box.box_px
+    if x2 < x1 or y2 < y1:
+        raise ValueError("its width or height is negative")
+    return box
+
+
+def _whole(number: Any) -> int:
+    """Raises ValueError for what is no whole number."""
+    value = float(number)
+    if not value.is_integer():
+        raise ValueError(f"{number!r} is no whole number")
+    return int(value)

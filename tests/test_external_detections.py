@@ -1,0 +1,290 @@
+"""Another detector's boxes: in a program, from a file, by other libraries' objects, with another tracker's ids."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam import BirdSLAM, Camera, Frame, open_recording
+from birdslam.geometry.camera import GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.integrations import norfair as norfair_adapter
+from birdslam.integrations import supervision as supervision_adapter
+from birdslam.perception import Detections
+from birdslam.perception.external import external_detections, undistort_boxes
+from birdslam.runtime.batch.offline import pipeline
+from birdslam.runtime.configuration import Configuration, ConfigurationError, load
+from birdslam.runtime.nodes.sources import open_source
+from birdslam.sources.detection_file import check_detections, read_detection_file
+from birdslam.sources.recording import DatasetError
+from birdslam.types import Estimate
+from birdslam.vehicles.placed_boxes import PlacedBox
+from birdslam.vehicles.placement.localisation import LocalisationConfig
+from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.track import EgoFrame, TrackingConfig
+from birdslam.vehicles.tracking import Tracker
+
+FRAMES = 10
+NAMES = ("person", "bicycle", "car", "motorcycle", "bus", "truck", "van", "trailer", "cyclist")
+LENS = Camera(1280, 720, 900.0, 900.0, 640.0, 360.0, 1.4, distortion=(-0.3, 0.1, 0.001, -0.002))
+
+
+@dataclass
+class Seen:
+    """Frames of the shipped drive, what its own network finds in them, and what `step` says of those boxes."""
+
+    recording: Any
+    frames: list[Frame]
+    found: list[Detections]
+    placed: list[tuple[PlacedBox | None, ...]]
+    estimates: list[Estimate]
+
+
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    recording = open_recording("demo")
+    looking = BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz).networks
+    slam = BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz)
+    out = Seen(recording, [], [], [], [])
+    for frame in recording.undistorted_frames():
+        boxes = looking.start(frame.frame_id, frame.image).result().detections
+        assert boxes is not None
+        given_boxes = external_detections(boxes.boxes_px, list(boxes.labels), boxes.scores)
+        _, estimate, placed = slam.step(frame, given_boxes)
+        out.frames.append(frame)
+        out.found.append(given_boxes)
+        out.placed.append(placed)
+        out.estimates.append(estimate)
+        if len(out.frames) == FRAMES:
+            return out
+    raise AssertionError("the shipped drive is longer")
+
+
+def test_each_box_is_answered_in_its_place(seen: Seen) -> None:
+    for found, placed, estimate in zip(seen.found, seen.placed, seen.estimates, strict=True):
+        assert len(placed) == len(found)
+        reported = {vehicle.vehicle: vehicle for vehicle in estimate.vehicles}
+        for place in placed:
+            if place is not None and place.track in reported:
+                T_ego_vehicle = estimate.T_world_ego.between(reported[place.track].T_world_vehicle)
+                assert (place.x_m, place.y_m) == (T_ego_vehicle.x_m, T_ego_vehicle.y_m)
+                speed_mps = float(np.hypot(*reported[place.track].velocity_mps))
+                assert place.speed_mps == pytest.approx(speed_mps, abs=1e-9)
+    last = [place for place in seen.placed[-1] if place is not None and place.track is not None]
+    assert len(last) >= 3
+    assert all(place.distance_sigma_m > 0.0 and place.speed_sigma_mps is not None for place in last)
+
+
+def test_the_order_of_the_boxes_is_the_callers(seen: Seen) -> None:
+    slam = BirdSLAM.with_shipped_networks(seen.recording.camera, seen.recording.rate_hz)
+    for frame, found, placed in zip(seen.frames, seen.found, seen.placed, strict=True):
+        back = slice(None, None, -1)
+        turned = external_detections(found.boxes_px[back], found.labels[back], found.scores[back])
+        assert slam.step(frame, turned)[2] == placed[back]
+
+
+def test_a_file_of_the_same_boxes_gives_the_same_estimates(seen: Seen, tmp_path: Path) -> None:
+    lines = [
+        {"image_id": frame.frame_id, "category_id": 3, "bbox": [x1, y1, x2 - x1, y2 - y1], "score": score}
+        for frame, found in zip(seen.frames, seen.found, strict=True)
+        for (x1, y1, x2, y2), score in zip(found.boxes_px.tolist(), found.scores.tolist(), strict=True)
+    ]
+    file = tmp_path / "boxes.json"
+    file.write_text(json.dumps(lines))
+    slam = BirdSLAM.with_shipped_networks(seen.recording.camera, seen.recording.rate_hz)
+    boxes = read_detection_file(file)
+    expected = [slam.step(frame, boxes[frame.frame_id])[1].vehicles for frame in seen.frames]
+    configuration = load(None, {"source.uri": "demo", "source.detections": str(file), "source.frames": FRAMES})
+    with pipeline(configuration) as drive:
+        driven = [record for record in drive(seen.recording) if isinstance(record, Estimate)][:FRAMES]
+    assert [estimate.vehicles for estimate in driven] == expected
+    assert any(expected)
+
+
+def test_boxes_of_another_tracker_keep_its_ids() -> None:
+    camera, ground = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65), GroundPlane(1.65)
+    tracker = Tracker(camera, TrackingConfig(), LocalisationConfig(), GroundSizeFilter(camera, GroundSizeConfig()))
+    rows = camera.cy_px + camera.fy_px * ground.height_m / np.array([12.0, 12.0, 20.0])
+    for frame in range(4):
+        tracker.ground_size.predict(0.1, None, None, 0.0, 0.0)
+        left = np.array([300.0, 420.0, 700.0])
+        heights = np.array([90.0, 90.0, 54.0])
+        boxes = np.column_stack([left, rows - heights, left + 100.0, rows])
+        # The two at one depth swap their places: what our own association would call a swap of ids, the other's decides
+        ids = np.array([70, 7, -1]) if frame % 2 == 0 else np.array([7, 70, -1])
+        detections = external_detections(boxes, ["car"] * 3, track_ids=ids)
+        tracks = tracker.localise_vehicles(EgoFrame(frame, frame * 100_000_000, SE2()), detections)
+        if frame:
+            assert {track.vehicle: track.observation.row for track in tracks} == {int(ids[0]): 0, int(ids[1]): 1}
+
+
+def test_only_filters_ids_along_with_boxes() -> None:
+    both = external_detections([[0, 0, 9, 9], [5, 5, 9, 9]], ["cat", "car"], [0.5, 0.6], [3, 4])
+    ids = both.only({"car"}).track_ids
+    assert ids is not None
+    assert ids.tolist() == [4]
+
+
+@pytest.mark.parametrize(
+    ("boxes", "labels", "scores", "ids", "says"),
+    [
+        ([[0, 0, 9, 9]], [], None, None, "labels: 0 for 1"),
+        ([[0, 0, 9, 9]], ["car"], [1.0, 0.5], None, "scores: 2 for 1"),
+        ([[0, 0, np.nan, 9]], ["car"], None, None, "finite"),
+        ([[9, 0, 0, 9]], ["car"], None, None, "x1 <= x2"),
+        ([[0, 0, 9, 9]], ["car"], [1.5], None, r"in \[0, 1\]"),
+        ([[0, 0, 9, 9]] * 2, ["car"] * 2, None, [4, 4], "each once"),
+        ([[0, 0, 9, 9]], ["car"], None, [0.5], "integers"),
+    ],
+)
+def test_boxes_that_are_none_are_refused(boxes: Any, labels: Any, scores: Any, ids: Any, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        external_detections(boxes, labels, scores, ids)
+
+
+@given(st.floats(100, 900), st.floats(100, 500), st.floats(20, 250), st.floats(20, 150))
+def test_a_box_of_a_distorted_image_is_undistorted_as_the_image_is(
+    x: float, y: float, width: float, height: float
+) -> None:
+    box = np.array([[x, y, x + width, y + height]])
+    straight = undistort_boxes(LENS, box)[0]
+    x1, y1, x2, y2 = straight
+    sides = np.array([(x1, (y + y + height) / 2), ((x + x + width) / 2, y1)])
+    assert x1 < x2
+    assert y1 < y2
+    # Back by the model that OpenCV's maps use: the left side's middle is where it was
+    points = undistort_points_back(np.array([[x, y + height / 2]]))
+    assert points[0, 0] == pytest.approx(sides[0, 0], abs=0.05)
+
+
+def undistort_points_back(px: np.ndarray) -> np.ndarray:
+    K = LENS.K
+    return cv2.undistortPoints(px.reshape(-1, 1, 2), K, np.array(LENS.distortion), P=K).reshape(-1, 2)
+
+
+def test_all_three_kinds_of_file_are_read(tmp_path: Path) -> None:
+    mot, kitti, coco = tmp_path / "mot.txt", tmp_path / "kitti.txt", tmp_path / "coco.json"
+    mot.write_text("1,5,10,20,30,40,0.9,-1,-1,-1\n2,5,12,20,30,40,0.8,-1,-1,-1\n")
+    kitti.write_text("0 5 Car 0 0 -10 10 20 40 60 -1 -1 -1 -1000 -1000 -1000 -10 0.9\n1 5 Car 0 0 -10 12 20 42 60\n")
+    coco.write_text(
+        '[{"image_id": 0, "category_id": 3, "bbox": [10, 20, 30, 40], "score": 0.9, "track_id": 5},'
+        ' {"image_id": 1, "category_id": 3, "bbox": [12, 20, 30, 40], "score": 0.8, "track_id": 5}]'
+    )
+    for path in (mot, kitti, coco):
+        found = read_detection_file(path)
+        assert found[0].boxes_px.tolist() == [[10.0, 20.0, 40.0, 60.0]]
+        assert found[1].boxes_px.tolist() == [[12.0, 20.0, 42.0, 60.0]]
+        assert [(f.labels, None if f.track_ids is None else f.track_ids.tolist()) for f in found.values()] == [
+            (("car",), [5])
+        ] * 2
+        assert found[0].scores.tolist() == [0.9]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("1,5,10,20,30,40,0.9\n1,5,10,20,thirty,40,0.9\n", "line 2"),
+        ("1,5,10,20,30,40,0.9\n2,5,10,20\n", "line 2: has 4 columns"),
+        ("0,5,10,20,30,40,0.9\n", "frames begin at 1"),
+        ("1,5,10,20,30,40,1.9\n", "line 1: score 1.9"),
+        ("1,5,10,20,-30,40,0.9\n", "line 1: its width"),
+        ("1,5,10,20,nan,40,0.9\n", "line 1: needs finite"),
+        ("1.5,5,10,20,30,40,0.9\n", "line 1: '1.5' is no whole number"),
+        ("1,5,10,20,30,40,0.9\n1,5,50,20,30,40,0.9\n", "line 1 to line 2: track_ids"),
+        ("0 5 Car 0 0 -10 10 20 40\n", "line 1: has 9 columns"),
+        ("", "holds no boxes"),
+        ("[{]", "is no JSON"),
+        ('{"images": []}', "are a list"),
+        ('[{"image_id": 0, "category_id": 3}]', "entry 0 is no box"),
+        ('[{"image_id": 0, "category_id": 3, "bbox": [1, 2, 3], "score": 1}]', "entry 0 is no box"),
+    ],
+)
+def test_a_file_that_is_none_names_its_first_wrong_line(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "boxes"
+    path.write_text(text)
+    with pytest.raises(DatasetError, match=says):
+        read_detection_file(path)
+
+
+def test_a_file_of_another_drive_is_refused(tmp_path: Path, seen: Seen) -> None:
+    path = tmp_path / "boxes.txt"
+    path.write_text(f"{len(seen.recording)},-1,10,20,30,40,0.9\n")
+    check_detections(seen.recording, path)
+    with pytest.raises(DatasetError, match="every 2th"):
+        check_detections(seen.recording, path, stride=2)
+    path.write_text(f"{len(seen.recording) + 1},-1,10,20,30,40,0.9\n")
+    with pytest.raises(DatasetError, match="ends at"):
+        check_detections(seen.recording, path)
+    path.write_text("1,-1,9000,20,30,40,0.9\n")
+    with pytest.raises(DatasetError, match="outside of the image"):
+        check_detections(seen.recording, path)
+    with pytest.raises(ConfigurationError, match="no loop"):
+        open_source(load(None, {"source.uri": "demo", "source.loop": True, "source.detections": str(path)}))
+    assert Configuration().source.detections == ""
+
+
+def test_supervisions_boxes_come_back_with_metres_in_columns(seen: Seen) -> None:
+    supervision = pytest.importorskip("supervision")
+    slam = BirdSLAM.with_shipped_networks(seen.recording.camera, seen.recording.rate_hz)
+    for frame, found, placed in zip(seen.frames, seen.found, seen.placed, strict=True):
+        class_id = np.array([NAMES.index(label) for label in found.labels])
+        theirs = supervision.Detections(found.boxes_px, confidence=found.scores, class_id=class_id)
+        ours = supervision_adapter.from_supervision(theirs, names=dict(enumerate(NAMES)))
+        answered = slam.step(frame, ours)[2]
+        assert answered == placed
+        supervision_adapter.add_metres(theirs, answered)
+    near = theirs[theirs.data["distance_m"] < 30.0]  # columns are filtered along with the boxes
+    assert 0 < len(near) < len(theirs)
+    for distance_m, track in zip(near.data["distance_m"], near.data["track"], strict=True):
+        assert any(p is not None and p.track == track and p.distance_m == distance_m for p in placed)
+    with pytest.raises(ValueError, match="no class_name"):
+        supervision_adapter.from_supervision(theirs)
+    with pytest.raises(ValueError, match="1 places for"):
+        supervision_adapter.add_metres(theirs, [None])
+
+
+@dataclass
+class Corners:
+    """As `norfair.Detection`: the package itself wants numpy below 2."""
+
+    points: np.ndarray
+    label: str = "car"
+    scores: np.ndarray | None = None
+    data: Any = None
+
+
+@dataclass
+class Tracked:
+    """As `norfair.TrackedObject`."""
+
+    id: int | None
+    last_detection: Corners
+    label: str = field(default="car")
+
+
+def test_norfairs_objects_keep_their_ids_and_get_their_places(seen: Seen) -> None:
+    slam = BirdSLAM.with_shipped_networks(seen.recording.camera, seen.recording.rate_hz)
+    for frame, found in zip(seen.frames, seen.found, strict=True):
+        x = np.argsort(found.boxes_px[:, 0])[:3]  # three whose order across the image lasts
+        corners = [Corners(found.boxes_px[i].reshape(2, 2), scores=np.array([0.9, 0.9])) for i in x]
+        tracked = [Tracked(100 + k, corner) for k, corner in enumerate(corners)]
+        ours = norfair_adapter.from_norfair(tracked)
+        assert ours.track_ids is not None
+        assert ours.track_ids.tolist() == [100, 101, 102]
+        norfair_adapter.add_metres(tracked, slam.step(frame, ours)[2])
+    tracks = {each.last_detection.data["birdslam"].track for each in tracked if each.last_detection.data["birdslam"]}
+    assert tracks <= {None, 100, 101, 102}
+    assert tracks - {None}
+    assert norfair_adapter.from_norfair([Corners(np.zeros((2, 2)))]).track_ids is None
+    with pytest.raises(ValueError, match="two corners"):
+        norfair_adapter.from_norfair([Corners(np.zeros((1, 2)))])
+    with pytest.raises(ValueError, match="data is a list"):
+        norfair_adapter.add_metres([Corners(np.zeros((2, 2)), data=[1])], [None])
