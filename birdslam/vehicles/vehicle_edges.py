@@ -6,7 +6,6 @@ certain for it.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import msgspec

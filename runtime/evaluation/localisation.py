@@ -13,9 +13,11 @@ from birdslam.bench.tracking.localisation import (
     CAMERA_OF_BOXES,
     CarError,
     LocalisationRow,
+    TiltRow,
     match_cars,
     measure,
     summarise_ranges,
+    tilt_row,
 )
 from birdslam.frontend import FrontEndConfig
 from birdslam.runtime.configuration import Configuration, ConfigurationError
@@ -33,14 +35,18 @@ class Sweep(NamedTuple):
 
 
 def evaluate_localisation(
-    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig
-) -> list[LocalisationRow]:
-    """The errors of the placed cars by range; `detections`: "rrc" or a folder as det_02_rrc. Raises DatasetError."""
+    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, tilt_from_images: bool = False
+) -> tuple[list[LocalisationRow], list[TiltRow]]:
+    """The errors of the placed cars by range, and of the roads that they were placed on.
+
+    `detections`: "rrc" or a folder as det_02_rrc; `tilt_from_images` as in `measure`. Raises DatasetError.
+    """
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
     with Progress("localisation", sum(map(len, sequences))) as progress:
         progress.reach(0)
-        by_sequence = _errors(root, sequences, detections, config, progress.advance)
-    return summarise_ranges([error for errors in by_sequence.values() for error in errors])
+        tilts: list[TiltRow] = []
+        by_sequence = _errors(root, sequences, detections, config, progress.advance, tilt_from_images, tilts)
+    return summarise_ranges([error for errors in by_sequence.values() for error in errors]), tilts
 
 
 def evaluate_left_out(
@@ -71,11 +77,16 @@ def _errors(
     detections: str,
     config: FrontEndConfig,
     advance: Callable[[int], None],
+    tilt_from_images: bool = False,
+    tilts: list[TiltRow] | None = None,
 ) -> dict[str, list[CarError]]:
     folder, out = root / "det_02_rrc" if detections == "rrc" else Path(detections), {}
     for sequence in sequences:
         found = read_detections(folder, sequence.name, len(sequence))
-        out[sequence.name] = match_cars(sequence, measure(sequence, found, config))
+        log = measure(sequence, found, config, tilt_from_images)
+        out[sequence.name] = match_cars(sequence, log)
+        if tilts is not None:
+            tilts.append(tilt_row(sequence, log))
         advance(len(sequence))
     return out
 

@@ -95,7 +95,7 @@ class YawFan:
     box_variance: Floats
 
     def marginalised(self, weight: Floats) -> tuple[Floats, Floats]:
-        """Shift (N, 2) from the first yaw's centre to the mean one, and its covariance (N, 2, 2), by `weight` (N, M)."""
+        """Shift (N, 2) from the first yaw's centre to the mean one, its covariance (N, 2, 2), by `weight` (N, M)."""
         mean = (weight[..., None] * self.centres_m).sum(axis=1)
         away = self.centres_m - mean[:, None]
         return mean - self.centres_m[:, 0], (weight[..., None] * away).swapaxes(1, 2) @ away
