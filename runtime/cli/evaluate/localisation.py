@@ -8,6 +8,7 @@ from pathlib import Path
 
 from birdslam.bench.tracking.leave_one_out import LeftOut
 from birdslam.bench.tracking.localisation import LocalisationRow, TiltRow
+from birdslam.bench.tracking.tables import movers_table
 from birdslam.outputs.drive_files import claim_directory, write_json
 from birdslam.paper import PAPER
 from birdslam.runtime.cli.arguments import add_config, add_settings, add_tracking_root
@@ -33,23 +34,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Writes report.json, or leave_one_out.json, and prints a table of it."""
     configuration = configuration_of(options)
-    config = configuration.slam.frontend
     output = Path(options.output)
     sweeps = [read_sweep(text, configuration) for text in options.leave_one_out]
     claim_directory(output)
     names = sequences_of(options.root, options.sequences)
     if sweeps:
-        left = evaluate_left_out(options.root, names, options.detections, config, sweeps)
+        left = evaluate_left_out(
+            options.root, names, options.detections, configuration.slam.frontend, sweeps, options.tilt == "images"
+        )
         write_json(output / "leave_one_out.json", left)
         print(_table_of_left_out(left))
     else:
-        used = PAPER.frontend if options.mode == "paper" else config
-        rows, tilts = evaluate_localisation(options.root, names, options.detections, used, options.tilt == "images")
+        used = PAPER if options.mode == "paper" else configuration.slam
+        tilt_from_images = options.tilt == "images"
+        rows, tilts, movers = evaluate_localisation(options.root, names, options.detections, used, tilt_from_images)
         write_json(output / "report.json", rows)
         write_json(output / "tilt.json", tilts)
+        write_json(output / "movers.json", movers)
         print(_table(rows))
         print()
         print(_table_of_tilts(tilts))
+        print()
+        print(movers_table(movers))
     print(f"results in {output}")
     return 0
 
