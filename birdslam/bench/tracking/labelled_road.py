@@ -1,8 +1,7 @@
-"""The road's tilt by labelled vehicles, and odometry that reports it with the errors that the images' has.
+"""The road's tilt by labelled vehicles: without images nothing else says how the camera leans over the road.
 
 A label's bottom stands on the road: its slope below the camera's axis is H / z - pitch + roll y/x (Eq. 1), less what
-the road differs by at each vehicle. Without images nothing else says how the camera leans over the road. Simulated
-odometry reports the calibrated plane; what drives has one from the images, and errs by `OdometryNoise.ground_rad`.
+the road differs by at each vehicle.
 """
 
 from __future__ import annotations
@@ -11,18 +10,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.bench.simulation.odometry import OdometryNoise, SimulatedOdometry, Walk
 from birdslam.geometry.camera import GroundPlane
-from birdslam.odometry.motion import Motion
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
-from birdslam.types import SpeedReading
 from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig
-
-Floats = NDArray[np.float64]
 
 HALF_SPAN = 3  # frames before and after, whose labels count too: a camera pitches within half a second
 NEAREST_M, FARTHEST_M = 5.0, 60.0  # of labels that are used
@@ -69,48 +61,3 @@ def _fitted(
     pitch_rad, roll_rad = (cov @ (J.T * weight) @ slope).tolist()
     sigma_pitch, sigma_roll = np.sqrt(np.diag(cov)).tolist()
     return LabelledGround(GroundPlane(height_m, pitch_rad, roll_rad), sigma_pitch, sigma_roll, len(times))
-
-
-class TiltFromImages:
-    """An EgoMotion: a simulated one, that reports the labelled road's pitch as the images would, while it drives.
-
-    Of the roll images say nothing: it is the calibrated one. Where no label tells the road, none is reported anew.
-    """
-
-    def __init__(
-        self,
-        odometry: SimulatedOdometry,
-        grounds: Sequence[LabelledGround | None],
-        noise: OdometryNoise,
-        rng: np.random.Generator,
-    ) -> None:
-        self._odometry, self._grounds = odometry, grounds
-        self._error, self._sigma_rad = Walk(noise.ground_rad, 1, rng), noise.ground_rad.sigma
-        self._reported = odometry.camera.ground
-
-    @property
-    def road_tracks(self) -> tuple[NDArray[np.int64], Floats]:
-        """Empty, as the simulated one's."""
-        return self._odometry.road_tracks
-
-    def track(self, image: NDArray[np.uint8]) -> None:
-        """Does nothing: no image is needed."""
-
-    def estimate(
-        self,
-        tracks: None,
-        frame_id: int,
-        t_source_ns: int,
-        vehicle_boxes_px: Floats,
-        road_mask: NDArray[np.bool_] | None = None,
-        speeds: Sequence[SpeedReading] = (),
-    ) -> Motion | None:
-        """The simulated motion, with the road's pitch."""
-        motion = self._odometry.estimate(tracks, frame_id, t_source_ns, vehicle_boxes_px, road_mask, speeds)
-        if motion is None:
-            return None
-        (error_rad,), labelled = self._error.draw(), self._grounds[frame_id]
-        if labelled is not None and not motion.standstill:
-            at = labelled.ground
-            self._reported = GroundPlane(at.height_m, at.pitch_rad + float(error_rad), self._odometry.camera.roll_rad)
-        return msgspec.structs.replace(motion, ground=self._reported, pitch_sigma_rad=self._sigma_rad)

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from birdslam.bench.simulation.odometry import EXACT, OdometryNoise, SimulatedOdometry
+from birdslam.bench.simulation.tilt_from_images import TiltFromImages
 from birdslam.bench.tracking.benchmark import make_log
-from birdslam.bench.tracking.labelled_road import LEAST_VEHICLES, TiltFromImages, labelled_grounds
+from birdslam.bench.tracking.labelled_road import LEAST_VEHICLES, labelled_grounds
 from birdslam.bench.tracking.metrics import match_vehicles
 from birdslam.frontend import EgoMotion, FrontEndConfig
 from birdslam.geometry.se2 import wrap
@@ -95,7 +96,8 @@ def measure(
     simulated = SimulatedOdometry(sequence.camera, sequence.camera_poses, EXACT, rng)
     odometry: EgoMotion = simulated
     if tilt_from_images:
-        odometry = TiltFromImages(simulated, labelled_grounds(sequence), OdometryNoise(), rng)
+        grounds = [None if labelled is None else labelled.ground for labelled in labelled_grounds(sequence)]
+        odometry = TiltFromImages(simulated, grounds, OdometryNoise(), rng)
 
     def perceive(frame: int, _: NDArray[np.uint8]) -> Ready:
         return Ready(Perception(detections[frame], segmentation=None, ages={"detector": 0}, status=()))
