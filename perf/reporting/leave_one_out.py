@@ -24,6 +24,7 @@ TRIED = {  # half and twice of each, all others as they are; of the gate 1.5 and
     **{"ground_size.sigma_roll_rad": (0.01, 0.04), "ground_size.sigma_edge_rel": (0.011, 0.044)},
     **{"ground_size.sigma_kerb_m": (0.009, 0.036), "ground_size.sigma_crown_rad": (0.0024, 0.0094)},
     **{"ground_size.sigma_tilt_rad": (0.0009, 0.0034), "tracking.heading.oblique": (0.05, 0.2)},
+    **{"localisation.vehicles.car.height_m": (1.47, 1.53)},
     **{"ground_size.box_memory_s": (0.25, 1.0), "ground_size.gate_sigma": (1.5, 3.0)},
     **{"ground_size.driving_mps": (0.5, 2.0), "ground_size.bend_per_m": (0.0025, 0.01)},
 }
