@@ -81,9 +81,11 @@ def within_gate(
     )
     height_m, sigma_class_rel, length_m = np.where(measured, of_tracks[..., None], of_classes[:, None])
     depth = height_m / tan_height
-    sigma_rel = np.hypot(sigma_box_rel, sigma_class_rel)
-    turned_m = length_m * turned_share  # its yaw is not known here
     learned = np.array([_learned_height_m(track) for track in tracks])[:, None]
+    # What a track's height is wrong by, its depth is wrong by too: both boxes are of the same vehicle, or of two
+    of_last = np.array([_sigma_height_rel(track.observation) for track in tracks])[:, None]
+    sigma_rel = np.hypot(sigma_box_rel, np.where(np.isnan(learned), sigma_class_rel, of_last))
+    turned_m = length_m * turned_share  # its yaw is not known here
     of_class = of_tracks[0][:, None]
     x_m = np.where(np.isnan(learned), 1.0, learned / of_class) * depth + length_m / 2.0
     along = np.square(x_m * sigma_rel) + np.square(turned_m)

@@ -30,10 +30,18 @@ from birdslam.vehicles.placement.localisation import (
     place,
 )
 from birdslam.vehicles.placement.tyre_contact import bottom_at_face
-from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, YawPrior, initial_yaw_rad, marginalise_yaw
+from birdslam.vehicles.placement.uncertain_yaw import (
+    HeadingConfig,
+    YawPrior,
+    fan_of,
+    initial_yaw_rad,
+    look_at_yaws,
+    weigh_yaws,
+)
 from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeFilter
 from birdslam.vehicles.state.parallax import LearnedSize, Parallax, ParallaxConfig
 from birdslam.vehicles.state.parallax_measurements import measure_boxes
+from birdslam.vehicles.state.yaw_by_outline import YawByOutline
 from birdslam.vehicles.track import Track
 
 Floats = NDArray[np.float64]
@@ -67,6 +75,13 @@ class Assignment:
         elif self.track.yaw_known:
             return self.track.sigma_yaw_rad, config.outlier_known
         return config.sigma_along_road_rad, config.outlier_unknown
+
+    @property
+    def yaw_known(self) -> bool:
+        """Whether motion or body have told it."""
+        if self.track is None:
+            return self.by_depth is not None and self.by_depth.front_seen
+        return self.track.yaw_known
 
     def expected_depth_m(self, T_world_ego: SE2) -> float:
         """Of the nearest face, before it is measured: as the track predicts it, or by the height of its class."""
@@ -115,10 +130,12 @@ class Placing:
         self.heading = heading
         self.pseudolidar = pseudolidar
         self.parallax = Parallax(parallax)
+        self.yaw_by_outline = YawByOutline(heading)
 
     def predict(self, dt_s: float, T_world_ego: SE2, step_cov: Floats | None) -> None:
         """To the next frame's ego pose, with the covariance (3, 3) of the step to it."""
         self.parallax.predict(dt_s, T_world_ego, step_cov)
+        self.yaw_by_outline.predict(dt_s, T_world_ego)
 
     def locate(self, assignments: Sequence[Assignment], T_world_ego: SE2) -> list[Place]:
         """In ego, one place for each assignment; the road's tilt and their sizes are learned from all."""
@@ -128,7 +145,7 @@ class Placing:
         sizes = self._sizes_by_parallax(assignments, expected, T_world_ego)
         assignments = self._with_side_outliers(assignments, sizes)
         depths = _depths_by_eq_1(assignments, expected, sizes, self.ground_size)
-        by_eq_1 = self._places_at(depths, assignments, expected.yaw_rad)
+        by_eq_1 = self._places_at(depths, assignments, expected.yaw_rad, T_world_ego)
         # The two sources of Fig. 2 become one
         fused = [fuse(where, a.by_depth, self.pseudolidar) for where, a in zip(by_eq_1, assignments, strict=True)]
         return [
@@ -166,6 +183,7 @@ class Placing:
                 sigmas = d.sigma_height_rel, d.sigma_width_rel
                 self.parallax.begin(centre_m, yaw_rad, T_world_ego, math.log(d.height_m), sigmas)
                 self.ground_size.begin(assignment.observation)
+                self.yaw_by_outline.begin()
 
     def _sizes_by_parallax(
         self, assignments: Sequence[Assignment], expected: _Prediction, T_world_ego: SE2
@@ -191,18 +209,30 @@ class Placing:
             out.append(replace(a, observation=widened))
         return out
 
-    def _places_at(self, depths: Depths, assignments: Sequence[Assignment], yaws_rad: Sequence[float]) -> list[Place]:
+    def _places_at(
+        self, depths: Depths, assignments: Sequence[Assignment], yaws_rad: Sequence[float], T_world_ego: SE2
+    ) -> list[Place]:
         """The places at these depths, with the uncertainty of the depths and of the yaws."""
         seen = [a.observation for a in assignments]
-        sigma_rad, outlier = np.array([a.yaw_uncertainty(self.heading) for a in assignments]).reshape(-1, 2).T
-        shift_m, cov = marginalise_yaw(
-            seen,
-            depths.log_depth,
-            depths.variance,
-            YawPrior(np.array(yaws_rad), sigma_rad, outlier),
-            self.localisation,
-            self.heading,
-        )
+        if not seen:
+            return []
+        sigma_rad, outlier = np.array([a.yaw_uncertainty(self.heading) for a in assignments]).T
+        prior = YawPrior(np.array(yaws_rad), sigma_rad, outlier)
+        yaws = fan_of(prior, self.yaw_by_outline.grid_rad - T_world_ego.yaw_rad)
+        fan = look_at_yaws(seen, depths.log_depth, yaws, self.localisation.reach_rel)
+        weight = weigh_yaws(fan, depths.variance, prior, self.heading)
+        near = yaws.shape[1] - len(self.yaw_by_outline.grid_rad)
+        untold = [k for k, a in enumerate(assignments) if not a.yaw_known]
+        if untold:
+            weight[untold, :near] = 0.0
+            weight[untold, near:] = self.yaw_by_outline.weigh(
+                [assignments[k].row for k in untold],
+                fan.residual[untold, near:],
+                fan.box_variance[untold],
+                depths.variance[untold],
+                np.exp(depths.log_depth[untold]),
+            )
+        shift_m, cov = fan.marginalised(weight)
         numbers = zip(seen, depths.log_depth.tolist(), depths.variance.tolist(), yaws_rad, shift_m, cov, strict=True)
         out = []
         for observation, log_depth, variance, yaw_rad, d, C in numbers:

@@ -59,7 +59,11 @@ class Tracker:
         self.placing = Placing(ground_size, localisation, config.parallax, self.pseudolidar, config.heading)
         self.yaw = YawFilter(config, localisation, ground_size)
         self.tracks: list[Track] = []
-        self._filters: tuple[VehicleFilter, ...] = (self.placing.parallax, ground_size)  # with a row for each track
+        self._filters: tuple[VehicleFilter, ...] = (  # with a row for each track
+            self.placing.parallax,
+            ground_size,
+            self.placing.yaw_by_outline,
+        )
         self._next_id = 0
         self._last: EgoFrame | None = None
 
@@ -121,6 +125,7 @@ class Tracker:
         for assignment, where in zip(assignments, places, strict=True):
             if assignment.track is None:
                 self.tracks.append(self._begin(assignment, where, frame))
+                self.yaw.correct_by_outline(assignment.row, self.tracks[-1], self.placing.yaw_by_outline)
         self._delete_lost(frame)
         return self._confirmed(frame)
 
@@ -205,6 +210,7 @@ class Tracker:
             track.votes[assignment.observation.label] += 1
             self.yaw.correct_by_motion(assignment.row, track)
             self.yaw.correct_by_body(assignment.row, track, assignment.by_depth)
+            self.yaw.correct_by_outline(assignment.row, track, self.placing.yaw_by_outline)
 
     def _zero_velocity_update(self, states: Floats, covs: Floats, which: NDArray[np.bool_]) -> None:
         """Of `which` of the states (N, 4), in place: predicted where they stand, they take no neighbour's box."""

@@ -6,7 +6,6 @@ certain for it.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import msgspec
@@ -44,8 +43,8 @@ def _vehicle_edge(track: Track, delay_ns: int, config: TrackingConfig) -> Vehicl
     seen, place = track.observation, track.place
     yaw_rad = wrap(wrap(-track.frame.T_world_ego.yaw_rad) + track.yaw_rad)
     xx, xy, yy = in_vehicle_axes(place.cov, yaw_rad)  # the tangent at the vehicle's pose
-    sigma_yaw_rad = math.hypot(config.sigma_yaw_moving_rad, track.sigma_yaw_rad)
-    var_yaw = (sigma_yaw_rad if track.yaw_known else config.sigma_yaw_unknown_rad) ** 2
+    least_rad = config.sigma_yaw_moving_rad if track.yaw_known else config.sigma_yaw_unknown_rad
+    var_yaw = least_rad**2 + track.sigma_yaw_rad**2
     return VehicleEdge(
         vehicle=track.vehicle,
         frame=track.frame.frame_id,

@@ -13,13 +13,18 @@ from birdslam.bench.tracking.localisation import (
     CAMERA_OF_BOXES,
     CarError,
     LocalisationRow,
+    TiltRow,
     match_cars,
     measure,
     summarise_ranges,
+    tilt_row,
 )
+from birdslam.bench.tracking.movers import MoversRow, movers_row
 from birdslam.frontend import FrontEndConfig
+from birdslam.graph.pose_graph import PoseGraph
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.progress import Progress
+from birdslam.slam import SlamConfig
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.sources.recording import DatasetError
 
@@ -33,28 +38,46 @@ class Sweep(NamedTuple):
 
 
 def evaluate_localisation(
-    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig
-) -> list[LocalisationRow]:
-    """The errors of the placed cars by range; `detections`: "rrc" or a folder as det_02_rrc. Raises DatasetError."""
+    root: Path, names: Sequence[str], detections: str, config: SlamConfig, tilt_from_images: bool = False
+) -> tuple[list[LocalisationRow], list[TiltRow], list[MoversRow]]:
+    """The errors of the placed cars by range, of the roads that they were placed on, and false movers.
+
+    `detections`: "rrc" or a folder as det_02_rrc; `tilt_from_images` as in `measure`. Raises DatasetError.
+    """
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
     with Progress("localisation", sum(map(len, sequences))) as progress:
         progress.reach(0)
-        by_sequence = _errors(root, sequences, detections, config, progress.advance)
-    return summarise_ranges([error for errors in by_sequence.values() for error in errors])
+        errors: list[CarError] = []
+        tilts: list[TiltRow] = []
+        movers: list[MoversRow] = []
+        for sequence in sequences:
+            found = read_detections(_folder(root, detections), sequence.name, len(sequence))
+            log = measure(sequence, found, config.frontend, tilt_from_images)
+            errors += match_cars(sequence, log)
+            tilts.append(tilt_row(sequence, log))
+            graph = PoseGraph(config.graph, config.weights)
+            movers.append(movers_row(sequence, log, [graph.optimise(record) for record in log], "truth"))
+            progress.advance(len(sequence))
+    return summarise_ranges(errors), tilts, movers
 
 
 def evaluate_left_out(
-    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, sweeps: Sequence[Sweep]
+    root: Path,
+    names: Sequence[str],
+    detections: str,
+    config: FrontEndConfig,
+    sweeps: Sequence[Sweep],
+    tilt_from_images: bool = False,
 ) -> list[LeftOut]:
     """How each sequence fares by the value that the others choose, for each sweep. Raises ConfigurationError."""
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
     drives = 1 + sum(len(sweep.by_value) - 1 for sweep in sweeps)
     rows: list[LeftOut] = []
     with Progress("localisation", drives * sum(map(len, sequences))) as progress:
-        as_they_are = _errors(root, sequences, detections, config, progress.advance)
+        as_they_are = _errors(root, sequences, detections, config, progress.advance, tilt_from_images)
         for key, as_it_is, by_value in sweeps:
             found = {
-                value: _errors(root, sequences, detections, varied, progress.advance)
+                value: _errors(root, sequences, detections, varied, progress.advance, tilt_from_images)
                 for value, varied in by_value.items()
                 if value != as_it_is
             }
@@ -71,13 +94,18 @@ def _errors(
     detections: str,
     config: FrontEndConfig,
     advance: Callable[[int], None],
+    tilt_from_images: bool = False,
 ) -> dict[str, list[CarError]]:
-    folder, out = root / "det_02_rrc" if detections == "rrc" else Path(detections), {}
+    folder, out = _folder(root, detections), {}
     for sequence in sequences:
         found = read_detections(folder, sequence.name, len(sequence))
-        out[sequence.name] = match_cars(sequence, measure(sequence, found, config))
+        out[sequence.name] = match_cars(sequence, measure(sequence, found, config, tilt_from_images))
         advance(len(sequence))
     return out
+
+
+def _folder(root: Path, detections: str) -> Path:
+    return root / "det_02_rrc" if detections == "rrc" else Path(detections)
 
 
 def read_sweep(text: str, configuration: Configuration) -> Sweep:

@@ -31,6 +31,7 @@ from birdslam.bench.tracking.benchmark import (
     summarise,
 )
 from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
+from birdslam.bench.tracking.movers import movers_row
 from birdslam.bench.tracking.picture import draw_sequence
 from birdslam.bench.tracking.relative_nees import nees_rows, over_seeds
 from birdslam.bench.tracking.report import BatchTiming, Outcome, Timing
@@ -154,7 +155,8 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
     def rows_of(trials: Sequence[Trial]) -> list[Row]:
         return summarise(sequence.name, trials, bodies, job.odometry, job.detections) if trials else []
 
-    seen = sights(sequence, _estimates(log, job)) if chosen and job.detections == "network" else []
+    estimates = _estimates(log, job) if chosen else []
+    seen = sights(sequence, estimates) if job.detections == "network" else []
     return Outcome(
         sequence=sequence.name,
         odometry=job.odometry,
@@ -167,6 +169,7 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
         timings=[_timing(log[:length], job) for length in _lengths(log, job)],
         nees=over_seeds(nees),
         updates_ms=updates_ms,
+        movers=movers_row(sequence, log, estimates, job.odometry) if chosen else None,
     )
 
 

@@ -13,9 +13,7 @@ from collections.abc import Mapping, Sequence
 import msgspec
 import numpy as np
 
-from birdslam.bench.tracking.localisation import CarError
-
-MOST = 25.0  # squared Mahalanobis distance of a car, at the most: five sigma
+from birdslam.bench.tracking.localisation import MOST, CarError
 
 
 class LeftOut(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,15 +1,15 @@
 """How well vehicles are placed on real roads: the front end's CV edges against labelled cars.
 
-Each matched, untruncated car's BEV centre is compared with the label's, along (depth, ego's x) and across (ego's y) the
+Each matched car's BEV centre is compared with the label's, along (depth, ego's x) and across (ego's y) the
 optical axis. The covariance is consistent where the ellipse that holds 68.3 % of a 2-D Gaussian (chi-square of two
 degrees of freedom: 2.30) holds as many of the errors, and the one for 95.4 % (6.18) likewise: `inside_1_sigma` and
-`inside_2_sigma`.
+`inside_2_sigma`; and where `nees` is 1 for young tracks and for old ones.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -17,12 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from birdslam.bench.simulation.odometry import EXACT, SimulatedOdometry
+from birdslam.bench.simulation.odometry import EXACT, OdometryNoise, SimulatedOdometry
+from birdslam.bench.simulation.tilt_from_images import TiltFromImages
 from birdslam.bench.tracking.benchmark import make_log
+from birdslam.bench.tracking.labelled_road import LEAST_VEHICLES, labelled_grounds
 from birdslam.bench.tracking.metrics import match_vehicles
-from birdslam.frontend import FrontEndConfig
+from birdslam.frontend import EgoMotion, FrontEndConfig
 from birdslam.geometry.se2 import wrap
 from birdslam.perception import Detections, Perception, Ready
+from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import Label
 from birdslam.types import Measurements, VehicleEdge
@@ -31,6 +34,10 @@ CAMERA_OF_BOXES = 2  # labels and RRC detections were drawn in its images
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0))
 INSIDE_1_SIGMA, INSIDE_2_SIGMA = (float(chi2.ppf(chi2.cdf(k**2, 1), 2)) for k in (1, 2))  # 2.30, 6.18
 MEASURED_KIND = "Car"
+MOST = 25.0  # squared Mahalanobis distance of a car, at the most: five sigma
+STANDS_MPS = 1.0  # an ego that is slower stands or nearly
+TALL_M = 1.75  # of a label: taller than nearly all cars
+AGES_S = ((0.0, 0.5), (0.5, 2.0), (2.0, 5.0), (5.0, math.inf))  # since the vehicle's first edge
 
 
 @dataclass(frozen=True)
@@ -45,6 +52,10 @@ class CarError:
     mahalanobis2: float
     yaw_error_rad: float
     log_det_cov: float  # of the place's covariance (2, 2), in m^4
+    cut: bool = False  # by the image's edge
+    height_m: float = 0.0  # of the label
+    ego_mps: float = math.inf  # the ego's speed
+    age_s: float = 0.0  # since the vehicle's first edge
 
 
 class LocalisationRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -59,11 +70,34 @@ class LocalisationRow(msgspec.Struct, frozen=True, kw_only=True):
     inside_2_sigma: float | None = None
     depth_bias_median_rel: float | None = None
     yaw_error_median_deg: float | None = None
+    cars: int = 0  # labelled tracks
+    nees: float | None = None  # mean squared Mahalanobis distance over its expectation; a car counts 25 at the most
+    yaw_off_10_deg: float | None = None  # share of those that are off by more
 
 
-def measure(sequence: TrackingSequence, detections: Sequence[Detections], config: FrontEndConfig) -> list[Measurements]:
-    """The front end over a sequence of known ego motion; of the road it knows only the calibrated camera."""
-    odometry = SimulatedOdometry(sequence.camera, sequence.camera_poses, EXACT, np.random.default_rng(0))
+class TiltRow(msgspec.Struct, frozen=True, kw_only=True):
+    """The road that the front end uses against the labelled one, over frames with two vehicles or more."""
+
+    sequence: str
+    n: int
+    pitch_error_median_mrad: float | None = None
+    roll_error_median_mrad: float | None = None
+
+
+def measure(
+    sequence: TrackingSequence, detections: Sequence[Detections], config: FrontEndConfig, tilt_from_images: bool = False
+) -> list[Measurements]:
+    """The front end over a sequence of known ego motion.
+
+    Of the road it knows only the calibrated camera, or, with `tilt_from_images`, its pitch too with the error that
+    images give it with.
+    """
+    rng = np.random.default_rng(0)
+    simulated = SimulatedOdometry(sequence.camera, sequence.camera_poses, EXACT, rng)
+    odometry: EgoMotion = simulated
+    if tilt_from_images:
+        grounds = [None if labelled is None else labelled.ground for labelled in labelled_grounds(sequence)]
+        odometry = TiltFromImages(simulated, grounds, OdometryNoise(), rng)
 
     def perceive(frame: int, _: NDArray[np.uint8]) -> Ready:
         return Ready(Perception(detections[frame], segmentation=None, ages={"detector": 0}, status=()))
@@ -72,20 +106,57 @@ def measure(sequence: TrackingSequence, detections: Sequence[Detections], config
 
 
 def match_cars(sequence: TrackingSequence, measurements: Iterable[Measurements]) -> list[CarError]:
-    """Every matched, untruncated car of the labels in every frame."""
+    """Every matched car of the labels in every frame."""
     errors: list[CarError] = []
+    speeds, first = ego_speeds_mps(sequence), dict[int, int]()
     for record in measurements:
         here, edges = sequence.labels_of(record.frame_id), {edge.vehicle: edge for edge in record.cv}
         pairs = match_vehicles(here, list(edges), np.array([e.box_px for e in edges.values()]).reshape(-1, 4))
+        for vehicle in edges:
+            first.setdefault(vehicle, record.t_source_ns)
         errors += [
-            _error(sequence, label, edges[pairs[label.track]])
+            _error(
+                sequence,
+                label,
+                edges[pairs[label.track]],
+                float(speeds[record.frame_id]),
+                (record.t_source_ns - first[pairs[label.track]]) * 1e-9,
+            )
             for label in here
-            if label.track in pairs and label.kind == MEASURED_KIND and label.truncated <= 0
+            if label.track in pairs and label.kind == MEASURED_KIND
         ]
     return errors
 
 
-def _error(sequence: TrackingSequence, label: Label, edge: VehicleEdge) -> CarError:
+def ego_speeds_mps(sequence: TrackingSequence) -> NDArray[np.float64]:
+    """(N,) by its poses 0.2 s before and after."""
+    frames = np.arange(len(sequence))
+    before, after = np.maximum(frames - 2, 0), np.minimum(frames + 2, len(frames) - 1)
+    at = sequence.camera_poses[:, :3, 3]
+    way_m = np.linalg.norm(at[after] - at[before], axis=1)
+    out: NDArray[np.float64] = way_m * KITTI_RATE_HZ / np.maximum(after - before, 1)
+    return out
+
+
+def tilt_row(sequence: TrackingSequence, measurements: Iterable[Measurements]) -> TiltRow:
+    """Errors of pitch and roll, of the roads that records were made over."""
+    labelled, errors = labelled_grounds(sequence), []
+    for record in measurements:
+        truth = labelled[record.frame_id]
+        if truth is not None and truth.vehicles >= LEAST_VEHICLES and record.ground is not None:
+            of_roll = abs(record.ground.roll_rad - truth.ground.roll_rad)
+            errors.append((abs(record.ground.pitch_rad - truth.ground.pitch_rad), of_roll))
+    if not errors:
+        return TiltRow(sequence=sequence.name, n=0)
+    pitch_mrad, roll_mrad = (1e3 * np.median(errors, axis=0)).tolist()
+    return TiltRow(
+        sequence=sequence.name, n=len(errors), pitch_error_median_mrad=pitch_mrad, roll_error_median_mrad=roll_mrad
+    )
+
+
+def _error(
+    sequence: TrackingSequence, label: Label, edge: VehicleEdge, ego_mps: float = math.inf, age_s: float = 0.0
+) -> CarError:
     truth = sequence.vehicle_truth(label, label.frame)  # world is the ego of that very frame
     error = np.array([edge.T_ego_vehicle.x_m - truth.x_m, edge.T_ego_vehicle.y_m - truth.y_m])
     R_ego_vehicle = edge.T_ego_vehicle.rotation()  # an edge's covariance is of the tangent at the vehicle's pose
@@ -99,13 +170,30 @@ def _error(sequence: TrackingSequence, label: Label, edge: VehicleEdge) -> CarEr
         mahalanobis2=float(error @ np.linalg.solve(cov, error)),
         log_det_cov=float(np.linalg.slogdet(cov)[1]),
         yaw_error_rad=wrap(edge.T_ego_vehicle.yaw_rad - truth.yaw_rad),
+        cut=label.truncated > 0,
+        height_m=label.height_m,
+        ego_mps=ego_mps,
+        age_s=age_s,
     )
 
 
 def summarise_ranges(errors: Sequence[CarError]) -> list[LocalisationRow]:
-    """A row for each sequence and range, then those of the union, "all"."""
+    """A row for each sequence and range, then those of the union, "all", of cars that the image does not cut.
+
+    After them those of parts of all: by whether the ego drives, by the age of the track, tall cars, and cars that the
+    image cuts.
+    """
+    whole = [e for e in errors if not e.cut]
     names = list(dict.fromkeys(error.sequence for error in errors))
-    groups = [(name, [e for e in errors if e.sequence == name]) for name in names] + [("all", list(errors))]
+    groups = [(name, [e for e in whole if e.sequence == name]) for name in names] + [("all", whole)]
+    parts: list[tuple[str, Callable[[CarError], bool]]] = [
+        ("ego drives", lambda e: e.ego_mps >= STANDS_MPS),
+        ("ego stands", lambda e: e.ego_mps < STANDS_MPS),
+        *((f"{low:g}-{high:g} s", lambda e, low=low, high=high: low <= e.age_s < high) for low, high in AGES_S),
+        (f"over {TALL_M} m", lambda e: e.height_m > TALL_M),
+    ]
+    groups += [(name, [e for e in whole if of_it(e)]) for name, of_it in parts]
+    groups.append(("cut", [e for e in errors if e.cut]))
     return [
         _row(name, f"{near:.0f}-{far:.0f}", [e for e in group if near <= e.depth_m < far])
         for name, group in groups
@@ -131,4 +219,7 @@ def _row(sequence: str, span: str, errors: Sequence[CarError]) -> LocalisationRo
         inside_2_sigma=float(np.mean(spread <= INSIDE_2_SIGMA)),
         depth_bias_median_rel=float(np.median(along / depth_m)),
         yaw_error_median_deg=math.degrees(float(np.median(turned))),
+        cars=len({(e.sequence, e.label) for e in errors}),
+        nees=float(np.mean(np.minimum(spread, MOST))) / 2.0,
+        yaw_off_10_deg=float(np.mean(turned > math.radians(10.0))),
     )

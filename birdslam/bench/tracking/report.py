@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from birdslam.bench.tracking import tables
 from birdslam.bench.tracking.benchmark import Row
+from birdslam.bench.tracking.movers import MoversRow
 from birdslam.bench.tracking.relative_nees import NeesRow
 from birdslam.bench.tracking.reported import MotionRow, RangeRow
 from birdslam.bench.tracking.tables import ODOMETRIES, Published
@@ -58,6 +59,13 @@ class BatchTiming:
     converged: bool
 
 
+ABOUT_MOVERS = (
+    "A track is one id on one labelled vehicle, of five sights or more. It is told to drive where the live estimate has "
+    "decided so with over 1.5 m/s. Standing: its label is slower than 0.5 m/s at every sight. Driving: for a second "
+    "or longer over 2 m/s; soon: told within a second of that."
+)
+
+
 @dataclass(frozen=True)
 class Timing:
     """The live graph over `frames` frames, and the batches of odometry of unknown scale and of metric odometry."""
@@ -83,6 +91,7 @@ class Outcome:
     timings: list[Timing]  # by the number of frames
     nees: list[NeesRow]
     updates_ms: dict[str, NDArray[np.float64]]
+    movers: MoversRow | None = None
 
 
 def render_report(setting: Setting, published: Published, outcomes: Sequence[Outcome]) -> str:
@@ -124,6 +133,9 @@ def render_report(setting: Setting, published: Published, outcomes: Sequence[Out
             f"## Tracks and relative errors of {name}\n\nHOTA and IDF1 of cars in the image by KITTI's rules; the rest "
             f"are means over vehicles seen in 5 frames or more. {note}\n\n{tables.tracks_table(rows, name)}"
         )
+    movers = [outcome.movers for outcome in outcomes if outcome.movers is not None]
+    if movers:
+        parts.append(f"## Standing tracks that are told to drive\n\n{ABOUT_MOVERS}\n\n{tables.movers_table(movers)}")
     ranges = [row for outcome in outcomes for row in outcome.ranges]
     if ranges:
         parts.append(

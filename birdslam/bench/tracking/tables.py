@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 
 from birdslam.bench.tracking.benchmark import EGO, Row, mean_ate_m
+from birdslam.bench.tracking.movers import MoversRow
 from birdslam.bench.tracking.relative_nees import NeesRow
 from birdslam.bench.tracking.reported import MotionRow, RangeRow
 from birdslam.sources.recording import DatasetError
@@ -286,6 +287,24 @@ def motion_table(rows: Sequence[MotionRow]) -> str:
         for row in rows
     ]
     return _markdown(head, lines)
+
+
+def movers_table(rows: Sequence[MoversRow]) -> str:
+    """Tracks of standing vehicles that are told to drive, and of driving ones that are told so, and in all."""
+    head = ["Seq", "odometry", "standing", "told to drive", "driving", "told", "soon", "where (ahead, left in m: m/s)"]
+    lines = [
+        [
+            row.sequence,
+            odometry_title(row.odometry),
+            *map(str, (row.standing, len(row.false), row.driving, row.told, row.soon)),
+            "; ".join(f"{one.x_m:.0f}, {one.y_m:.0f}: {one.told_mps:.1f}" for one in row.false) or "-",
+        ]
+        for row in rows
+    ]
+    sums = [
+        sum(count) for count in zip(*((r.standing, len(r.false), r.driving, r.told, r.soon) for r in rows), strict=True)
+    ]
+    return _markdown(head, [*lines, ["all", "", *map(str, sums), ""]])
 
 
 def nees_table(rows: Sequence[NeesRow]) -> str:

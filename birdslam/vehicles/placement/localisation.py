@@ -32,7 +32,7 @@ class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 DIMENSIONS = {
-    "car": Dimensions(3.9, 1.63, 1.53),
+    "car": Dimensions(3.85, 1.61, 1.5),
     "van": Dimensions(5.0, 1.9, 2.1, sigma_height_rel=0.12),
     "truck": Dimensions(7.0, 2.4, 3.0, sigma_length_rel=0.3, sigma_height_rel=0.2),
     "bus": Dimensions(11.0, 2.5, 3.1, sigma_length_rel=0.2, sigma_height_rel=0.1),

@@ -37,7 +37,13 @@ class HeadingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Of the vehicles, when first seen: they stand or drive across the ego's road. By the labels of KITTI tracking 0000
     # to 0020 43 of 343 do
     across: Share = 0.1
-    fan: Annotated[int, msgspec.Meta(ge=4, le=90)] = 12  # yaws over half a turn: the opposite has the same outline
+    fan: Annotated[int, msgspec.Meta(ge=4, le=90)] = 36  # yaws over half a turn: the opposite has the same outline
+    # Of a vehicle at its first sight, by its labels: 46 of 297 are headed neither along the ego's way nor across it
+    oblique: Share = 0.1
+    sigma_across_rad: float = 0.2  # of those across the ego's way
+    bend_m: float = 5.0  # of the way, over which its bend is told
+    box_memory_s: float = 0.5  # for so long the width of a box has the same error
+    least_width_rel: float = 0.03  # 1-sigma of a box's width, at least
 
 
 @dataclass(frozen=True)
@@ -76,25 +82,27 @@ def initial_yaw_rad(seen: Observation, config: HeadingConfig) -> float:
     return across_rad if config.across > 0.0 and more_likely > math.log(1.0 / config.across - 1.0) else 0.0
 
 
-def marginalise_yaw(
-    seen: Sequence[Observation],
-    log_depth: Floats,
-    variance: Floats,
-    yaws_prior: YawPrior,
-    localisation: LocalisationConfig,
-    config: HeadingConfig,
-) -> tuple[Floats, Floats]:
-    """(N, 2) m in ego: how far the mean centre lies from the centre at the mean yaw; its covariance (N, 2, 2) by yaw.
+@dataclass(frozen=True)
+class YawFan:
+    """Where the centres (N, M, 2) in ego of boxes (N,) would be at each of the yaws of a fan.
 
-    `log_depth` (N,) is of the nearest faces, with its `variance`.
+    `residual` (N, M): by how much the log of a box's width exceeds the log of its footprint's outline at that yaw;
+    `box_variance` (N,) is that of the log width.
     """
-    if not seen:
-        return np.zeros((0, 2)), np.zeros((0, 2, 2))
-    n, fan = len(seen), config.fan
-    uniform = np.broadcast_to(np.arange(fan) * (math.pi / fan), (n, fan))
-    yaws = np.hstack([yaws_prior.yaw_rad[:, None] + yaws_prior.sigma_rad[:, None] * _GAUSS_HERMITE, uniform])  # (N, M)
-    outlier = yaws_prior.outlier[:, None]
-    prior = np.hstack([(1.0 - outlier) * _GAUSS_HERMITE_WEIGHT, np.broadcast_to(outlier / fan, (n, fan))])
+
+    centres_m: Floats
+    residual: Floats
+    box_variance: Floats
+
+    def marginalised(self, weight: Floats) -> tuple[Floats, Floats]:
+        """Shift (N, 2) from the first yaw's centre to the mean one, its covariance (N, 2, 2), by `weight` (N, M)."""
+        mean = (weight[..., None] * self.centres_m).sum(axis=1)
+        away = self.centres_m - mean[:, None]
+        return mean - self.centres_m[:, 0], (weight[..., None] * away).swapaxes(1, 2) @ away
+
+
+def look_at_yaws(seen: Sequence[Observation], log_depth: Floats, yaws: Floats, reach_rel: float) -> YawFan:
+    """The fan of boxes whose nearest faces are at `log_depth` (N,), at the yaws (N, M) against the ego."""
     left, right, var_left, var_right, half_l, half_w = np.array(
         [
             (
@@ -113,7 +121,7 @@ def marginalise_yaw(
     c, s = np.cos(yaws), np.sin(yaws)
     ahead = np.stack([half_l * c - half_w * s, half_l * c + half_w * s])
     aside = np.stack([half_l * s + half_w * c, half_l * s - half_w * c])
-    ahead, aside = (np.concatenate([half, -half]) * localisation.reach_rel for half in (ahead, aside))
+    ahead, aside = (np.concatenate([half, -half]) * reach_rel for half in (ahead, aside))
     depth_m = np.exp(log_depth)[:, None]
     x_m = depth_m + ahead.max(axis=0)
     far_m = np.maximum(x_m + ahead, 0.1)
@@ -123,12 +131,42 @@ def marginalise_yaw(
         outline = (y_m + aside) / far_m
         widest, least = outline.max(axis=0), outline.min(axis=0)
         y_m = y_m + ((left - widest) * of_left + (right - least) * of_right) / (of_left + of_right) * x_m
-
     residual = np.log(np.maximum(left - right, 1e-3) / np.maximum(widest - least, 1e-3))
-    noise = variance[:, None] + config.sigma_width_rel**2 + (var_left + var_right) / (left - right) ** 2
-    weight = prior * np.exp(-0.5 * residual**2 / noise) + prior * _MIN_WEIGHT
-    weight /= weight.sum(axis=1, keepdims=True)
-    centres = np.stack([x_m, y_m], axis=-1)
-    mean = (weight[..., None] * centres).sum(axis=1)
-    away = centres - mean[:, None]
-    return mean - centres[:, 0], (weight[..., None] * away).swapaxes(1, 2) @ away
+    box_variance = ((var_left + var_right) / (left - right) ** 2)[:, 0]
+    return YawFan(np.stack([x_m, y_m], axis=-1), residual, box_variance)
+
+
+def fan_of(yaws_prior: YawPrior, fan_rad: Floats) -> Floats:
+    """(N, 3 + F): the points of each prior's normal distribution, the mean first, then its fan (N, F) or (F,)."""
+    n = len(yaws_prior.yaw_rad)
+    near = yaws_prior.yaw_rad[:, None] + yaws_prior.sigma_rad[:, None] * _GAUSS_HERMITE
+    return np.hstack([near, np.broadcast_to(fan_rad, (n, fan_rad.shape[-1]))])
+
+
+def weigh_yaws(fan: YawFan, variance: Floats, yaws_prior: YawPrior, config: HeadingConfig) -> Floats:
+    """(N, M) of a fan as `fan_of` has it: its posterior by the widths of the boxes, at depths of this log variance."""
+    outlier, many = yaws_prior.outlier[:, None], fan.residual.shape[1] - len(_GAUSS_HERMITE)
+    uniform = np.broadcast_to(outlier / many, (len(outlier), many))
+    prior = np.hstack([(1.0 - outlier) * _GAUSS_HERMITE_WEIGHT, uniform])
+    noise = (variance + config.sigma_width_rel**2 + fan.box_variance)[:, None]
+    weight: Floats = prior * np.exp(-0.5 * fan.residual**2 / noise) + prior * _MIN_WEIGHT
+    return weight / weight.sum(axis=1, keepdims=True)
+
+
+def marginalise_yaw(
+    seen: Sequence[Observation],
+    log_depth: Floats,
+    variance: Floats,
+    yaws_prior: YawPrior,
+    localisation: LocalisationConfig,
+    config: HeadingConfig,
+) -> tuple[Floats, Floats]:
+    """(N, 2) m in ego: how far the mean centre lies from the centre at the mean yaw; its covariance (N, 2, 2) by yaw.
+
+    `log_depth` (N,) is of the nearest faces, with its `variance`; of the yaws nothing but their prior is known.
+    """
+    if not seen:
+        return np.zeros((0, 2)), np.zeros((0, 2, 2))
+    yaws = fan_of(yaws_prior, np.arange(config.fan) * (math.pi / config.fan))
+    fan = look_at_yaws(seen, log_depth, yaws, localisation.reach_rel)
+    return fan.marginalised(weigh_yaws(fan, variance, yaws_prior, config))

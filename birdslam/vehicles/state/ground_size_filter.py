@@ -1,11 +1,15 @@
 """The road's tilt and the vehicles' sizes, each from the other, by the boxes of the vehicles alone.
 
-    x = [pitch, roll, and of every vehicle: log h, log w, kerb]   and, for one frame only, of every box: log z
+    x = [pitch, roll, and of every vehicle: log h, log w, edge, tilt]   and, for one frame only, of every box: log z
 
-One Kalman filter holds them all. With H the camera's height, d the kerb, y/x the bearing, r on to the roof's far edge
-where the camera looks down on it, and slopes that count downwards from the plane of the road, a box measures
-bottom = (H + d) / z - pitch + roll y/x (Eq. 1), top = (H + d - h) / (z + r) - pitch + roll y/x, and
+One Kalman filter holds them all. With H the camera's height, y/x the bearing, r on to the roof's far edge where the
+camera looks down on it, and slopes that count downwards from the plane of the road, a box measures
+bottom = (H + edge) / z - pitch - tilt + roll y/x (Eq. 1), top = (H - h) / (z + r) - pitch - tilt + roll y/x, and
 log width = log w + log(class's outline) - log z.
+
+What is wrong with one vehicle for as long as it is in sight is a state, so that its many frames don't average it away:
+`edge` is by how much its box ends lower than the ego's plane at its face (m: the kerb, and where the detector draws the
+edge of this vehicle), `tilt` by how much the road at it is tilted against the ego's (rad).
 """
 
 from __future__ import annotations
@@ -27,7 +31,8 @@ from birdslam.vehicles.state.parallax import LearnedSize
 
 Floats = NDArray[np.float64]
 
-COMMON, OWN = 2, 3  # states: pitch, roll; and of each vehicle log h, log w, kerb
+COMMON, OWN = 2, 4  # states: pitch, roll; and of each vehicle log h, log w, edge, tilt
+HEIGHT, OUTLINE, EDGE, TILT = range(OWN)
 Cue = Literal["bottom", "top", "width"]
 CUES: tuple[Cue, ...] = ("bottom", "top", "width")  # measurements of each box, in this order
 ITERATIONS = 2
@@ -45,13 +50,16 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pitch_memory_s: float = 5.0  # of driving: how long the pitch's deviation from the calibration lasts
     sigma_pitch_step_rad: float = 0.0008  # a frame of driving: the road's change of grade, and the odometry's error
     sigma_pitch_blind_rad: float = 0.003  # a frame without odometry
-    sigma_roll_rad: float = 0.01  # of the camera over real roads against its calibration
+    sigma_roll_rad: float = 0.02  # of the camera over real roads against its calibration
     roll_memory_s: float = 20.0  # of driving: how long the roll's deviation lasts
     # Road and views change with time far above this speed, and with the way far below it: of a second, 1 - exp(-speed /
     # this) is of driving. KITTI tracking chose between it and 3 m/s
     driving_mps: float = 1.0
-    sigma_kerb_m: float = 0.04  # how far the road under a vehicle in the ego's lane lies off the ego's plane
-    sigma_crown_rad: float = 0.007  # and the more the farther it stands to the side
+    sigma_kerb_m: float = 0.018  # how far the road under a vehicle lies off the ego's plane, whatever its distance
+    sigma_edge_rel: float = 0.022  # of its height: a detector draws the lower edge of one vehicle alike in all frames
+    sigma_tilt_rad: float = 0.0017  # of the road at a vehicle against the ego's
+    sigma_crown_rad: float = 0.0047  # and the more the farther it stands to the side, a unit of y/x
+    tilt_memory_s: float = 5.0  # of driving: how long that tilt lasts
     width_drift_rel: float = 0.002  # of the outline, a frame
     width_turn_rel: float = 1.0  # of the outline, a radian that the line of sight turned: the yaw is not known as well
     # 1-sigma of the curvature of a vehicle's own way: a bend of 200 m. KITTI tracking chose between it and 100 m
@@ -89,6 +97,7 @@ class GroundSizeFilter:
         self.config = config
         self._unseen_s = np.zeros(0)  # of each vehicle
         self._driven_s = np.zeros(0)  # and how much of that counts as driving of the ego
+        self._sigma_tilt = np.zeros(0)
         self._x = np.array([camera.pitch_rad, camera.roll_rad])
         self._P = np.diag([config.sigma_pitch_rad**2, config.sigma_roll_rad**2])
         self._image_ground = camera.ground
@@ -114,7 +123,7 @@ class GroundSizeFilter:
     def without_vehicles(self) -> GroundSizeFilter:
         """A copy without vehicles, to predict the road further while this one stays."""
         ground = copy.copy(self)
-        ground._unseen_s, ground._driven_s = np.zeros(0), np.zeros(0)
+        ground._unseen_s, ground._driven_s, ground._sigma_tilt = np.zeros(0), np.zeros(0), np.zeros(0)
         ground._x, ground._P = self._x[:COMMON].copy(), self._P[:COMMON, :COMMON].copy()
         return ground
 
@@ -122,12 +131,15 @@ class GroundSizeFilter:
         """A vehicle seen for the first time, in the next row: of its class's size until boxes correct it."""
         config, dimensions = self.config, seen.dimensions
         self._unseen_s, self._driven_s = (np.append(s, config.box_memory_s) for s in (self._unseen_s, self._driven_s))
-        sigma_road_m = math.hypot(config.sigma_kerb_m, config.sigma_crown_rad * seen.bearing * seen.depth_by_height_m)
-        self._x = np.append(self._x, [math.log(dimensions.height_m), 0.0, 0.0])
+        sigma_edge_m = math.hypot(config.sigma_kerb_m, config.sigma_edge_rel * dimensions.height_m)
+        self._sigma_tilt = np.append(
+            self._sigma_tilt, math.hypot(config.sigma_tilt_rad, config.sigma_crown_rad * seen.bearing)
+        )
+        self._x = np.append(self._x, [math.log(dimensions.height_m), 0.0, 0.0, 0.0])
         P = np.zeros((len(self._x), len(self._x)))
         P[:-OWN, :-OWN] = self._P
         P[range(-OWN, 0), range(-OWN, 0)] = np.square(
-            [dimensions.sigma_height_rel, dimensions.sigma_width_rel, sigma_road_m]
+            [dimensions.sigma_height_rel, dimensions.sigma_width_rel, sigma_edge_m, self._sigma_tilt[-1]]
         )
         self._P = P
 
@@ -154,10 +166,14 @@ class GroundSizeFilter:
         step = config.sigma_pitch_blind_rad if turn_rad is None else config.sigma_pitch_step_rad
         self._x[0] += turn_rad or 0.0
         self._x[:COMMON] = calibrated + keep * (self._x[:COMMON] - calibrated)
-        scale = np.concatenate([keep, np.ones(len(self._x) - COMMON)])
+        keep_tilt = math.exp(-share * dt_s / config.tilt_memory_s)
+        scale = np.ones(len(self._x))
+        scale[:COMMON], scale[COMMON + TILT :: OWN] = keep, keep_tilt
+        self._x[COMMON + TILT :: OWN] *= keep_tilt
         self._P *= np.outer(scale, scale)
         noise = np.zeros(len(self._x))
         noise[:COMMON] = (1.0 - keep**2) * sigma**2
+        noise[COMMON + TILT :: OWN] = (1.0 - keep_tilt**2) * np.square(self._sigma_tilt)
         noise[0] += share * step**2
         self._P[np.diag_indices_from(self._P)] += noise
         if image_ground is not None and image_ground != self._image_ground:
@@ -177,6 +193,7 @@ class GroundSizeFilter:
         """Forget the vehicles of all other rows; what was learned of the road from them stays."""
         at = [*range(COMMON), *(COMMON + OWN * row + k for row in rows for k in range(OWN))]
         self._unseen_s, self._driven_s = self._unseen_s[rows], self._driven_s[rows]
+        self._sigma_tilt = self._sigma_tilt[rows]
         self._x, self._P = self._x[at], self._P[np.ix_(at, at)]
 
     def estimate_depths(
@@ -291,25 +308,26 @@ class GroundSizeFilter:
         rows = np.arange(n)
         depth = np.exp(x[m:])
         height = np.exp(x[at])
-        below = self._image_ground.height_m + x[at + 2]
-        far = np.where(below > height, depth + reach, depth)
-        level = x[0] - self._x[0]
+        camera_m = self._image_ground.height_m
+        below = camera_m + x[at + EDGE]
+        far = np.where(camera_m > height, depth + reach, depth)
+        level = x[0] - self._x[0] + x[at + TILT]
         lean = (x[1] - self._x[1]) * bearing
         expected = np.concatenate(
             [
                 bev.road_slope(depth, below) - level + lean,  # Eq. 1
-                (below - height) / far - level + lean,
+                (camera_m - height) / far - level + lean,
                 x[at + 1] - x[m:],
             ]
         )
         J = np.zeros((len(CUES) * n, m + n))
         J[: 2 * n, 0] = -1.0
         J[:n, 1] = J[n : 2 * n, 1] = bearing
-        J[rows, at + 2] = 1.0 / depth
+        J[rows, at + TILT] = J[n + rows, at + TILT] = -1.0
+        J[rows, at + EDGE] = 1.0 / depth
         J[rows, m + rows] = -below / depth
         J[n + rows, at] = -height / far
-        J[n + rows, at + 2] = 1.0 / far
-        J[n + rows, m + rows] = -(below - height) / far**2 * depth
+        J[n + rows, m + rows] = -(camera_m - height) / far**2 * depth
         J[2 * n + rows, at + 1] = 1.0
         J[2 * n + rows, m + rows] = -1.0
         return expected, J

@@ -87,6 +87,11 @@ class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     side_outlier_memory_s: Annotated[float, msgspec.Meta(gt=0.0)] = 0.15  # how long one lasts
     sigma_side_outlier_rel: float = 0.3  # of the box's width
     gate_sigma: float = 3.0  # past it of all filters a measurement is an outlier: its noise is raised
+    another: float = 0.02  # of the boxes: they are of another vehicle than the track's
+    leap_sigma: float = 2.5  # what stands and is seen farther off than that may be another vehicle
+    sigma_another_rel: float = 0.15  # how far off it stands along the line of sight: a row of parked vehicles
+    sigma_another_m: float = 1.0  # and across it
+    sigma_another_size_rel: float = 0.1  # how much its size differs
 
 
 @dataclass(frozen=True)
@@ -118,6 +123,7 @@ class Parallax:
         self.config = config
         driving = 1.0 - config.standing - config.unusual - config.creeping - config.crossing
         birth = [config.standing, config.unusual, 0.0, config.creeping, driving, config.crossing]
+        self._another_var = config.sigma_another_size_rel**2
         self._prior_weight = np.maximum(birth, MIN_WEIGHT)
         self._x = np.zeros((0, FILTERS, len(STATES)))
         self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
@@ -230,7 +236,12 @@ class Parallax:
 
         PJt = P @ J.swapaxes(-1, -2)
         S = J @ PJt
-        S = S + self._noise(boxes, innovation, S, of_box, of_face * of_view)
+        noise = self._noise(boxes, innovation, S, of_box, of_face * of_view)
+        S = S + noise
+        changed = self._with_another(P, J, S, noise, innovation, boxes, T_world_ego)
+        if changed.any():
+            PJt = P @ J.swapaxes(-1, -2)
+            S = J @ PJt + noise
         shift = side_outlier_shift(boxes, innovation, config.sigma_side_outlier_rel * np.sqrt(of_box))
         share = np.minimum(config.side_outlier + self._side_outlier[rows], MAX_SIDE_OUTLIER).T
         after = update_with_side_outliers(P, PJt, S, innovation, shift, share)
@@ -238,6 +249,7 @@ class Parallax:
         self._P[rows] = after.cov
 
         log_likelihood = after.log_likelihood[:, : len(MODES)]
+        log_likelihood[changed[:, : len(MODES)]] += math.log(config.another)
         weight = self._weight[rows] * np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
         weight = np.maximum(weight / weight.sum(axis=1, keepdims=True), MIN_WEIGHT)
         self._weight[rows] = weight
@@ -247,6 +259,45 @@ class Parallax:
         side_outlier = (after.outlier[..., : len(MODES)] * weight).sum(axis=-1).T
         self._side_outlier[rows] = side_outlier
         return self._size_measurements(rows, of_face + config.sigma_scale_rel**2, in_path, side_outlier)
+
+    def _with_another(
+        self,
+        P: Floats,
+        J: Floats,
+        S: Floats,
+        noise: Floats,
+        innovation: Floats,
+        boxes: ParallaxMeasurements,
+        T_world_ego: SE2,
+    ) -> NDArray[np.bool_]:
+        """(N, FILTERS): where the box is likelier of another standing vehicle. P (N, FILTERS, 8, 8) grows there.
+
+        Along a row of parked vehicles boxes are mistaken for a neighbour's: what stands then seems to leap once, and
+        that is no motion. Its place and its size are its own.
+        """
+        config, changed = self.config, np.zeros(P.shape[:2], np.bool_)
+        stand = np.array([*STATIONARY, *WITHOUT_GROUND])
+        fits = _log_likelihood(innovation[:, stand], S[:, stand])
+        at = np.flatnonzero(
+            _squared_mahalanobis(innovation[:, [STANDING]], S[:, [STANDING]])[:, 0] > config.leap_sigma**2
+        )
+        if not len(at):
+            return changed
+        along = np.column_stack([np.ones(len(at)), boxes.bearing[at]]) * (
+            config.sigma_another_rel * boxes.depth_m[at, None]
+        )
+        ray = along @ T_world_ego.rotation().T
+        leapt = P[np.ix_(at, stand)]
+        leapt[..., :2, :2] += (ray[:, :, None] * ray[:, None, :])[:, None] + config.sigma_another_m**2 * np.eye(2)
+        leapt[..., HEIGHT, HEIGHT] += self._another_var
+        leapt[..., WIDTH, WIDTH] += self._another_var
+        J_at = J[np.ix_(at, stand)]
+        S_at = J_at @ leapt @ J_at.swapaxes(-1, -2) + noise[np.ix_(at, stand)]
+        better = _log_likelihood(innovation[np.ix_(at, stand)], S_at) + math.log(config.another) > fits[at]
+        rows, columns = np.nonzero(better)
+        P[at[rows], stand[columns]] = leapt[rows, columns]
+        changed[at[rows], stand[columns]] = True
+        return changed
 
     def _noise(
         self, boxes: ParallaxMeasurements, innovation: Floats, S: Floats, of_box: Floats, face_var: Floats
@@ -339,6 +390,12 @@ class Parallax:
 def _squared_mahalanobis(gap: Floats, S: Floats) -> Floats:
     """(...): Mahalanobis distances squared of gaps (..., 4) with covariances (..., 4, 4)."""
     out: Floats = np.einsum("...a,...a->...", gap, np.linalg.solve(S, gap[..., None])[..., 0])
+    return out
+
+
+def _log_likelihood(innovation: Floats, S: Floats) -> Floats:
+    """(...), less a constant."""
+    out: Floats = -0.5 * (_squared_mahalanobis(innovation, S) + np.log(np.linalg.det(S)))
     return out
 
 

@@ -11,8 +11,10 @@ from birdslam.geometry.se2 import SE2, wrap
 from birdslam.vehicles.placement.depth_fusion import DepthPlace
 from birdslam.vehicles.placement.localisation import LocalisationConfig, centre_at, extent_m
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
+from birdslam.vehicles.state.yaw_by_outline import YawByOutline
 from birdslam.vehicles.track import Track, TrackingConfig
 
+LEAST_TURN_RAD = 0.02  # a smaller turn is none, so that yaws that are not told don't quiver
 MOTION_LOGIT = 6.0  # log odds of the front of a vehicle that was seen to move
 
 
@@ -69,19 +71,32 @@ class YawFilter:
             track.yaw_rad, track.front_logit = wrap(track.yaw_rad + math.pi), -track.front_logit
         self._correct(row, track, turn, (self.config.body_yaw_inflation * by_depth.sigma_yaw_rad) ** 2)
 
-    def _correct(self, row: int, track: Track, turn: float, variance: float) -> None:
-        """The yaw by a measured turn (rad) with its variance, and with it what was derived from the old yaw.
+    def correct_by_outline(self, row: int, track: Track, outline: YawByOutline) -> None:
+        """To the likeliest yaw by its widths so far, while neither motion nor body has told it."""
+        if track.yaw_known or track.observation.cut_side:
+            return
+        yaw_rad, track.sigma_yaw_rad = outline.estimate(row, track.yaw_rad)
+        turn = wrap(yaw_rad - track.yaw_rad)
+        if abs(turn) > LEAST_TURN_RAD:
+            self._turn(row, track, turn)
 
-        A vehicle turns about what was seen of it: that its centre lies elsewhere than was thought is no motion.
-        """
+    def _correct(self, row: int, track: Track, turn: float, variance: float) -> None:
+        """The yaw by a measured turn (rad) with its variance."""
         before = track.sigma_yaw_rad**2 + (self.config.sigma_yaw_rate_radps * self._dt_s) ** 2
         gain = before / (before + variance) if track.yaw_known else 1.0
         track.sigma_yaw_rad = math.sqrt((1.0 - gain) * before if track.yaw_known else variance)
-        track.yaw_rad = wrap(track.yaw_rad + gain * turn)
         track.yaw_known = True
+        self._turn(row, track, gain * turn)
+
+    def _turn(self, row: int, track: Track, turn: float) -> None:
+        """Turns it by `turn` (rad), and with it what was derived from the old yaw.
+
+        A vehicle turns about what was seen of it: that its centre lies elsewhere than was thought is no motion.
+        """
+        track.yaw_rad = wrap(track.yaw_rad + turn)
         seen, depth_m, ego_yaw_rad = track.observation, track.place.depth_m, track.frame.T_world_ego.yaw_rad
         yaw_ego_rad = wrap(track.yaw_rad - ego_yaw_rad)
-        yaws_rad = yaw_ego_rad, yaw_ego_rad - gain * turn
+        yaws_rad = yaw_ego_rad, yaw_ego_rad - turn
         after, before_it = (extent_m(seen.dimensions, yaw_rad, depth_m, seen.bearing)[1] for yaw_rad in yaws_rad)
         self.ground_size.rescale_outline(row, math.log(after / before_it))
         (x, y, *_), (x0, y0, *_) = (centre_at(seen, depth_m, yaw_rad, self.localisation) for yaw_rad in yaws_rad)

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from birdslam.bench.tracking.leave_one_out import LeftOut
-from birdslam.bench.tracking.localisation import LocalisationRow
+from birdslam.bench.tracking.localisation import LocalisationRow, TiltRow
+from birdslam.bench.tracking.tables import movers_table
 from birdslam.outputs.drive_files import claim_directory, write_json
 from birdslam.paper import PAPER
 from birdslam.runtime.cli.arguments import add_config, add_settings, add_tracking_root
@@ -20,6 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_tracking_root(parser)
     parser.add_argument("--detections", default="rrc", metavar="rrc|DIR", help="DIR: as det_02_rrc")
     parser.add_argument("--mode", choices=("default", "paper"), default="default", help="paper: Eq. 1 on level ground")
+    text = "the road's pitch: with the images' error of it, as odometry on images reports it, or none"
+    parser.add_argument("--tilt", choices=("images", "none"), default="images", help=text)
     text = "how each sequence fares by a constant that the others chose of these values; may be repeated"
     parser.add_argument("--leave-one-out", action="append", default=[], metavar="KEY=V1,V2", help=text)
     add_config(parser)
@@ -31,21 +34,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Writes report.json, or leave_one_out.json, and prints a table of it."""
     configuration = configuration_of(options)
-    config = configuration.slam.frontend
     output = Path(options.output)
     sweeps = [read_sweep(text, configuration) for text in options.leave_one_out]
     claim_directory(output)
     names = sequences_of(options.root, options.sequences)
     if sweeps:
-        left = evaluate_left_out(options.root, names, options.detections, config, sweeps)
+        left = evaluate_left_out(
+            options.root, names, options.detections, configuration.slam.frontend, sweeps, options.tilt == "images"
+        )
         write_json(output / "leave_one_out.json", left)
         print(_table_of_left_out(left))
     else:
-        rows = evaluate_localisation(
-            options.root, names, options.detections, PAPER.frontend if options.mode == "paper" else config
-        )
+        used = PAPER if options.mode == "paper" else configuration.slam
+        tilt_from_images = options.tilt == "images"
+        rows, tilts, movers = evaluate_localisation(options.root, names, options.detections, used, tilt_from_images)
         write_json(output / "report.json", rows)
+        write_json(output / "tilt.json", tilts)
+        write_json(output / "movers.json", movers)
         print(_table(rows))
+        print()
+        print(_table_of_tilts(tilts))
+        print()
+        print(movers_table(movers))
     print(f"results in {output}")
     return 0
 
@@ -61,9 +71,8 @@ def _table_of_left_out(rows: Sequence[LeftOut]) -> str:
 
 
 def _table(rows: Sequence[LocalisationRow]) -> str:
-    lines = [
-        f"{'sequence':10}{'range m':>9}{'n':>7}{'depth':>9}{'bias':>9}{'across m':>10}{'1 sigma':>9}{'2 sigma':>9}"
-    ]
+    titles = f"{'depth':>9}{'bias':>9}{'across m':>10}{'1 sigma':>9}{'2 sigma':>9}{'NEES':>7}{'yaw >10':>9}"
+    lines = [f"{'':12}{'range m':>9}{'cars':>6}{'n':>7}{titles}"]
     for row in rows:
         cells = (
             (row.depth_error_median_rel, "9.1%"),
@@ -71,7 +80,18 @@ def _table(rows: Sequence[LocalisationRow]) -> str:
             (row.lateral_error_median_m, "10.2f"),
             (row.inside_1_sigma, "9.0%"),
             (row.inside_2_sigma, "9.0%"),
+            (row.nees, "7.2f"),
+            (row.yaw_off_10_deg, "9.0%"),
         )
         numbers = "".join(format(value, form) for value, form in cells if value is not None)
-        lines.append(f"{row.sequence:10}{row.range:>9}{row.n:>7}{numbers}")
+        lines.append(f"{row.sequence:12}{row.range:>9}{row.cars:>6}{row.n:>7}{numbers}")
+    return "\n".join(lines)
+
+
+def _table_of_tilts(rows: Sequence[TiltRow]) -> str:
+    lines = [f"{'sequence':12}{'frames':>8}{'pitch mrad':>12}{'roll mrad':>11}  median errors against the labels' road"]
+    for row in rows:
+        cells = (row.pitch_error_median_mrad, "12.1f"), (row.roll_error_median_mrad, "11.1f")
+        numbers = "".join(format(value, form) for value, form in cells if value is not None)
+        lines.append(f"{row.sequence:12}{row.n:>8}{numbers}")
     return "\n".join(lines)

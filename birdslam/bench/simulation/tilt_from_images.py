@@ -1,0 +1,65 @@
+"""Odometry without images that reports the road's pitch as images would: with their errors of it.
+
+`SimulatedOdometry` reports the calibrated plane; what drives has one from the images, and errs by `ground_rad` of
+`OdometryNoise`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.bench.simulation.odometry import OdometryNoise, SimulatedOdometry, Walk
+from birdslam.geometry.camera import GroundPlane
+from birdslam.odometry.motion import Motion
+from birdslam.types import SpeedReading
+
+Floats = NDArray[np.float64]
+
+
+class TiltFromImages:
+    """An EgoMotion: a simulated one, that reports the road's pitch as the images would, while it drives.
+
+    `grounds` are the true ones, by frame; where one is None, none is reported anew. Of the roll images say nothing: it
+    is the calibrated one.
+    """
+
+    def __init__(
+        self,
+        odometry: SimulatedOdometry,
+        grounds: Sequence[GroundPlane | None],
+        noise: OdometryNoise,
+        rng: np.random.Generator,
+    ) -> None:
+        self._odometry, self._grounds = odometry, grounds
+        self._error, self._sigma_rad = Walk(noise.ground_rad, 1, rng), noise.ground_rad.sigma
+        self._reported = odometry.camera.ground
+
+    @property
+    def road_tracks(self) -> tuple[NDArray[np.int64], Floats]:
+        """Empty, as the simulated one's."""
+        return self._odometry.road_tracks
+
+    def track(self, image: NDArray[np.uint8]) -> None:
+        """Does nothing: no image is needed."""
+
+    def estimate(
+        self,
+        tracks: None,
+        frame_id: int,
+        t_source_ns: int,
+        vehicle_boxes_px: Floats,
+        road_mask: NDArray[np.bool_] | None = None,
+        speeds: Sequence[SpeedReading] = (),
+    ) -> Motion | None:
+        """The simulated motion, with the road's pitch."""
+        motion = self._odometry.estimate(tracks, frame_id, t_source_ns, vehicle_boxes_px, road_mask, speeds)
+        if motion is None:
+            return None
+        (error_rad,), at = self._error.draw(), self._grounds[frame_id]
+        if at is not None and not motion.standstill:
+            self._reported = GroundPlane(at.height_m, at.pitch_rad + float(error_rad), self._odometry.camera.roll_rad)
+        return msgspec.structs.replace(motion, ground=self._reported, pitch_sigma_rad=self._sigma_rad)

@@ -1,0 +1,63 @@
+"""The road's tilt by labelled vehicles: without images nothing else says how the camera leans over the road.
+
+A label's bottom stands on the road: its slope below the camera's axis is H / z - pitch + roll y/x (Eq. 1), less what
+the road differs by at each vehicle.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from birdslam.geometry.camera import GroundPlane
+from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
+from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig
+
+HALF_SPAN = 3  # frames before and after, whose labels count too: a camera pitches within half a second
+NEAREST_M, FARTHEST_M = 5.0, 60.0  # of labels that are used
+LEAST_VEHICLES = 2  # a tilt by fewer is not held to another's
+
+
+@dataclass(frozen=True)
+class LabelledGround:
+    """The camera over the road of one frame, the 1-sigma of its pitch and roll (rad), and the vehicles that tell it."""
+
+    ground: GroundPlane
+    sigma_pitch_rad: float
+    sigma_roll_rad: float
+    vehicles: int
+
+
+def labelled_grounds(sequence: TrackingSequence) -> list[LabelledGround | None]:
+    """One for each frame; None where no vehicle is labelled near it. What roads do is `GroundSizeConfig`'s."""
+    road = GroundSizeConfig()
+    found: dict[int, list[tuple[int, float, float, float]]] = {}
+    for label in sequence.labels:
+        x, y, z = label.place_m
+        if label.kind in VEHICLE_KINDS and label.truncated <= 0 and NEAREST_M < z < FARTHEST_M:
+            slope = (y - sequence.camera.height_m) / z
+            found.setdefault(label.frame, []).append((label.track, z, -x / z, slope))
+    out: list[LabelledGround | None] = []
+    for frame in range(len(sequence)):
+        near = [one for k in range(frame - HALF_SPAN, frame + HALF_SPAN + 1) for one in found.get(k, ())]
+        out.append(_fitted(near, sequence.camera.height_m, road) if near else None)
+    return out
+
+
+def _fitted(
+    labels: Sequence[tuple[int, float, float, float]], height_m: float, road: GroundSizeConfig
+) -> LabelledGround:
+    """Least squares with the priors of roads; a vehicle counts once, in however many frames it is labelled."""
+    times = Counter(track for track, *_ in labels)
+    z, bearing, slope = np.array([numbers for _, *numbers in labels]).T
+    variance = road.sigma_tilt_rad**2 + (road.sigma_kerb_m / z) ** 2 + (road.sigma_crown_rad * bearing) ** 2
+    weight = 1.0 / (variance * np.array([times[track] for track, *_ in labels]))
+    J = np.column_stack([-np.ones_like(bearing), bearing])
+    information = (J.T * weight) @ J + np.diag([road.sigma_pitch_rad**-2, road.sigma_roll_rad**-2])
+    cov = np.linalg.inv(information)
+    pitch_rad, roll_rad = (cov @ (J.T * weight) @ slope).tolist()
+    sigma_pitch, sigma_roll = np.sqrt(np.diag(cov)).tolist()
+    return LabelledGround(GroundPlane(height_m, pitch_rad, roll_rad), sigma_pitch, sigma_roll, len(times))
