@@ -343,7 +343,8 @@ class Odometry:
         self, tracks: Tracks, frame_id: int, t_source_ns: int, boxes_px: Floats, dt_s: float, car: CarMotion | None
     ) -> Motion:
         """The speed is held: what has not moved may be on the glass. After a while the window begins anew."""
-        motion = self._coast(frame_id, dt_s, [Status.VIEW_OBSTRUCTED] * self._selector.obstructed, car)
+        obstructed = self._selector.obstructed or self._stillness.contradicted
+        motion = self._coast(frame_id, dt_s, [Status.VIEW_OBSTRUCTED] * obstructed, car)
         if dt_s > _MAX_HELD * self.config.stillness.long_s:  # what moves has left the image; what stands would be told
             self._start_window(tracks, frame_id, t_source_ns, boxes_px)
             self._scale.lose_tilt()

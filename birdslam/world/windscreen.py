@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 Edit = Callable[[int, int, Image], Image]  # an image's index, how many there are, the image -> what is seen of it
 
-KINDS = ("nothing", "drops", "drops_defocused", "dirt", "reflection")
+KINDS = ("nothing", "drops", "rain", "drops_defocused", "dirt", "reflection")
 # Drops in front of the focus: their number, radius and blur over the image's width, the share of a pixel's light that
 # comes through them, how far what is behind is drawn to their middle, and the light that they add (sky) or take
 _DEFOCUSED_DROPS, _DEFOCUSED_RADIUS_REL, _DEFOCUS_REL = 45, (0.012, 0.04), 0.006
@@ -25,7 +25,7 @@ BONNET_SHARE = 0.14  # of the image's height, in its middle
 class Overlay:
     """`draw` puts one of KINDS over an image, the same each time.
 
-    Dirt is opaque, a drop shows the image upside down and blurred within a bright rim, a reflection is added to what
+    Dirt is opaque, a drop (of rain: small, and many) shows the image upside down and blurred within a bright rim, a reflection is added to what
     lies behind it. A drop in front of the focus is a wide, faint disc without a rim that blurs what is behind it, bends
     it towards its middle and takes or adds some light.
     """
@@ -36,12 +36,13 @@ class Overlay:
             self._lens = _Lens(width_px, height_px, seed)
             return
         rng = np.random.default_rng(seed)
-        count = {"drops": 60, "dirt": 45, "reflection": 40}.get(kind, 0)
+        count = {"drops": 60, "rain": 1200, "dirt": 45, "reflection": 40}.get(kind, 0)
         cover = np.zeros((height_px, width_px), np.float32)  # share of the overlay in each pixel
         brightness = np.zeros((height_px, width_px), np.float32)  # its own brightness
         for _ in range(count):
             centre = (int(rng.integers(0, width_px)), int(rng.integers(0, height_px)))
-            radius = int(rng.integers(5, 26) * width_px / 1242)
+            largest = 8 if kind == "rain" else 26
+            radius = max(1, int(rng.integers(largest // 5, largest) * width_px / 1242))
             light = float(rng.uniform(15.0, 70.0))
             if kind == "reflection":  # of what lies on the dashboard: edges over the lower half
                 centre = (centre[0], height_px // 2 + centre[1] // 2)
@@ -50,8 +51,9 @@ class Overlay:
             else:
                 cv2.circle(cover, centre, radius, 1.0, -1, cv2.LINE_AA)
                 cv2.circle(brightness, centre, radius, light if kind == "dirt" else 0.0, -1, cv2.LINE_AA)
-                if kind == "drops":
-                    cv2.ellipse(brightness, centre, (radius, radius), 0.0, 200.0, 340.0, light, 2, cv2.LINE_AA)
+                if kind in ("drops", "rain"):
+                    thick = 2 if kind == "drops" else 1
+                    cv2.ellipse(brightness, centre, (radius, radius), 0.0, 200.0, 340.0, light, thick, cv2.LINE_AA)
         self._cover = cv2.GaussianBlur(cover, (0, 0), 1.5)[..., None]
         self._light = cv2.GaussianBlur(brightness, (0, 0), 1.0)[..., None]
 
@@ -84,6 +86,7 @@ class _Lens:
             x, y = rng.uniform(0.0, width_px), rng.uniform(0.0, height_px)
             radius = rng.uniform(*_DEFOCUSED_RADIUS_REL) * width_px
             shape = np.exp(-(np.square((u - x) / radius) + np.square((v - y) / (1.2 * radius))) ** 2)  # a soft disc
+            shape[shape < 1e-3] = 0.0
             bend = rng.uniform(*_BEND) * shape
             self._u += bend * (x - u)
             self._v += bend * (y - v)

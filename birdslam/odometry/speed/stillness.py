@@ -111,6 +111,12 @@ class NearRoadStillness:
         return long, quantile(np.array(short), 0.5), quantile(contrast.astype(np.float64), _QUANTILE)
 
     @property
+    def contradicted(self) -> bool:
+        """Whether the near road is seen to have changed by more than noise."""
+        changes = self.changes
+        return changes is not None and changes[0] >= self.config.growth * max(changes[1], _ROUNDING_GREY)
+
+    @property
     def proven(self) -> bool:
         """Whether the near road is seen to have stood for the long lag."""
         changes, cfg = self.changes, self.config
