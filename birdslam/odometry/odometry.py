@@ -301,6 +301,7 @@ class Odometry:
             interval_ns,
             sigma_across_m=float(np.hypot(*sigma[:2])) / np.sqrt(2.0),
             sigma_rotation_rad=float(np.linalg.norm(sigma[3:])) / np.sqrt(3.0),
+            on_glass=self._selector.obstructed,
         )
         factor = self._scale.measure_scale(step, view)
         self._window.rescale(factor)

@@ -77,6 +77,8 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mount_walk_rad_per_sqrt_m: Positive = 0.0007  # of the mean pitch and roll, as loads and tanks change
     carried_after_m: Positive = 6.0  # without an accepted alignment, until the status says so
     invalid_sigma_rel: Positive = 0.15  # of the scale; above it a frame is invalid
+    # By judgement: behind rain drawn over recorded drives lengths are off by 1 to 6 %, all the way
+    sigma_on_glass_rel: Positive = 0.03  # of the scale, lasting, while something on the windscreen is in view
     mount_change: MountChangeConfig = MountChangeConfig()
     car: CarSpeedConfig = CarSpeedConfig()
     # mode "paper" only

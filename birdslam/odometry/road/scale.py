@@ -57,6 +57,7 @@ class RoadScale:
         self._vanishing_points = VanishingPointDetector(camera, config.vanishing_point)
         self._keyframes = RoadKeyframes(config.keyframes)
         self._confirmations = 0.0  # what alignments in a row tell of the length, each 0 to 1
+        self._on_glass = False  # corners are fixed to the windscreen
         self._informed = False  # the newest image's alignment told the length
         self._was_known = False  # a scale was known once: then the drive has shown how the camera is mounted
         self._rejected = 0.0  # alignments in a row, each by its new share of the path: those of one view err together
@@ -75,8 +76,12 @@ class RoadScale:
 
     @property
     def sigma_rel(self) -> float:
-        """1-sigma of the scale as a fraction."""
-        return float(np.sqrt(self._filter.cov[0, 0]))
+        """1-sigma of the scale as a fraction.
+
+        What is on the glass bends and blurs the road's image the same way in each, so that its error is in no mean.
+        """
+        lasting = self.config.sigma_on_glass_rel if self._on_glass or self._fixed_pattern.present else 0.0
+        return float(np.hypot(np.sqrt(self._filter.cov[0, 0]), lasting))
 
     @property
     def unknown(self) -> bool:
@@ -142,7 +147,7 @@ class RoadScale:
 
     def _measure_road(self, step: Pose, view: RoadView) -> float:
         """The factor on all lengths, by the road alone."""
-        self.fit, self._informed = None, False
+        self.fit, self._informed, self._on_glass = None, False, view.on_glass
         travelled_m = float(np.linalg.norm(step.p))
         self._filter.predict(step.R, travelled_m)
         if not self._direction_predicted:
