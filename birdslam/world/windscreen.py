@@ -25,9 +25,9 @@ BONNET_SHARE = 0.14  # of the image's height, in its middle
 class Overlay:
     """`draw` puts one of KINDS over an image, the same each time.
 
-    Dirt is opaque, a drop (of rain: small, and many) shows the image upside down and blurred within a bright rim, a reflection is added to what
-    lies behind it. A drop in front of the focus is a wide, faint disc without a rim that blurs what is behind it, bends
-    it towards its middle and takes or adds some light.
+    Dirt is opaque, a drop (of rain: small, and many) shows the image upside down and blurred within a bright rim, a
+    reflection is added to what lies behind it. A drop in front of the focus is a wide, faint disc without a rim that
+    blurs what is behind it, bends it towards its middle or away from it, and takes or adds some light.
     """
 
     def __init__(self, kind: str, width_px: int, height_px: int, seed: int) -> None:
@@ -85,7 +85,7 @@ class _Lens:
         for _ in range(_DEFOCUSED_DROPS):
             x, y = rng.uniform(0.0, width_px), rng.uniform(0.0, height_px)
             radius = rng.uniform(*_DEFOCUSED_RADIUS_REL) * width_px
-            shape = np.exp(-(np.square((u - x) / radius) + np.square((v - y) / (1.2 * radius))) ** 2)  # a soft disc
+            shape = np.exp(-((np.square((u - x) / radius) + np.square((v - y) / (1.2 * radius))) ** 2))  # a soft disc
             shape[shape < 1e-3] = 0.0
             bend = rng.uniform(*_BEND) * shape
             self._u += bend * (x - u)

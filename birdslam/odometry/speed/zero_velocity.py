@@ -48,7 +48,8 @@ def near_road_flow_px(
 ) -> float | None:
     """Optical flow of the reference image's corners on the near road, third quartile; None where there are too few.
 
-    `boxes_px` (N, 4) are vehicles, `on_glass` (M,) the ids of fixed corners, which do not count. Infinite where most corners were lost: a stationary car would have kept them.
+    `boxes_px` (N, 4) are vehicles, `on_glass` (M,) the ids of fixed corners, which do not count. Infinite where most
+    corners were lost: a stationary car would have kept them.
     """
     rays = rays_cam(camera, reference.px)
     near = (rays @ ground.normal_cam < -camera.height_m / _NEAR_M) & outside(reference.px, boxes_px)
