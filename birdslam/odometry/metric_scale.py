@@ -35,6 +35,7 @@ class RoadView:
     interval_ns: tuple[int, int] = (0, 0)  # of the motion, by t_source_ns
     sigma_across_m: float = 0.0  # 1-sigma of the position across the direction of travel, by the corners
     sigma_rotation_rad: float = 0.0  # 1-sigma of the rotation, by the corners
+    on_glass: bool = False  # there are corners fixed to the windscreen
 
 
 class MetricScale(Protocol):

@@ -24,6 +24,7 @@ from birdslam.odometry.corners.resection import InlierLimits, PoseEstimate, pose
 from birdslam.odometry.corners.selection import Corners, CornerSelector
 from birdslam.odometry.corners.sliding_window import match_ids
 from birdslam.odometry.corners.two_view import initial_two_view
+from birdslam.odometry.median import quantile
 from birdslam.odometry.metric_scale import MetricScale, RoadView
 from birdslam.odometry.motion import Motion, planar, step_cov, violates_nonholonomic
 from birdslam.odometry.motion_model import NO_MOTION, MotionModel
@@ -37,6 +38,7 @@ from birdslam.odometry.road.scale import RoadScale
 from birdslam.odometry.road.vanishing_point import VanishingPoint
 from birdslam.odometry.speed.constant_velocity import ConstantVelocityPrior, largest_sigma_m
 from birdslam.odometry.speed.scale import MOVING_M, CarMotion
+from birdslam.odometry.speed.stillness import NearRoadStillness
 from birdslam.odometry.speed.zero_velocity import is_stationary, near_road_flow_px
 from birdslam.odometry.working_resolution import WorkingResolution
 from birdslam.types import SpeedReading, Status
@@ -51,6 +53,8 @@ _MIN_INTERVAL_S = 0.004
 _KNOWN_SCALE_SIGMA_REL = 0.3  # of a scale by which the travelled distance is used
 _MOVING_MPS = 3.0  # from one image to the next a car does not stop from this
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step by two images alone: 1 cm, 0.25 deg
+_STILL_OUTER_PX = 1.5  # four of five corners have moved less where the median has not
+_MAX_HELD = 1.5  # times as long as a standstill takes to be told
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
 _STRATEGIES: dict[str, type[RoadScale] | type[MovingMedianScale]] = {"kalman": RoadScale, "paper": MovingMedianScale}
 
@@ -85,6 +89,7 @@ class Odometry:
         self._records = MotionRecords(cfg.motion, cfg.start.camera_ahead_m, self._scale, self._model)
         self._velocity_prior = ConstantVelocityPrior(cfg.constant_velocity)
         self._selector = CornerSelector(self.camera, cfg.fixed_corners, cfg.below_plane)
+        self._stillness = NearRoadStillness(self.camera, cfg.stillness)
         self._obstructed = False  # fixed corners were left out of the newest motion
         self._searched: Pose | None = None  # the step to the present image, where it was searched for
         self._road_tracks: tuple[Ints, Floats] = _NO_TRACKS
@@ -166,7 +171,19 @@ class Odometry:
             return motion
 
         cfg = self.config
+        self._stillness.update(tracks.image, t_source_ns, boxes_px)
         corners, located = self._relative_pose(tracks, boxes_px, dt_s, car)
+        on_glass = corners.ids[corners.fixed]
+        flow_px = near_road_flow_px(
+            self.camera, self._scale.ground, self._tracker.reference, tracks, boxes_px, on_glass
+        )
+        stationary = located is not None and self._is_stationary(
+            self._pose.between(located[0]), corners, flow_px, dt_s, car
+        )
+        if self._needs_proof(car) and (stationary or self._seems_still(corners)):
+            if not self._stillness.proven:
+                return self._hold(tracks, frame_id, t_source_ns, boxes_px, dt_s, car)
+            stationary, located = True, (self._pose, _TWO_VIEW_INFORMATION)
         slips = False
         if located is not None and self._is_moving(car):
             step = planar(self._pose.between(located[0]), self._scale.ground)
@@ -181,8 +198,7 @@ class Odometry:
         pose, info = located
         if is_night(tracks.image):
             info = info / cfg.motion.night_inflation
-        flow_px = near_road_flow_px(self.camera, self._scale.ground, self._tracker.reference, tracks, boxes_px)
-        if self._is_stationary(self._pose.between(pose), corners, flow_px, dt_s, car):
+        if stationary:
             # The pose is held, so this frame is as good a start of the next motion as the one that the car stopped in.
             motion = self._stand(frame_id)
         else:
@@ -235,14 +251,12 @@ class Odometry:
 
     def _two_view_pose(self, corners: Corners, dt_s: float, car: CarMotion | None) -> PoseEstimate | None:
         """Starts the window anew from the reference image and this one."""
-        cfg, displacement_px = self.config, corners.displacement_px
-        reference = self._tracker.reference
+        cfg, reference = self.config, self._tracker.reference
         a, b = match_ids(reference.ids, corners.ids)
         if len(a) < cfg.min_fitting:
             return None
         xy_a, xy_b = self.camera.to_xy(reference.px[a]), corners.xy[b]
-        still = float(np.median(displacement_px)) < cfg.zero_velocity.still_px
-        if still and float(np.quantile(displacement_px, 0.8)) < 1.5:
+        if self._seems_still(corners):
             return self._pose, _TWO_VIEW_INFORMATION
         guess = self._searched if self._searched is not None else self._model.predict(dt_s)
         found = initial_two_view(xy_a, xy_b, guess, self._focal_px, cfg.two_view_px)
@@ -287,6 +301,7 @@ class Odometry:
             interval_ns,
             sigma_across_m=float(np.hypot(*sigma[:2])) / np.sqrt(2.0),
             sigma_rotation_rad=float(np.linalg.norm(sigma[3:])) / np.sqrt(3.0),
+            on_glass=self._selector.obstructed,
         )
         factor = self._scale.measure_scale(step, view)
         self._window.rescale(factor)
@@ -307,6 +322,34 @@ class Odometry:
             if car.is_moving(cfg.zero_velocity.length_m) and (flow_px is None or car.agreed):
                 return False
         return is_stationary(cfg.zero_velocity, step, corners.displacement_px, flow_px, speed_mps, dt_s)
+
+    def _seems_still(self, corners: Corners) -> bool:
+        """Whether the corners have hardly moved, be they of the street or on the glass."""
+        displacement_px = corners.displacement_px
+        return len(displacement_px) >= self.config.min_fitting and (
+            quantile(displacement_px, 0.5) < self.config.zero_velocity.still_px
+            and quantile(displacement_px, 0.8) < _STILL_OUTER_PX
+        )
+
+    def _needs_proof(self, car: CarMotion | None) -> bool:
+        """Whether corners that stand are no evidence of a car that stands: they may be on the glass.
+
+        Where the scale is known and nothing was found on the glass, they are the street's, which has moved before.
+        """
+        if car is not None and car.agreed and not car.is_moving(self.config.zero_velocity.length_m):
+            return False
+        return self._scale.unknown or self._selector.obstructed
+
+    def _hold(
+        self, tracks: Tracks, frame_id: int, t_source_ns: int, boxes_px: Floats, dt_s: float, car: CarMotion | None
+    ) -> Motion:
+        """The speed is held: what has not moved may be on the glass. After a while the window begins anew."""
+        obstructed = self._selector.obstructed or self._stillness.contradicted
+        motion = self._coast(frame_id, dt_s, [Status.VIEW_OBSTRUCTED] * obstructed, car)
+        if dt_s > _MAX_HELD * self.config.stillness.long_s:  # what moves has left the image; what stands would be told
+            self._start_window(tracks, frame_id, t_source_ns, boxes_px)
+            self._scale.lose_tilt()
+        return motion
 
     def _is_moving(self, car: CarMotion | None) -> bool:
         """Whether the car is known to move: by its own speed, or by its last motion in a known scale."""

@@ -14,6 +14,7 @@ from birdslam.odometry.motion import MotionConfig
 from birdslam.odometry.obstruction.fixed_corners import FixedCornersConfig
 from birdslam.odometry.road.kalman_filter import RoadScaleConfig
 from birdslam.odometry.speed.constant_velocity import ConstantVelocityConfig
+from birdslam.odometry.speed.stillness import StillnessConfig
 from birdslam.odometry.speed.zero_velocity import ZeroVelocityConfig
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -36,3 +37,4 @@ class OdometryConfig(KeyframeConfig, frozen=True, forbid_unknown_fields=True):
     fixed_corners: FixedCornersConfig = FixedCornersConfig()
     constant_velocity: ConstantVelocityConfig = ConstantVelocityConfig()
     below_plane: BelowPlaneConfig = BelowPlaneConfig()
+    stillness: StillnessConfig = StillnessConfig()

@@ -14,26 +14,35 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 Edit = Callable[[int, int, Image], Image]  # an image's index, how many there are, the image -> what is seen of it
 
-KINDS = ("nothing", "drops", "dirt", "reflection")
+KINDS = ("nothing", "drops", "rain", "drops_defocused", "dirt", "reflection")
+# Drops in front of the focus: their number, radius and blur over the image's width, the share of a pixel's light that
+# comes through them, how far what is behind is drawn to their middle, and the light that they add (sky) or take
+_DEFOCUSED_DROPS, _DEFOCUSED_RADIUS_REL, _DEFOCUS_REL = 45, (0.012, 0.04), 0.006
+_DEFOCUSED_COVER, _BEND, _DEFOCUSED_LIGHT_GREY = (0.4, 0.95), (-0.5, 0.5), (-25.0, 35.0)
 BONNET_SHARE = 0.14  # of the image's height, in its middle
 
 
 class Overlay:
     """`draw` puts one of KINDS over an image, the same each time.
 
-    Dirt is opaque, a drop shows the image upside down and blurred within a bright rim, a reflection is added to what
-    lies behind it.
+    Dirt is opaque, a drop (of rain: small, and many) shows the image upside down and blurred within a bright rim, a
+    reflection is added to what lies behind it. A drop in front of the focus is a wide, faint disc without a rim that
+    blurs what is behind it, bends it towards its middle or away from it, and takes or adds some light.
     """
 
     def __init__(self, kind: str, width_px: int, height_px: int, seed: int) -> None:
         self.kind = kind
+        if kind == "drops_defocused":
+            self._lens = _Lens(width_px, height_px, seed)
+            return
         rng = np.random.default_rng(seed)
-        count = {"drops": 60, "dirt": 45, "reflection": 40}.get(kind, 0)
+        count = {"drops": 60, "rain": 1200, "dirt": 45, "reflection": 40}.get(kind, 0)
         cover = np.zeros((height_px, width_px), np.float32)  # share of the overlay in each pixel
         brightness = np.zeros((height_px, width_px), np.float32)  # its own brightness
         for _ in range(count):
             centre = (int(rng.integers(0, width_px)), int(rng.integers(0, height_px)))
-            radius = int(rng.integers(5, 26) * width_px / 1242)
+            largest = 8 if kind == "rain" else 26
+            radius = max(1, int(rng.integers(largest // 5, largest) * width_px / 1242))
             light = float(rng.uniform(15.0, 70.0))
             if kind == "reflection":  # of what lies on the dashboard: edges over the lower half
                 centre = (centre[0], height_px // 2 + centre[1] // 2)
@@ -42,8 +51,9 @@ class Overlay:
             else:
                 cv2.circle(cover, centre, radius, 1.0, -1, cv2.LINE_AA)
                 cv2.circle(brightness, centre, radius, light if kind == "dirt" else 0.0, -1, cv2.LINE_AA)
-                if kind == "drops":
-                    cv2.ellipse(brightness, centre, (radius, radius), 0.0, 200.0, 340.0, light, 2, cv2.LINE_AA)
+                if kind in ("drops", "rain"):
+                    thick = 2 if kind == "drops" else 1
+                    cv2.ellipse(brightness, centre, (radius, radius), 0.0, 200.0, 340.0, light, thick, cv2.LINE_AA)
         self._cover = cv2.GaussianBlur(cover, (0, 0), 1.5)[..., None]
         self._light = cv2.GaussianBlur(brightness, (0, 0), 1.0)[..., None]
 
@@ -51,6 +61,8 @@ class Overlay:
         """(H, W) grey or (H, W, 3)."""
         if self.kind == "nothing":
             return image
+        if self.kind == "drops_defocused":
+            return self._lens.draw(image)
         seen = image.reshape(*image.shape[:2], -1).astype(np.float32)
         if self.kind == "dirt":
             drawn = (1.0 - self._cover) * seen + self._cover * self._light
@@ -60,16 +72,50 @@ class Overlay:
         return np.clip(drawn, 0.0, 255.0).astype(np.uint8).reshape(image.shape)
 
 
-def from_middle(kind: str, seed: int) -> Edit:
-    """One of KINDS over the second half of the images."""
+class _Lens:
+    """Drops in front of the focus: `draw` shows the image through them."""
+
+    def __init__(self, width_px: int, height_px: int, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        v, u = np.mgrid[:height_px, :width_px].astype(np.float32)
+        self._u, self._v = u.copy(), v.copy()  # where a pixel's light comes from
+        self._cover = np.zeros((height_px, width_px), np.float32)
+        self._light = np.zeros((height_px, width_px), np.float32)
+        self._blur_px = _DEFOCUS_REL * width_px
+        for _ in range(_DEFOCUSED_DROPS):
+            x, y = rng.uniform(0.0, width_px), rng.uniform(0.0, height_px)
+            radius = rng.uniform(*_DEFOCUSED_RADIUS_REL) * width_px
+            shape = np.exp(-((np.square((u - x) / radius) + np.square((v - y) / (1.2 * radius))) ** 2))  # a soft disc
+            shape[shape < 1e-3] = 0.0
+            bend = rng.uniform(*_BEND) * shape
+            self._u += bend * (x - u)
+            self._v += bend * (y - v)
+            self._cover = np.maximum(self._cover, rng.uniform(*_DEFOCUSED_COVER) * shape)
+            self._light += rng.uniform(*_DEFOCUSED_LIGHT_GREY) * shape
+
+    def draw(self, image: Image) -> Image:
+        """(H, W) grey or (H, W, 3)."""
+        bent = cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        behind = cv2.GaussianBlur(bent, (0, 0), self._blur_px).astype(np.float32)
+        cover, light = (part if image.ndim == 2 else part[..., None] for part in (self._cover, self._light))
+        return np.clip((1.0 - cover) * bent + cover * behind + light, 0.0, 255.0).astype(np.uint8)
+
+
+def from_share(kind: str, seed: int, share: float) -> Edit:
+    """One of KINDS over the images after a share of them: 0 from the first one on."""
     overlays: dict[tuple[int, ...], Overlay] = {}
 
     def edit(index: int, count: int, image: Image) -> Image:
         size = (image.shape[1], image.shape[0])
         overlay = overlays.setdefault(size, Overlay(kind, *size, seed))
-        return overlay.draw(image) if 2 * index >= count else image
+        return overlay.draw(image) if index >= share * count else image
 
     return edit
+
+
+def from_middle(kind: str, seed: int) -> Edit:
+    """One of KINDS over the second half of the images."""
+    return from_share(kind, seed, 0.5)
 
 
 def bonnet(image: Image, lacquer: float = 40.0, mirrored: float = 0.35) -> Image:

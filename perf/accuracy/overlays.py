@@ -1,15 +1,18 @@
-"""Rain drops, dirt and a windscreen's reflection that come in the middle of a drive: does the ego-motion go on?
+"""Rain drops, dirt and a windscreen's reflection over recorded drives: does the ego-motion go on, is it right?
 
-    python -m perf overlays [SEQUENCE ...] [--output FILE.json] [--data DIR] [--networks] [--model ROLE=PATH ...]
+    python -m perf overlays [SEQUENCE ...] [--kinds KIND ...] [--seeds N ...] [--output FILE.json] [--data DIR]
+        [--networks] [--model ROLE=PATH ...]
 
-Each is drawn over the second half of each sequence, seeded, and stands still in the image (`windscreen.Overlay`);
-`night` blackens all but the end of the street, over 30 images, after which the road is back. Counts the frames of the
-second half that were called valid with a speed off by more than a tenth (and how many of them where the truth is
-interpolated or accelerates as no car does), and those called standstill while the car drove.
+Each is drawn over each sequence from its first image on and from its middle on, seeded, and stands still in the image
+(`windscreen.Overlay`); `night` blackens all but the end of the street, over 30 images from the middle on, after which
+the road is back. Counts the frames since then that were called valid with a speed off by more than a tenth (and how
+many of them where the truth is interpolated or accelerates as no car does), and those called standstill while the car
+drove. A frame is valid as the front end has it: a speed that has been held for too long is not.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,24 +21,27 @@ import numpy as np
 
 from birdslam.bench.ego import truth_quality
 from birdslam.odometry.odometry import Odometry
+from birdslam.odometry.plausibility import PlausibilityConfig
 from birdslam.perception import ModelError
 from birdslam.perf.accuracy.drives import Drive, Task, add_drive_options, is_valid, is_wrong, networks_of, read, uri_of
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.recording import DatasetError
-from birdslam.types import Status
+from birdslam.types import NS_PER_S, Status
 from birdslam.world import windscreen
 from birdslam.world.windscreen import Image
 
-label = "drops, dirt and a reflection from the middle of recorded drives on"
+label = "drops, dirt and a reflection over recorded drives"
 
 SEQUENCES = (
     "kitti_odometry/sequences/00",
     "kitti_odometry/sequences/06",
     "kitti_tracking/training/image_03/0005",
+    "kitti_tracking/training/image_02/0002",
 )
 KINDS = (*windscreen.KINDS, "night")
+BEGINS = {"from the start": 0.0, "from the middle": 0.5}  # at which share of the images
 NIGHT_IMAGES = 30
 _COUNTS = ("frames", "valid", "wrong_valid", "wrong_valid_truth_doubtful", "standstill", "obstructed")
 DRIVES_M = 0.1  # in one image, by the truth: such a car does not stand
@@ -44,26 +50,38 @@ DRIVES_M = 0.1  # in one image, by the truth: such a car does not stand
 def run(arguments: list[str]) -> None:
     parser = benchmark_parser("overlays", label)
     add_drive_options(parser)
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     options = parser.parse_args(arguments)
     configuration = networks_of(options)
     cv2.setNumThreads(1)
     try:
-        with Ledger(options.output, label, seed=options.seed, networks=configuration is not None) as ledger:
+        with Ledger(options.output, label, seeds=options.seeds, networks=configuration is not None) as ledger:
             for sequence in options.sequences or SEQUENCES:
                 task = Task(uri_of(sequence, options.data), "", False, 1, 1, 0, None)
-                for kind in KINDS:
+                for kind, seed, begin in variants(options.kinds, options.seeds):
                     # The networks see the overlay as well
-                    name, drive = read(replace(task, configuration=configuration), edit_of(kind, options.seed))
-                    row = measure(drive)
-                    ledger.add(f"{name} {kind}", row_text(row), **row)
+                    edit = edit_of(kind, seed, BEGINS[begin])
+                    name, drive = read(replace(task, configuration=configuration), edit)
+                    row = measure(drive, BEGINS[begin])
+                    ledger.add(f"{name} {kind} {begin}, seed {seed}", row_text(row), **row)
     except (DatasetError, ModelError) as error:
         raise PerfError(str(error)) from error
 
 
-def edit_of(kind: str, seed: int) -> windscreen.Edit:
-    """What is drawn over the images of the second half."""
-    return _night if kind == "night" else windscreen.from_middle(kind, seed)
+def variants(kinds: Sequence[str], seeds: Sequence[int]) -> list[tuple[str, int, str]]:
+    """Kind, seed, and from where on; what does not depend on a seed or a begin is there once."""
+    out = []
+    for kind in kinds:
+        drawn = kind not in ("nothing", "night")
+        begins = ["from the start"] if kind == "nothing" else ["from the middle"] if kind == "night" else list(BEGINS)
+        out += [(kind, seed, begin) for seed in (seeds if drawn else seeds[:1]) for begin in begins]
+    return out
+
+
+def edit_of(kind: str, seed: int, share: float) -> windscreen.Edit:
+    """What is drawn over the images after a share of them."""
+    return _night if kind == "night" else windscreen.from_share(kind, seed, share)
 
 
 def _night(index: int, count: int, image: Image) -> Image:
@@ -75,20 +93,26 @@ def _night(index: int, count: int, image: Image) -> Image:
     return out
 
 
-def measure(drive: Drive) -> dict[str, Any]:
-    """What the odometry says of the second half."""
-    odometry, half = Odometry(drive.camera), len(drive.images) // 2
+def measure(drive: Drive, share: float = 0.5) -> dict[str, Any]:
+    """What the odometry says of the images after a share of them."""
+    odometry, first = Odometry(drive.camera), int(share * len(drive.images))
+    blind_ns, measured_ns = round(PlausibilityConfig().blind_s * NS_PER_S), drive.t_ns[0]
     doubtful = truth_quality.doubtful(drive.poses, np.array(drive.t_ns, np.int64))
     row = dict.fromkeys(_COUNTS, 0)
     way_m = true_m = 0.0
     for k, image in enumerate(drive.images):
         motion = odometry.estimate(odometry.track(image), k, drive.t_ns[k], *drive.seen[k])
-        if motion is None or k < half:
+        if motion is None:
             continue
+        if Status.ODOMETRY_COASTING not in motion.status:
+            measured_ns = drive.t_ns[k]
+        if k < first:
+            continue
+        valid = is_valid(motion) and drive.t_ns[k] - measured_ns <= blind_ns
         step_m = float(np.linalg.norm(drive.poses[k, :3, 3] - drive.poses[motion.from_frame, :3, 3]))
         row["frames"] += 1
-        row["valid"] += is_valid(motion)
-        wrong = is_valid(motion) and is_wrong(motion, drive.poses)
+        row["valid"] += valid
+        wrong = valid and is_wrong(motion, drive.poses)
         row["wrong_valid"] += wrong
         row["wrong_valid_truth_doubtful"] += wrong and bool(doubtful[k])
         row["standstill"] += motion.standstill and step_m > DRIVES_M * (k - motion.from_frame)

@@ -30,7 +30,7 @@ class Corners:
 
     ids: Ints  # (N,) ascending
     xy: Floats  # (N, 2) normalised coordinates
-    displacement_px: Floats  # (M,) since the reference image, of those that it shows too
+    displacement_px: Floats  # (M,) since the reference image, of those that it shows too and that are not fixed
     fixed: Bools  # (N,) fixed in the image while the car drives: on the windscreen, or on a line along the road
 
     def without_fixed(self) -> Corners:
@@ -47,6 +47,11 @@ class CornerSelector:
         self._fixed_corners = FixedCorners(camera, fixed_corners)
         self._below_plane = BelowPlaneFilter(camera, below_plane)
 
+    @property
+    def obstructed(self) -> bool:
+        """Whether there are corners on the glass."""
+        return self._fixed_corners.present
+
     def select(
         self, tracks: Tracks, reference: Tracks, boxes_px: Floats, ground: GroundPlane, driven_m: float
     ) -> Corners:
@@ -56,9 +61,11 @@ class CornerSelector:
         fixed = self._fixed_corners.update(ids, px, ground, driven_m)
         inlier = self._below_plane.inliers(ids)
         ids, px, fixed = ids[inlier], px[inlier], fixed[inlier]
+        fixed &= self.obstructed
         a, b = match_ids(reference.ids, ids)
+        a, b = a[~fixed[b]], b[~fixed[b]]
         displacement: Floats = np.sqrt(((px[b] - reference.px[a]) ** 2).sum(axis=1))
-        return Corners(ids, self._camera.to_xy(px), displacement, fixed & self._fixed_corners.present)
+        return Corners(ids, self._camera.to_xy(px), displacement, fixed)
 
     def reject_below_plane(self, window: SlidingWindow, pose: Pose, ground: GroundPlane) -> None:
         """Rejects landmarks of the window, which is in metres; not behind a dirty windscreen, whose depths err."""

@@ -30,6 +30,7 @@ from birdslam.odometry.road.vanishing_point import VanishingPoint, VanishingPoin
 from birdslam.odometry.speed.scale import CarMotion, SpeedScale
 from birdslam.types import SpeedReading, SpeedSource, Status
 
+_TOLD = 0.5  # of an alignment's information about the length (kalman_filter.py): with more it counts as told
 _MIN_STEP_M = 0.1  # of a motion whose rotation gives the curvature of the path
 # The share of the least correlation that suffices where the landmarks agree, whose errors are independent: on a
 # rendered motorway behind a coarse encoder correlations reach 0.2
@@ -55,7 +56,9 @@ class RoadScale:
         self._bonnet = Bonnet(config.bonnet)
         self._vanishing_points = VanishingPointDetector(camera, config.vanishing_point)
         self._keyframes = RoadKeyframes(config.keyframes)
-        self._confirmations = 0
+        self._confirmations = 0.0  # what alignments in a row tell of the length, each 0 to 1
+        self._on_glass = False  # corners are fixed to the windscreen
+        self._informed = False  # the newest image's alignment told the length
         self._was_known = False  # a scale was known once: then the drive has shown how the camera is mounted
         self._rejected = 0.0  # alignments in a row, each by its new share of the path: those of one view err together
         self._rejections = 0  # and their number
@@ -73,8 +76,12 @@ class RoadScale:
 
     @property
     def sigma_rel(self) -> float:
-        """1-sigma of the scale as a fraction."""
-        return float(np.sqrt(self._filter.cov[0, 0]))
+        """1-sigma of the scale as a fraction.
+
+        What is on the glass bends and blurs the road's image the same way in each, so that its error is in no mean.
+        """
+        lasting = self.config.sigma_on_glass_rel if self._on_glass or self._fixed_pattern.present else 0.0
+        return float(np.hypot(np.sqrt(self._filter.cov[0, 0]), lasting))
 
     @property
     def unknown(self) -> bool:
@@ -94,11 +101,11 @@ class RoadScale:
         self._keyframes.clear()
         if not self._fixed_pattern.present:
             self._keyframes.insert(RoadFrame(image, image), pose, 0.0)
-        if not self._confirmations:
+        if not self._has_begun:
             sigma_rel = 1.0
         self._filter.reset_scale(sigma_rel)
         if sigma_rel > self.config.doubt_sigma_rel:
-            self._confirmations = 0
+            self._confirmations = 0.0
         self._car.restart()
 
     def speed_predicted(self, sigma_rel: float) -> None:
@@ -140,7 +147,7 @@ class RoadScale:
 
     def _measure_road(self, step: Pose, view: RoadView) -> float:
         """The factor on all lengths, by the road alone."""
-        self.fit = None
+        self.fit, self._informed, self._on_glass = None, False, view.on_glass
         travelled_m = float(np.linalg.norm(step.p))
         self._filter.predict(step.R, travelled_m)
         if not self._direction_predicted:
@@ -156,7 +163,7 @@ class RoadScale:
         keyframe = self._keyframe(pose)
         if keyframe is not None:
             T = keyframe.pose.between(pose)
-            if not self._was_known and not self._confirmations and self.unknown:
+            if not self._was_known and not self._has_begun and self.unknown:
                 self._filter.initialise_pitch(T.R.T @ T.p)
             bend_per_m = _bend_per_m(step.R, travelled_m)
             wide = self._fixed_pattern.present
@@ -172,7 +179,7 @@ class RoadScale:
                     by_landmarks = self._car.scale_factor / factor
                 T = Pose(T.R, T.p * factor)
                 factor *= self._align_and_update(keyframe.corrected, frame.corrected, T, px, by_landmarks, view)
-        measured = self._filter.carried_m == 0.0 and self._is_known()  # here, in metres
+        measured = self._informed and self._is_known()  # here, in metres
         self._mount_change.update(self._filter.tilt, factor * travelled_m, measured)
         self._insert_keyframe(frame, pose, factor)
         return factor
@@ -217,14 +224,14 @@ class RoadScale:
     def _update_bonnet(self, view: RoadView, travelled_m: float) -> None:
         """Where a bonnet turns out to have been taken for road, scale and tilt are dropped."""
         driven_m = travelled_m
-        if not self._confirmations:  # the length is not known: optical flow tells whether the car has moved
+        if not self._has_begun:  # the length is not known: optical flow tells whether the car has moved
             if view.flow_px < _MOVING_PX:
                 return
             driven_m = np.inf
         if self._bonnet.update(view.grey, self._aligner.top_px, driven_m):
             self._filter.reset_scale(1.0)
             self._filter.lose_tilt()
-            self._confirmations = 0
+            self._confirmations = 0.0
 
     def _landmark_scale(self, window: SlidingWindow) -> float | None:
         """Metres in the window's unit of length by its landmarks on the road, where the scale is doubtful."""
@@ -255,7 +262,7 @@ class RoadScale:
 
     def _sees_road(self) -> bool:
         seen = self._filter.carried_m <= self.config.carried_after_m and not self._predicted
-        return seen and self._confirmations > 0
+        return seen and self._has_begun
 
     def status(self) -> list[Status]:
         """What is wrong with the scale, the ground plane or the mount."""
@@ -277,8 +284,13 @@ class RoadScale:
         ground = self.ground
         return ground.pitch_rad, ground.roll_rad
 
+    @property
+    def _has_begun(self) -> bool:
+        """Whether an alignment has told a length since it was last unknown."""
+        return self._confirmations >= _TOLD
+
     def _is_known(self) -> bool:
-        return self._confirmations >= self.config.confirmations
+        return self._confirmations > self.config.confirmations - _TOLD
 
     def _is_doubtful(self) -> bool:
         return self.sigma_rel > self.config.doubt_sigma_rel or self._rejected >= self.config.doubt_after
@@ -312,7 +324,7 @@ class RoadScale:
         search = None
         if self._is_doubtful():
             # A confirmed scale must be beaten clearly: the dark below a car ahead correlates with standing still
-            lead = 0.02 if not self._confirmations else 0.1
+            lead = 0.02 if not self._has_begun else 0.1
             search = LengthSearch(self._tilt, lead, cfg.sigma_unseen_rad if self._rejected >= cfg.doubt_after else 0.0)
         found = best_alignment(self._aligner, filter_, past, present, T, px, by_landmarks, sigma_motion, search)
         if found is None:
@@ -327,13 +339,17 @@ class RoadScale:
             self._rejected += new
             self._rejections += 1
             return 1.0
-        self._rejected, self._rejections, self._predicted = 0.0, 0, False
         self.fit = fit
         filter_.cov = prior_cov
-        factor = searched * filter_.update_alignment(fit, min(1.0, filter_.carried_m / length))
+        tells = filter_.information(fit)
+        self._rejected *= 1.0 - tells
+        self._informed = tells >= _TOLD
+        if self._informed:
+            self._rejections, self._predicted = 0, False
+        factor = searched * filter_.update_alignment(fit, min(1.0, filter_.unaligned_m / length))
         if abs(np.log(factor)) > cfg.doubt_sigma_rel:
             self._car.road_contradicts(float(np.log(factor)))
-        self._confirmations = 1 if abs(np.log(factor)) > 0.3 else self._confirmations + 1
+        self._confirmations = tells if abs(np.log(factor)) > 0.3 else self._confirmations + tells
         self._was_known = self._was_known or self._is_known()
         if not self._is_known() and not self._car.measures:
             filter_.cov[0, 0] = max(filter_.cov[0, 0], (1.1 * cfg.doubt_sigma_rel) ** 2)

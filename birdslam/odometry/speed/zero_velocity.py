@@ -23,11 +23,13 @@ from birdslam.odometry.median import quantile
 from birdslam.odometry.road.points import outside
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
 _NEAR_M = 20.0  # road nearer than this moves in the image with the car
 # Of its corners: the number needed, and the share that a stationary car keeps. By judgement; no data chose them
 _MIN_NEAR, _MIN_NEAR_SHARE = 8, 0.4
+_NO_IDS: Ints = np.zeros(0, np.int64)
 
 
 class ZeroVelocityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,14 +44,16 @@ class ZeroVelocityConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
 
 def near_road_flow_px(
-    camera: Camera, ground: GroundPlane, reference: Tracks, tracks: Tracks, boxes_px: Floats
+    camera: Camera, ground: GroundPlane, reference: Tracks, tracks: Tracks, boxes_px: Floats, on_glass: Ints = _NO_IDS
 ) -> float | None:
     """Optical flow of the reference image's corners on the near road, third quartile; None where there are too few.
 
-    `boxes_px` (N, 4) are vehicles. Infinite where most corners were lost: a stationary car would have kept them.
+    `boxes_px` (N, 4) are vehicles, `on_glass` (M,) the ids of fixed corners, which do not count. Infinite where most
+    corners were lost: a stationary car would have kept them.
     """
     rays = rays_cam(camera, reference.px)
     near = (rays @ ground.normal_cam < -camera.height_m / _NEAR_M) & outside(reference.px, boxes_px)
+    near &= ~np.isin(reference.ids, on_glass)
     if near.sum() < _MIN_NEAR:
         return None
     a, b = match_ids(reference.ids[near], tracks.ids)

@@ -1,0 +1,132 @@
+"""A standstill needs positive evidence: what has not moved may be on the windscreen."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from birdslam.geometry.camera import Camera
+from birdslam.odometry.motion import Motion
+from birdslam.odometry.odometry import Odometry
+from birdslam.odometry.speed.stillness import NearRoadStillness, StillnessConfig
+from birdslam.types import Status
+
+WIDTH_PX, HEIGHT_PX, HORIZON_PX = 384, 216, 96
+CAMERA = Camera(WIDTH_PX, HEIGHT_PX, 320.0, 320.0, 191.5, 96.0, height_m=1.3)
+NO_BOXES = np.zeros((0, 4))
+
+
+def _texture(
+    seed: int, contrast_grey: float, rows: int = 4000, columns: int = WIDTH_PX, grain_px: float = 3.0
+) -> np.ndarray:
+    grain = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(rows, columns)), (0, 0), grain_px)
+    return contrast_grey * grain / float(grain.std())
+
+
+ROAD = _texture(1, 1.0)
+
+
+def road_image(along_m: float, contrast_grey: float) -> np.ndarray:
+    """(H, W) float: a road whose texture is stretched in columns alone, under a bare sky."""
+    image = np.full((HEIGHT_PX, WIDTH_PX), 120.0)
+    rows = np.arange(HORIZON_PX + 4, HEIGHT_PX)
+    depth_m = CAMERA.fy_px * CAMERA.height_m / (rows - HORIZON_PX)
+    image[rows] = 90.0 + contrast_grey * ROAD[((along_m + depth_m) * 40.0).astype(int) % len(ROAD)]
+    return image
+
+
+def behind_drops(image: np.ndarray, seed: int = 2, count: int = 500) -> np.ndarray:
+    """Small drops that stand still over most of the image."""
+    rng, out = np.random.default_rng(seed), image.astype(np.float32)
+    for _ in range(count):
+        centre = (int(rng.integers(0, WIDTH_PX)), int(rng.integers(0, HEIGHT_PX)))
+        cv2.circle(out, centre, int(rng.integers(1, 4)), float(rng.uniform(40.0, 200.0)), -1, cv2.LINE_AA)
+    return out
+
+
+def shown(image: np.ndarray, rng: np.random.Generator, noise_grey: float = 1.5, gain: float = 1.0) -> np.ndarray:
+    return np.clip(gain * image + rng.normal(0.0, noise_grey, image.shape), 0, 255).astype(np.uint8)
+
+
+def watched(
+    speed_mps: float, rate_hz: float, contrast_grey: float, drops: int, seconds: float = 1.5, drift: float = 0.0
+) -> tuple[NearRoadStillness, list[bool]]:
+    """The test after some seconds, and whether it was proven at each image; brightness grows by `drift` a second."""
+    stillness, rng = NearRoadStillness(CAMERA, StillnessConfig()), np.random.default_rng(0)
+    proven = []
+    for k in range(round(seconds * rate_hz)):
+        image = behind_drops(road_image(speed_mps * k / rate_hz, contrast_grey), count=drops)
+        grey = shown(image, rng, gain=1.0 + drift * k / rate_hz)
+        stillness.update(grey, round(k / rate_hz * 1e9), NO_BOXES)
+        proven.append(stillness.proven)
+    return stillness, proven
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 30.0])
+@pytest.mark.parametrize("drops", [0, 500])
+def test_a_car_that_stands_is_told_after_a_second_and_not_before(rate_hz: float, drops: int) -> None:
+    _, proven = watched(0.0, rate_hz, 20.0, drops, drift=0.02)
+    first = proven.index(True) / rate_hz
+    assert 0.85 <= first <= 1.1
+    assert all(proven[proven.index(True) :])
+
+
+@pytest.mark.parametrize("speed_mps", [0.5, 3.0, 28.0])
+@pytest.mark.parametrize("contrast_grey", [8.0, 20.0])
+def test_a_car_that_drives_behind_drops_is_not_said_to_stand(speed_mps: float, contrast_grey: float) -> None:
+    """At 28 m/s each image of the road is another one: a second changes it no more than a tenth does."""
+    stillness, proven = watched(speed_mps, 10.0, contrast_grey, 500)
+    assert stillness.changes is not None
+    assert not any(proven)
+
+
+def test_a_slow_change_says_that_the_car_moves() -> None:
+    stillness, proven = watched(0.12, 30.0, 20.0, 500)
+    assert stillness.contradicted
+    assert not any(proven)
+
+
+def test_a_road_that_shows_nothing_tells_nothing() -> None:
+    stillness, proven = watched(0.0, 10.0, 0.0, 0)
+    assert not stillness.contradicted
+    assert not any(proven)
+
+
+def test_vehicles_are_no_road_and_a_view_full_of_them_tells_nothing() -> None:
+    rng = np.random.default_rng(3)
+    aside, everything = np.array([[200.0, 60.0, 384.0, 216.0]]), np.array([[0.0, 0.0, 384.0, 216.0]])
+    for boxes_px, tells in ((aside, True), (everything, False)):
+        stillness = NearRoadStillness(CAMERA, StillnessConfig())
+        for k in range(13):
+            image = road_image(0.0, 20.0)
+            image[60:, 205:380] = rng.uniform(0.0, 255.0)  # it drives
+            stillness.update(shown(image, rng), k * 100_000_000, boxes_px)
+        assert stillness.proven == tells
+
+
+def _drive(speed_mps: float, contrast_grey: float, seconds: float, rate_hz: float = 20.0) -> list[Motion]:
+    """From the first image on behind drops; the road's grain is faint, so that the drops have the corners."""
+    odometry, rng, out = Odometry(CAMERA), np.random.default_rng(0), []
+    for k in range(round(seconds * rate_hz)):
+        image = shown(behind_drops(road_image(speed_mps * k / rate_hz, contrast_grey)), rng, noise_grey=1.0)
+        motion = odometry.estimate(odometry.track(image), k, round(k / rate_hz * 1e9), NO_BOXES)
+        out += [] if motion is None else [motion]
+    return out
+
+
+def test_a_drive_that_begins_behind_rain_is_no_standstill_and_is_not_valid() -> None:
+    motions = _drive(24.0, 8.0, 2.5)
+    assert not any(motion.standstill for motion in motions)
+    assert all(Status.SCALE_INVALID in motion.status for motion in motions)
+    held = [motion for motion in motions if Status.ODOMETRY_COASTING in motion.status]
+    assert len(held) > 0.8 * len(motions)
+    assert held[5].cov[0, 0] > held[0].cov[0, 0]  # the longer it is held, the less it is known
+
+
+def test_a_stop_behind_rain_is_found_within_a_second_and_a_half() -> None:
+    motions = _drive(0.0, 20.0, 2.0)
+    stands = [motion.standstill for motion in motions]
+    assert not any(stands[:16])
+    assert all(stands[28:])
+    assert np.array_equal(motions[-1].t_prev_curr_m, np.zeros(3))
