@@ -9,15 +9,22 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
 from birdslam.odometry.odometry import Odometry
-from birdslam.odometry.working_resolution import FOCAL_PX, LARGEST_FOCAL_PX, WorkingResolution
+from birdslam.odometry.working_resolution import (
+    FOCAL_PX,
+    LARGEST_FOCAL_PX,
+    LEAST_FOCAL_PX,
+    SMALLEST_FOCAL_PX,
+    WorkingResolution,
+)
 
 
 def camera(focal_px: float, width_px: int = 1920, height_px: int = 1080) -> Camera:
     return Camera(width_px, height_px, focal_px, focal_px, 0.5 * (width_px - 1), 0.52 * height_px, height_m=1.3)
 
 
-def test_a_film_that_suits_it_stays_as_it_is() -> None:
-    given_camera = camera(LARGEST_FOCAL_PX)
+@pytest.mark.parametrize("focal_px", [LARGEST_FOCAL_PX, SMALLEST_FOCAL_PX, LEAST_FOCAL_PX - 1.0])
+def test_a_film_that_suits_it_stays_as_it_is(focal_px: float) -> None:
+    given_camera = camera(focal_px)
     resolution = WorkingResolution(given_camera)
     image, boxes = np.zeros((1080, 1920), np.uint8), np.ones((2, 4))
     assert resolution.camera is given_camera
@@ -25,7 +32,11 @@ def test_a_film_that_suits_it_stays_as_it_is() -> None:
     assert resolution.boxes_px(boxes) is boxes
 
 
-@given(st.floats(LARGEST_FOCAL_PX + 1.0, 4000.0), st.floats(100.0, 1800.0), st.floats(100.0, 1000.0))
+@given(
+    st.one_of(st.floats(LARGEST_FOCAL_PX + 1.0, 4000.0), st.floats(LEAST_FOCAL_PX, SMALLEST_FOCAL_PX - 1.0)),
+    st.floats(100.0, 1800.0),
+    st.floats(100.0, 1000.0),
+)
 def test_a_pixel_is_the_same_ray_at_both_resolutions(focal_px: float, u: float, v: float) -> None:
     given_camera = camera(focal_px)
     resolution = WorkingResolution(given_camera)

@@ -63,7 +63,7 @@ class CalibrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     crest_m: Positive = 30.0  # correlation length of crests and sags
     min_looks: Annotated[int, msgspec.Meta(ge=3)] = 5  # at the vanishing point
     max_sigma_rad: Positive = 0.02  # of the result's pitch, which all lengths along the road rest on
-    max_sigma_roll_rad: Positive = 0.03  # of its roll: at the side of the own lane that is 6 cm of height
+    max_sigma_roll_rad: Positive = 0.02  # of its roll: at the side of the own lane that is 4 cm of height
     restart_rad: Positive = 0.01  # farther than this from the start's tilt, the drive is repeated from the result
     max_drives: Annotated[int, msgspec.Meta(ge=1)] = 3
 

@@ -2,7 +2,8 @@
 
 What follows corners and compares roads has its lengths in pixels of cameras of 600 to 900 px of focal length. A film
 with more pixels shows no more of the road but the encoder's blocks and the sensor's noise: it is made smaller first, by
-the mean over areas, so that a pixel is the same angle. A smaller film stays as it is.
+the mean over areas, so that a pixel is the same angle. One with fewer is made larger: with its own pixels the same
+smoothing, windows and limits would be other angles of the road.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 
-FOCAL_PX = 720.0  # that of an image that is made smaller
+FOCAL_PX = 720.0  # that of an image that is made smaller or larger
 LARGEST_FOCAL_PX = 900.0  # with more it is made smaller
+SMALLEST_FOCAL_PX = 600.0  # with less it is made larger
+LEAST_FOCAL_PX = 400.0  # with still less it stays: made larger it would cost four times the time and show little more
 
 
 class WorkingResolution:
@@ -24,7 +27,8 @@ class WorkingResolution:
     def __init__(self, camera: Camera) -> None:
         focal_px = 0.5 * (camera.fx_px + camera.fy_px)
         self._given = camera
-        self.is_given = focal_px <= LARGEST_FOCAL_PX
+        self.is_given = SMALLEST_FOCAL_PX <= focal_px <= LARGEST_FOCAL_PX or focal_px < LEAST_FOCAL_PX
+        self._interpolation = cv2.INTER_AREA if focal_px > FOCAL_PX else cv2.INTER_CUBIC
         width_px, height_px = camera.width_px, camera.height_px
         if not self.is_given:
             width_px, height_px = (round(side * FOCAL_PX / focal_px) for side in (width_px, height_px))
@@ -49,7 +53,7 @@ class WorkingResolution:
         if image.shape[:2] != (self._given.height_px, self._given.width_px):
             raise ValueError(f"an image of {image.shape[1]}x{image.shape[0]} is none of this camera")
         size = self.camera.width_px, self.camera.height_px
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return np.asarray(cv2.resize(image, size, interpolation=self._interpolation), np.uint8)
 
     def boxes_px(self, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 4) x1, y1, x2, y2 of the given image."""

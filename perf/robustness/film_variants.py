@@ -1,0 +1,147 @@
+"""What is done to a film before it is driven: another size, rate or compression, and what is in the camera's way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+
+Image = NDArray[np.uint8]
+Timed = tuple[int, Image]  # t_source_ns, the raw image
+Shown = Callable[[int, Image], Image]  # of an image's index and the image
+
+LEAST_WIDTH_PX, MOST_WIDTH_PX = 320, 3840
+_ENCODER = "libx264"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """How a film differs from the one at hand."""
+
+    name: str
+    size: float = 1.0
+    every: int = 1  # each n-th image alone
+    repeats: int = 1  # how often each image comes, as films of another rate have it
+    crf: int | None = None  # of H.264: 18 is fine, 35 coarse
+    shown: Shown | None = None
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera whose images these are; `camera` is that of the film at hand."""
+        if self.size == 1.0:
+            return camera
+        width_px, height_px = (round(side * self.size) for side in (camera.width_px, camera.height_px))
+        x, y = width_px / camera.width_px, height_px / camera.height_px
+        return replace(
+            camera,
+            width_px=width_px,
+            height_px=height_px,
+            fx_px=camera.fx_px * x,
+            fy_px=camera.fy_px * y,
+            cx_px=(camera.cx_px + 0.5) * x - 0.5,
+            cy_px=(camera.cy_px + 0.5) * y - 0.5,
+        )
+
+    def fits(self, camera: Camera) -> bool:
+        """Whether films have such a width."""
+        return LEAST_WIDTH_PX <= camera.width_px * self.size <= MOST_WIDTH_PX
+
+    def images(self, film: Iterator[Timed], folder: Path) -> Iterator[Timed]:
+        """The film's images so changed; `folder` takes what is encoded."""
+        before: Timed | None = None
+        for t_ns, image in _encoded(self._resized(film), self.crf, folder):
+            if before is not None:  # each repetition between an image and the next
+                for repeat in range(1, self.repeats):
+                    yield before[0] + repeat * (t_ns - before[0]) // self.repeats, before[1]
+            before = t_ns, image
+            yield before
+
+    def _resized(self, film: Iterator[Timed]) -> Iterator[Timed]:
+        for k, (t_ns, image) in enumerate(film):
+            if k % self.every:
+                continue
+            if self.shown is not None:
+                image = self.shown(k, image)
+            if self.size != 1.0:
+                size = round(image.shape[1] * self.size), round(image.shape[0] * self.size)
+                how = cv2.INTER_AREA if self.size < 1.0 else cv2.INTER_CUBIC
+                image = np.asarray(cv2.resize(image, size, interpolation=how), np.uint8)
+            yield t_ns, image
+
+
+def variants(camera: Camera) -> list[Variant]:
+    """Those of a film of this camera, the unchanged one first."""
+    every = [
+        Variant("unchanged"),
+        *(Variant(f"{size:g} of the size", size=size) for size in (0.5, 0.75, 1.5, 2.0)),
+        *(Variant(f"every {n} images", every=n) for n in (2, 3)),
+        Variant("each image twice", repeats=2),
+        *(Variant(f"H.264, crf {crf}", crf=crf) for crf in (18, 28, 35)),
+        Variant("caption", shown=_caption),
+        Variant("bonnet", shown=_bonnet),
+        Variant("flicker", shown=_flicker),
+    ]
+    return [variant for variant in every if variant.fits(camera)]
+
+
+def _encoded(film: Iterator[Timed], crf: int | None, folder: Path) -> Iterator[Timed]:
+    """The film through an encoder and a decoder, in times of its own."""
+    if crf is None:
+        yield from film
+        return
+    import av  # only here: nothing else needs an encoder
+
+    path, times_ns = folder / "encoded.mp4", []
+    with av.open(str(path), "w") as out:
+        stream = None
+        for t_ns, image in film:
+            if stream is None:
+                stream = out.add_stream(_ENCODER, rate=Fraction(30), options={"crf": str(crf), "preset": "veryfast"})
+                stream.height, stream.width = (side - side % 2 for side in image.shape[:2])
+                stream.pix_fmt = "yuv420p"
+            even = np.ascontiguousarray(image[: stream.height, : stream.width])
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(even, "gray" if even.ndim == 2 else "bgr24")))
+            times_ns.append((t_ns, image.shape[:2]))
+        if stream is not None:
+            out.mux(stream.encode(None))
+    with av.open(str(path)) as encoded:
+        for (t_ns, (rows, columns)), frame in zip(times_ns, encoded.decode(video=0), strict=True):
+            image = np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+            more = ((0, rows - image.shape[0]), (0, columns - image.shape[1]), (0, 0))
+            yield t_ns, np.pad(image, more, mode="edge")
+
+
+# --- what is in the way ---
+
+
+def _caption(index: int, image: Image) -> Image:
+    """Place and time along the lower edge, as dashboard cameras write them."""
+    out = image.copy()
+    rows, columns = out.shape[:2]
+    text = f"CAMERA 2020-01-01 12:{index // 1800:02d}:{index // 30 % 60:02d}  51.0000 -114.0000"
+    at = round(0.01 * columns), round(0.985 * rows)
+    cv2.putText(out, text, at, cv2.FONT_HERSHEY_PLAIN, columns / 900.0, (235, 235, 235), max(1, columns // 700))
+    return out
+
+
+def _bonnet(_: int, image: Image) -> Image:
+    """A dark bonnet in the lowest eighth, with an edge as bright as the sky in it."""
+    out = image.copy()
+    rows, columns = out.shape[:2]
+    centre, axes = (columns // 2, round(1.25 * rows)), (round(0.7 * columns), round(0.38 * rows))
+    cv2.ellipse(out, centre, axes, 0.0, 180.0, 360.0, (40, 40, 42), cv2.FILLED)
+    cv2.ellipse(out, centre, axes, 0.0, 180.0, 360.0, (130, 130, 130), max(1, rows // 200))
+    return out
+
+
+def _flicker(index: int, image: Image) -> Image:
+    """Lamps of 100 Hz before a camera of 30 Hz, or an exposure that hunts."""
+    gain = 1.0 + 0.12 * np.sin(2.0 * np.pi * index / 3.0)
+    return np.asarray(np.clip(image * gain, 0, 255), np.uint8)
