@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import msgspec
@@ -13,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.calibration.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
-from birdslam.calibration.height_check import HeightCheck, KnownLength
+from birdslam.calibration.height_check import VEHICLES, HeightCheck, KnownLength
 from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
 from birdslam.calibration.lens import (
     FIELD_OF_VIEW_DEG,
@@ -31,14 +33,15 @@ from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded, parsed, recording_uri
 from birdslam.runtime.progress import with_progress
 from birdslam.sources.camera_file import camera_text, load_camera
-from birdslam.sources.recording import DatasetError, Recording
+from birdslam.sources.recording import DatasetError, Recording, check_times
 from birdslam.sources.speed_file import read_speed_curve
-from birdslam.types import Frame
+from birdslam.types import NS_PER_S, Frame
 
 UNKNOWN_HEIGHT_M = 1.5  # where none was given: all lengths are in proportion to it, and it is replaced
-MAX_SIGMA_HEIGHT_REL = 0.1
+MAX_SIGMA_HEIGHT_REL = 0.2  # a height that is known less well is none
 AGREES_SIGMA = 2.0
 _LENS_S = 120.0  # of a film, from which its lens is found
+_MOUNT_S = 180.0  # of a film, from which pitch, roll and height are found
 
 
 @dataclass(frozen=True)
@@ -56,10 +59,16 @@ class Given:
     speed: Path | None = None  # lines of time in s, speed in m/s
 
 
-def calibrate_drive(
-    configuration: Configuration, source: str, given: Given, stride: int = 1
-) -> tuple[Camera, list[str]]:
-    """The camera, and what it rests on, a line each. `source`: a KITTI directory or a source's URI.
+class Calibrated(NamedTuple):
+    """A camera, and what it rests on, a line each; `lengths_by` is what its metres rest on, as a sentence goes on."""
+
+    camera: Camera
+    report: list[str]
+    lengths_by: str
+
+
+def calibrate_drive(configuration: Configuration, source: str, given: Given, stride: int = 1) -> Calibrated:
+    """The camera of a drive. `source`: a KITTI directory or a source's URI.
 
     Raises CalibrationError, ConfigurationError, DatasetError.
     """
@@ -78,8 +87,9 @@ def calibrate_drive(
     with Inference(configuration) as inference:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
-            frames = offline_frames(RecordedSource(recording, configuration.source))
-            for frame in with_progress(frames, "calibrate", len(recording) or None):
+            most = round(_MOUNT_S * recording.rate_hz)
+            frames = islice(offline_frames(RecordedSource(recording, configuration.source)), most)
+            for frame in with_progress(frames, "calibrate", min(most, len(recording)) or None):
                 yield frame, inference.start(frame)
 
         try:
@@ -92,8 +102,8 @@ def calibrate_drive(
             )
         except CalibrationError as error:
             raise CalibrationError(f"{uri}: {error}") from None
-    camera, chosen = _with_height(found, known_height, uri)
-    return camera, [*_report(found, camera, chosen, uri, lens)]
+    camera, height_by = _with_height(found, known_height, lens, uri)
+    return Calibrated(camera, [*_report(found, camera, height_by, uri, lens)], _lengths_by(camera, height_by, lens))
 
 
 # --- what is given ---
@@ -238,43 +248,65 @@ def _lengths(recording: Recording, speed_file: Path | None) -> dict[str, KnownLe
                 return None
             return float(np.interp(end_ns * 1e-9, t_s, way_m) - np.interp(start_ns * 1e-9, t_s, way_m))
 
-        first, last = recording_span_s(recording)
-        if t_s[-1] < first or t_s[0] > last:
-            raise DatasetError(
-                f"{speed_file}: its times {t_s[0]:g} to {t_s[-1]:g} s lie outside the recording's, "
-                f"{first:g} to {last:g} s"
-            )
+        check_times(recording, speed_file, round(t_s[0] * NS_PER_S), round(t_s[-1] * NS_PER_S))
         out["speed"] = by_speed
     return out
-
-
-def recording_span_s(recording: Recording) -> tuple[float, float]:
-    """Times of the first and the last frame, by the recording's clock."""
-    times = [frame.t_source_ns * 1e-9 for frame in recording.frames()]
-    return times[0], times[-1]
 
 
 # --- what is found ---
 
 
-def _with_height(found: Calibration, known: bool, uri: str) -> tuple[Camera, HeightCheck | None]:
+class HeightBy(NamedTuple):
+    """Where the camera's height comes from; `check` is the cue that gave it, None where it was stated."""
+
+    words: str
+    check: HeightCheck | None
+    sigma_rel: float  # of all lengths along the road, by this height and the focal length
+
+
+def _with_height(found: Calibration, known: bool, lens: Intrinsics | None, uri: str) -> tuple[Camera, HeightBy]:
     """The camera with the height that was stated, else with the surest that was estimated."""
+    focal_rel = _focal_sigma_rel(lens)
     if known:
-        return found.camera, None
-    checks = sorted(found.height_checks, key=lambda check: check.sigma_m)
-    if not checks or checks[0].sigma_m > MAX_SIGMA_HEIGHT_REL * checks[0].height_m:
-        raise CalibrationError(
-            f"{uri}: the camera's height is not known, and nothing here tells it: measure it (--height M), or give the "
-            "car's speed (--speed FILE)"
-        )
+        by = HeightBy("as stated", None, focal_rel)
+    else:
+        checks = sorted(found.height_checks, key=lambda check: check.sigma_m / check.height_m)
+        if not checks or checks[0].sigma_m > MAX_SIGMA_HEIGHT_REL * checks[0].height_m:
+            raise CalibrationError(
+                f"{uri}: the camera's height is not known, and nothing here tells it (too few cars are seen): measure "
+                "it (--height M), or give the car's speed (--speed FILE)"
+            )
+        check = checks[0]
+        own_rel = check.sigma_m / check.height_m
+        by_vehicles = check.cue == VEHICLES
+        cue = f"the size of {check.samples} cars" if by_vehicles else f"the {check.cue} along {found.path_m:.0f} m"
+        # A known length holds height and focal length together
+        sigma_rel = math.hypot(own_rel, focal_rel) if by_vehicles else own_rel
+        by = HeightBy(f"by {cue}, +- {check.sigma_m:.2f} m", check, sigma_rel)
+    height_m = found.camera.height_m if by.check is None else by.check.height_m
     try:
-        return msgspec.structs.replace(found.camera, height_m=checks[0].height_m), checks[0]
+        return msgspec.structs.replace(found.camera, height_m=height_m, scale_sigma_rel=min(by.sigma_rel, 1.0)), by
     except ValueError as error:
-        raise CalibrationError(f"{uri}: by {checks[0].cue}: {error}") from None
+        raise CalibrationError(f"{uri}: {by.words}: {error}") from None
+
+
+def _focal_sigma_rel(lens: Intrinsics | None) -> float:
+    """As a fraction of the focal length, where it is an estimate; a chessboard's is measured."""
+    if lens is None or lens.sigma_focal_px is None or lens.reprojection_px is not None:
+        return 0.0
+    return lens.sigma_focal_px / lens.fx_px
+
+
+def _lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None) -> str:
+    focal_rel = _focal_sigma_rel(lens)
+    words = f"the camera's height of {camera.height_m:.2f} m ({by.words})"
+    if focal_rel and lens is not None and (by.check is None or by.check.cue == VEHICLES):
+        words += f" and its focal length of {lens.fx_px:.0f} px, +- {focal_rel:.0%}"
+    return words
 
 
 def _report(
-    found: Calibration, camera: Camera, chosen: HeightCheck | None, uri: str, lens: Intrinsics | None
+    found: Calibration, camera: Camera, height_by: HeightBy, uri: str, lens: Intrinsics | None
 ) -> Iterator[str]:
     yield f"from {uri}: {found.frames} frames, {found.path_m:.0f} m"
     source = "the recording" if lens is None else lens.source
@@ -294,10 +326,11 @@ def _report(
         )
     if found.yaw_rad is not None:
         yield f"optical axis {np.degrees(found.yaw_rad):+.2f} deg left of the way driven (for information)"
-    stated = "as stated" if chosen is None else f"by {chosen.cue}, +- {chosen.sigma_m:.2f} m"
-    yield f"height {camera.height_m:.3f} m, {stated}"
+    yield f"height {camera.height_m:.3f} m, {height_by.words}"
+    if height_by.sigma_rel:
+        yield f"all lengths +- {height_by.sigma_rel:.0%}, by height and focal length (scale_sigma_rel)"
     for check in found.height_checks:
-        if check is chosen:
+        if check is height_by.check:
             continue
         away = abs(check.height_m - camera.height_m) / check.sigma_m
         verdict = "agrees" if away < AGREES_SIGMA else f"DISAGREES ({away:.1f} sigma)"
