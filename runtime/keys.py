@@ -57,7 +57,7 @@ GROUPS = (
             "camera.tilt_sigma_rad": "How sure are these two angles (1-sigma)? As well as a bracket is screwed on",
             "camera.distortion": "What does the lens bend? OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; none: the "
             "images are undistorted",
-            "camera.scale_sigma_rel": "How sure are height and focal length, and so all lengths, together (1-sigma, as a "
+            "camera.scale_sigma_rel": "How sure are height and focal length, and so all lengths together (1-sigma, a "
             "fraction)? 0: they were measured",
             "camera.fisheye": "Are those numbers k1, k2, k3, k4 of a fisheye lens (equidistant)?",
             "camera_sha256": 'Which camera file must it be, and no other? Its SHA-256; "": any',

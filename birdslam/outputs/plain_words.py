@@ -17,7 +17,7 @@ MEANINGS: Mapping[Status, str] = {
     Status.LOW_TEXTURE: "hardly anything in the picture can be followed",
     Status.ODOMETRY_COASTING: "the motion is guessed from the moment before, not seen",
     Status.SCALE_CARRIED: "the road is hidden: the length of a metre is kept from before",
-    Status.SCALE_INVALID: "the length of a metre is not known: the road shows too little of it, or has not shown it for long",
+    Status.SCALE_INVALID: "the road shows too little to know how long a metre is, or has not shown it for long",
     Status.MOTION_IMPLAUSIBLE: "the motion that was seen is none that a car makes",
     Status.STANDSTILL: "the car stands",
     Status.GROUND_VIOLATED: "the road is not as flat as it is taken for",
@@ -105,10 +105,9 @@ def _lengths(drive: DriveCounts) -> Iterable[str]:
     if drive.scale_sigma_rel is None:
         return
     by = drive.lengths_by or "the camera's height and lens, as its camera file or the recording states them"
-    if drive.speed_sources.get(SpeedSource.CAR.value):
-        by += (
-            f"; on {_share(drive.speed_sources[SpeedSource.CAR.value], drive.frames)} of the frames the car's own speed"
-        )
+    by_car = drive.speed_sources.get(SpeedSource.CAR.value, 0)
+    if by_car:
+        by += f", on {_share(by_car, drive.frames)} of the frames on the car's own speed"
     yield f"Lengths are known to {drive.scale_sigma_rel:.0%} (1 sigma; twice that is sure). They rest on {by}."
     if not drive.camera_sigma_rel:
         yield "In that the height counts as exact: an error of 5 % in it is an error of 5 % in all lengths."

@@ -1,4 +1,4 @@
-"""The networks that a film of a real road wants, beside the one that ships: the shipped one saw rendered streets alone."""
+"""The networks that a film of a real road wants, beside the shipped one, which has seen rendered streets alone."""
 
 from __future__ import annotations
 
