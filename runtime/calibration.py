@@ -38,8 +38,13 @@ from birdslam.sources.speed_file import read_speed_curve
 from birdslam.types import NS_PER_S, Frame
 
 UNKNOWN_HEIGHT_M = 1.5  # where none was given: all lengths are in proportion to it, and it is replaced
-MAX_SIGMA_HEIGHT_REL = 0.2  # a height that is known less well is none
+# Of the height by the size of cars, beside the estimate's own sigma: how much taller cars are from country to country.
+# Its own sigma alone is honest on KITTI's sequences, which are of one town (docs/calibration.md)
+COUNTRY_SIGMA_REL = 0.08
+# Where nothing shows the height: behind a car's windscreen, 1.1 to 1.6 m; by judgement
+WINDSCREEN_M, WINDSCREEN_SIGMA_REL = 1.35, 0.2
 AGREES_SIGMA = 2.0
+METADATA_SIGMA_REL = 0.1  # of a focal length by metadata: a film often shows less than the sensor sees; by judgement
 _LENS_S = 120.0  # of a film, from which its lens is found
 _MOUNT_S = 180.0  # of a film, from which pitch, roll and height are found
 
@@ -134,14 +139,8 @@ def lens_of_drive(
     configuration: Configuration, uri: str, given: Given, size_px: tuple[int, int], stride: int
 ) -> Intrinsics:
     """The lens of a film that says nothing of its camera, by what its images show. Raises CalibrationError."""
-    fov_deg, sigma_rel = FIELD_OF_VIEW_DEG[given.kind]
-    by = f"that of a {given.kind}, {fov_deg:g} deg across"
-    if given.fov_deg is not None:
-        if not 10.0 <= given.fov_deg <= 150.0:
-            raise ConfigurationError(f"--fov {given.fov_deg:g}: is no field of view of a camera here (10 to 150 deg)")
-        fov_deg, sigma_rel, by = given.fov_deg, STATED_SIGMA_REL, f"as stated, {given.fov_deg:g} deg across"
     width_px, height_px = size_px
-    focal_px = focal_by_field_of_view(width_px, fov_deg)
+    focal_px, sigma_rel, by = _focal_length(given, uri, width_px)
     middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
     camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
     recording = open_recorded(uri, camera, stride, configuration.source.topics)
@@ -178,6 +177,24 @@ def lens_of_drive(
         ),
         sigma_focal_px=lens.focal_px * lens.focal_sigma_rel,
     )
+
+
+def _focal_length(given: Given, uri: str, width_px: int) -> tuple[float, float, str]:
+    """What is known of it before the drive: as stated, by the film's metadata, or by the kind of camera.
+
+    In pixels, its 1-sigma as a fraction, and where it comes from. Raises ConfigurationError.
+    """
+    if given.fov_deg is not None:
+        if not 10.0 <= given.fov_deg <= 150.0:
+            raise ConfigurationError(f"--fov {given.fov_deg:g}: is no field of view of a camera here (10 to 150 deg)")
+        focal_px = focal_by_field_of_view(width_px, given.fov_deg)
+        return focal_px, STATED_SIGMA_REL, f"as stated, {given.fov_deg:g} deg across"
+    kind, path = _class_and_path(uri)
+    stated_px = kind.stated_focal_px(path)
+    if stated_px is not None and focal_by_field_of_view(width_px, 150.0) < stated_px:
+        return stated_px, METADATA_SIGMA_REL, f"that of the film's own metadata, {stated_px:.0f} px"
+    fov_deg, sigma_rel = FIELD_OF_VIEW_DEG[given.kind]
+    return focal_by_field_of_view(width_px, fov_deg), sigma_rel, f"that of a {given.kind}, {fov_deg:g} deg across"
 
 
 def _lossless(configuration: Configuration) -> Configuration:
@@ -262,32 +279,41 @@ class HeightBy(NamedTuple):
     words: str
     check: HeightCheck | None
     sigma_rel: float  # of all lengths along the road, by this height and the focal length
+    estimated: bool = False
 
 
 def _with_height(found: Calibration, known: bool, lens: Intrinsics | None, uri: str) -> tuple[Camera, HeightBy]:
     """The camera with the height that was stated, else with the surest that was estimated."""
     focal_rel = _focal_sigma_rel(lens)
     if known:
-        by = HeightBy("as stated", None, focal_rel)
+        height_m, by = found.camera.height_m, HeightBy("as stated", None, focal_rel)
     else:
-        checks = sorted(found.height_checks, key=lambda check: check.sigma_m / check.height_m)
-        if not checks or checks[0].sigma_m > MAX_SIGMA_HEIGHT_REL * checks[0].height_m:
-            raise CalibrationError(
-                f"{uri}: the camera's height is not known, and nothing here tells it (too few cars are seen): measure "
-                "it (--height M), or give the car's speed (--speed FILE)"
-            )
-        check = checks[0]
-        own_rel = check.sigma_m / check.height_m
-        by_vehicles = check.cue == VEHICLES
-        cue = f"the size of {check.samples} cars" if by_vehicles else f"the {check.cue} along {found.path_m:.0f} m"
-        # A known length holds height and focal length together
-        sigma_rel = math.hypot(own_rel, focal_rel) if by_vehicles else own_rel
-        by = HeightBy(f"by {cue}, +- {check.sigma_m:.2f} m", check, sigma_rel)
-    height_m = found.camera.height_m if by.check is None else by.check.height_m
+        height_m, by = _estimated_height(found, focal_rel)
     try:
         return msgspec.structs.replace(found.camera, height_m=height_m, scale_sigma_rel=min(by.sigma_rel, 1.0)), by
     except ValueError as error:
-        raise CalibrationError(f"{uri}: {by.words}: {error}") from None
+        raise CalibrationError(f"{uri}: height {by.words}: {error}") from None
+
+
+def _estimated_height(found: Calibration, focal_rel: float) -> tuple[float, HeightBy]:
+    """By a known length, by the size of cars, or by where cameras are."""
+    sigmas = {
+        check.cue: math.hypot(check.sigma_m / check.height_m, COUNTRY_SIGMA_REL * (check.cue == VEHICLES))
+        for check in found.height_checks
+    }
+    check = min(found.height_checks, key=lambda check: sigmas[check.cue], default=None)
+    if check is None or sigmas[check.cue] > WINDSCREEN_SIGMA_REL:
+        sigma_rel = math.hypot(WINDSCREEN_SIGMA_REL, focal_rel)
+        words = f"of most windscreens, +- {WINDSCREEN_SIGMA_REL:.0%}, since nothing here tells it"
+        return WINDSCREEN_M, HeightBy(words, None, sigma_rel, estimated=True)
+    own_rel = sigmas[check.cue]
+    if check.cue == VEHICLES:
+        by = HeightBy(
+            f"by the size of {check.samples} cars, +- {own_rel:.0%}", check, math.hypot(own_rel, focal_rel), True
+        )
+    else:  # a known length holds height and focal length together
+        by = HeightBy(f"by {check.cue} along {found.path_m:.0f} m, +- {own_rel:.0%}", check, own_rel, True)
+    return check.height_m, by
 
 
 def _focal_sigma_rel(lens: Intrinsics | None) -> float:
@@ -300,8 +326,8 @@ def _focal_sigma_rel(lens: Intrinsics | None) -> float:
 def _lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None) -> str:
     focal_rel = _focal_sigma_rel(lens)
     words = f"the camera's height of {camera.height_m:.2f} m ({by.words})"
-    if focal_rel and lens is not None and (by.check is None or by.check.cue == VEHICLES):
-        words += f" and its focal length of {lens.fx_px:.0f} px, +- {focal_rel:.0%}"
+    if focal_rel and (by.check is None or by.check.cue == VEHICLES):
+        words += f" and its focal length of {camera.fx_px:.0f} px, +- {focal_rel:.0%}"
     return words
 
 
