@@ -15,13 +15,14 @@ import numpy as np
 
 from birdslam.geometry.camera import Camera
 from birdslam.ros.bag import BagTopics
-from birdslam.sources.film_file import films_in, stated_focal_rel, why_unreadable
+from birdslam.sources.films.container import films_in, stated_focal_rel, why_unreadable
 from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.sources.schemes import VIDEO
 from birdslam.types import NS_PER_S
 
 GAP_NS = NS_PER_S  # a longer time between two frames is told as a frame without an image
 NAME_RESOLUTION_S = 2.0  # names tell times by the second, and each of two may be rounded
+_COUNTED = (".mp4", ".mov", ".m4v", ".avi", ".3gp")  # containers that say how many frames there are
 _USUAL_HZ = 1.0, 240.0  # a rate that a container states outside of these is measured
 _MEASURED_FRAMES = 24
 # 20240131_235959, 2024-01-31 23.59.59 and the like
@@ -45,6 +46,12 @@ class _Film:
     def length_s(self) -> float:
         return self.declared / self.rate_hz
 
+    def ends_early(self, frames: int, last_s: float) -> bool:
+        """Whether it holds less than is declared, having given so many frames, the last at that time."""
+        if self.path.suffix.lower() in _COUNTED:
+            return frames < 0.99 * self.declared - 1.0  # some containers miscount by a frame
+        return last_s < 0.98 * self.length_s - 0.5  # the count is the time by the mean rate
+
 
 class VideoRecording(Recording):
     """A film, or the films of a directory in their natural order as one drive.
@@ -56,13 +63,16 @@ class VideoRecording(Recording):
     """
 
     def __init__(self, path: Path, camera: Camera | None, stride: int = 1) -> None:
+        files = films_in(path, VIDEO.suffixes)
+        for file in files if camera is None else ():
+            _capture(file).release()  # what is wrong with the film goes before what it lacks
         if camera is None:
             raise DatasetError(
                 f"video:{path}: a film knows nothing of its camera: a camera file is needed (`birdslam run` without "
                 "--camera finds it)"
             )
         self.camera, self._stride, self.name = camera, stride, path.stem
-        self._films = _in_sequence([_film(file, camera) for file in films_in(path, VIDEO.suffixes)])
+        self._films = _in_sequence([_film(file, camera) for file in files])
         self.rate_hz = self._films[0].rate_hz / stride
 
     @classmethod
@@ -114,8 +124,7 @@ class VideoRecording(Recording):
                     yield RecordedFrame(index, t_ns, image if ok else None, error)  # type: ignore[arg-type]
                     index += 1
                 position += 1
-            short = position < 0.99 * film.declared - 1.0  # some containers miscount by a frame
-            if short and t_ns - begin_ns < 0.98 * film.length_s * NS_PER_S:  # or count by the mean rate alone
+            if film.ends_early(position, (t_ns - begin_ns) / NS_PER_S):
                 error = f"{film.path}: ends after {position} of {film.declared} frames: cut off"
                 yield RecordedFrame(index, t_ns + film.period_ns, None, error)
         finally:
