@@ -184,7 +184,7 @@ def _describe(models: ModelsConfig, sender: Connection) -> None:
 def check_runtime_dir(vehicle: str, runtime_dir: Path | None) -> None:
     """Raises ConfigurationError where sockets can't lie there."""
     try:
-        for name in NODES:
+        for name in (*NODES, "supervisor"):
             socket_path(runtime_dir_of(vehicle, runtime_dir), name)
     except (ValueError, OSError) as error:
         raise ConfigurationError(f"vehicle {vehicle!r}, runtime directory: {error}") from error

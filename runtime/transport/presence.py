@@ -22,7 +22,7 @@ from birdslam.runtime.transport.closing import Closing
 
 _MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux, without its final zero
 _SHARED_MEMORY = Path("/dev/shm")
-_OWN = "offline-"  # then a process' number: the runtime directory of one that drives over a recording
+_OWN = "own-"  # then a process' number: the runtime directory of one that drives over a recording
 
 
 class VehicleBusy(RuntimeError):
