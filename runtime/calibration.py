@@ -27,6 +27,7 @@ from birdslam.calibration.lens import (
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError
+from birdslam.outputs.plain_words import LengthsBy
 from birdslam.ros.bag import BagTopics
 from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
 from birdslam.runtime.nodes.inference import Inference
@@ -44,6 +45,8 @@ COUNTRY_SIGMA_REL = 0.08
 # Where nothing shows the height: behind a car's windscreen, 1.1 to 1.6 m; by judgement
 WINDSCREEN_M, WINDSCREEN_SIGMA_REL = 1.35, 0.2
 AGREES_SIGMA = 2.0
+# For a drive that follows at once: it looks for the tilt itself, and begins from what the first pass knows
+ROUGH = CalibrationConfig(max_sigma_rad=0.05, max_sigma_roll_rad=0.1)
 METADATA_SIGMA_REL = 0.1  # of a focal length by metadata: a film often shows less than the sensor sees; by judgement
 _LENS_S = 120.0  # of a film, from which its lens is found
 _MOUNT_S = 180.0  # of a film, from which pitch, roll and height are found
@@ -65,14 +68,20 @@ class Given:
 
 
 class Calibrated(NamedTuple):
-    """A camera, and what it rests on, a line each; `lengths_by` is what its metres rest on, as a sentence goes on."""
+    """A camera, and what it rests on, a line each; `lengths_by` is what its metres rest on."""
 
     camera: Camera
     report: list[str]
-    lengths_by: str
+    lengths_by: LengthsBy
 
 
-def calibrate_drive(configuration: Configuration, source: str, given: Given, stride: int = 1) -> Calibrated:
+def calibrate_drive(
+    configuration: Configuration,
+    source: str,
+    given: Given,
+    stride: int = 1,
+    config: CalibrationConfig = CalibrationConfig(),  # noqa: B008
+) -> Calibrated:
     """The camera of a drive. `source`: a KITTI directory or a source's URI.
 
     Raises CalibrationError, ConfigurationError, DatasetError.
@@ -102,7 +111,7 @@ def calibrate_drive(configuration: Configuration, source: str, given: Given, str
                 drive,
                 recording.camera,
                 configuration.slam.frontend,
-                CalibrationConfig(),
+                config,
                 _lengths(recording, given.speed),
             )
         except CalibrationError as error:
@@ -140,7 +149,7 @@ def lens_of_drive(
 ) -> Intrinsics:
     """The lens of a film that says nothing of its camera, by what its images show. Raises CalibrationError."""
     width_px, height_px = size_px
-    focal_px, sigma_rel, by = _focal_length(given, uri, width_px)
+    focal_px, sigma_rel, by = focal_length_of(given, uri, width_px)
     middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
     camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
     recording = open_recorded(uri, camera, stride, configuration.source.topics)
@@ -179,7 +188,7 @@ def lens_of_drive(
     )
 
 
-def _focal_length(given: Given, uri: str, width_px: int) -> tuple[float, float, str]:
+def focal_length_of(given: Given, uri: str, width_px: int) -> tuple[float, float, str]:
     """What is known of it before the drive: as stated, by the film's metadata, or by the kind of camera.
 
     In pixels, its 1-sigma as a fraction, and where it comes from. Raises ConfigurationError.
@@ -279,7 +288,6 @@ class HeightBy(NamedTuple):
     words: str
     check: HeightCheck | None
     sigma_rel: float  # of all lengths along the road, by this height and the focal length
-    estimated: bool = False
 
 
 def _with_height(found: Calibration, known: bool, lens: Intrinsics | None, uri: str) -> tuple[Camera, HeightBy]:
@@ -305,14 +313,12 @@ def _estimated_height(found: Calibration, focal_rel: float) -> tuple[float, Heig
     if check is None or sigmas[check.cue] > WINDSCREEN_SIGMA_REL:
         sigma_rel = math.hypot(WINDSCREEN_SIGMA_REL, focal_rel)
         words = f"of most windscreens, +- {WINDSCREEN_SIGMA_REL:.0%}, since nothing here tells it"
-        return WINDSCREEN_M, HeightBy(words, None, sigma_rel, estimated=True)
+        return WINDSCREEN_M, HeightBy(words, None, sigma_rel)
     own_rel = sigmas[check.cue]
     if check.cue == VEHICLES:
-        by = HeightBy(
-            f"by the size of {check.samples} cars, +- {own_rel:.0%}", check, math.hypot(own_rel, focal_rel), True
-        )
+        by = HeightBy(f"by the size of {check.samples} cars, +- {own_rel:.0%}", check, math.hypot(own_rel, focal_rel))
     else:  # a known length holds height and focal length together
-        by = HeightBy(f"by {check.cue} along {found.path_m:.0f} m, +- {own_rel:.0%}", check, own_rel, True)
+        by = HeightBy(f"by {check.cue} along {found.path_m:.0f} m, +- {own_rel:.0%}", check, own_rel)
     return check.height_m, by
 
 
@@ -323,12 +329,14 @@ def _focal_sigma_rel(lens: Intrinsics | None) -> float:
     return lens.sigma_focal_px / lens.fx_px
 
 
-def _lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None) -> str:
-    focal_rel = _focal_sigma_rel(lens)
+def _lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None) -> LengthsBy:
     words = f"the camera's height of {camera.height_m:.2f} m ({by.words})"
-    if focal_rel and (by.check is None or by.check.cue == VEHICLES):
+    focal_rel = _focal_sigma_rel(lens)
+    if by.check is not None and by.check.cue != VEHICLES:  # a known length holds both together
+        return LengthsBy(words, by.sigma_rel)
+    if focal_rel:
         words += f" and its focal length of {camera.fx_px:.0f} px, +- {focal_rel:.0%}"
-    return words
+    return LengthsBy(words, math.sqrt(max(by.sigma_rel**2 - focal_rel**2, 0.0)), focal_rel)
 
 
 def _report(

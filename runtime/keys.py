@@ -193,7 +193,8 @@ GROUPS = (
         {
             "runtime.runtime_dir": 'Where are sockets, locks and vitals? "": in the user\'s own folder',
             "runtime.ready_timeout_s": "How long may a node take to load, to warm up and to find the others?",
-            "runtime.watchdog_ms": "After how long without a sign of life has a node stalled?",
+            "runtime.watchdog_ms": "After how long without a sign of life has a node stalled? none: 2 s, at rate "
+            '"max" a minute',
             "runtime.restart": 'Is a node that died or stalled begun anew? none: "always", but "never" at rate "max", '
             "which may lose no image",
             "runtime.restarts_max": "How often may that be, before the run ends?",

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
 from birdslam.ros.bag import BagTopics
-from birdslam.runtime.calibration import METADATA_SIGMA_REL, Given, _focal_length
+from birdslam.runtime.calibration import METADATA_SIGMA_REL, Given, focal_length_of
 from birdslam.runtime.cli.main import main
 from birdslam.sources.films.video import VideoRecording
 from birdslam.sources.opening import open_recording
@@ -204,21 +204,21 @@ def test_what_is_no_film_is_one_clear_line(tmp_path: Path, capfd: pytest.Capture
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mov"])
-def test_a_phones_metadata_state_the_focal_length(suffix: str, tmp_path: Path) -> None:
+def test_a_phones_metadata_state_thefocal_length_of(suffix: str, tmp_path: Path) -> None:
     path = film(tmp_path / f"phone.{suffix}", range(0, 200, 40), metadata={FOCAL_KEY: "26", "title": "a drive"})
     assert VideoRecording.stated_focal_px(path) == pytest.approx(WIDTH * 26 / 36)
-    focal_px, sigma_rel, by = _focal_length(Given(), f"video:{path}", WIDTH)
+    focal_px, sigma_rel, by = focal_length_of(Given(), f"video:{path}", WIDTH)
     assert (focal_px, sigma_rel) == (pytest.approx(WIDTH * 26 / 36), METADATA_SIGMA_REL)
     assert "metadata" in by
-    assert "as stated, 60 deg" in _focal_length(Given(fov_deg=60.0), f"video:{path}", WIDTH)[2]  # goes before it
+    assert "as stated, 60 deg" in focal_length_of(Given(fov_deg=60.0), f"video:{path}", WIDTH)[2]  # goes before it
     without = film(tmp_path / f"other.{suffix}", range(0, 200, 40))
     assert VideoRecording.stated_focal_px(without) is None
-    assert "that of a phone" in _focal_length(Given(kind="phone"), f"video:{without}", WIDTH)[2]
+    assert "that of a phone" in focal_length_of(Given(kind="phone"), f"video:{without}", WIDTH)[2]
 
 
 @settings(max_examples=60)
 @given(st.data())
-def test_damaged_metadata_say_nothing_or_a_focal_length(data: st.DataObject) -> None:
+def test_damaged_metadata_say_nothing_or_afocal_length_of(data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = film(Path(folder) / "f.mp4", [0, 40], metadata={FOCAL_KEY: "26"})
         whole = bytearray(path.read_bytes())

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.camera_scale import with_camera_scale
-from birdslam.outputs.plain_words import MEANINGS, REMEDIES, DriveCounts, readme, verdict
+from birdslam.outputs.plain_words import MEANINGS, REMEDIES, DriveCounts, LengthsBy, readme, verdict
 from birdslam.types import INVALIDATING, Estimate, Status, VehicleEstimate
 
 
@@ -63,14 +63,19 @@ def test_what_is_not_valid_is_told_with_its_reason_the_most_frequent_first() -> 
 
 
 def test_an_unmeasured_height_is_the_next_thing_to_measure() -> None:
-    by_cars = "the camera's height of 1.40 m (by the size of 12 cars, +- 11%)"
+    by_cars = LengthsBy("the camera's height of 1.40 m (by the size of 12 cars, +- 11%)", 0.11)
     said = verdict(drive(scale_sigma_rel=0.12, camera_sigma_rel=0.11, lengths_by=by_cars))
-    assert any("Lengths are known to 12%" in line and by_cars in line for line in said)
-    assert any("--height M" in line and "5 % of height is 5 % of all lengths" in line for line in said)
-    stated = "the camera's height of 1.35 m (as stated) and its focal length of 834 px, +- 25%"
-    said = verdict(drive(scale_sigma_rel=0.25, camera_sigma_rel=0.25, lengths_by=stated))
-    assert any("--fov DEG" in line for line in said)
-    assert not any("--height M" in line for line in said)
+    assert any("Lengths are known to 12%" in line and by_cars.words in line for line in said)
+    (step,) = [line for line in said if line.startswith("Next")]
+    assert "--height M" in step
+    assert "5 % of height is 5 % of all lengths" in step
+    stated = LengthsBy("the camera's height of 1.35 m (as stated) and its focal length, +- 25%", 0.0, 0.25)
+    (step,) = [line for line in verdict(drive(camera_sigma_rel=0.25, lengths_by=stated)) if line.startswith("Next")]
+    assert "--fov DEG" in step
+    both = LengthsBy("both", 0.1, 0.25)
+    first, second = [line for line in verdict(drive(camera_sigma_rel=0.27, lengths_by=both)) if line.startswith("Next")]
+    assert "--fov" in first  # what is least known
+    assert "--height" in second
 
 
 def test_the_readme_names_each_file() -> None:

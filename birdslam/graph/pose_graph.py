@@ -78,11 +78,8 @@ class PoseGraph:
         """
         m = weighted(measurements, self.weights)  # Eq. 4
         self._camera_sigma_rel = m.camera_sigma_rel or self._camera_sigma_rel
-        return with_camera_scale(self._optimise(m, records), self._camera_sigma_rel)
-
-    def _optimise(self, m: Measurements, records: Sequence[object]) -> Estimate:
         if m.cc is None and not _NO_PIXELS.isdisjoint(m.status):
-            return self._coast(m)
+            return with_camera_scale(self._coast(m), self._camera_sigma_rel)
         window, edges = self.window, pose_edges(m)
         follows = window is not None and self._follows(m, window, edges)
         reset = window is not None and not follows
@@ -99,7 +96,8 @@ class PoseGraph:
         if not window.is_finite:  # numbers that no road has: begin anew rather than publish them
             window, reset = self._begin(m, True), True
         status = (*m.status, Status.GRAPH_RESET) if reset else m.status
-        return self._estimate(m, status, window.ego_cov, self._vehicle_estimates(m, window))
+        estimate = self._estimate(m, status, window.ego_cov, self._vehicle_estimates(m, window))
+        return with_camera_scale(estimate, self._camera_sigma_rel)
 
     def vehicles_in_ego(self) -> dict[BodyId, tuple[SE2, Floats]]:
         """T_ego_vehicle with its covariance (3, 3) in ego, of the vehicles that the newest frame sees.

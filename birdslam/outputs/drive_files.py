@@ -24,7 +24,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.bev_picture import Scene, Track, draw
 from birdslam.outputs.final_trajectories import EGO_FILES
-from birdslam.outputs.plain_words import DriveCounts, readme, verdict
+from birdslam.outputs.plain_words import DriveCounts, LengthsBy, readme, verdict
 from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row, tum_row
 from birdslam.types import INVALIDATING, Attitude, Estimate, MapUpdate, Status, VehicleEstimate
 
@@ -203,11 +203,11 @@ class Recorder:
                 for x_m, y_m in self._T_picture_world @ np.array(points).reshape(-1, 2):
                     kept.add(float(x_m), float(y_m))
 
-    def finish(self, summary: dict[str, Any], lengths_by: str = "") -> list[str]:
+    def finish(self, summary: dict[str, Any], lengths_by: LengthsBy | None = None) -> list[str]:
         """Write summary.json (`summary` over the recorder's own counts; a number that is not finite becomes null),
         bev.png and README.txt, and close the files; gives the verdict on the drive (plain_words.py), a sentence each.
 
-        `lengths_by`: what the camera's height and lens rest on.
+        `lengths_by`: what the camera's height and lens rest on; None: what is stated of them.
         """
         self.close()
         sigmas = self._sigmas.array()
@@ -225,7 +225,7 @@ class Recorder:
             "speed_sources": dict(sorted(self.speed_sources.items())),
         }
         known = {name: counts[name] for name in DriveCounts.__dataclass_fields__ if name in counts}
-        sentences = verdict(DriveCounts(**known, lengths_by=lengths_by))
+        sentences = verdict(DriveCounts(**known, lengths_by=lengths_by or self._stated()))
         encoded = msgspec.json.encode({**counts, "verdict": sentences, **summary}, enc_hook=_plain)
         (self._directory / "summary.json").write_bytes(msgspec.json.format(encoded, indent=2) + b"\n")
         draw(self._scene(), self._directory / "bev.png")
@@ -233,6 +233,11 @@ class Recorder:
         text = readme(self._directory.resolve().name, sentences, there)
         (self._directory / "README.txt").write_text(text, encoding="utf-8")
         return sentences
+
+    def _stated(self) -> LengthsBy:
+        """Of a camera whose file says how sure it is, but not why."""
+        sigma_rel = self._camera.scale_sigma_rel
+        return LengthsBy(height_sigma_rel=sigma_rel)
 
     def _begin_epoch(self, estimate: Estimate) -> None:
         """Put the new world where the last one was left."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from birdslam.types import INVALIDATING, SpeedSource, Status
 
@@ -56,8 +57,20 @@ REMEDIES: Mapping[Status, str] = {
     Status.COASTED_TOO_LONG: "take every frame, however long it takes (--rate max)",
     Status.CAR_SPEED_IMPLAUSIBLE: "see whether the times of the speed file are those of the film",
 }
+WORTH_MEASURING_REL = 0.04  # a tape and a lens' data sheet are better than this
 OFTEN = 0.2  # of the frames: then a status is worth a remedy
 WORTH_TELLING = (Status.CALIBRATION_DRIFT, Status.SCALE_ESTIMATED, Status.VIEW_OBSTRUCTED, Status.STANDSTILL)
+
+
+class LengthsBy(NamedTuple):
+    """What the metres of a camera rest on: in words, and 1-sigma of all lengths by its height and its focal length."""
+
+    words: str = "the camera's height and lens, as its camera file or the recording states them"
+    height_sigma_rel: float = 0.0
+    focal_sigma_rel: float = 0.0
+
+
+AS_STATED = LengthsBy()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +86,7 @@ class DriveCounts:
     valid_path_m: float
     scale_sigma_rel: float | None  # median of the valid frames
     camera_sigma_rel: float  # of that, by the camera's height and lens
-    lengths_by: str = ""  # what the camera's height and lens rest on, where a first pass found them
+    lengths_by: LengthsBy = AS_STATED  # otherwise where a first pass found them
 
 
 def verdict(drive: DriveCounts) -> list[str]:
@@ -104,7 +117,7 @@ def _validity(drive: DriveCounts) -> Iterable[str]:
 def _lengths(drive: DriveCounts) -> Iterable[str]:
     if drive.scale_sigma_rel is None:
         return
-    by = drive.lengths_by or "the camera's height and lens, as its camera file or the recording states them"
+    by = drive.lengths_by.words
     by_car = drive.speed_sources.get(SpeedSource.CAR.value, 0)
     if by_car:
         by += f", on {_share(by_car, drive.frames)} of the frames on the car's own speed"
@@ -114,16 +127,22 @@ def _lengths(drive: DriveCounts) -> Iterable[str]:
 
 
 def _next_steps(drive: DriveCounts) -> Iterable[str]:
-    if drive.camera_sigma_rel > 0.0 and "as stated" not in drive.lengths_by:
-        yield (
-            "Next: measure how high the camera stands over the road, to 2 cm, and give it (--height M): 5 % of height "
-            "is 5 % of all lengths."
-        )
-    elif drive.camera_sigma_rel > 0.04:
-        yield (
-            "Next: say how wide the camera sees (--fov DEG), or photograph a chessboard (birdslam calibrate "
-            "--chessboard): 5 % of focal length is 5 % of lengths along the road."
-        )
+    height_rel, focal_rel = drive.lengths_by.height_sigma_rel, drive.lengths_by.focal_sigma_rel
+    advice = [
+        (
+            height_rel,
+            "measure how high the camera stands over the road, to 2 cm, and give it (--height M): 5 % of height is 5 % "
+            "of all lengths.",
+        ),
+        (
+            focal_rel,
+            "say how wide the camera sees (--fov DEG), or photograph a chessboard (birdslam calibrate --chessboard): "
+            "5 % of focal length is 5 % of lengths along the road.",
+        ),
+    ]
+    for sigma_rel, words in sorted(advice, reverse=True):  # what is least known comes first
+        if sigma_rel > WORTH_MEASURING_REL:
+            yield f"Next: {words}"
     for status, remedy in REMEDIES.items():
         if drive.statuses.get(status.value, 0) > OFTEN * drive.frames:
             yield f"Against {status.value}: {remedy}."

@@ -17,6 +17,7 @@ from typing import Any
 import msgspec
 
 from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
+from birdslam.outputs.plain_words import LengthsBy
 from birdslam.perception import ModelError, load_network
 from birdslam.perception.pointnet import load_pointnet
 from birdslam.runtime.configuration import Configuration, ConfigurationError, ModelsConfig, complete
@@ -43,7 +44,7 @@ WITHOUT_MODELS = "no networks: odometry only, without vehicles and lanes"
 DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come to in a long drive among lane lines
 
 
-def run(configuration: Configuration, lengths_by: str = "") -> int:
+def run(configuration: Configuration, lengths_by: LengthsBy | None = None) -> int:
     """A whole run; gives the exit status. Raises what a user has to mend before anything is started.
 
     `lengths_by`: what the metres rest on, for the verdict at the end, where a first pass found the camera. A drive of
@@ -57,7 +58,7 @@ def run(configuration: Configuration, lengths_by: str = "") -> int:
         return _run(configuration, lengths_by)
 
 
-def _run(configuration: Configuration, lengths_by: str) -> int:
+def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
     realtime.use_one_heap()  # before networks are looked at, which begins threads
     configuration, models, frames = check(configuration)
     give_back_memory()  # the networks that were looked at

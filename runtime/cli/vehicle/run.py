@@ -8,6 +8,7 @@ from pathlib import Path
 
 import msgspec
 
+from birdslam.outputs.plain_words import LengthsBy
 from birdslam.perception import ModelError
 from birdslam.runtime.cli.arguments import add_final_results, add_lens, add_other_odometry, add_pipeline, add_topics
 from birdslam.runtime.cli.commands import sources_note
@@ -79,11 +80,11 @@ def _networks(configuration: Configuration, fetch_them: bool) -> tuple[str, ...]
     return recommended(directory).at_hand
 
 
-def _calibrated(configuration: Configuration, options: argparse.Namespace) -> tuple[Configuration, str]:
+def _calibrated(configuration: Configuration, options: argparse.Namespace) -> tuple[Configuration, LengthsBy]:
     """With the camera that a first pass over the film finds, whose file lies with the results; and what its lengths
     rest on."""
     # Only where it is asked for: the whole front end comes with it
-    from birdslam.runtime.calibration import Given, calibrate_drive, write_camera_file
+    from birdslam.runtime.calibration import ROUGH, Given, calibrate_drive, write_camera_file
 
     source = configuration.source
     if configuration.camera is not None:
@@ -94,7 +95,7 @@ def _calibrated(configuration: Configuration, options: argparse.Namespace) -> tu
         )
     speed = Path(source.speed).expanduser() if source.speed else None
     given = Given(height_m=options.height, fov_deg=options.fov, kind=options.kind, speed=speed)
-    found = calibrate_drive(configuration, source.uri, given)
+    found = calibrate_drive(configuration, source.uri, given, config=ROUGH)
     path = Path(configuration.output) / "camera.toml"
     write_camera_file(path, found.camera, found.report)
     print("\n".join((*found.report, f"camera file: {path}")), flush=True)
