@@ -2,9 +2,9 @@
 
 `ego.kitti.txt`: camera poses `T_first_i`, row k is frame k (a frame without an estimate keeps the pose before it).
 `ego.tum.txt`, `tracks/ID.tum.txt`: the ego, and the footprint's centre of each vehicle seen, in world. `map.csv`: road
-landmarks and lane points in world, with their epoch and lane (-1: of none). `summary.json`: counts. `bev.png`: all of
-it from above. `README.txt`: how far to believe it, and what each file is. Where a new epoch begins TUM files carry a
-comment; KITTI rows go on from the last pose.
+landmarks and lane points in world, with their epoch and lane (-1: of none). `frames.csv`: a line a frame, with its
+statuses. `summary.json`: counts. `bev.png`: all of it from above. `README.txt`: how far to believe it, and what each
+file is. Where a new epoch begins TUM files carry a comment; KITTI rows go on from the last pose.
 """
 
 from __future__ import annotations
@@ -29,10 +29,14 @@ from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row
 from birdslam.types import INVALIDATING, Attitude, Estimate, MapUpdate, Status, VehicleEstimate
 
 FILLED_FRAMES = 10_000  # a longer gap in the frame numbers is a new source, not dropped frames
+FRAMES_FILE = "frames.csv"
+FRAME_COLUMNS = ("frame", "t_s", "epoch", "x_m", "y_m", "yaw_rad", "speed_mps", "scale_sigma_rel", "valid", "status")
 FILES = {  # what README.txt says of each that is there
     "summary.json": "all counts, the configuration and the versions",
     "bev.png": "the drive from above",
     "ego.tum.txt": "the car's way: time, place and attitude in metres, a line a frame",
+    "frames.csv": "a line a frame: place, speed, how sure a metre is, whether it is valid, and each status",
+    "report.html": "all of it to look at, in any browser",
     "ego.kitti.txt": "the same as KITTI has it: the camera's poses",
     "ego.final.tum.txt": "the car's way, smoothed when the drive was over",
     "tracks": "the way of each other vehicle, as ego.tum.txt; ID.final.tum.txt: smoothed",
@@ -123,15 +127,20 @@ class Recorder:
         self._files = ExitStack()
         try:
             self._tracks_directory.mkdir(exist_ok=True)
-            later = (directory / name for name in ("summary.json", "bev.png", "README.txt", *EGO_FILES.values()))
+            later = (
+                directory / name
+                for name in ("summary.json", "bev.png", "README.txt", "report.html", *EGO_FILES.values())
+            )
             for old in (*self._tracks_directory.glob("*.tum.txt"), *later):
                 old.unlink(missing_ok=True)  # stale tracks beside new ones would be taken for this run's
-            self._kitti, self._tum, self._map = map(self._open, ("ego.kitti.txt", "ego.tum.txt", "map.csv"))
+            names = ("ego.kitti.txt", "ego.tum.txt", "map.csv", FRAMES_FILE)
+            self._kitti, self._tum, self._map, self._table = map(self._open, names)
         except OSError as error:
             self.close()
             raise ResultsError(f"output directory {directory}: {error.strerror}: {error.filename}") from None
         self._tum.write("# t_s x_m y_m z_m qx qy qz qw: the ego (the camera's foot on the road) in world\n")
         self._map.write("epoch,kind,x_m,y_m,lane\n")
+        self._table.write(",".join(FRAME_COLUMNS) + "\n")
         self.statuses: Counter[str] = Counter()
         self.speed_sources: Counter[str] = Counter()
         self._trajectory = CameraTrajectory(camera.ground)
@@ -179,6 +188,7 @@ class Recorder:
             self._sigmas.add(estimate.scale_sigma_rel)
         self.statuses.update(status.value for status in estimate.status)
         self.speed_sources.update(source.value for source in estimate.speed_sources)
+        self._table.write(self._frame_row(estimate) + "\n")
         pose = ego_pose(estimate.T_world_ego, estimate.attitude)
         self._tum.write(tum_row(estimate.t_source_ns, pose) + "\n")
         self._write_row(estimate, pose)
@@ -233,6 +243,17 @@ class Recorder:
         text = readme(self._directory.resolve().name, sentences, there)
         (self._directory / "README.txt").write_text(text, encoding="utf-8")
         return sentences
+
+    def _frame_row(self, estimate: Estimate) -> str:
+        T, last, speed = estimate.T_world_ego, self._last, ""
+        if last is not None and last.epoch == estimate.epoch and estimate.t_source_ns > last.t_source_ns:
+            step = last.T_world_ego.between(T)
+            speed = f"{math.hypot(step.x_m, step.y_m) * 1e9 / (estimate.t_source_ns - last.t_source_ns):.3f}"
+        status = " ".join(one.value for one in estimate.status)
+        return (
+            f"{estimate.frame_id},{estimate.t_source_ns * 1e-9:.6f},{estimate.epoch},{T.x_m:.3f},{T.y_m:.3f},"
+            f"{T.yaw_rad:.5f},{speed},{estimate.scale_sigma_rel:.4f},{int(estimate.valid)},{status}"
+        )
 
     def _stated(self) -> LengthsBy:
         """Of a camera whose file says how sure it is, but not why."""

@@ -27,6 +27,7 @@ from birdslam.runtime.process import realtime
 from birdslam.runtime.process.child import give_back_memory
 from birdslam.runtime.recording.recording import RecordingError
 from birdslam.runtime.supervision.demo_report import DemoReport
+from birdslam.runtime.supervision.drive_report import REPORT, can_report, write_report
 from birdslam.runtime.supervision.final_results import FinalResults, check_results
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.supervision.logbook import Logbook, Results
@@ -104,7 +105,15 @@ def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
         supervisor.fail(f"results can't be written: {error}", 1)
     if logbook.unwritten is not None:
         supervisor.fail(f"results are incomplete: {logbook.unwritten}", 1)
+    if reported := bool(sentences) and not configuration.live and can_report():
+        try:
+            write_report(output, output / REPORT)
+        except (ResultsError, RecordingError) as error:
+            supervisor.fail(f"the report can't be written: {error}", 1)
+            reported = False
     live.say(table(summary, output))
+    if reported:
+        live.say(f"{'to look at':24}{output / REPORT}")
     if sentences:
         live.say("\n".join(("", *sentences)))
     if supervisor.failure:
