@@ -42,6 +42,8 @@ from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 from birdslam.vehicles.vehicle_edges import vehicle_edges
 
+MEASURED_SIGMA_REL = 0.05  # a height or lens that is known better counts as measured
+
 
 class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The parts of the front end."""
@@ -114,6 +116,8 @@ class FrontEnd:
         )
         self.height = CameraHeightEstimator(camera, config.height, config.localisation)
         self._lanes = LaneMapper(camera, config.static_map, config.lanes, config.lane_edges, lane_head)
+        estimated = camera.scale_sigma_rel > MEASURED_SIGMA_REL
+        self._scale_status = (Status.SCALE_ESTIMATED,) if estimated else ()
         self._last_frame: int | None = None
         self._last = 0, 0.0, SE2()  # when, the camera's pitch against the level, and T_world_ego
 
@@ -139,7 +143,7 @@ class FrontEnd:
         measurements = _measurements(
             frame,
             [
-                *(*status, *lanes.status, *perception.status),
+                *(*status, *lanes.status, *perception.status, *self._scale_status),
                 *(motion.status if motion else (Status.NOT_INITIALISED,)),
             ],
             cc=cc,
@@ -151,6 +155,7 @@ class FrontEnd:
             ground=Ground(height_m=ground.height_m, pitch_rad=ground.pitch_rad, roll_rad=ground.roll_rad),
             scale_sigma_rel=0.0 if motion is None else motion.scale_sigma_rel,
             speed_sources=() if motion is None else motion.speed_sources,
+            camera_sigma_rel=self.camera.scale_sigma_rel,
             ages=dict(perception.ages if lanes.age is None else perception.ages | {"lanes": lanes.age}),
         )
         return self._plausibility.admit(measurements)

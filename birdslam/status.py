@@ -47,6 +47,9 @@ class Status(enum.StrEnum):
     GRAPH_RESET = "graph_reset"  # the optimizer began a new epoch on this frame
     GRAPH_RESTORED = "graph_restored"  # the optimizer restarted from its last checkpoint: the epoch goes on
     NOT_INITIALISED = "not_initialised"  # no motion has been measured yet
+    SCALE_ESTIMATED = (
+        "scale_estimated"  # the camera's height or focal length is estimated, not measured: see scale_sigma_rel
+    )
     UNKNOWN = "unknown"  # a newer sender's status that this reader does not know
 
     @classmethod

@@ -295,9 +295,10 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     ages: dict[str, int] = {}  # frames since that of each network's result; 0 is this frame
     status: tuple[Status, ...] = ()
     speed_sources: tuple[SpeedSource, ...] = ()  # where the metres of this frame's motion come from
+    camera_sigma_rel: float = 0.0  # 1-sigma of all lengths together by the camera's height and lens, as a fraction
 
     def __post_init__(self) -> None:
-        check_finite(self, "scale_sigma_rel")
+        check_finite(self, "scale_sigma_rel", "camera_sigma_rel")
 
 
 class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True, gc=False):
@@ -348,7 +349,7 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     vehicles: tuple[VehicleEstimate, ...] = ()  # all tracked vehicles, also those just out of sight
     attitude: Attitude = Attitude()  # height and tilt, which the pose leaves out
     ground: Ground | None = None  # the camera over the road
-    scale_sigma_rel: float = 0.0  # 1-sigma of the metric scale as a fraction
+    scale_sigma_rel: float = 0.0  # 1-sigma of the metric scale as a fraction, that of the camera's height in it
     status: tuple[Status, ...] = ()  # expected trouble
     speed_sources: tuple[SpeedSource, ...] = ()  # where the metres of this frame's motion come from
 

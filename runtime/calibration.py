@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import msgspec
@@ -13,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.calibration.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
-from birdslam.calibration.height_check import HeightCheck, KnownLength
+from birdslam.calibration.height_check import VEHICLES, HeightCheck, KnownLength
 from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
 from birdslam.calibration.lens import (
     FIELD_OF_VIEW_DEG,
@@ -25,20 +27,29 @@ from birdslam.calibration.lens import (
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError
+from birdslam.outputs.plain_words import LengthsBy
 from birdslam.ros.bag import BagTopics
 from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded, parsed, recording_uri
 from birdslam.runtime.progress import with_progress
 from birdslam.sources.camera_file import camera_text, load_camera
-from birdslam.sources.recording import DatasetError, Recording
+from birdslam.sources.recording import DatasetError, Recording, check_times
 from birdslam.sources.speed_file import read_speed_curve
-from birdslam.types import Frame
+from birdslam.types import NS_PER_S, Frame
 
 UNKNOWN_HEIGHT_M = 1.5  # where none was given: all lengths are in proportion to it, and it is replaced
-MAX_SIGMA_HEIGHT_REL = 0.1
+# Of the height by the size of cars, beside the estimate's own sigma: how much taller cars are from country to country.
+# Its own sigma alone is honest on KITTI's sequences, which are of one town (docs/calibration.md)
+COUNTRY_SIGMA_REL = 0.08
+# Where nothing shows the height: behind a car's windscreen, 1.1 to 1.6 m; by judgement
+WINDSCREEN_M, WINDSCREEN_SIGMA_REL = 1.35, 0.2
 AGREES_SIGMA = 2.0
+# For a drive that follows at once: it looks for the tilt itself, and begins from what the first pass knows
+ROUGH = CalibrationConfig(max_sigma_rad=0.05, max_sigma_roll_rad=0.1)
+METADATA_SIGMA_REL = 0.1  # of a focal length by metadata: a film often shows less than the sensor sees; by judgement
 _LENS_S = 120.0  # of a film, from which its lens is found
+_MOUNT_S = 180.0  # of a film, from which pitch, roll and height are found
 
 
 @dataclass(frozen=True)
@@ -56,10 +67,22 @@ class Given:
     speed: Path | None = None  # lines of time in s, speed in m/s
 
 
+class Calibrated(NamedTuple):
+    """A camera, and what it rests on, a line each; `lengths_by` is what its metres rest on."""
+
+    camera: Camera
+    report: list[str]
+    lengths_by: LengthsBy
+
+
 def calibrate_drive(
-    configuration: Configuration, source: str, given: Given, stride: int = 1
-) -> tuple[Camera, list[str]]:
-    """The camera, and what it rests on, a line each. `source`: a KITTI directory or a source's URI.
+    configuration: Configuration,
+    source: str,
+    given: Given,
+    stride: int = 1,
+    config: CalibrationConfig = CalibrationConfig(),  # noqa: B008
+) -> Calibrated:
+    """The camera of a drive. `source`: a KITTI directory or a source's URI.
 
     Raises CalibrationError, ConfigurationError, DatasetError.
     """
@@ -78,8 +101,9 @@ def calibrate_drive(
     with Inference(configuration) as inference:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
-            frames = offline_frames(RecordedSource(recording, configuration.source))
-            for frame in with_progress(frames, "calibrate", len(recording) or None):
+            most = round(_MOUNT_S * recording.rate_hz)
+            frames = islice(offline_frames(RecordedSource(recording, configuration.source)), most)
+            for frame in with_progress(frames, "calibrate", min(most, len(recording)) or None):
                 yield frame, inference.start(frame)
 
         try:
@@ -87,13 +111,13 @@ def calibrate_drive(
                 drive,
                 recording.camera,
                 configuration.slam.frontend,
-                CalibrationConfig(),
+                config,
                 _lengths(recording, given.speed),
             )
         except CalibrationError as error:
             raise CalibrationError(f"{uri}: {error}") from None
-    camera, chosen = _with_height(found, known_height, uri)
-    return camera, [*_report(found, camera, chosen, uri, lens)]
+    camera, height_by = _with_height(found, known_height, lens, uri)
+    return Calibrated(camera, [*_report(found, camera, height_by, uri, lens)], _lengths_by(camera, height_by, lens))
 
 
 # --- what is given ---
@@ -124,14 +148,8 @@ def lens_of_drive(
     configuration: Configuration, uri: str, given: Given, size_px: tuple[int, int], stride: int
 ) -> Intrinsics:
     """The lens of a film that says nothing of its camera, by what its images show. Raises CalibrationError."""
-    fov_deg, sigma_rel = FIELD_OF_VIEW_DEG[given.kind]
-    by = f"that of a {given.kind}, {fov_deg:g} deg across"
-    if given.fov_deg is not None:
-        if not 10.0 <= given.fov_deg <= 150.0:
-            raise ConfigurationError(f"--fov {given.fov_deg:g}: is no field of view of a camera here (10 to 150 deg)")
-        fov_deg, sigma_rel, by = given.fov_deg, STATED_SIGMA_REL, f"as stated, {given.fov_deg:g} deg across"
     width_px, height_px = size_px
-    focal_px = focal_by_field_of_view(width_px, fov_deg)
+    focal_px, sigma_rel, by = focal_length_of(given, uri, width_px)
     middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
     camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
     recording = open_recorded(uri, camera, stride, configuration.source.topics)
@@ -168,6 +186,24 @@ def lens_of_drive(
         ),
         sigma_focal_px=lens.focal_px * lens.focal_sigma_rel,
     )
+
+
+def focal_length_of(given: Given, uri: str, width_px: int) -> tuple[float, float, str]:
+    """What is known of it before the drive: as stated, by the film's metadata, or by the kind of camera.
+
+    In pixels, its 1-sigma as a fraction, and where it comes from. Raises ConfigurationError.
+    """
+    if given.fov_deg is not None:
+        if not 10.0 <= given.fov_deg <= 150.0:
+            raise ConfigurationError(f"--fov {given.fov_deg:g}: is no field of view of a camera here (10 to 150 deg)")
+        focal_px = focal_by_field_of_view(width_px, given.fov_deg)
+        return focal_px, STATED_SIGMA_REL, f"as stated, {given.fov_deg:g} deg across"
+    kind, path = _class_and_path(uri)
+    stated_px = kind.stated_focal_px(path)
+    if stated_px is not None and focal_by_field_of_view(width_px, 150.0) < stated_px:
+        return stated_px, METADATA_SIGMA_REL, f"that of the film's own metadata, {stated_px:.0f} px"
+    fov_deg, sigma_rel = FIELD_OF_VIEW_DEG[given.kind]
+    return focal_by_field_of_view(width_px, fov_deg), sigma_rel, f"that of a {given.kind}, {fov_deg:g} deg across"
 
 
 def _lossless(configuration: Configuration) -> Configuration:
@@ -238,43 +274,73 @@ def _lengths(recording: Recording, speed_file: Path | None) -> dict[str, KnownLe
                 return None
             return float(np.interp(end_ns * 1e-9, t_s, way_m) - np.interp(start_ns * 1e-9, t_s, way_m))
 
-        first, last = recording_span_s(recording)
-        if t_s[-1] < first or t_s[0] > last:
-            raise DatasetError(
-                f"{speed_file}: its times {t_s[0]:g} to {t_s[-1]:g} s lie outside the recording's, "
-                f"{first:g} to {last:g} s"
-            )
+        check_times(recording, speed_file, round(t_s[0] * NS_PER_S), round(t_s[-1] * NS_PER_S))
         out["speed"] = by_speed
     return out
-
-
-def recording_span_s(recording: Recording) -> tuple[float, float]:
-    """Times of the first and the last frame, by the recording's clock."""
-    times = [frame.t_source_ns * 1e-9 for frame in recording.frames()]
-    return times[0], times[-1]
 
 
 # --- what is found ---
 
 
-def _with_height(found: Calibration, known: bool, uri: str) -> tuple[Camera, HeightCheck | None]:
+class HeightBy(NamedTuple):
+    """Where the camera's height comes from; `check` is the cue that gave it, None where it was stated."""
+
+    words: str
+    check: HeightCheck | None
+    sigma_rel: float  # of all lengths along the road, by this height and the focal length
+
+
+def _with_height(found: Calibration, known: bool, lens: Intrinsics | None, uri: str) -> tuple[Camera, HeightBy]:
     """The camera with the height that was stated, else with the surest that was estimated."""
+    focal_rel = _focal_sigma_rel(lens)
     if known:
-        return found.camera, None
-    checks = sorted(found.height_checks, key=lambda check: check.sigma_m)
-    if not checks or checks[0].sigma_m > MAX_SIGMA_HEIGHT_REL * checks[0].height_m:
-        raise CalibrationError(
-            f"{uri}: the camera's height is not known, and nothing here tells it: measure it (--height M), or give the "
-            "car's speed (--speed FILE)"
-        )
+        height_m, by = found.camera.height_m, HeightBy("as stated", None, focal_rel)
+    else:
+        height_m, by = _estimated_height(found, focal_rel)
     try:
-        return msgspec.structs.replace(found.camera, height_m=checks[0].height_m), checks[0]
+        return msgspec.structs.replace(found.camera, height_m=height_m, scale_sigma_rel=min(by.sigma_rel, 1.0)), by
     except ValueError as error:
-        raise CalibrationError(f"{uri}: by {checks[0].cue}: {error}") from None
+        raise CalibrationError(f"{uri}: height {by.words}: {error}") from None
+
+
+def _estimated_height(found: Calibration, focal_rel: float) -> tuple[float, HeightBy]:
+    """By a known length, by the size of cars, or by where cameras are."""
+    sigmas = {
+        check.cue: math.hypot(check.sigma_m / check.height_m, COUNTRY_SIGMA_REL * (check.cue == VEHICLES))
+        for check in found.height_checks
+    }
+    check = min(found.height_checks, key=lambda check: sigmas[check.cue], default=None)
+    if check is None or sigmas[check.cue] > WINDSCREEN_SIGMA_REL:
+        sigma_rel = math.hypot(WINDSCREEN_SIGMA_REL, focal_rel)
+        words = f"of most windscreens, +- {WINDSCREEN_SIGMA_REL:.0%}, since nothing here tells it"
+        return WINDSCREEN_M, HeightBy(words, None, sigma_rel)
+    own_rel = sigmas[check.cue]
+    if check.cue == VEHICLES:
+        by = HeightBy(f"by the size of {check.samples} cars, +- {own_rel:.0%}", check, math.hypot(own_rel, focal_rel))
+    else:  # a known length holds height and focal length together
+        by = HeightBy(f"by {check.cue} along {found.path_m:.0f} m, +- {own_rel:.0%}", check, own_rel)
+    return check.height_m, by
+
+
+def _focal_sigma_rel(lens: Intrinsics | None) -> float:
+    """As a fraction of the focal length, where it is an estimate; a chessboard's is measured."""
+    if lens is None or lens.sigma_focal_px is None or lens.reprojection_px is not None:
+        return 0.0
+    return lens.sigma_focal_px / lens.fx_px
+
+
+def _lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None) -> LengthsBy:
+    words = f"the camera's height of {camera.height_m:.2f} m ({by.words})"
+    focal_rel = _focal_sigma_rel(lens)
+    if by.check is not None and by.check.cue != VEHICLES:  # a known length holds both together
+        return LengthsBy(words, by.sigma_rel)
+    if focal_rel:
+        words += f" and its focal length of {camera.fx_px:.0f} px, +- {focal_rel:.0%}"
+    return LengthsBy(words, math.sqrt(max(by.sigma_rel**2 - focal_rel**2, 0.0)), focal_rel)
 
 
 def _report(
-    found: Calibration, camera: Camera, chosen: HeightCheck | None, uri: str, lens: Intrinsics | None
+    found: Calibration, camera: Camera, height_by: HeightBy, uri: str, lens: Intrinsics | None
 ) -> Iterator[str]:
     yield f"from {uri}: {found.frames} frames, {found.path_m:.0f} m"
     source = "the recording" if lens is None else lens.source
@@ -294,10 +360,11 @@ def _report(
         )
     if found.yaw_rad is not None:
         yield f"optical axis {np.degrees(found.yaw_rad):+.2f} deg left of the way driven (for information)"
-    stated = "as stated" if chosen is None else f"by {chosen.cue}, +- {chosen.sigma_m:.2f} m"
-    yield f"height {camera.height_m:.3f} m, {stated}"
+    yield f"height {camera.height_m:.3f} m, {height_by.words}"
+    if height_by.sigma_rel:
+        yield f"all lengths +- {height_by.sigma_rel:.0%}, by height and focal length (scale_sigma_rel)"
     for check in found.height_checks:
-        if check is chosen:
+        if check is height_by.check:
             continue
         away = abs(check.height_m - camera.height_m) / check.sigma_m
         verdict = "agrees" if away < AGREES_SIGMA else f"DISAGREES ({away:.1f} sigma)"

@@ -70,6 +70,7 @@ __all__ = [
 ]
 
 NO_MODEL = "none"  # as --model: no network but those that are named beside it, not the shipped one either
+WATCHDOG_S, LOSSLESS_WATCHDOG_S = 2.0, 60.0  # the latter where a drive may take as long as it likes, on any computer
 _USER = re.compile(r"(?<=://)[^/@]*@")
 
 
@@ -125,6 +126,12 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     def runtime_dir(self) -> Path | None:
         """Where sockets and locks go; None: the user's own place (runtime/transport/presence.py)."""
         return Path(self.runtime.runtime_dir) if self.runtime.runtime_dir else None
+
+    @property
+    def watchdog_s(self) -> float:
+        """A ready node that has shown no life for so long is stalled."""
+        watchdog_ms = self.runtime.watchdog_ms
+        return (LOSSLESS_WATCHDOG_S if self.lossless else WATCHDOG_S) if watchdog_ms is None else watchdog_ms / 1e3
 
     @property
     def deadline_ns(self) -> int | None:

@@ -57,6 +57,8 @@ GROUPS = (
             "camera.tilt_sigma_rad": "How sure are these two angles (1-sigma)? As well as a bracket is screwed on",
             "camera.distortion": "What does the lens bend? OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; none: the "
             "images are undistorted",
+            "camera.scale_sigma_rel": "How sure are height and focal length, and so all lengths together (1-sigma, a "
+            "fraction)? 0: they were measured",
             "camera.fisheye": "Are those numbers k1, k2, k3, k4 of a fisheye lens (equidistant)?",
             "camera_sha256": 'Which camera file must it be, and no other? Its SHA-256; "": any',
             "slam.frontend.odometry.start.camera_ahead_m": "How far ahead of the rear axle is the camera?",
@@ -193,7 +195,8 @@ GROUPS = (
         {
             "runtime.runtime_dir": 'Where are sockets, locks and vitals? "": in the user\'s own folder',
             "runtime.ready_timeout_s": "How long may a node take to load, to warm up and to find the others?",
-            "runtime.watchdog_ms": "After how long without a sign of life has a node stalled?",
+            "runtime.watchdog_ms": "After how long without a sign of life has a node stalled? none: 2 s, at rate "
+            '"max" a minute',
             "runtime.restart": 'Is a node that died or stalled begun anew? none: "always", but "never" at rate "max", '
             "which may lose no image",
             "runtime.restarts_max": "How often may that be, before the run ends?",

@@ -147,7 +147,8 @@ class RuntimeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     drain_timeout_s: Positive = 2.0  # for the last frame's estimate to come back before the end is announced
     stop_timeout_s: Positive = 10.0  # for all nodes to end
     beat_s: Positive = 0.1  # a node's loop shows life at least so often
-    watchdog_ms: Annotated[float, msgspec.Meta(ge=200.0)] = 2000.0  # a ready node without a beat for so long is stalled
+    # A ready node without a beat for so long is stalled; None: 2 s, at rate "max", where nobody waits for it, a minute
+    watchdog_ms: Annotated[float, msgspec.Meta(ge=200.0)] | None = None
     term_grace_ms: Positive = 200.0  # between a stalled node's SIGTERM and its SIGKILL
     switch_interval_s: Positive = 5e-4  # of the GIL, for the threads that wait beside a busy one
     # A node that died or stalled is begun anew; None: "always", but "never" at rate "max", which may lose no frame

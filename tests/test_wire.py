@@ -118,6 +118,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         ages={"detector": 1, "segmenter": 3},
         status=(Status.DETECTIONS_CARRIED, Status.SCALE_CARRIED),
         speed_sources=(SpeedSource.ROAD, SpeedSource.CAR),
+        camera_sigma_rel=0.125,
     ),
     Estimate(
         **_TIMES,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.vehicles.camera_height import BoxHeight
 
+VEHICLES = "vehicles"  # the cue of their sizes
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Step = tuple[int, int, float]  # from frame, to frame, length as the odometry measured it
@@ -86,7 +87,7 @@ def checks_by_vehicles(
     if mounting is None:
         return []
     sigma_m = float(np.sqrt(mounting.cov[0, 0]))
-    return [HeightCheck(cue="vehicles", height_m=float(mounting.state[0]), sigma_m=sigma_m, samples=mounting.vehicles)]
+    return [HeightCheck(cue=VEHICLES, height_m=float(mounting.state[0]), sigma_m=sigma_m, samples=mounting.vehicles)]
 
 
 def solve_mounting(

@@ -85,11 +85,14 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     distortion: tuple[float, ...] = ()
     tilt_sigma_rad: Positive = 0.015  # 1-sigma of pitch and roll; by default of a bracket mounted by hand
     fisheye: bool = False  # `distortion` is k1, k2, k3, k4 of the equidistant model
+    # 1-sigma of all lengths as a fraction, where height or focal length are estimates; 0: they were measured
+    scale_sigma_rel: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
 
     def __post_init__(self) -> None:
         lens = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
         if not all(
-            math.isfinite(n) for n in (*lens, self.height_m, self.pitch_rad, self.roll_rad, self.tilt_sigma_rad)
+            math.isfinite(n)
+            for n in (*lens, self.height_m, self.pitch_rad, self.roll_rad, self.tilt_sigma_rad, self.scale_sigma_rel)
         ):
             raise ValueError("camera: every number must be finite")
         if not (0.0 < self.cx_px < self.width_px and 0.0 < self.cy_px < self.height_px):

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.se2 import SE2
+from birdslam.graph.camera_scale import with_camera_scale
 from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, packed, plain, unpack, unpacked
 from birdslam.graph.costs import Floats
 from birdslam.graph.edges import PoseEdges, pose_edges
@@ -65,6 +66,7 @@ class PoseGraph:
         self._birth = np.diag(np.square([config.birth_forward_mps, config.birth_sideways_mps, config.birth_turn_radps]))
         # Whether a vehicle stands is judged by its velocity's covariance: Eq. 6 alone has none that was measured
         self._birth_det = float(self._birth[0, 0] * self._birth[1, 1]) if config.constant_velocity else None
+        self._camera_sigma_rel = 0.0  # of the last frame that said it
         self.window: Window | None = None  # None before the first frame
         solver()
 
@@ -75,8 +77,9 @@ class PoseGraph:
         edge ties to a pose of the window begins a new epoch.
         """
         m = weighted(measurements, self.weights)  # Eq. 4
+        self._camera_sigma_rel = m.camera_sigma_rel or self._camera_sigma_rel
         if m.cc is None and not _NO_PIXELS.isdisjoint(m.status):
-            return self._coast(m)
+            return with_camera_scale(self._coast(m), self._camera_sigma_rel)
         window, edges = self.window, pose_edges(m)
         follows = window is not None and self._follows(m, window, edges)
         reset = window is not None and not follows
@@ -93,7 +96,8 @@ class PoseGraph:
         if not window.is_finite:  # numbers that no road has: begin anew rather than publish them
             window, reset = self._begin(m, True), True
         status = (*m.status, Status.GRAPH_RESET) if reset else m.status
-        return self._estimate(m, status, window.ego_cov, self._vehicle_estimates(m, window))
+        estimate = self._estimate(m, status, window.ego_cov, self._vehicle_estimates(m, window))
+        return with_camera_scale(estimate, self._camera_sigma_rel)
 
     def vehicles_in_ego(self) -> dict[BodyId, tuple[SE2, Floats]]:
         """T_ego_vehicle with its covariance (3, 3) in ego, of the vehicles that the newest frame sees.

@@ -63,6 +63,7 @@ class Scene:
     path_m: float
     frames: int
     track_count: int
+    sigma_rel: float = 0.0  # 1-sigma of all lengths, where the camera's height or lens is an estimate
 
 
 def draw(scene: Scene, path: Path) -> None:
@@ -100,7 +101,8 @@ def draw(scene: Scene, path: Path) -> None:
     figure.text(
         left_in / width_in,
         1.0 - 0.62 / height_in,
-        f"{scene.path_m:.1f} m in {scene.frames} frames, {scene.track_count} vehicle tracks",
+        f"{scene.path_m:.1f} m in {scene.frames} frames, {scene.track_count} vehicle tracks"
+        + (f"; all lengths +- {scene.sigma_rel:.0%}" if scene.sigma_rel >= 0.005 else ""),
         color=FAINT,
         fontsize=9.5,
     )

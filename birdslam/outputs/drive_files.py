@@ -2,8 +2,9 @@
 
 `ego.kitti.txt`: camera poses `T_first_i`, row k is frame k (a frame without an estimate keeps the pose before it).
 `ego.tum.txt`, `tracks/ID.tum.txt`: the ego, and the footprint's centre of each vehicle seen, in world. `map.csv`: road
-landmarks and lane points in world, with their epoch and lane (-1: of none). `summary.json`: counts. `bev.png`: all of
-it from above. Where a new epoch begins TUM files carry a comment; KITTI rows go on from the last pose.
+landmarks and lane points in world, with their epoch and lane (-1: of none). `frames.csv`: a line a frame, with its
+statuses. `summary.json`: counts. `bev.png`: all of it from above. `README.txt`: how far to believe it, and what each
+file is. Where a new epoch begins TUM files carry a comment; KITTI rows go on from the last pose.
 """
 
 from __future__ import annotations
@@ -23,10 +24,26 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.bev_picture import Scene, Track, draw
 from birdslam.outputs.final_trajectories import EGO_FILES
+from birdslam.outputs.plain_words import DriveCounts, LengthsBy, readme, verdict
 from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row, tum_row
-from birdslam.types import Attitude, Estimate, MapUpdate, Status, VehicleEstimate
+from birdslam.types import INVALIDATING, Attitude, Estimate, MapUpdate, Status, VehicleEstimate
 
 FILLED_FRAMES = 10_000  # a longer gap in the frame numbers is a new source, not dropped frames
+FRAMES_FILE = "frames.csv"
+FRAME_COLUMNS = ("frame", "t_s", "epoch", "x_m", "y_m", "yaw_rad", "speed_mps", "scale_sigma_rel", "valid", "status")
+FILES = {  # what README.txt says of each that is there
+    "summary.json": "all counts, the configuration and the versions",
+    "bev.png": "the drive from above",
+    "ego.tum.txt": "the car's way: time, place and attitude in metres, a line a frame",
+    "frames.csv": "a line a frame: place, speed, how sure a metre is, whether it is valid, and each status",
+    "report.html": "all of it to look at, in any browser",
+    "ego.kitti.txt": "the same as KITTI has it: the camera's poses",
+    "ego.final.tum.txt": "the car's way, smoothed when the drive was over",
+    "tracks": "the way of each other vehicle, as ego.tum.txt; ID.final.tum.txt: smoothed",
+    "map.csv": "points of the road and of the lanes, in metres",
+    "camera.toml": "the camera as the first pass found it, for `--camera` next time",
+    "logs": "what each process said",
+}
 MOST_POSES, MOST_TRACK_POSES, MOST_POINTS, MOST_TRACKS = 4000, 100, 20_000, 200  # in the picture; under 3 MB in all
 
 
@@ -105,26 +122,33 @@ class Recorder:
 
     def __init__(self, directory: Path, camera: Camera) -> None:
         claim_directory(directory)
-        self._directory = directory
+        self._directory, self._camera = directory, camera
         self._tracks_directory = directory / "tracks"
         self._files = ExitStack()
         try:
             self._tracks_directory.mkdir(exist_ok=True)
-            later = (directory / name for name in ("summary.json", "bev.png", *EGO_FILES.values()))
+            later = (
+                directory / name
+                for name in ("summary.json", "bev.png", "README.txt", "report.html", *EGO_FILES.values())
+            )
             for old in (*self._tracks_directory.glob("*.tum.txt"), *later):
                 old.unlink(missing_ok=True)  # stale tracks beside new ones would be taken for this run's
-            self._kitti, self._tum, self._map = map(self._open, ("ego.kitti.txt", "ego.tum.txt", "map.csv"))
+            names = ("ego.kitti.txt", "ego.tum.txt", "map.csv", FRAMES_FILE)
+            self._kitti, self._tum, self._map, self._table = map(self._open, names)
         except OSError as error:
             self.close()
             raise ResultsError(f"output directory {directory}: {error.strerror}: {error.filename}") from None
         self._tum.write("# t_s x_m y_m z_m qx qy qz qw: the ego (the camera's foot on the road) in world\n")
         self._map.write("epoch,kind,x_m,y_m,lane\n")
+        self._table.write(",".join(FRAME_COLUMNS) + "\n")
         self.statuses: Counter[str] = Counter()
         self.speed_sources: Counter[str] = Counter()
         self._trajectory = CameraTrajectory(camera.ground)
         self._next_row = 0
         self._frames = self._invalid = 0
-        self._path_m = 0.0
+        self._invalid_by: Counter[str] = Counter()
+        self._path_m = self._valid_path_m = 0.0
+        self._sigmas = Thinned(1, MOST_POSES)  # of the scale, in valid frames
         self._last: Estimate | None = None
         self._epoch: int | None = None
         self._epoch_count = 0
@@ -156,10 +180,15 @@ class Recorder:
         elif self._last is not None:
             step = self._last.T_world_ego.between(estimate.T_world_ego)
             self._path_m += math.hypot(step.x_m, step.y_m)
+            self._valid_path_m += math.hypot(step.x_m, step.y_m) * estimate.valid
         self._frames += 1
         self._invalid += not estimate.valid
+        self._invalid_by.update(status.value for status in estimate.status if status in INVALIDATING)
+        if estimate.valid:
+            self._sigmas.add(estimate.scale_sigma_rel)
         self.statuses.update(status.value for status in estimate.status)
         self.speed_sources.update(source.value for source in estimate.speed_sources)
+        self._table.write(self._frame_row(estimate) + "\n")
         pose = ego_pose(estimate.T_world_ego, estimate.attitude)
         self._tum.write(tum_row(estimate.t_source_ns, pose) + "\n")
         self._write_row(estimate, pose)
@@ -184,22 +213,52 @@ class Recorder:
                 for x_m, y_m in self._T_picture_world @ np.array(points).reshape(-1, 2):
                     kept.add(float(x_m), float(y_m))
 
-    def finish(self, summary: dict[str, Any]) -> None:
-        """Write summary.json (`summary` over the recorder's own counts; a number that is not finite becomes null) and
-        bev.png, and close the files."""
+    def finish(self, summary: dict[str, Any], lengths_by: LengthsBy | None = None) -> list[str]:
+        """Write summary.json (`summary` over the recorder's own counts; a number that is not finite becomes null),
+        bev.png and README.txt, and close the files; gives the verdict on the drive (plain_words.py), a sentence each.
+
+        `lengths_by`: what the camera's height and lens rest on; None: what is stated of them.
+        """
         self.close()
-        counts = {
+        sigmas = self._sigmas.array()
+        counts: dict[str, Any] = {
             "frames": self._frames,
             "invalid_frames": self._invalid,
+            "invalid_by": dict(sorted(self._invalid_by.items())),
             "path_m": round(self._path_m, 3),
+            "valid_path_m": round(self._valid_path_m, 3),
+            "scale_sigma_rel": round(float(np.median(sigmas)), 5) if len(sigmas) else None,
+            "camera_sigma_rel": self._camera.scale_sigma_rel,
             "tracks": self._track_count,
             "epochs": self._epoch_count,
             "statuses": dict(sorted(self.statuses.items())),
             "speed_sources": dict(sorted(self.speed_sources.items())),
         }
-        encoded = msgspec.json.encode({**counts, **summary}, enc_hook=_plain)
+        known = {name: counts[name] for name in DriveCounts.__dataclass_fields__ if name in counts}
+        sentences = verdict(DriveCounts(**known, lengths_by=lengths_by or self._stated()))
+        encoded = msgspec.json.encode({**counts, "verdict": sentences, **summary}, enc_hook=_plain)
         (self._directory / "summary.json").write_bytes(msgspec.json.format(encoded, indent=2) + b"\n")
         draw(self._scene(), self._directory / "bev.png")
+        there = {name: what for name, what in FILES.items() if (self._directory / name).exists()}
+        text = readme(self._directory.resolve().name, sentences, there)
+        (self._directory / "README.txt").write_text(text, encoding="utf-8")
+        return sentences
+
+    def _frame_row(self, estimate: Estimate) -> str:
+        T, last, speed = estimate.T_world_ego, self._last, ""
+        if last is not None and last.epoch == estimate.epoch and estimate.t_source_ns > last.t_source_ns:
+            step = last.T_world_ego.between(T)
+            speed = f"{math.hypot(step.x_m, step.y_m) * 1e9 / (estimate.t_source_ns - last.t_source_ns):.3f}"
+        status = " ".join(one.value for one in estimate.status)
+        return (
+            f"{estimate.frame_id},{estimate.t_source_ns * 1e-9:.6f},{estimate.epoch},{T.x_m:.3f},{T.y_m:.3f},"
+            f"{T.yaw_rad:.5f},{speed},{estimate.scale_sigma_rel:.4f},{int(estimate.valid)},{status}"
+        )
+
+    def _stated(self) -> LengthsBy:
+        """Of a camera whose file says how sure it is, but not why."""
+        sigma_rel = self._camera.scale_sigma_rel
+        return LengthsBy(height_sigma_rel=sigma_rel)
 
     def _begin_epoch(self, estimate: Estimate) -> None:
         """Put the new world where the last one was left."""
@@ -269,6 +328,7 @@ class Recorder:
             ego = np.vstack([ego, _numbers(self._T_picture_world @ self._last.T_world_ego)])
         return Scene(
             name=self._directory.resolve().name,
+            sigma_rel=self._camera.scale_sigma_rel,
             ego=ego,
             breaks=self._breaks.array(),
             tracks=tracks,

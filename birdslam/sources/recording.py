@@ -65,6 +65,11 @@ class Recording(ABC):
         """The intrinsics of a recording that may lack the camera's height; None of any other. Raises DatasetError."""
         return None
 
+    @classmethod
+    def stated_focal_px(cls, path: Path) -> float | None:
+        """A focal length that the recording's metadata state, roughly; None of most. Raises DatasetError."""
+        return None
+
     @abstractmethod
     def __len__(self) -> int:
         """Frames in the recording, unreadable ones counted."""

@@ -73,13 +73,13 @@ DEMO = Scheme(
 )
 VIDEO = Scheme(
     name="video",
-    written=("video:FILE",),
-    what="a film, as OpenCV reads it",
-    opener="birdslam.sources.video:VideoRecording",
+    written=("video:FILE", "video:DIR"),
+    what="a film, as OpenCV reads it; DIR: all films in it, one after the other in the order of their names",
+    opener="birdslam.sources.films.video:VideoRecording",
     camera="frame size",
     clock="recorded times",
     refused=("topics",),
-    suffixes=(".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm"),
+    suffixes=(".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".ts", ".m2ts", ".mts", ".mpg", ".3gp", ".flv", ".wmv"),
 )
 ROSBAG = Scheme(
     name="rosbag",

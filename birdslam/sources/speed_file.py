@@ -2,7 +2,7 @@
 
 A line is a time in s by the recording's clock and a speed in m/s, then, where the car says more, the 1-sigma of the
 speed in m/s, a yaw rate in rad/s (counter-clockwise) and its 1-sigma; by commas (a cell may be empty) or blanks, with
-`#` comments.
+`#` comments. A first line that names its columns may have them in any order: speed_tables.py.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from birdslam.sources.recording import DatasetError, Recording, check_times
 from birdslam.sources.speed_log import SpeedLog
+from birdslam.sources.speed_tables import names_columns, table_readings
 from birdslam.types import NS_PER_S, SpeedReading
 
 # 1-sigma where a file states none; chosen on no data: some steps of a wheel sensor's message (often 0.1 km/h), and
@@ -77,10 +78,12 @@ def _lines(path: Path) -> Iterator[tuple[int, SpeedReading]]:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: can't be read: {getattr(error, 'strerror', None) or 'not UTF-8'}") from None
-    for number, line in enumerate(lines, start=1):
-        text = line.partition("#")[0].strip()
-        if not text:
-            continue
+    texts = [(number, line, line.partition("#")[0].strip()) for number, line in enumerate(lines, start=1)]
+    texts = [entry for entry in texts if entry[2]]
+    if texts and names_columns(texts[0][2]):
+        yield from table_readings(path, [(number, text) for number, _, text in texts])
+        return
+    for number, line, text in texts:
         try:
             yield number, _reading(text.split(",") if "," in text else text.split())
         except ValueError:

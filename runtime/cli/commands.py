@@ -44,6 +44,7 @@ COMMANDS = (
     Command("run", "capture, perceive and optimize a source, live", "vehicle.run"),
     Command("replay", "the back end alone on a recording: does it give the same, bit for bit?", "drives.replay"),
     Command("export", "a recording in the formats of others: a ROS 2 bag (pip install birdslam[ros])", "drives.export"),
+    Command("report", "a drive as one HTML page to look at, offline (pip install birdslam[report])", "drives.report"),
     Command("view", "show a recording, or what goes on now, in rerun (pip install birdslam[view])", "drives.view"),
     Command("top", "a live table of the nodes: rates, ages, budgets, restarts", "vehicle.top"),
     Command("listen", "print live estimates, as a planner gets them, until the source ends", "vehicle.listen"),

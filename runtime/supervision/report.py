@@ -82,6 +82,11 @@ def table(summary: dict[str, Any], output: Path) -> str:
     by = f" ({', '.join(f'{n} by {name}' for name, n in dropped.items())})" if dropped else ""
     unseen = summary["frames_predicted"]
     predicted = f" ({unseen} of them predicted, not looked at)" if unseen else ""
+    paced = (
+        ("age at the planner", spread(summary["age_ms"])),
+        ("  of its budget", budget),
+        *((f"  {name}", spread(figures)) for name, figures in summary["stages_ms"].items()),
+    )
     rows = [
         ("ended", summary["ended"]),
         (
@@ -91,9 +96,9 @@ def table(summary: dict[str, Any], output: Path) -> str:
         ),
         ("rate", f"{summary['rate_hz']:.2f} Hz"),
         ("networks began on", f"{summary['looks']} frames"),
-        ("age at the planner", spread(summary["age_ms"])),
-        ("  of its budget", budget),
-        *((f"  {name}", spread(figures)) for name, figures in summary["stages_ms"].items()),
+        *(
+            paced if summary["configuration"]["source"]["rate"] != "max" else ()
+        ),  # there frames wait, and nobody for them
         *((f"  {name} restarted", f"{n} times") for name, n in summary["restarts"].items() if n),
         *((f"  {status}", f"{n} frames") for status, n in summary["statuses"].items()),
         *((f"  metres from {source}", f"{n} frames") for source, n in summary["speed_sources"].items()),

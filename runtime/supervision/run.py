@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from typing import Any
 import msgspec
 
 from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
+from birdslam.outputs.plain_words import LengthsBy
 from birdslam.perception import ModelError, load_network
 from birdslam.perception.pointnet import load_pointnet
 from birdslam.runtime.configuration import Configuration, ConfigurationError, ModelsConfig, complete
@@ -26,6 +27,7 @@ from birdslam.runtime.process import realtime
 from birdslam.runtime.process.child import give_back_memory
 from birdslam.runtime.recording.recording import RecordingError
 from birdslam.runtime.supervision.demo_report import DemoReport
+from birdslam.runtime.supervision.drive_report import REPORT, can_report, write_report
 from birdslam.runtime.supervision.final_results import FinalResults, check_results
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.supervision.logbook import Logbook, Results
@@ -35,15 +37,29 @@ from birdslam.runtime.supervision.report import summarise, table
 from birdslam.runtime.supervision.supervisor import Supervisor
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Bus
-from birdslam.runtime.transport.presence import VehicleLock, runtime_dir_of, socket_path
+from birdslam.runtime.transport.presence import VehicleLock, own_runtime_dir, runtime_dir_of, socket_path
 from birdslam.sources.recording import DatasetError
 
+ANY_VEHICLE = Configuration().vehicle  # of one that is not named
 WITHOUT_MODELS = "no networks: odometry only, without vehicles and lanes"
 DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come to in a long drive among lane lines
 
 
-def run(configuration: Configuration) -> int:
-    """A whole run; gives the exit status. Raises what a user has to mend before anything is started."""
+def run(configuration: Configuration, lengths_by: LengthsBy | None = None) -> int:
+    """A whole run; gives the exit status. Raises what a user has to mend before anything is started.
+
+    `lengths_by`: what the metres rest on, for the verdict at the end, where a first pass found the camera. A drive of
+    every frame of a recording, by no name and in no place of its own, has a bus for itself alone.
+    """
+    alone = configuration.lossless and configuration.vehicle == ANY_VEHICLE and configuration.runtime_dir is None
+    with own_runtime_dir(configuration.vehicle) if alone else nullcontext() as directory:
+        if directory is not None:
+            runtime = msgspec.structs.replace(configuration.runtime, runtime_dir=str(directory))
+            configuration = msgspec.structs.replace(configuration, runtime=runtime)
+        return _run(configuration, lengths_by)
+
+
+def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
     realtime.use_one_heap()  # before networks are looked at, which begins threads
     configuration, models, frames = check(configuration)
     give_back_memory()  # the networks that were looked at
@@ -82,13 +98,24 @@ def run(configuration: Configuration) -> int:
             supervisor.fail(f"final results can't be written: {error}", 1)
         except KeyboardInterrupt:
             supervisor.fail("the final results were cut short", INTERRUPTED_STATUS)
+    sentences: list[str] = []
     try:
-        recorder.finish(summary)
+        sentences = recorder.finish(summary, lengths_by)
     except OSError as error:
         supervisor.fail(f"results can't be written: {error}", 1)
     if logbook.unwritten is not None:
         supervisor.fail(f"results are incomplete: {logbook.unwritten}", 1)
+    if reported := bool(sentences) and not configuration.live and can_report():
+        try:
+            write_report(output, output / REPORT)
+        except (ResultsError, RecordingError) as error:
+            supervisor.fail(f"the report can't be written: {error}", 1)
+            reported = False
     live.say(table(summary, output))
+    if reported:
+        live.say(f"{'to look at':24}{output / REPORT}")
+    if sentences:
+        live.say("\n".join(("", *sentences)))
     if supervisor.failure:
         print(f"birdslam: {supervisor.failure}", file=sys.stderr)
     return supervisor.exit_status
@@ -167,7 +194,7 @@ def _describe(models: ModelsConfig, sender: Connection) -> None:
 def check_runtime_dir(vehicle: str, runtime_dir: Path | None) -> None:
     """Raises ConfigurationError where sockets can't lie there."""
     try:
-        for name in NODES:
+        for name in (*NODES, "supervisor"):
             socket_path(runtime_dir_of(vehicle, runtime_dir), name)
     except (ValueError, OSError) as error:
         raise ConfigurationError(f"vehicle {vehicle!r}, runtime directory: {error}") from error

@@ -155,13 +155,13 @@ class Station:
     def stalled(self, before: Station | None) -> str:
         """Why the process at work is to be ended, or nothing; `before` is the node that sends to it."""
         runtime, process = self._config.runtime, self.process
-        limit_s, now_s = runtime.watchdog_ms / 1e3, time.monotonic()
+        limit_s, now_s = self._config.watchdog_s, time.monotonic()
         if process.exit_status is not None or process.begun_s is None or self._kill_s is not None:
             return ""
         self.was_ready = self.was_ready or process.ready
         silent_s = process.silent_s()
         if silent_s > limit_s:
-            return f"is stalled: its loop has shown no life for {runtime.watchdog_ms:g} ms"
+            return f"is stalled: its loop has shown no life for {1e3 * limit_s:g} ms"
         if before is not None and process.ready:
             sent = before.process.vitals["frames"]
             taken = sum(process.vitals[counter] for counter in ("frames", "torn", "outrun"))

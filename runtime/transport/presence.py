@@ -7,11 +7,14 @@ there is no such variable. It belongs to one user alone (0700), and holds the so
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import hashlib
 import os
+import shutil
 import socket
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 from birdslam.runtime.topology import check_name
@@ -19,6 +22,7 @@ from birdslam.runtime.transport.closing import Closing
 
 _MAX_SOCKET_PATH_BYTES = 107  # sun_path of Linux, without its final zero
 _SHARED_MEMORY = Path("/dev/shm")
+_OWN = "own-"  # then a process' number: the runtime directory of one that drives over a recording
 
 
 class VehicleBusy(RuntimeError):
@@ -31,15 +35,50 @@ def runtime_dir_of(vehicle: str, runtime_dir: Path | None = None) -> Path:
     Raises ValueError for a bad vehicle name, PermissionError where the directory is open to other users.
     """
     check_name("vehicle", vehicle)
-    if runtime_dir is None:
-        session_dir = os.environ.get("XDG_RUNTIME_DIR")
-        runtime_dir = Path(session_dir, "birdslam") if session_dir else Path(f"/tmp/birdslam-{os.getuid()}")
-        runtime_dir.mkdir(mode=0o700, exist_ok=True)
-        _check_private(runtime_dir)
-    directory = runtime_dir / vehicle
+    directory = (_users_runtime_dir() if runtime_dir is None else runtime_dir) / vehicle
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     _check_private(directory)
     return directory.resolve()
+
+
+def _users_runtime_dir() -> Path:
+    session_dir = os.environ.get("XDG_RUNTIME_DIR")
+    directory = Path(session_dir, "birdslam") if session_dir else Path(f"/tmp/birdslam-{os.getuid()}")
+    directory.mkdir(mode=0o700, exist_ok=True)
+    _check_private(directory)
+    return directory
+
+
+@contextlib.contextmanager
+def own_runtime_dir(vehicle: str) -> Iterator[Path]:
+    """A runtime directory for this process alone, gone afterwards: a bus on which nobody else is.
+
+    So that drives over recordings run side by side, and never stand in the way of the car that bears the name. Removes
+    too what such processes left that were killed.
+    """
+    place = _users_runtime_dir()
+    for left in place.glob(f"{_OWN}*"):
+        if not _runs(left.name.removeprefix(_OWN)):
+            _remove_left(left)
+    directory = place / f"{_OWN}{os.getpid()}"
+    directory.mkdir(mode=0o700, exist_ok=True)
+    try:
+        yield directory
+    finally:
+        shutil.rmtree(directory, ignore_errors=True)
+
+
+def _runs(pid: str) -> bool:
+    return not pid.isdigit() or Path("/proc", pid).exists()
+
+
+def _remove_left(directory: Path) -> None:
+    for lock in directory.glob("*/lock"):
+        try:
+            VehicleLock(lock.parent.name, directory).close()  # its sockets and its ring
+        except (VehicleBusy, OSError, ValueError):  # of another container, which has its own process numbers
+            return
+    shutil.rmtree(directory, ignore_errors=True)
 
 
 def _check_private(directory: Path) -> None:

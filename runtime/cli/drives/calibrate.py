@@ -51,8 +51,8 @@ def run(options: argparse.Namespace) -> int:
         kind=options.kind,
         speed=options.known_speed,
     )
-    camera, report = calibrate_drive(configuration_of(options), options.source, given, options.stride or 1)
-    write_camera_file(Path(options.output), camera, report)
-    print("\n".join(report))
+    found = calibrate_drive(configuration_of(options), options.source, given, options.stride or 1)
+    write_camera_file(Path(options.output), found.camera, found.report)
+    print("\n".join(found.report))
     print(f"camera file: {options.output}")
     return 0

@@ -1,0 +1,49 @@
+"""What an unsure camera height or focal length does to an estimate: all of its lengths are wrong by one factor."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from birdslam.geometry.se2 import SE2
+from birdslam.types import Estimate, VehicleEstimate
+
+
+def with_camera_scale(estimate: Estimate, sigma_rel: float) -> Estimate:
+    """The estimate with covariances that have in them a common factor of 1 +- `sigma_rel` on all lengths.
+
+    The factor is the same for all of a drive, so that no window averages it out: it scales the world about its origin,
+    and moves a pose p by sigma * p, a velocity v by sigma * v. Headings keep.
+    """
+    if not sigma_rel:
+        return estimate
+    return msgspec.structs.replace(
+        estimate,
+        cov=_widened(estimate.cov, estimate.T_world_ego, sigma_rel),
+        vehicles=tuple(_vehicle(vehicle, sigma_rel) for vehicle in estimate.vehicles),
+        scale_sigma_rel=math.hypot(estimate.scale_sigma_rel, sigma_rel),
+    )
+
+
+def _vehicle(vehicle: VehicleEstimate, sigma_rel: float) -> VehicleEstimate:
+    u, v = (sigma_rel * along for along in vehicle.velocity_mps)
+    uu, uv, vu, vv = vehicle.velocity_cov
+    return msgspec.structs.replace(
+        vehicle,
+        cov=_widened(vehicle.cov, vehicle.T_world_vehicle, sigma_rel),
+        velocity_cov=(uu + u * u, uv + u * v, vu + u * v, vv + v * v),
+    )
+
+
+def _widened(cov: tuple[float, ...], pose: SE2, sigma_rel: float) -> tuple[float, ...]:
+    """Of a pose, row-major of its tangent, whose axes are the body's own."""
+    cos, sin = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+    x_m = sigma_rel * (cos * pose.x_m + sin * pose.y_m)
+    y_m = sigma_rel * (cos * pose.y_m - sin * pose.x_m)
+    out = list(cov)
+    out[0] += x_m * x_m
+    out[1] += x_m * y_m
+    out[3] += x_m * y_m
+    out[4] += y_m * y_m
+    return tuple(out)

@@ -1,0 +1,1 @@
+"""Films: their frames, and what their containers say beside them."""

@@ -1,0 +1,159 @@
+"""A film's file beside its pictures: why it does not open, and what an MP4 or MOV says of the lens.
+
+MP4 and MOV files are boxes: four bytes of length, four of a name, then the content (ISO/IEC 14496-12). Apple's phones,
+and others after them, state how wide the lens saw as a focal length of the 35 mm format, among the metadata of
+QuickTime (`mdta` keys).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from birdslam.sources.recording import DatasetError
+
+FULL_FRAME_MM = 36.0  # across
+_FOCAL_KEY = re.compile(rb"focal_length.*35mm", re.IGNORECASE)
+_MOST_BYTES = 1 << 26  # of the index: an hour has some MB
+_INSIDE = (b"moov", b"trak", b"udta", b"mdia")
+_STATED_MM = 5.0, 300.0  # what a focal length may be
+
+
+class _Box(NamedTuple):
+    name: bytes
+    begin: int  # of its content
+    end: int
+
+
+def why_unreadable(path: Path) -> str:
+    """Why OpenCV can't open a file that is there, as far as its first bytes tell."""
+    try:
+        size, head = path.stat().st_size, _read(path, 0, 12)
+    except OSError as error:
+        return f"can't be read: {error.strerror}"
+    if not size:
+        return "is empty"
+    if head[4:8] in (b"ftyp", b"mdat", b"moov", b"wide", b"free", b"skip"):
+        names = [box.name for box in _boxes_of_file(path)]
+        if b"moov" not in names:
+            return "is cut off: its index, which a camera writes last, is missing (power lost while it recorded?)"
+    return "is no video that OpenCV can open: no pictures in it, or of a codec that it has not"
+
+
+def stated_focal_rel(path: Path) -> float | None:
+    """The focal length as a fraction of the picture's long side, where an MP4 or MOV states it; else None.
+
+    Of the 35 mm format, whose pictures are 36 mm wide; a film may show less than the whole sensor.
+    """
+    if path.suffix.lower() not in (".mp4", ".mov", ".m4v"):
+        return None
+    try:
+        moov = next((box for box in _boxes_of_file(path) if box.name == b"moov"), None)
+        if moov is None or moov.end - moov.begin > _MOST_BYTES:
+            return None
+        focal_mm = _focal_mm(_read(path, moov.begin, moov.end - moov.begin))
+    except OSError:
+        return None
+    return None if focal_mm is None else focal_mm / FULL_FRAME_MM
+
+
+def natural(path: Path) -> list[tuple[int, int | str]]:
+    """Sorts names with numbers as people do: film2 before film10."""
+    return [(0, int(part)) if part.isdigit() else (1, part.lower()) for part in re.split(r"(\d+)", path.name) if part]
+
+
+def films_in(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """A film's file, or all of a directory in their natural order. Raises DatasetError."""
+    if not path.is_dir():
+        return [path]
+    films = sorted((file for file in path.iterdir() if file.suffix.lower() in suffixes), key=natural)
+    films = [film for film in films if film.is_file() and not film.name.startswith(".")]  # ._ files of macOS
+    if not films:
+        raise DatasetError(f"{path}: has no films ({', '.join(suffixes)})")
+    return films
+
+
+def _boxes_of_file(path: Path) -> Iterator[_Box]:
+    """The outermost boxes, as far as the file goes."""
+    size, at = path.stat().st_size, 0
+    while at + 8 <= size:
+        length, name, header = _header(_read(path, at, 16), size - at)
+        if length < header:
+            return
+        yield _Box(name, at + header, min(at + length, size))
+        at += length
+
+
+def _header(head: bytes, rest: int) -> tuple[int, bytes, int]:
+    """Length of a box with its header, its name, and the length of the header."""
+    length, name = int.from_bytes(head[:4], "big"), head[4:8]
+    if length == 1 and len(head) >= 16:
+        return int.from_bytes(head[8:16], "big"), name, 16
+    return (rest if length == 0 else length), name, 8
+
+
+def _boxes(data: bytes, begin: int, end: int) -> Iterator[_Box]:
+    while begin + 8 <= end:
+        length, name, header = _header(data[begin : begin + 16], end - begin)
+        if length < header or begin + length > end:
+            return
+        yield _Box(name, begin + header, begin + length)
+        begin += length
+
+
+def _focal_mm(moov: bytes) -> float | None:
+    """Searches the metadata of the film and of its tracks."""
+    waiting = [_Box(b"moov", 0, len(moov))]
+    while waiting:
+        box = waiting.pop()
+        for inner in _boxes(moov, box.begin, box.end):
+            if inner.name in _INSIDE:
+                waiting.append(inner)
+            elif inner.name == b"meta":
+                found = _of_meta(moov, inner)
+                if found is not None:
+                    return found
+    return None
+
+
+def _of_meta(data: bytes, meta: _Box) -> float | None:
+    """`keys` names what `ilst` holds, by number. QuickTime's meta begins with boxes, MPEG's with a version."""
+    skip = 0 if data[meta.begin + 4 : meta.begin + 8] in (b"hdlr", b"keys", b"mhdr") else 4
+    parts = {box.name: box for box in _boxes(data, meta.begin + skip, meta.end)}
+    if b"keys" not in parts or b"ilst" not in parts:
+        return None
+    names = [data[box.begin : box.end] for box in _boxes(data, parts[b"keys"].begin + 8, parts[b"keys"].end)]
+    for item in _boxes(data, parts[b"ilst"].begin, parts[b"ilst"].end):
+        number = int.from_bytes(item.name, "big")
+        if 1 <= number <= len(names) and _FOCAL_KEY.search(names[number - 1]):
+            for value in _boxes(data, item.begin, item.end):
+                if value.name == b"data":
+                    return _number(data[value.begin : value.end])
+    return None
+
+
+def _number(value: bytes) -> float | None:
+    """Of a `data` box: its type, its locale, then a text, a whole number or a float."""
+    kind, content = int.from_bytes(value[1:4], "big"), value[8:]
+    try:
+        if kind == 1:
+            number = float(content.decode("ascii"))
+        elif kind in (21, 22):
+            number = float(int.from_bytes(content, "big", signed=kind == 21))
+        elif kind in (23, 24):
+            number = float(struct.unpack(">f" if kind == 23 else ">d", content)[0])
+        else:
+            return None
+    except (ValueError, struct.error):
+        return None
+    return number if math.isfinite(number) and _STATED_MM[0] <= number <= _STATED_MM[1] else None
+
+
+def _read(path: Path, at: int, length: int) -> bytes:
+    with path.open("rb") as file:
+        file.seek(at)
+        return file.read(length)

@@ -1,0 +1,194 @@
+"""Films as recorded drives, through OpenCV: one file, or a directory of those that a camera wrote in turn."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from birdslam.geometry.camera import Camera
+from birdslam.ros.bag import BagTopics
+from birdslam.sources.films.container import films_in, stated_focal_rel, why_unreadable
+from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
+from birdslam.sources.schemes import VIDEO
+from birdslam.types import NS_PER_S
+
+GAP_NS = NS_PER_S  # a longer time between two frames is told as a frame without an image
+NAME_RESOLUTION_S = 2.0  # names tell times by the second, and each of two may be rounded
+_COUNTED = (".mp4", ".mov", ".m4v", ".avi", ".3gp")  # containers that say how many frames there are
+_USUAL_HZ = 1.0, 240.0  # a rate that a container states outside of these is measured
+_MEASURED_FRAMES = 24
+# 20240131_235959, 2024-01-31 23.59.59 and the like
+_NAME_TIME = re.compile(r"(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_. T]{0,3}(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)")
+
+
+@dataclass(frozen=True)
+class _Film:
+    """One file: what its container declares, and when it begins after the one before it has ended."""
+
+    path: Path
+    rate_hz: float
+    declared: int  # frames; 0: nothing is declared
+    gap_ns: int = 0
+
+    @property
+    def period_ns(self) -> int:
+        return round(NS_PER_S / self.rate_hz)
+
+    @property
+    def length_s(self) -> float:
+        return self.declared / self.rate_hz
+
+    def ends_early(self, frames: int, last_s: float) -> bool:
+        """Whether it holds less than is declared, having given so many frames, the last at that time."""
+        if self.path.suffix.lower() in _COUNTED:
+            return frames < 0.99 * self.declared - 1.0  # some containers miscount by a frame
+        return last_s < 0.98 * self.length_s - 0.5  # the count is the time by the mean rate
+
+
+class VideoRecording(Recording):
+    """A film, or the films of a directory in their natural order as one drive.
+
+    Frames have the container's own times, also where those are uneven, and stand upright as a phone's film says.
+    `len` is what the containers declare (0 where one declares nothing). Films follow each other without a gap, but
+    where their names tell times that leave one. A gap of more than a second, there or within a film, is one frame
+    without an image.
+    """
+
+    def __init__(self, path: Path, camera: Camera | None, stride: int = 1) -> None:
+        files = films_in(path, VIDEO.suffixes)
+        for file in files if camera is None else ():
+            _capture(file).release()  # what is wrong with the film goes before what it lacks
+        if camera is None:
+            raise DatasetError(
+                f"video:{path}: a film knows nothing of its camera: a camera file is needed (`birdslam run` without "
+                "--camera finds it)"
+            )
+        self.camera, self._stride, self.name = camera, stride, path.stem
+        self._films = _in_sequence([_film(file, camera) for file in files])
+        self.rate_hz = self._films[0].rate_hz / stride
+
+    @classmethod
+    def frame_size(cls, path: Path, topics: BagTopics) -> tuple[int, int]:
+        """As it is shown: a film that a phone took upright is higher than wide. Raises DatasetError."""
+        capture = _capture(films_in(path, VIDEO.suffixes)[0])
+        size = _size(capture)
+        capture.release()
+        return size
+
+    @classmethod
+    def stated_focal_px(cls, path: Path) -> float | None:
+        """The focal length by the container's metadata, of the whole sensor; None where it does not say."""
+        focal_rel = stated_focal_rel(films_in(path, VIDEO.suffixes)[0])
+        return None if focal_rel is None else focal_rel * max(cls.frame_size(path, BagTopics()))
+
+    def __len__(self) -> int:
+        declared = [film.declared for film in self._films]
+        return -(-sum(declared) // self._stride) if all(declared) else 0
+
+    def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
+        """Every frame in order, its time from the container; a file cut off ends with one unreadable frame."""
+        index, t_ns = 0, -self._films[0].period_ns
+        for film in self._films:
+            begin_ns = t_ns + film.period_ns + film.gap_ns
+            for frame in self._frames_of(film, index, begin_ns, t_ns, start):
+                index, t_ns = frame.index + 1, frame.t_source_ns
+                if frame.index >= start:
+                    yield frame
+
+    def _frames_of(self, film: _Film, index: int, begin_ns: int, last_ns: int, start: int) -> Iterator[RecordedFrame]:
+        """One file's, numbered from `index` on; those before `start` are not decoded to an image."""
+        capture = _capture(film.path)
+        try:
+            position, shift_ns, t_ns = 0, begin_ns, last_ns
+            while capture.grab():
+                stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6) + shift_ns
+                if stamp_ns <= t_ns:  # a clock that began anew, or a container without times, which gives zeros
+                    shift_ns += t_ns + film.period_ns - stamp_ns
+                    stamp_ns = t_ns + film.period_ns
+                gap_ns, t_ns = (stamp_ns - t_ns if index else 0), stamp_ns
+                if gap_ns > GAP_NS + film.period_ns:
+                    words = f"{film.path}: {gap_ns / NS_PER_S:.1f} s are missing before frame {position}"
+                    yield RecordedFrame(index, t_ns - film.period_ns // 2, None, words)
+                    index += 1
+                if position % self._stride == 0:
+                    ok, image = capture.retrieve() if index >= start else (False, None)
+                    error = None if ok else f"{film.path}: frame {position} can't be decoded"
+                    yield RecordedFrame(index, t_ns, image if ok else None, error)  # type: ignore[arg-type]
+                    index += 1
+                position += 1
+            if film.ends_early(position, (t_ns - begin_ns) / NS_PER_S):
+                error = f"{film.path}: ends after {position} of {film.declared} frames: cut off"
+                yield RecordedFrame(index, t_ns + film.period_ns, None, error)
+        finally:
+            capture.release()
+
+
+def _film(path: Path, camera: Camera) -> _Film:
+    """Opened once, to see that it fits. Raises DatasetError."""
+    capture = _capture(path)
+    rate_hz, size = capture.get(cv2.CAP_PROP_FPS), _size(capture)
+    declared = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+    if not _USUAL_HZ[0] <= rate_hz <= _USUAL_HZ[1]:  # not a number, too
+        declared = round(declared / rate_hz) if math.isfinite(rate_hz) and rate_hz > 0.0 else 0  # as seconds
+        rate_hz = _measured_hz(capture)
+        declared = round(declared * rate_hz)
+    capture.release()
+    if not (math.isfinite(rate_hz) and 0.0 < rate_hz <= 1000.0):
+        raise DatasetError(f"{path}: neither its container nor its frames tell a usable frame rate ({rate_hz:g})")
+    if size != (camera.width_px, camera.height_px):
+        raise DatasetError(
+            f"{path}: is {size[0]}x{size[1]}, but the camera given is {camera.width_px}x{camera.height_px}"
+        )
+    return _Film(path, rate_hz, declared)
+
+
+def _measured_hz(capture: cv2.VideoCapture) -> float:
+    """By the times of the first frames; NaN where they have none."""
+    times: list[float] = []
+    while len(times) < _MEASURED_FRAMES and capture.grab():
+        times.append(capture.get(cv2.CAP_PROP_POS_MSEC))
+    steps = np.diff(times)
+    return float(1e3 / np.median(steps)) if len(steps) and np.median(steps) > 0.0 else math.nan
+
+
+def _in_sequence(films: list[_Film]) -> list[_Film]:
+    """With the gaps that the times in their names leave between them."""
+    out = films[:1]
+    for before, film in pairwise(films):
+        began, begins = _name_time(before.path), _name_time(film.path)
+        gap_s = 0.0
+        if began is not None and begins is not None and before.declared:
+            gap_s = (begins - began).total_seconds() - before.length_s
+        gap_ns = round(gap_s * NS_PER_S) if gap_s > NAME_RESOLUTION_S else 0
+        out.append(_Film(film.path, film.rate_hz, film.declared, gap_ns))
+    return out
+
+
+def _name_time(path: Path) -> datetime | None:
+    found = _NAME_TIME.search(path.stem)
+    try:
+        return datetime(*map(int, found.groups())) if found else None  # type: ignore[arg-type]
+    except ValueError:  # digits that are none
+        return None
+
+
+def _capture(path: Path) -> cv2.VideoCapture:
+    """The film, opened. Raises DatasetError."""
+    if not path.is_file():
+        raise DatasetError(f"{path}: {'is no file' if path.exists() else 'no such file'}")
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise DatasetError(f"{path}: {why_unreadable(path)}")
+    return capture
+
+
+def _size(capture: cv2.VideoCapture) -> tuple[int, int]:
+    return round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))

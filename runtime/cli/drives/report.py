@@ -1,0 +1,24 @@
+"""`birdslam report`: a drive to look at, in any browser."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from birdslam.runtime.supervision.drive_report import REPORT, write_report
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The results, and where the report goes."""
+    parser.add_argument("source", type=Path, metavar="DIR|FILE.mcap", help="of `birdslam run --output` or `--record`")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE.html", help=f"default: {REPORT} beside the results")
+    parser.add_argument("--video", type=Path, metavar="FILE.mp4", help="of --video, where the results do not name it")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Writes it, says where."""
+    beside = options.source if options.source.is_dir() else options.source.parent
+    path = options.output or beside / REPORT
+    size = write_report(options.source, path, options.video)
+    print(f"{path}: {size / 1e6:.1f} MB, opens in any browser, offline")
+    return 0

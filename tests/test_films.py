@@ -1,0 +1,233 @@
+"""Films as cameras and phones write them: uneven times, turned pictures, several files, and what is no film.
+
+The films are written by PyAV, which is a dev dependency alone.
+"""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from birdslam.geometry.camera import Camera
+from birdslam.ros.bag import BagTopics
+from birdslam.runtime.calibration import METADATA_SIGMA_REL, Given, focal_length_of
+from birdslam.runtime.cli.main import main
+from birdslam.sources.films.video import VideoRecording
+from birdslam.sources.opening import open_recording
+from birdslam.sources.recording import DatasetError, RecordedFrame
+
+av = pytest.importorskip("av", reason="films are written by PyAV (pip install av)")
+
+WIDTH, HEIGHT = 96, 64
+CAMERA = Camera(WIDTH, HEIGHT, 80.0, 80.0, 48.0, 32.0, 1.4)
+UPRIGHT = Camera(HEIGHT, WIDTH, 80.0, 80.0, 32.0, 48.0, 1.4)
+# Of the display matrix in a track's header: a point of the file's picture to one of the screen
+TURNED = {90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}
+FOCAL_KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+
+
+def film(
+    path: Path,
+    times_ms: Sequence[int],
+    codec: str = "libx264",
+    audio: bool = False,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    metadata: dict[str, str] | None = None,
+) -> Path:
+    """One frame at each time; its upper left quarter is bright, the rest is darker from frame to frame."""
+    with av.open(str(path), "w", options={"movflags": "use_metadata_tags"} if metadata else {}) as container:
+        container.metadata.update(metadata or {})
+        options = {"x265-params": "log-level=none"} if codec == "libx265" else {}
+        stream = container.add_stream(codec, rate=30, options=options)
+        stream.width, stream.height = size
+        stream.pix_fmt = "yuv420p" if size[0] % 2 == 0 else "yuv444p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        sound = container.add_stream("aac", rate=44100) if audio else None
+        for number, t_ms in enumerate(times_ms):
+            picture = np.full((size[1], size[0], 3), 100 - number % 20, np.uint8)
+            picture[: size[1] // 2, : size[0] // 2] = 220
+            frame = av.VideoFrame.from_ndarray(picture, "bgr24")
+            frame.pts, frame.time_base = t_ms, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        if sound is not None:
+            silence = av.AudioFrame.from_ndarray(np.zeros((2, 1024), np.float32), "fltp", "stereo")
+            silence.rate, silence.pts = 44100, 0
+            container.mux([*sound.encode(silence), *sound.encode(None)])
+        container.mux(stream.encode(None))
+    return path
+
+
+def turned(path: Path, degrees: int) -> Path:
+    """The film with the flag of a phone that was held otherwise."""
+    data = path.read_bytes()
+    at = data.index(b"tkhd") + 4 + 40  # version 0: flags, times, number, length, layer, volume; then the matrix
+    a, b, c, d = (65536 * n for n in TURNED[degrees])
+    path.write_bytes(data[:at] + struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30) + data[at + 36 :])
+    return path
+
+
+def frames(path: Path, camera: Camera = CAMERA, stride: int = 1) -> list[RecordedFrame]:
+    return list(open_recording(f"video:{path}", camera, stride).frames())
+
+
+def times_ms(seen: Sequence[RecordedFrame]) -> list[int]:
+    return [round(frame.t_source_ns / 1e6) for frame in seen]
+
+
+STEPS = st.lists(st.integers(10, 400), min_size=1, max_size=12)
+
+
+@settings(max_examples=12)
+@given(STEPS, st.sampled_from([("mp4", "libx264"), ("mkv", "libx264"), ("ts", "libx264"), ("mov", "libx264")]))
+def test_the_times_are_the_containers_however_uneven(steps_ms: list[int], kind: tuple[str, str]) -> None:
+    suffix, codec = kind
+    stamps = [0, *np.cumsum(steps_ms).tolist()]
+    with tempfile.TemporaryDirectory() as folder:
+        seen = frames(film(Path(folder) / f"film.{suffix}", stamps, codec))
+    assert [frame.error for frame in seen] == [None] * len(stamps)  # none is taken for cut off
+    assert times_ms(seen) == pytest.approx(stamps, abs=1.0)
+
+
+@pytest.mark.parametrize(("name", "codec"), [("f.mov", "libx265"), ("f.webm", "libvpx-vp9"), ("f.mkv", "ffv1")])
+def test_other_codecs_are_read_too(name: str, codec: str, tmp_path: Path) -> None:
+    if codec not in av.codecs_available:
+        pytest.skip(f"this PyAV has no {codec}")
+    seen = frames(film(tmp_path / name, range(0, 400, 40), codec))
+    assert [frame.error for frame in seen] == [None] * 10
+    assert seen[4].image is not None
+    assert seen[4].image[:20, :30].mean() > seen[4].image[40:].mean() + 80.0
+
+
+def test_sound_and_odd_sizes_do_no_harm(tmp_path: Path) -> None:
+    assert len(frames(film(tmp_path / "a.mp4", range(0, 400, 40), audio=True))) == 10
+    odd = Camera(97, 65, 80.0, 80.0, 48.0, 32.0, 1.4)
+    (first, *_) = frames(film(tmp_path / "b.mp4", range(0, 400, 40), size=(97, 65)), odd)
+    assert first.image is not None
+    assert first.image.shape == (65, 97, 3)
+
+
+@pytest.mark.parametrize(("degrees", "bright"), [(90, (0, 1)), (180, (1, 1)), (270, (1, 0))])
+def test_a_phones_film_stands_upright(degrees: int, bright: tuple[int, int], tmp_path: Path) -> None:
+    path = turned(film(tmp_path / "phone.mp4", range(0, 200, 40)), degrees)
+    camera = CAMERA if degrees == 180 else UPRIGHT
+    assert VideoRecording.frame_size(path, BagTopics()) == (camera.width_px, camera.height_px)
+    image = frames(path, camera)[2].image
+    assert image is not None
+    halves = [np.array_split(rows, 2, axis=1) for rows in np.array_split(image, 2)]
+    means = np.array([[quarter.mean() for quarter in row] for row in halves])
+    assert np.unravel_index(means.argmax(), (2, 2)) == bright  # where the upper left quarter has come to
+    with pytest.raises(DatasetError, match="but the camera given is"):
+        frames(path, UPRIGHT if degrees == 180 else CAMERA)
+
+
+@settings(max_examples=15)
+@given(st.lists(st.integers(1, 6), min_size=1, max_size=4), st.integers(1, 3))
+def test_films_of_a_directory_are_one_drive_in_natural_order(counts: list[int], stride: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for number, count in enumerate(counts):
+            film(Path(folder) / f"clip{8 + number}.mp4", range(0, 40 * count, 40))  # clip9 before clip10
+        (Path(folder) / "notes.txt").write_text("no film")
+        (Path(folder) / "._clip8.mp4").write_text("of macOS")
+        recording = open_recording(f"video:{folder}", CAMERA)
+        seen = list(recording.frames())
+        assert len(recording) == len(seen) == sum(counts)
+        assert [frame.index for frame in seen] == list(range(sum(counts)))
+        steps = np.diff(times_ms(seen))
+        assert (steps > 0).all()
+        assert (steps < 100).all()  # one follows the other without a gap
+        assert times_ms(seen)[0] == 0
+        later = list(recording.frames(start=min(3, len(seen))))
+        assert times_ms(later) == times_ms(seen)[3:]
+
+
+def test_a_gap_between_films_is_a_frame_that_says_so(tmp_path: Path) -> None:
+    film(tmp_path / "20240131_120000.mp4", range(0, 2000, 40))
+    film(tmp_path / "20240131_120002.mp4", range(0, 2000, 40))  # begins where the first ends
+    film(tmp_path / "20240131_120134.mp4", range(0, 400, 40))  # half a minute after the second has ended: 90 s
+    seen = frames(tmp_path)
+    gaps = [frame for frame in seen if frame.image is None]
+    assert len(gaps) == 1
+    assert "90.0 s are missing" in str(gaps[0].error)
+    at = seen.index(gaps[0])
+    assert at == 100
+    assert seen[at + 1].t_source_ns - seen[at - 1].t_source_ns == pytest.approx(90.04e9, abs=0.1e9)
+    assert seen[at - 1].t_source_ns < gaps[0].t_source_ns < seen[at + 1].t_source_ns
+
+
+def test_a_gap_within_a_film_is_told_too(tmp_path: Path) -> None:
+    seen = frames(film(tmp_path / "f.mkv", [0, 40, 80, 5080, 5120, 5160]))
+    assert [frame.image is None for frame in seen] == [False, False, False, True, False, False, False]
+    assert times_ms(seen)[4:] == pytest.approx([5080, 5120, 5160], abs=1)
+
+
+def test_what_is_no_film_is_one_clear_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    whole = film(tmp_path / "whole.mp4", range(0, 2000, 40)).read_bytes()
+    (tmp_path / "empty.mp4").write_bytes(b"")
+    (tmp_path / "cut.mp4").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.mp4").write_text("no film\n" * 50)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("")
+    (tmp_path / "two").mkdir()
+    film(tmp_path / "two" / "1.mp4", range(0, 400, 40))
+    film(tmp_path / "two" / "2.mp4", range(0, 400, 40), size=(64, 64))
+    with av.open(str(tmp_path / "sound.mp4"), "w") as container:
+        sound = container.add_stream("aac", rate=44100)
+        silence = av.AudioFrame.from_ndarray(np.zeros((2, 1024), np.float32), "fltp", "stereo")
+        silence.rate, silence.pts = 44100, 0
+        container.mux([*sound.encode(silence), *sound.encode(None)])
+    one = film(tmp_path / "one.mp4", [0])
+    for name, said in (
+        ("none.mp4", "no such file"),
+        ("empty.mp4", "empty.mp4: is empty"),
+        ("cut.mp4", "cut.mp4: is cut off: its index"),
+        ("text.mp4", "text.mp4: is no video that OpenCV can open"),
+        ("sound.mp4", "sound.mp4: is no video that OpenCV can open: no pictures in it"),
+        ("other", "has no films (.mp4,"),
+        ("two", "2.mp4: is 64x64, but the camera given is 96x64"),
+        (one.name, "its images do not show its lens"),
+    ):
+        arguments = ["run", "--source", f"video:{tmp_path / name}", "--model", "none", "--fov", "60"]
+        assert main([*arguments, "--height", "1.4", "--output", str(tmp_path / "out")]) == 2, name
+        told = capfd.readouterr()
+        assert told.out == ""
+        assert said in told.err
+        assert told.err.startswith("birdslam: ")
+        assert told.err.count("\n") == 1, told.err  # neither FFmpeg's words nor OpenCV's
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mov"])
+def test_a_phones_metadata_state_thefocal_length_of(suffix: str, tmp_path: Path) -> None:
+    path = film(tmp_path / f"phone.{suffix}", range(0, 200, 40), metadata={FOCAL_KEY: "26", "title": "a drive"})
+    assert VideoRecording.stated_focal_px(path) == pytest.approx(WIDTH * 26 / 36)
+    focal_px, sigma_rel, by = focal_length_of(Given(), f"video:{path}", WIDTH)
+    assert (focal_px, sigma_rel) == (pytest.approx(WIDTH * 26 / 36), METADATA_SIGMA_REL)
+    assert "metadata" in by
+    assert "as stated, 60 deg" in focal_length_of(Given(fov_deg=60.0), f"video:{path}", WIDTH)[2]  # goes before it
+    without = film(tmp_path / f"other.{suffix}", range(0, 200, 40))
+    assert VideoRecording.stated_focal_px(without) is None
+    assert "that of a phone" in focal_length_of(Given(kind="phone"), f"video:{without}", WIDTH)[2]
+
+
+@settings(max_examples=60)
+@given(st.data())
+def test_damaged_metadata_say_nothing_or_afocal_length_of(data: st.DataObject) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = film(Path(folder) / "f.mp4", [0, 40], metadata={FOCAL_KEY: "26"})
+        whole = bytearray(path.read_bytes())
+        begin = whole.index(b"moov")
+        for _ in range(data.draw(st.integers(1, 8))):
+            whole[data.draw(st.integers(begin, len(whole) - 1))] = data.draw(st.integers(0, 255))
+        from birdslam.sources.films.container import stated_focal_rel, why_unreadable
+
+        path.write_bytes(whole[: data.draw(st.integers(0, len(whole)))])
+        found = stated_focal_rel(path)
+        assert found is None or 5.0 / 36.0 <= found <= 300.0 / 36.0
+        assert why_unreadable(path)

@@ -1,0 +1,120 @@
+"""How far a drive is to be believed: every status has its words, and the sentences never say more than is true."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.camera_scale import with_camera_scale
+from birdslam.outputs.plain_words import MEANINGS, REMEDIES, DriveCounts, LengthsBy, readme, verdict
+from birdslam.types import INVALIDATING, Estimate, Status, VehicleEstimate
+
+
+def drive(frames: int = 100, invalid: int = 0, **more: object) -> DriveCounts:
+    plain = {
+        "invalid_by": {},
+        "statuses": {},
+        "speed_sources": {"road": frames},
+        "path_m": 200.0,
+        "valid_path_m": 180.0,
+        "scale_sigma_rel": 0.03 if frames > invalid else None,
+        "camera_sigma_rel": 0.0,
+    }
+    return DriveCounts(frames=frames, invalid_frames=invalid, **{**plain, **more})  # type: ignore[arg-type]
+
+
+def test_every_status_has_plain_words() -> None:
+    assert set(MEANINGS) == set(Status)
+    for words in (*MEANINGS.values(), *REMEDIES.values()):
+        assert 5 < len(words) < 110
+        assert "_" not in words
+    assert len(set(MEANINGS.values())) == len(Status)
+
+
+@given(st.integers(0, 10_000), st.data())
+def test_the_share_is_100_percent_only_where_all_is_valid_and_0_only_where_nothing_is(
+    frames: int, data: st.DataObject
+) -> None:
+    invalid = data.draw(st.integers(0, frames))
+    first, *_ = verdict(drive(frames, invalid))
+    if not frames:
+        assert first.startswith("There is nothing")
+    elif not invalid:
+        assert first.startswith(f"All {frames} frames")
+    elif invalid == frames:
+        assert first.startswith("None of it")
+    else:
+        share = int(first.split()[0])
+        assert 1 <= share <= 99
+        assert share == pytest.approx(100.0 * (frames - invalid) / frames, abs=1.0)
+
+
+def test_what_is_not_valid_is_told_with_its_reason_the_most_frequent_first() -> None:
+    said = verdict(drive(100, 30, invalid_by={"camera_dark": 5, "scale_invalid": 30}, statuses={"scale_invalid": 30}))
+    reasons = [line for line in said if line.startswith("Not valid")]
+    assert [line.split()[2] for line in reasons] == ["30", "5"]
+    assert "how long a metre is" in reasons[0]
+    assert any("--speed FILE" in line for line in said)  # a remedy, since it was often so
+
+
+def test_an_unmeasured_height_is_the_next_thing_to_measure() -> None:
+    by_cars = LengthsBy("the camera's height of 1.40 m (by the size of 12 cars, +- 11%)", 0.11)
+    said = verdict(drive(scale_sigma_rel=0.12, camera_sigma_rel=0.11, lengths_by=by_cars))
+    assert any("Lengths are known to 12%" in line and by_cars.words in line for line in said)
+    (step,) = [line for line in said if line.startswith("Next")]
+    assert "--height M" in step
+    assert "5 % of height is 5 % of all lengths" in step
+    stated = LengthsBy("the camera's height of 1.35 m (as stated) and its focal length, +- 25%", 0.0, 0.25)
+    (step,) = [line for line in verdict(drive(camera_sigma_rel=0.25, lengths_by=stated)) if line.startswith("Next")]
+    assert "--fov DEG" in step
+    both = LengthsBy("both", 0.1, 0.25)
+    first, second = [line for line in verdict(drive(camera_sigma_rel=0.27, lengths_by=both)) if line.startswith("Next")]
+    assert "--fov" in first  # what is least known
+    assert "--height" in second
+
+
+def test_the_readme_names_each_file() -> None:
+    text = readme("drive", ["All 3 frames are valid."], {"bev.png": "from above", "tracks": "the vehicles"})
+    assert "All 3 frames are valid." in text
+    assert text.index("bev.png") < text.index("tracks")
+    assert text.endswith("\n")
+
+
+# --- one factor on all lengths ---
+
+PLACES = st.builds(SE2, st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.floats(-3.0, 3.0))
+
+
+@given(PLACES, PLACES, st.floats(-30.0, 30.0), st.floats(-30.0, 30.0), st.floats(0.001, 0.3))
+def test_an_unsure_scale_moves_everything_along_its_own_place(
+    ego: SE2, car: SE2, u_mps: float, v_mps: float, sigma_rel: float
+) -> None:
+    vehicle = VehicleEstimate(
+        vehicle=1, T_world_vehicle=car, cov=(0.0,) * 9, velocity_mps=(u_mps, v_mps), velocity_cov=(0.0,) * 4, age_ns=0,
+        frames=3,
+    )  # fmt: skip
+    sure = Estimate(
+        epoch=0, frame_id=1, t_source_ns=1, t_capture_ns=1, t_utc_ns=0, T_world_ego=ego, cov=(0.0,) * 9, valid=True,
+        vehicles=(vehicle,), scale_sigma_rel=0.04,
+    )  # fmt: skip
+    assert with_camera_scale(sure, 0.0) is sure
+    found = with_camera_scale(sure, sigma_rel)
+    assert found.scale_sigma_rel == pytest.approx(math.hypot(0.04, sigma_rel))
+    (seen,) = found.vehicles
+    for pose, cov in ((ego, found.cov), (car, seen.cov)):
+        # A world that is 1 sigma larger, in the tangent at the pose: that far it is, and there alone
+        larger = SE2(pose.x_m * (1.0 + sigma_rel), pose.y_m * (1.0 + sigma_rel), pose.yaw_rad)
+        step = pose.between(larger)
+        along = np.array([step.x_m, step.y_m, 0.0])
+        assert np.reshape(cov, (3, 3)) == pytest.approx(np.outer(along, along), rel=1e-6, abs=1e-6)
+    u = sigma_rel * np.array([u_mps, v_mps])
+    assert np.reshape(seen.velocity_cov, (2, 2)) == pytest.approx(np.outer(u, u), rel=1e-9, abs=1e-12)
+
+
+def test_no_status_that_is_only_told_makes_a_frame_invalid() -> None:
+    assert Status.SCALE_ESTIMATED not in INVALIDATING
