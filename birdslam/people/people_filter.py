@@ -1,0 +1,360 @@
+"""Where people are and how they move: Kalman filters, one for each mode of motion and height, mixed by likelihood.
+
+    x = [x, y, vx, vy, log h, tilt, kerb]
+
+With H the camera's height, b the kerb (the road under the feet lies b lower than the ego's plane), and slopes that count
+downwards from the plane of the road, the box of somebody at depth X, whose nearest foot is at X - reach, measures
+
+    bearing = Y / X,   bottom = (H + b) / (X - reach) - tilt (Eq. 1),   top = (H + b - h) / X - tilt,
+    log width = log w - log X.
+
+Feet that something hides are a second hypothesis of each box: then the bottom lies higher by a share of h / X. Modes are
+standing and walking, which people change (interacting multiple model, Blom and Bar-Shalom 1988), for a grown-up's height
+and for a child's, which they don't. So the road places first and the size second: a small box whose foot is near is a
+child's, and no distant adult's. Tilt, kerb and height are states, so that what lasts for a track is not averaged away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry import bev
+from birdslam.geometry.se2 import SE2
+from birdslam.people.people_boxes import PEDESTRIAN, PersonBox
+
+Floats = NDArray[np.float64]
+
+STATES = X, Y, VX, VY, HEIGHT, TILT, KERB = range(7)
+STANDING, MOVING = 0, 1
+FILTERS = 4  # (adult, child) times (standing, moving)
+STANDING_FILTERS, MOVING_FILTERS, CHILD_FILTERS = [0, 2], [1, 3], [2, 3]
+BEARING, BOTTOM, TOP, WIDTH = range(4)
+UNUSED = 1e3  # 1-sigma of what is not measured
+DEPTH_UNKNOWN = 0.6  # 1-sigma at birth, as a fraction
+NEAREST_M = 0.7
+BIRTH_ITERATIONS, ITERATIONS = 4, 2
+MIN_WEIGHT = 1e-6  # of a filter: one that was ruled out may come back
+MIN_SLOPE = 1e-3
+
+
+class Sizes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a kind of road user measures, and how it moves."""
+
+    height_m: float  # of a grown-up
+    sigma_height_rel: float
+    child_m: float  # of a child
+    sigma_child_rel: float
+    child: float  # of them, are children
+    width_m: float  # of the box
+    sigma_width_rel: float
+    length_m: float  # of the footprint
+    footprint_m: float  # its width
+    reach_m: float  # from the centre to the nearest foot or wheel, along the line of sight
+    moves_mps: float  # 1-sigma of the velocity of who moves
+    change_mps: float  # 1-sigma by which that changes within a second
+
+
+class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Priors of people and of the road under them, and how long the errors of a box last."""
+
+    pedestrian: Sizes = Sizes(1.72, 0.065, 1.2, 0.15, 0.06, 0.68, 0.3, 0.7, 0.6, 0.25, 1.2, 0.8)
+    cyclist: Sizes = Sizes(1.74, 0.07, 1.45, 0.12, 0.06, 0.9, 0.5, 1.75, 0.6, 0.35, 4.0, 1.5)
+    standing: float = 0.35  # of them stand when first seen
+    stands_for_s: float = 10.0  # on average
+    moves_for_s: float = 10.0  # until a stop
+    stop_mps: float = 0.08  # 1-sigma of the velocity of who stands: they sway
+    sigma_tilt_rad: float = 0.004  # of the road at somebody against the ego's, beside the front end's own sigma
+    tilt_memory_s: float = 5.0  # how long that lasts
+    sigma_roll_rad: float = 0.01  # of the front end's roll, which tilts what is aside
+    kerb_m: float = -0.03  # people are on pavements too
+    sigma_kerb_m: float = 0.08
+    hidden_share: float = 0.3  # of a person's height, that is hidden where the feet are
+    sigma_hidden_share: float = 0.18
+    box_memory_s: float = 0.4  # for so long a box has the same error: this time counts as one box
+    width_memory_s: float = 2.0  # and its width, by clothes and by what is carried
+    sways: float = 0.2  # of a second, that changes the box of who stands before an ego that stands
+    driving_mps: float = 1.0  # as `GroundSizeConfig.driving_mps`
+
+    def sizes(self, label: str) -> Sizes:
+        """Of a kind."""
+        return self.pedestrian if label == PEDESTRIAN else self.cyclist
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Means (N, 7) and covariances (N, 7, 7) of the mixtures, and the probabilities (N,) of standing and a child."""
+
+    mean: Floats
+    cov: Floats
+    standing: Floats
+    child: Floats
+
+
+class PeopleFilter:
+    """predict() once a frame, then correct() the rows that boxes are of, and begin() new ones.
+
+    State, of each person and each filter: x, y (m), vx, vy (m/s) in the odometry's world, log of the height in metres,
+    tilt (rad) and kerb (m) of the road there against the front end's ground. Measurements: of each box the bearing, the
+    slopes of its bottom and top, the log of its width (see the module). Read by `people_tracker` for association, and
+    by `people_edges`.
+    """
+
+    def __init__(self, config: PeopleConfig) -> None:
+        self.config = config
+        self._x = np.zeros((0, FILTERS, len(STATES)))
+        self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
+        self._weight = np.zeros((0, FILTERS))
+        self._unseen_s = np.zeros(0)
+        self._stood_s = np.zeros(0)  # of that, in which neither the ego drove
+        self._sizes = np.zeros((0, 6))  # reach, moves, change, log width, sigma width, sway
+
+    def __len__(self) -> int:
+        return len(self._x)
+
+    def keep_rows(self, rows: Sequence[int]) -> None:
+        """Forgets all others."""
+        self._x, self._P, self._weight = self._x[rows], self._P[rows], self._weight[rows]
+        self._unseen_s, self._stood_s, self._sizes = self._unseen_s[rows], self._stood_s[rows], self._sizes[rows]
+
+    def predict(
+        self,
+        dt_s: float,
+        T_world_ego: SE2,
+        ego_cov: Floats | None,
+        ground_shift_rad: float,
+        sigma_pitch_rad: float,
+        ego_mps: float,
+    ) -> None:
+        """To the next frame: people move, and the ground's estimate moved by `ground_shift_rad` beside its own motion.
+
+        `ego_cov` (3, 3) is of the ego's step, in its tangent. `sigma_pitch_rad` is of the front end's ground.
+        """
+        config, n = self.config, len(self._x)
+        if not n or dt_s <= 0.0:
+            return
+        self._unseen_s += dt_s
+        self._stood_s += dt_s * math.exp(-ego_mps / config.driving_mps)
+        self._mix(dt_s)
+        F = np.eye(len(STATES))
+        F[X, VX] = F[Y, VY] = dt_s
+        self._x = self._x @ F.T
+        self._P = F @ self._P @ F.T
+        q = np.square(self._sizes[:, 2])
+        for moving in MOVING_FILTERS:
+            for at, by in ((X, VX), (Y, VY)):
+                self._P[:, moving, at, at] += q * dt_s**3 / 3.0
+                self._P[:, moving, at, by] += q * dt_s**2 / 2.0
+                self._P[:, moving, by, at] += q * dt_s**2 / 2.0
+                self._P[:, moving, by, by] += q * dt_s
+        driving = -math.expm1(-ego_mps / config.driving_mps)
+        keep = math.exp(-driving * dt_s / config.tilt_memory_s)
+        self._x[..., TILT] = keep * (self._x[..., TILT] - ground_shift_rad)
+        self._P[..., TILT, :] *= keep
+        self._P[..., TILT] *= keep
+        self._P[..., TILT, TILT] += (1.0 - keep**2) * (sigma_pitch_rad**2 + config.sigma_tilt_rad**2)
+        if ego_cov is not None:  # an error of the ego's step moves everybody against it
+            at = self._x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]
+            J = np.zeros((n, FILTERS, 2, 3))
+            J[..., :2, :2] = T_world_ego.rotation()
+            J[..., 0, 2], J[..., 1, 2] = -at[..., 1], at[..., 0]
+            self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
+
+    def _mix(self, dt_s: float) -> None:
+        """People start and stop: who starts has any velocity of its kind, who stops has none."""
+        config = self.config
+        start, stop = -math.expm1(-dt_s / config.stands_for_s), -math.expm1(-dt_s / config.moves_for_s)
+        x, P, weight = self._x.copy(), self._P.copy(), self._weight.copy()
+        velocity = slice(VX, HEIGHT)
+        for standing, moving in zip(STANDING_FILTERS, MOVING_FILTERS, strict=True):
+            w_s, w_m = self._weight[:, standing], self._weight[:, moving]
+            started, started_P = self._x[:, standing].copy(), self._P[:, standing].copy()
+            started_P[:, velocity, :] = 0.0
+            started_P[:, :, velocity] = 0.0
+            started_P[:, VX, VX] = started_P[:, VY, VY] = self._sizes[:, 1] ** 2
+            stopped, stopped_P = self._x[:, moving].copy(), self._P[:, moving].copy()
+            stopped[:, velocity] = 0.0
+            stopped_P[:, velocity, :] = 0.0
+            stopped_P[:, :, velocity] = 0.0
+            stopped_P[:, VX, VX] = stopped_P[:, VY, VY] = config.stop_mps**2
+            for into, (a, (xa, Pa)), (b, (xb, Pb)) in (
+                (standing, (w_s * (1 - start), (self._x[:, standing], self._P[:, standing])), (w_m * stop, (stopped, stopped_P))),
+                (moving, (w_m * (1 - stop), (self._x[:, moving], self._P[:, moving])), (w_s * start, (started, started_P))),
+            ):  # fmt: skip
+                total = np.maximum(a + b, 1e-300)
+                share = (b / total)[:, None]
+                gap = xb - xa
+                x[:, into] = xa + share * gap
+                P[:, into] = (
+                    (1.0 - share)[..., None] * Pa
+                    + share[..., None] * Pb
+                    + (share * (1.0 - share))[..., None] * gap[:, :, None] * gap[:, None, :]
+                )
+                weight[:, into] = total
+        self._x, self._P = x, P
+        self._weight = weight / weight.sum(axis=1, keepdims=True)
+
+    def begin(
+        self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float, sigma_pitch_rad: float
+    ) -> None:
+        """People seen for the first time, each in a row after the others, already corrected by their boxes."""
+        if not boxes:
+            return
+        config, n, before = self.config, len(boxes), len(self._x)
+        x, P = np.zeros((n, FILTERS, len(STATES))), np.zeros((n, FILTERS, len(STATES), len(STATES)))
+        weight, rows = np.zeros((n, FILTERS)), np.zeros((n, 6))
+        for k, box in enumerate(boxes):
+            sizes = config.sizes(box.label)
+            rows[k] = [
+                sizes.reach_m, sizes.moves_mps, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel, 0.0
+            ]  # fmt: skip
+            for child, (h_m, sigma) in enumerate(
+                ((sizes.height_m, sizes.sigma_height_rel), (sizes.child_m, sizes.sigma_child_rel))
+            ):
+                x_m = min(h_m / max(box.tan_height, MIN_SLOPE), bev.MAX_RANGE_M)
+                both = slice(2 * child, 2 * child + 2)
+                x[k, both, :2] = T_world_ego @ np.array([x_m, box.bearing * x_m])
+                x[k, both, HEIGHT], x[k, both, KERB] = math.log(h_m), config.kerb_m
+                P[k, both, :2, :2] = np.eye(2) * (DEPTH_UNKNOWN * x_m) ** 2
+                P[k, both, HEIGHT, HEIGHT] = sigma**2
+                P[k, 2 * child + STANDING, [VX, VY], [VX, VY]] = config.stop_mps**2
+                P[k, 2 * child + MOVING, [VX, VY], [VX, VY]] = sizes.moves_mps**2
+                share = sizes.child if child else 1.0 - sizes.child
+                weight[k, both] = share * np.array([config.standing, 1.0 - config.standing])
+            P[k, :, TILT, TILT] = (
+                sigma_pitch_rad**2 + config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
+            )
+            P[k, :, KERB, KERB] = config.sigma_kerb_m**2
+        self._x, self._P = np.concatenate([self._x, x]), np.concatenate([self._P, P])
+        self._weight = np.concatenate([self._weight, weight])
+        self._sizes = np.concatenate([self._sizes, rows])
+        self._unseen_s = np.concatenate([self._unseen_s, np.full(n, max(config.box_memory_s, config.width_memory_s))])
+        self._stood_s = np.concatenate([self._stood_s, np.zeros(n)])
+        self.correct(range(before, before + n), boxes, T_world_ego, height_m, BIRTH_ITERATIONS)
+
+    def correct(
+        self,
+        rows: Sequence[int],
+        boxes: Sequence[PersonBox],
+        T_world_ego: SE2,
+        height_m: float,
+        iterations: int = ITERATIONS,
+    ) -> None:
+        """The people in `rows` by their boxes, one each; `height_m` is the camera's over the road."""
+        if not boxes:
+            return
+        at = np.asarray(rows)
+        z, R = self._measured(at, boxes)  # (M, 4), (M, 2, 4): feet visible, feet hidden
+        hidden = np.array([box.hidden for box in boxes])
+        x0, P0 = self._x[at][:, :, None], self._P[at][:, :, None]  # (M, K, 1, 7)
+        x = np.repeat(x0, 2, axis=2)
+        for _ in range(iterations):
+            expected, J = self._expected(x, at, T_world_ego, height_m)
+            noise = np.zeros((*x.shape[:3], 4, 4))
+            noise[..., range(4), range(4)] = R[:, None]
+            noise[:, :, 1, BOTTOM, BOTTOM] += (
+                self.config.sigma_hidden_share * (expected[:, :, 0, BOTTOM] - expected[:, :, 0, TOP])
+            ) ** 2
+            PJt = P0 @ J.swapaxes(-1, -2)
+            S = J @ PJt + noise
+            innovation = z[:, None, None] - expected - ((x0 - x)[..., None, :] @ J.swapaxes(-1, -2))[..., 0, :]
+            information = np.linalg.inv(S)
+            gain = PJt @ information
+            x = x0 + (gain @ innovation[..., None])[..., 0]
+        P = P0 - gain @ PJt.swapaxes(-1, -2)
+        P = (P + P.swapaxes(-1, -2)) / 2.0
+        squared = (innovation[..., None, :] @ information @ innovation[..., None])[..., 0, 0]
+        log_likelihood = -0.5 * (squared + np.linalg.slogdet(S)[1])
+        log_weight = log_likelihood + np.log(np.stack([1.0 - hidden, hidden], axis=1))[:, None]
+        log_weight += np.log(np.maximum(self._weight[at], 1e-300))[:, :, None]
+        log_weight -= log_weight.max(axis=(1, 2), keepdims=True)
+        weight = np.exp(log_weight)
+        weight /= weight.sum(axis=(1, 2), keepdims=True)
+        share = weight / np.maximum(weight.sum(axis=2, keepdims=True), 1e-300)
+        self._x[at], self._P[at] = _merged(x, P, share)
+        of_filters = np.maximum(weight.sum(axis=2), MIN_WEIGHT)
+        self._weight[at] = of_filters / of_filters.sum(axis=1, keepdims=True)
+        self._unseen_s[at] = self._stood_s[at] = 0.0
+
+    def _measured(self, at: NDArray[np.intp], boxes: Sequence[PersonBox]) -> tuple[Floats, Floats]:
+        """(M, 4) of the boxes, and their variances (M, 2, 4), more where an error is the one of the frames before."""
+        config = self.config
+        z = np.array([[b.bearing, b.slope_bottom, b.slope_top, b.log_width] for b in boxes])
+        sigma = np.array([[b.sigma_bearing, b.sigma_bottom, b.sigma_top, 1.0] for b in boxes])
+        sigma[:, WIDTH] = np.where([b.whole for b in boxes], self._sizes[at, 4], UNUSED)
+        R = np.square(sigma)
+        speed_mps = np.sqrt((np.square(self._x[at][..., VX:HEIGHT]).sum(axis=-1) * self._weight[at]).sum(axis=1))
+        unseen_s = self._unseen_s[at]
+        stood_s = self._stood_s[at] * np.exp(-speed_mps / config.driving_mps)
+        changed_s = np.maximum(unseen_s - stood_s, config.sways * unseen_s)
+        R[:, BEARING] *= np.maximum(1.0, config.box_memory_s / unseen_s)
+        R[:, [BOTTOM, TOP]] *= np.maximum(1.0, config.box_memory_s / changed_s)[:, None]
+        R[:, WIDTH] *= np.maximum(1.0, config.width_memory_s / changed_s)
+        return z, np.stack([R, R], axis=1)
+
+    def _expected(
+        self, x: Floats, at: NDArray[np.intp], T_world_ego: SE2, height_m: float
+    ) -> tuple[Floats, Floats]:
+        """Measurements (M, K, 2, 4) expected of states (M, K, 2, 7), feet visible and hidden, and their Jacobians."""
+        R = T_world_ego.rotation()
+        in_ego = (x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]) @ R
+        depth, y = np.maximum(in_ego[..., 0], NEAREST_M), in_ego[..., 1]
+        foot = np.maximum(depth - self._sizes[at, 0][:, None, None], 0.5 * NEAREST_M)
+        height, below = np.exp(x[..., HEIGHT]), height_m + x[..., KERB]
+        expected, J = np.empty((*x.shape[:3], 4)), np.zeros((*x.shape[:3], 4, len(STATES)))
+        expected[..., BEARING] = y / depth
+        expected[..., BOTTOM] = bev.road_slope(foot, below) - x[..., TILT]  # Eq. 1
+        expected[..., TOP] = (below - height) / depth - x[..., TILT]
+        expected[..., WIDTH] = self._sizes[at, 3][:, None, None] - np.log(depth)
+        by_depth = np.stack(
+            [-y / depth**2, -below / foot**2, -(below - height) / depth**2, -1.0 / depth], axis=-1
+        )
+        J[..., :2] = by_depth[..., None] * R[:, 0]
+        J[..., BEARING, :2] += R[:, 1] / depth[..., None]
+        J[..., BOTTOM, TILT] = J[..., TOP, TILT] = -1.0
+        J[..., BOTTOM, KERB], J[..., TOP, KERB] = 1.0 / foot, 1.0 / depth
+        J[..., TOP, HEIGHT] = -height / depth
+        hidden = self.config.hidden_share * (height / depth)[:, :, 1]
+        expected[:, :, 1, BOTTOM] -= hidden
+        J[:, :, 1, BOTTOM, HEIGHT] -= hidden
+        J[:, :, 1, BOTTOM, :2] += (hidden / depth[:, :, 1])[..., None] * R[:, 0]
+        return expected, J
+
+    def moments(self, after_s: float = 0.0) -> Moments:
+        """Of everybody, `after_s` later, as they move."""
+        mean, cov = _merged(self._x, self._P, self._weight)
+        if after_s > 0.0 and len(mean):
+            F = np.eye(len(STATES))
+            F[X, VX] = F[Y, VY] = after_s
+            mean, cov = mean @ F.T, F @ cov @ F.T
+            moving = self._weight[:, MOVING_FILTERS].sum(axis=1)
+            q = moving * np.square(self._sizes[:, 2])
+            cov[:, [X, Y], [X, Y]] += (q * after_s**3 / 3.0)[:, None]
+            cov[:, [VX, VY], [VX, VY]] += (q * after_s)[:, None]
+        return Moments(
+            mean, cov, self._weight[:, STANDING_FILTERS].sum(axis=1), self._weight[:, CHILD_FILTERS].sum(axis=1)
+        )
+
+    def expected_boxes(self, T_world_ego: SE2, height_m: float) -> tuple[Floats, Floats, Floats]:
+        """Bearing, bottom and top (N, 3) expected of everybody, their covariance (N, 3, 3), heights at a depth of 1."""
+        n = len(self._x)
+        x = np.repeat(self._x[:, :, None], 2, axis=2)
+        expected, J = self._expected(x, np.arange(n), T_world_ego, height_m)
+        expected, J = expected[:, :, 0, :WIDTH], J[:, :, 0, :WIDTH]
+        S = J @ self._P @ J.swapaxes(-1, -2)
+        mean, S = _merged(expected, S, self._weight)
+        return mean, S, mean[:, BOTTOM] - mean[:, TOP]
+
+
+def _merged(x: Floats, P: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Mean (..., S) and covariance (..., S, S) of Gaussian mixtures (..., C, S), (..., C, S, S) by weights (..., C)."""
+    mean = (weight[..., None] * x).sum(axis=-2)
+    gap = x - mean[..., None, :]
+    spread = P + gap[..., :, None] * gap[..., None, :]
+    return mean, (weight[..., None, None] * spread).sum(axis=-3)
+
