@@ -35,14 +35,14 @@ COVER_WIDTH = 0.3  # of a box's width: a nearer box that covers less of its lowe
 class PeopleBoxesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How sure boxes of people are; fractions are of the box's height."""
 
-    sigma_edge_rel: float = 0.03  # 1-sigma of lower and upper edge: RRC's boxes of people on KITTI tracking
+    sigma_edge_rel: float = 0.02  # 1-sigma of lower and upper edge: RRC's boxes of people on KITTI tracking
     sigma_edge_px: float = 0.5  # and beside it
     sigma_side_rel: float = 0.035  # of the middle column: arms and legs swing
     sigma_growth: float = 2.0  # as `LocalisationConfig.sigma_growth`
     sure_score: float = 0.85
     cut_margin_px: float = 4.0  # an edge so near to the image's border counts as cut
-    hidden: float = 0.04  # prior probability that feet are hidden though no box covers them: behind what has no box
-    hidden_covered: float = 0.6  # and where a nearer box covers them
+    hidden: float = 0.003  # prior probability that feet are hidden though no box covers them: behind what has no box
+    hidden_covered: float = 0.03  # and where a nearer box covers them
     hidden_cut: float = 0.98  # and where the image's border cuts the box
 
 

@@ -1,12 +1,14 @@
 """Where people are and how they move: Kalman filters, one for each mode of motion and height, mixed by likelihood.
 
-    x = [x, y, vx, vy, log h, tilt, kerb]
+    x = [x, y, vx, vy, log h, tilt, kerb, foot, head]
 
 With H the camera's height, b the kerb (the road under the feet lies b lower than the ego's plane), and slopes that count
 downwards from the plane of the road, the box of somebody at depth X, whose nearest foot is at X - reach, measures
 
-    bearing = Y / X,   bottom = (H + b) / (X - reach) - tilt (Eq. 1),   top = (H + b - h) / X - tilt,
-    log width = log w - log X.
+    bearing = Y / X,   bottom = (H + b) / (X - reach) - tilt + foot h / X (Eq. 1),
+    log of the height = log(h) - log(X) + reach (H + b) / (h X) + foot - head,   log width = log w - log X,
+
+where foot and head are errors of the box that last for a while: somebody's pose, what a detector makes of clothes.
 
 Feet that something hides are a second hypothesis of each box: then the bottom lies higher by a share of h / X. Modes are
 standing and walking, which people change (interacting multiple model, Blom and Bar-Shalom 1988), for a grown-up's height
@@ -30,15 +32,15 @@ from birdslam.people.people_boxes import PEDESTRIAN, PersonBox
 
 Floats = NDArray[np.float64]
 
-STATES = X, Y, VX, VY, HEIGHT, TILT, KERB = range(7)
+STATES = X, Y, VX, VY, HEIGHT, TILT, KERB, FOOT, HEAD = range(9)
 STANDING, MOVING = 0, 1
 FILTERS = 4  # (adult, child) times (standing, moving)
 STANDING_FILTERS, MOVING_FILTERS, CHILD_FILTERS = [0, 2], [1, 3], [2, 3]
-BEARING, BOTTOM, TOP, WIDTH = range(4)
+BEARING, BOTTOM, TALL, WIDTH = range(4)
 UNUSED = 1e3  # 1-sigma of what is not measured
 DEPTH_UNKNOWN = 0.6  # 1-sigma at birth, as a fraction
 NEAREST_M = 0.7
-BIRTH_ITERATIONS, ITERATIONS = 4, 2
+BIRTH_ITERATIONS, ITERATIONS = 4, 1
 MIN_WEIGHT = 1e-6  # of a filter: one that was ruled out may come back
 MIN_SLOPE = 1e-3
 
@@ -63,9 +65,9 @@ class Sizes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Priors of people and of the road under them, and how long the errors of a box last."""
 
-    pedestrian: Sizes = Sizes(1.72, 0.065, 1.2, 0.15, 0.06, 0.68, 0.3, 0.7, 0.6, 0.25, 1.2, 0.8)
+    pedestrian: Sizes = Sizes(1.72, 0.075, 1.2, 0.15, 0.06, 0.68, 0.3, 0.7, 0.6, 0.25, 1.2, 0.8)
     cyclist: Sizes = Sizes(1.74, 0.07, 1.45, 0.12, 0.06, 0.9, 0.5, 1.75, 0.6, 0.35, 4.0, 1.5)
-    standing: float = 0.35  # of them stand when first seen
+    standing: float = 0.25  # of them stand when first seen
     stands_for_s: float = 10.0  # on average
     moves_for_s: float = 10.0  # until a stop
     stop_mps: float = 0.08  # 1-sigma of the velocity of who stands: they sway
@@ -75,11 +77,13 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     kerb_m: float = -0.03  # people are on pavements too
     sigma_kerb_m: float = 0.08
     hidden_share: float = 0.3  # of a person's height, that is hidden where the feet are
-    sigma_hidden_share: float = 0.18
-    box_memory_s: float = 0.4  # for so long a box has the same error: this time counts as one box
-    width_memory_s: float = 2.0  # and its width, by clothes and by what is carried
-    sways: float = 0.2  # of a second, that changes the box of who stands before an ego that stands
-    driving_mps: float = 1.0  # as `GroundSizeConfig.driving_mps`
+    sigma_hidden_share: float = 0.35
+    box_memory_s: float = 0.3  # for so long a box has the same error: this time counts as one box
+    width_memory_s: float = 5.0  # and its width, by clothes and by what is carried: it counts once in so long
+    outline_memory_s: float = 2.0  # errors that last: a box that is drawn too low or too high, by
+    sigma_outline_rel: float = 0.025  # of its height
+    sure_feet: float = 0.01  # a box whose feet are hidden with less probability tells of the road
+    sigma_common_rel: float = 0.03  # of the mean height of those who are there
 
     def sizes(self, label: str) -> Sizes:
         """Of a kind."""
@@ -88,7 +92,7 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Moments:
-    """Means (N, 7) and covariances (N, 7, 7) of the mixtures, and the probabilities (N,) of standing and a child."""
+    """Means (N, 9) and covariances (N, 9, 9) of the mixtures, and the probabilities (N,) of standing and a child."""
 
     mean: Floats
     cov: Floats
@@ -111,8 +115,8 @@ class PeopleFilter:
         self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
         self._weight = np.zeros((0, FILTERS))
         self._unseen_s = np.zeros(0)
-        self._stood_s = np.zeros(0)  # of that, in which neither the ego drove
-        self._sizes = np.zeros((0, 6))  # reach, moves, change, log width, sigma width, sway
+        self._sizes = np.zeros((0, 5))  # reach, moves, change, log width, sigma width
+        self._tilt_prior = np.zeros((0, 2))  # mean and variance, as the front end and the others have it
 
     def __len__(self) -> int:
         return len(self._x)
@@ -120,7 +124,8 @@ class PeopleFilter:
     def keep_rows(self, rows: Sequence[int]) -> None:
         """Forgets all others."""
         self._x, self._P, self._weight = self._x[rows], self._P[rows], self._weight[rows]
-        self._unseen_s, self._stood_s, self._sizes = self._unseen_s[rows], self._stood_s[rows], self._sizes[rows]
+        self._unseen_s, self._sizes = self._unseen_s[rows], self._sizes[rows]
+        self._tilt_prior = self._tilt_prior[rows]
 
     def predict(
         self,
@@ -128,18 +133,15 @@ class PeopleFilter:
         T_world_ego: SE2,
         ego_cov: Floats | None,
         ground_shift_rad: float,
-        sigma_pitch_rad: float,
-        ego_mps: float,
     ) -> None:
         """To the next frame: people move, and the ground's estimate moved by `ground_shift_rad` beside its own motion.
 
-        `ego_cov` (3, 3) is of the ego's step, in its tangent. `sigma_pitch_rad` is of the front end's ground.
+        `ego_cov` (3, 3) is of the ego's step, in its tangent.
         """
         config, n = self.config, len(self._x)
         if not n or dt_s <= 0.0:
             return
         self._unseen_s += dt_s
-        self._stood_s += dt_s * math.exp(-ego_mps / config.driving_mps)
         self._mix(dt_s)
         F = np.eye(len(STATES))
         F[X, VX] = F[Y, VY] = dt_s
@@ -152,12 +154,18 @@ class PeopleFilter:
                 self._P[:, moving, at, by] += q * dt_s**2 / 2.0
                 self._P[:, moving, by, at] += q * dt_s**2 / 2.0
                 self._P[:, moving, by, by] += q * dt_s
-        driving = -math.expm1(-ego_mps / config.driving_mps)
-        keep = math.exp(-driving * dt_s / config.tilt_memory_s)
-        self._x[..., TILT] = keep * (self._x[..., TILT] - ground_shift_rad)
+        keep = math.exp(-dt_s / config.tilt_memory_s)
+        mean, var = self._tilt_prior.T
+        self._x[..., TILT] = mean[:, None] + keep * (self._x[..., TILT] - ground_shift_rad - mean[:, None])
         self._P[..., TILT, :] *= keep
         self._P[..., TILT] *= keep
-        self._P[..., TILT, TILT] += (1.0 - keep**2) * (sigma_pitch_rad**2 + config.sigma_tilt_rad**2)
+        self._P[..., TILT, TILT] += ((1.0 - keep**2) * (var + config.sigma_tilt_rad**2))[:, None]
+        keep = math.exp(-dt_s / config.outline_memory_s)
+        for state in (FOOT, HEAD):
+            self._x[..., state] *= keep
+            self._P[..., state, :] *= keep
+            self._P[..., state] *= keep
+            self._P[..., state, state] += (1.0 - keep**2) * config.sigma_outline_rel**2
         if ego_cov is not None:  # an error of the ego's step moves everybody against it
             at = self._x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]
             J = np.zeros((n, FILTERS, 2, 3))
@@ -199,19 +207,20 @@ class PeopleFilter:
         self._x, self._P = x, P
         self._weight = weight / weight.sum(axis=1, keepdims=True)
 
-    def begin(
-        self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float, sigma_pitch_rad: float
-    ) -> None:
-        """People seen for the first time, each in a row after the others, already corrected by their boxes."""
+    def begin(self, boxes: Sequence[PersonBox], tilt_prior: Floats, T_world_ego: SE2, height_m: float) -> None:
+        """People seen for the first time, each in a row after the others, already corrected by their boxes.
+
+        `tilt_prior` (N, 2): mean and variance of the road's tilt there against the front end's ground.
+        """
         if not boxes:
             return
         config, n, before = self.config, len(boxes), len(self._x)
         x, P = np.zeros((n, FILTERS, len(STATES))), np.zeros((n, FILTERS, len(STATES), len(STATES)))
-        weight, rows = np.zeros((n, FILTERS)), np.zeros((n, 6))
+        weight, rows = np.zeros((n, FILTERS)), np.zeros((n, 5))
         for k, box in enumerate(boxes):
             sizes = config.sizes(box.label)
             rows[k] = [
-                sizes.reach_m, sizes.moves_mps, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel, 0.0
+                sizes.reach_m, sizes.moves_mps, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel
             ]  # fmt: skip
             for child, (h_m, sigma) in enumerate(
                 ((sizes.height_m, sizes.sigma_height_rel), (sizes.child_m, sizes.sigma_child_rel))
@@ -226,15 +235,17 @@ class PeopleFilter:
                 P[k, 2 * child + MOVING, [VX, VY], [VX, VY]] = sizes.moves_mps**2
                 share = sizes.child if child else 1.0 - sizes.child
                 weight[k, both] = share * np.array([config.standing, 1.0 - config.standing])
+            x[k, :, TILT] = tilt_prior[k, 0]
             P[k, :, TILT, TILT] = (
-                sigma_pitch_rad**2 + config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
+                tilt_prior[k, 1] + config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
             )
+            P[k, :, [FOOT, HEAD], [FOOT, HEAD]] = config.sigma_outline_rel**2
             P[k, :, KERB, KERB] = config.sigma_kerb_m**2
         self._x, self._P = np.concatenate([self._x, x]), np.concatenate([self._P, P])
         self._weight = np.concatenate([self._weight, weight])
         self._sizes = np.concatenate([self._sizes, rows])
+        self._tilt_prior = np.concatenate([self._tilt_prior, tilt_prior])
         self._unseen_s = np.concatenate([self._unseen_s, np.full(n, max(config.box_memory_s, config.width_memory_s))])
-        self._stood_s = np.concatenate([self._stood_s, np.zeros(n)])
         self.correct(range(before, before + n), boxes, T_world_ego, height_m, BIRTH_ITERATIONS)
 
     def correct(
@@ -249,17 +260,14 @@ class PeopleFilter:
         if not boxes:
             return
         at = np.asarray(rows)
-        z, R = self._measured(at, boxes)  # (M, 4), (M, 2, 4): feet visible, feet hidden
+        z, R = self._measured(at, boxes)  # (M, 4), (M, 4, 4)
         hidden = np.array([box.hidden for box in boxes])
-        x0, P0 = self._x[at][:, :, None], self._P[at][:, :, None]  # (M, K, 1, 7)
+        x0, P0 = self._x[at][:, :, None], self._P[at][:, :, None]  # (M, K, 1, 9)
         x = np.repeat(x0, 2, axis=2)
         for _ in range(iterations):
             expected, J = self._expected(x, at, T_world_ego, height_m)
-            noise = np.zeros((*x.shape[:3], 4, 4))
-            noise[..., range(4), range(4)] = R[:, None]
-            noise[:, :, 1, BOTTOM, BOTTOM] += (
-                self.config.sigma_hidden_share * (expected[:, :, 0, BOTTOM] - expected[:, :, 0, TOP])
-            ) ** 2
+            noise = np.broadcast_to(R[:, None, None], (*x.shape[:3], 4, 4)).copy()
+            _hide_feet(noise[:, :, 1], np.exp(expected[:, :, 0, TALL]), self.config)
             PJt = P0 @ J.swapaxes(-1, -2)
             S = J @ PJt + noise
             innovation = z[:, None, None] - expected - ((x0 - x)[..., None, :] @ J.swapaxes(-1, -2))[..., 0, :]
@@ -279,28 +287,20 @@ class PeopleFilter:
         self._x[at], self._P[at] = _merged(x, P, share)
         of_filters = np.maximum(weight.sum(axis=2), MIN_WEIGHT)
         self._weight[at] = of_filters / of_filters.sum(axis=1, keepdims=True)
-        self._unseen_s[at] = self._stood_s[at] = 0.0
+        self._unseen_s[at] = 0.0
 
     def _measured(self, at: NDArray[np.intp], boxes: Sequence[PersonBox]) -> tuple[Floats, Floats]:
-        """(M, 4) of the boxes, and their variances (M, 2, 4), more where an error is the one of the frames before."""
+        """(M, 4) of the boxes, and their covariances (M, 4, 4), more where an error is the one of the frames before."""
         config = self.config
-        z = np.array([[b.bearing, b.slope_bottom, b.slope_top, b.log_width] for b in boxes])
-        sigma = np.array([[b.sigma_bearing, b.sigma_bottom, b.sigma_top, 1.0] for b in boxes])
-        sigma[:, WIDTH] = np.where([b.whole for b in boxes], self._sizes[at, 4], UNUSED)
-        R = np.square(sigma)
-        speed_mps = np.sqrt((np.square(self._x[at][..., VX:HEIGHT]).sum(axis=-1) * self._weight[at]).sum(axis=1))
+        z, R = measured_boxes(boxes)
         unseen_s = self._unseen_s[at]
-        stood_s = self._stood_s[at] * np.exp(-speed_mps / config.driving_mps)
-        changed_s = np.maximum(unseen_s - stood_s, config.sways * unseen_s)
-        R[:, BEARING] *= np.maximum(1.0, config.box_memory_s / unseen_s)
-        R[:, [BOTTOM, TOP]] *= np.maximum(1.0, config.box_memory_s / changed_s)[:, None]
-        R[:, WIDTH] *= np.maximum(1.0, config.width_memory_s / changed_s)
-        return z, np.stack([R, R], axis=1)
+        R *= np.maximum(1.0, config.box_memory_s / unseen_s)[:, None, None]
+        uses = np.array([b.whole for b in boxes]) & (unseen_s >= config.width_memory_s)
+        R[:, WIDTH, WIDTH] = np.where(uses, self._sizes[at, 4], UNUSED) ** 2
+        return z, R
 
-    def _expected(
-        self, x: Floats, at: NDArray[np.intp], T_world_ego: SE2, height_m: float
-    ) -> tuple[Floats, Floats]:
-        """Measurements (M, K, 2, 4) expected of states (M, K, 2, 7), feet visible and hidden, and their Jacobians."""
+    def _expected(self, x: Floats, at: NDArray[np.intp], T_world_ego: SE2, height_m: float) -> tuple[Floats, Floats]:
+        """Measurements (M, K, 2, 4) expected of states (M, K, 2, 9), feet visible and hidden, and their Jacobians."""
         R = T_world_ego.rotation()
         in_ego = (x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]) @ R
         depth, y = np.maximum(in_ego[..., 0], NEAREST_M), in_ego[..., 1]
@@ -308,21 +308,20 @@ class PeopleFilter:
         height, below = np.exp(x[..., HEIGHT]), height_m + x[..., KERB]
         expected, J = np.empty((*x.shape[:3], 4)), np.zeros((*x.shape[:3], 4, len(STATES)))
         expected[..., BEARING] = y / depth
-        expected[..., BOTTOM] = bev.road_slope(foot, below) - x[..., TILT]  # Eq. 1
-        expected[..., TOP] = (below - height) / depth - x[..., TILT]
+        tall = height / depth
+        expected[..., BOTTOM] = bev.road_slope(foot, below) - x[..., TILT] + x[..., FOOT] * tall  # Eq. 1
+        nearer = (depth - foot) * below / (foot * height)  # how much taller a nearer foot makes it
+        expected[..., TALL] = x[..., HEIGHT] - np.log(depth) + np.log1p(nearer) + x[..., FOOT] - x[..., HEAD]
         expected[..., WIDTH] = self._sizes[at, 3][:, None, None] - np.log(depth)
-        by_depth = np.stack(
-            [-y / depth**2, -below / foot**2, -(below - height) / depth**2, -1.0 / depth], axis=-1
-        )
+        by_depth = np.stack([-y / depth**2, -below / foot**2, -(1.0 + nearer) / depth, -1.0 / depth], axis=-1)
         J[..., :2] = by_depth[..., None] * R[:, 0]
         J[..., BEARING, :2] += R[:, 1] / depth[..., None]
-        J[..., BOTTOM, TILT] = J[..., TOP, TILT] = -1.0
-        J[..., BOTTOM, KERB], J[..., TOP, KERB] = 1.0 / foot, 1.0 / depth
-        J[..., TOP, HEIGHT] = -height / depth
-        hidden = self.config.hidden_share * (height / depth)[:, :, 1]
-        expected[:, :, 1, BOTTOM] -= hidden
-        J[:, :, 1, BOTTOM, HEIGHT] -= hidden
-        J[:, :, 1, BOTTOM, :2] += (hidden / depth[:, :, 1])[..., None] * R[:, 0]
+        J[..., BOTTOM, TILT], J[..., BOTTOM, KERB], J[..., BOTTOM, FOOT] = -1.0, 1.0 / foot, tall
+        J[..., TALL, HEIGHT], J[..., TALL, FOOT], J[..., TALL, HEAD] = 1.0, 1.0, -1.0
+        # Where feet are hidden the box ends higher, by a share of the height, and is so much shorter
+        share = self.config.hidden_share
+        expected[:, :, 1, BOTTOM] -= share * tall[:, :, 1]
+        expected[:, :, 1, TALL] += math.log(1.0 - share)
         return expected, J
 
     def moments(self, after_s: float = 0.0) -> Moments:
@@ -340,15 +339,85 @@ class PeopleFilter:
             mean, cov, self._weight[:, STANDING_FILTERS].sum(axis=1), self._weight[:, CHILD_FILTERS].sum(axis=1)
         )
 
-    def expected_boxes(self, T_world_ego: SE2, height_m: float) -> tuple[Floats, Floats, Floats]:
-        """Bearing, bottom and top (N, 3) expected of everybody, their covariance (N, 3, 3), heights at a depth of 1."""
+    def tilts_of(self, boxes: Sequence[PersonBox], sigma_pitch_rad: float, height_m: float) -> Floats:
+        """(N, 2): mean and variance of the road's tilt against the front end's ground, as everybody else's box has it.
+
+        A box alone tells it by the height of its kind; its own must not be told to it twice. Of several the mean is
+        known no better than the mean of heights is.
+        """
+        config, n = self.config, len(boxes)
+        if not n:
+            return np.zeros((0, 2))
+        tilt, variance, slope = np.zeros(n), np.full(n, UNUSED), np.zeros(n)
+        for k, box in enumerate(boxes):
+            if box.whole and box.hidden <= config.sure_feet and box.tan_height > MIN_SLOPE:
+                sizes = config.sizes(box.label)
+                depth = sizes.height_m / box.tan_height
+                tilt[k] = bev.road_slope(max(depth - sizes.reach_m, NEAREST_M), height_m + config.kerb_m)
+                tilt[k] -= box.slope_bottom
+                rel = math.hypot(sizes.sigma_height_rel, 2.0 * config.sigma_outline_rel)
+                slope[k] = height_m / depth
+                variance[k] = (slope[k] * rel) ** 2 + (config.sigma_kerb_m / depth) ** 2
+        weight = information = 1.0 / variance
+        for _ in range(2):  # a child, or feet that something hides, tells another tilt (Cauchy)
+            mean = float((weight * tilt).sum()) / (float(weight.sum()) + sigma_pitch_rad**-2)
+            weight = information / (1.0 + information * np.square(tilt - mean) / 4.0)
+        total = weight.sum() - weight + sigma_pitch_rad**-2  # of all others, and of the front end
+        mean_tilt = ((weight * tilt).sum() - weight * tilt) / total
+        by_heights = config.sigma_common_rel * ((weight * slope).sum() - weight * slope) / total
+        return np.stack([mean_tilt, 1.0 / total + np.square(by_heights)], axis=1)
+
+    def expect_tilt(self, rows: Sequence[int], tilt_prior: Floats) -> None:
+        """What the next frames draw the tilts in `rows` to, (M, 2)."""
+        self._tilt_prior[np.asarray(rows, dtype=np.intp)] = tilt_prior
+
+    def distances(self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float) -> tuple[Floats, Floats]:
+        """(N, M) squared Mahalanobis distances of boxes from everybody, and -2 log of their likelihoods.
+
+        Each is the better one of feet visible and hidden.
+        """
         n = len(self._x)
         x = np.repeat(self._x[:, :, None], 2, axis=2)
         expected, J = self._expected(x, np.arange(n), T_world_ego, height_m)
-        expected, J = expected[:, :, 0, :WIDTH], J[:, :, 0, :WIDTH]
-        S = J @ self._P @ J.swapaxes(-1, -2)
-        mean, S = _merged(expected, S, self._weight)
-        return mean, S, mean[:, BOTTOM] - mean[:, TOP]
+        expected, J = expected[..., :WIDTH], J[..., :WIDTH, :]
+        S = J @ self._P[:, :, None] @ J.swapaxes(-1, -2)
+        mean, S = _merged(expected.swapaxes(1, 2), S.swapaxes(1, 2), self._weight[:, None])  # (N, 2, 3), (N, 2, 3, 3)
+        z, R = measured_boxes(boxes)
+        noise = np.stack([R, R])
+        _hide_feet(noise[1], np.exp(z[:, TALL]) / (1.0 - self.config.hidden_share), self.config)
+        hidden = np.array([b.hidden for b in boxes])
+        squared, told = np.full((n, len(boxes)), np.inf), np.full((n, len(boxes)), np.inf)
+        for k, prior in enumerate((1.0 - hidden, hidden)):
+            gap = z[None, :, :WIDTH] - mean[:, None, k]
+            whole = S[:, None, k] + noise[k][None, :, :WIDTH, :WIDTH]
+            d2 = (gap[..., None, :] @ np.linalg.inv(whole) @ gap[..., None])[..., 0, 0]
+            cost = d2 + np.linalg.slogdet(whole)[1] - 2.0 * np.log(prior)[None]
+            squared, told = np.where(cost < told, d2, squared), np.minimum(told, cost)
+        return squared, told
+
+
+def measured_boxes(boxes: Sequence[PersonBox]) -> tuple[Floats, Floats]:
+    """(M, 4) bearing, bottom, log of the height and of the width, and their covariance (M, 4, 4); of width none."""
+    tall = np.array([max(b.tan_height, MIN_SLOPE) for b in boxes])
+    z = np.array([[b.bearing, b.slope_bottom, 0.0, b.log_width] for b in boxes])
+    z[:, TALL] = np.log(tall)
+    bottom, top = np.array([[b.sigma_bottom, b.sigma_top] for b in boxes]).T
+    R = np.zeros((len(boxes), 4, 4))
+    R[:, BEARING, BEARING] = np.square([b.sigma_bearing for b in boxes])
+    R[:, BOTTOM, BOTTOM] = bottom**2
+    R[:, BOTTOM, TALL] = R[:, TALL, BOTTOM] = bottom**2 / tall
+    R[:, TALL, TALL] = (bottom**2 + top**2) / tall**2
+    R[:, WIDTH, WIDTH] = UNUSED**2
+    return z, R
+
+
+def _hide_feet(noise: Floats, tall: Floats, config: PeopleConfig) -> None:
+    """What hidden feet add to the covariance (..., 4, 4) of boxes of `tall` (...), a height at a depth of 1, in place."""
+    of_bottom, of_height = config.sigma_hidden_share * tall, config.sigma_hidden_share / (1.0 - config.hidden_share)
+    noise[..., BOTTOM, BOTTOM] += of_bottom**2
+    noise[..., BOTTOM, TALL] += of_bottom * of_height
+    noise[..., TALL, BOTTOM] += of_bottom * of_height
+    noise[..., TALL, TALL] += of_height**2
 
 
 def _merged(x: Floats, P: Floats, weight: Floats) -> tuple[Floats, Floats]:
@@ -357,4 +426,3 @@ def _merged(x: Floats, P: Floats, weight: Floats) -> tuple[Floats, Floats]:
     gap = x - mean[..., None, :]
     spread = P + gap[..., :, None] * gap[..., None, :]
     return mean, (weight[..., None, None] * spread).sum(axis=-3)
-

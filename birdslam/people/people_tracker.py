@@ -24,11 +24,11 @@ Floats = NDArray[np.float64]
 
 FIRST_ID = 1 << 20  # people's numbers begin here, so that no vehicle has one of them
 NEVER = 1e9  # the cost of what can't be
-NEW = 0.0  # -2 log of the density of new people in bearing and slopes: about one in the image
+NEW = 2.0  # -2 log of the density of new people in bearing, slope and log height: about one in the image
 SIDE_MARGIN = 0.03  # of the image's width: who is predicted farther outside has left
 LEAVES_S = 0.3  # until who left the image is forgotten
 MAX_SPEED_MPS = {PEDESTRIAN: 6.0, CYCLIST: 16.0}
-STANDS, WALKS = 0.6, 0.35  # probability of standing: hysteresis of what is reported
+STANDS, WALKS = 0.7, 0.4  # probability of standing: hysteresis of what is reported
 
 
 class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -96,44 +96,30 @@ class PeopleTracker:
         if detections is not None:
             boxes = people_boxes(detections, self.camera, ground, self.config.boxes)
             pairs = self._associate(boxes, ego.T_world_ego, ground.height_m)
+            tilts = self.filter.tilts_of(boxes, road.sigma_pitch_rad, ground.height_m)
             rows = [row for row, _ in pairs]
+            self.filter.expect_tilt(rows, tilts[[k for _, k in pairs]])
             self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, ground.height_m)
             for row, k in pairs:
                 track = self.tracks[row]
                 track.box, track.seen_ns, track.seen_frame = boxes[k], ego.t_source_ns, ego.frame_id
                 track.hits += 1
                 track.votes[boxes[k].label] += 1
-            self._begin(boxes, {k for _, k in pairs}, frame, road)
+            self._begin(boxes, tilts, {k for _, k in pairs}, frame, ground.height_m)
         self._conclude(frame)
 
     def _predict(self, frame: OpenFrame, road: GroundSizeFilter) -> None:
         ego, pitch_rad = frame.ego, road.ground.pitch_rad
         shift_rad = 0.0 if self._pitch_rad is None else pitch_rad - self._pitch_rad - (frame.turn_rad or 0.0)
         self._pitch_rad = pitch_rad
-        ego_mps = 10.0 if frame.travelled_m is None else frame.travelled_m / max(frame.dt_s, 1e-3)
-        self.filter.predict(
-            frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, road.sigma_pitch_rad, ego_mps
-        )  # fmt: skip
+        self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad)
 
     def _associate(self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float) -> list[tuple[int, int]]:
         """(row, box): the assignment of least total cost, the negative log-likelihood within the gate."""
         if not boxes or not self.tracks:
             return []
-        mean, S, tan_height = self.filter.expected_boxes(T_world_ego, height_m)
-        z = np.array([[b.bearing, b.slope_bottom, b.slope_top] for b in boxes])
-        R = np.square([[b.sigma_bearing, b.sigma_bottom, b.sigma_top] for b in boxes])
-        hidden = np.array([b.hidden for b in boxes])
-        hides = self.config.people
-        cost = np.full((len(self.tracks), len(boxes)), NEVER)
-        for is_hidden, prior in ((False, 1.0 - hidden), (True, hidden)):
-            gap = z[None] - mean[:, None]
-            whole = S[:, None] + (R[:, :, None] * np.eye(3))[None]
-            if is_hidden:
-                gap[..., 1] += hides.hidden_share * tan_height[:, None]
-                whole[..., 1, 1] += np.square(hides.sigma_hidden_share * tan_height)[:, None]
-            squared = (gap[..., None, :] @ np.linalg.inv(whole) @ gap[..., None])[..., 0, 0]
-            told = squared + np.linalg.slogdet(whole)[1] - 2.0 * np.log(prior)[None]
-            cost = np.minimum(cost, np.where(squared <= self.config.gate, told, NEVER))
+        squared, told = self.filter.distances(boxes, T_world_ego, height_m)
+        cost = np.where(squared <= self.config.gate, told, NEVER)
         births = np.where(np.eye(len(boxes)), NEW, NEVER)  # a row of somebody new for each box
         rows, columns = self._assign(np.vstack([cost, births]))
         known = len(self.tracks)
@@ -141,19 +127,21 @@ class PeopleTracker:
             (int(i), int(j)) for i, j in zip(rows, columns, strict=True) if i < known and cost[i, j] < NEVER
         ]  # fmt: skip
 
-    def _begin(self, boxes: list[PersonBox], matched: set[int], frame: OpenFrame, road: GroundSizeFilter) -> None:
+    def _begin(
+        self, boxes: list[PersonBox], tilts: Floats, matched: set[int], frame: OpenFrame, height_m: float
+    ) -> None:
         followed = np.array([boxes[k].box_px for k in matched]).reshape(-1, 4)
-        births = []
+        births: list[int] = []
         for k, box in enumerate(boxes):
             if k in matched or box.label == BICYCLE or box.score < self.config.birth_score:
                 continue
             if len(followed) and iou(np.array([box.box_px]), followed).max() > self.config.birth_iou:
                 continue
-            births.append(box)
+            births.append(k)
         ego = frame.ego
-        self.filter.begin(births, ego.T_world_ego, road.ground.height_m, road.sigma_pitch_rad)
+        self.filter.begin([boxes[k] for k in births], tilts[births], ego.T_world_ego, height_m)
         self.tracks += [
-            PersonTrack(box, ego.t_source_ns, ego.frame_id, votes=Counter({box.label: 1})) for box in births
+            PersonTrack(boxes[k], ego.t_source_ns, ego.frame_id, votes=Counter({boxes[k].label: 1})) for k in births
         ]  # fmt: skip
 
     def _conclude(self, frame: OpenFrame) -> None:

@@ -144,7 +144,9 @@ def judge(sequence: TrackingSequence, measurements: Iterable[Measurements], kind
         asked = [label for label in here if label.kind in KINDS[kind]]
         told = [p for p in m.people if p.label == kind]
         seen = [p for p in told if p.age_ns == 0]
-        overlap = iou(np.array([a.box_px for a in asked]).reshape(-1, 4), np.array([p.box_px for p in seen]).reshape(-1, 4))
+        overlap = iou(
+            np.array([a.box_px for a in asked]).reshape(-1, 4), np.array([p.box_px for p in seen]).reshape(-1, 4)
+        )
         before, after = max(0, m.frame_id - 2), min(len(ego) - 1, m.frame_id + 2)
         step = ego[before].between(ego[after])
         ego_mps = math.hypot(step.x_m, step.y_m) / max(0.1 * (after - before), 0.1)
