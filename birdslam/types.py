@@ -42,6 +42,7 @@ Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 BodyId = Annotated[int, msgspec.Meta(ge=0)]
 NS_PER_S = 1_000_000_000
 PEOPLE = frozenset({"pedestrian", "cyclist"})  # labels of `Estimate.people`
+FIRST_PERSON = 1 << 20  # people's numbers begin here, so that no vehicle has one of them
 IN_SIGHT_NS = 350_000_000  # perceive runs its networks at least three times a second
 
 

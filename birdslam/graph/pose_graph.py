@@ -24,8 +24,8 @@ from birdslam.graph.factors.factor import Factor, GraphFrame
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.factors.vehicle_detection import VehicleDetections
 from birdslam.graph.graph_config import GraphConfig, check_together
-from birdslam.graph.marginals import vehicle_estimates
 from birdslam.graph.hidden_road import hidden_fans
+from birdslam.graph.marginals import vehicle_estimates
 from birdslam.graph.minimum import minimise, solver
 from birdslam.graph.pending_map import PendingMap
 from birdslam.graph.people import people_estimates

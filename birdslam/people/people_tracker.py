@@ -16,13 +16,13 @@ from birdslam.geometry.se2 import SE2
 from birdslam.people.people_boxes import BICYCLE, CYCLIST, PEDESTRIAN, PeopleBoxesConfig, PersonBox, people_boxes
 from birdslam.people.people_filter import PeopleConfig, PeopleFilter
 from birdslam.perception import Detections
+from birdslam.types import FIRST_PERSON
 from birdslam.vehicles.out_of_sequence import OpenFrame
 from birdslam.vehicles.placement.localisation import iou
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 
 Floats = NDArray[np.float64]
 
-FIRST_ID = 1 << 20  # people's numbers begin here, so that no vehicle has one of them
 NEVER = 1e9  # the cost of what can't be
 NEW = 2.0  # -2 log of the density of new people in bearing, slope and log height: about one in the image
 SIDE_MARGIN = 0.03  # of the image's width: who is predicted farther outside has left
@@ -86,7 +86,7 @@ class PeopleTracker:
         self.tracks: list[PersonTrack] = []
         self.frame: OpenFrame | None = None  # the last settled one
         self._pitch_rad: float | None = None
-        self._next_id = FIRST_ID
+        self._next_id = FIRST_PERSON
 
     def settle(self, frame: OpenFrame, detections: Detections | None, road: GroundSizeFilter) -> None:
         """The next frame. None for `detections`: no detector looked at it. `road` is the ground in it."""

@@ -17,6 +17,14 @@ from birdslam.bench.tracking.localisation import (
     measure,
     summarise_ranges,
 )
+from birdslam.bench.tracking.people import (
+    PeopleRow,
+    PeopleTracks,
+    boxes_of_hulls,
+    has_people,
+    judge,
+    summarise_people,
+)
 from birdslam.frontend import FrontEndConfig
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.progress import Progress
@@ -41,6 +49,30 @@ def evaluate_localisation(
         progress.reach(0)
         by_sequence = _errors(root, sequences, detections, config, progress.advance)
     return summarise_ranges([error for errors in by_sequence.values() for error in errors])
+
+
+def evaluate_people(
+    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, kind: str
+) -> tuple[list[PeopleRow], list[PeopleTracks]]:
+    """The errors of placed pedestrians or cyclists by range, and their tracks in bird's-eye view. Raises DatasetError.
+
+    Sequences without labels of the kind are left out. No detector's boxes of cyclists were recorded: those of the
+    labels' hulls stand in.
+    """
+    sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
+    sequences = [sequence for sequence in sequences if has_people(sequence, kind)]
+    if not sequences:
+        raise DatasetError(f"{root}: none of these sequences has labels of a {kind}")
+    folder, results = root / "det_02_rrc" if detections == "rrc" else Path(detections), []
+    with Progress("people", sum(map(len, sequences))) as progress:
+        progress.reach(0)
+        for sequence in sequences:
+            found = read_detections(folder, sequence.name, len(sequence))
+            if kind == "cyclist" and detections == "rrc":
+                found = boxes_of_hulls(sequence, found, kind)
+            results.append(judge(sequence, measure(sequence, found, config), kind))
+            progress.advance(len(sequence))
+    return summarise_people(results)
 
 
 def evaluate_left_out(

@@ -95,6 +95,11 @@ class PeopleTracks(msgspec.Struct, frozen=True, kw_only=True):
     switches_per_minute: float
 
 
+def has_people(sequence: TrackingSequence, kind: str) -> bool:
+    """Whether somebody of the kind is labelled."""
+    return any(label.kind in KINDS[kind] for label in sequence.labels)
+
+
 def boxes_of_hulls(sequence: TrackingSequence, recorded: Sequence[Detections], kind: str) -> list[Detections]:
     """Boxes for whom no detector's were recorded: the outlines of labelled bodies, with noise as real boxes show.
 
