@@ -35,7 +35,7 @@ COVER_WIDTH = 0.3  # of a box's width: a nearer box that covers less of its lowe
 class PeopleBoxesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How sure boxes of people are; fractions are of the box's height."""
 
-    sigma_edge_rel: float = 0.02  # 1-sigma of lower and upper edge: RRC's boxes of people on KITTI tracking
+    sigma_edge_rel: float = 0.018  # 1-sigma of lower and upper edge: RRC's boxes of people on KITTI tracking
     sigma_edge_px: float = 0.5  # and beside it
     sigma_side_rel: float = 0.035  # of the middle column: arms and legs swing
     sigma_growth: float = 2.0  # as `LocalisationConfig.sigma_growth`

@@ -11,7 +11,7 @@ downwards from the plane of the road, the box of somebody at depth X, whose near
 where foot and head are errors of the box that last for a while: somebody's pose, what a detector makes of clothes.
 
 Feet that something hides are a second hypothesis of each box: then the bottom lies higher by a share of h / X. Modes are
-standing and walking, which people change (interacting multiple model, Blom and Bar-Shalom 1988), for a grown-up's height
+standing, walking along the road and walking anyhow, which people change (interacting multiple model, Blom and Bar-Shalom 1988), for a grown-up's height
 and for a child's, which they don't. So the road places first and the size second: a small box whose foot is near is a
 child's, and no distant adult's. Tilt, kerb and height are states, so that what lasts for a track is not averaged away.
 """
@@ -33,9 +33,11 @@ from birdslam.people.people_boxes import PEDESTRIAN, PersonBox
 Floats = NDArray[np.float64]
 
 STATES = X, Y, VX, VY, HEIGHT, TILT, KERB, FOOT, HEAD = range(9)
-STANDING, MOVING = 0, 1
-FILTERS = 4  # (adult, child) times (standing, moving)
-STANDING_FILTERS, MOVING_FILTERS, CHILD_FILTERS = [0, 2], [1, 3], [2, 3]
+# Who moves along the road comes towards the ego or goes away from it; others cross, or walk anyhow
+MOTIONS = STANDING, TOWARDS, AWAY, CROSSING = range(4)
+FILTERS = 2 * len(MOTIONS)  # for an adult's height, and for a child's
+STANDING_FILTERS, CHILD_FILTERS = [STANDING, len(MOTIONS) + STANDING], slice(len(MOTIONS), None)
+VELOCITY = slice(2, 4)
 BEARING, BOTTOM, TALL, WIDTH = range(4)
 UNUSED = 1e3  # 1-sigma of what is not measured
 DEPTH_UNKNOWN = 0.6  # 1-sigma at birth, as a fraction
@@ -58,30 +60,37 @@ class Sizes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     length_m: float  # of the footprint
     footprint_m: float  # its width
     reach_m: float  # from the centre to the nearest foot or wheel, along the line of sight
-    moves_mps: float  # 1-sigma of the velocity of who moves
-    change_mps: float  # 1-sigma by which that changes within a second
+    along_mps: float  # speed of who moves along the road
+    sigma_along_mps: float  # of it
+    sigma_beside_mps: float  # and across it
+    crossing_mps: float  # 1-sigma of the velocity of who moves anyhow
+    change_mps: float  # 1-sigma by which a velocity changes within a second
 
 
 class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Priors of people and of the road under them, and how long the errors of a box last."""
 
-    pedestrian: Sizes = Sizes(1.72, 0.075, 1.2, 0.15, 0.06, 0.68, 0.3, 0.7, 0.6, 0.25, 1.2, 0.8)
-    cyclist: Sizes = Sizes(1.74, 0.07, 1.45, 0.12, 0.06, 0.9, 0.5, 1.75, 0.6, 0.35, 4.0, 1.5)
-    standing: float = 0.25  # of them stand when first seen
+    pedestrian: Sizes = Sizes(1.72, 0.075, 1.2, 0.15, 0.06, 0.68, 0.3, 0.7, 0.6, 0.25, 1.3, 0.4, 0.25, 1.1, 0.5)
+    cyclist: Sizes = Sizes(1.74, 0.07, 1.45, 0.12, 0.06, 0.9, 0.5, 1.75, 0.6, 0.35, 4.5, 2.0, 0.5, 4.0, 1.2)
+    standing: float = 0.2  # of them stand when first seen
     stands_for_s: float = 10.0  # on average
     moves_for_s: float = 10.0  # until a stop
+    crossing: float = 0.3  # of those who move
+    turns_after_s: float = 10.0  # from one way of moving to another
     stop_mps: float = 0.08  # 1-sigma of the velocity of who stands: they sway
-    sigma_tilt_rad: float = 0.004  # of the road at somebody against the ego's, beside the front end's own sigma
-    tilt_memory_s: float = 5.0  # how long that lasts
+    sigma_tilt_rad: float = 0.012  # of the road at somebody against the ego's, beside the front end's own sigma
+    tilt_memory_s: float = 5.0  # of driving: how long that lasts
+    tilt_drift_rad: float = 0.002  # and by how much it changes within a second as people walk on
+    driving_mps: float = 1.0  # as `GroundSizeConfig.driving_mps`
     sigma_roll_rad: float = 0.01  # of the front end's roll, which tilts what is aside
     kerb_m: float = -0.03  # people are on pavements too
     sigma_kerb_m: float = 0.08
     hidden_share: float = 0.3  # of a person's height, that is hidden where the feet are
     sigma_hidden_share: float = 0.35
-    box_memory_s: float = 0.3  # for so long a box has the same error: this time counts as one box
+    box_memory_s: float = 0.15  # for so long a box has the same error: this time counts as one box
     width_memory_s: float = 5.0  # and its width, by clothes and by what is carried: it counts once in so long
-    outline_memory_s: float = 2.0  # errors that last: a box that is drawn too low or too high, by
-    sigma_outline_rel: float = 0.025  # of its height
+    outline_memory_s: float = 1.0  # errors that last: a box that is drawn too low or too high, by
+    sigma_outline_rel: float = 0.028  # of its height
     sure_feet: float = 0.01  # a box whose feet are hidden with less probability tells of the road
     sigma_common_rel: float = 0.03  # of the mean height of those who are there
 
@@ -115,7 +124,8 @@ class PeopleFilter:
         self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
         self._weight = np.zeros((0, FILTERS))
         self._unseen_s = np.zeros(0)
-        self._sizes = np.zeros((0, 5))  # reach, moves, change, log width, sigma width
+        self._sizes = np.zeros((0, 4))  # reach, change, log width, sigma width
+        self._moves = np.zeros((0, len(MOTIONS), 3))  # speed along the road, 1-sigma of it and of that across it
         self._tilt_prior = np.zeros((0, 2))  # mean and variance, as the front end and the others have it
 
     def __len__(self) -> int:
@@ -125,7 +135,7 @@ class PeopleFilter:
         """Forgets all others."""
         self._x, self._P, self._weight = self._x[rows], self._P[rows], self._weight[rows]
         self._unseen_s, self._sizes = self._unseen_s[rows], self._sizes[rows]
-        self._tilt_prior = self._tilt_prior[rows]
+        self._tilt_prior, self._moves = self._tilt_prior[rows], self._moves[rows]
 
     def predict(
         self,
@@ -133,6 +143,7 @@ class PeopleFilter:
         T_world_ego: SE2,
         ego_cov: Floats | None,
         ground_shift_rad: float,
+        ego_mps: float,
     ) -> None:
         """To the next frame: people move, and the ground's estimate moved by `ground_shift_rad` beside its own motion.
 
@@ -142,24 +153,27 @@ class PeopleFilter:
         if not n or dt_s <= 0.0:
             return
         self._unseen_s += dt_s
-        self._mix(dt_s)
+        self._mix(dt_s, T_world_ego.yaw_rad)
         F = np.eye(len(STATES))
         F[X, VX] = F[Y, VY] = dt_s
         self._x = self._x @ F.T
         self._P = F @ self._P @ F.T
-        q = np.square(self._sizes[:, 2])
-        for moving in MOVING_FILTERS:
-            for at, by in ((X, VX), (Y, VY)):
-                self._P[:, moving, at, at] += q * dt_s**3 / 3.0
-                self._P[:, moving, at, by] += q * dt_s**2 / 2.0
-                self._P[:, moving, by, at] += q * dt_s**2 / 2.0
-                self._P[:, moving, by, by] += q * dt_s
-        keep = math.exp(-dt_s / config.tilt_memory_s)
+        q = np.square(self._sizes[:, 1])[:, None]
+        moving = np.ones(FILTERS, dtype=np.bool_)
+        moving[STANDING_FILTERS] = False
+        for at, by in ((X, VX), (Y, VY)):
+            self._P[:, moving, at, at] += q * dt_s**3 / 3.0
+            self._P[:, moving, at, by] += q * dt_s**2 / 2.0
+            self._P[:, moving, by, at] += q * dt_s**2 / 2.0
+            self._P[:, moving, by, by] += q * dt_s
+        driving = -math.expm1(-ego_mps / config.driving_mps)
+        keep = math.exp(-driving * dt_s / config.tilt_memory_s)
         mean, var = self._tilt_prior.T
         self._x[..., TILT] = mean[:, None] + keep * (self._x[..., TILT] - ground_shift_rad - mean[:, None])
         self._P[..., TILT, :] *= keep
         self._P[..., TILT] *= keep
         self._P[..., TILT, TILT] += ((1.0 - keep**2) * (var + config.sigma_tilt_rad**2))[:, None]
+        self._P[..., TILT, TILT] += config.tilt_drift_rad**2 * dt_s
         keep = math.exp(-dt_s / config.outline_memory_s)
         for state in (FOOT, HEAD):
             self._x[..., state] *= keep
@@ -173,39 +187,51 @@ class PeopleFilter:
             J[..., 0, 2], J[..., 1, 2] = -at[..., 1], at[..., 0]
             self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
 
-    def _mix(self, dt_s: float) -> None:
-        """People start and stop: who starts has any velocity of its kind, who stops has none."""
+    def _mix(self, dt_s: float, road_rad: float) -> None:
+        """People start, stop and turn: who starts has the velocities of that way of moving, who stops has none."""
+        config, n, m = self.config, len(self._x), len(MOTIONS)
+        start, stop, turn = (
+            -math.expm1(-dt_s / s) for s in (config.stands_for_s, config.moves_for_s, config.turns_after_s)
+        )
+        share = self._shares()[1:] / (1.0 - config.standing)
+        change = np.zeros((m, m))  # from, to
+        change[STANDING, 1:] = start * share
+        change[1:, STANDING] = stop
+        change[1:, 1:] = (1.0 - stop) * turn * share
+        change[np.diag_indices(m)] += 1.0 - change.sum(axis=1)
+        x = np.repeat(self._x.reshape(n, 2, 1, m, -1), m, axis=2)  # height, to, from
+        P = np.repeat(self._P.reshape(n, 2, 1, m, len(STATES), -1), m, axis=2)
+        mean, cov = self._velocities(road_rad)
+        began = np.zeros((m, m), dtype=np.bool_)  # to, from
+        began[1:, STANDING] = began[STANDING, 1:] = True
+        x[:, :, began, VELOCITY] = 0.0
+        P[:, :, began, VELOCITY] = 0.0
+        P[:, :, began, :, VELOCITY] = 0.0
+        for to in MOTIONS:
+            sources = began[to]
+            x[:, :, to, sources, VELOCITY] = mean[:, None, to, None]
+            P[:, :, to, sources, VELOCITY, VELOCITY] = cov[:, None, to, None]
+        weight = self._weight.reshape(n, 2, 1, m) * change.T
+        total = np.maximum(weight.sum(axis=-1), 1e-300)
+        mixed_x, mixed_P = _merged(x, P, weight / total[..., None])
+        self._x, self._P = mixed_x.reshape(self._x.shape), mixed_P.reshape(self._P.shape)
+        self._weight = total.reshape(n, FILTERS)
+        self._weight /= self._weight.sum(axis=1, keepdims=True)
+
+    def _shares(self) -> Floats:
+        """(4,) of the motions, when first seen."""
         config = self.config
-        start, stop = -math.expm1(-dt_s / config.stands_for_s), -math.expm1(-dt_s / config.moves_for_s)
-        x, P, weight = self._x.copy(), self._P.copy(), self._weight.copy()
-        velocity = slice(VX, HEIGHT)
-        for standing, moving in zip(STANDING_FILTERS, MOVING_FILTERS, strict=True):
-            w_s, w_m = self._weight[:, standing], self._weight[:, moving]
-            started, started_P = self._x[:, standing].copy(), self._P[:, standing].copy()
-            started_P[:, velocity, :] = 0.0
-            started_P[:, :, velocity] = 0.0
-            started_P[:, VX, VX] = started_P[:, VY, VY] = self._sizes[:, 1] ** 2
-            stopped, stopped_P = self._x[:, moving].copy(), self._P[:, moving].copy()
-            stopped[:, velocity] = 0.0
-            stopped_P[:, velocity, :] = 0.0
-            stopped_P[:, :, velocity] = 0.0
-            stopped_P[:, VX, VX] = stopped_P[:, VY, VY] = config.stop_mps**2
-            for into, (a, (xa, Pa)), (b, (xb, Pb)) in (
-                (standing, (w_s * (1 - start), (self._x[:, standing], self._P[:, standing])), (w_m * stop, (stopped, stopped_P))),
-                (moving, (w_m * (1 - stop), (self._x[:, moving], self._P[:, moving])), (w_s * start, (started, started_P))),
-            ):  # fmt: skip
-                total = np.maximum(a + b, 1e-300)
-                share = (b / total)[:, None]
-                gap = xb - xa
-                x[:, into] = xa + share * gap
-                P[:, into] = (
-                    (1.0 - share)[..., None] * Pa
-                    + share[..., None] * Pb
-                    + (share * (1.0 - share))[..., None] * gap[:, :, None] * gap[:, None, :]
-                )
-                weight[:, into] = total
-        self._x, self._P = x, P
-        self._weight = weight / weight.sum(axis=1, keepdims=True)
+        along = (1.0 - config.standing) * (1.0 - config.crossing) / 2.0
+        return np.array([config.standing, along, along, (1.0 - config.standing) * config.crossing])
+
+    def _velocities(self, road_rad: float) -> tuple[Floats, Floats]:
+        """Means (N, 4, 2) and covariances (N, 4, 2, 2) of the velocities with which each motion begins, in world."""
+        c, s = math.cos(road_rad), math.sin(road_rad)
+        R = np.array([[c, -s], [s, c]])
+        speed, along, beside = np.moveaxis(self._moves, -1, 0)
+        D = np.zeros((*speed.shape, 2, 2))
+        D[..., 0, 0], D[..., 1, 1] = along**2, beside**2
+        return speed[..., None] * R[:, 0], R @ D @ R.T
 
     def begin(self, boxes: Sequence[PersonBox], tilt_prior: Floats, T_world_ego: SE2, height_m: float) -> None:
         """People seen for the first time, each in a row after the others, already corrected by their boxes.
@@ -216,31 +242,39 @@ class PeopleFilter:
             return
         config, n, before = self.config, len(boxes), len(self._x)
         x, P = np.zeros((n, FILTERS, len(STATES))), np.zeros((n, FILTERS, len(STATES), len(STATES)))
-        weight, rows = np.zeros((n, FILTERS)), np.zeros((n, 5))
+        weight, rows = np.zeros((n, FILTERS)), np.zeros((n, 4))
+        moves = np.zeros((n, len(MOTIONS), 3))
         for k, box in enumerate(boxes):
             sizes = config.sizes(box.label)
+            moves[k] = [
+                (0.0, config.stop_mps, config.stop_mps),
+                (-sizes.along_mps, sizes.sigma_along_mps, sizes.sigma_beside_mps),
+                (sizes.along_mps, sizes.sigma_along_mps, sizes.sigma_beside_mps),
+                (0.0, sizes.crossing_mps, sizes.crossing_mps),
+            ]
             rows[k] = [
-                sizes.reach_m, sizes.moves_mps, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel
+                sizes.reach_m, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel
             ]  # fmt: skip
             for child, (h_m, sigma) in enumerate(
                 ((sizes.height_m, sizes.sigma_height_rel), (sizes.child_m, sizes.sigma_child_rel))
             ):
                 x_m = min(h_m / max(box.tan_height, MIN_SLOPE), bev.MAX_RANGE_M)
-                both = slice(2 * child, 2 * child + 2)
+                both = slice(len(MOTIONS) * child, len(MOTIONS) * (child + 1))
                 x[k, both, :2] = T_world_ego @ np.array([x_m, box.bearing * x_m])
                 x[k, both, HEIGHT], x[k, both, KERB] = math.log(h_m), config.kerb_m
                 P[k, both, :2, :2] = np.eye(2) * (DEPTH_UNKNOWN * x_m) ** 2
                 P[k, both, HEIGHT, HEIGHT] = sigma**2
-                P[k, 2 * child + STANDING, [VX, VY], [VX, VY]] = config.stop_mps**2
-                P[k, 2 * child + MOVING, [VX, VY], [VX, VY]] = sizes.moves_mps**2
-                share = sizes.child if child else 1.0 - sizes.child
-                weight[k, both] = share * np.array([config.standing, 1.0 - config.standing])
+                weight[k, both] = (sizes.child if child else 1.0 - sizes.child) * self._shares()
             x[k, :, TILT] = tilt_prior[k, 0]
             P[k, :, TILT, TILT] = (
                 tilt_prior[k, 1] + config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
             )
             P[k, :, [FOOT, HEAD], [FOOT, HEAD]] = config.sigma_outline_rel**2
             P[k, :, KERB, KERB] = config.sigma_kerb_m**2
+        self._moves = np.concatenate([self._moves, moves])
+        mean, cov = self._velocities(T_world_ego.yaw_rad)
+        x[..., VELOCITY] = np.tile(mean[before:], (1, 2, 1))
+        P[..., VELOCITY, VELOCITY] = np.tile(cov[before:], (1, 2, 1, 1))
         self._x, self._P = np.concatenate([self._x, x]), np.concatenate([self._P, P])
         self._weight = np.concatenate([self._weight, weight])
         self._sizes = np.concatenate([self._sizes, rows])
@@ -296,7 +330,7 @@ class PeopleFilter:
         unseen_s = self._unseen_s[at]
         R *= np.maximum(1.0, config.box_memory_s / unseen_s)[:, None, None]
         uses = np.array([b.whole for b in boxes]) & (unseen_s >= config.width_memory_s)
-        R[:, WIDTH, WIDTH] = np.where(uses, self._sizes[at, 4], UNUSED) ** 2
+        R[:, WIDTH, WIDTH] = np.where(uses, self._sizes[at, 3], UNUSED) ** 2
         return z, R
 
     def _expected(self, x: Floats, at: NDArray[np.intp], T_world_ego: SE2, height_m: float) -> tuple[Floats, Floats]:
@@ -312,7 +346,7 @@ class PeopleFilter:
         expected[..., BOTTOM] = bev.road_slope(foot, below) - x[..., TILT] + x[..., FOOT] * tall  # Eq. 1
         nearer = (depth - foot) * below / (foot * height)  # how much taller a nearer foot makes it
         expected[..., TALL] = x[..., HEIGHT] - np.log(depth) + np.log1p(nearer) + x[..., FOOT] - x[..., HEAD]
-        expected[..., WIDTH] = self._sizes[at, 3][:, None, None] - np.log(depth)
+        expected[..., WIDTH] = self._sizes[at, 2][:, None, None] - np.log(depth)
         by_depth = np.stack([-y / depth**2, -below / foot**2, -(1.0 + nearer) / depth, -1.0 / depth], axis=-1)
         J[..., :2] = by_depth[..., None] * R[:, 0]
         J[..., BEARING, :2] += R[:, 1] / depth[..., None]
@@ -331,8 +365,7 @@ class PeopleFilter:
             F = np.eye(len(STATES))
             F[X, VX] = F[Y, VY] = after_s
             mean, cov = mean @ F.T, F @ cov @ F.T
-            moving = self._weight[:, MOVING_FILTERS].sum(axis=1)
-            q = moving * np.square(self._sizes[:, 2])
+            q = (1.0 - self._weight[:, STANDING_FILTERS].sum(axis=1)) * np.square(self._sizes[:, 1])
             cov[:, [X, Y], [X, Y]] += (q * after_s**3 / 3.0)[:, None]
             cov[:, [VX, VY], [VX, VY]] += (q * after_s)[:, None]
         return Moments(

@@ -26,9 +26,10 @@ Floats = NDArray[np.float64]
 NEVER = 1e9  # the cost of what can't be
 NEW = 2.0  # -2 log of the density of new people in bearing, slope and log height: about one in the image
 SIDE_MARGIN = 0.03  # of the image's width: who is predicted farther outside has left
+UNKNOWN_MPS = 10.0  # an ego of unknown motion is taken to drive
 LEAVES_S = 0.3  # until who left the image is forgotten
-MAX_SPEED_MPS = {PEDESTRIAN: 6.0, CYCLIST: 16.0}
-STANDS, WALKS = 0.7, 0.4  # probability of standing: hysteresis of what is reported
+
+STANDS, WALKS = 0.85, 0.5  # probability of standing: hysteresis of what is reported
 
 
 class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -112,7 +113,8 @@ class PeopleTracker:
         ego, pitch_rad = frame.ego, road.ground.pitch_rad
         shift_rad = 0.0 if self._pitch_rad is None else pitch_rad - self._pitch_rad - (frame.turn_rad or 0.0)
         self._pitch_rad = pitch_rad
-        self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad)
+        ego_mps = UNKNOWN_MPS if frame.travelled_m is None else frame.travelled_m / max(frame.dt_s, 1e-3)
+        self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, ego_mps)
 
     def _associate(self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float) -> list[tuple[int, int]]:
         """(row, box): the assignment of least total cost, the negative log-likelihood within the gate."""
