@@ -67,7 +67,7 @@ class NearbyUser(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Nearby(msgspec.Struct, frozen=True, kw_only=True):
-    """Every road user of the newest estimate, who is `nearby` first and then the soonest: an aid, no safety function."""
+    """Every road user of the newest estimate, who is `nearby` first, then the soonest: an aid, no safety function."""
 
     epoch: int
     frame_id: FrameId

@@ -35,9 +35,9 @@ from birdslam.runtime.wire import (
 )
 from birdslam.sources.speed_log import KEPT_READINGS
 from birdslam.types import (
+    Approach,
     Attitude,
     EgoEdge,
-    Approach,
     Estimate,
     FollowedPerson,
     FrameRef,

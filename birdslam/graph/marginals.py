@@ -14,7 +14,7 @@ import numpy as np
 
 from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.approach import approaches
+from birdslam.graph.around.approach import approaches
 from birdslam.graph.costs import Floats, Triple
 from birdslam.graph.standing import judge, reported_velocity
 from birdslam.graph.vehicles import VehicleNode

@@ -16,6 +16,8 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.se2 import SE2
+from birdslam.graph.around.hidden_road import hidden_fans
+from birdslam.graph.around.people import people_estimates
 from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, packed, plain, unpack, unpacked
 from birdslam.graph.costs import Floats
 from birdslam.graph.edges import PoseEdges, pose_edges
@@ -24,11 +26,9 @@ from birdslam.graph.factors.factor import Factor, GraphFrame
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.factors.vehicle_detection import VehicleDetections
 from birdslam.graph.graph_config import GraphConfig, check_together
-from birdslam.graph.hidden_road import hidden_fans
 from birdslam.graph.marginals import vehicle_estimates
 from birdslam.graph.minimum import minimise, solver
 from birdslam.graph.pending_map import PendingMap
-from birdslam.graph.people import people_estimates
 from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edge
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window

@@ -35,7 +35,7 @@ COVER_WIDTH = 0.3  # of a box's width: a nearer box that covers less of its lowe
 class PeopleBoxesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How sure boxes of people are; fractions are of the box's height."""
 
-    sigma_edge_rel: float = 0.018  # 1-sigma of lower and upper edge: RRC's boxes of people on KITTI tracking
+    sigma_edge_rel: float = 0.03  # 1-sigma of lower and upper edge: RRC's boxes of people on KITTI tracking
     sigma_edge_px: float = 0.5  # and beside it
     sigma_side_rel: float = 0.035  # of the middle column: arms and legs swing
     sigma_growth: float = 2.0  # as `LocalisationConfig.sigma_growth`
@@ -99,20 +99,18 @@ def _joined(detections: Detections) -> tuple[Floats, list[str], list[bool]]:
     """(boxes and scores (N, 5), labels, which are whole): riders and their bicycles as one, without occupants."""
     found = np.column_stack([detections.boxes_px, detections.scores])
     sizes = found[:, 2:4] - found[:, :2]
-    solid = (sizes >= 1.0).all(axis=1)
-    of = {
-        name: found[[i for i, label in enumerate(detections.labels) if label in names and solid[i]]]
-        for name, names in (
-            (PERSON, (PERSON,)), (BICYCLE, (BICYCLE,)), (MOTORCYCLE, (MOTORCYCLE,)), (CYCLIST, (CYCLIST,)),
-            ("car", CARS),
-        )
-    }  # fmt: skip
-    people = _without_copies(of[PERSON])
-    cyclists = _without_copies(of[CYCLIST])
+    solid = np.flatnonzero((sizes >= 1.0).all(axis=1)).tolist()
+
+    def of(*labels: str) -> Floats:
+        return found[[i for i in solid if detections.labels[i] in labels]]
+
+    bicycles, motorcycles = of(BICYCLE), of(MOTORCYCLE)
+    people = _without_copies(of(PERSON))
+    cyclists = _without_copies(of(CYCLIST))
     if len(cyclists) and len(people):
         people = people[iou(people[:, :4], cyclists[:, :4]).max(axis=1) < 0.5]
-    people = people[~_occupants(people, of["car"])]
-    mounts = np.vstack([of[BICYCLE], of[MOTORCYCLE]])
+    people = people[~_occupants(people, of(*CARS))]
+    mounts = np.vstack([bicycles, motorcycles])
     rider_of = _riders(people, mounts)
     rows, labels, whole = [], [], []
     for i, person in enumerate(people):
@@ -121,13 +119,13 @@ def _joined(detections: Detections) -> tuple[Floats, list[str], list[bool]]:
             rows.append(person)
             labels.append(PEDESTRIAN)
             whole.append(True)
-        elif mount < len(of[BICYCLE]):
+        elif mount < len(bicycles):
             bike = mounts[mount]
             rows.append(np.concatenate([np.minimum(person[:2], bike[:2]), np.maximum(person[2:], bike[2:])]))
             labels.append(CYCLIST)
             whole.append(True)
     ridden = set(rider_of.values())
-    for k, bike in enumerate(of[BICYCLE]):
+    for k, bike in enumerate(bicycles):
         if k not in ridden:
             rows.append(bike)
             labels.append(BICYCLE)

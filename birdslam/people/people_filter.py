@@ -1,19 +1,22 @@
-"""Where people are and how they move: Kalman filters, one for each mode of motion and height, mixed by likelihood.
+"""Where people are and how they move: Kalman filters, one for each way of moving and height, mixed by likelihood.
 
     x = [x, y, vx, vy, log h, tilt, kerb, foot, head]
 
-With H the camera's height, b the kerb (the road under the feet lies b lower than the ego's plane), and slopes that count
-downwards from the plane of the road, the box of somebody at depth X, whose nearest foot is at X - reach, measures
+With H the camera's height, b the kerb (the road under the feet lies b lower than the ego's plane), and slopes that
+count downwards from the plane of the road, the box of somebody at depth X, whose nearest foot is at X - reach, measures
 
     bearing = Y / X,   bottom = (H + b) / (X - reach) - tilt + foot h / X (Eq. 1),
-    log of the height = log(h) - log(X) + reach (H + b) / (h X) + foot - head,   log width = log w - log X,
+    log of the height = log(h) - log(X) + log(1 + reach (H + b) / ((X - reach) h)) + foot - head,
+    log of the width = log(w) - log(X),
 
-where foot and head are errors of the box that last for a while: somebody's pose, what a detector makes of clothes.
+where foot and head are errors of the box that last for a while: somebody's pose, what a detector makes of clothes. The
+logarithms keep the derivatives the same from frame to frame; with the top's slope in their place the filter grows too
+sure of itself. Feet that something hides are a second hypothesis of each box: then it ends higher by a share of h / X.
 
-Feet that something hides are a second hypothesis of each box: then the bottom lies higher by a share of h / X. Modes are
-standing, walking along the road and walking anyhow, which people change (interacting multiple model, Blom and Bar-Shalom 1988), for a grown-up's height
-and for a child's, which they don't. So the road places first and the size second: a small box whose foot is near is a
-child's, and no distant adult's. Tilt, kerb and height are states, so that what lasts for a track is not averaged away.
+People stand, walk along the road or walk anyhow, and change between these (interacting multiple model, Blom and
+Bar-Shalom 1988), each with a grown-up's height and with a child's, which does not change. So the road places first and
+the size second: a small box whose foot is near is a child's, and no distant adult's. Tilt, kerb and height are states,
+so that what lasts for a track is not averaged away.
 """
 
 from __future__ import annotations
@@ -80,17 +83,17 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stop_mps: float = 0.08  # 1-sigma of the velocity of who stands: they sway
     sigma_tilt_rad: float = 0.012  # of the road at somebody against the ego's, beside the front end's own sigma
     tilt_memory_s: float = 5.0  # of driving: how long that lasts
-    tilt_drift_rad: float = 0.002  # and by how much it changes within a second as people walk on
+    tilt_drift_rad: float = 0.006  # and by how much it changes within a second as people walk on
     driving_mps: float = 1.0  # as `GroundSizeConfig.driving_mps`
     sigma_roll_rad: float = 0.01  # of the front end's roll, which tilts what is aside
     kerb_m: float = -0.03  # people are on pavements too
-    sigma_kerb_m: float = 0.08
+    sigma_kerb_m: float = 0.1
     hidden_share: float = 0.3  # of a person's height, that is hidden where the feet are
     sigma_hidden_share: float = 0.35
-    box_memory_s: float = 0.15  # for so long a box has the same error: this time counts as one box
+    box_memory_s: float = 0.4  # for so long a box has the same error: this time counts as one box
     width_memory_s: float = 5.0  # and its width, by clothes and by what is carried: it counts once in so long
-    outline_memory_s: float = 1.0  # errors that last: a box that is drawn too low or too high, by
-    sigma_outline_rel: float = 0.028  # of its height
+    outline_memory_s: float = 2.0  # errors that last: a box that is drawn too low or too high, by
+    sigma_outline_rel: float = 0.05  # of its height
     sure_feet: float = 0.01  # a box whose feet are hidden with less probability tells of the road
     sigma_common_rel: float = 0.03  # of the mean height of those who are there
 
@@ -181,10 +184,10 @@ class PeopleFilter:
             self._P[..., state] *= keep
             self._P[..., state, state] += (1.0 - keep**2) * config.sigma_outline_rel**2
         if ego_cov is not None:  # an error of the ego's step moves everybody against it
-            at = self._x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]
+            from_ego = self._x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]
             J = np.zeros((n, FILTERS, 2, 3))
             J[..., :2, :2] = T_world_ego.rotation()
-            J[..., 0, 2], J[..., 1, 2] = -at[..., 1], at[..., 0]
+            J[..., 0, 2], J[..., 1, 2] = -from_ego[..., 1], from_ego[..., 0]
             self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
 
     def _mix(self, dt_s: float, road_rad: float) -> None:
@@ -445,7 +448,7 @@ def measured_boxes(boxes: Sequence[PersonBox]) -> tuple[Floats, Floats]:
 
 
 def _hide_feet(noise: Floats, tall: Floats, config: PeopleConfig) -> None:
-    """What hidden feet add to the covariance (..., 4, 4) of boxes of `tall` (...), a height at a depth of 1, in place."""
+    """What hidden feet add to covariances (..., 4, 4) of boxes of `tall` (...), a height at a depth of 1, in place."""
     of_bottom, of_height = config.sigma_hidden_share * tall, config.sigma_hidden_share / (1.0 - config.hidden_share)
     noise[..., BOTTOM, BOTTOM] += of_bottom**2
     noise[..., BOTTOM, TALL] += of_bottom * of_height

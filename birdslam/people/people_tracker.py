@@ -1,4 +1,7 @@
-"""People followed through time: which box is whom, who is new, who is gone; ids that last through a second of hiding."""
+"""People followed through time: which box is whom, who is new, who is gone.
+
+Ids last through a second of hiding.
+"""
 
 from __future__ import annotations
 

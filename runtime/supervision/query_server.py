@@ -25,7 +25,9 @@ class QueryServer:
         self._atlas = Atlas(configuration.atlas)
         self._newest: Estimate | None = None
         self._turn = threading.Lock()  # one thread adds, another answers
-        bus.answer_queries({"map": self._map, "trajectory": self._trajectory, "nearby": self._nearby, "configuration": self._settings})
+        bus.answer_queries(
+            {"map": self._map, "trajectory": self._trajectory, "nearby": self._nearby, "configuration": self._settings}
+        )
 
     def add(self, estimate: Estimate) -> None:
         """One frame's."""

@@ -1,7 +1,7 @@
 """What the camera can't see of the road: the fans behind vehicles, out of which somebody could step.
 
-The camera stands over the ego's origin. A vehicle of height h, whose farthest corner is d away along a ray, hides the
-road behind it as far as the ray over its roof goes: d H / (H - h) for a camera at H, or without end where it is as tall.
+The camera stands over the ego's origin. A vehicle of height h, whose outline is d away along a ray, hides the road
+behind it as far as the ray over its roof goes: d H / (H - h) for a camera at H, or without end where it is as tall.
 """
 
 from __future__ import annotations

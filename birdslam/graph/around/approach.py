@@ -1,8 +1,8 @@
 """Who may come near: the closest approach of road users to the ego, were all to go on as they move now.
 
 An aid for planners and no safety function: nobody's intention is in it, and nobody who was not detected.
-With p and v the place and velocity of somebody against the ego's, t = -p.v / v.v and d = |p + v t|; their sigmas come from
-the covariances of p and v to first order.
+With p and v the place and velocity of somebody against the ego's, t = -p.v / v.v and d = |p + v t|; their sigmas come
+from the covariances of p and v to first order.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """People in the world of the graph: those that the front end follows, from the ego's newest pose.
 
 They are filtered outside the joint graph (people/people_filter.py): sixty people more would not fit into a frame's
-millisecond, and a person's box says nothing of the ego. What they get here is the graph's world, epoch and ego, with the
-ego's covariance, and where frames bring no picture the way that they went on.
+millisecond, and a person's box says nothing of the ego. What they get here is the graph's world, epoch and ego, with
+the ego's covariance, and where frames bring no picture the way that they went on.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.approach import approaches
+from birdslam.graph.around.approach import approaches
 from birdslam.graph.costs import Floats
 from birdslam.types import FollowedPerson, RoadUser
 
