@@ -341,7 +341,7 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
         check_finite(self, "scale_sigma_rel")
 
 
-class Approach(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
+class Approach(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """How near somebody comes to the ego, were both to go on as they move now: an aid, and no safety function.
 
     From means and covariances of place and velocity, to first order. `nearby` is a hint to look at: within 5 s they
@@ -411,17 +411,25 @@ class RoadUser(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 VehicleEstimate = RoadUser  # its name before people were road users
 
 
-class HiddenFan(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+class HiddenFan(msgspec.Struct, frozen=True, kw_only=True):
     """Road that the camera can't see for a vehicle before it: a polygon in ego, in m, counter-clockwise.
 
     Somebody could step out of it.
     """
 
     vehicle: BodyId  # behind whom
-    corners_m: tuple[tuple[float, float], ...]
+    x_m: tuple[float, ...]  # of its corners
+    y_m: tuple[float, ...]  # of its corners
 
     def __post_init__(self) -> None:
-        check_points(self, *self.corners_m)
+        check_finite(self, "x_m", "y_m")
+        if len(self.x_m) != len(self.y_m):
+            raise ValueError(f"HiddenFan has {len(self.x_m)} x_m and {len(self.y_m)} y_m")
+
+    @property
+    def corners_m(self) -> tuple[tuple[float, float], ...]:
+        """(x, y) of each corner."""
+        return tuple(zip(self.x_m, self.y_m, strict=True))
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):

@@ -200,7 +200,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
                 **_KNOWN,
             ),
         ),
-        hidden=(HiddenFan(vehicle=7, corners_m=((20.5, -4.0), (30.75, -6.0), (31.0, -3.0), (20.75, -2.0))),),
+        hidden=(HiddenFan(vehicle=7, x_m=(20.5, 30.75, 31.0, 20.75), y_m=(-4.0, -6.0, -3.0, -2.0)),),
     ),
     MapUpdate(
         epoch=2, frame_id=4711, landmarks_m=((80.5, -9.0),), lanes_m=((81.0, -7.25), (82.0, -7.5)), lane_ids=(12, -1)

@@ -39,7 +39,7 @@ class PeopleBoxesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     sigma_edge_px: float = 0.5  # and beside it
     sigma_side_rel: float = 0.035  # of the middle column: arms and legs swing
     sigma_growth: float = 2.0  # as `LocalisationConfig.sigma_growth`
-    sure_score: float = 0.85
+    sure_score: float = 0.85  # from it on nothing grows
     cut_margin_px: float = 4.0  # an edge so near to the image's border counts as cut
     hidden: float = 0.003  # prior probability that feet are hidden though no box covers them: behind what has no box
     hidden_covered: float = 0.03  # and where a nearer box covers them

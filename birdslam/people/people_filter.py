@@ -53,19 +53,19 @@ MIN_SLOPE = 1e-3
 class Sizes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a kind of road user measures, and how it moves."""
 
-    height_m: float  # of a grown-up
-    sigma_height_rel: float
-    child_m: float  # of a child
-    sigma_child_rel: float
+    height_m: float  # mean of grown-ups
+    sigma_height_rel: float  # 1-sigma of it
+    child_m: float  # mean height of children
+    sigma_child_rel: float  # 1-sigma of it
     child: float  # of them, are children
-    width_m: float  # of the box
-    sigma_width_rel: float
+    width_m: float  # mean of boxes
+    sigma_width_rel: float  # 1-sigma of it
     length_m: float  # of the footprint
     footprint_m: float  # its width
     reach_m: float  # from the centre to the nearest foot or wheel, along the line of sight
     along_mps: float  # speed of who moves along the road
-    sigma_along_mps: float  # of it
-    sigma_beside_mps: float  # and across it
+    sigma_along_mps: float  # 1-sigma of it
+    sigma_beside_mps: float  # 1-sigma of the velocity across it
     crossing_mps: float  # 1-sigma of the velocity of who moves anyhow
     change_mps: float  # 1-sigma by which a velocity changes within a second
 
@@ -73,8 +73,41 @@ class Sizes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Priors of people and of the road under them, and how long the errors of a box last."""
 
-    pedestrian: Sizes = Sizes(1.72, 0.075, 1.2, 0.15, 0.06, 0.68, 0.3, 0.7, 0.6, 0.25, 1.3, 0.4, 0.25, 1.1, 0.5)
-    cyclist: Sizes = Sizes(1.74, 0.07, 1.45, 0.12, 0.06, 0.9, 0.5, 1.75, 0.6, 0.35, 4.5, 2.0, 0.5, 4.0, 1.2)
+    # Heights by KITTI tracking's labels, widths of boxes, how people walk; docs/constants.md has the data
+    pedestrian: Sizes = Sizes(
+        height_m=1.72,
+        sigma_height_rel=0.075,
+        child_m=1.2,
+        sigma_child_rel=0.15,
+        child=0.06,
+        width_m=0.68,
+        sigma_width_rel=0.3,
+        length_m=0.7,
+        footprint_m=0.6,
+        reach_m=0.25,
+        along_mps=1.3,
+        sigma_along_mps=0.4,
+        sigma_beside_mps=0.25,
+        crossing_mps=1.1,
+        change_mps=0.5,
+    )
+    cyclist: Sizes = Sizes(  # with the rider
+        height_m=1.74,
+        sigma_height_rel=0.07,
+        child_m=1.45,
+        sigma_child_rel=0.12,
+        child=0.06,
+        width_m=0.9,
+        sigma_width_rel=0.5,
+        length_m=1.75,
+        footprint_m=0.6,
+        reach_m=0.35,
+        along_mps=4.5,
+        sigma_along_mps=2.0,
+        sigma_beside_mps=0.5,
+        crossing_mps=4.0,
+        change_mps=1.2,
+    )
     standing: float = 0.2  # of them stand when first seen
     stands_for_s: float = 10.0  # on average
     moves_for_s: float = 10.0  # until a stop
@@ -87,9 +120,9 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     driving_mps: float = 1.0  # as `GroundSizeConfig.driving_mps`
     sigma_roll_rad: float = 0.01  # of the front end's roll, which tilts what is aside
     kerb_m: float = -0.03  # people are on pavements too
-    sigma_kerb_m: float = 0.1
+    sigma_kerb_m: float = 0.1  # 1-sigma of it
     hidden_share: float = 0.3  # of a person's height, that is hidden where the feet are
-    sigma_hidden_share: float = 0.35
+    sigma_hidden_share: float = 0.35  # 1-sigma of it
     box_memory_s: float = 0.4  # for so long a box has the same error: this time counts as one box
     width_memory_s: float = 5.0  # and its width, by clothes and by what is carried: it counts once in so long
     outline_memory_s: float = 2.0  # errors that last: a box that is drawn too low or too high, by

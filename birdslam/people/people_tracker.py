@@ -41,12 +41,12 @@ class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     gate: float = 16.3  # squared Mahalanobis distance of bearing, bottom and top: 99.9 % of three
     birth_score: float = 0.5  # a box must reach it to begin a track
     birth_iou: float = 0.55  # a box that overlaps a followed one's more begins none
-    confirm_hits: int = 2
-    forget_unconfirmed_s: float = 0.25
+    confirm_hits: int = 2  # a track gets its id when it has been seen so often
+    forget_unconfirmed_s: float = 0.25  # without a box, of who has no id yet
     forget_s: float = 1.5  # without a box, of who has an id
     most: int = 60  # who is followed at once: the nearest
-    boxes: PeopleBoxesConfig = PeopleBoxesConfig()
-    people: PeopleConfig = PeopleConfig()
+    boxes: PeopleBoxesConfig = PeopleBoxesConfig()  # how sure boxes are
+    people: PeopleConfig = PeopleConfig()  # how people are and move
 
 
 @dataclass

@@ -38,7 +38,6 @@ def hidden_fans(vehicles: Sequence[RoadUser], world: SE2, camera_m: float) -> tu
         ends = [c * min(reach, FARTHEST_M / abs(c)) for c in (first, last)]
         if all(abs(e) > abs(c) + LEAST_M for e, c in zip(ends, (first, last), strict=True)):
             polygon = (first, ends[0], ends[1], last)
-            fans.append(
-                (abs(at), HiddenFan(vehicle=vehicle.vehicle, corners_m=tuple((c.real, c.imag) for c in polygon)))
-            )
+            x_m, y_m = tuple(c.real for c in polygon), tuple(c.imag for c in polygon)
+            fans.append((abs(at), HiddenFan(vehicle=vehicle.vehicle, x_m=x_m, y_m=y_m)))
     return tuple(fan for _, fan in sorted(fans, key=lambda fan: fan[0]))
