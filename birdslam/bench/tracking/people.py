@@ -3,7 +3,8 @@
 Each matched, untruncated person's place is compared with the label's as cars' are (localisation.py): along (depth,
 ego's x) and across, with the share of errors inside the ellipses of 68.3 and 95.4 %. Speeds are compared with those of
 the labels' places over a second. Tracks are judged in bird's-eye view: similarity falls from 1 at the label's place to
-0.5 at 2 m, so that CLEAR MOT and IDF1 match within 2 m (as nuScenes does) and HOTA averages over all thresholds.
+0.5 at 2 m, so that CLEAR MOT and IDF1 match within 2 m (as nuScenes does) and HOTA averages over all thresholds. Tracks
+are those in sight, as a planner takes them: a lost one goes on for a while, but not for these metrics.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ from birdslam.bench.tracking.metrics import BoxFrame, assign, clear_mot, hota_pa
 from birdslam.perception import Detections
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import DONT_CARE, Label, hull_px
-from birdslam.types import FollowedPerson, Measurements, Moves
+from birdslam.types import IN_SIGHT_NS, FollowedPerson, Measurements, Moves
 from birdslam.vehicles.placement.localisation import iou
 
 Floats = NDArray[np.float64]
 
 KINDS = {"pedestrian": ("Pedestrian",), "cyclist": ("Cyclist",)}  # of the labels
-NEUTRAL = {"pedestrian": ("Person", "Person_sitting"), "cyclist": ("Pedestrian", "Person", "Person_sitting")}
+# Riders have no recorded boxes of their own, but some of pedestrians
+NEUTRAL = {"pedestrian": ("Person", "Person_sitting", "Cyclist"), "cyclist": ("Pedestrian", "Person", "Person_sitting")}
 RANGES_M = ((5.0, 15.0), (15.0, 30.0), (30.0, 50.0))
 HALF_AT_M = 2.0  # where similarity is 0.5
 WALKING_MPS, STANDING_MPS = 0.5, 0.2  # true speeds: of who walks, and of who stands
@@ -158,7 +160,8 @@ def judge(sequence: TrackingSequence, measurements: Iterable[Measurements], kind
         for i, j in zip(*assign(overlap, MATCH_IOU), strict=True):
             if asked[i].truncated <= 0:
                 result.errors.append(_error(sequence, asked[i], seen[j], places, ego_mps))
-        result.tracked.append(_tracked(sequence, here, asked, told, kind))
+        in_sight = [p for p in told if p.age_ns <= IN_SIGHT_NS]
+        result.tracked.append(_tracked(sequence, here, in_sight, kind))
     return result
 
 
@@ -205,7 +208,6 @@ def _error(
 def _tracked(
     sequence: TrackingSequence,
     here: Sequence[Label],
-    asked: Sequence[Label],
     told: Sequence[FollowedPerson],
     kind: str,
 ) -> BoxFrame:

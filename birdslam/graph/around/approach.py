@@ -43,4 +43,6 @@ def approaches(p: Floats, v: Floats, p_cov: Floats, v_cov: Floats) -> list[Appro
 
 def _form(a: Floats, cov: Floats) -> Floats:
     """(N,): a' C a."""
-    return np.asarray(np.einsum("ni,nij,nj->n", a, cov, a))
+    x, y = a[:, 0], a[:, 1]
+    out: Floats = x * (x * cov[:, 0, 0] + 2.0 * y * cov[:, 0, 1]) + y * y * cov[:, 1, 1]
+    return out

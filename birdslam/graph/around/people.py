@@ -7,7 +7,6 @@ the ego's covariance, and where frames bring no picture the way that they went o
 
 from __future__ import annotations
 
-import cmath
 import math
 from collections.abc import Sequence
 
@@ -62,15 +61,16 @@ def people_estimates(
     R = world.rotation()
     in_world, velocity = (world @ p).tolist(), (v @ R.T).tolist()
     velocity_cov = (R @ U @ R.T).tolist()
-    age_ns = round(since_s * 1e9)
+    later_ns = round(since_s * 1e9)
+    yaws = np.arctan2(np.sin(heading + world.yaw_rad), np.cos(heading + world.yaw_rad)).tolist()
     return tuple(
         RoadUser(
             vehicle=f.person,
-            T_world_vehicle=SE2(x, y, cmath.phase(cmath.rect(1.0, world.yaw_rad + turn))),
+            T_world_vehicle=SE2(x, y, yaw_rad),
             cov=(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, yaw),
             velocity_mps=(vx, vy),
             velocity_cov=(uxx, uxy, uxy, uyy),
-            age_ns=f.age_ns + age_ns,
+            age_ns=f.age_ns + later_ns,
             frames=f.frames,
             label=f.label,
             length_m=f.length_m,
@@ -83,7 +83,7 @@ def people_estimates(
             child=f.child,
             approach=approach,
         )
-        for f, (x, y), (vx, vy), ((xx, xy), (_, yy)), ((uxx, uxy), (_, uyy)), turn, yaw, approach in zip(
-            people, in_world, velocity, own, velocity_cov, heading.tolist(), yaw_var, near, strict=True
+        for f, (x, y), (vx, vy), ((xx, xy), (_, yy)), ((uxx, uxy), (_, uyy)), yaw_rad, yaw, approach in zip(
+            people, in_world, velocity, own, velocity_cov, yaws, yaw_var, near, strict=True
         )
     )
