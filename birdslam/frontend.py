@@ -20,6 +20,8 @@ from birdslam.odometry.dead_reckoning import DeadReckoning
 from birdslam.odometry.external import ExternalConfig
 from birdslam.odometry.odometry import Motion, Odometry, OdometryConfig
 from birdslam.odometry.plausibility import PlausibilityConfig, PlausibilityGate
+from birdslam.people.people_records import followed_people
+from birdslam.people.people_tracker import PeopleTracker, PeopleTrackingConfig
 from birdslam.perception import Perception
 from birdslam.types import (
     EgoEdge,
@@ -60,6 +62,7 @@ class FrontEndConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lanes: LanesConfig = LanesConfig()
     lane_edges: LaneEdgesConfig = LaneEdgesConfig()
     height: CameraHeightConfig = CameraHeightConfig()
+    people: PeopleTrackingConfig = PeopleTrackingConfig()
 
 
 class Pending(Protocol):
@@ -103,6 +106,7 @@ class FrontEnd:
         self.odometry: EgoMotion = odometry or Odometry(camera, config.odometry)
         self._dead_reckoning = DeadReckoning(camera, config.static_map.attitude_memory_m)
         self._plausibility = PlausibilityGate(config.plausibility)
+        self.people = PeopleTracker(camera, config.people)
         self.vehicles = OutOfSequenceTracker(
             Tracker(
                 camera,
@@ -113,12 +117,14 @@ class FrontEnd:
                 frustum_network,
             ),
             config.out_of_sequence,
+            (self.people,),
         )
         self.height = CameraHeightEstimator(camera, config.height, config.localisation)
         self._lanes = LaneMapper(camera, config.static_map, config.lanes, config.lane_edges, lane_head)
         estimated = camera.scale_sigma_rel > MEASURED_SIGMA_REL
         self._scale_status = (Status.SCALE_ESTIMATED,) if estimated else ()
         self._last_frame: int | None = None
+        self._present = EgoFrame(-1, 0, SE2())
         self._last = 0, 0.0, SE2()  # when, the camera's pitch against the level, and T_world_ego
 
     def measure(self, frame: Frame, pending: Pending) -> Measurements:
@@ -156,6 +162,7 @@ class FrontEnd:
             scale_sigma_rel=0.0 if motion is None else motion.scale_sigma_rel,
             speed_sources=() if motion is None else motion.speed_sources,
             camera_sigma_rel=self.camera.scale_sigma_rel,
+            people=followed_people(self.people, self._present),
             ages=dict(perception.ages if lanes.age is None else perception.ages | {"lanes": lanes.age}),
         )
         return self._plausibility.admit(measurements)
@@ -185,6 +192,7 @@ class FrontEnd:
     ) -> tuple[tuple[VehicleEdge, ...], tuple[MotionEdge, ...]]:
         """CV and VV edges of this frame's detections, or of late ones, which are of an earlier frame."""
         opened = self._open_frame(frame, motion)
+        self._present = opened.ego
         self.vehicles.open_frame(opened)
         age = perception.ages.get("detector", 0)
         depth = perception.depth if perception.ages.get("depth", 0) == age else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from birdslam.geometry.se2 import SE2
-from birdslam.types import BodyId, FrameId, check_finite, check_points
+from birdslam.types import Approach, BodyId, Estimate, FrameId, check_finite, check_points
 
 
 class TimedPose(msgspec.Struct, frozen=True, array_like=True):
@@ -54,3 +54,48 @@ class MapSnapshot(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError(f"lane_ids has {len(self.lane_ids)} entries for {len(self.lanes_m)} points of lanes_m")
         check_finite(self, "cell_m")
         check_points(self, *self.landmarks_m, *self.lanes_m)
+
+
+class NearbyUser(msgspec.Struct, frozen=True, kw_only=True):
+    """A road user as the ego has it: where it is, and how near it may come."""
+
+    vehicle: BodyId  # its number
+    label: str  # its class
+    T_ego_vehicle: SE2
+    approach: Approach
+    age_ns: int = 0  # source time since it was last seen
+
+
+class Nearby(msgspec.Struct, frozen=True, kw_only=True):
+    """Every road user of the newest estimate, who is `nearby` first, then the soonest: an aid, no safety function."""
+
+    epoch: int
+    frame_id: FrameId
+    t_source_ns: int
+    t_capture_ns: int
+    valid: bool
+    users: tuple[NearbyUser, ...] = ()
+
+
+def nearby(estimate: Estimate) -> Nearby:
+    """The road users of an estimate in the order of their closest approach."""
+    users = [
+        NearbyUser(
+            vehicle=user.vehicle,
+            label=user.label,
+            T_ego_vehicle=estimate.T_world_ego.between(user.T_world_vehicle),
+            approach=user.approach,
+            age_ns=user.age_ns,
+        )
+        for user in estimate.road_users
+        if user.approach is not None
+    ]
+    users.sort(key=lambda user: (not user.approach.nearby, user.approach.time_s, user.approach.distance_m))
+    return Nearby(
+        epoch=estimate.epoch,
+        frame_id=estimate.frame_id,
+        t_source_ns=estimate.t_source_ns,
+        t_capture_ns=estimate.t_capture_ns,
+        valid=estimate.valid,
+        users=tuple(users),
+    )

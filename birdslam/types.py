@@ -41,6 +41,8 @@ FrameId = Annotated[int, msgspec.Meta(ge=0)]
 Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 BodyId = Annotated[int, msgspec.Meta(ge=0)]
 NS_PER_S = 1_000_000_000
+PEOPLE = frozenset({"pedestrian", "cyclist"})  # labels of `Estimate.people`
+FIRST_PERSON = 1 << 20  # people's numbers begin here, so that no vehicle has one of them
 IN_SIGHT_NS = 350_000_000  # perceive runs its networks at least three times a second
 
 
@@ -274,6 +276,44 @@ class Ground(msgspec.Struct, frozen=True, kw_only=True):
         check_finite(self, "height_m", "pitch_rad", "roll_rad")
 
 
+class FollowedPerson(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
+    """A person or cyclist in one frame, as the front end's filter has followed them until it (people/).
+
+    Place and velocity over the ground are in the axes of this frame's ego. People are filtered outside the joint graph:
+    sixty of them and ten vehicles would not fit into its millisecond; the graph gives them its world and its ego.
+    """
+
+    person: BodyId  # its number, which no vehicle has
+    x_m: float
+    y_m: float
+    cov: Cov2
+    vx_mps: float  # over the ground
+    vy_mps: float
+    velocity_cov: Cov2  # including the probability that they stand
+    label: str = "pedestrian"
+    label_probability: Probability = 1.0
+    score: float = 1.0  # of the last box
+    box_px: Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)] = (0.0, 0.0, 0.0, 0.0)  # the last
+    height_m: float = 1.7
+    sigma_height_m: float = 0.0
+    child: Probability = 0.0  # the probability of a child's height
+    length_m: float = 0.7  # of the footprint
+    width_m: float = 0.6
+    standing: Probability = 0.5  # the probability that they stand
+    moves: Moves = Moves.UNDECIDED
+    age_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # source time since their last box; 0: it is of this frame
+    frames: int = 1  # that they were seen in
+
+    def __post_init__(self) -> None:
+        cov, u = self.cov, self.velocity_cov
+        total = self.x_m + self.y_m + self.vx_mps + self.vy_mps + sum(cov) + sum(u) + self.score + sum(self.box_px)
+        total += self.height_m + self.sigma_height_m + self.length_m + self.width_m
+        if not _is_sound(total, cov[0], cov[3], u[0], u[3]):
+            check_finite(self, "x_m", "y_m", "vx_mps", "vy_mps", "score", "box_px", "height_m", "sigma_height_m")
+            check_finite(self, "length_m", "width_m")
+            _check_cov(self, "cov", "velocity_cov")
+
+
 class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     """perceive -> optimize: the front end's measurements of one frame, the edges of Eqs. 6 and 7.
 
@@ -296,13 +336,36 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     status: tuple[Status, ...] = ()
     speed_sources: tuple[SpeedSource, ...] = ()  # where the metres of this frame's motion come from
     camera_sigma_rel: float = 0.0  # 1-sigma of all lengths together by the camera's height and lens, as a fraction
+    people: tuple[FollowedPerson, ...] = ()  # all that are followed, also those out of sight
 
     def __post_init__(self) -> None:
         check_finite(self, "scale_sigma_rel", "camera_sigma_rel")
 
 
-class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """One vehicle in an `Estimate`: pose and velocity over the ground, in world."""
+class Approach(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """How near somebody comes to the ego, were both to go on as they move now: an aid, and no safety function.
+
+    From means and covariances of place and velocity, to first order. `nearby` is a hint to look at: within 5 s they
+    may come within 2 m of the ego's middle, at 2 sigma.
+    """
+
+    time_s: float  # until the closest approach; 0: they part
+    sigma_s: float
+    distance_m: float  # of the centres then
+    sigma_m: float
+    nearby: bool = False
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.time_s + self.sigma_s + self.distance_m + self.sigma_m):
+            check_finite(self, "time_s", "sigma_s", "distance_m", "sigma_m")
+
+
+class RoadUser(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """One road user in an `Estimate`, of whatever class: pose and velocity over the ground, in world.
+
+    `label` is car, van, truck, bus, trailer, motorcycle (with who rides it), cyclist (bicycle and rider) or pedestrian.
+    A person that does not move has no yaw: its variance is that of an unknown one.
+    """
 
     vehicle: BodyId  # its number, for as long as it is followed
     T_world_vehicle: SE2  # where it is
@@ -317,11 +380,26 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     delay_ns: int = 0  # delay of the image that it was seen in: it was last seen age_ns + delay_ns ago
     moves: Moves = Moves.UNDECIDED  # whether it stands or drives, with hysteresis
     standing: Probability = 0.5  # the last probability that it stands
+    label_probability: Probability | None = None  # of its class; None: nobody said
+    height_m: float | None = None  # None: not known
+    sigma_height_m: float = 0.0
+    child: Probability = 0.0  # the probability of a child's height
+    approach: Approach | None = None  # to the ego; None: not computed
 
     @property
     def in_sight(self) -> bool:
         """Seen within IN_SIGHT_NS: networks need not run on every frame."""
         return self.age_ns <= IN_SIGHT_NS
+
+    @property
+    def seen(self) -> bool:
+        """In this very frame; else it is predicted."""
+        return self.age_ns == 0
+
+    @property
+    def is_person(self) -> bool:
+        """A pedestrian or a cyclist."""
+        return self.label in PEOPLE
 
     def __post_init__(self) -> None:
         cov, u = self.cov, self.velocity_cov
@@ -329,6 +407,30 @@ class VehicleEstimate(msgspec.Struct, frozen=True, kw_only=True, gc=False):
         if not _is_sound(total, cov[0], cov[4], cov[8], u[0], u[3]):
             check_finite(self, "velocity_mps", "length_m", "width_m", "standing")
             _check_cov(self, "cov", "velocity_cov")
+
+
+VehicleEstimate = RoadUser  # its name before people were road users
+
+
+class HiddenFan(msgspec.Struct, frozen=True, kw_only=True):
+    """Road that the camera can't see for a vehicle before it: a polygon in ego, in m, counter-clockwise.
+
+    Somebody could step out of it.
+    """
+
+    vehicle: BodyId  # behind whom
+    x_m: tuple[float, ...]  # of its corners
+    y_m: tuple[float, ...]  # of its corners
+
+    def __post_init__(self) -> None:
+        check_finite(self, "x_m", "y_m")
+        if len(self.x_m) != len(self.y_m):
+            raise ValueError(f"HiddenFan has {len(self.x_m)} x_m and {len(self.y_m)} y_m")
+
+    @property
+    def corners_m(self) -> tuple[tuple[float, float], ...]:
+        """(x, y) of each corner."""
+        return tuple(zip(self.x_m, self.y_m, strict=True))
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
@@ -352,6 +454,13 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     scale_sigma_rel: float = 0.0  # 1-sigma of the metric scale as a fraction, that of the camera's height in it
     status: tuple[Status, ...] = ()  # expected trouble
     speed_sources: tuple[SpeedSource, ...] = ()  # where the metres of this frame's motion come from
+    people: tuple[RoadUser, ...] = ()  # pedestrians and cyclists, also those just out of sight
+    hidden: tuple[HiddenFan, ...] = ()  # of the road ahead, behind vehicles
+
+    @property
+    def road_users(self) -> tuple[RoadUser, ...]:
+        """Vehicles and people."""
+        return self.vehicles + self.people
 
     def __post_init__(self) -> None:
         check_finite(self, "scale_sigma_rel")

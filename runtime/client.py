@@ -2,7 +2,8 @@
 
 A planner can start before the system does, and lives through its restarts (`Estimate.epoch` then says that the world
 frame began anew). It can never slow the vehicle down: a planner that is busy gets only the newest estimate. One that
-comes late has the last estimate at once, and queries the rest: `map`, `trajectory`, `configuration`, `health`.
+comes late has the last estimate at once, and queries the rest: `map`, `trajectory`, `nearby`, `configuration`,
+`health`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from birdslam.queries import MapSnapshot, Trajectory
+from birdslam.queries import MapSnapshot, Nearby, Trajectory
 from birdslam.runtime.transport.bus import Bus, BusClosed, Message
 from birdslam.runtime.transport.closing import Closing
 from birdslam.runtime.transport.reply_parts import whole_map, whole_trajectory
@@ -132,6 +133,11 @@ class Planner(Closing):
         """Where everybody has been in the newest epoch, or in its last `last_s` of the source's time; else as `map`."""
         parts = self._bus.query("trajectory", timeout_s, **({} if last_s is None else {"last_s": last_s}))
         return whole_trajectory(parts) if parts else None
+
+    def nearby(self, timeout_s: float = 2.0) -> Nearby | None:
+        """Every road user by its closest approach, an aid and no safety function; else as `map`."""
+        parts = self._bus.query("nearby", timeout_s)
+        return parts[0] if parts else None
 
     def configuration(self, timeout_s: float = 2.0) -> dict[str, Any] | None:
         """The configuration of the run as plain data, as in summary.json; else as `map`."""

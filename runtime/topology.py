@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from birdslam.queries import MapSnapshot, Trajectory
+from birdslam.queries import MapSnapshot, Nearby, Trajectory
 from birdslam.runtime.wire import Health
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedReading
 
@@ -107,6 +107,7 @@ QUERIES = {
             "where everybody has been, in the newest epoch",
             {"last_s": "only the last so many seconds of the source's time; left out: all"},
         ),
+        Query("nearby", Nearby, "every road user by its closest approach, were all to go on as they move now", {}),
         Query("configuration", dict, "the configuration of the run, as in summary.json, without passwords", {}),
     )
 }

@@ -179,6 +179,7 @@ def test_diagnostics(sent: dict[str, list[Any]]) -> None:
     assert values == {
         "frame_id": "1", "epoch": "0", "valid": "true", "scale_sigma_rel": "0.02", "speed_sources": "road",
         "vehicles": "1",
+        "people": "0",
     }  # fmt: skip
     assert {status.hardware_id for status in found} == {"bus"}
 

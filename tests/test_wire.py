@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
-from birdslam.queries import MapSnapshot, TimedPose, Trajectory, VehiclePath
+from birdslam.queries import MapSnapshot, Nearby, NearbyUser, TimedPose, Trajectory, VehiclePath
 from birdslam.runtime.topology import CAR, NODES, PROCESSES, QUERIES, TOPICS, alive_key, check_name, key_of
 from birdslam.runtime.wire import (
     MAX_MESSAGE_BYTES,
@@ -35,11 +35,14 @@ from birdslam.runtime.wire import (
 )
 from birdslam.sources.speed_log import KEPT_READINGS
 from birdslam.types import (
+    Approach,
     Attitude,
     EgoEdge,
     Estimate,
+    FollowedPerson,
     FrameRef,
     Ground,
+    HiddenFan,
     LandmarkEdge,
     LandmarkKind,
     LanePoint,
@@ -73,6 +76,13 @@ _READING = SpeedReading(
     yaw_rate_radps=-0.125,
     yaw_rate_sigma_radps=0.015625,
 )
+_KNOWN = {
+    "label_probability": 0.75,
+    "height_m": 1.25,
+    "sigma_height_m": 0.125,
+    "child": 0.875,
+    "approach": Approach(time_s=2.5, sigma_s=0.25, distance_m=1.5, sigma_m=0.75, nearby=True),
+}
 # Every field holds something else than its default.
 EXAMPLES: tuple[msgspec.Struct, ...] = (
     _READING,
@@ -119,6 +129,30 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         status=(Status.DETECTIONS_CARRIED, Status.SCALE_CARRIED),
         speed_sources=(SpeedSource.ROAD, SpeedSource.CAR),
         camera_sigma_rel=0.125,
+        people=(
+            FollowedPerson(
+                person=1_048_579,
+                x_m=12.5,
+                y_m=-3.75,
+                cov=_COV2,
+                vx_mps=0.25,
+                vy_mps=1.25,
+                velocity_cov=_COV2,
+                label="cyclist",
+                label_probability=0.75,
+                score=0.625,
+                box_px=(700.5, 160.25, 731.0, 251.5),
+                height_m=1.25,
+                sigma_height_m=0.125,
+                child=0.875,
+                length_m=1.75,
+                width_m=0.5,
+                standing=0.0625,
+                moves=Moves.DRIVING,
+                age_ns=60_000_000,
+                frames=12,
+            ),
+        ),
     ),
     Estimate(
         **_TIMES,
@@ -141,6 +175,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
                 delay_ns=60_000_000,
                 moves=Moves.DRIVING,
                 standing=0.0625,
+                **_KNOWN,
             ),
         ),
         attitude=_ATTITUDE,
@@ -148,6 +183,25 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         scale_sigma_rel=0.015,
         status=(Status.STANDSTILL,),
         speed_sources=(SpeedSource.CARRIED,),
+        people=(
+            VehicleEstimate(
+                vehicle=1_048_579,
+                T_world_vehicle=SE2(104.5, -18.0, 2.25),
+                cov=_COV3,
+                velocity_mps=(-0.5, 1.25),
+                velocity_cov=_COV2,
+                age_ns=30_000_000,
+                frames=12,
+                label="pedestrian",
+                length_m=0.75,
+                width_m=0.5,
+                delay_ns=60_000_000,
+                moves=Moves.STANDING,
+                standing=0.9375,
+                **_KNOWN,
+            ),
+        ),
+        hidden=(HiddenFan(vehicle=7, x_m=(20.5, 30.75, 31.0, 20.75), y_m=(-4.0, -6.0, -3.0, -2.0)),),
     ),
     MapUpdate(
         epoch=2, frame_id=4711, landmarks_m=((80.5, -9.0),), lanes_m=((81.0, -7.25), (82.0, -7.5)), lane_ids=(12, -1)
@@ -197,6 +251,22 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
                 label="truck",
                 length_m=8.5,
                 width_m=2.5,
+            ),
+        ),
+    ),
+    Nearby(
+        epoch=2,
+        frame_id=7,
+        t_source_ns=700_000_000,
+        t_capture_ns=1_234_567_890_123,
+        valid=True,
+        users=(
+            NearbyUser(
+                vehicle=1_048_579,
+                label="pedestrian",
+                T_ego_vehicle=SE2(9.0, 1.0, 0.25),
+                approach=_KNOWN["approach"],
+                age_ns=30_000_000,
             ),
         ),
     ),

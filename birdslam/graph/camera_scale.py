@@ -7,7 +7,7 @@ import math
 import msgspec
 
 from birdslam.geometry.se2 import SE2
-from birdslam.types import Estimate, VehicleEstimate
+from birdslam.types import Estimate, RoadUser
 
 
 def with_camera_scale(estimate: Estimate, sigma_rel: float) -> Estimate:
@@ -21,12 +21,13 @@ def with_camera_scale(estimate: Estimate, sigma_rel: float) -> Estimate:
     return msgspec.structs.replace(
         estimate,
         cov=_widened(estimate.cov, estimate.T_world_ego, sigma_rel),
-        vehicles=tuple(_vehicle(vehicle, sigma_rel) for vehicle in estimate.vehicles),
+        vehicles=tuple(_road_user(vehicle, sigma_rel) for vehicle in estimate.vehicles),
+        people=tuple(_road_user(person, sigma_rel) for person in estimate.people),
         scale_sigma_rel=math.hypot(estimate.scale_sigma_rel, sigma_rel),
     )
 
 
-def _vehicle(vehicle: VehicleEstimate, sigma_rel: float) -> VehicleEstimate:
+def _road_user(vehicle: RoadUser, sigma_rel: float) -> RoadUser:
     u, v = (sigma_rel * along for along in vehicle.velocity_mps)
     uu, uv, vu, vv = vehicle.velocity_cov
     return msgspec.structs.replace(

@@ -16,8 +16,9 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.pending_map import PendingState
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import WindowState
+from birdslam.types import FollowedPerson
 
-VERSION = 7
+VERSION = 8
 _MAGIC = b"BirdSLAM graph\n"
 _SUM_BYTES = 16
 _KINDS = {"<f8": np.float64, "<c16": np.complex128, "<i8": np.int64}
@@ -36,6 +37,7 @@ class Epoch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     t_ns: int
     t_before_ns: int
     motion: SE2
+    people: list[FollowedPerson]  # as the newest measurements have them
 
 
 class Checkpoint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -14,11 +14,12 @@ import numpy as np
 
 from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
+from birdslam.graph.around.approach import approaches
 from birdslam.graph.costs import Floats, Triple
 from birdslam.graph.standing import judge, reported_velocity
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import Window
-from birdslam.types import VehicleEstimate
+from birdslam.types import Approach, VehicleEstimate
 
 # The Jacobian of a vehicle in world (place in its own axes, yaw, velocity) by (x, y, yaw) of the ego, of the vehicle in
 # ego, and of its twist: where each entry stands in a row of what `marginals_in_world` calls numbers
@@ -52,12 +53,18 @@ def vehicle_estimates(
     ahead_s = [max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles]
     poses, velocities, covs = marginals_in_world(window, ahead_s, changes)
     covs += _of_sizes(window.world, ego_mps, vehicles, poses, velocities)
-    out = []
-    for v, pose, velocity, cov in zip(vehicles, poses, velocities, covs.tolist(), strict=True):
+    told: list[tuple[tuple[float, float], tuple[float, float, float, float]]] = []
+    for v, velocity, cov in zip(vehicles, velocities, covs.tolist(), strict=True):
         velocity_cov = cov[3][3], cov[3][4], cov[4][3], cov[4][4]
         if birth_det is not None:
             judge(v, velocity, velocity_cov, birth_det, t_ns)
             velocity, velocity_cov = reported_velocity(v, velocity, velocity_cov)
+        told.append((velocity, velocity_cov))
+    near = _approaches(window, ego_mps, vehicles, poses, told)
+    out = []
+    for v, pose, (velocity, velocity_cov), cov, approach in zip(
+        vehicles, poses, told, covs.tolist(), near, strict=True
+    ):
         reported = VehicleEstimate(
             vehicle=v.vehicle,
             T_world_vehicle=pose,
@@ -72,9 +79,30 @@ def vehicle_estimates(
             delay_ns=v.delay_ns,
             moves=v.moves,
             standing=0.5 if v.standing is None else v.standing,
+            height_m=v.height_m or None,
+            sigma_height_m=v.sigma_height_m,
+            approach=approach,
         )
         out.append(reported)
     return tuple(out)
+
+
+def _approaches(
+    window: Window,
+    ego_mps: complex,
+    vehicles: Sequence[VehicleNode],
+    poses: Sequence[SE2],
+    told: Sequence[tuple[tuple[float, float], tuple[float, float, float, float]]],
+) -> list[Approach]:
+    """Of each vehicle to the ego, in the ego's axes: without the ego's error in world, which both have."""
+    world = window.world
+    R = world.rotation()
+    p = (np.array([(T.x_m, T.y_m) for T in poses]) - [world.x_m, world.y_m]) @ R
+    v = np.array([velocity for velocity, _ in told]) @ R - [ego_mps.real, ego_mps.imag]
+    U = R.T @ np.array([cov for _, cov in told]).reshape(-1, 2, 2) @ R
+    by_size = np.square([node.size_bias_rel for node in vehicles])[:, None, None]
+    P = window.P.take(window.layout.own)[:, 3:5, 3:5] + by_size * p[:, :, None] * p[:, None, :]
+    return approaches(p, v, P, U)
 
 
 def _of_sizes(

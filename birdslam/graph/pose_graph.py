@@ -16,6 +16,8 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.se2 import SE2
+from birdslam.graph.around.hidden_road import hidden_fans
+from birdslam.graph.around.people import people_estimates
 from birdslam.graph.camera_scale import with_camera_scale
 from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, packed, plain, unpack, unpacked
 from birdslam.graph.costs import Floats
@@ -31,8 +33,20 @@ from birdslam.graph.pending_map import PendingMap
 from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edge
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
-from birdslam.types import INVALIDATING, BodyId, Estimate, MapUpdate, Measurements, SpeedSource, Status, VehicleEstimate
+from birdslam.types import (
+    INVALIDATING,
+    BodyId,
+    Estimate,
+    FollowedPerson,
+    MapUpdate,
+    Measurements,
+    SpeedSource,
+    Status,
+    VehicleEstimate,
+)
 
+_STANDS = SE2()
+USUAL_CAMERA_M = 1.5  # over the road, where a record does not say
 _NO_PIXELS = frozenset({Status.END_OF_SOURCE, Status.FRAME_UNREADABLE, Status.COASTING})
 
 
@@ -68,6 +82,7 @@ class PoseGraph:
         self._birth_det = float(self._birth[0, 0] * self._birth[1, 1]) if config.constant_velocity else None
         self._camera_sigma_rel = 0.0  # of the last frame that said it
         self.window: Window | None = None  # None before the first frame
+        self._people: tuple[FollowedPerson, ...] = ()  # in the newest frame's ego
         solver()
 
     def optimise(self, measurements: Measurements, records: Sequence[object] = ()) -> Estimate:
@@ -96,7 +111,9 @@ class PoseGraph:
         if not window.is_finite:  # numbers that no road has: begin anew rather than publish them
             window, reset = self._begin(m, True), True
         status = (*m.status, Status.GRAPH_RESET) if reset else m.status
-        estimate = self._estimate(m, status, window.ego_cov, self._vehicle_estimates(m, window))
+        self._people = m.people
+        vehicles = self._vehicle_estimates(m, window)
+        estimate = self._estimate(m, status, window.ego_cov, vehicles, self._ego_mps)
         return with_camera_scale(estimate, self._camera_sigma_rel)
 
     def vehicles_in_ego(self) -> dict[BodyId, tuple[SE2, Floats]]:
@@ -133,6 +150,7 @@ class PoseGraph:
                 t_ns=self._t_ns,
                 t_before_ns=self._t_before_ns,
                 motion=self._motion,
+                people=list(self._people),
             )
         return pack(Checkpoint(settings=self.settings, epoch=self.epoch, begun=begun, pending=self._map.state()))
 
@@ -169,6 +187,7 @@ class PoseGraph:
         graph._vehicles = VehicleNodes(config.forget_s, config.max_vehicles, config.detection_contradictions)
         graph._vehicles.resume(begun.vehicles)
         graph._t_ns, graph._t_before_ns, graph._motion = begun.t_ns, begun.t_before_ns, begun.motion
+        graph._people = tuple(begun.people)
         return graph
 
     def _begin(self, m: Measurements, reset: bool) -> Window:
@@ -262,28 +281,42 @@ class PoseGraph:
             change += np.abs(twist)
         back = way.inverse().adjoint()
         cov = back @ window.ego_cov @ back.T + np.diag(np.square(change * since_s))
-        estimate = self._estimate(m, m.status, cov, self._vehicle_estimates(m, window))
-        return msgspec.structs.replace(estimate, T_world_ego=window.world @ way)
+        vehicles = self._vehicle_estimates(m, window)
+        return self._estimate(m, m.status, cov, vehicles, self._ego_mps, since_s, way)
+
+    @property
+    def _ego_mps(self) -> complex:
+        """The ego's velocity in its own axes, of the last motion."""
+        since_s = (self._t_ns - self._t_before_ns) * 1e-9
+        return complex(self._motion.x_m, self._motion.y_m) / max(since_s, SHORTEST_S)
 
     def _vehicle_estimates(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
-        since_s = (self._t_ns - self._t_before_ns) * 1e-9
-        ego_mps = complex(self._motion.x_m, self._motion.y_m) / max(since_s, SHORTEST_S)
         return vehicle_estimates(
-            window, self._vehicles.nodes, m.t_source_ns, self._twist_growth, ego_mps, self._birth_det
+            window, self._vehicles.nodes, m.t_source_ns, self._twist_growth, self._ego_mps, self._birth_det
         )
 
     def _estimate(
-        self, m: Measurements, status: tuple[Status, ...], cov: Floats, vehicles: tuple[VehicleEstimate, ...]
+        self,
+        m: Measurements,
+        status: tuple[Status, ...],
+        cov: Floats,
+        vehicles: tuple[VehicleEstimate, ...],
+        ego_mps: complex = 0j,
+        since_s: float = 0.0,
+        way: SE2 = _STANDS,
     ) -> Estimate:
+        """`since_s` after the window's newest pose, from which the ego went on by `way`."""
         numbers = cov.ravel().tolist()
         numbers[::4] = [max(variance, 0.0) for variance in numbers[::4]]  # where all is known, rounding has either sign
+        before = SE2() if self.window is None else self.window.world
+        world = before if way is _STANDS else before @ way
         return Estimate(
             epoch=self.epoch,
             frame_id=m.frame_id,
             t_source_ns=m.t_source_ns,
             t_capture_ns=m.t_capture_ns,
             t_utc_ns=m.t_utc_ns,
-            T_world_ego=SE2() if self.window is None else self.window.world,
+            T_world_ego=world,
             cov=tuple(numbers),
             valid=INVALIDATING.isdisjoint(status),
             vehicles=vehicles,
@@ -292,4 +325,6 @@ class PoseGraph:
             scale_sigma_rel=m.scale_sigma_rel,
             status=tuple(dict.fromkeys(status)),
             speed_sources=m.speed_sources,
+            people=people_estimates(self._people, since_s, before, cov, ego_mps, way),
+            hidden=hidden_fans(vehicles, world, USUAL_CAMERA_M if m.ground is None else m.ground.height_m),
         )

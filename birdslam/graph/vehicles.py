@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cmath
+import math
 from dataclasses import dataclass
 
 from birdslam.graph.costs import rotated
@@ -11,6 +12,7 @@ from birdslam.types import Moves, VehicleEdge
 
 PATH_HALF_WIDTH_M = 1.75  # half a lane, as in vehicles/state/parallax.py
 BESIDE_M = 15.0  # farther aside is another road, or none: see standing.py
+MOST_LOG_HEIGHT = 2.0  # of what is no vehicle
 SHORTEST_S = 1e-3  # source clocks that stand still or run backwards
 
 
@@ -35,6 +37,8 @@ class VehicleNode:
     size_bias_rel: float = 0.0  # 1-sigma of its distance by its size's error, a fraction: the same in all frames
     standing: float | None = None  # the probability by all that is known; None: of that nothing
     moves: Moves = Moves.UNDECIDED
+    height_m: float = 0.0  # 0: not known
+    sigma_height_m: float = 0.0
 
 
 @dataclass(slots=True)
@@ -128,6 +132,9 @@ class VehicleNodes:
             v.length_m, v.width_m, v.delay_ns = edge.length_m, edge.width_m, edge.delay_ns
             v.standing_seen = edge.standing or None  # 0: nobody said
             v.size_bias_rel = abs(edge.depth_per_height) * edge.sigma_log_height
+            if edge.sigma_log_height > 0.0:
+                v.height_m = math.exp(min(edge.log_height, MOST_LOG_HEIGHT))
+                v.sigma_height_m = v.height_m * min(edge.sigma_log_height, 1.0)
             v.in_path = abs(edge.T_ego_vehicle.y_m) < PATH_HALF_WIDTH_M
         before = len(self.nodes)
         alive = [row for row, v in enumerate(self.nodes) if (t_ns - v.seen_ns) * 1e-9 <= self._forget_s]

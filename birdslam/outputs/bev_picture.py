@@ -13,12 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.types import FIRST_PERSON, PEOPLE
+
 DPI = 160
 LONG_SIDE_IN = 9.0  # of the map itself
 PANEL_IN = 2.9
 MARGIN_M = 6.0
 SHORT_TRACK_FRAMES = 5  # a track seen in fewer frames is mostly a false alarm: it is left out of the picture
 MOVING_SPEED_MPS, MOVING_WAY_M, MOVING_WAY_REL = 1.5, 3.0, 0.15  # a vehicle that does both moves, see Track.moving
+PEOPLE_SPEED_MPS, PEOPLE_WAY_M = 0.5, 1.0  # and a person
 LISTED_TRACKS = 22
 LABEL_CHARACTERS = 12
 EGO_LENGTH_M, EGO_WIDTH_M, EGO_AXLE_M = 4.2, 1.8, 1.7  # how the ego is drawn, its nose EGO_AXLE_M before the camera
@@ -46,8 +49,9 @@ class Track:
         speed alone does not tell."""
         third = max(len(self.poses) // 3, 1)
         way = np.median(self.poses[-third:, :2], axis=0) - np.median(self.poses[:third, :2], axis=0)
-        creep_m = MOVING_WAY_M + MOVING_WAY_REL * self.farthest_m
-        return self.speed_mps > MOVING_SPEED_MPS and float(np.hypot(*way)) > creep_m
+        person = self.label in PEOPLE
+        creep_m = (PEOPLE_WAY_M if person else MOVING_WAY_M) + MOVING_WAY_REL * self.farthest_m
+        return self.speed_mps > (PEOPLE_SPEED_MPS if person else MOVING_SPEED_MPS) and float(np.hypot(*way)) > creep_m
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,7 @@ def draw(scene: Scene, path: Path) -> None:
     figure.text(
         left_in / width_in,
         1.0 - 0.62 / height_in,
-        f"{scene.path_m:.1f} m in {scene.frames} frames, {scene.track_count} vehicle tracks"
+        f"{scene.path_m:.1f} m in {scene.frames} frames, {scene.track_count} tracks"
         + (f"; all lengths +- {scene.sigma_rel:.0%}" if scene.sigma_rel >= 0.005 else ""),
         color=FAINT,
         fontsize=9.5,
@@ -134,6 +138,11 @@ def _extent(scene: Scene, tracks: list[Track]) -> tuple[float, float, float, flo
         float(centre[1] - size[1] / 2.0),
         float(centre[1] + size[1] / 2.0),
     )
+
+
+def number_of(vehicle: int) -> int:
+    """As pictures show it: people's numbers begin anew."""
+    return vehicle & (FIRST_PERSON - 1)
 
 
 def colour_of(vehicle: int) -> tuple[float, float, float]:
@@ -175,7 +184,7 @@ def _draw_track(axes: Any, track: Track, ego: NDArray[np.float64]) -> None:
     away = left if left @ (last[:2] - [x_m, y_m]) >= 0.0 else -left
     half_m = float(np.abs((outline - way[-1]) @ _paper(away[None])[0]).max())
     axes.annotate(
-        f"{track.vehicle}",
+        f"{number_of(track.vehicle)}",
         _paper((last[:2] + half_m * away)[None])[0],
         xytext=tuple(8.0 * _paper(away[None])[0]),
         textcoords="offset points",
@@ -236,9 +245,9 @@ def _draw_panel(figure: Any, scene: Scene, tracks: list[Track], corner: tuple[fl
 
     handles: list[Any] = [Line2D([], [], color=EGO, linewidth=2.5, label="ego, from the ring to the arrow")]
     if any(track.moving for track in tracks):
-        handles.append(Patch(facecolor=SAMPLE, edgecolor=SAMPLE, label="moving vehicle, last seen"))
+        handles.append(Patch(facecolor=SAMPLE, edgecolor=SAMPLE, label="moving, last seen"))
     if not all(track.moving for track in tracks):
-        handles.append(Patch(facecolor=f"{SAMPLE}26", edgecolor=SAMPLE, label="standing vehicle, last seen"))
+        handles.append(Patch(facecolor=f"{SAMPLE}26", edgecolor=SAMPLE, label="standing, last seen"))
     if len(scene.lanes):
         handles.append(mark(LANE, "o", "lane line"))
     if len(scene.landmarks):
@@ -274,7 +283,9 @@ def _draw_panel(figure: Any, scene: Scene, tracks: list[Track], corner: tuple[fl
         speed = f"{track.speed_mps:5.1f}" if track.moving else "    -"
         name = track.label[:LABEL_CHARACTERS]
         write(
-            line, f"{track.vehicle:>4}  {name:<{LABEL_CHARACTERS}} {track.frames:>6} {speed}", colour_of(track.vehicle)
+            line,
+            f"{number_of(track.vehicle):>4}  {name:<{LABEL_CHARACTERS}} {track.frames:>6} {speed}",
+            colour_of(track.vehicle),
         )
     hidden = scene.track_count - len(listed)  # short ones among them
     if hidden > 0:

@@ -194,7 +194,7 @@ class Recorder:
         self._write_row(estimate, pose)
         T_picture_ego = self._T_picture_world @ estimate.T_world_ego
         self._ego.add(T_picture_ego.x_m, T_picture_ego.y_m, T_picture_ego.yaw_rad)
-        for vehicle in estimate.vehicles:
+        for vehicle in estimate.road_users:
             if vehicle.age_ns == 0:
                 self._add_vehicle(estimate, vehicle)
         self._last = estimate

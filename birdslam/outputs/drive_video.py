@@ -30,9 +30,10 @@ from birdslam.outputs.bev_picture import (
     LANE,
     PAPER,
     colour_of,
+    number_of,
 )
 from birdslam.outputs.drive_files import ResultsError
-from birdslam.types import Estimate, MapUpdate, VehicleEstimate
+from birdslam.types import Estimate, MapUpdate, RoadUser
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -40,7 +41,7 @@ Floats = NDArray[np.float64]
 MOST_SCALE, MOST_WIDTH_PX = 1.5, 1280  # of the camera's image, enlarged or reduced
 STRIP_PX, PANEL_PX = 96, 368  # height of the strip of text below the image, width of the bird's-eye view
 AHEAD_M, BEHIND_M = 50.0, 10.0  # shown of the bird's-eye view
-BOX_HEIGHT_M = 1.5  # estimates have none
+BOX_HEIGHT_M = 1.5  # of one whose height is not known
 MOST_POINTS, MOST_POSES = 12_000, 400
 SHIFT = 4  # OpenCV's fractional bits: outlines don't jump from pixel to pixel
 RING_M = 10.0
@@ -104,11 +105,13 @@ class SideBySide:
         ground = self._camera.ground
         if estimate.ground is not None:
             ground = GroundPlane(estimate.ground.height_m, estimate.ground.pitch_rad, estimate.ground.roll_rad)
-        for vehicle in estimate.vehicles:
+        for vehicle in estimate.road_users:
             if not vehicle.in_sight:
                 continue
             foot = outline(estimate.T_world_ego.between(vehicle.T_world_vehicle), vehicle.length_m, vehicle.width_m)
-            corners = np.vstack([np.column_stack([foot, np.full(4, z_m)]) for z_m in (0.0, BOX_HEIGHT_M)])
+            corners = np.vstack(
+                [np.column_stack([foot, np.full(4, z_m)]) for z_m in (0.0, vehicle.height_m or BOX_HEIGHT_M)]
+            )
             if corners[:, 0].min() < 1.0:  # reaches behind the image plane
                 continue
             px = (bev.ego_to_pixel(self._camera, ground, corners) + 0.5) * self._scale - 0.5
@@ -118,7 +121,7 @@ class SideBySide:
             for a, b in zip(low.tolist(), high.tolist(), strict=True):
                 cv2.line(view, a, b, colour, 1, cv2.LINE_AA, SHIFT)
             at = np.clip(px[4:].min(axis=0), -1e4, 1e4)
-            text = f"{vehicle.vehicle}  {foot[:, 0].min():.0f} m"
+            text = f"{name_of(vehicle)}  {foot[:, 0].min():.0f} m"
             cv2.putText(view, text, (int(at[0]), int(at[1]) - 4), FONT, 0.4, colour, 1, cv2.LINE_AA)
         return view
 
@@ -136,7 +139,11 @@ class SideBySide:
                 panel[at[:, 1], at[:, 0]] = _bgr(colour)
         way = _fixed(self._panel_px(T_ego_world @ np.array(self._way)))
         cv2.polylines(panel, [way], False, _bgr(EGO), 2, cv2.LINE_AA, SHIFT)
-        for vehicle in estimate.vehicles:
+        for fan in estimate.hidden:
+            cv2.polylines(
+                panel, [_fixed(self._panel_px(np.array(fan.corners_m)))], True, _bgr(FAINT), 1, cv2.LINE_AA, SHIFT
+            )
+        for vehicle in estimate.road_users:
             pose = estimate.T_world_ego.between(vehicle.T_world_vehicle)
             px = self._panel_px(outline(pose, vehicle.length_m, vehicle.width_m))
             if vehicle.in_sight:
@@ -144,7 +151,7 @@ class SideBySide:
             cv2.polylines(panel, [_fixed(px)], True, _colour_of(vehicle), 1, cv2.LINE_AA, SHIFT)
             u, v = px.max(axis=0)
             if 0 <= u < PANEL_PX and 0 <= v < len(panel):
-                cv2.putText(panel, f"{vehicle.vehicle}", (int(u) + 2, int(v)), FONT, 0.35, _bgr(INK), 1, cv2.LINE_AA)
+                cv2.putText(panel, name_of(vehicle), (int(u) + 2, int(v)), FONT, 0.35, _bgr(INK), 1, cv2.LINE_AA)
         for true in true_outlines:
             cv2.polylines(panel, [_fixed(self._panel_px(true))], True, (255, 255, 255), 1, cv2.LINE_AA, SHIFT)
         own = outline(SE2(EGO_AXLE_M - EGO_LENGTH_M / 2.0, 0.0, 0.0), EGO_LENGTH_M, EGO_WIDTH_M)
@@ -211,9 +218,10 @@ class DriveVideo:
 
     def _picture(self, t_ns: int, image: Image, estimate: Estimate) -> Image:
         seen = sum(vehicle.in_sight for vehicle in estimate.vehicles)
+        people = sum(person.in_sight for person in estimate.people)
         white = "white outlines: truth, " if self._truth else ""
         words = (
-            f"BirdSLAM  {t_ns * 1e-9:5.1f} s  frame {estimate.frame_id}  {seen} vehicles in sight",
+            f"BirdSLAM  {t_ns * 1e-9:5.1f} s  frame {estimate.frame_id}  {seen} vehicles, {people} people in sight",
             f"right: from above, 10 m rings; filled: estimates, {white}cyan: ego",
             " ".join(status.value for status in estimate.status) or "all well",
         )
@@ -263,7 +271,13 @@ def outline(pose: SE2, length_m: float, width_m: float) -> Floats:
     return pose @ np.array([[x_m, y_m], [x_m, -y_m], [-x_m, -y_m], [-x_m, y_m]])
 
 
-def _colour_of(vehicle: VehicleEstimate) -> tuple[int, int, int]:
+def name_of(user: RoadUser) -> str:
+    """Its number, with the class of who is no car."""
+    number = number_of(user.vehicle)
+    return f"{number}" if user.label == "car" else f"{user.label} {number}"
+
+
+def _colour_of(vehicle: RoadUser) -> tuple[int, int, int]:
     red, green, blue = (round(255 * share) for share in colour_of(vehicle.vehicle))
     return blue, green, red
 

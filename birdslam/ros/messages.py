@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import Transform, ego_pose, mount_pose
-from birdslam.types import NS_PER_S, Attitude, EgoEdge, Estimate, MapUpdate, VehicleEstimate
+from birdslam.types import NS_PER_S, Attitude, EgoEdge, Estimate, MapUpdate, RoadUser
 
 Floats = NDArray[np.float64]
 Sent = tuple[str, Any]  # topic, message
 
 ODOM, BASE, CAMERA = "odom", "base_link", "camera_optical_frame"
 UNKNOWN = 1e6  # variance of what is not estimated
-VEHICLE_HEIGHT_M = 1.5  # of boxes; no height is estimated
+VEHICLE_HEIGHT_M = 1.5  # of boxes of a height that is not known
 LANE_WIDTH_M = 0.15  # drawn
 PLANE = (0, 1, 5)  # x, y and yaw among ROS' six: x, y, z, about x, about y, about z
 
@@ -67,9 +67,12 @@ class RosMessages:
         cov = _rotated(np.reshape(estimate.cov, (3, 3)), T_odom_ego.yaw_rad)
         twist, twist_cov = _twist(estimate, before, T_odom_ego, motion)
         yield "/birdslam/odometry", self._odometry(BASE, pose, cov, twist, twist_cov, t_ns)
-        yield "/birdslam/vehicles", self._detections(estimate, t_ns)
+        yield "/birdslam/vehicles", self._detections(estimate, estimate.vehicles, t_ns)
         for vehicle in estimate.vehicles:
             yield "/birdslam/vehicles/odometry", self._vehicle(vehicle, estimate.attitude.z_m, t_ns)
+        yield "/birdslam/people", self._detections(estimate, estimate.people, t_ns)
+        for person in estimate.people:
+            yield "/birdslam/people/odometry", self._vehicle(person, estimate.attitude.z_m, t_ns, "person")
         yield "/diagnostics", self._diagnostics(estimate, t_ns)
 
     def of_map(self, update: MapUpdate, t_ns: int) -> Iterator[Sent]:
@@ -94,7 +97,7 @@ class RosMessages:
             header = self._header(ODOM, self._path[-1][0])
             yield "/birdslam/path", self._make("nav_msgs/msg/Path", header=header, poses=poses)
 
-    def _vehicle(self, vehicle: VehicleEstimate, z_m: float, t_ns: int) -> Any:
+    def _vehicle(self, vehicle: RoadUser, z_m: float, t_ns: int, kind: str = "vehicle") -> Any:
         T_odom_vehicle = self._T_odom_world @ vehicle.T_world_vehicle
         pose = ego_pose(T_odom_vehicle, Attitude(z_m=z_m))
         cov = _rotated(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
@@ -103,22 +106,25 @@ class RosMessages:
         vx, vy = (R_vehicle_world @ vehicle.velocity_mps).tolist()
         twist_cov = np.diag([0.0, 0.0, UNKNOWN])
         twist_cov[:2, :2] = R_vehicle_world @ np.reshape(vehicle.velocity_cov, (2, 2)) @ R_vehicle_world.T
-        return self._odometry(f"vehicle_{vehicle.vehicle}", pose, cov, (vx, vy, 0.0), twist_cov, t_ns)
+        return self._odometry(f"{kind}_{vehicle.vehicle}", pose, cov, (vx, vy, 0.0), twist_cov, t_ns)
 
-    def _detections(self, estimate: Estimate, t_ns: int) -> Any:
+    def _detections(self, estimate: Estimate, users: Sequence[RoadUser], t_ns: int) -> Any:
         header, detections = self._header(ODOM, t_ns), []
-        for vehicle in estimate.vehicles:
+        for vehicle in users:
+            height_m = vehicle.height_m or VEHICLE_HEIGHT_M
             T_odom_vehicle = self._T_odom_world @ vehicle.T_world_vehicle
             z_m = estimate.attitude.z_m
             foot = self._pose(ego_pose(T_odom_vehicle, Attitude(z_m=z_m)))
-            middle = self._pose(ego_pose(T_odom_vehicle, Attitude(z_m=z_m + VEHICLE_HEIGHT_M / 2.0)))
+            middle = self._pose(ego_pose(T_odom_vehicle, Attitude(z_m=z_m + height_m / 2.0)))
             cov = _rotated(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
             hypothesis = self._make(
                 "vision_msgs/msg/ObjectHypothesisWithPose",
-                hypothesis=self._make("vision_msgs/msg/ObjectHypothesis", class_id=vehicle.label, score=1.0),
+                hypothesis=self._make(
+                    "vision_msgs/msg/ObjectHypothesis", class_id=vehicle.label, score=_score(vehicle)
+                ),
                 pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=foot, covariance=_six(cov)),
             )
-            size = self._vector(vehicle.length_m, vehicle.width_m, VEHICLE_HEIGHT_M)
+            size = self._vector(vehicle.length_m, vehicle.width_m, height_m)
             box = self._make("vision_msgs/msg/BoundingBox3D", center=middle, size=size)
             detections.append(
                 self._make(
@@ -137,6 +143,7 @@ class RosMessages:
             "scale_sigma_rel": f"{estimate.scale_sigma_rel:.6g}",
             "speed_sources": ", ".join(source.value for source in estimate.speed_sources),
             "vehicles": len(estimate.vehicles),
+            "people": len(estimate.people),
         }
         status = self._make(
             "diagnostic_msgs/msg/DiagnosticStatus",
@@ -200,6 +207,11 @@ class RosMessages:
 
     def _vector(self, x: float, y: float, z: float) -> Any:
         return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def _score(user: RoadUser) -> float:
+    """The probability of its class; 1 where nobody said."""
+    return 1.0 if user.label_probability is None else user.label_probability
 
 
 def _twist(

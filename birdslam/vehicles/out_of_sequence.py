@@ -9,7 +9,9 @@ their work. The road under the camera in the newest frame is predicted over the 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -40,11 +42,19 @@ class OpenFrame:
     travelled_m: float | None = None
 
 
+class Beside(Protocol):
+    """Who follows others than vehicles by the same detections, over the same road."""
+
+    def settle(self, frame: OpenFrame, detections: Detections | None, road: GroundSizeFilter) -> None:
+        """The next frame in order, after the vehicles in it were localised; `road` is the one in it."""
+
+
 class OutOfSequenceTracker:
     """open_frame(), then ingest_detections(), once a frame; after both `road` is the one under the camera in it."""
 
-    def __init__(self, tracker: Tracker, config: OutOfSequenceConfig) -> None:
+    def __init__(self, tracker: Tracker, config: OutOfSequenceConfig, beside: Sequence[Beside] = ()) -> None:
         self.tracker = tracker
+        self._beside = tuple(beside)
         self.ground_size = tracker.ground_size  # at the last settled frame
         self.road = self.ground_size  # at the newest frame
         self.config = config
@@ -106,7 +116,10 @@ class OutOfSequenceTracker:
         frame = self._open.popleft()
         self.road = self.ground_size
         _predict(self.ground_size, frame)
-        return self.tracker.localise_vehicles(frame.ego, detections, depth, road)
+        tracks = self.tracker.localise_vehicles(frame.ego, detections, depth, road)
+        for follower in self._beside:
+            follower.settle(frame, detections, self.ground_size)
+        return tracks
 
 
 def _predict(ground_size: GroundSizeFilter, frame: OpenFrame) -> None:

@@ -33,7 +33,7 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import curve, noise, spread, write_json
 from birdslam.perf.reporting.machine import Steal
-from birdslam.types import Measurements
+from birdslam.types import FIRST_PERSON, FollowedPerson, Measurements
 
 label = "the pose graph's update against gtsam's smoothers"
 
@@ -52,6 +52,7 @@ _LAG_FRAMES = GraphConfig().ego_nodes
 def run(arguments: list[str]) -> None:
     parser = benchmark_parser("optimizer", label, output="JSON, a list of objects")
     parser.add_argument("--vehicles", default="0,1,3,6,10,15", help="in sight, a list")
+    parser.add_argument("--people", type=int, default=0, help="followed beside the vehicles, of `ours` and `ours_live`")
     parser.add_argument("--frames", type=int, default=10_000)
     parser.add_argument("--contenders", default=",".join(CONTENDERS), help="a list")
     parser.add_argument("--limit-s", type=float, default=60.0, help="time for each contender's frames")
@@ -62,20 +63,33 @@ def run(arguments: list[str]) -> None:
         for vehicles in (int(n) for n in options.vehicles.split(",")):
             log = Path(folder) / f"{vehicles}.log"
             config = DriveConfig(frames=options.frames, vehicles=vehicles, traffic="convoy")
-            write_log(log, config, options.seed)
+            write_log(log, config, options.seed, options.people)
             for contender in options.contenders.split(","):
                 row = measure(contender, vehicles, log, options.limit_s)
-                rows.append({"name": f"{contender} {vehicles} vehicles", **row})
+                name = f"{contender} {vehicles} vehicles" + (f" {options.people} people" if options.people else "")
+                rows.append({"name": name, **row})
                 print(f"{rows[-1]['name']:44} {summary(row)}", flush=True)
                 if options.output is not None:
                     write_json(options.output, rows)  # after each: Ctrl-C keeps what was measured
 
 
-def write_log(log: Path, config: DriveConfig, seed: int) -> None:
+def write_log(log: Path, config: DriveConfig, seed: int, people: int = 0) -> None:
     """What every contender takes."""
+    crowd = tuple(_walker(k) for k in range(people))
     everything = drive(config, seed).measurements
-    with_key_frames = (m if k % _LAG_FRAMES == 0 else replace(m, cp=()) for k, m in enumerate(everything))
+    with_key_frames = (
+        replace(m, people=crowd) if k % _LAG_FRAMES == 0 else replace(m, cp=(), people=crowd)
+        for k, m in enumerate(everything)
+    )
     log.write_bytes(msgspec.msgpack.encode([msgspec.msgpack.encode(m) for m in with_key_frames]))
+
+
+def _walker(number: int) -> FollowedPerson:
+    cov = (0.4, 0.01, 0.01, 0.05)
+    x_m, y_m = 5.0 + 0.5 * number, (-1.0) ** number * 4.0
+    return FollowedPerson(
+        person=FIRST_PERSON + number, x_m=x_m, y_m=y_m, cov=cov, vx_mps=0.3, vy_mps=-1.2, velocity_cov=cov
+    )
 
 
 def summary(row: dict[str, Any]) -> str:

@@ -20,6 +20,14 @@ from birdslam.bench.tracking.localisation import (
     tilt_row,
 )
 from birdslam.bench.tracking.movers import MoversRow, movers_row
+from birdslam.bench.tracking.people import (
+    PeopleRow,
+    PeopleTracks,
+    boxes_of_hulls,
+    has_people,
+    judge,
+    summarise_people,
+)
 from birdslam.frontend import FrontEndConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.runtime.configuration import Configuration, ConfigurationError
@@ -59,6 +67,35 @@ def evaluate_localisation(
             movers.append(movers_row(sequence, log, [graph.optimise(record) for record in log], "truth"))
             progress.advance(len(sequence))
     return summarise_ranges(errors), tilts, movers
+
+
+def evaluate_people(
+    root: Path,
+    names: Sequence[str],
+    detections: str,
+    config: FrontEndConfig,
+    kind: str,
+    tilt_from_images: bool = False,
+) -> tuple[list[PeopleRow], list[PeopleTracks]]:
+    """The errors of placed pedestrians or cyclists by range, and their tracks in bird's-eye view. Raises DatasetError.
+
+    Sequences without labels of the kind are left out. No detector's boxes of cyclists were recorded: those of the
+    labels' hulls stand in.
+    """
+    sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
+    sequences = [sequence for sequence in sequences if has_people(sequence, kind)]
+    if not sequences:
+        raise DatasetError(f"{root}: none of these sequences has labels of a {kind}")
+    folder, results = _folder(root, detections), []
+    with Progress("people", sum(map(len, sequences))) as progress:
+        progress.reach(0)
+        for sequence in sequences:
+            found = read_detections(folder, sequence.name, len(sequence))
+            if kind == "cyclist" and detections == "rrc":
+                found = boxes_of_hulls(sequence, found, kind)
+            results.append(judge(sequence, measure(sequence, found, config, tilt_from_images), kind))
+            progress.advance(len(sequence))
+    return summarise_people(results)
 
 
 def evaluate_left_out(

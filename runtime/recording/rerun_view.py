@@ -104,7 +104,7 @@ class Viewer:
         self._grow(estimate.frame_id)
         self._path.append(tuple(T_world_ego[:3, 3].tolist()))
         self._stream.log(f"world/path/{self._block}", rr.LineStrips3D([self._path], colors=EGO))
-        self._vehicles(estimate.vehicles)
+        self._vehicles(estimate.road_users)
         self._from_above(estimate)
         self._plots(estimate)
         self._last = estimate
@@ -137,13 +137,18 @@ class Viewer:
             self._block, self._path, self._points = block, self._path[-1:], []
 
     def _vehicles(self, vehicles: tuple[VehicleEstimate, ...]) -> None:
-        middle_m = self._height_m + VEHICLE_HEIGHT_M / 2.0
-        centers = np.array([(v.T_world_vehicle.x_m, v.T_world_vehicle.y_m, middle_m) for v in vehicles]).reshape(-1, 3)
+        heights = [v.height_m or VEHICLE_HEIGHT_M for v in vehicles]
+        centers = np.array(
+            [
+                (v.T_world_vehicle.x_m, v.T_world_vehicle.y_m, self._height_m + height_m / 2.0)
+                for v, height_m in zip(vehicles, heights, strict=True)
+            ]
+        ).reshape(-1, 3)
         colors = [SEEN if v.in_sight else UNSEEN for v in vehicles]
         speeds_mps = [math.hypot(*v.velocity_mps) for v in vehicles]
         boxes = rr.Boxes3D(
             centers=centers,
-            sizes=[(v.length_m, v.width_m, VEHICLE_HEIGHT_M) for v in vehicles],
+            sizes=[(v.length_m, v.width_m, height_m) for v, height_m in zip(vehicles, heights, strict=True)],
             quaternions=[_turned(v.T_world_vehicle.yaw_rad) for v in vehicles],
             labels=[f"{v.label} {v.vehicle}  {mps:.1f} m/s" for v, mps in zip(vehicles, speeds_mps, strict=True)],
             colors=colors,
@@ -163,12 +168,12 @@ class Viewer:
     def _from_above(self, estimate: Estimate) -> None:
         T_ego_world = estimate.T_world_ego.inverse()
         footprints, ellipses = [_footprint(SE2(), 4.0, 1.7)], []
-        for vehicle in estimate.vehicles:
+        for vehicle in estimate.road_users:
             T_ego_vehicle = T_ego_world @ vehicle.T_world_vehicle
             footprints.append(_footprint(T_ego_vehicle, vehicle.length_m, vehicle.width_m))
             ellipses.append(ellipse(T_ego_vehicle, vehicle.cov))
-        colors = [EGO, *(SEEN if v.in_sight else UNSEEN for v in estimate.vehicles)]
-        labels = ["ego", *(f"{v.label} {v.vehicle}" for v in estimate.vehicles)]
+        colors = [EGO, *(SEEN if v.in_sight else UNSEEN for v in estimate.road_users)]
+        labels = ["ego", *(f"{v.label} {v.vehicle}" for v in estimate.road_users)]
         shown = [_above(np.vstack([outline, outline[:1]])) for outline in footprints]
         self._stream.log("bev/bodies", rr.LineStrips2D(shown, colors=colors, labels=labels))
         around = [_above(np.vstack([outline, outline[:1]])) for outline in ellipses]

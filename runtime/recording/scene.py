@@ -83,7 +83,7 @@ def from_estimate(estimate: Estimate, t_ns: int) -> Iterator[Drawn]:
     z_m = estimate.attitude.z_m
     outline = _ellipse(estimate.T_world_ego, estimate.cov, z_m, EGO if estimate.valid else UNSEEN)
     entities = [SceneEntity(timestamp=t, frame_id="world", id="ego", lines=(outline,))]
-    entities += [_entity(vehicle, t, z_m) for vehicle in estimate.vehicles]
+    entities += [_entity(vehicle, t, z_m) for vehicle in estimate.road_users]
     gone = SceneEntityDeletion(timestamp=t, type=ALL)
     yield "/scene", SceneUpdate(deletions=(gone,), entities=tuple(entities))
 
@@ -112,6 +112,13 @@ def _boxes(measurements: Measurements, t: Time) -> ImageAnnotations:
         boxes.append(PointsAnnotation(timestamp=t, points=corners, outline_color=VEHICLE))
         text = f"{edge.label} {edge.vehicle}  {math.hypot(edge.T_ego_vehicle.x_m, edge.T_ego_vehicle.y_m):.1f} m"
         texts.append(TextAnnotation(timestamp=t, position=Point2(x1, y1), text=text))
+    for person in measurements.people:
+        if person.age_ns == 0:
+            x1, y1, x2, y2 = person.box_px
+            corners = tuple(Point2(x, y) for x, y in ((x1, y1), (x2, y1), (x2, y2), (x1, y2)))
+            boxes.append(PointsAnnotation(timestamp=t, points=corners, outline_color=VEHICLE))
+            text = f"{person.label} {person.person}  {math.hypot(person.x_m, person.y_m):.1f} m"
+            texts.append(TextAnnotation(timestamp=t, position=Point2(x1, y1), text=text))
     return ImageAnnotations(points=tuple(boxes), texts=tuple(texts))
 
 
@@ -167,18 +174,17 @@ def _ellipse(body: SE2, cov: tuple[float, ...], z_m: float, color: Color) -> Lin
 
 
 def _entity(vehicle: VehicleEstimate, t: Time, z_m: float) -> SceneEntity:
-    pose = _pose(ego_pose(vehicle.T_world_vehicle, Attitude(z_m=z_m + VEHICLE_HEIGHT_M / 2.0)))
+    height_m = vehicle.height_m or VEHICLE_HEIGHT_M
+    pose = _pose(ego_pose(vehicle.T_world_vehicle, Attitude(z_m=z_m + height_m / 2.0)))
     at, (vx, vy) = pose.position, vehicle.velocity_mps
     color = VEHICLE if vehicle.in_sight else UNSEEN
-    above = FoxglovePose(Vector3(at.x, at.y, z_m + VEHICLE_HEIGHT_M + 0.8))
+    above = FoxglovePose(Vector3(at.x, at.y, z_m + height_m + 0.8))
     in_a_second = LinePrimitive(type=LINE_STRIP, points=(at, Vector3(at.x + vx, at.y + vy, at.z)), color=color)
     return SceneEntity(
         timestamp=t,
         frame_id="world",
         id=f"vehicle {vehicle.vehicle}",
-        cubes=(
-            CubePrimitive(pose=pose, size=Vector3(vehicle.length_m, vehicle.width_m, VEHICLE_HEIGHT_M), color=color),
-        ),
+        cubes=(CubePrimitive(pose=pose, size=Vector3(vehicle.length_m, vehicle.width_m, height_m), color=color),),
         lines=(_ellipse(vehicle.T_world_vehicle, vehicle.cov, z_m, color), in_a_second),
         texts=(TextPrimitive(pose=above, text=f"{vehicle.label} {vehicle.vehicle}  {math.hypot(vx, vy):.1f} m/s"),),
     )

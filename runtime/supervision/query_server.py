@@ -9,7 +9,7 @@ import threading
 from collections.abc import Mapping, Sequence
 
 from birdslam.mapping.atlas import Atlas
-from birdslam.queries import MapSnapshot, Trajectory
+from birdslam.queries import MapSnapshot, Nearby, Trajectory, nearby
 from birdslam.runtime.configuration import Configuration, without_passwords
 from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.transport.queries import QueryRefused, positive
@@ -25,7 +25,9 @@ class QueryServer:
         self._atlas = Atlas(configuration.atlas)
         self._newest: Estimate | None = None
         self._turn = threading.Lock()  # one thread adds, another answers
-        bus.answer_queries({"map": self._map, "trajectory": self._trajectory, "configuration": self._settings})
+        bus.answer_queries(
+            {"map": self._map, "trajectory": self._trajectory, "nearby": self._nearby, "configuration": self._settings}
+        )
 
     def add(self, estimate: Estimate) -> None:
         """One frame's."""
@@ -53,6 +55,13 @@ class QueryServer:
         if trajectory is None:
             raise QueryRefused("there is no trajectory yet: nothing has been estimated")
         return trajectory_parts(trajectory)
+
+    def _nearby(self, parameters: Mapping[str, str]) -> Sequence[Nearby]:
+        with self._turn:
+            newest = self._newest
+        if newest is None:
+            raise QueryRefused("nobody is near yet: nothing has been estimated")
+        return (nearby(newest),)
 
     def _settings(self, parameters: Mapping[str, str]) -> Sequence[Configuration]:
         """With nothing that lets anybody in: a camera's address may bear a password."""

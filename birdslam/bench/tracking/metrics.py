@@ -96,8 +96,24 @@ def _mostly_inside(box: Floats, regions: Floats) -> bool:
     return bool((span[:, 0] * span[:, 1] > 0.5 * area).any())
 
 
+@dataclass(frozen=True)
+class Hota:
+    """HOTA and its parts in [0, 1], each the mean over the thresholds."""
+
+    hota: float
+    det_a: float
+    ass_a: float
+    loc_a: float
+
+
 def hota(frames: Sequence[BoxFrame]) -> float | None:
     """Higher order tracking accuracy in [0, 1], the mean over the IoU thresholds; None without labels and tracks."""
+    parts = hota_parts(frames)
+    return None if parts is None else parts.hota
+
+
+def hota_parts(frames: Sequence[BoxFrame]) -> Hota | None:
+    """HOTA with DetA, AssA and LocA; None without labels and tracks."""
     labels, tracks, label_count, track_count = _census(frames)
     if not label_count.sum() and not track_count.sum():
         return None
@@ -108,7 +124,7 @@ def hota(frames: Sequence[BoxFrame]) -> float | None:
         share = np.divide(frame.overlap, total, out=np.zeros_like(frame.overlap), where=total > 1e-9)
         potential[np.ix_(rows, columns)] += share
     alignment = potential / np.maximum(label_count[:, None] + track_count[None] - potential, 1e-9)
-    found = np.zeros(len(HOTA_IOU))
+    found, closeness = np.zeros(len(HOTA_IOU)), np.zeros(len(HOTA_IOU))
     shared = np.zeros((len(HOTA_IOU), len(labels), len(tracks)))
     for frame, rows, columns in _placed(frames, labels, tracks):
         if not frame.overlap.size:
@@ -117,11 +133,47 @@ def hota(frames: Sequence[BoxFrame]) -> float | None:
         for level, least in enumerate(HOTA_IOU):
             good = frame.overlap[i, j] >= least - 1e-9
             found[level] += good.sum()
+            closeness[level] += frame.overlap[i[good], j[good]].sum()
             shared[level][rows[i[good]], columns[j[good]]] += 1
     association = shared / np.maximum(label_count[:, None] + track_count[None] - shared, 1e-9)
     ass = (shared * association).sum(axis=(1, 2)) / np.maximum(found, 1.0)
     det = found / np.maximum(label_count.sum() + track_count.sum() - found, 1.0)
-    return float(np.sqrt(det * ass).mean())
+    loc = np.maximum(1e-10, closeness) / np.maximum(1e-10, found)  # 1 where nothing was found, as TrackEval has it
+    return Hota(float(np.sqrt(det * ass).mean()), float(det.mean()), float(ass.mean()), float(loc.mean()))
+
+
+@dataclass(frozen=True)
+class ClearMot:
+    """CLEAR MOT (Bernardin and Stiefelhagen 2008) at one threshold."""
+
+    mota: float
+    found: int
+    missed: int
+    false_alarms: int
+    switches: int
+
+
+def clear_mot(frames: Sequence[BoxFrame], least: float = MATCH_IOU) -> ClearMot:
+    """TrackEval's CLEAR: who was matched in the frame before stays so where the pair still overlaps by `least`."""
+    last: dict[int, int] = {}  # label -> its last track
+    matched_before: dict[int, int] = {}
+    found = missed = false_alarms = switches = 0
+    for frame in frames:
+        stays = np.array(
+            [[matched_before.get(int(label)) == int(track) for track in frame.tracks] for label in frame.labels],
+            dtype=np.bool_,
+        ).reshape(frame.overlap.shape)
+        score = np.where(frame.overlap >= least - 1e-9, 1000.0 * stays + frame.overlap, 0.0)
+        rows, columns = least_cost(-score)
+        pairs = {int(frame.labels[i]): int(frame.tracks[j]) for i, j in zip(rows, columns, strict=True) if score[i, j]}
+        switches += sum(last.get(label, track) != track for label, track in pairs.items())
+        last.update(pairs)
+        matched_before = pairs
+        found += len(pairs)
+        missed += len(frame.labels) - len(pairs)
+        false_alarms += len(frame.tracks) - len(pairs)
+    mota = (found - false_alarms - switches) / max(1, found + missed)
+    return ClearMot(mota, found, missed, false_alarms, switches)
 
 
 def idf1(frames: Sequence[BoxFrame]) -> float | None:

@@ -1,4 +1,4 @@
-"""`birdslam evaluate localisation`: where the front end puts the labelled cars of KITTI tracking."""
+"""`birdslam evaluate localisation`: where the front end puts the labelled cars, or people, of KITTI tracking."""
 
 from __future__ import annotations
 
@@ -8,11 +8,19 @@ from pathlib import Path
 
 from birdslam.bench.tracking.leave_one_out import LeftOut
 from birdslam.bench.tracking.localisation import LocalisationRow, TiltRow
+from birdslam.bench.tracking.people import KINDS, PeopleRow, PeopleTracks
 from birdslam.bench.tracking.tables import movers_table
 from birdslam.outputs.drive_files import claim_directory, write_json
 from birdslam.paper import PAPER
 from birdslam.runtime.cli.arguments import add_config, add_settings, add_tracking_root
-from birdslam.runtime.evaluation.localisation import evaluate_left_out, evaluate_localisation, read_sweep, sequences_of
+from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.evaluation.localisation import (
+    evaluate_left_out,
+    evaluate_localisation,
+    evaluate_people,
+    read_sweep,
+    sequences_of,
+)
 from birdslam.runtime.options import configuration_of
 
 
@@ -23,6 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mode", choices=("default", "paper"), default="default", help="paper: Eq. 1 on level ground")
     text = "the road's pitch: with the images' error of it, as odometry on images reports it, or none"
     parser.add_argument("--tilt", choices=("images", "none"), default="images", help=text)
+    text = "of whom; cyclists by boxes of the labels' hulls, with the noise of real ones"
+    parser.add_argument("--class", dest="kind", choices=("car", *KINDS), default="car", help=text)
     text = "how each sequence fares by a constant that the others chose of these values; may be repeated"
     parser.add_argument("--leave-one-out", action="append", default=[], metavar="KEY=V1,V2", help=text)
     add_config(parser)
@@ -38,15 +48,22 @@ def run(options: argparse.Namespace) -> int:
     sweeps = [read_sweep(text, configuration) for text in options.leave_one_out]
     claim_directory(output)
     names = sequences_of(options.root, options.sequences)
-    if sweeps:
-        left = evaluate_left_out(
-            options.root, names, options.detections, configuration.slam.frontend, sweeps, options.tilt == "images"
+    config, tilt_from_images = configuration.slam.frontend, options.tilt == "images"
+    if options.kind != "car":
+        if sweeps or options.mode == "paper":
+            raise ConfigurationError("--class: --leave-one-out and --mode paper are of cars alone")
+        people, tracks = evaluate_people(
+            options.root, names, options.detections, config, options.kind, tilt_from_images
         )
+        write_json(output / "report.json", {"places": people, "tracks": tracks})
+        print(_table_of_people(people))
+        print(_table_of_tracks(tracks))
+    elif sweeps:
+        left = evaluate_left_out(options.root, names, options.detections, config, sweeps, tilt_from_images)
         write_json(output / "leave_one_out.json", left)
         print(_table_of_left_out(left))
     else:
         used = PAPER if options.mode == "paper" else configuration.slam
-        tilt_from_images = options.tilt == "images"
         rows, tilts, movers = evaluate_localisation(options.root, names, options.detections, used, tilt_from_images)
         write_json(output / "report.json", rows)
         write_json(output / "tilt.json", tilts)
@@ -68,6 +85,34 @@ def _table_of_left_out(rows: Sequence[LeftOut]) -> str:
         for row in rows
     )
     return "\n".join([f"{'sequence':10}{titles}  constant", *lines])
+
+
+def _table_of_people(rows: Sequence[PeopleRow]) -> str:
+    titles = f"{'depth':>9}{'bias':>9}{'across m':>10}{'1 sigma':>9}{'2 sigma':>9}{'walking':>9}{'standing':>9}"
+    lines = [f"{'sequence':11}{'range m':>9}{'n':>7}{titles}  (m/s: error of who walks, speed of who stands)"]
+    for row in rows:
+        cells = (
+            (row.depth_error_median_rel, "9.1%"),
+            (row.depth_bias_median_rel, "+9.1%"),
+            (row.lateral_error_median_m, "10.2f"),
+            (row.inside_1_sigma, "9.0%"),
+            (row.inside_2_sigma, "9.0%"),
+            (row.walking_speed_error_median_mps, "9.2f"),
+            (row.standing_speed_median_mps, "9.2f"),
+        )
+        numbers = "".join(f"{'-':>9}" if value is None else format(value, form) for value, form in cells)
+        lines.append(f"{row.sequence:11}{row.range:>9}{row.n:>7}{numbers}")
+    return "\n".join(lines)
+
+
+def _table_of_tracks(rows: Sequence[PeopleTracks]) -> str:
+    titles = "".join(f"{title:>9}" for title in ("HOTA", "DetA", "AssA", "LocA", "IDF1", "MOTA", "switches", "a min"))
+    lines = [f"{'sequence':11}{'labels':>9}{titles}  (bird's-eye view, within 2 m)"]
+    for row in rows:
+        shares = (row.hota, row.det_a, row.ass_a, row.loc_a, row.idf1, row.mota)
+        numbers = "".join(f"{share:9.3f}" for share in shares)
+        lines.append(f"{row.sequence:11}{row.labels:>9}{numbers}{row.switches:9}{row.switches_per_minute:9.1f}")
+    return "\n".join(lines)
 
 
 def _table(rows: Sequence[LocalisationRow]) -> str:

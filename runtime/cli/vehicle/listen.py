@@ -54,7 +54,7 @@ def _of_vehicle(options: argparse.Namespace) -> Generator[str | None]:
             else:
                 vehicles = "  ".join(
                     f"{v.label} {v.vehicle} at {v.T_world_vehicle.x_m:.1f} {v.T_world_vehicle.y_m:.1f} m"
-                    for v in estimate.vehicles
+                    for v in estimate.road_users
                 )
                 yield f"{_ego(estimate, planner.latest().age_ms, estimate.valid)}  {vehicles}".rstrip()
             if Status.END_OF_SOURCE in estimate.status:
@@ -72,7 +72,7 @@ def _of_fleet(options: argparse.Namespace) -> Generator[str | None]:
                 yield msgspec.json.encode({"vehicle": reading.vehicle, "estimate": estimate}).decode()
             else:
                 ego = _ego(estimate, reading.age_ms, reading.valid)
-                yield f"{reading.vehicle}: {ego}  {len(estimate.vehicles)} in sight"
+                yield f"{reading.vehicle}: {ego}  {len(estimate.vehicles)} in sight, {len(estimate.people)} people"
         yield None
 
 

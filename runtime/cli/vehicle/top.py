@@ -133,7 +133,8 @@ class VehicleTable:
         return (
             f"{self._bus.vehicle}: frame {estimate.frame_id}  epoch {estimate.epoch}  "
             f"{'valid' if estimate.valid else 'NOT VALID'}  {age_ms:.0f} ms old{left}  "
-            f"tracks {len(estimate.vehicles)}  metres from {' and '.join(estimate.speed_sources) or 'nothing yet'}  "
+            f"tracks {len(estimate.vehicles)}  people {len(estimate.people)}  "
+            f"metres from {' and '.join(estimate.speed_sources) or 'nothing yet'}  "
             f"{' '.join(estimate.status)}"
         ).rstrip()
 

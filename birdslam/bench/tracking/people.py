@@ -1,0 +1,316 @@
+"""How well people are placed and followed on real roads: the front end's people against labelled ones.
+
+Each matched, untruncated person's place is compared with the label's as cars' are (localisation.py): along (depth,
+ego's x) and across, with the share of errors inside the ellipses of 68.3 and 95.4 %. Speeds are compared with those of
+the labels' places over a second. Tracks are judged in bird's-eye view: similarity falls from 1 at the label's place to
+0.5 at 2 m, so that CLEAR MOT and IDF1 match within 2 m (as nuScenes does) and HOTA averages over all thresholds. Tracks
+are those in sight, as a planner takes them: a lost one goes on for a while, but not for these metrics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.bench.tracking.localisation import INSIDE_1_SIGMA, INSIDE_2_SIGMA
+from birdslam.bench.tracking.metrics import BoxFrame, assign, clear_mot, hota_parts, idf1
+from birdslam.perception import Detections
+from birdslam.sources.kitti_tracking import TrackingSequence
+from birdslam.sources.label_projection import DONT_CARE, Label, hull_px
+from birdslam.types import IN_SIGHT_NS, FollowedPerson, Measurements, Moves
+from birdslam.vehicles.placement.localisation import iou
+
+Floats = NDArray[np.float64]
+
+KINDS = {"pedestrian": ("Pedestrian",), "cyclist": ("Cyclist",)}  # of the labels
+# Riders have no recorded boxes of their own, but some of pedestrians
+NEUTRAL = {"pedestrian": ("Person", "Person_sitting", "Cyclist"), "cyclist": ("Pedestrian", "Person", "Person_sitting")}
+RANGES_M = ((5.0, 15.0), (15.0, 30.0), (30.0, 50.0))
+HALF_AT_M = 2.0  # where similarity is 0.5
+WALKING_MPS, STANDING_MPS = 0.5, 0.2  # true speeds: of who walks, and of who stands
+TRUTH_S = 0.5  # a label's speed is its places' of so long before and after
+MATCH_IOU = 0.4  # of a box with the label's, in the image
+STANDING_EGO = ("0012", "0016", "0017")  # the ego stands, or nearly
+HULL_SIGMA = (0.035, 0.035, 0.035, 0.03)  # of RRC's boxes of people, left, upper, right, lower, of the height
+HULL_MEMORY = 0.7  # of a box's error, from frame to frame at 10 Hz
+
+
+@dataclass(frozen=True)
+class PersonError:
+    """One person in one frame: true depth, error in ego (2,), its square over its covariance; speeds, true and told."""
+
+    sequence: str
+    label: int
+    frame: int
+    depth_m: float
+    error_m: Floats
+    mahalanobis2: float
+    true_mps: Floats  # (2,) in ego
+    told_mps: Floats
+    stands: bool
+    occluded: int
+    ego_mps: float
+
+
+@dataclass
+class PeopleResult:
+    """Of one sequence."""
+
+    name: str
+    frames: int
+    errors: list[PersonError] = field(default_factory=list)
+    tracked: list[BoxFrame] = field(default_factory=list)
+
+
+class PeopleRow(msgspec.Struct, frozen=True, kw_only=True):
+    """A row of report.json: places and speeds in one range; None where nobody was there."""
+
+    sequence: str
+    range: str
+    n: int
+    depth_error_median_rel: float | None = None
+    depth_bias_median_rel: float | None = None
+    lateral_error_median_m: float | None = None
+    inside_1_sigma: float | None = None
+    inside_2_sigma: float | None = None
+    walking_speed_error_median_mps: float | None = None
+    standing_speed_median_mps: float | None = None
+
+
+class PeopleTracks(msgspec.Struct, frozen=True, kw_only=True):
+    """A row of report.json: tracks in bird's-eye view."""
+
+    sequence: str
+    labels: int  # people times frames
+    hota: float
+    det_a: float
+    ass_a: float
+    loc_a: float
+    idf1: float
+    mota: float
+    switches: int
+    switches_per_minute: float
+
+
+def has_people(sequence: TrackingSequence, kind: str) -> bool:
+    """Whether somebody of the kind is labelled."""
+    return any(label.kind in KINDS[kind] for label in sequence.labels)
+
+
+def boxes_of_hulls(sequence: TrackingSequence, recorded: Sequence[Detections], kind: str) -> list[Detections]:
+    """Boxes for whom no detector's were recorded: the outlines of labelled bodies, with noise as real boxes show.
+
+    Errors last from frame to frame (HULL_MEMORY). Recorded boxes of persons on the same body make way.
+    """
+    rng, errors, out = np.random.default_rng(0), dict[int, Floats](), []
+    for frame, found in enumerate(recorded):
+        boxes = []
+        for label in sequence.labels_of(frame):
+            if label.kind not in KINDS[kind] or label.occluded > 2:
+                continue
+            hull = hull_px(label, sequence.camera, sequence.T_cam0_camera)
+            if hull is None:
+                continue
+            draw = rng.normal(size=4) * HULL_SIGMA
+            last = errors.get(label.track)
+            error = draw if last is None else HULL_MEMORY * last + math.sqrt(1.0 - HULL_MEMORY**2) * draw
+            errors[label.track] = error
+            box = hull + error * (hull[3] - hull[1])
+            box = np.clip(box, 0.0, [sequence.camera.width_px, sequence.camera.height_px] * 2)
+            if (box[2:] - box[:2] >= 4.0).all():
+                boxes.append(box)
+        hulls = np.array(boxes).reshape(-1, 4)
+        keep = [
+            i
+            for i, label in enumerate(found.labels)
+            if label != "person" or not len(hulls) or iou(found.boxes_px[i : i + 1], hulls).max() < MATCH_IOU
+        ]
+        out.append(
+            replace(
+                found,
+                boxes_px=np.vstack([hulls, found.boxes_px[keep]]),
+                scores=np.concatenate([np.full(len(hulls), 0.85), found.scores[keep]]),
+                labels=("cyclist",) * len(hulls) + tuple(found.labels[i] for i in keep),
+            )
+        )
+    return out
+
+
+def judge(sequence: TrackingSequence, measurements: Iterable[Measurements], kind: str) -> PeopleResult:
+    """What the records say of the people of a kind, in every frame, against the labels."""
+    result = PeopleResult(sequence.name, len(sequence))
+    places = _true_places(sequence, KINDS[kind])
+    ego = sequence.ego_truth(0)
+    for m in measurements:
+        here = sequence.labels_of(m.frame_id)
+        asked = [label for label in here if label.kind in KINDS[kind]]
+        told = [p for p in m.people if p.label == kind]
+        seen = [p for p in told if p.age_ns == 0]
+        overlap = iou(
+            np.array([a.box_px for a in asked]).reshape(-1, 4), np.array([p.box_px for p in seen]).reshape(-1, 4)
+        )
+        before, after = max(0, m.frame_id - 2), min(len(ego) - 1, m.frame_id + 2)
+        step = ego[before].between(ego[after])
+        ego_mps = math.hypot(step.x_m, step.y_m) / max(0.1 * (after - before), 0.1)
+        for i, j in zip(*assign(overlap, MATCH_IOU), strict=True):
+            if asked[i].truncated <= 0:
+                result.errors.append(_error(sequence, asked[i], seen[j], places, ego_mps))
+        in_sight = [p for p in told if p.age_ns <= IN_SIGHT_NS]
+        result.tracked.append(_tracked(sequence, here, in_sight, kind))
+    return result
+
+
+def _true_places(sequence: TrackingSequence, kinds: Sequence[str]) -> dict[int, dict[int, Floats]]:
+    out: dict[int, dict[int, Floats]] = {}
+    for label in sequence.labels:
+        if label.kind in kinds:
+            truth = sequence.vehicle_truth(label, 0)
+            out.setdefault(label.track, {})[label.frame] = np.array([truth.x_m, truth.y_m])
+    return out
+
+
+def _true_velocity(places: dict[int, Floats], frame: int) -> Floats:
+    """(2,) m/s in world: the slope of the places of a second around the frame; NaN where there are too few."""
+    reach = round(TRUTH_S * 10)
+    near = [(f - frame) * 0.1 for f in range(frame - reach, frame + reach + 1) if f in places]
+    if len(near) < 4:
+        return np.full(2, np.nan)
+    at = np.array([places[frame + round(t * 10)] for t in near])
+    return np.asarray(np.polyfit(near, at, 1)[0])
+
+
+def _error(
+    sequence: TrackingSequence, label: Label, told: FollowedPerson, places: dict[int, dict[int, Floats]], ego_mps: float
+) -> PersonError:
+    truth = sequence.vehicle_truth(label, label.frame)
+    error = np.array([told.x_m - truth.x_m, told.y_m - truth.y_m])
+    R = sequence.ego_truth(0)[label.frame].rotation()
+    return PersonError(
+        sequence=sequence.name,
+        label=label.track,
+        frame=label.frame,
+        depth_m=truth.x_m,
+        error_m=error,
+        mahalanobis2=float(error @ np.linalg.solve(np.reshape(told.cov, (2, 2)), error)),
+        true_mps=_true_velocity(places[label.track], label.frame) @ R,
+        told_mps=np.array([told.vx_mps, told.vy_mps]),
+        stands=told.moves is Moves.STANDING,
+        occluded=label.occluded,
+        ego_mps=ego_mps,
+    )
+
+
+def _tracked(
+    sequence: TrackingSequence,
+    here: Sequence[Label],
+    told: Sequence[FollowedPerson],
+    kind: str,
+) -> BoxFrame:
+    """Similarities of labelled and followed people; left out is who stands where a label is that nobody asks for.
+
+    As KITTI has it: heavily occluded or truncated people are not asked for, sitting ones and DontCare regions are
+    neutral, and so are unmatched ones lower than 25 px.
+    """
+    at = np.array([[p.x_m, p.y_m] for p in told]).reshape(-1, 2)
+    neutral = [label for label in here if label.kind in (*KINDS[kind], *NEUTRAL[kind])]
+    similarity = _similarity(sequence, neutral, at)
+    rows, columns = assign(similarity, 0.5)
+    counts = np.array([n.kind in KINDS[kind] and n.occluded <= 2 and n.truncated <= 0 for n in neutral], dtype=np.bool_)
+    taken = {int(j): bool(counts[i]) for i, j in zip(rows, columns, strict=True)}
+    regions = np.array([label.box_px for label in here if label.kind == DONT_CARE]).reshape(-1, 4)
+    keep = []
+    for j, person in enumerate(told):
+        if j in taken:
+            keep += [j] if taken[j] else []
+        elif person.box_px[3] - person.box_px[1] > 25.0 and not _inside(person.box_px, regions):
+            keep.append(j)
+    ids = np.array([label.track for label, c in zip(neutral, counts, strict=True) if c], dtype=np.int64)
+    people = np.array([told[j].person for j in keep], dtype=np.int64)
+    return BoxFrame(ids, people, similarity[counts][:, keep])
+
+
+def _similarity(sequence: TrackingSequence, labels: Sequence[Label], at: Floats) -> Floats:
+    truth = [sequence.vehicle_truth(label, label.frame) for label in labels]
+    places = np.array([[t.x_m, t.y_m] for t in truth]).reshape(-1, 2)
+    away = np.linalg.norm(places[:, None] - at[None], axis=-1)
+    return np.asarray(np.maximum(0.0, 1.0 - away / (2.0 * HALF_AT_M)))
+
+
+def _inside(box: tuple[float, ...], regions: Floats) -> bool:
+    x1, y1, x2, y2 = box
+    for n1, m1, n2, m2 in regions.tolist():
+        shared = max(0.0, min(x2, n2) - max(x1, n1)) * max(0.0, min(y2, m2) - max(y1, m1))
+        if shared > 0.5 * (x2 - x1) * (y2 - y1):
+            return True
+    return False
+
+
+def summarise_people(results: Sequence[PeopleResult]) -> tuple[list[PeopleRow], list[PeopleTracks]]:
+    """A row for each sequence and range; then of those where the ego drives, where it stands, and of all."""
+    moving = [r for r in results if r.name not in STANDING_EGO]
+    standing = [r for r in results if r.name in STANDING_EGO]
+    groups = [(r.name, [r]) for r in results]
+    if len(results) > 1:
+        groups += [("ego drives", moving), ("ego stands", standing), ("all", list(results))]
+    groups = [(name, group) for name, group in groups if any(r.errors for r in group)]
+    rows = [
+        _row(name, f"{near:.0f}-{far:.0f}", [e for r in group for e in r.errors if near <= e.depth_m < far])
+        for name, group in groups
+        for near, far in RANGES_M
+    ]
+    return rows, [_tracks(name, group) for name, group in groups]
+
+
+def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
+    if not errors:
+        return PeopleRow(sequence=sequence, range=span, n=0)
+    depth_m = np.array([e.depth_m for e in errors])
+    along, across = np.array([e.error_m for e in errors]).T
+    spread = np.array([e.mahalanobis2 for e in errors])
+    true = np.array([e.true_mps for e in errors])
+    told = np.array([e.told_mps for e in errors])
+    speed = np.linalg.norm(true, axis=1)
+    walking, standing = speed > WALKING_MPS, speed < STANDING_MPS
+    return PeopleRow(
+        sequence=sequence,
+        range=span,
+        n=len(errors),
+        depth_error_median_rel=float(np.median(np.abs(along) / depth_m)),
+        depth_bias_median_rel=float(np.median(along / depth_m)),
+        lateral_error_median_m=float(np.median(np.abs(across))),
+        inside_1_sigma=float(np.mean(spread <= INSIDE_1_SIGMA)),
+        inside_2_sigma=float(np.mean(spread <= INSIDE_2_SIGMA)),
+        walking_speed_error_median_mps=_median(np.linalg.norm(told - true, axis=1)[walking]),
+        standing_speed_median_mps=_median(np.linalg.norm(told, axis=1)[standing]),
+    )
+
+
+def _median(values: Floats) -> float | None:
+    return float(np.median(values)) if len(values) else None
+
+
+def _tracks(name: str, group: Sequence[PeopleResult]) -> PeopleTracks:
+    """Of several sequences: their frames one after the other, nobody in two of them."""
+    frames, offset = [], 0
+    for result in group:
+        frames += [replace(f, labels=f.labels + offset, tracks=f.tracks + offset) for f in result.tracked]
+        offset += 1 << 32
+    parts, clear = hota_parts(frames), clear_mot(frames)
+    minutes = sum(r.frames for r in group) / 600.0
+    return PeopleTracks(
+        sequence=name,
+        labels=sum(len(f.labels) for f in frames),
+        hota=0.0 if parts is None else parts.hota,
+        det_a=0.0 if parts is None else parts.det_a,
+        ass_a=0.0 if parts is None else parts.ass_a,
+        loc_a=0.0 if parts is None else parts.loc_a,
+        idf1=idf1(frames) or 0.0,
+        mota=clear.mota,
+        switches=clear.switches,
+        switches_per_minute=clear.switches / max(minutes, 1e-9),
+    )

@@ -1,0 +1,68 @@
+"""What a frame's record says of everybody who is followed, as they are in that frame."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from birdslam.people.people_filter import HEIGHT, VX
+from birdslam.people.people_tracker import PeopleTracker
+from birdslam.types import FollowedPerson, Moves
+from birdslam.vehicles.track import EgoFrame
+
+KNOWN_FRAMES = 4  # from so many on it is said who stands
+
+
+def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[FollowedPerson, ...]:
+    """Of the present frame; people were seen in it or in an earlier one, and go on as they moved."""
+    tracks, frame = tracker.tracks, tracker.frame
+    if not tracks or frame is None:
+        return ()
+    after_s = max(0.0, (present.t_source_ns - frame.ego.t_source_ns) * 1e-9)
+    moments = tracker.filter.moments(after_s)
+    R, T = present.T_world_ego.rotation(), present.T_world_ego
+    at = (moments.mean[:, :2] - [T.x_m, T.y_m]) @ R
+    velocity = moments.mean[:, VX:HEIGHT] @ R
+    cov = (R.T @ moments.cov[:, :2, :2] @ R).reshape(-1, 4)
+    velocity_cov = (R.T @ moments.cov[:, VX:HEIGHT, VX:HEIGHT] @ R).reshape(-1, 4)
+    sigma = np.sqrt(moments.cov[:, HEIGHT, HEIGHT])
+    out = []
+    for k, track in enumerate(tracks):
+        if track.person < 0:
+            continue
+        height_m = math.exp(float(moments.mean[k, HEIGHT]))
+        sizes = tracker.config.people.sizes(track.label)
+        stands = track.stands and track.hits >= KNOWN_FRAMES
+        vx, vy = (0.0, 0.0) if stands else velocity[k].tolist()
+        moves = Moves.STANDING if stands else Moves.DRIVING if track.hits >= KNOWN_FRAMES else Moves.UNDECIDED
+        out.append(
+            FollowedPerson(
+                person=track.person,
+                x_m=float(at[k, 0]),
+                y_m=float(at[k, 1]),
+                cov=_symmetric(cov[k].tolist()),
+                vx_mps=vx,
+                vy_mps=vy,
+                velocity_cov=_symmetric(velocity_cov[k].tolist()),
+                label=track.label,
+                label_probability=track.label_probability,
+                score=track.box.score,
+                box_px=track.box.box_px,
+                height_m=height_m,
+                sigma_height_m=height_m * float(sigma[k]),
+                child=min(1.0, max(0.0, float(moments.child[k]))),
+                length_m=sizes.length_m,
+                width_m=sizes.footprint_m,
+                standing=min(1.0, max(0.0, float(moments.standing[k]))),
+                moves=moves,
+                age_ns=max(0, present.t_source_ns - track.seen_ns),
+                frames=track.hits,
+            )
+        )
+    return tuple(sorted(out, key=lambda person: person.person))
+
+
+def _symmetric(cov: list[float]) -> tuple[float, ...]:
+    xx, xy, yx, yy = cov
+    return xx, (xy + yx) / 2.0, (xy + yx) / 2.0, yy

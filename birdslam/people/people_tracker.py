@@ -1,0 +1,176 @@
+"""People followed through time: which box is whom, who is new, who is gone.
+
+Ids last through a second of hiding.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.people.people_boxes import BICYCLE, CYCLIST, PEDESTRIAN, PeopleBoxesConfig, PersonBox, people_boxes
+from birdslam.people.people_filter import PeopleConfig, PeopleFilter
+from birdslam.perception import Detections
+from birdslam.types import FIRST_PERSON
+from birdslam.vehicles.out_of_sequence import OpenFrame
+from birdslam.vehicles.placement.localisation import iou
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
+
+Floats = NDArray[np.float64]
+
+NEVER = 1e9  # the cost of what can't be
+NEW = 2.0  # -2 log of the density of new people in bearing, slope and log height: about one in the image
+SIDE_MARGIN = 0.03  # of the image's width: who is predicted farther outside has left
+UNKNOWN_MPS = 10.0  # an ego of unknown motion is taken to drive
+LEAVES_S = 0.3  # until who left the image is forgotten
+
+STANDS, WALKS = 0.85, 0.5  # probability of standing: hysteresis of what is reported
+
+
+class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """When boxes are the same person."""
+
+    gate: float = 16.3  # squared Mahalanobis distance of bearing, bottom and top: 99.9 % of three
+    birth_score: float = 0.5  # a box must reach it to begin a track
+    birth_iou: float = 0.55  # a box that overlaps a followed one's more begins none
+    confirm_hits: int = 2  # a track gets its id when it has been seen so often
+    forget_unconfirmed_s: float = 0.25  # without a box, of who has no id yet
+    forget_s: float = 1.5  # without a box, of who has an id
+    most: int = 60  # who is followed at once: the nearest
+    boxes: PeopleBoxesConfig = PeopleBoxesConfig()  # how sure boxes are
+    people: PeopleConfig = PeopleConfig()  # how people are and move
+
+
+@dataclass
+class PersonTrack:
+    """One followed person, in the row of the filter at which it stands."""
+
+    box: PersonBox  # the last one
+    seen_ns: int
+    seen_frame: int
+    person: int = -1  # the persistent id, once confirmed
+    hits: int = 1
+    votes: Counter[str] = field(default_factory=Counter)
+    stands: bool = False  # with hysteresis
+    outside_s: float = 0.0  # for how long it has been predicted outside the image
+
+    @property
+    def label(self) -> str:
+        """A bicycle whose rider was seen now and then is a cyclist's."""
+        return CYCLIST if self.votes[CYCLIST] * 2 >= self.votes[PEDESTRIAN] and self.votes[CYCLIST] else PEDESTRIAN
+
+    @property
+    def label_probability(self) -> float:
+        """By Laplace's rule of succession."""
+        of = self.votes[self.label]
+        return (of + 1.0) / (self.votes[PEDESTRIAN] + self.votes[CYCLIST] + 2.0)
+
+
+class PeopleTracker:
+    """settle() once for each frame, in order, with its detections or without any.
+
+    What it knows of the road is the front end's ground in that frame.
+    """
+
+    def __init__(self, camera: Camera, config: PeopleTrackingConfig) -> None:
+        from scipy.optimize import linear_sum_assignment  # only who tracks holds its 9 MB
+
+        self._assign = linear_sum_assignment
+        self.camera = camera
+        self.config = config
+        self.filter = PeopleFilter(config.people)
+        self.tracks: list[PersonTrack] = []
+        self.frame: OpenFrame | None = None  # the last settled one
+        self._pitch_rad: float | None = None
+        self._next_id = FIRST_PERSON
+
+    def settle(self, frame: OpenFrame, detections: Detections | None, road: GroundSizeFilter) -> None:
+        """The next frame. None for `detections`: no detector looked at it. `road` is the ground in it."""
+        ego, ground = frame.ego, road.ground
+        self._predict(frame, road)
+        self.frame = frame
+        if detections is not None:
+            boxes = people_boxes(detections, self.camera, ground, self.config.boxes)
+            pairs = self._associate(boxes, ego.T_world_ego, ground.height_m)
+            tilts = self.filter.tilts_of(boxes, road.sigma_pitch_rad, ground.height_m)
+            rows = [row for row, _ in pairs]
+            self.filter.expect_tilt(rows, tilts[[k for _, k in pairs]])
+            self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, ground.height_m)
+            for row, k in pairs:
+                track = self.tracks[row]
+                track.box, track.seen_ns, track.seen_frame = boxes[k], ego.t_source_ns, ego.frame_id
+                track.hits += 1
+                track.votes[boxes[k].label] += 1
+            self._begin(boxes, tilts, {k for _, k in pairs}, frame, ground.height_m)
+        self._conclude(frame)
+
+    def _predict(self, frame: OpenFrame, road: GroundSizeFilter) -> None:
+        ego, pitch_rad = frame.ego, road.ground.pitch_rad
+        shift_rad = 0.0 if self._pitch_rad is None else pitch_rad - self._pitch_rad - (frame.turn_rad or 0.0)
+        self._pitch_rad = pitch_rad
+        ego_mps = UNKNOWN_MPS if frame.travelled_m is None else frame.travelled_m / max(frame.dt_s, 1e-3)
+        self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, ego_mps)
+
+    def _associate(self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float) -> list[tuple[int, int]]:
+        """(row, box): the assignment of least total cost, the negative log-likelihood within the gate."""
+        if not boxes or not self.tracks:
+            return []
+        squared, told = self.filter.distances(boxes, T_world_ego, height_m)
+        cost = np.where(squared <= self.config.gate, told, NEVER)
+        births = np.where(np.eye(len(boxes)), NEW, NEVER)  # a row of somebody new for each box
+        rows, columns = self._assign(np.vstack([cost, births]))
+        known = len(self.tracks)
+        return [
+            (int(i), int(j)) for i, j in zip(rows, columns, strict=True) if i < known and cost[i, j] < NEVER
+        ]  # fmt: skip
+
+    def _begin(
+        self, boxes: list[PersonBox], tilts: Floats, matched: set[int], frame: OpenFrame, height_m: float
+    ) -> None:
+        followed = np.array([boxes[k].box_px for k in matched]).reshape(-1, 4)
+        births: list[int] = []
+        for k, box in enumerate(boxes):
+            if k in matched or box.label == BICYCLE or box.score < self.config.birth_score:
+                continue
+            if len(followed) and iou(np.array([box.box_px]), followed).max() > self.config.birth_iou:
+                continue
+            births.append(k)
+        ego = frame.ego
+        self.filter.begin([boxes[k] for k in births], tilts[births], ego.T_world_ego, height_m)
+        self.tracks += [
+            PersonTrack(boxes[k], ego.t_source_ns, ego.frame_id, votes=Counter({boxes[k].label: 1})) for k in births
+        ]  # fmt: skip
+
+    def _conclude(self, frame: OpenFrame) -> None:
+        """Forgets who is gone, gives ids, and decides who stands."""
+        if not self.tracks:
+            return
+        ego, moments = frame.ego, self.filter.moments()
+        at = (moments.mean[:, :2] - [ego.T_world_ego.x_m, ego.T_world_ego.y_m]) @ ego.T_world_ego.rotation()
+        edge = (0.5 + SIDE_MARGIN) * self.camera.width_px / self.camera.fx_px
+        alive = []
+        for row, track in enumerate(self.tracks):
+            x_m, y_m = at[row].tolist()
+            outside = x_m < 1.0 or abs(y_m) > edge * x_m
+            track.outside_s = track.outside_s + frame.dt_s if outside and track.seen_ns != ego.t_source_ns else 0.0
+            lasting = track.hits >= self.config.confirm_hits
+            unseen_s = (ego.t_source_ns - track.seen_ns) * 1e-9
+            limit_s = self.config.forget_s if lasting else self.config.forget_unconfirmed_s
+            if unseen_s <= limit_s and track.outside_s <= LEAVES_S and math.isfinite(x_m + y_m):
+                alive.append((math.hypot(x_m, y_m), row))
+        rows = sorted(row for _, row in sorted(alive)[: self.config.most])
+        if len(rows) < len(self.tracks):
+            self.tracks = [self.tracks[row] for row in rows]
+            self.filter.keep_rows(rows)
+        for track, standing in zip(self.tracks, moments.standing[rows].tolist(), strict=True):
+            if track.person < 0 and track.hits >= self.config.confirm_hits:
+                track.person, self._next_id = self._next_id, self._next_id + 1
+            track.stands = standing > (WALKS if track.stands else STANDS)

@@ -1,0 +1,358 @@
+"""People in bird's-eye view: placed by feet and height, followed, told of in the world of the graph."""
+
+from __future__ import annotations
+
+import math
+import runpy
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.around.approach import approaches
+from birdslam.graph.around.hidden_road import hidden_fans
+from birdslam.graph.graph_config import GraphConfig
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.graph.weights import WeightsConfig
+from birdslam.people.people_boxes import PeopleBoxesConfig, people_boxes
+from birdslam.people.people_records import followed_people
+from birdslam.people.people_tracker import PeopleTracker, PeopleTrackingConfig
+from birdslam.perception import Detections
+from birdslam.queries import nearby
+from birdslam.types import (
+    FIRST_PERSON,
+    EgoEdge,
+    Estimate,
+    FollowedPerson,
+    Ground,
+    Measurements,
+    Moves,
+    RoadUser,
+    Status,
+)
+from birdslam.vehicles.out_of_sequence import OpenFrame
+from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.track import EgoFrame
+
+CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65)
+ROAD = GroundSizeFilter(CAMERA, GroundSizeConfig())
+Box = tuple[float, float, float, float]
+HZ = 10.0
+
+
+def box_of(x_m: float, y_m: float, height_m: float = 1.72, width_m: float = 0.6, reach_m: float = 0.25) -> Box:
+    """Of somebody at a place in ego, over a level road; the feet reach out to the camera."""
+    foot, head = bev.ego_to_pixel(CAMERA, CAMERA.ground, np.array([[x_m - reach_m, y_m, 0.0], [x_m, y_m, height_m]]))
+    middle = bev.ego_to_pixel(CAMERA, CAMERA.ground, np.array([[x_m, y_m, 0.0]]))[0, 0]
+    half = width_m / x_m * CAMERA.fx_px / 2.0
+    return float(middle - half), float(head[1]), float(middle + half), float(foot[1])
+
+
+def found(boxes: list[Box], labels: list[str] | None = None, score: float = 0.9) -> Detections:
+    names = tuple(labels or ["person"] * len(boxes))
+    return Detections(np.array(boxes, dtype=float).reshape(-1, 4), np.full(len(boxes), score), names)
+
+
+class Scene:
+    """A tracker, and the ego that drives along x."""
+
+    def __init__(self, ego_mps: float = 0.0) -> None:
+        self.tracker = PeopleTracker(CAMERA, PeopleTrackingConfig())
+        self.ego_mps, self.k = ego_mps, 0
+
+    @property
+    def ego_m(self) -> float:
+        return self.ego_mps * self.k / HZ
+
+    def see(self, detections: Detections | None) -> tuple[FollowedPerson, ...]:
+        """The next frame."""
+        ego = EgoFrame(self.k, round(self.k * 1e9 / HZ), SE2(self.ego_m, 0.0, 0.0), np.zeros((3, 3)))
+        dt_s = 0.0 if self.k == 0 else 1.0 / HZ
+        frame = OpenFrame(ego, dt_s, 0.0, None, 0.0, self.ego_mps * dt_s)
+        self.tracker.settle(frame, detections, ROAD)
+        self.k += 1
+        return followed_people(self.tracker, ego)
+
+
+def observed(boxes: list[Box], labels: list[str]) -> list[str]:
+    return [box.label for box in people_boxes(found(boxes, labels), CAMERA, CAMERA.ground, PeopleBoxesConfig())]
+
+
+# --- which boxes are whom ---
+
+
+def test_a_rider_and_the_bicycle_are_one_and_a_motorcycles_rider_is_no_pedestrian() -> None:
+    person, mount = (600.0, 150.0, 640.0, 250.0), (595.0, 200.0, 645.0, 265.0)
+    (whole,) = people_boxes(found([person, mount], ["person", "bicycle"]), CAMERA, CAMERA.ground, PeopleBoxesConfig())
+    assert whole.label == "cyclist"
+    assert whole.box_px == (595.0, 150.0, 645.0, 265.0)
+    assert observed([person, mount], ["person", "motorcycle"]) == []
+    beside = (660.0, 150.0, 700.0, 262.0)
+    assert sorted(observed([person, beside, mount], ["person", "person", "bicycle"])) == ["cyclist", "pedestrian"]
+
+
+def test_who_sits_in_a_car_is_no_pedestrian_and_who_stands_before_or_behind_it_is() -> None:
+    car = (500.0, 160.0, 700.0, 280.0)
+    assert observed([car, (560.0, 170.0, 600.0, 220.0)], ["car", "person"]) == []
+    assert observed([car, (560.0, 165.0, 600.0, 290.0)], ["car", "person"]) == ["pedestrian"]
+    assert observed([car, (560.0, 130.0, 600.0, 220.0)], ["car", "person"]) == ["pedestrian"]
+
+
+def test_a_bicycle_without_a_rider_begins_no_track() -> None:
+    scene = Scene()
+    for _ in range(5):
+        assert scene.see(found([(595.0, 200.0, 645.0, 265.0)], ["bicycle"])) == ()
+
+
+# --- places ---
+
+
+@given(x_m=st.floats(7.0, 40.0), bearing=st.floats(-0.6, 0.6), height_m=st.floats(1.55, 1.9))
+@settings(max_examples=25)
+def test_a_standing_person_is_placed_within_the_sigmas(x_m: float, bearing: float, height_m: float) -> None:
+    scene = Scene()
+    for _ in range(3):
+        people = scene.see(found([box_of(x_m, bearing * x_m, height_m)]))
+    (person,) = people
+    error = np.array([person.x_m - x_m, person.y_m - bearing * x_m])
+    assert error @ np.linalg.solve(np.reshape(person.cov, (2, 2)), error) < 3.0**2
+    assert abs(error[0]) < 0.12 * x_m
+    assert person.person == FIRST_PERSON
+
+
+def test_a_child_is_near_and_no_distant_adult() -> None:
+    scene = Scene()
+    for _ in range(4):
+        (child,) = scene.see(found([box_of(8.0, 1.0, 1.1)])) or (None,)
+    assert child is not None
+    assert child.x_m == pytest.approx(8.0, rel=0.12)  # an adult's box of that height is one at 12.5 m
+    assert child.child > 0.5
+    assert child.height_m == pytest.approx(1.1, rel=0.15)
+
+
+def test_feet_that_the_images_border_cuts_tell_no_place() -> None:
+    scene = Scene()
+    x1, y1, x2, _ = box_of(3.4, 0.3)
+    for _ in range(4):
+        (person,) = scene.see(found([(x1, y1, x2, 374.0)])) or (None,)
+    assert person is not None
+    assert abs(person.x_m - 3.4) < 3.0 * math.sqrt(person.cov[0])
+
+
+def test_feet_that_a_car_hides_do_not_move_who_was_seen_before() -> None:
+    scene, (x1, y1, x2, y2) = Scene(), box_of(12.0, 2.0)
+    for _ in range(6):
+        scene.see(found([(x1, y1, x2, y2)]))
+    hidden = y2 - 0.45 * (y2 - y1)
+    car = (x1 - 60.0, hidden - 15.0, x2 + 60.0, y2 + 30.0)
+    for _ in range(6):
+        (person,) = scene.see(found([(x1, y1, x2, hidden), car], ["person", "car"]))
+    assert person.x_m == pytest.approx(12.0, rel=0.12)
+
+
+def test_covariances_hold_what_boxes_and_heights_really_err() -> None:
+    rng, inside = np.random.default_rng(4), []
+    for _ in range(40):
+        height_m = 1.72 * math.exp(rng.normal(0.0, 0.06))
+        x_m, scene = rng.uniform(6.0, 25.0), Scene()
+        for _ in range(12):
+            box = np.array(box_of(x_m, 1.0, height_m))
+            box += rng.normal(0.0, 0.02, 4) * (box[3] - box[1])
+            people = scene.see(found([tuple(box.tolist())]))
+        inside += [abs(p.x_m - x_m) < math.sqrt(p.cov[0]) for p in people]
+    assert len(inside) >= 38
+    assert np.mean(inside) > 0.55
+
+
+# --- motion and ids ---
+
+
+def test_a_standing_person_stands_while_the_ego_drives() -> None:
+    rng, scene, told = np.random.default_rng(2), Scene(ego_mps=5.0), []
+    for k in range(40):
+        box = np.array(box_of(32.0 - scene.ego_m, 3.0))
+        box += rng.normal(0.0, 0.015, 4) * (box[3] - box[1])
+        people = scene.see(found([tuple(box.tolist())]))
+        told += [math.hypot(p.vx_mps, p.vy_mps) for p in people if k > 10]
+    assert np.median(told) < 0.3
+    assert people[0].moves is Moves.STANDING
+
+
+def test_a_walker_has_a_velocity_and_an_id_that_lasts_through_a_second_of_hiding() -> None:
+    scene, ids = Scene(), set()
+    for k in range(35):
+        y_m = 4.0 - 1.3 * k / HZ
+        hidden = 15 <= k < 25
+        people = scene.see(found([] if hidden else [box_of(12.0, y_m)]))
+        ids |= {p.person for p in people}
+        if k == 24:
+            (person,) = people
+            assert person.age_ns > 900_000_000
+            assert abs(person.y_m - y_m) < 0.8
+    (person,) = people
+    assert ids == {FIRST_PERSON}
+    assert (person.vx_mps, person.vy_mps) == pytest.approx((0.0, -1.3), abs=0.4)
+    assert person.moves is Moves.DRIVING
+    for _ in range(20):
+        people = scene.see(found([]))
+    assert people == ()
+
+
+def test_people_whose_boxes_overlap_by_half_stay_apart_and_cross_with_their_ids() -> None:
+    scene = Scene()
+    for k in range(40):
+        left, right = 1.2 - 1.0 * k / HZ, -1.8 + 1.0 * k / HZ
+        people = scene.see(found([box_of(9.0, left), box_of(11.0, right)]))
+    assert len(people) == 2
+    nearer = min(people, key=lambda p: p.x_m)
+    assert nearer.person == FIRST_PERSON
+    assert nearer.vy_mps < -0.5
+    pair = Scene()
+    for _ in range(10):
+        people = pair.see(found([box_of(10.0, 0.0), box_of(10.0, 0.3)]))
+    assert len({p.person for p in people}) == 2
+
+
+def test_frames_that_nobody_looked_at_cost_nothing_but_certainty() -> None:
+    scene = Scene()
+    for _ in range(5):
+        scene.see(found([box_of(10.0, 0.0)]))
+    (before,) = scene.see(found([box_of(10.0, 0.0)]))
+    (after,) = scene.see(None)
+    assert after.person == before.person
+    assert after.age_ns == 100_000_000
+    assert after.cov[0] > before.cov[0]
+
+
+# --- in the graph's world ---
+
+
+def measured(frame: int, people: tuple[FollowedPerson, ...], ahead_m: float = 0.5, **fields: object) -> Measurements:
+    cc = None if frame == 0 else EgoEdge(
+        from_frame=frame - 1, to_frame=frame, T_from_to=SE2(ahead_m, 0.0, 0.0),
+        cov=(1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-6),
+    )  # fmt: skip
+    t_ns = frame * 100_000_000
+    return Measurements(
+        frame_id=frame, t_source_ns=t_ns, t_capture_ns=t_ns, t_utc_ns=t_ns, cc=cc, people=people,
+        ground=Ground(height_m=1.65), **fields,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def person_at(
+    x_m: float, y_m: float, vx: float = 0.0, vy: float = 0.0, number: int = 0, **fields: object
+) -> FollowedPerson:
+    numbers = {"cov": (0.04, 0.0, 0.0, 0.01), "velocity_cov": (0.01, 0.0, 0.0, 0.01)} | fields
+    return FollowedPerson(person=FIRST_PERSON + number, x_m=x_m, y_m=y_m, vx_mps=vx, vy_mps=vy, **numbers)  # type: ignore[arg-type]
+
+
+def driven(frames: int, *people: FollowedPerson) -> tuple[PoseGraph, Estimate]:
+    graph = PoseGraph(GraphConfig(), WeightsConfig())
+    for k in range(frames):
+        estimate = graph.optimise(measured(k, people))
+    return graph, estimate
+
+
+def test_people_stand_in_world_with_the_egos_covariance_and_vehicles_stay_apart_from_them() -> None:
+    _, estimate = driven(20, person_at(10.0, 2.0, vy=-1.0))
+    (user,) = estimate.people
+    assert estimate.vehicles == ()
+    assert estimate.road_users == (user,)
+    assert user.is_person
+    assert user.seen
+    assert (user.T_world_vehicle.x_m, user.T_world_vehicle.y_m) == pytest.approx((19.5, 2.0), abs=0.05)
+    assert user.T_world_vehicle.yaw_rad == pytest.approx(-math.pi / 2.0, abs=0.01)
+    assert user.velocity_mps == pytest.approx((0.0, -1.0), abs=0.01)
+    assert user.cov[0] + user.cov[4] > 0.05  # its own, and the ego's
+
+
+def test_people_go_on_while_no_picture_comes_and_through_a_checkpoint() -> None:
+    graph, estimate = driven(10, person_at(10.0, 2.0, vy=-1.0))
+    late = msgspec.structs.replace(measured(12, (), 0.0, status=(Status.COASTING,)), cc=None)
+    restored = PoseGraph.restore(graph.checkpoint(), GraphConfig(), WeightsConfig())
+    coasted = graph.optimise(late)
+    (before,), (after,) = estimate.people, coasted.people
+    assert after.T_world_vehicle.y_m == pytest.approx(before.T_world_vehicle.y_m - 0.3, abs=0.01)
+    assert after.age_ns == before.age_ns + 300_000_000
+    assert after.cov[0] > before.cov[0]
+    assert restored.optimise(late) == coasted
+
+
+def test_a_crowd_is_cut_to_the_nearest_sixty() -> None:
+    crowd = tuple(person_at(5.0 + 0.5 * k, 0.0, number=k) for k in range(80))
+    _, estimate = driven(3, *crowd)
+    assert [user.vehicle - FIRST_PERSON for user in estimate.people] == list(range(60))
+
+
+@given(
+    p=st.tuples(st.floats(3.0, 40.0), st.floats(-8.0, 8.0)),
+    v=st.tuples(st.floats(-15.0, -1.0), st.floats(-2.0, 2.0)),
+)
+@settings(max_examples=25)
+def test_the_closest_approach_is_that_of_straight_ways(p: tuple[float, float], v: tuple[float, float]) -> None:
+    small = np.eye(2)[None] * 1e-4
+    (found,) = approaches(np.array([p]), np.array([v]), small, small)
+    times = np.linspace(0.0, 30.0, 30_001)
+    away = np.hypot(p[0] + v[0] * times, p[1] + v[1] * times)
+    assert found.distance_m == pytest.approx(away.min(), abs=0.01)
+    assert found.time_s == pytest.approx(times[away.argmin()], abs=0.02)
+    rng = np.random.default_rng(0)
+    ps, vs = rng.normal(p, 0.01, (4000, 2)), rng.normal(v, 0.01, (4000, 2))
+    drawn = -(ps * vs).sum(axis=1) / (vs * vs).sum(axis=1)
+    if 0.1 < found.time_s < 29.0:
+        assert found.sigma_s == pytest.approx(drawn.std(), rel=0.15)
+
+
+def test_who_crosses_our_way_is_nearby_and_who_walks_away_is_not() -> None:
+    people = person_at(12.0, 3.0, vy=-1.2), person_at(12.0, 6.0, vy=1.2, number=1), person_at(25.0, 0.0, number=2)
+    _, estimate = driven(10, *people)
+    crossing, leaving, ahead = (user.approach for user in estimate.people)
+    assert crossing is not None
+    assert crossing.nearby
+    assert crossing.time_s == pytest.approx(2.4, abs=0.2)
+    assert leaving is not None
+    assert not leaving.nearby
+    assert ahead is not None
+    assert ahead.time_s == pytest.approx(5.0, abs=0.1)
+    told = nearby(estimate)
+    assert told.users[0].vehicle == estimate.people[0].vehicle
+    assert told.users[0].T_ego_vehicle.x_m == pytest.approx(12.0, abs=0.1)
+
+
+def test_the_road_behind_a_parked_car_is_hidden_and_holds_a_child_before_it_steps_out() -> None:
+    car = RoadUser(
+        vehicle=3, T_world_vehicle=SE2(10.0, 3.0, 0.0), cov=(0.01,) * 9, velocity_mps=(0.0, 0.0), age_ns=0, frames=9,
+        velocity_cov=(0.01,) * 4, length_m=4.0, width_m=1.8, height_m=1.5,
+    )  # fmt: skip
+    (fan,) = hidden_fans((car,), SE2(), 1.65)
+    corners = np.array(fan.corners_m)
+
+    def holds(x_m: float, y_m: float) -> bool:
+        edges = np.roll(corners, -1, axis=0) - corners
+        to = np.array([x_m, y_m]) - corners
+        return bool((edges[:, 0] * to[:, 1] - edges[:, 1] * to[:, 0] > 0.0).all())
+
+    assert holds(16.0, 4.5)  # behind it, as the camera looks
+    assert not holds(16.0, -1.0)
+    assert not holds(7.0, 3.0)
+    assert hidden_fans((msgspec.structs.replace(car, T_world_vehicle=SE2(-10.0, 3.0, 0.0)),), SE2(), 1.65) == ()
+
+
+def test_the_example_stops_for_a_person_ahead_and_for_nobody_else() -> None:
+    example = Path(__file__).resolve().parent.parent / "docs" / "examples" / "stop_for_people.py"
+    who_stops_us = runpy.run_path(str(example))["who_stops_us"]
+    scene = Scene()
+    for _ in range(5):
+        people = scene.see(found([box_of(12.0, 0.4)]))
+    assert len(who_stops_us(driven(5, *people)[1])) == 1
+    aside = Scene()
+    for _ in range(5):
+        people = aside.see(found([box_of(12.0, 7.0)]))
+    assert len(people) == 1
+    assert who_stops_us(driven(5, *people)[1]) == []
