@@ -66,8 +66,10 @@ class _Track(msgspec.Struct):
 class LineTracker:
     """State: the filter, in the ego's frame at `T_world_filter`, and its lines' tracks."""
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, certain_m: float = CERTAIN_M) -> None:
+        """`certain_m` metres of evidence make a line sure in its first image."""
         self.camera = camera
+        self._certain_m = certain_m
         self._next = 0
         self.clear()
 
@@ -253,7 +255,7 @@ class LineTracker:
         self._filter.keep(np.array(kept, dtype=np.int64))
         self._tracks = [self._tracks[k] for k in kept]
         for track in self._tracks:
-            if track.line < 0 and (track.score >= CONFIRMED or track.evidence_m >= CERTAIN_M):
+            if track.line < 0 and (track.score >= CONFIRMED or track.evidence_m >= self._certain_m):
                 track.line, self._next = self._next, self._next + 1
 
     def lines(self, T_world_ego: SE2) -> tuple[LaneLine, ...]:
@@ -325,7 +327,7 @@ def still_lines(
     boxes_px: Floats,
 ) -> tuple[tuple[LaneLine, ...], GroundPlane]:
     """The lines of a single image, and the ground under its camera with the pitch that makes them parallel."""
-    tracker = LineTracker(camera)
+    tracker = LineTracker(camera, certain_m=LEAST_PAINT_M)  # there will be no other
     tracker.update(SE2(), camera.ground, camera.tilt_sigma_rad, image, segmentation, boxes_px, search_tilt=True)
     ground = GroundPlane(camera.height_m, camera.pitch_rad + tracker.tilt_rad, camera.roll_rad)
     return tracker.lines(SE2()), ground

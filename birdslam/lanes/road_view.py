@@ -84,9 +84,10 @@ def road_view(
         excess = np.asarray(0.5 * (green + red) - blue, np.float32)
     else:
         grey = seen(image, cv2.INTER_LINEAR)
-    covered = np.zeros(segmentation.road.shape, np.uint8)
+    covered = np.zeros(segmentation.road.shape, np.uint8)  # by boxes; road that shows in their corners is seen
     for x1, y1, x2, y2 in boxes_px:
         covered[max(0, int(y1)) : max(0, int(np.ceil(y2))), max(0, int(x1)) : max(0, int(np.ceil(x2)))] = 1
+    covered &= ~(segmentation.road | segmentation.lane)
     road, paint, hidden = (
         seen(mask.view(np.uint8), cv2.INTER_NEAREST) > 0 for mask in (segmentation.road, segmentation.lane, covered)
     )
