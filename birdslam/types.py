@@ -375,6 +375,79 @@ class Lane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
         _check_cov(self, "cov")
 
 
+class LaneChange(enum.StrEnum):
+    """The ego's change of lanes: told once, in the frame in which the middle of the ego has crossed the line."""
+
+    NONE = "none"
+    LEFT = "left"
+    RIGHT = "right"
+
+    @classmethod
+    def _missing_(cls, value: object) -> LaneChange | None:
+        return cls.NONE if isinstance(value, str) else None
+
+
+class VehicleLane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """In which lane a vehicle is: probabilities that sum to one, from the covariances of both."""
+
+    vehicle: BodyId
+    ego_lane: Probability = 0.0
+    left: Probability = 0.0  # in a lane to the left of the ego's that goes the ego's way
+    right: Probability = 0.0
+    oncoming: Probability = 0.0  # in a lane to the left or right, and driving against the ego's way
+    off_road: Probability = 0.0  # in none of the known lanes
+
+
+class Leader(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """The next vehicle ahead in the ego's lane."""
+
+    vehicle: BodyId
+    gap_m: float  # along the lane, from the camera's foot to the vehicle's rear
+    gap_sigma_m: float
+    time_gap_s: float | None = None  # at the ego's speed; None while the ego stands
+    probability: Probability = 1.0  # that it is in the ego's lane
+
+    def __post_init__(self) -> None:
+        check_finite(self, "gap_m", "gap_sigma_m")
+
+
+class Lanes(msgspec.Struct, frozen=True, kw_only=True):
+    """The lines and lanes around the ego in one frame, in ego."""
+
+    lines: tuple[LaneLine, ...] = ()  # from left to right, 8 m ahead
+    lanes: tuple[Lane, ...] = ()  # from left to right
+    ego_index: int | None = None  # the ego's lane among `lanes`; None: it is in none that is known
+    change: LaneChange = LaneChange.NONE
+    vehicles: tuple[VehicleLane, ...] = ()  # of an `Estimate`
+    leader: Leader | None = None  # of an `Estimate`
+    age_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # source time since the image that lines were last seen in
+
+    @property
+    def ego(self) -> Lane | None:
+        """The ego's lane."""
+        return None if self.ego_index is None else self.lanes[self.ego_index]
+
+    @property
+    def left(self) -> Lane | None:
+        """The lane at its left."""
+        return None if not self.ego_index else self.lanes[self.ego_index - 1]
+
+    @property
+    def right(self) -> Lane | None:
+        """The lane at its right."""
+        if self.ego_index is None or self.ego_index + 1 >= len(self.lanes):
+            return None
+        return self.lanes[self.ego_index + 1]
+
+    def line(self, line: BodyId | None) -> LaneLine | None:
+        """A line by its number."""
+        return next((found for found in self.lines if found.line == line), None)
+
+    def __post_init__(self) -> None:
+        if self.ego_index is not None and not 0 <= self.ego_index < len(self.lanes):
+            raise ValueError(f"Lanes.ego_index is {self.ego_index}, of {len(self.lanes)} lanes")
+
+
 class Attitude(msgspec.Struct, frozen=True, kw_only=True):
     """What SE(2) leaves out: the ego's height and tilt in the world, integrated from image odometry.
 
@@ -421,6 +494,7 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     ages: dict[str, int] = {}  # frames since that of each network's result; 0 is this frame
     status: tuple[Status, ...] = ()
     speed_sources: tuple[SpeedSource, ...] = ()  # where the metres of this frame's motion come from
+    road_lanes: Lanes | None = None  # None: no line was seen yet
 
     def __post_init__(self) -> None:
         check_finite(self, "scale_sigma_rel")
@@ -477,6 +551,7 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     scale_sigma_rel: float = 0.0  # 1-sigma of the metric scale as a fraction
     status: tuple[Status, ...] = ()  # expected trouble
     speed_sources: tuple[SpeedSource, ...] = ()  # where the metres of this frame's motion come from
+    lanes: Lanes | None = None  # lines and lanes in ego; None: no line was seen yet
 
     def __post_init__(self) -> None:
         check_finite(self, "scale_sigma_rel")

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.se2 import SE2
+from birdslam.lanes.occupancy import VehicleInEgo, with_vehicles
 from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, packed, plain, unpack, unpacked
 from birdslam.graph.costs import Floats
 from birdslam.graph.edges import PoseEdges, pose_edges
@@ -30,7 +31,17 @@ from birdslam.graph.pending_map import PendingMap
 from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edge
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
-from birdslam.types import INVALIDATING, BodyId, Estimate, MapUpdate, Measurements, SpeedSource, Status, VehicleEstimate
+from birdslam.types import (
+    INVALIDATING,
+    BodyId,
+    Estimate,
+    Lanes,
+    MapUpdate,
+    Measurements,
+    SpeedSource,
+    Status,
+    VehicleEstimate,
+)
 
 _NO_PIXELS = frozenset({Status.END_OF_SOURCE, Status.FRAME_UNREADABLE, Status.COASTING})
 
@@ -93,7 +104,11 @@ class PoseGraph:
         if not window.is_finite:  # numbers that no road has: begin anew rather than publish them
             window, reset = self._begin(m, True), True
         status = (*m.status, Status.GRAPH_RESET) if reset else m.status
-        return self._estimate(m, status, window.ego_cov, self._vehicle_estimates(m, window))
+        vehicles = self._vehicle_estimates(m, window)
+        estimate = self._estimate(m, status, window.ego_cov, vehicles)
+        if m.road_lanes is None:
+            return estimate
+        return msgspec.structs.replace(estimate, lanes=self._lanes(m.road_lanes, window, vehicles))
 
     def vehicles_in_ego(self) -> dict[BodyId, tuple[SE2, Floats]]:
         """T_ego_vehicle with its covariance (3, 3) in ego, of the vehicles that the newest frame sees.
@@ -260,6 +275,20 @@ class PoseGraph:
         cov = back @ window.ego_cov @ back.T + np.diag(np.square(change * since_s))
         estimate = self._estimate(m, m.status, cov, self._vehicle_estimates(m, window))
         return msgspec.structs.replace(estimate, T_world_ego=window.world @ way)
+
+    def _lanes(self, lanes: Lanes, window: Window, vehicles: tuple[VehicleEstimate, ...]) -> Lanes:
+        """The front end's lanes, with who is in them; the covariances have nothing of the ego's error in world."""
+        T_ego_world, seen = window.world.inverse(), []
+        for row, (node, estimate) in enumerate(zip(self._vehicles.nodes, vehicles, strict=True)):
+            T_ego_vehicle = T_ego_world @ estimate.T_world_vehicle
+            states = window.layout.poses[row]
+            by_size = node.size_bias_rel * np.array([T_ego_vehicle.x_m, T_ego_vehicle.y_m, 0.0])  # see marginals.py
+            cov = window.P[np.ix_(states, states)] + np.outer(by_size, by_size)
+            yaw_rad = estimate.T_world_vehicle.yaw_rad
+            speed_mps = estimate.velocity_mps[0] * math.cos(yaw_rad) + estimate.velocity_mps[1] * math.sin(yaw_rad)
+            seen.append(VehicleInEgo(estimate.vehicle, T_ego_vehicle, cov, estimate.length_m, speed_mps))
+        passed_s = max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
+        return with_vehicles(lanes, seen, self._motion.x_m / passed_s)
 
     def _vehicle_estimates(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
         since_s = (self._t_ns - self._t_before_ns) * 1e-9

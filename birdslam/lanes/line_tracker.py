@@ -7,7 +7,7 @@ says where each is, and only what lies on no known line can be a new one.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -46,6 +46,10 @@ SOLID, DASHED = 0.8, 0.6  # share of a line that is painted
 LEAST_PAINTED = 0.2  # of a dashed line; less of it is an arrow, or a scrap
 YELLOW = 25.0  # excess of yellow over the road's
 PROFILE_M = 4.0, 22.0  # where paint and gaps are resolved
+
+
+_AHEAD_M = np.arange(5.0, TO_M + 1.0, 5.0)
+_AHEAD = basis(_AHEAD_M)
 
 
 class _Track(msgspec.Struct):
@@ -258,38 +262,51 @@ class LineTracker:
             if track.line < 0 and (track.score >= CONFIRMED or track.evidence_m >= self._certain_m):
                 track.line, self._next = self._next, self._next + 1
 
-    def lines(self, T_world_ego: SE2) -> tuple[LaneLine, ...]:
-        """The lines that are sure, in the ego's frame at `T_world_ego`, from left to right."""
-        if self._T_world_filter is None:
-            return ()
-        step = self._T_world_filter.between(T_world_ego)
-        out = []
-        for k, track in enumerate(self._tracks):
-            if track.line < 0:
+    def lines(self) -> TrackedLines:
+        """The lines that are sure, as they are after the last update; nothing changes them any more."""
+        sure = [k for k, track in enumerate(self._tracks) if track.line >= 0]
+        return TrackedLines(
+            self._T_world_filter or SE2(),
+            tuple(msgspec.structs.replace(self._tracks[k]) for k in sure),
+            self._filter.curves[sure].copy(),
+            tuple(self._filter.block(k).copy() for k in sure),
+        )
+
+
+@dataclass(frozen=True)
+class TrackedLines:
+    """The lines after an update: tracks, curves (n, 4) and covariances (4, 4) in the ego at `T_world_seen`."""
+
+    T_world_seen: SE2
+    tracks: tuple[_Track, ...]
+    curves: Floats
+    covs: tuple[Floats, ...]
+
+    def at(self, T_world_ego: SE2) -> tuple[LaneLine, ...]:
+        """The lines in the ego's frame at `T_world_ego`, moved by the ego's motion, from left to right."""
+        step, out = self.T_world_seen.between(T_world_ego), []
+        for track, seen, seen_cov in zip(self.tracks, self.curves, self.covs, strict=True):
+            curve, J = moved(seen, step)
+            cov = J @ seen_cov @ J.T
+            sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", _AHEAD, cov, _AHEAD), 0.0))
+            known = _AHEAD_M[sigma < WORST_SIGMA_M]
+            if not len(known) or not np.isfinite(cov).all():
                 continue
-            curve, J = moved(self._filter.curves[k], step)
-            cov = J @ self._filter.block(k) @ J.T
-            x = np.arange(5.0, TO_M + 1.0, 5.0)
-            sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", basis(x), cov, basis(x)), 0.0))
-            known = x[sigma < WORST_SIGMA_M]
-            if not len(known):
-                continue
-            out.append(
-                LaneLine(
-                    line=track.line,
-                    offset_m=float(curve[0]),
-                    slope=float(curve[1]),
-                    curvature_per_m=float(curve[2]),
-                    curvature_rate_per_m2=float(curve[3]),
-                    cov=tuple(cov.ravel().tolist()),
-                    seen_from_m=track.seen_from_m - step.x_m,
-                    seen_to_m=track.seen_to_m - step.x_m,
-                    to_m=float(known[-1]),
-                    kind=_kind(track),
-                    colour=_colour(track),
-                    existence=_existence(track),
-                )
+            line = LaneLine(
+                line=track.line,
+                offset_m=float(curve[0]),
+                slope=float(curve[1]),
+                curvature_per_m=float(curve[2]),
+                curvature_rate_per_m2=float(curve[3]),
+                cov=tuple(cov.ravel().tolist()),
+                seen_from_m=track.seen_from_m - step.x_m,
+                seen_to_m=track.seen_to_m - step.x_m,
+                to_m=float(known[-1]),
+                kind=_kind(track),
+                colour=_colour(track),
+                existence=_existence(track),
             )
+            out.append(line)
         return tuple(sorted(out, key=lambda line: -line.y_m(8.0)))
 
 
@@ -330,6 +347,6 @@ def still_lines(
     tracker = LineTracker(camera, certain_m=LEAST_PAINT_M)  # there will be no other
     tracker.update(SE2(), camera.ground, camera.tilt_sigma_rad, image, segmentation, boxes_px, search_tilt=True)
     ground = GroundPlane(camera.height_m, camera.pitch_rad + tracker.tilt_rad, camera.roll_rad)
-    return tracker.lines(SE2()), ground
+    return tracker.lines().at(SE2()), ground
 
 
