@@ -16,7 +16,6 @@ import msgspec
 import numpy as np
 
 from birdslam.geometry.se2 import SE2
-from birdslam.lanes.occupancy import VehicleInEgo, with_vehicles
 from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, packed, plain, unpack, unpacked
 from birdslam.graph.costs import Floats
 from birdslam.graph.edges import PoseEdges, pose_edges
@@ -31,6 +30,7 @@ from birdslam.graph.pending_map import PendingMap
 from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edge
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
+from birdslam.lanes.occupancy import VehicleInEgo, with_vehicles
 from birdslam.types import (
     INVALIDATING,
     BodyId,

@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis, moved
@@ -193,14 +192,18 @@ class LineTracker:
                 side = 1 if track.kind == LEFT_EDGE else -1
                 past = np.clip(column + side * round(PAST_EDGE_M / (view.y_m[1] - view.y_m[0])), 0, len(view.y_m) - 1)
                 looked = clear & (x > NEAR_M) & (x < FAR_M) & ~view.outside[rows, past] & ~view.hidden[rows, past]
-                if view.row_m[looked & view.road[rows, past]].sum() > MOST_ROAD_PAST * max(view.row_m[looked].sum(), 1.0):
+                if view.row_m[looked & view.road[rows, past]].sum() > MOST_ROAD_PAST * max(
+                    view.row_m[looked].sum(), 1.0
+                ):
                     track.score -= 1.0
                     continue
             support_m = float(np.minimum(mine.weight, 1.0).sum())
             track.evidence_m += support_m
             if support_m >= 2.0:
                 track.score = min(track.score + (1.0 if mine.masked.mean() > 0.3 else 0.5), MOST_SCORE)
-                track.seen_from_m = min(track.seen_from_m, float(mine.x_m.min())) if track.looks else float(mine.x_m.min())
+                track.seen_from_m = (
+                    min(track.seen_from_m, float(mine.x_m.min())) if track.looks else float(mine.x_m.min())
+                )
                 track.seen_to_m = max(track.seen_to_m, float(np.quantile(mine.x_m, 0.98)))
             elif visible_m > 8.0:
                 track.score -= 1.0
@@ -250,9 +253,7 @@ class LineTracker:
             track = self._tracks[k]
             if track.score <= 0.0 or (track.looks and track.seen_to_m < FORGOTTEN_M):
                 continue
-            if any(
-                self._tracks[j].kind == track.kind and np.all(np.abs(ys[j] - ys[k]) < SAME_M) for j in kept
-            ):
+            if any(self._tracks[j].kind == track.kind and np.all(np.abs(ys[j] - ys[k]) < SAME_M) for j in kept):
                 continue
             kept.append(k)
         kept.sort()
@@ -348,5 +349,3 @@ def still_lines(
     tracker.update(SE2(), camera.ground, camera.tilt_sigma_rad, image, segmentation, boxes_px, search_tilt=True)
     ground = GroundPlane(camera.height_m, camera.pitch_rad + tracker.tilt_rad, camera.roll_rad)
     return tracker.lines().at(SE2()), ground
-
-

@@ -39,9 +39,7 @@ def with_vehicles(lanes: Lanes, vehicles: Sequence[VehicleInEgo], ego_mps: float
         return lanes
     placed = [(v, _placed(v, lanes)) for v in vehicles if abs(v.T_ego_vehicle.x_m) < FARTHEST_M]
     ahead = [
-        (v, where)
-        for v, where in placed
-        if v.T_ego_vehicle.x_m > 0.5 * v.length_m and where.ego_lane > LEAST_LEADER
+        (v, where) for v, where in placed if v.T_ego_vehicle.x_m > 0.5 * v.length_m and where.ego_lane > LEAST_LEADER
     ]
     leader = min(ahead, key=lambda item: item[0].T_ego_vehicle.x_m, default=None)
     return msgspec.structs.replace(

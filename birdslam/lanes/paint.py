@@ -133,7 +133,7 @@ def _symbols(view: RoadView, response: NDArray[np.float32], usable: Bools, least
     row, first, past = _runs(bright)
     width, label = (past - first) * LATTICE_M, labels[row, first]
     widest = np.zeros(count)
-    np.maximum.at(widest, label, width - 2.0 * view.sigma_y_m[row])
+    np.maximum.at(widest, label, (width - 2.0 * view.sigma_y_m[row]).astype(np.float64))
     mean = np.bincount(label, width, count) / np.maximum(np.bincount(label, minlength=count), 1)
     found = (widest > SYMBOL_M) | ((widest > HEAD_M) & (widest > HEAD_RATIO * mean))
     found[0] = False
@@ -221,7 +221,11 @@ def edge_points(view: RoadView, middle_m: Floats) -> tuple[LinePoints, LinePoint
         y_m = view.y_m[past[kept]] - 0.5 * side * LATTICE_M
         sigma = np.hypot(SIGMA_EDGE_M, EDGE_PIXELS * view.sigma_y_m[kept])
         nothing = np.full(len(kept), np.nan)
-        out.append(LinePoints(view.x_m[kept], y_m, sigma, np.minimum(view.row_m[kept], MOST_ROW_M), np.ones(len(kept), bool), nothing))
+        out.append(
+            LinePoints(
+                view.x_m[kept], y_m, sigma, np.minimum(view.row_m[kept], MOST_ROW_M), np.ones(len(kept), bool), nothing
+            )
+        )
     return out[0], out[1]
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.lanes.curves import Floats
 from birdslam.lanes.paint import LinePoints
@@ -83,7 +82,8 @@ def _histograms(offsets: Floats, weight: Floats, bins: int) -> Floats:
     smooth = 0.5 * votes
     smooth[:, 1:] += 0.25 * votes[:, :-1]
     smooth[:, :-1] += 0.25 * votes[:, 1:]
-    return smooth
+    out: Floats = smooth
+    return out
 
 
 def find_lines(points: LinePoints, curve: Floats, least_m: float, apart_m: float, most: int) -> list[Peak]:

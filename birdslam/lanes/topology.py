@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +39,7 @@ class LaneRow:
 def lane_row(lines: tuple[LaneLine, ...], usual_m: float = WIDTH_M, usual_sigma_m: float = WIDTH_SIGMA_M) -> LaneRow:
     """The lanes between the lines of a moment; `usual_m` is the width of the ego's lane by what was seen before."""
     bounds = _bounds(lines)
-    lanes = [
-        _between(left, right)
-        for left, right in zip(bounds[:-1], bounds[1:], strict=True)
-        if _is_lane(left, right)
-    ]
+    lanes = [_between(left, right) for left, right in pairwise(bounds) if _is_lane(left, right)]
     ego = next((k for k, lane in enumerate(lanes) if _holds_ego(lane)), None)
     if ego is None:
         own = _completed(bounds, usual_m, usual_sigma_m)
@@ -111,7 +108,7 @@ def _bound(line: LaneLine) -> Bound:
 
 
 def _between(left: LaneLine, right: LaneLine) -> Lane:
-    """The lane between two lines; its centre's covariance as if they erred alone, though they share the shape's error."""
+    """The lane between two lines: its centre is their mean, and their shapes' errors are the road's, common to both."""
     a, b = _shape(left), _shape(right)
     P, Q = np.array(left.cov).reshape(4, 4), np.array(right.cov).reshape(4, 4)
     shared = _shared(P, Q)

@@ -59,6 +59,6 @@ def evaluate_stills(configuration: Configuration, folder: Path, height_m: float 
             if not cv2.imwrite(str(picture), draw(image, camera, still)):
                 raise ResultsError(f"{picture}: can't be written")
             progress.advance()
-    report = report_of(scores, tuple(head.manifest.title or head.path.name for head in heads))
+    report = report_of(scores, tuple(head.name for head in heads))
     write_json(output / REPORT, report)
     return report

@@ -88,7 +88,8 @@ def read_pair(pair: Pair) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     for path, read in ((pair.image, image), (pair.mask, mask)):
         if read is None:
             raise DatasetError(f"{path}: can't be read as an image")
-    assert image is not None and mask is not None
+    assert image is not None
+    assert mask is not None
     if image.shape != mask.shape:
         raise DatasetError(f"{pair.mask}: is of another size than {pair.image.name}")
     return np.asarray(image, np.uint8), np.asarray(mask, np.uint8)

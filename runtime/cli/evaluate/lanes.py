@@ -6,20 +6,24 @@ import argparse
 from pathlib import Path
 
 from birdslam.runtime.cli.arguments import add_config, add_pipeline
+from birdslam.runtime.evaluation.drive_lanes import DriveReport, evaluate_drive
 from birdslam.runtime.evaluation.lanes import draw_frame_lanes
 from birdslam.runtime.evaluation.still_lanes import REPORT, evaluate_stills
 from birdslam.runtime.options import configuration_of
 
-KITTI_ROAD = "kitti-road"
+KITTI_ROAD, LINES = "kitti-road", "lines"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The drive, the frame or the kind of truth, and the pipeline."""
     parser.add_argument("drive", metavar="DRIVE|DIR", help="a KITTI directory, or a source's URI; images with --truth")
     parser.add_argument("--frame", type=int, metavar="N", help="which one; default: the last")
-    text = "kitti-road: DIR holds single images image_N.png with masks ego_lane_N.png of the ego's lane"
-    parser.add_argument("--truth", choices=(KITTI_ROAD,), help=text)
-    parser.add_argument("--height", type=float, metavar="M", help="of the camera over the road, with --truth kitti-road")
+    text = "kitti-road: DIR holds single images image_N.png with masks ego_lane_N.png of the ego's lane; "
+    text += "lines: DRIVE is a rendered one, demo:DIR, with its true lines"
+    parser.add_argument("--truth", choices=(KITTI_ROAD, LINES), help=text)
+    parser.add_argument(
+        "--height", type=float, metavar="M", help="of the camera over the road, with --truth kitti-road"
+    )
     add_config(parser)
     add_pipeline(parser)
 
@@ -27,7 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Draws it and names the file; with truth prints the scores."""
     configuration = configuration_of(options)
-    if options.truth != KITTI_ROAD:
+    if options.truth == LINES:
+        print(_text(evaluate_drive(configuration, options.drive)))
+        return 0
+    if options.truth is None:
         print(draw_frame_lanes(configuration, options.drive, options.frame))
         return 0
     report = evaluate_stills(configuration, Path(options.drive), options.height)
@@ -37,3 +44,30 @@ def run(options: argparse.Namespace) -> int:
     print(f"{report.images} images: mean IoU of the ego's lane {report.ego_lane_iou_mean:.3f}")
     print(Path(configuration.output) / REPORT)
     return 0
+
+
+def _text(report: DriveReport) -> str:
+    lines, vehicles = report.lines, report.vehicles
+    out = [f"{lines.drive}: {lines.frames} frames"]
+    out += [
+        f"  {at.ahead_m:4.0f} m ahead: error {at.error_median_m:.3f} m median, {at.error_p95_m:.3f} m p95, "
+        f"bias {at.bias_m:+.3f} m, {at.within_2_sigma:.0%} within 2 sigma, {at.lines} lines"
+        for at in lines.ranges
+        if at.error_median_m is not None
+    ]
+    said = {
+        "heading": (lines.heading_error_median_deg, "{:.2f} deg"),
+        "width": (lines.width_error_rel, "{:+.1%}"),
+        "lines found": (lines.recall, "{:.0%}"),
+        "false lines a km": (lines.false_lines_per_km, "{:.1f}"),
+        "frames with an ego lane": (lines.ego_lane_share, "{:.1%}"),
+        "wrong": (lines.ego_lane_wrong, "{:.1%}"),
+        "jitter": (lines.jitter_m, "{:.3f} m"),
+        "right after": (lines.found_after_s, "{:.2f} s"),
+        "vehicles in their lane": (vehicles.right, "{:.1%} of " + str(vehicles.vehicles)),
+        "log loss": (vehicles.log_loss, "{:.3f}"),
+        "leader named": (vehicles.leader_right, "{:.1%} of " + str(vehicles.leaders)),
+        "gap's error": (vehicles.gap_error_median_m, "{:.2f} m median"),
+    }
+    out += [f"  {name}: {form.format(value)}" for name, (value, form) in said.items() if value is not None]
+    return "\n".join(out)
