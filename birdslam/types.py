@@ -394,8 +394,8 @@ class VehicleLane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     ego_lane: Probability = 0.0
     left: Probability = 0.0  # in a lane to the left of the ego's that goes the ego's way
     right: Probability = 0.0
-    oncoming: Probability = 0.0  # in a lane to the left or right, and driving against the ego's way
-    off_road: Probability = 0.0  # in none of the known lanes
+    oncoming: Probability = 0.0  # not in the ego's lane, and driving against the ego's way
+    off_road: Probability = 0.0  # in none of the known lanes, and standing or driving the ego's way
 
 
 class Leader(msgspec.Struct, frozen=True, kw_only=True, gc=False):
@@ -421,6 +421,7 @@ class Lanes(msgspec.Struct, frozen=True, kw_only=True):
     vehicles: tuple[VehicleLane, ...] = ()  # of an `Estimate`
     leader: Leader | None = None  # of an `Estimate`
     age_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # source time since the image that lines were last seen in
+    tilt_rad: float = 0.0  # to be added to the pitch of `Ground`: so the lines of that image were parallel
 
     @property
     def ego(self) -> Lane | None:

@@ -286,7 +286,8 @@ class PoseGraph:
             cov = window.P[np.ix_(states, states)] + np.outer(by_size, by_size)
             yaw_rad = estimate.T_world_vehicle.yaw_rad
             speed_mps = estimate.velocity_mps[0] * math.cos(yaw_rad) + estimate.velocity_mps[1] * math.sin(yaw_rad)
-            seen.append(VehicleInEgo(estimate.vehicle, T_ego_vehicle, cov, estimate.length_m, speed_mps))
+            size = estimate.length_m
+            seen.append(VehicleInEgo(estimate.vehicle, T_ego_vehicle, cov, size, speed_mps, estimate.standing))
         passed_s = max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
         return with_vehicles(lanes, seen, self._motion.x_m / passed_s)
 

@@ -27,12 +27,19 @@ class EgoLane:
         self._width_m, self._sigma_m = WIDTH_M, WIDTH_SIGMA_M
         self._sides: dict[int, float] = {}  # line -> its side when it was last far enough: +1 left, -1 right
 
-    def lanes(self, lines: tuple[LaneLine, ...], age_ns: int) -> Lanes:
+    def lanes(self, lines: tuple[LaneLine, ...], age_ns: int, tilt_rad: float) -> Lanes:
         """The lanes between the lines (of a moment, in ego), and whether the ego has just changed."""
         row = lane_row(lines, self._width_m, self._sigma_m)
         own = None if row.ego is None else row.lanes[row.ego]
         self._learn_width(own)
-        return Lanes(lines=lines, lanes=row.lanes, ego_index=row.ego, change=self._changed(lines), age_ns=age_ns)
+        return Lanes(
+            lines=lines,
+            lanes=row.lanes,
+            ego_index=row.ego,
+            change=self._changed(lines),
+            age_ns=age_ns,
+            tilt_rad=tilt_rad,
+        )
 
     def _learn_width(self, own: Lane | None) -> None:
         if own is None or own.left_bound is not Bound.PAINT or own.right_bound is not Bound.PAINT:

@@ -41,6 +41,8 @@ FORGOTTEN_M = -2.0  # a line that ended so far behind the ego is dropped
 NEAR_M, FAR_M = 5.0, 25.0  # where a line that is there has to be seen
 PAST_EDGE_M, MOST_ROAD_PAST = 0.8, 0.35  # so far past an edge there is no road along so much of it
 WORST_SIGMA_M = 0.6  # to which range a line is predicted
+SIGMA_HEIGHT_REL = 0.02  # of the camera's height, as of landmarks (mapping.StaticMapConfig)
+SIGMA_OFFSET_M = 0.03  # of the camera's roll, 0.01 rad at 1.5 m, and of the paint's middle
 SOLID, DASHED = 0.8, 0.6  # share of a line that is painted
 LEAST_PAINTED = 0.2  # of a dashed line; less of it is an arrow, or a scrap
 YELLOW = 25.0  # excess of yellow over the road's
@@ -271,6 +273,7 @@ class LineTracker:
             tuple(msgspec.structs.replace(self._tracks[k]) for k in sure),
             self._filter.curves[sure].copy(),
             tuple(self._filter.block(k).copy() for k in sure),
+            self.tilt_rad,
         )
 
 
@@ -282,13 +285,14 @@ class TrackedLines:
     tracks: tuple[_Track, ...]
     curves: Floats
     covs: tuple[Floats, ...]
+    tilt_rad: float  # of their image against its pitch
 
     def at(self, T_world_ego: SE2) -> tuple[LaneLine, ...]:
         """The lines in the ego's frame at `T_world_ego`, moved by the ego's motion, from left to right."""
         step, out = self.T_world_seen.between(T_world_ego), []
         for track, seen, seen_cov in zip(self.tracks, self.curves, self.covs, strict=True):
             curve, J = moved(seen, step)
-            cov = J @ seen_cov @ J.T
+            cov = J @ seen_cov @ J.T + _systematic(curve)
             sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", _AHEAD, cov, _AHEAD), 0.0))
             known = _AHEAD_M[sigma < WORST_SIGMA_M]
             if not len(known) or not np.isfinite(cov).all():
@@ -309,6 +313,14 @@ class TrackedLines:
             )
             out.append(line)
         return tuple(sorted(out, key=lambda line: -line.y_m(8.0)))
+
+
+def _systematic(curve: Floats) -> Floats:
+    """(4, 4) covariance that no number of images lessens: of the camera's height, which scales a curve, and its roll."""
+    by_height = np.array([curve[0], 0.0, -curve[2], -2.0 * curve[3]])
+    out: Floats = SIGMA_HEIGHT_REL**2 * np.outer(by_height, by_height)
+    out[0, 0] += SIGMA_OFFSET_M**2
+    return out
 
 
 def _existence(track: _Track) -> float:

@@ -18,19 +18,20 @@ Floats = NDArray[np.float64]
 LEAST_LEADER = 0.5  # probability of the ego's lane
 FARTHEST_M = 120.0
 AGAINST = -0.3  # cosine of a vehicle's heading to the lane's, below which it comes towards
-SLOW_MPS = 1.0  # below it a vehicle's heading says nothing of its way, and a time gap is no number
+SLOW_MPS = 1.0  # below it a vehicle may stand, and a time gap is no number
 BEND_SIGMA_PER_M = 0.002  # 1-sigma of a lane's curvature beyond where it was seen
 
 
 @dataclass(frozen=True)
 class VehicleInEgo:
-    """A vehicle in ego: its pose, covariance (3, 3), length and speed along its heading."""
+    """A vehicle in ego: its pose, covariance (3, 3), length, speed along its heading, probability that it stands."""
 
     vehicle: int
     T_ego_vehicle: SE2
     cov: Floats
     length_m: float
     speed_mps: float
+    standing: float = 0.0
 
 
 def with_vehicles(lanes: Lanes, vehicles: Sequence[VehicleInEgo], ego_mps: float) -> Lanes:
@@ -62,8 +63,11 @@ def _placed(v: VehicleInEgo, lanes: Lanes) -> VehicleLane:
     right = sum(shares[index + 1 :] if index is not None else ())
     off = max(0.0, 1.0 - ego - left - right)
     oncoming = 0.0
-    if abs(v.speed_mps) > SLOW_MPS and math.cos(v.T_ego_vehicle.yaw_rad) * math.copysign(1.0, v.speed_mps) < AGAINST:
-        oncoming, left, right = left + right, 0.0, 0.0
+    drives = 1.0 if abs(v.speed_mps) > SLOW_MPS else 1.0 - v.standing
+    if math.cos(v.T_ego_vehicle.yaw_rad) * (-1.0 if v.speed_mps < -SLOW_MPS else 1.0) < AGAINST:
+        # Who comes towards us drives on a road, also beyond the lanes that are known
+        oncoming = drives * (left + right + off)
+        left, right, off = ((1.0 - drives) * share for share in (left, right, off))
     return VehicleLane(
         vehicle=v.vehicle, ego_lane=min(ego, 1.0), left=left, right=right, oncoming=oncoming, off_road=off
     )

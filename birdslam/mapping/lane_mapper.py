@@ -192,7 +192,7 @@ class LaneMapper:
         if self._lines is None:
             return None
         seen_ns, lines = self._lines
-        return self._ego_lane.lanes(lines.at(T_world_ego), max(0, t_source_ns - seen_ns))
+        return self._ego_lane.lanes(lines.at(T_world_ego), max(0, t_source_ns - seen_ns), lines.tilt_rad)
 
     def _take_result(self) -> _LaneResult | None:
         """The result of a run that has ended."""

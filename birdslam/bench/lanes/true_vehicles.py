@@ -13,7 +13,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.sources.shipped_drive import TrueBody, TrueLine
 from birdslam.types import Estimate, VehicleLane
 
-MATCH_M = 3.0  # from an estimated vehicle to its body
+MATCH_M, MATCH_REL = 2.0, 0.05  # from an estimated vehicle to its body, and so much more in a metre of distance
 LEAST_PROBABILITY = 1e-3  # a certain error counts as so much in the log loss
 AGAINST_RAD = math.pi / 2
 PLACES = ("ego_lane", "left", "right", "oncoming", "off_road")
@@ -95,7 +95,7 @@ def _nearest(pose: SE2, bodies: Sequence[TrueBody]) -> TrueBody | None:
         return math.hypot(body.T_ego_body.x_m - pose.x_m, body.T_ego_body.y_m - pose.y_m)
 
     body = min(bodies, key=distance_m, default=None)
-    return body if body is not None and distance_m(body) < MATCH_M else None
+    return body if body is not None and distance_m(body) < MATCH_M + MATCH_REL * abs(pose.x_m) else None
 
 
 def true_place(body: TrueBody, truth: tuple[TrueLine, ...]) -> str | None:
