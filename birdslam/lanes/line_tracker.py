@@ -316,7 +316,7 @@ class TrackedLines:
 
 
 def _systematic(curve: Floats) -> Floats:
-    """(4, 4) covariance that no number of images lessens: of the camera's height, which scales a curve, and its roll."""
+    """(4, 4) what no number of images lessens: errors of the camera's height, which scales a curve, and its roll."""
     by_height = np.array([curve[0], 0.0, -curve[2], -2.0 * curve[3]])
     out: Floats = SIGMA_HEIGHT_REL**2 * np.outer(by_height, by_height)
     out[0, 0] += SIGMA_OFFSET_M**2

@@ -23,6 +23,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.bev_picture import Scene, Track, draw
 from birdslam.outputs.final_trajectories import EGO_FILES
+from birdslam.outputs.line_map import LineMap
 from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row, tum_row
 from birdslam.types import Attitude, Estimate, MapUpdate, Status, VehicleEstimate
 
@@ -114,6 +115,8 @@ class Recorder:
             for old in (*self._tracks_directory.glob("*.tum.txt"), *later):
                 old.unlink(missing_ok=True)  # stale tracks beside new ones would be taken for this run's
             self._kitti, self._tum, self._map = map(self._open, ("ego.kitti.txt", "ego.tum.txt", "map.csv"))
+            self._lines = LineMap(directory / "map.geojson")
+            self._files.callback(self._lines.close)
         except OSError as error:
             self.close()
             raise ResultsError(f"output directory {directory}: {error.strerror}: {error.filename}") from None
@@ -165,6 +168,7 @@ class Recorder:
         self._write_row(estimate, pose)
         T_picture_ego = self._T_picture_world @ estimate.T_world_ego
         self._ego.add(T_picture_ego.x_m, T_picture_ego.y_m, T_picture_ego.yaw_rad)
+        self._lines.add(estimate, self._T_picture_world)
         for vehicle in estimate.vehicles:
             if vehicle.age_ns == 0:
                 self._add_vehicle(estimate, vehicle)
@@ -277,6 +281,7 @@ class Recorder:
             path_m=self._path_m,
             frames=self._frames,
             track_count=self._track_count,
+            lines=tuple(self._lines.drawn()),
         )
 
 
