@@ -45,6 +45,7 @@ SIGMA_HEIGHT_REL = 0.02  # of the camera's height, as of landmarks (mapping.Stat
 SIGMA_OFFSET_M = 0.03  # of the camera's roll, 0.01 rad at 1.5 m, and of the paint's middle
 SOLID, DASHED = 0.8, 0.6  # share of a line that is painted
 LEAST_PAINTED = 0.2  # of a dashed line; less of it is an arrow, or a scrap
+LEAST_EXISTENCE, LOOKS_OF_A_SCRAP = 0.4, 4.0  # what has less after so many images is dropped
 YELLOW = 25.0  # excess of yellow over the road's
 PROFILE_M = 4.0, 22.0  # where paint and gaps are resolved
 
@@ -253,6 +254,8 @@ class LineTracker:
         ys = self._filter.curves @ basis(x).T
         for k in sorted(range(len(self._tracks)), key=lambda k: -self._tracks[k].score):
             track = self._tracks[k]
+            if track.looks >= LOOKS_OF_A_SCRAP and _existence(track) < LEAST_EXISTENCE:
+                continue
             if track.score <= 0.0 or (track.looks and track.seen_to_m < FORGOTTEN_M):
                 continue
             if any(self._tracks[j].kind == track.kind and np.all(np.abs(ys[j] - ys[k]) < SAME_M) for j in kept):
