@@ -18,6 +18,8 @@ from birdslam.bench.lanes.kitti_road import (
     report_of,
     score,
 )
+from birdslam.bench.lanes.paint_masks import PaintReport, find_images, read, score_paint
+from birdslam.bench.lanes.paint_masks import report_of as paint_report
 from birdslam.outputs.drive_files import ResultsError, claim_directory, write_json
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.inference import Inference
@@ -25,6 +27,33 @@ from birdslam.runtime.progress import Progress
 from birdslam.sources.recording import DatasetError
 
 REPORT = "report.json"
+
+
+def evaluate_paint(configuration: Configuration, folder: Path) -> PaintReport:
+    """Scores the paint that the configured network finds in a folder's images; writes the report to the output.
+
+    Raises ConfigurationError, DatasetError, ModelError, ResultsError.
+    """
+    pairs = find_images(folder)
+    output = Path(configuration.output)
+    claim_directory(output)
+    lossless = msgspec.structs.replace(configuration.source, rate="max")
+    configuration = msgspec.structs.replace(configuration, source=lossless)
+    scores = []
+    with Inference(configuration) as inference, Progress(folder.name, len(pairs)) as progress:
+        for image_path, mask_path in pairs:
+            image, mask = read(image_path), read(mask_path)
+            if image.shape != mask.shape:
+                raise DatasetError(f"{mask_path}: is of another size than its image")
+            segmentation = inference.networks.start(0, image).result().segmentation
+            if segmentation is None:
+                raise ConfigurationError("--model: no network segments road and lanes")
+            scores.append(score_paint(image_path.name, image, segmentation.lane, mask))
+            progress.advance()
+        own = next((spec for spec in (configuration.models.segmenter,) if spec is not None), None)
+        report = paint_report("shipped" if own is None else Path(own.path).name, scores)
+    write_json(output / REPORT, report)
+    return report
 
 
 def evaluate_stills(configuration: Configuration, folder: Path, height_m: float | None) -> StillsReport:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from birdslam.bench.lanes.paint_masks import PaintReport
 from birdslam.runtime.cli.arguments import add_config, add_pipeline
 from birdslam.runtime.evaluation.drive_lanes import DriveReport, evaluate_drive
 from birdslam.runtime.evaluation.lanes import draw_frame_lanes
-from birdslam.runtime.evaluation.still_lanes import REPORT, evaluate_stills
+from birdslam.runtime.evaluation.still_lanes import REPORT, evaluate_paint, evaluate_stills
 from birdslam.runtime.options import configuration_of
 
-KITTI_ROAD, LINES = "kitti-road", "lines"
+KITTI_ROAD, LINES, PAINT = "kitti-road", "lines", "paint"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,8 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("drive", metavar="DRIVE|DIR", help="a KITTI directory, or a source's URI; images with --truth")
     parser.add_argument("--frame", type=int, metavar="N", help="which one; default: the last")
     text = "kitti-road: DIR holds single images image_N.png with masks ego_lane_N.png of the ego's lane; "
-    text += "lines: DRIVE is a rendered one, demo:DIR, with its true lines"
-    parser.add_argument("--truth", choices=(KITTI_ROAD, LINES), help=text)
+    text += "lines: DRIVE is a rendered one, demo:DIR, with its true lines; "
+    text += "paint: DIR holds imgs/NAME.png and masks/NAME.png of lane markings, as comma10k has them"
+    parser.add_argument("--truth", choices=(KITTI_ROAD, LINES, PAINT), help=text)
     parser.add_argument(
         "--height", type=float, metavar="M", help="of the camera over the road, with --truth kitti-road"
     )
@@ -34,6 +36,9 @@ def run(options: argparse.Namespace) -> int:
     if options.truth == LINES:
         print(_text(evaluate_drive(configuration, options.drive)))
         return 0
+    if options.truth == PAINT:
+        print(_paint_text(evaluate_paint(configuration, Path(options.drive))))
+        return 0
     if options.truth is None:
         print(draw_frame_lanes(configuration, options.drive, options.frame))
         return 0
@@ -44,6 +49,22 @@ def run(options: argparse.Namespace) -> int:
     print(f"{report.images} images: mean IoU of the ego's lane {report.ego_lane_iou_mean:.3f}")
     print(Path(configuration.output) / REPORT)
     return 0
+
+
+def _paint_text(report: PaintReport) -> str:
+    def said(value: float | None) -> str:
+        return "    -" if value is None else f"{value:5.2f}"
+
+    out = [
+        f"{found.image[:24]:24} {'night' if found.night else '':5} precision {said(found.precision)} "
+        f"recall {said(found.recall)}, {found.true_px} px of paint"
+        for found in report.by_image
+    ]
+    out.append(
+        f"{report.network}: {report.images} images, at 5 px: precision {said(report.precision)}, "
+        f"recall {said(report.recall)}, by night {said(report.recall_by_night)}"
+    )
+    return "\n".join(out)
 
 
 def _text(report: DriveReport) -> str:
