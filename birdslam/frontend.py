@@ -157,6 +157,7 @@ class FrontEnd:
             vv=vv,
             cp=(*cp, *lanes.edges),
             lanes=lanes.points,
+            road_lanes=lanes.lanes,
             attitude=self._dead_reckoning.attitude,
             ground=Ground(height_m=ground.height_m, pitch_rad=ground.pitch_rad, roll_rad=ground.roll_rad),
             scale_sigma_rel=0.0 if motion is None else motion.scale_sigma_rel,
@@ -237,6 +238,8 @@ class FrontEnd:
             perception.segmentation,
             frame.frame_id - age,
             _boxes_px(perception),
+            frame.image,
+            frame.t_source_ns,
         )
 
 

@@ -66,6 +66,12 @@ def _is_sound(total: float, *variances: float) -> bool:
     return math.isfinite(total) and min(variances) >= 0.0
 
 
+def _curve_sigma(cov: tuple[float, ...], x_m: float) -> float:
+    """1-sigma of y at x of a cubic with this covariance (4, 4)."""
+    at = (1.0, x_m, x_m * x_m / 2.0, x_m * x_m * x_m / 6.0)
+    return math.sqrt(max(0.0, sum(at[i] * cov[4 * i + j] * at[j] for i in range(4) for j in range(4))))
+
+
 def check_points(record: msgspec.Struct, *points_m: tuple[float, float]) -> None:
     for x_m, y_m in points_m:
         if not math.isfinite(x_m + y_m):
@@ -251,6 +257,200 @@ class LanePoint(msgspec.Struct, frozen=True, array_like=True, gc=False):
             check_finite(self, "x_m", "y_m")
 
 
+class LineKind(enum.StrEnum):
+    """What a line on the road is."""
+
+    UNKNOWN = "unknown"
+    SOLID = "solid"
+    DASHED = "dashed"
+    DOUBLE = "double"  # two lines of paint side by side
+    EDGE = "edge"  # where the road ends, with or without a kerb
+
+    @classmethod
+    def _missing_(cls, value: object) -> LineKind | None:
+        return cls.UNKNOWN if isinstance(value, str) else None
+
+
+class LineColour(enum.StrEnum):
+    """The colour of a painted line, where it is sure."""
+
+    UNKNOWN = "unknown"
+    WHITE = "white"
+    YELLOW = "yellow"
+
+    @classmethod
+    def _missing_(cls, value: object) -> LineColour | None:
+        return cls.UNKNOWN if isinstance(value, str) else None
+
+
+Cov4 = Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)]
+
+
+class LaneLine(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """A line on the road, or the road's edge, as a curve in ego (to third order a clothoid):
+
+    y(x) = offset_m + slope x + curvature_per_m x^2 / 2 + curvature_rate_per_m2 x^3 / 6, from `seen_from_m` to `to_m`.
+    `cov` (4, 4) row-major is that of the four numbers, in their order.
+    """
+
+    line: BodyId  # its number, for as long as it is followed
+    offset_m: float  # to the left of the ego
+    slope: float  # dy/dx at the ego: the tangent of its heading
+    curvature_per_m: float  # > 0: to the left
+    curvature_rate_per_m2: float
+    cov: Cov4
+    seen_from_m: float  # x of the nearest point that was seen of it, behind the ego < 0
+    seen_to_m: float  # x of the farthest point that was seen of it; beyond, up to `to_m`, it is predicted
+    to_m: float  # x up to which it is known to 0.6 m
+    kind: LineKind = LineKind.UNKNOWN
+    colour: LineColour = LineColour.UNKNOWN
+    existence: Probability = 1.0  # the probability that it is a line
+
+    def y_m(self, x_m: float) -> float:
+        """Where it is `x_m` ahead of the ego."""
+        rate = self.curvature_rate_per_m2
+        return self.offset_m + x_m * (self.slope + x_m * (self.curvature_per_m / 2.0 + x_m * rate / 6.0))
+
+    def sigma_m(self, x_m: float) -> float:
+        """1-sigma of `y_m(x_m)`."""
+        return _curve_sigma(self.cov, x_m)
+
+    def __post_init__(self) -> None:
+        shape = self.offset_m + self.slope + self.curvature_per_m + self.curvature_rate_per_m2
+        total = shape + self.seen_from_m + self.seen_to_m + self.to_m + sum(self.cov)
+        if not _is_sound(total, *self.cov[::5]):
+            check_finite(self, "offset_m", "slope", "curvature_per_m", "curvature_rate_per_m2")
+            check_finite(self, "seen_from_m", "seen_to_m", "to_m")
+            _check_cov(self, "cov")
+
+
+class Bound(enum.StrEnum):
+    """What a lane's left or right is known by."""
+
+    PAINT = "paint"
+    EDGE = "edge"  # the road's edge
+    WIDTH = "width"  # neither is seen: the other side's line, and the width of lanes
+
+    @classmethod
+    def _missing_(cls, value: object) -> Bound | None:
+        return cls.WIDTH if isinstance(value, str) else None
+
+
+class Lane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """A lane in ego: its centre line, a curve as `LaneLine` has it, and its width."""
+
+    offset_m: float  # of the centre line, to the left of the ego
+    slope: float
+    curvature_per_m: float
+    curvature_rate_per_m2: float
+    cov: Cov4  # (4, 4) of those four
+    width_m: float  # at the ego
+    width_slope: float  # by which it grows in a metre ahead
+    width_sigma_m: float
+    to_m: float  # x up to which it is known
+    left: BodyId | None = None  # the line at its left; None where `left_bound` is WIDTH
+    right: BodyId | None = None
+    left_bound: Bound = Bound.PAINT
+    right_bound: Bound = Bound.PAINT
+    carriageway: bool = False  # no paint divides it: all of the road between its edges, for both directions perhaps
+
+    def centre_m(self, x_m: float) -> float:
+        """y of the centre line `x_m` ahead of the ego."""
+        rate = self.curvature_rate_per_m2
+        return self.offset_m + x_m * (self.slope + x_m * (self.curvature_per_m / 2.0 + x_m * rate / 6.0))
+
+    def left_m(self, x_m: float) -> float:
+        """y of its left bound `x_m` ahead of the ego."""
+        return self.centre_m(x_m) + 0.5 * (self.width_m + self.width_slope * x_m)
+
+    def right_m(self, x_m: float) -> float:
+        """y of its right bound `x_m` ahead of the ego."""
+        return self.centre_m(x_m) - 0.5 * (self.width_m + self.width_slope * x_m)
+
+    def sigma_m(self, x_m: float) -> float:
+        """1-sigma of `centre_m(x_m)`."""
+        return _curve_sigma(self.cov, x_m)
+
+    def __post_init__(self) -> None:
+        check_finite(self, "offset_m", "slope", "curvature_per_m", "curvature_rate_per_m2")
+        check_finite(self, "width_m", "width_slope", "width_sigma_m", "to_m")
+        _check_cov(self, "cov")
+
+
+class LaneChange(enum.StrEnum):
+    """The ego's change of lanes: told once, in the frame in which the middle of the ego has crossed the line."""
+
+    NONE = "none"
+    LEFT = "left"
+    RIGHT = "right"
+
+    @classmethod
+    def _missing_(cls, value: object) -> LaneChange | None:
+        return cls.NONE if isinstance(value, str) else None
+
+
+class VehicleLane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """In which lane a vehicle is: probabilities that sum to one, from the covariances of both."""
+
+    vehicle: BodyId
+    ego_lane: Probability = 0.0
+    left: Probability = 0.0  # in a lane to the left of the ego's that goes the ego's way
+    right: Probability = 0.0
+    oncoming: Probability = 0.0  # not in the ego's lane, and driving against the ego's way
+    off_road: Probability = 0.0  # in none of the known lanes, and standing or driving the ego's way
+
+
+class Leader(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """The next vehicle ahead in the ego's lane."""
+
+    vehicle: BodyId
+    gap_m: float  # along the lane, from the camera's foot to the vehicle's rear
+    gap_sigma_m: float
+    time_gap_s: float | None = None  # at the ego's speed; None while the ego stands
+    probability: Probability = 1.0  # that it is in the ego's lane
+
+    def __post_init__(self) -> None:
+        check_finite(self, "gap_m", "gap_sigma_m")
+
+
+class Lanes(msgspec.Struct, frozen=True, kw_only=True):
+    """The lines and lanes around the ego in one frame, in ego."""
+
+    lines: tuple[LaneLine, ...] = ()  # from left to right, 8 m ahead
+    lanes: tuple[Lane, ...] = ()  # from left to right
+    ego_index: int | None = None  # the ego's lane among `lanes`; None: it is in none that is known
+    change: LaneChange = LaneChange.NONE
+    vehicles: tuple[VehicleLane, ...] = ()  # of an `Estimate`
+    leader: Leader | None = None  # of an `Estimate`
+    age_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # source time since the image that lines were last seen in
+    tilt_rad: float = 0.0  # to be added to the pitch of `Ground`: so the lines of that image were parallel
+
+    @property
+    def ego(self) -> Lane | None:
+        """The ego's lane."""
+        return None if self.ego_index is None else self.lanes[self.ego_index]
+
+    @property
+    def left(self) -> Lane | None:
+        """The lane at its left."""
+        return None if not self.ego_index else self.lanes[self.ego_index - 1]
+
+    @property
+    def right(self) -> Lane | None:
+        """The lane at its right."""
+        if self.ego_index is None or self.ego_index + 1 >= len(self.lanes):
+            return None
+        return self.lanes[self.ego_index + 1]
+
+    def line(self, line: BodyId | None) -> LaneLine | None:
+        """A line by its number."""
+        return next((found for found in self.lines if found.line == line), None)
+
+    def __post_init__(self) -> None:
+        if self.ego_index is not None and not 0 <= self.ego_index < len(self.lanes):
+            raise ValueError(f"Lanes.ego_index is {self.ego_index}, of {len(self.lanes)} lanes")
+
+
 class Attitude(msgspec.Struct, frozen=True, kw_only=True):
     """What SE(2) leaves out: the ego's height and tilt in the world, integrated from image odometry.
 
@@ -337,6 +537,7 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     speed_sources: tuple[SpeedSource, ...] = ()  # where the metres of this frame's motion come from
     camera_sigma_rel: float = 0.0  # 1-sigma of all lengths together by the camera's height and lens, as a fraction
     people: tuple[FollowedPerson, ...] = ()  # all that are followed, also those out of sight
+    road_lanes: Lanes | None = None  # None: no line was seen yet
 
     def __post_init__(self) -> None:
         check_finite(self, "scale_sigma_rel", "camera_sigma_rel")
@@ -461,6 +662,8 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     def road_users(self) -> tuple[RoadUser, ...]:
         """Vehicles and people."""
         return self.vehicles + self.people
+
+    lanes: Lanes | None = None  # lines and lanes in ego; None: no line was seen yet
 
     def __post_init__(self) -> None:
         check_finite(self, "scale_sigma_rel")

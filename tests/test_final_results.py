@@ -208,7 +208,7 @@ def test_a_run_writes_what_is_evaluated_and_takes_its_temporary_recording_away(t
     assert names == sorted(
         [
             *("bev.png", "drive.mp4", "ego.final.kitti.txt", "ego.final.tum.txt", "ego.kitti.txt", "ego.tum.txt"),
-            *("logs", "map.csv", "summary.json", "tracks"),
+            *("logs", "map.csv", "map.geojson", "summary.json", "tracks"),
         ]
     )
 

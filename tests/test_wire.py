@@ -37,6 +37,7 @@ from birdslam.sources.speed_log import KEPT_READINGS
 from birdslam.types import (
     Approach,
     Attitude,
+    Bound,
     EgoEdge,
     Estimate,
     FollowedPerson,
@@ -45,7 +46,14 @@ from birdslam.types import (
     HiddenFan,
     LandmarkEdge,
     LandmarkKind,
+    Lane,
+    LaneChange,
+    LaneLine,
     LanePoint,
+    Lanes,
+    Leader,
+    LineColour,
+    LineKind,
     MapUpdate,
     Measurements,
     MotionEdge,
@@ -55,6 +63,7 @@ from birdslam.types import (
     Status,
     VehicleEdge,
     VehicleEstimate,
+    VehicleLane,
 )
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -83,6 +92,49 @@ _KNOWN = {
     "child": 0.875,
     "approach": Approach(time_s=2.5, sigma_s=0.25, distance_m=1.5, sigma_m=0.75, nearby=True),
 }
+_COV4 = (0.04, 0.001, -0.0002, 0.0, 0.001, 0.0001, 0.0, 0.0, -0.0002, 0.0, 1e-06, 0.0, 0.0, 0.0, 0.0, 1e-10)
+_LANES = Lanes(
+    lines=(
+        LaneLine(
+            line=4,
+            offset_m=1.75,
+            slope=0.0125,
+            curvature_per_m=0.0025,
+            curvature_rate_per_m2=-0.00003125,
+            cov=_COV4,
+            seen_from_m=-3.5,
+            seen_to_m=38.25,
+            to_m=50.0,
+            kind=LineKind.DASHED,
+            colour=LineColour.YELLOW,
+            existence=0.875,
+        ),
+    ),
+    lanes=(
+        Lane(
+            offset_m=0.125,
+            slope=0.0125,
+            curvature_per_m=0.0025,
+            curvature_rate_per_m2=-0.00003125,
+            cov=_COV4,
+            width_m=3.25,
+            width_slope=0.015625,
+            width_sigma_m=0.0625,
+            to_m=45.0,
+            left=4,
+            right=6,
+            left_bound=Bound.EDGE,
+            right_bound=Bound.WIDTH,
+            carriageway=True,
+        ),
+    ),
+    ego_index=0,
+    change=LaneChange.LEFT,
+    vehicles=(VehicleLane(vehicle=7, ego_lane=0.5, left=0.125, right=0.0625, oncoming=0.25, off_road=0.0625),),
+    leader=Leader(vehicle=7, gap_m=18.5, gap_sigma_m=0.75, time_gap_s=1.25, probability=0.5),
+    age_ns=100_000_000,
+    tilt_rad=0.00390625,
+)
 # Every field holds something else than its default.
 EXAMPLES: tuple[msgspec.Struct, ...] = (
     _READING,
@@ -153,6 +205,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
                 frames=12,
             ),
         ),
+        road_lanes=_LANES,
     ),
     Estimate(
         **_TIMES,
@@ -202,6 +255,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
             ),
         ),
         hidden=(HiddenFan(vehicle=7, x_m=(20.5, 30.75, 31.0, 20.75), y_m=(-4.0, -6.0, -3.0, -2.0)),),
+        lanes=_LANES,
     ),
     MapUpdate(
         epoch=2, frame_id=4711, landmarks_m=((80.5, -9.0),), lanes_m=((81.0, -7.25), (82.0, -7.5)), lane_ids=(12, -1)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import msgspec
 
 from birdslam.geometry.se2 import SE2
-from birdslam.types import Estimate, RoadUser
+from birdslam.types import Estimate, Lane, LaneLine, Lanes, RoadUser
+
+Curve = TypeVar("Curve", LaneLine, Lane)
 
 
 def with_camera_scale(estimate: Estimate, sigma_rel: float) -> Estimate:
@@ -23,6 +26,7 @@ def with_camera_scale(estimate: Estimate, sigma_rel: float) -> Estimate:
         cov=_widened(estimate.cov, estimate.T_world_ego, sigma_rel),
         vehicles=tuple(_road_user(vehicle, sigma_rel) for vehicle in estimate.vehicles),
         people=tuple(_road_user(person, sigma_rel) for person in estimate.people),
+        lanes=None if estimate.lanes is None else _lanes(estimate.lanes, sigma_rel),
         scale_sigma_rel=math.hypot(estimate.scale_sigma_rel, sigma_rel),
     )
 
@@ -35,6 +39,30 @@ def _road_user(vehicle: RoadUser, sigma_rel: float) -> RoadUser:
         cov=_widened(vehicle.cov, vehicle.T_world_vehicle, sigma_rel),
         velocity_cov=(uu + u * u, uv + u * v, vu + u * v, vv + v * v),
     )
+
+
+def _lanes(lanes: Lanes, sigma_rel: float) -> Lanes:
+    return msgspec.structs.replace(
+        lanes,
+        lines=tuple(_curve(line, sigma_rel) for line in lanes.lines),
+        lanes=tuple(
+            msgspec.structs.replace(
+                _curve(lane, sigma_rel), width_sigma_m=math.hypot(lane.width_sigma_m, sigma_rel * lane.width_m)
+            )
+            for lane in lanes.lanes
+        ),
+        leader=lanes.leader
+        and msgspec.structs.replace(
+            lanes.leader, gap_sigma_m=math.hypot(lanes.leader.gap_sigma_m, sigma_rel * lanes.leader.gap_m)
+        ),
+    )
+
+
+def _curve(curve: Curve, sigma_rel: float) -> Curve:
+    """A factor on all lengths keeps a slope, and divides a curvature by itself and its rate by its square."""
+    moved = (curve.offset_m, 0.0, -curve.curvature_per_m, -2.0 * curve.curvature_rate_per_m2)
+    by_factor = (sigma_rel * sigma_rel * a * b for a in moved for b in moved)
+    return msgspec.structs.replace(curve, cov=tuple(c + d for c, d in zip(curve.cov, by_factor, strict=True)))
 
 
 def _widened(cov: tuple[float, ...], pose: SE2, sigma_rel: float) -> tuple[float, ...]:

@@ -33,11 +33,13 @@ from birdslam.graph.pending_map import PendingMap
 from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edge
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
+from birdslam.lanes.occupancy import VehicleInEgo, with_vehicles
 from birdslam.types import (
     INVALIDATING,
     BodyId,
     Estimate,
     FollowedPerson,
+    Lanes,
     MapUpdate,
     Measurements,
     SpeedSource,
@@ -114,6 +116,8 @@ class PoseGraph:
         self._people = m.people
         vehicles = self._vehicle_estimates(m, window)
         estimate = self._estimate(m, status, window.ego_cov, vehicles, self._ego_mps)
+        if m.road_lanes is not None:
+            estimate = msgspec.structs.replace(estimate, lanes=self._lanes(m.road_lanes, window, vehicles))
         return with_camera_scale(estimate, self._camera_sigma_rel)
 
     def vehicles_in_ego(self) -> dict[BodyId, tuple[SE2, Floats]]:
@@ -289,6 +293,21 @@ class PoseGraph:
         """The ego's velocity in its own axes, of the last motion."""
         since_s = (self._t_ns - self._t_before_ns) * 1e-9
         return complex(self._motion.x_m, self._motion.y_m) / max(since_s, SHORTEST_S)
+
+    def _lanes(self, lanes: Lanes, window: Window, vehicles: tuple[VehicleEstimate, ...]) -> Lanes:
+        """The front end's lanes, with who is in them; the covariances have nothing of the ego's error in world."""
+        T_ego_world, seen = window.world.inverse(), []
+        for row, (node, estimate) in enumerate(zip(self._vehicles.nodes, vehicles, strict=True)):
+            T_ego_vehicle = T_ego_world @ estimate.T_world_vehicle
+            states = window.layout.poses[row]
+            by_size = node.size_bias_rel * np.array([T_ego_vehicle.x_m, T_ego_vehicle.y_m, 0.0])  # see marginals.py
+            cov = window.P[np.ix_(states, states)] + np.outer(by_size, by_size)
+            yaw_rad = estimate.T_world_vehicle.yaw_rad
+            speed_mps = estimate.velocity_mps[0] * math.cos(yaw_rad) + estimate.velocity_mps[1] * math.sin(yaw_rad)
+            size = estimate.length_m
+            seen.append(VehicleInEgo(estimate.vehicle, T_ego_vehicle, cov, size, speed_mps, estimate.standing))
+        passed_s = max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
+        return with_vehicles(lanes, seen, self._motion.x_m / passed_s)
 
     def _vehicle_estimates(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
         return vehicle_estimates(

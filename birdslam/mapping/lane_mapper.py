@@ -19,18 +19,21 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
+from birdslam.lanes.ego_lane import EgoLane
+from birdslam.lanes.line_tracker import LineTracker, TrackedLines
 from birdslam.mapping.landmark_edges import StaticMapConfig
 from birdslam.mapping.lane_edges import LaneEdgesConfig, Station, lane_stations
 from birdslam.mapping.lane_ids import NO_LANE, cell_keys
 from birdslam.mapping.lanes import AmodalLanes, Completion, LanesConfig, LaneView, lane_view, points_of
 from birdslam.perception import Segmentation
-from birdslam.types import LandmarkEdge, LanePoint, Status
+from birdslam.types import LandmarkEdge, LanePoint, Lanes, Status
 
 Floats = NDArray[np.float64]
 Ids = NDArray[np.int64]
 Submit = Callable[..., Future[Any]]  # (function, *arguments), as of an executor
 
 REMEMBERED_FRAMES = 64  # whose poses are kept for late segmentations
+REMEMBERED_IMAGES = 8  # ... and whose images: lines are looked for in the image of a segmentation
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class LaneOutput:
     edges: tuple[LandmarkEdge, ...] = ()
     age: int | None = None
     status: tuple[Status, ...] = ()
+    lanes: Lanes | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,8 @@ class _LaneResult:
     stations: list[Station]
     with_lanes: bool  # lanes of many frames were detected too, not only this frame's points
     failed: bool  # the completion network gave no usable numbers
+    lines: TrackedLines | None  # None: not looked for, or the image of the segmentation is no more at hand
+    seen_ns: int  # source time of that image
 
 
 @dataclass(frozen=True)
@@ -77,6 +83,7 @@ class _PastFrame:
     T_world_ego: SE2
     ground: GroundPlane
     sigma_pitch_rad: float
+    t_source_ns: int = 0
 
 
 def _run_now(run: Callable[..., Any], *arguments: Any) -> Future[Any]:
@@ -110,7 +117,10 @@ class LaneMapper:
         self.head = head
         self._submit = head.submit or _run_now
         self._amodal = AmodalLanes(lanes, head.complete)
+        self._tracker, self._ego_lane = LineTracker(camera), EgoLane()
+        self._lines: tuple[int, TrackedLines] | None = None  # and the source time of their image
         self._frames: deque[_PastFrame] = deque(maxlen=REMEMBERED_FRAMES)
+        self._images: deque[tuple[int, NDArray[np.uint8]]] = deque(maxlen=REMEMBERED_IMAGES)
         self._used_frame = -1
         self._run: Future[_LaneResult] | None = None
         self._run_frame = -1
@@ -124,9 +134,15 @@ class LaneMapper:
         self._frames.clear()
         self._lanes_due_frame = self._lanes_frame = None
         self._stations = (-1, [])
+        self._lines = None
+        self._ego_lane.clear()
         self._run_outdated = self._run is not None
         if not self._run_outdated:
-            self._amodal.clear()
+            self._forget()
+
+    def _forget(self) -> None:
+        self._amodal.clear()
+        self._tracker.clear()
 
     def view(self, T_world_ego: SE2) -> LaneView:
         """The grids and lanes around the ego, for a picture; not while a run is under way."""
@@ -141,12 +157,17 @@ class LaneMapper:
         segmentation: Segmentation | None,
         segmented_frame: int,
         boxes_px: Floats,
+        image: NDArray[np.uint8] | None = None,
+        t_source_ns: int = 0,
     ) -> LaneOutput:
         """Lane points and edges of the segmentation of `segmented_frame`, if it is new and the ego has moved.
 
-        `boxes_px` (N, 4) are the vehicles' latest boxes, within which nothing is used.
+        `boxes_px` (N, 4) are the vehicles' latest boxes, within which nothing is used. Lines are found in the images,
+        (H, W) grey or (H, W, 3) BGR, of which this frame's is kept for its segmentation.
         """
-        self._frames.append(_PastFrame(frame_id, T_world_ego, ground, sigma_pitch_rad))
+        self._frames.append(_PastFrame(frame_id, T_world_ego, ground, sigma_pitch_rad, t_source_ns))
+        if image is not None:
+            self._images.append((frame_id, image))
         earlier = self._take_result()
         status: tuple[Status, ...] = ()
         if segmentation is not None and segmented_frame != self._used_frame:
@@ -160,8 +181,18 @@ class LaneMapper:
                 if self._amodal.has_moved(then.T_world_ego):
                     self._lanes_due_frame = frame_id if due else self._lanes_due_frame
                     self._run_frame = frame_id
-                    self._run = self._submit(self._detect_lanes, T_world_ego, then, segmentation, boxes_px, due)
-        return self._output(earlier or self._take_result(), frame_id, T_world_ego, status)
+                    seen = next((kept for kept_id, kept in self._images if kept_id == segmented_frame), None)
+                    run = (T_world_ego, then, segmentation, boxes_px, due, seen if due else None)
+                    self._run = self._submit(self._detect_lanes, *run)
+        found = earlier or self._take_result()
+        return self._output(found, frame_id, T_world_ego, status, self._lanes_at(T_world_ego, t_source_ns))
+
+    def _lanes_at(self, T_world_ego: SE2, t_source_ns: int) -> Lanes | None:
+        """The lanes by the lines as they were last seen, predicted by the ego's motion since; None before the first."""
+        if self._lines is None:
+            return None
+        seen_ns, lines = self._lines
+        return self._ego_lane.lanes(lines.at(T_world_ego), max(0, t_source_ns - seen_ns), lines.tilt_rad)
 
     def _take_result(self) -> _LaneResult | None:
         """The result of a run that has ended."""
@@ -170,33 +201,51 @@ class LaneMapper:
         found, self._run = self._run.result(), None
         if self._run_outdated:
             self._run_outdated = False
-            self._amodal.clear()
+            self._forget()
             return None
         self._stations = self._run_frame, found.stations
+        if found.lines is not None:
+            self._lines = found.seen_ns, found.lines
         if found.with_lanes:
             self._lanes_frame = self._run_frame
         return found
 
     def _output(
-        self, found: _LaneResult | None, frame_id: int, T_world_ego: SE2, status: tuple[Status, ...]
+        self,
+        found: _LaneResult | None,
+        frame_id: int,
+        T_world_ego: SE2,
+        status: tuple[Status, ...],
+        lanes: Lanes | None,
     ) -> LaneOutput:
         age = None if self._lanes_frame is None else frame_id - self._lanes_frame
         seen_frame, seen = self._stations
         carried = 0 <= frame_id - seen_frame <= self.edges.carried_frames
         edges = tuple(station.edge(frame_id, T_world_ego) for station in seen) if carried else ()
         if found is None:
-            return LaneOutput(edges=edges, age=age, status=status)
+            return LaneOutput(edges=edges, age=age, status=status, lanes=lanes)
         points = (T_world_ego.inverse() @ found.points_m).tolist()
         return LaneOutput(
             tuple(LanePoint(x, y, lane) for (x, y), lane in zip(points, found.lanes.tolist(), strict=True)),
             edges,
             age,
             (*status, Status.NETWORK_FAILED) if found.failed else status,
+            lanes,
         )
 
     def _detect_lanes(
-        self, T_world_ego: SE2, then: _PastFrame, segmentation: Segmentation, boxes_px: Floats, due: bool
+        self,
+        T_world_ego: SE2,
+        then: _PastFrame,
+        segmentation: Segmentation,
+        boxes_px: Floats,
+        due: bool,
+        image: NDArray[np.uint8] | None,
     ) -> _LaneResult:
+        lines = None
+        if image is not None:
+            self._tracker.update(then.T_world_ego, then.ground, then.sigma_pitch_rad, image, segmentation, boxes_px)
+            lines = self._tracker.lines()
         road_m, boundary_m = points_of(segmentation, self.camera, then.ground, boxes_px, self._amodal.config)
         on_world_m = then.T_world_ego @ boundary_m
         found = lane_stations(
@@ -220,7 +269,8 @@ class LaneMapper:
         seen_m = seen_m[: self.config.max_lane_points - len(points_m)]
         all_lanes = np.concatenate([lanes, np.full(len(seen_m), NO_LANE)])
         failed = due and self._amodal.completion_failed
-        return _LaneResult(np.concatenate([points_m, seen_m]), all_lanes, found, due, failed)
+        points_m = np.concatenate([points_m, seen_m])
+        return _LaneResult(points_m, all_lanes, found, due, failed, lines, then.t_source_ns)
 
     def _lanes_m(self, T_world_ego: SE2) -> tuple[Floats, Ids]:
         """(N, 2) points, in world, of the lanes ahead, and their lanes (N,): the mean of each cell.

@@ -28,6 +28,7 @@ EGO_LENGTH_M, EGO_WIDTH_M, EGO_AXLE_M = 4.2, 1.8, 1.7  # how the ego is drawn, i
 
 PAPER, INK, FAINT, GRID = "#12161d", "#e8ebf0", "#8b95a5", "#232a35"
 EGO, LANE, LANDMARK, BREAK, SAMPLE = "#35d0ff", "#f3ecd2", "#5f6b7c", "#ff5d5d", "#c3cad6"
+LINE = "#ffb84d"
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,7 @@ class Scene:
     frames: int
     track_count: int
     sigma_rel: float = 0.0  # 1-sigma of all lengths, where the camera's height or lens is an estimate
+    lines: tuple[NDArray[np.float64], ...] = ()  # polylines (N, 2) of lane lines and road edges
 
 
 def draw(scene: Scene, path: Path) -> None:
@@ -163,6 +165,8 @@ def _draw_map(axes: Any, scene: Scene) -> None:
     for points, colour, size, alpha in ((scene.landmarks, LANDMARK, 3.0, 0.8), (scene.lanes, LANE, 2.2, 0.75)):
         if len(points):
             axes.scatter(*_paper(points).T, s=size, color=colour, alpha=alpha, linewidths=0)
+    for line in scene.lines:
+        axes.plot(*_paper(line).T, color=LINE, linewidth=1.1, alpha=0.9)
 
 
 def _draw_track(axes: Any, track: Track, ego: NDArray[np.float64]) -> None:
@@ -248,6 +252,8 @@ def _draw_panel(figure: Any, scene: Scene, tracks: list[Track], corner: tuple[fl
         handles.append(Patch(facecolor=SAMPLE, edgecolor=SAMPLE, label="moving, last seen"))
     if not all(track.moving for track in tracks):
         handles.append(Patch(facecolor=f"{SAMPLE}26", edgecolor=SAMPLE, label="standing, last seen"))
+    if scene.lines:
+        handles.append(Line2D([], [], color=LINE, linewidth=1.5, label="line of the road, tracked"))
     if len(scene.lanes):
         handles.append(mark(LANE, "o", "lane line"))
     if len(scene.landmarks):

@@ -24,6 +24,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.bev_picture import Scene, Track, draw
 from birdslam.outputs.final_trajectories import EGO_FILES
+from birdslam.outputs.line_map import LineMap
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, readme, verdict
 from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row, tum_row
 from birdslam.types import INVALIDATING, Attitude, Estimate, MapUpdate, Status, VehicleEstimate
@@ -41,6 +42,7 @@ FILES = {  # what README.txt says of each that is there
     "ego.final.tum.txt": "the car's way, smoothed when the drive was over",
     "tracks": "the way of each other vehicle, as ego.tum.txt; ID.final.tum.txt: smoothed",
     "map.csv": "points of the road and of the lanes, in metres",
+    "map.geojson": "lane lines and road edges as polylines, in metres",
     "camera.toml": "the camera as the first pass found it, for `--camera` next time",
     "logs": "what each process said",
 }
@@ -135,6 +137,8 @@ class Recorder:
                 old.unlink(missing_ok=True)  # stale tracks beside new ones would be taken for this run's
             names = ("ego.kitti.txt", "ego.tum.txt", "map.csv", FRAMES_FILE)
             self._kitti, self._tum, self._map, self._table = map(self._open, names)
+            self._lines = LineMap(directory / "map.geojson")
+            self._files.callback(self._lines.close)
         except OSError as error:
             self.close()
             raise ResultsError(f"output directory {directory}: {error.strerror}: {error.filename}") from None
@@ -194,6 +198,7 @@ class Recorder:
         self._write_row(estimate, pose)
         T_picture_ego = self._T_picture_world @ estimate.T_world_ego
         self._ego.add(T_picture_ego.x_m, T_picture_ego.y_m, T_picture_ego.yaw_rad)
+        self._lines.add(estimate, self._T_picture_world)
         for vehicle in estimate.road_users:
             if vehicle.age_ns == 0:
                 self._add_vehicle(estimate, vehicle)
@@ -337,6 +342,7 @@ class Recorder:
             path_m=self._path_m,
             frames=self._frames,
             track_count=self._track_count,
+            lines=tuple(self._lines.drawn()),
         )
 
 

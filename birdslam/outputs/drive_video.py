@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from birdslam.geometry import bev
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
+from birdslam.lanes.outline import lane_px, line_px
 from birdslam.outputs.bev_picture import (
     EGO,
     EGO_AXLE_M,
@@ -28,12 +29,13 @@ from birdslam.outputs.bev_picture import (
     INK,
     LANDMARK,
     LANE,
+    LINE,
     PAPER,
     colour_of,
     number_of,
 )
 from birdslam.outputs.drive_files import ResultsError
-from birdslam.types import Estimate, MapUpdate, RoadUser
+from birdslam.types import Estimate, Lanes, LineKind, MapUpdate, RoadUser
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -41,6 +43,7 @@ Floats = NDArray[np.float64]
 MOST_SCALE, MOST_WIDTH_PX = 1.5, 1280  # of the camera's image, enlarged or reduced
 STRIP_PX, PANEL_PX = 96, 368  # height of the strip of text below the image, width of the bird's-eye view
 AHEAD_M, BEHIND_M = 50.0, 10.0  # shown of the bird's-eye view
+LANE_ALPHA = 0.18  # of the ego's lane over the image
 BOX_HEIGHT_M = 1.5  # of one whose height is not known
 MOST_POINTS, MOST_POSES = 12_000, 400
 SHIFT = 4  # OpenCV's fractional bits: outlines don't jump from pixel to pixel
@@ -105,6 +108,8 @@ class SideBySide:
         ground = self._camera.ground
         if estimate.ground is not None:
             ground = GroundPlane(estimate.ground.height_m, estimate.ground.pitch_rad, estimate.ground.roll_rad)
+        if estimate.lanes is not None:
+            self._draw_lanes(view, ground, estimate.lanes)
         for vehicle in estimate.road_users:
             if not vehicle.in_sight:
                 continue
@@ -125,6 +130,20 @@ class SideBySide:
             cv2.putText(view, text, (int(at[0]), int(at[1]) - 4), FONT, 0.4, colour, 1, cv2.LINE_AA)
         return view
 
+    def _draw_lanes(self, view: Image, ground: GroundPlane, lanes: Lanes) -> None:
+        """The ego's lane as a shade, and the lines: paint, and dimmer the road's edges."""
+        ground = GroundPlane(ground.height_m, ground.pitch_rad + lanes.tilt_rad, ground.roll_rad)
+        if lanes.ego is not None:
+            area = (lane_px(self._camera, ground, lanes.ego) + 0.5) * self._scale - 0.5
+            shade = view.copy()
+            if len(area) > 2:
+                cv2.fillPoly(shade, [_fixed(area)], _bgr(EGO), cv2.LINE_AA, SHIFT)
+            cv2.addWeighted(shade, LANE_ALPHA, view, 1.0 - LANE_ALPHA, 0.0, view)
+        for line in lanes.lines:
+            px = (line_px(self._camera, ground, line) + 0.5) * self._scale - 0.5
+            colour = _bgr(FAINT if line.kind is LineKind.EDGE else LINE)
+            cv2.polylines(view, [_fixed(px)], False, colour, 2, cv2.LINE_AA, SHIFT)
+
     def _from_above(self, estimate: Estimate, true_outlines: Sequence[Floats]) -> Image:
         panel = np.full((self.size_px[1], PANEL_PX, 3), _bgr(PAPER), np.uint8)
         T_ego_world = estimate.T_world_ego.inverse()
@@ -137,6 +156,11 @@ class SideBySide:
                 at = np.rint(self._panel_px(T_ego_world @ np.array(points))).astype(np.int64)
                 at = at[((at >= 0) & (at < [PANEL_PX, self.size_px[1]])).all(axis=1)]
                 panel[at[:, 1], at[:, 0]] = _bgr(colour)
+        for line in () if estimate.lanes is None else estimate.lanes.lines:
+            x_m = np.arange(max(-BEHIND_M, line.seen_from_m), min(line.to_m, AHEAD_M), 2.0)
+            at_m = np.column_stack([x_m, [line.y_m(x) for x in x_m.tolist()]])
+            colour = FAINT if line.kind is LineKind.EDGE else LINE
+            cv2.polylines(panel, [_fixed(self._panel_px(at_m))], False, _bgr(colour), 1, cv2.LINE_AA, SHIFT)
         way = _fixed(self._panel_px(T_ego_world @ np.array(self._way)))
         cv2.polylines(panel, [way], False, _bgr(EGO), 2, cv2.LINE_AA, SHIFT)
         for fan in estimate.hidden:

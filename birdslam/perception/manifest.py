@@ -248,6 +248,25 @@ class ClassMaps(
             raise ValueError(f"maps: each meaning once, got {', '.join(meanings)}")
 
 
+class RowAnchors(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="row_anchors"
+):
+    """Lane lines by rows (1, columns + 1, rows, lines): logits of a line's column in a row, the last: not there.
+
+    As exports of Ultra-Fast-Lane-Detection give them. `rows` are the rows as fractions of the input's height, in the
+    output's order; `columns` lie evenly from the input's left to its right. The network knows lines and no road.
+    """
+
+    output: str
+    columns: Count
+    rows: Annotated[tuple[Fraction, ...], msgspec.Meta(min_length=2)]
+    lines: Count = 4
+
+    def __post_init__(self) -> None:
+        if len(set(self.rows)) != len(self.rows):
+            raise ValueError("rows: each row once")
+
+
 class Disparity(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="decoding", tag="disparity"
 ):
@@ -337,7 +356,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     schedule: Schedule = Schedule()
     tiles: Tiles | None = None
     detector: Yolox | CenterNet | Ssd | BoxList | None = None
-    segmenter: ClassMaps | None = None
+    segmenter: ClassMaps | RowAnchors | None = None
     depth: Disparity | MetricDepth | None = None
     multitask: MultiTask | None = None
 

@@ -18,6 +18,7 @@ from birdslam.perception.decoding.centernet import CenterNetDecoder
 from birdslam.perception.decoding.depth import DisparityDecoder, MetricDepthDecoder
 from birdslam.perception.decoding.detection import YoloxDecoder
 from birdslam.perception.decoding.multitask import OUTPUTS, Findings, MultiTaskDecoder
+from birdslam.perception.decoding.row_anchors import RowAnchorsDecoder
 from birdslam.perception.decoding.segmentation import ClassMapsDecoder
 from birdslam.perception.manifest import (
     BoxList,
@@ -31,6 +32,7 @@ from birdslam.perception.manifest import (
     ModelError,
     MultiTask,
     Role,
+    RowAnchors,
     Schedule,
     Ssd,
     Yolox,
@@ -76,6 +78,7 @@ DECODINGS: dict[type, tuple[Callable[..., Decoder], str, Callable[[Any], tuple[s
     Disparity: (DisparityDecoder, "depth", lambda table: (table.output,)),
     MetricDepth: (MetricDepthDecoder, "depth", lambda table: (table.output,)),
     ClassMaps: (ClassMapsDecoder, "segmentation", lambda table: tuple(dict.fromkeys(m.output for m in table.maps))),
+    RowAnchors: (RowAnchorsDecoder, "segmentation", lambda table: (table.output,)),
     MultiTask: (MultiTaskDecoder, "", lambda table: OUTPUTS),
 }
 

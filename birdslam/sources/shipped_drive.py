@@ -30,6 +30,9 @@ LABELS = ("car", "van", "truck", "bus", "cyclist", "pedestrian")
 # Columns of the file's `bodies`, one row for each body in the image of each frame
 COLUMNS = ("frame", "body", "label", "x_m", "y_m", "yaw_rad", "length_m", "width_m", "height_m", "vx_mps", "vy_mps",
            "visible", "truncated", "x1_px", "y1_px", "x2_px", "y2_px")  # fmt: skip
+# Columns of `lines`, which a drive may have: points of the painted lines and of the road's edges in ego
+LINE_COLUMNS = ("frame", "line", "kind", "x_m", "y_m")
+LINE_KINDS = ("solid", "dashed", "dotted", "double", "double_dashed", "kerb")
 _ARRAYS = ("images", "ends", "rate_hz", "poses", "ground", "bodies")
 
 
@@ -49,6 +52,15 @@ class TrueBody:
     box_px: tuple[float, float, float, float]  # of the whole body, clipped to the image
 
 
+@dataclass(frozen=True)
+class TrueLine:
+    """A painted line, or the road's edge (`kerb`), in one frame of the drive: also where it is hidden, or has gaps."""
+
+    line: int  # the same through the whole drive
+    kind: str  # of LINE_KINDS
+    points_m: Floats  # (N, 2) in ego
+
+
 class DemoRecording(Recording):
     """The shipped drive, or another of its kind in `directory`. Raises DatasetError where it can't be read."""
 
@@ -58,6 +70,7 @@ class DemoRecording(Recording):
         try:
             with np.load(path, allow_pickle=False) as file:
                 images, ends, rate_hz, self._poses, self._ground, self._bodies = (file[name] for name in _ARRAYS)
+                self._lines = file.get("lines")
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
             raise DatasetError(f"{path}: is no drive of the built-in world: {error}") from None
         if not (len(ends) == len(self._poses) == len(self._ground) > 0 and int(ends[-1]) == len(images)):
@@ -103,16 +116,37 @@ class DemoRecording(Recording):
             )  # fmt: skip
         return tuple(out)
 
+    @property
+    def has_lines(self) -> bool:
+        """Whether the drive knows its true lines: the shipped one does not."""
+        return self._lines is not None
+
+    def truth_lines(self, index: int) -> tuple[TrueLine, ...]:
+        """Every line around the ego in a frame. Raises DatasetError where the drive has none."""
+        if self._lines is None:
+            raise DatasetError(f"{self._path}: has no true lines: render it anew (`python -m perf roads --keep DIR`)")
+        rows = self._lines[self._lines[:, 0] == index * self._stride].astype(np.float64)
+        return tuple(
+            TrueLine(int(line), LINE_KINDS[int(kind)], rows[(rows[:, 1] == line) & (rows[:, 2] == kind), 3:])
+            for line, kind in np.unique(rows[:, 1:3], axis=0)
+        )
+
 
 def write_drive(
-    directory: Path, images: list[bytes], rate_hz: float, poses: Floats, ground: Floats, bodies: Floats
+    directory: Path,
+    images: list[bytes],
+    rate_hz: float,
+    poses: Floats,
+    ground: Floats,
+    bodies: Floats,
+    lines: Floats | None = None,
 ) -> None:
-    """Write `drive.npz`: WebP images, (N, 3, 4) poses, (N, 3) height, pitch and roll, rows of COLUMNS."""
+    """Write `drive.npz`: WebP images, (N, 3, 4) poses, (N, 3) height, pitch, roll, rows of COLUMNS, LINE_COLUMNS."""
     directory.mkdir(parents=True, exist_ok=True)
     joined = np.frombuffer(b"".join(images), np.uint8)
     ends = np.cumsum([len(image) for image in images], dtype=np.int64)
     with (directory / "drive.npz").open("wb") as file:
         np.savez_compressed(
             file, images=joined, ends=ends, rate_hz=np.float64(rate_hz), poses=poses, ground=ground,
-            bodies=bodies.astype(np.float32),
+            bodies=bodies.astype(np.float32), **({} if lines is None else {"lines": lines.astype(np.float32)}),
         )  # fmt: skip

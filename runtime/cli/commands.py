@@ -84,7 +84,7 @@ COMMANDS = (
     Command("evaluate localisation",
             "where the front end puts the labelled cars of KITTI tracking, by range, from a detector's boxes",
             "evaluate.localisation"),
-    Command("evaluate lanes", "a picture of what a frame's lanes are made of: road and lane cells, seen and completed",
+    Command("evaluate lanes", "a picture of what a frame's lanes are made of; with --truth, lanes against it",
             "evaluate.lanes"),
 )  # fmt: skip
 

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.progress import with_progress
 from birdslam.sources.recording import DatasetError
-from birdslam.sources.shipped_drive import COLUMNS, LABELS, Floats, write_drive
+from birdslam.sources.shipped_drive import COLUMNS, LABELS, LINE_COLUMNS, LINE_KINDS, Floats, write_drive
 
 if TYPE_CHECKING:
     from birdslam.world.truth import WorldFrame
 
+LINES_TO_M, LINE_STEP_M = 60.0, 2.0  # of the true lines
 SAMPLES = 2  # of a pixel, across and down
 CAMERA_KEYS = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "height_m", "pitch_rad", "roll_rad")
 
@@ -48,14 +49,22 @@ def write(directory: Path, frames: Iterable[WorldFrame], camera: Camera, rate_hz
     poses: list[Floats] = []
     ground: list[tuple[float, float, float]] = []
     bodies: list[tuple[float, ...]] = []
+    lines: list[Floats] = []
     for frame in frames:
         images.append(_webp(frame.image, quality))
         poses.append(frame.T_world_cam)
         ground.append((frame.camera.height_m, frame.camera.pitch_rad, frame.camera.roll_rad))
         bodies.extend(_rows(frame))
+        lines.append(_line_rows(frame))
     from_first = (np.linalg.inv(poses[0]) @ np.array(poses)).astype(np.float64)
     write_drive(
-        directory, images, rate_hz, from_first[:, :3], np.array(ground), np.array(bodies).reshape(-1, len(COLUMNS))
+        directory,
+        images,
+        rate_hz,
+        from_first[:, :3],
+        np.array(ground),
+        np.array(bodies).reshape(-1, len(COLUMNS)),
+        np.concatenate(lines),
     )
     (directory / "camera.toml").write_text(_toml(camera), encoding="utf-8")
 
@@ -79,6 +88,22 @@ def _rows(frame: WorldFrame) -> Iterator[tuple[float, ...]]:
             body.length_m, body.width_m, body.height_m, along, left, body.visible, body.truncated,
             *body.box_px.tolist(),
         )  # fmt: skip
+
+
+def _line_rows(frame: WorldFrame) -> Floats:
+    """Rows of LINE_COLUMNS: the points of each line from the ego to LINES_TO_M ahead."""
+    rows = [np.zeros((0, len(LINE_COLUMNS)))]
+    for lane in frame.lanes:
+        x = lane.points_m[:, 0]
+        points = lane.points_m[(x > -LINE_STEP_M) & (x < LINES_TO_M)]
+        kept = points[:: max(1, round(LINE_STEP_M / _spacing_m(lane.points_m)))]
+        known = np.tile([frame.frame_id, lane.lane_id, LINE_KINDS.index(lane.kind)], (len(kept), 1))
+        rows.append(np.hstack([known, kept]))
+    return np.concatenate(rows)
+
+
+def _spacing_m(points_m: Floats) -> float:
+    return max(float(np.linalg.norm(np.diff(points_m, axis=0), axis=1).mean()), 1e-3)
 
 
 def _toml(camera: Camera) -> str:

@@ -15,7 +15,7 @@ from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import load
 from birdslam.runtime.fleet.listener import Fleet
 from birdslam.runtime.supervision.run import check_runtime_dir
-from birdslam.types import Estimate, Status
+from birdslam.types import Estimate, Lanes, Status
 
 MAX_AGE_MS = 1000.0  # of a fleet's estimate that counts as on time
 
@@ -56,7 +56,8 @@ def _of_vehicle(options: argparse.Namespace) -> Generator[str | None]:
                     f"{v.label} {v.vehicle} at {v.T_world_vehicle.x_m:.1f} {v.T_world_vehicle.y_m:.1f} m"
                     for v in estimate.road_users
                 )
-                yield f"{_ego(estimate, planner.latest().age_ms, estimate.valid)}  {vehicles}".rstrip()
+                ego = _ego(estimate, planner.latest().age_ms, estimate.valid)
+                yield f"{ego}  {_lane(estimate.lanes)}{vehicles}".rstrip()
             if Status.END_OF_SOURCE in estimate.status:
                 return
         yield None
@@ -74,6 +75,18 @@ def _of_fleet(options: argparse.Namespace) -> Generator[str | None]:
                 ego = _ego(estimate, reading.age_ms, reading.valid)
                 yield f"{reading.vehicle}: {ego}  {len(estimate.vehicles)} in sight, {len(estimate.people)} people"
         yield None
+
+
+def _lane(lanes: Lanes | None) -> str:
+    """The ego's lane and who is ahead in it."""
+    if lanes is None or lanes.ego is None:
+        return ""
+    own = lanes.ego
+    said = f"lane {lanes.ego_index + 1 if lanes.ego_index is not None else 0} of {len(lanes.lanes)} from the left, "
+    said += f"{own.width_m:.1f} m wide, its middle {own.offset_m:+.2f} m"
+    if lanes.leader is not None:
+        said += f", {lanes.leader.vehicle} ahead at {lanes.leader.gap_m:.0f} m"
+    return said + "  "
 
 
 def _ego(estimate: Estimate, age_ms: float, valid: bool) -> str:

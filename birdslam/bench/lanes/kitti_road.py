@@ -1,0 +1,199 @@
+"""The ego's lane in single images, against masks as KITTI's road benchmark has them (Fritsch et al. 2013).
+
+A folder holds pairs image_N.png, ego_lane_N.png. In a mask magenta is the ego's lane, red is not, black is ignored.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.lanes.line_tracker import still_lines
+from birdslam.lanes.outline import lane_mask, line_px, visible
+from birdslam.lanes.topology import LaneRow, lane_row
+from birdslam.perception import Segmentation
+from birdslam.sources.recording import DatasetError
+from birdslam.types import Bound, LaneLine
+
+Bools = NDArray[np.bool_]
+
+# KITTI's camera 2 of 2011_09_26, rectified
+FOCAL_PX, CENTRE_PX, HEIGHT_M = 721.5377, (609.5593, 172.854), 1.65
+FARTHEST_M = 30.0  # of the comparison
+HALF_WIDTH_M, CELL_M = 10.0, 0.05  # of its grid
+LANE, IGNORED = (255, 0, 255), (0, 0, 0)  # BGR
+
+
+@dataclass(frozen=True)
+class Pair:
+    """An image and its mask."""
+
+    number: int
+    image: Path
+    mask: Path
+
+
+class StillScore(msgspec.Struct, frozen=True, kw_only=True):
+    """The ego's lane of one image."""
+
+    image: str
+    ego_lane_iou: float  # in bird's-eye view to 30 m, of what the image shows of the lane
+    ego_lane_iou_image: float  # in the image
+    pitch_deg: float  # that made the lines parallel
+    lines: int
+    width_m: float | None = None  # None: no lane was found
+    left: Bound | None = None
+    right: Bound | None = None
+
+
+class StillsReport(msgspec.Struct, frozen=True, kw_only=True):
+    """All images of a folder."""
+
+    images: int
+    ego_lane_iou_mean: float
+    ego_lane_iou_image_mean: float
+    ego_lane_iou_least: float
+    without_lane: int  # images in which none was found; their IoU is 0
+    networks: tuple[str, ...]
+    by_image: tuple[StillScore, ...]
+
+
+def find_pairs(folder: Path) -> list[Pair]:
+    """The pairs of a folder by their number. Raises DatasetError where there are none, or an image has no mask."""
+    pairs = []
+    for image in folder.glob("image_*.png"):
+        match = re.fullmatch(r"image_(\d+)\.png", image.name)
+        if match is None:
+            continue
+        mask = folder / f"ego_lane_{match[1]}.png"
+        if not mask.is_file():
+            raise DatasetError(f"{image}: has no mask {mask.name} beside it")
+        pairs.append(Pair(int(match[1]), image, mask))
+    if not pairs:
+        raise DatasetError(f"{folder}: holds no pairs image_N.png, ego_lane_N.png")
+    return sorted(pairs, key=lambda pair: pair.number)
+
+
+def read_pair(pair: Pair) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """(H, W, 3) BGR image and mask. Raises DatasetError."""
+    image, mask = (cv2.imread(str(path), cv2.IMREAD_COLOR) for path in (pair.image, pair.mask))
+    for path, read in ((pair.image, image), (pair.mask, mask)):
+        if read is None:
+            raise DatasetError(f"{path}: can't be read as an image")
+    assert image is not None
+    assert mask is not None
+    if image.shape != mask.shape:
+        raise DatasetError(f"{pair.mask}: is of another size than {pair.image.name}")
+    return np.asarray(image, np.uint8), np.asarray(mask, np.uint8)
+
+
+def camera_of(image: NDArray[np.uint8], stated: Camera | None, height_m: float | None) -> Camera:
+    """The stated camera, or KITTI's, for an image of this size. Raises DatasetError where that can't be."""
+    height_px, width_px = image.shape[:2]
+    if stated is not None:
+        if (stated.width_px, stated.height_px) != (width_px, height_px):
+            raise DatasetError(
+                f"an image of {width_px}x{height_px} does not fit the camera of {stated.width_px}x{stated.height_px}"
+            )
+        return stated if height_m is None else msgspec.structs.replace(stated, height_m=height_m)
+    try:
+        return Camera(
+            width_px=width_px,
+            height_px=height_px,
+            fx_px=FOCAL_PX,
+            fy_px=FOCAL_PX,
+            cx_px=CENTRE_PX[0],
+            cy_px=CENTRE_PX[1],
+            height_m=HEIGHT_M if height_m is None else height_m,
+        )
+    except ValueError as error:
+        raise DatasetError(f"an image of {width_px}x{height_px} is none of KITTI's camera: {error}") from None
+
+
+@dataclass(frozen=True)
+class Still:
+    """What was found in one image."""
+
+    lines: tuple[LaneLine, ...]
+    row: LaneRow
+    ground: GroundPlane
+    area: Bools  # (H, W) of the ego's lane, as far as the image shows it
+
+
+def find_lane(
+    camera: Camera, image: NDArray[np.uint8], segmentation: Segmentation, boxes_px: NDArray[np.float64]
+) -> Still:
+    """The lines and the ego's lane of one image without a past."""
+    lines, ground = still_lines(camera, image, segmentation, boxes_px)
+    row = lane_row(lines)
+    area = np.zeros(image.shape[:2], dtype=bool)
+    if row.ego is not None:
+        area = visible(lane_mask(camera, ground, row.lanes[row.ego]), segmentation)
+    return Still(lines, row, ground, area)
+
+
+def score(name: str, camera: Camera, still: Still, mask: NDArray[np.uint8]) -> StillScore:
+    """The lane against its mask (H, W, 3)."""
+    truth, counted = (mask == LANE).all(axis=2), (mask != IGNORED).any(axis=2)
+    cells = grid_px(camera)
+    lane = None if still.row.ego is None else still.row.lanes[still.row.ego]
+    return StillScore(
+        image=name,
+        ego_lane_iou=iou(still.area[cells], truth[cells], counted[cells]),
+        ego_lane_iou_image=iou(still.area, truth, counted),
+        pitch_deg=float(np.degrees(still.ground.pitch_rad)),
+        lines=len(still.lines),
+        width_m=None if lane is None else lane.width_m,
+        left=None if lane is None else lane.left_bound,
+        right=None if lane is None else lane.right_bound,
+    )
+
+
+def grid_px(camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the pixels that a grid on the road falls on, to FARTHEST_M, by the camera's own ground."""
+    x_m = np.arange(1.0, FARTHEST_M, CELL_M)
+    y_m = np.arange(-HALF_WIDTH_M, HALF_WIDTH_M, CELL_M)
+    grid = np.stack(np.meshgrid(x_m, y_m, indexing="ij"), axis=-1).reshape(-1, 2)
+    px = bev.ego_to_pixel(camera, camera.ground, grid)
+    px = np.round(px[np.isfinite(px).all(axis=1)])
+    inside = np.all((px >= 0) & (px < [camera.width_px, camera.height_px]), axis=1)
+    column, row = px[inside].astype(np.int64).T
+    return row, column
+
+
+def iou(found: Bools, truth: Bools, counted: Bools) -> float:
+    """Intersection over union where it counts; 1 where there is neither."""
+    union = int(np.sum((found | truth) & counted))
+    return 1.0 if union == 0 else float(np.sum(found & truth & counted)) / union
+
+
+def report_of(scores: list[StillScore], networks: tuple[str, ...]) -> StillsReport:
+    """The report of a folder's images."""
+    by_road = [s.ego_lane_iou for s in scores]
+    return StillsReport(
+        images=len(scores),
+        ego_lane_iou_mean=float(np.mean(by_road)),
+        ego_lane_iou_image_mean=float(np.mean([s.ego_lane_iou_image for s in scores])),
+        ego_lane_iou_least=min(by_road),
+        without_lane=sum(s.width_m is None for s in scores),
+        networks=networks,
+        by_image=tuple(scores),
+    )
+
+
+def draw(image: NDArray[np.uint8], camera: Camera, still: Still) -> NDArray[np.uint8]:
+    """The image with its lines and the ego's lane: paint red, edges blue, the lane green."""
+    out = image.copy()
+    out[still.area] = (out[still.area] * 0.6 + np.array([0.0, 100.0, 0.0])).astype(np.uint8)
+    for line in still.lines:
+        colour = (255, 100, 0) if line.kind == "edge" else (0, 0, 255)
+        cv2.polylines(out, [np.round(line_px(camera, still.ground, line)).astype(np.int32)], False, colour, 2)
+    return out

@@ -1,0 +1,115 @@
+"""In which lane the vehicles of a rendered drive are, and the gap to the leader, against the truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+
+from birdslam.bench.lanes.true_lines import KERB, ego_bounds, y_at
+from birdslam.geometry.se2 import SE2
+from birdslam.sources.shipped_drive import TrueBody, TrueLine
+from birdslam.types import Estimate, VehicleLane
+
+MATCH_M, MATCH_REL = 2.0, 0.05  # from an estimated vehicle to its body, and so much more in a metre of distance
+LEAST_PROBABILITY = 1e-3  # a certain error counts as so much in the log loss
+AGAINST_RAD = math.pi / 2
+PLACES = ("ego_lane", "left", "right", "oncoming", "off_road")
+
+
+class VehiclesReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Vehicles in lanes, over all frames of a drive."""
+
+    vehicles: int  # estimates of vehicles that stand for a body whose lane is known
+    right: float | None = None  # share whose likeliest place is the true one
+    log_loss: float | None = None  # mean of -log of the true place's probability
+    leaders: int = 0  # frames with a true leader that is tracked
+    leader_right: float | None = None  # share in which it is the one that was named
+    gap_error_median_m: float | None = None  # of its gap
+    gap_error_p95_m: float | None = None
+
+
+class VehicleScores:
+    """Collects frame by frame."""
+
+    def __init__(self) -> None:
+        self._right: list[bool] = []
+        self._losses: list[float] = []
+        self._leaders: list[bool] = []
+        self._gaps: list[float] = []
+
+    def add(self, estimate: Estimate, bodies: Sequence[TrueBody], truth: tuple[TrueLine, ...]) -> None:
+        """One frame."""
+        lanes = estimate.lanes
+        if lanes is None or not lanes.vehicles:
+            return
+        T_ego_world = estimate.T_world_ego.inverse()
+        poses = {v.vehicle: T_ego_world @ v.T_world_vehicle for v in estimate.vehicles}
+        body_of: dict[int, TrueBody] = {}
+        for place in lanes.vehicles:
+            body = _nearest(poses[place.vehicle], bodies)
+            if body is None:
+                continue
+            body_of[place.vehicle] = body
+            where = true_place(body, truth)
+            if where is not None:
+                self._add_place(place, where)
+        self._add_leader(estimate, body_of, bodies, truth)
+
+    def _add_place(self, place: VehicleLane, where: str) -> None:
+        shares = {name: getattr(place, name) for name in PLACES}
+        self._right.append(max(shares, key=lambda name: shares[name]) == where)
+        self._losses.append(-math.log(max(shares[where], LEAST_PROBABILITY)))
+
+    def _add_leader(
+        self, estimate: Estimate, body_of: dict[int, TrueBody], bodies: Sequence[TrueBody], truth: tuple[TrueLine, ...]
+    ) -> None:
+        ahead = [b for b in bodies if b.T_ego_body.x_m > 0.5 * b.length_m and true_place(b, truth) == "ego_lane"]
+        leader = min(ahead, key=lambda b: b.T_ego_body.x_m, default=None)
+        if leader is None or all(body.body != leader.body for body in body_of.values()):
+            return
+        assert estimate.lanes is not None
+        named = estimate.lanes.leader
+        found = None if named is None else body_of.get(named.vehicle)
+        self._leaders.append(found is not None and found.body == leader.body)
+        if named is not None and self._leaders[-1]:
+            self._gaps.append(abs(named.gap_m - (leader.T_ego_body.x_m - 0.5 * leader.length_m)))
+
+    def report(self) -> VehiclesReport:
+        """What was collected."""
+        return VehiclesReport(
+            vehicles=len(self._right),
+            right=float(np.mean(self._right)) if self._right else None,
+            log_loss=float(np.mean(self._losses)) if self._losses else None,
+            leaders=len(self._leaders),
+            leader_right=float(np.mean(self._leaders)) if self._leaders else None,
+            gap_error_median_m=float(np.median(self._gaps)) if self._gaps else None,
+            gap_error_p95_m=float(np.quantile(self._gaps, 0.95)) if self._gaps else None,
+        )
+
+
+def _nearest(pose: SE2, bodies: Sequence[TrueBody]) -> TrueBody | None:
+    def distance_m(body: TrueBody) -> float:
+        return math.hypot(body.T_ego_body.x_m - pose.x_m, body.T_ego_body.y_m - pose.y_m)
+
+    body = min(bodies, key=distance_m, default=None)
+    return body if body is not None and distance_m(body) < MATCH_M + MATCH_REL * abs(pose.x_m) else None
+
+
+def true_place(body: TrueBody, truth: tuple[TrueLine, ...]) -> str | None:
+    """One of PLACES; None where the lines beside the body are not known."""
+    x, y = body.T_ego_body.x_m, body.T_ego_body.y_m
+    bounds = ego_bounds(truth, x)
+    here = [at for t in truth if (at := y_at(t, x)) is not None]
+    painted = [at for t in truth if t.kind != KERB and (at := y_at(t, x)) is not None]
+    if bounds is None or len(here) < 2 or not painted:
+        return None
+    if not min(painted) < y < max(painted):
+        return "off_road"
+    if bounds[1] < y < bounds[0]:
+        return "ego_lane"
+    if abs(body.T_ego_body.yaw_rad) > AGAINST_RAD and math.hypot(*body.velocity_mps) > 1.0:
+        return "oncoming"
+    return "left" if y >= bounds[0] else "right"

@@ -1,0 +1,56 @@
+"""A line as a cubic in the ego's frame, y(x) = a + h x + c x^2 / 2 + d x^3 / 6, and its motion under the ego's.
+
+To third order that is a clothoid: offset a, heading h (as a tangent), curvature c, its rate d (Dickmanns and Mysliwetz
+1992). A curve is (..., 4): a in m, h, c in 1/m, d in 1/m^2.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.se2 import SE2
+
+Floats = NDArray[np.float64]
+
+
+def basis(x_m: Floats) -> Floats:
+    """(N, 4) by which a curve gives y at x (N,)."""
+    x = np.asarray(x_m, dtype=np.float64)
+    return np.stack([np.ones_like(x), x, x * x / 2.0, x * x * x / 6.0], axis=-1)
+
+
+def slope_basis(x_m: Floats) -> Floats:
+    """(N, 4) by which a curve gives dy/dx at x (N,)."""
+    x = np.asarray(x_m, dtype=np.float64)
+    return np.stack([np.zeros_like(x), np.ones_like(x), x, x * x / 2.0], axis=-1)
+
+
+def moved(curve: Floats, T_old_new: SE2) -> tuple[Floats, Floats]:
+    """The curve (4,) in the ego's new frame, and the derivative (4, 4) of the new by the old.
+
+    The point where the new y axis cuts the curve is found by Newton's method; its tangent and curvature turn with the
+    axes. The rate of curvature is kept.
+    """
+    yaw = T_old_new.yaw_rad
+    sin, cos = math.sin(yaw), math.cos(yaw)
+    a, h, c, d = (float(v) for v in curve)
+    x = T_old_new.x_m
+    for _ in range(3):  # (x - x_m) cos + (y - y_m) sin = 0
+        y = a + x * (h + x * (c / 2.0 + x * d / 6.0))
+        slope = h + x * (c + x * d / 2.0)
+        x -= ((x - T_old_new.x_m) * cos + (y - T_old_new.y_m) * sin) / max(cos + slope * sin, 0.2)
+    y = a + x * (h + x * (c / 2.0 + x * d / 6.0))
+    slope = h + x * (c + x * d / 2.0)
+    along = max(cos + slope * sin, 0.2)  # dx of the new frame by that of the old
+    a_new = -(x - T_old_new.x_m) * sin + (y - T_old_new.y_m) * cos
+    h_new = (slope * cos - sin) / along
+    c_new = (c + d * x) / along**3
+    J = np.zeros((4, 4))
+    J[0] = basis(np.array(x)) / along
+    J[1] = slope_basis(np.array(x)) / along**2
+    J[2] = np.array([0.0, 0.0, 1.0, x]) / along**3
+    J[3, 3] = 1.0
+    return np.array([a_new, h_new, c_new, d]), J

@@ -1,0 +1,194 @@
+"""The joint Kalman filter of a road's lines: cubics in the ego's frame that share what a road's lines share.
+
+State: the curves (a, h, c, d) of all lines, with one covariance. A line is born with the shape of those that are known,
+and correlated with it, and a road's bend moves all of them together: so a line that a car hides bends with its
+neighbours. The ego's motion moves the curves, so that paint seen at 10 m is map at 2 m later. An update solves for all
+curves and for the error of the camera's pitch in this image, which all points have in common, by iteratively reweighted
+least squares with the prediction as a prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.se2 import SE2
+from birdslam.lanes.curves import basis, moved, slope_basis
+from birdslam.lanes.paint import LinePoints
+from birdslam.lanes.road_view import tilted
+
+Floats = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+# Prior of a road's shape in an image without a past: heading, curvature, its rate, beside what the search has found
+SIGMA_SHAPE = np.array([0.0, 0.03, 0.004, 2e-4])
+# ... and of one line against the others
+SIGMA_OWN = np.array([0.2, 0.04, 2e-3, 3e-5])
+SIGMA_OWN_EDGE = np.array([0.3, 0.02, 5e-4, 1e-5])  # of a road's edge: a mask's border wanders more than the road's
+# Random walks in a metre of travel, of all lines together and of each
+WALK_SHAPE = np.array([0.0, 0.0, 2e-4, 4e-5])
+WALK_OWN = np.array([0.008, 8e-4, 3e-5, 2e-6])
+RATE_MEMORY_M = 30.0  # a clothoid's rate of curvature dies away over so much travel
+# Errors of the ego's motion in a metre of travel, sideways and in heading
+STEP_SIGMA_M, STEP_SIGMA_RAD = 0.005, 0.001
+BIN_M = 1.0  # of a line: its points are one observation
+SIGMA_BIN_M = 0.04  # of paint about a smooth curve
+MOST_IN_BIN = 3  # points that count as independent
+INDEPENDENT_M = 6.0  # images of the same paint err alike: so much travel makes them independent
+GATE_SIGMAS, LEAST_GATE_M, WIDEST_GATE_M = 3.0, 0.25, 0.7
+KERNEL_SIGMAS = 2.0  # Cauchy
+ITERATIONS = 4
+
+
+@dataclass(frozen=True)
+class Support:
+    """What an update saw of one line: which bins of `BIN_M` (floor of x), and the points by their index."""
+
+    bins: Ids
+    points: Ids
+
+
+class LineFilter:
+    """The curves' means (n, 4) and their covariance (4 n, 4 n)."""
+
+    def __init__(self) -> None:
+        self.curves: Floats = np.zeros((0, 4))
+        self.cov: Floats = np.zeros((0, 0))
+
+    def __len__(self) -> int:
+        return len(self.curves)
+
+    def block(self, k: int) -> Floats:
+        """(4, 4) covariance of one curve."""
+        part = slice(4 * k, 4 * k + 4)
+        return self.cov[part, part]
+
+    def begin(self, offsets_m: Floats, headings: Floats, curvature_per_m: float, edges: NDArray[np.bool_]) -> None:
+        """Lines (n,) of an image without a past, by what the search has found; `edges` are those of the road."""
+        count = len(offsets_m)
+        self.curves = np.zeros((count, 4))
+        self.curves[:, 0], self.curves[:, 1], self.curves[:, 2] = offsets_m, headings, curvature_per_m
+        self.cov = _together(SIGMA_SHAPE**2, np.zeros(4), count)
+        self.cov += np.diag(np.where(edges[:, None], SIGMA_OWN_EDGE, SIGMA_OWN).ravel() ** 2)
+
+    def add(self, offset_m: float, heading: float, like: int, edge: bool) -> None:
+        """A further line, with the bend of the line `like`."""
+        count = len(self.curves)
+        curve = self.curves[like].copy()
+        curve[0], curve[1] = offset_m, heading
+        rows = np.vstack([np.eye(4 * count), np.eye(4 * count)[4 * like : 4 * like + 4]])
+        rows[4 * count, :] = 0.0  # its offset is its own
+        self.cov = rows @ self.cov @ rows.T
+        self.cov[4 * count :, 4 * count :] += np.diag((SIGMA_OWN_EDGE if edge else SIGMA_OWN) ** 2)
+        self.curves = np.vstack([self.curves, curve])
+
+    def keep(self, kept: Ids) -> None:
+        """Drops the other lines."""
+        rows = (4 * np.asarray(kept, dtype=np.int64)[:, None] + np.arange(4)).ravel()
+        self.curves, self.cov = self.curves[kept], self.cov[np.ix_(rows, rows)]
+
+    def predict(self, T_old_new: SE2) -> None:
+        """Moves the curves to the ego's new frame."""
+        count = len(self.curves)
+        if not count:
+            return
+        step_m = float(np.hypot(T_old_new.x_m, T_old_new.y_m))
+        J = np.zeros((4 * count, 4 * count))
+        keep = np.exp(-step_m / RATE_MEMORY_M)
+        sideways = np.zeros(4 * count)
+        turned = np.zeros(4 * count)
+        for k, curve in enumerate(self.curves):
+            part = slice(4 * k, 4 * k + 4)
+            self.curves[k], J[part, part] = moved(curve, T_old_new)
+            sideways[4 * k], turned[4 * k + 1] = -1.0, -1.0
+        J[3::4] *= keep
+        self.curves[:, 3] *= keep
+        self.cov = J @ self.cov @ J.T + _together(WALK_SHAPE**2 * step_m, WALK_OWN**2 * step_m, count)
+        self.cov += np.outer(sideways, sideways) * STEP_SIGMA_M**2 * step_m
+        self.cov += np.outer(turned, turned) * STEP_SIGMA_RAD**2 * step_m
+
+    def across_sigma_m(self, k: int, x_m: Floats) -> Floats:
+        """(N,) 1-sigma of a line's y at x (N,)."""
+        at = basis(x_m)
+        out: Floats = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", at, self.block(k), at), 0.0))
+        return out
+
+    def update(
+        self,
+        points: LinePoints,
+        of: NDArray[np.int64],
+        classes: NDArray[np.int64],
+        height_m: float,
+        sigma_tilt_rad: float,
+        travelled_m: float,
+        first_tilt_rad: float = 0.0,
+    ) -> tuple[list[Support], float]:
+        """Lines by the points of their own class: `of` (N,) that of the points, `classes` (n,) that of the lines.
+
+        Returns what was seen of each line, and the tilt of the camera against the pitch that the points were made with.
+        """
+        count = len(self.curves)
+        size = 4 * count + 1
+        prior = np.zeros((size, size))
+        prior[:-1, :-1] = np.linalg.inv(self.cov + 1e-14 * np.eye(4 * count))
+        prior[-1, -1] = 1.0 / max(sigma_tilt_rad, 1e-5) ** 2
+        mean = np.concatenate([self.curves.ravel(), [0.0]])
+        state = mean.copy()
+        state[-1] = first_tilt_rad  # the curves of an image without a past are those of this tilt
+        information, seen = prior, [Support(np.zeros(0, np.int64), np.zeros(0, np.int64))] * count
+        inflation = max(1.0, INDEPENDENT_M / max(travelled_m, 0.5))
+        for _ in range(ITERATIONS):
+            curves, tilt = state[:-1].reshape(count, 4), float(state[-1])
+            x, y = tilted(points.x_m, points.y_m, height_m, tilt)
+            owner = self._owners(x, y, points, curves, of, classes)
+            information, gradient = prior.copy(), prior @ (mean - state)
+            for k in range(count):
+                mine = np.flatnonzero(owner == k)
+                seen[k] = Support(np.zeros(0, np.int64), mine)
+                if not len(mine):
+                    continue
+                cells = np.floor(x[mine] / BIN_M).astype(np.int64)
+                bins, index, counts = np.unique(cells, return_inverse=True, return_counts=True)
+                seen[k] = Support(bins, mine)
+                weight = points.weight[mine] / points.sigma_m[mine] ** 2
+                total = np.bincount(index, weight)
+                x_bin = np.bincount(index, weight * x[mine]) / total
+                slope = slope_basis(x[mine]) @ curves[k]
+                residual = y[mine] - basis(x[mine]) @ curves[k]
+                r_bin = np.bincount(index, weight * residual) / total
+                by_tilt = (slope * x[mine] - y[mine]) * x[mine] / height_m
+                tilt_bin = np.bincount(index, weight * by_tilt) / total
+                variance = np.bincount(index, points.sigma_m[mine] ** 2) / counts / np.minimum(counts, MOST_IN_BIN)
+                variance = (variance + SIGMA_BIN_M**2) * inflation
+                robust = 1.0 / (1.0 + r_bin**2 / (variance / inflation) / KERNEL_SIGMAS**2)
+                H = np.zeros((len(bins), size))
+                H[:, 4 * k : 4 * k + 4] = basis(x_bin)
+                H[:, -1] = -tilt_bin
+                scaled = H * (robust / variance)[:, None]
+                information += scaled.T @ H
+                gradient += scaled.T @ r_bin
+            state = state + np.linalg.solve(information, gradient)
+        cov = np.linalg.inv(information)
+        self.curves = state[:-1].reshape(count, 4)
+        self.cov = 0.5 * (cov + cov.T)[:-1, :-1]
+        return seen, float(state[-1])
+
+    def _owners(
+        self, x: Floats, y: Floats, points: LinePoints, curves: Floats, of: Ids, classes: Ids
+    ) -> NDArray[np.int64]:
+        """(N,) the line that each point is on, -1: none."""
+        at = basis(x)
+        gap = np.abs(y[:, None] - at @ curves.T)
+        spread = np.stack([self.across_sigma_m(k, x) for k in range(len(curves))], axis=1)
+        gate = np.clip(GATE_SIGMAS * np.hypot(spread, points.sigma_m[:, None]), LEAST_GATE_M, WIDEST_GATE_M)
+        gap = np.where((gap < gate) & (of[:, None] == classes[None]), gap, np.inf)
+        nearest = np.argmin(gap, axis=1)
+        return np.where(np.isfinite(gap[np.arange(len(x)), nearest]), nearest, -1)
+
+
+def _together(common: Floats, own: Floats, count: int) -> Floats:
+    """(4 n, 4 n) variances (4,) that all lines have in common, and that each has for itself."""
+    out: Floats = np.kron(np.ones((count, count)), np.diag(common)) + np.kron(np.eye(count), np.diag(own))
+    return out

@@ -1,0 +1,366 @@
+"""Lines over a drive: from each image's points to lines with ids that last.
+
+An image without a past is searched for the shape of its lines (`parallel_search`); from then on the filter's prediction
+says where each is, and only what lies on no known line can be a new one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.lanes.curves import basis, moved
+from birdslam.lanes.line_filter import LineFilter, Support
+from birdslam.lanes.paint import LinePoints, edge_points, paint_points
+from birdslam.lanes.parallel_search import Peak, find_lines, find_shape
+from birdslam.lanes.road_view import RoadView, road_view
+from birdslam.perception import Segmentation
+from birdslam.types import LaneLine, LineColour, LineKind
+
+Floats = NDArray[np.float64]
+
+PAINT, LEFT_EDGE, RIGHT_EDGE = 0, 1, 2  # classes of lines: each is seen by points of its own
+MOVED_M = 0.8  # travelled between two updates: an image from the same place has the same errors
+STANDING_UPDATES = 4  # of a car that has not moved yet
+LEAST_PAINT_M, LEAST_EDGE_M = 2.4, 8.0  # evidence of a new line
+EVIDENCE_M = 6.0  # metres of paint that make a line three to two
+CERTAIN_M = 5.0  # ... that needs no second image
+APART_M = 0.45  # from a known line
+EDGE_WEIGHT = 0.3  # of an edge's points in the search: side roads and kerbstones bend a mask's border
+MOST_LINES = 9
+CONFIRMED, MOST_SCORE = 3.0, 8.0
+SAME_M = 0.3  # two lines nearer than this along all of 5 to 20 m are one
+TO_M = 60.0  # to which a line is predicted at the most
+FORGOTTEN_M = -2.0  # a line that ended so far behind the ego is dropped
+NEAR_M, FAR_M = 5.0, 25.0  # where a line that is there has to be seen
+PAST_EDGE_M, MOST_ROAD_PAST = 0.8, 0.35  # so far past an edge there is no road along so much of it
+WORST_SIGMA_M = 0.6  # to which range a line is predicted
+SIGMA_HEIGHT_REL = 0.02  # of the camera's height, as of landmarks (mapping.StaticMapConfig)
+SIGMA_OFFSET_M = 0.03  # of the camera's roll, 0.01 rad at 1.5 m, and of the paint's middle
+SOLID, DASHED = 0.8, 0.6  # share of a line that is painted
+LEAST_PAINTED = 0.2  # of a dashed line; less of it is an arrow, or a scrap
+LEAST_EXISTENCE, LOOKS_OF_A_SCRAP = 0.4, 4.0  # what has less after so many images is dropped
+YELLOW = 25.0  # excess of yellow over the road's
+PROFILE_M = 4.0, 22.0  # where paint and gaps are resolved
+
+
+_AHEAD_M = np.arange(5.0, TO_M + 1.0, 5.0)
+_AHEAD = basis(_AHEAD_M)
+
+
+class _Track(msgspec.Struct):
+    """What is known of a line beside its curve."""
+
+    kind: int  # class of its points
+    line: int = -1  # its id, once it is sure
+    score: float = 0.0
+    evidence_m: float = 0.0
+    seen_from_m: float = 0.0  # in the filter's ego frame
+    seen_to_m: float = 0.0
+    painted: float = 0.0  # share, a running mean
+    looks: float = 0.0  # weight of that mean
+    yellow: float = 0.0
+    coloured: float = 0.0
+
+
+class LineTracker:
+    """State: the filter, in the ego's frame at `T_world_filter`, and its lines' tracks."""
+
+    def __init__(self, camera: Camera, certain_m: float = CERTAIN_M) -> None:
+        """`certain_m` metres of evidence make a line sure in its first image."""
+        self.camera = camera
+        self._certain_m = certain_m
+        self._next = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """All lines are dropped; ids go on counting."""
+        self._filter = LineFilter()
+        self._tracks: list[_Track] = []
+        self._T_world_filter: SE2 | None = None
+        self._standing = 0
+        self.tilt_rad = 0.0  # of the last image against its pitch
+
+    def update(
+        self,
+        T_world_ego: SE2,
+        ground: GroundPlane,
+        sigma_pitch_rad: float,
+        image: NDArray[np.uint8],
+        segmentation: Segmentation,
+        boxes_px: Floats,
+        search_tilt: bool = False,
+    ) -> None:
+        """One image: `ground` under its camera, its masks, and the boxes (B, 4) of vehicles in it.
+
+        `search_tilt`: the pitch is as uncertain as sigma says, and this image alone has to show it.
+        """
+        travelled_m = self._advance(T_world_ego)
+        if travelled_m is None:
+            return
+        view = road_view(self.camera, ground, image, segmentation, boxes_px)
+        paint = paint_points(view)
+        first_tilt_rad = 0.0
+        if not len(self._filter):
+            first_tilt_rad = self._begin(view, paint, ground, sigma_pitch_rad, search_tilt)
+        if not len(self._filter):
+            return
+        points, of = self._with_edges(view, paint)
+        classes = np.array([track.kind for track in self._tracks])
+        seen, self.tilt_rad = self._filter.update(
+            points, of, classes, ground.height_m, sigma_pitch_rad, travelled_m, first_tilt_rad
+        )
+        self._judge(view, points, seen)
+        self._add_lines(points, of, seen, ground.height_m)
+        self._drop_lines()
+
+    def _advance(self, T_world_ego: SE2) -> float | None:
+        """Moves the filter to the ego; the distance since its last update, None where it is too short for another."""
+        if self._T_world_filter is None:
+            self._T_world_filter = T_world_ego
+            return 10.0
+        step = self._T_world_filter.between(T_world_ego)
+        distance = float(np.hypot(step.x_m, step.y_m))
+        if distance < MOVED_M:
+            self._standing += 1
+            return None if self._standing > STANDING_UPDATES else MOVED_M
+        self._standing = 0
+        self._filter.predict(step)
+        self._T_world_filter = T_world_ego
+        for track in self._tracks:
+            track.seen_from_m -= step.x_m
+            track.seen_to_m -= step.x_m
+        return distance
+
+    def _begin(
+        self, view: RoadView, paint: LinePoints, ground: GroundPlane, sigma_pitch_rad: float, search_tilt: bool
+    ) -> float:
+        """Lines of an image without a past; gives the tilt that was found with them."""
+        left, right = edge_points(view, np.zeros(len(view.x_m)))
+        edges = (replace(edge, weight=EDGE_WEIGHT * edge.weight) for edge in (left, right))
+        shape = find_shape(_joined(paint, *edges), ground.height_m, sigma_pitch_rad if search_tilt else 0.0)
+        if shape is None:
+            return 0.0
+        curve = np.array([0.0, shape.heading, shape.curvature_per_m, 0.0])
+        found: list[tuple[int, Peak]] = []
+        for kind, points, least_m, most in (
+            (PAINT, paint, LEAST_PAINT_M, MOST_LINES - 2),
+            (LEFT_EDGE, left, LEAST_EDGE_M, 1),
+            (RIGHT_EDGE, right, LEAST_EDGE_M, 1),
+        ):
+            turned = points.tilted(ground.height_m, shape.tilt_rad)
+            found += [(kind, peak) for peak in find_lines(turned, curve, least_m, APART_M, most)]
+            if kind == PAINT and found:  # paint says better than a mask's border where the road goes
+                curve[1] = np.average([p.heading for _, p in found], weights=[p.evidence_m for _, p in found])
+        self._filter.begin(
+            np.array([peak.offset_m for _, peak in found]),
+            np.array([peak.heading for _, peak in found]),
+            shape.curvature_per_m,
+            np.array([kind != PAINT for kind, _ in found], dtype=bool),
+        )
+        self._tracks = [_Track(kind, score=1.0) for kind, _ in found]
+        return shape.tilt_rad
+
+    def _with_edges(self, view: RoadView, paint: LinePoints) -> tuple[LinePoints, NDArray[np.int64]]:
+        """All points of the image, and the class of each; edges are looked for from the way ahead."""
+        shape = self._filter.curves[self._reference()].copy()
+        shape[0] = 0.0
+        left, right = edge_points(view, basis(view.x_m) @ shape)
+        of = np.repeat([PAINT, LEFT_EDGE, RIGHT_EDGE], [len(paint), len(left), len(right)])
+        return _joined(paint, left, right), of
+
+    def _reference(self) -> int:
+        """The line that is known best."""
+        return int(np.argmin([self._filter.across_sigma_m(k, np.array([15.0]))[0] for k in range(len(self._tracks))]))
+
+    def _judge(self, view: RoadView, points: LinePoints, seen: list[Support]) -> None:
+        """Which lines were seen, over which range, how much of them is paint."""
+        for k, (track, support) in enumerate(zip(self._tracks, seen, strict=True)):
+            x = view.x_m
+            y = basis(x) @ self._filter.curves[k]
+            column = np.round((y - view.y_m[0]) / (view.y_m[1] - view.y_m[0])).astype(np.int64)
+            inside = (column >= 0) & (column < len(view.y_m))
+            at = np.clip(column, 0, len(view.y_m) - 1)
+            rows = np.arange(len(x))
+            clear = inside & ~view.outside[rows, at] & ~view.hidden[rows, at]
+            visible_m = float(view.row_m[clear & (x > NEAR_M) & (x < FAR_M)].sum())
+            mine = points.of(support.points)
+            if track.kind != PAINT:
+                side = 1 if track.kind == LEFT_EDGE else -1
+                past = np.clip(column + side * round(PAST_EDGE_M / (view.y_m[1] - view.y_m[0])), 0, len(view.y_m) - 1)
+                looked = clear & (x > NEAR_M) & (x < FAR_M) & ~view.outside[rows, past] & ~view.hidden[rows, past]
+                if view.row_m[looked & view.road[rows, past]].sum() > MOST_ROAD_PAST * max(
+                    view.row_m[looked].sum(), 1.0
+                ):
+                    track.score -= 1.0
+                    continue
+            support_m = float(np.minimum(mine.weight, 1.0).sum())
+            track.evidence_m += support_m
+            if support_m >= 2.0:
+                track.score = min(track.score + (1.0 if mine.masked.mean() > 0.3 else 0.5), MOST_SCORE)
+                track.seen_from_m = (
+                    min(track.seen_from_m, float(mine.x_m.min())) if track.looks else float(mine.x_m.min())
+                )
+                track.seen_to_m = max(track.seen_to_m, float(np.quantile(mine.x_m, 0.98)))
+            elif visible_m > 8.0:
+                track.score -= 1.0
+            near = (x > PROFILE_M[0]) & (x < PROFILE_M[1]) & clear
+            length_m = float(view.row_m[near].sum())
+            if length_m > 6.0 and track.kind == PAINT:
+                profile = (mine.x_m > PROFILE_M[0]) & (mine.x_m < PROFILE_M[1])
+                rows_seen = len(np.unique(mine.x_m[profile]))
+                share = min(1.0, rows_seen / max(1, int(near.sum())))
+                track.looks = min(track.looks + 1.0, 8.0)
+                track.painted += (share - track.painted) / track.looks
+                yellow = mine.yellow[profile & np.isfinite(mine.yellow)]
+                if len(yellow):
+                    track.coloured = min(track.coloured + 1.0, 8.0)
+                    track.yellow += (float(np.median(yellow)) - track.yellow) / track.coloured
+            elif track.kind != PAINT:
+                track.looks += 1.0
+
+    def _add_lines(self, points: LinePoints, of: NDArray[np.int64], seen: list[Support], height_m: float) -> None:
+        """Lines of points that lie on none that is known."""
+        free = np.ones(len(points), bool)
+        for support in seen:
+            free[support.points] = False
+        like = self._reference()
+        curve = self._filter.curves[like]
+        at = basis(np.array([10.0]))[0]
+        turned = points.tilted(height_m, self.tilt_rad)
+        for kind, least_m in ((PAINT, LEAST_PAINT_M), (LEFT_EDGE, LEAST_EDGE_M), (RIGHT_EDGE, LEAST_EDGE_M)):
+            if kind != PAINT and any(track.kind == kind for track in self._tracks):
+                continue
+            mine = turned.of(free & (of == kind))
+            for peak in find_lines(mine, curve, least_m, APART_M, 3 if kind == PAINT else 1):
+                there = at @ np.array([peak.offset_m, peak.heading, curve[2], curve[3]])
+                known = self._filter.curves @ at
+                taken = [abs(there - y) < APART_M for y, t in zip(known, self._tracks, strict=True) if t.kind == kind]
+                if any(taken) or len(self._tracks) >= MOST_LINES:
+                    continue
+                self._filter.add(peak.offset_m, peak.heading, like, kind != PAINT)
+                self._tracks.append(_Track(kind, score=1.0))
+
+    def _drop_lines(self) -> None:
+        """Lines that are no more seen, have ended behind the ego, or lie on another."""
+        kept: list[int] = []
+        x = np.array([5.0, 12.0, 20.0])
+        ys = self._filter.curves @ basis(x).T
+        for k in sorted(range(len(self._tracks)), key=lambda k: -self._tracks[k].score):
+            track = self._tracks[k]
+            if track.looks >= LOOKS_OF_A_SCRAP and _existence(track) < LEAST_EXISTENCE:
+                continue
+            if track.score <= 0.0 or (track.looks and track.seen_to_m < FORGOTTEN_M):
+                continue
+            if any(self._tracks[j].kind == track.kind and np.all(np.abs(ys[j] - ys[k]) < SAME_M) for j in kept):
+                continue
+            kept.append(k)
+        kept.sort()
+        self._filter.keep(np.array(kept, dtype=np.int64))
+        self._tracks = [self._tracks[k] for k in kept]
+        for track in self._tracks:
+            if track.line < 0 and (track.score >= CONFIRMED or track.evidence_m >= self._certain_m):
+                track.line, self._next = self._next, self._next + 1
+
+    def lines(self) -> TrackedLines:
+        """The lines that are sure, as they are after the last update; nothing changes them any more."""
+        sure = [k for k, track in enumerate(self._tracks) if track.line >= 0]
+        return TrackedLines(
+            self._T_world_filter or SE2(),
+            tuple(msgspec.structs.replace(self._tracks[k]) for k in sure),
+            self._filter.curves[sure].copy(),
+            tuple(self._filter.block(k).copy() for k in sure),
+            self.tilt_rad,
+        )
+
+
+@dataclass(frozen=True)
+class TrackedLines:
+    """The lines after an update: tracks, curves (n, 4) and covariances (4, 4) in the ego at `T_world_seen`."""
+
+    T_world_seen: SE2
+    tracks: tuple[_Track, ...]
+    curves: Floats
+    covs: tuple[Floats, ...]
+    tilt_rad: float  # of their image against its pitch
+
+    def at(self, T_world_ego: SE2) -> tuple[LaneLine, ...]:
+        """The lines in the ego's frame at `T_world_ego`, moved by the ego's motion, from left to right."""
+        step, out = self.T_world_seen.between(T_world_ego), []
+        for track, seen, seen_cov in zip(self.tracks, self.curves, self.covs, strict=True):
+            curve, J = moved(seen, step)
+            cov = J @ seen_cov @ J.T + _systematic(curve)
+            sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", _AHEAD, cov, _AHEAD), 0.0))
+            known = _AHEAD_M[sigma < WORST_SIGMA_M]
+            if not len(known) or not np.isfinite(cov).all():
+                continue
+            line = LaneLine(
+                line=track.line,
+                offset_m=float(curve[0]),
+                slope=float(curve[1]),
+                curvature_per_m=float(curve[2]),
+                curvature_rate_per_m2=float(curve[3]),
+                cov=tuple(cov.ravel().tolist()),
+                seen_from_m=track.seen_from_m - step.x_m,
+                seen_to_m=track.seen_to_m - step.x_m,
+                to_m=float(known[-1]),
+                kind=_kind(track),
+                colour=_colour(track),
+                existence=_existence(track),
+            )
+            out.append(line)
+        return tuple(sorted(out, key=lambda line: -line.y_m(8.0)))
+
+
+def _systematic(curve: Floats) -> Floats:
+    """(4, 4) what no number of images lessens: errors of the camera's height, which scales a curve, and its roll."""
+    by_height = np.array([curve[0], 0.0, -curve[2], -2.0 * curve[3]])
+    out: Floats = SIGMA_HEIGHT_REL**2 * np.outer(by_height, by_height)
+    out[0, 0] += SIGMA_OFFSET_M**2
+    return out
+
+
+def _existence(track: _Track) -> float:
+    """The probability that it is a line: by its paint, and by how little of the road in view has none."""
+    existence = 1.0 - math.exp(-track.evidence_m / EVIDENCE_M)
+    if track.kind != PAINT or not track.looks:
+        return existence
+    return existence * min(1.0, track.painted / LEAST_PAINTED)
+
+
+def _kind(track: _Track) -> LineKind:
+    if track.kind != PAINT:
+        return LineKind.EDGE
+    if track.looks < 1.0:
+        return LineKind.UNKNOWN
+    return LineKind.SOLID if track.painted > SOLID else LineKind.DASHED if track.painted < DASHED else LineKind.UNKNOWN
+
+
+def _colour(track: _Track) -> LineColour:
+    if track.kind != PAINT or not track.coloured:
+        return LineColour.UNKNOWN
+    return LineColour.YELLOW if track.yellow > YELLOW else LineColour.WHITE
+
+
+def _joined(*parts: LinePoints) -> LinePoints:
+    names = ("x_m", "y_m", "sigma_m", "weight", "masked", "yellow")
+    return LinePoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def still_lines(
+    camera: Camera,
+    image: NDArray[np.uint8],
+    segmentation: Segmentation,
+    boxes_px: Floats,
+) -> tuple[tuple[LaneLine, ...], GroundPlane]:
+    """The lines of a single image, and the ground under its camera with the pitch that makes them parallel."""
+    tracker = LineTracker(camera, certain_m=LEAST_PAINT_M)  # there will be no other
+    tracker.update(SE2(), camera.ground, camera.tilt_sigma_rad, image, segmentation, boxes_px, search_tilt=True)
+    ground = GroundPlane(camera.height_m, camera.pitch_rad + tracker.tilt_rad, camera.roll_rad)
+    return tracker.lines().at(SE2()), ground

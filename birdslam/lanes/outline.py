@@ -1,0 +1,56 @@
+"""A lane in the image: the outline of its area, and a line as a polyline."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.perception import Segmentation
+from birdslam.types import Lane, LaneLine
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+FROM_M, STEP_M = 1.0, 0.5  # of the points of an outline
+_FAR_PX = 20_000.0  # OpenCV draws no farther
+_CLOSE_PX = 9  # gaps of a mask that are closed: its border to paint, and noise
+
+
+def line_px(camera: Camera, ground: GroundPlane, line: LaneLine, to_m: float | None = None) -> Floats:
+    """(N, 2) pixels of a line from the nearest road in the image to where it is known, or to `to_m`."""
+    x_m = np.arange(FROM_M, line.to_m if to_m is None else to_m, STEP_M)
+    return _px(camera, ground, x_m, np.array([line.y_m(x) for x in x_m.tolist()]))
+
+
+def lane_px(camera: Camera, ground: GroundPlane, lane: Lane) -> Floats:
+    """(N, 2) pixels of the polygon around a lane, along its left bound and back along its right one."""
+    x_m = np.arange(FROM_M, lane.to_m, STEP_M)
+    left = _px(camera, ground, x_m, np.array([lane.left_m(x) for x in x_m.tolist()]))
+    right = _px(camera, ground, x_m, np.array([lane.right_m(x) for x in x_m.tolist()]))
+    return np.vstack([left, right[::-1]])
+
+
+def lane_mask(camera: Camera, ground: GroundPlane, lane: Lane) -> Bools:
+    """(H, W) the area of a lane in the image, also behind what stands on it."""
+    mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    outline = lane_px(camera, ground, lane)
+    if len(outline) > 2:
+        cv2.fillPoly(mask, [np.round(outline).astype(np.int32)], 1)
+    return mask > 0
+
+
+def visible(area: Bools, segmentation: Segmentation) -> Bools:
+    """(H, W) what the image shows of an area of the road: not what cars and kerbs cover."""
+    road = (segmentation.road | segmentation.lane).view(np.uint8)
+    closed = cv2.morphologyEx(road, cv2.MORPH_CLOSE, np.ones((_CLOSE_PX, _CLOSE_PX), np.uint8)) > 0
+    out: Bools = area & closed
+    return out
+
+
+def _px(camera: Camera, ground: GroundPlane, x_m: Floats, y_m: Floats) -> Floats:
+    px = bev.ego_to_pixel(camera, ground, np.column_stack([x_m, y_m]))
+    out: Floats = np.clip(px[np.isfinite(px).all(axis=1)], -_FAR_PX, _FAR_PX)
+    return out

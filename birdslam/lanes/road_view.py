@@ -1,0 +1,125 @@
+"""The road seen from above, with the resolution that the image has: what lines are found in.
+
+Rows lie across the road at growing distances, as far apart as the image resolves; columns are a regular lattice to the
+left and right. So a painted line is as wide in the last row as in the first.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.perception import Segmentation
+
+Floats = NDArray[np.float64]
+Grid = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+NEAREST_M = 3.0  # of a row; most cameras see the road from 5 m on
+FARTHEST_M = 50.0
+ROW_M = 0.25  # between near rows
+HALF_WIDTH_M = 10.0  # of a row
+LATTICE_M = 0.04  # between columns: a painted line of 0.12 m has three
+
+
+@dataclass(frozen=True)
+class RoadView:
+    """An image and its masks from above: (R, C) over `x_m` (R,), growing, and `y_m` (C,), growing to the left.
+
+    `outside` is what the image does not show, `hidden` what vehicles cover.
+    """
+
+    x_m: Floats
+    y_m: Floats
+    row_m: Floats  # (R,) the length of road that a row stands for
+    sigma_y_m: Floats  # (R,) one pixel across the road
+    grey: Grid
+    road: Bools
+    paint: Bools
+    hidden: Bools
+    outside: Bools
+    excess: Grid | None  # yellow: (red + green) / 2 - blue; None of a grey image
+
+
+@functools.lru_cache(maxsize=4)
+def _columns_m() -> Floats:
+    out: Floats = np.arange(-HALF_WIDTH_M, HALF_WIDTH_M + 0.5 * LATTICE_M, LATTICE_M)
+    out.flags.writeable = False
+    return out
+
+
+def _rows_m(fy_px: float, height_m: float) -> Floats:
+    """Distances of the rows: `ROW_M` apart, or a pixel where that is more (a pixel is x^2 / f H on the road)."""
+    near = np.arange(NEAREST_M, FARTHEST_M, ROW_M)
+    turn_m = np.sqrt(ROW_M * fy_px * height_m)  # from here on a pixel is more
+    near = near[near < turn_m]
+    first = fy_px * height_m / turn_m  # pixels below the horizon
+    far = fy_px * height_m / np.arange(first, fy_px * height_m / FARTHEST_M, -1.0)
+    out: Floats = np.concatenate([near, far[(far > near[-1] + 0.5 * ROW_M) & (far <= FARTHEST_M)]])
+    return out
+
+
+def road_view(
+    camera: Camera, ground: GroundPlane, image: NDArray[np.uint8], segmentation: Segmentation, boxes_px: Floats
+) -> RoadView:
+    """`image` (H, W) grey or (H, W, 3) BGR; `boxes_px` (B, 4) of the vehicles in it."""
+    x_m, y_m = _rows_m(camera.fy_px, ground.height_m), _columns_m()
+    u, v = _pixels(camera, ground, x_m, y_m)
+    outside = (u < 0.0) | (u > camera.width_px - 1) | (v < 0.0) | (v > camera.height_px - 1)
+
+    def seen(plane: NDArray[np.uint8], how: int) -> NDArray[np.uint8]:
+        return np.asarray(cv2.remap(plane, u, v, how, borderMode=cv2.BORDER_REPLICATE))
+
+    excess = None
+    if image.ndim == 3:
+        sampled = seen(image, cv2.INTER_LINEAR)
+        grey = cv2.cvtColor(sampled, cv2.COLOR_BGR2GRAY)
+        blue, green, red = (plane.astype(np.float32) for plane in cv2.split(sampled))
+        excess = np.asarray(0.5 * (green + red) - blue, np.float32)
+    else:
+        grey = seen(image, cv2.INTER_LINEAR)
+    covered = np.zeros(segmentation.road.shape, np.uint8)  # by boxes; road that shows in their corners is seen
+    for x1, y1, x2, y2 in boxes_px:
+        covered[max(0, int(y1)) : max(0, int(np.ceil(y2))), max(0, int(x1)) : max(0, int(np.ceil(x2)))] = 1
+    covered &= ~(segmentation.road | segmentation.lane)
+    road, paint, hidden = (
+        seen(mask.view(np.uint8), cv2.INTER_NEAREST) > 0 for mask in (segmentation.road, segmentation.lane, covered)
+    )
+    row_m = np.gradient(x_m)
+    return RoadView(
+        x_m,
+        y_m,
+        row_m,
+        x_m / camera.fx_px,
+        np.asarray(grey, np.float32),
+        road & ~outside,
+        paint & ~outside & ~hidden,
+        hidden,
+        outside,
+        excess,
+    )
+
+
+def _pixels(camera: Camera, ground: GroundPlane, x_m: Floats, y_m: Floats) -> tuple[Grid, Grid]:
+    """(R, C) columns and rows of the image: as bev.ego_to_pixel, of a grid."""
+    ahead, left, up = ground.R_ego_cam
+    right, down, depth = (
+        (a * x_m - c * ground.height_m)[:, None] + b * y_m for a, b, c in zip(ahead, left, up, strict=True)
+    )
+    depth = np.maximum(depth, 1e-3)
+    u = camera.fx_px * (right / depth) + camera.cx_px
+    v = camera.fy_px * (down / depth) + camera.cy_px
+    return u.astype(np.float32), v.astype(np.float32)
+
+
+def tilted(x_m: Floats, y_m: Floats, height_m: float, by_rad: Floats | float) -> tuple[Floats, Floats]:
+    """Where points of the road lie if the camera's nose is lower by `by_rad` than it was taken to be (Eq. 1)."""
+    slope = bev.road_slope(x_m, height_m) + by_rad
+    x = bev.meet_road(np.ones_like(slope), np.maximum(slope, 1e-4), height_m)
+    return x, y_m * x / x_m

@@ -1,0 +1,176 @@
+"""Lanes of lines: which lines bound lanes, the lane of the ego, what completes a lane that has a line on one side only.
+
+Arrows, kerbs and tar look like lines too. Of all the lines those are the bounds that make a row of plausible lanes,
+found by dynamic programming from left to right: each bound counts by the probability that it is a line, each strip
+between two of them by its width.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.types import Bound, Lane, LaneLine, LineKind
+
+Floats = NDArray[np.float64]
+
+AT_M = 8.0  # where lanes are judged: in view of most cameras, and near enough to be sure
+LEAST_LANE_M, WIDEST_LANE_M = 2.3, 4.2
+WIDEST_TO_EDGE_M = 5.5  # of a lane that ends at the road's edge, parked cars included
+LEAST_STRIP_M = 0.8  # a hard shoulder, a cycle lane
+NO_LANE_COST = 0.6  # of a strip that is no lane
+WIDE_COST = 0.4  # of a lane wider than most
+PAINT_AT_EDGE_M = 0.6  # nearer to the road's edge than this a painted line is that edge's
+WIDTH_M, WIDTH_SIGMA_M = 3.4, 0.4  # of a lane nobody has measured
+
+
+@dataclass(frozen=True)
+class LaneRow:
+    """Lanes from left to right and which of them the ego is in, None: in none that is known."""
+
+    lanes: tuple[Lane, ...]
+    ego: int | None
+
+
+def lane_row(lines: tuple[LaneLine, ...], usual_m: float = WIDTH_M, usual_sigma_m: float = WIDTH_SIGMA_M) -> LaneRow:
+    """The lanes between the lines of a moment; `usual_m` is the width of the ego's lane by what was seen before."""
+    bounds = _bounds(lines)
+    lanes = [_between(left, right) for left, right in pairwise(bounds) if _is_lane(left, right)]
+    ego = next((k for k, lane in enumerate(lanes) if _holds_ego(lane)), None)
+    if ego is None:
+        own = _completed(bounds, usual_m, usual_sigma_m)
+        if own is not None:
+            lanes.append(own)
+            lanes.sort(key=lambda lane: -lane.centre_m(AT_M))
+            ego = lanes.index(own)
+    return LaneRow(tuple(lanes), ego)
+
+
+def _holds_ego(lane: Lane) -> bool:
+    """Whether the ego's foot is in it; near the ego, since it may stand askew."""
+    return lane.left_m(0.0) > 0.0 >= lane.right_m(0.0)
+
+
+def _bounds(lines: tuple[LaneLine, ...]) -> list[LaneLine]:
+    """The lines that bound lanes, from left to right."""
+    paint = [line for line in lines if line.kind is not LineKind.EDGE]
+    usable = paint + [
+        line
+        for line in lines
+        if line.kind is LineKind.EDGE and all(abs(line.y_m(AT_M) - p.y_m(AT_M)) > PAINT_AT_EDGE_M for p in paint)
+    ]
+    usable.sort(key=lambda line: -line.y_m(AT_M))
+    best: list[tuple[float, list[LaneLine]]] = []
+    for k, line in enumerate(usable):
+        gain = line.existence
+        choice: tuple[float, list[LaneLine]] = (gain, [line])
+        for j in range(k):
+            score = best[j][0] + gain - _strip_cost(usable[j], line)
+            if score > choice[0]:
+                choice = score, [*best[j][1], line]
+        best.append(choice)
+    return max(best, key=lambda item: item[0])[1] if best else []
+
+
+def _strip_cost(left: LaneLine, right: LaneLine) -> float:
+    width = left.y_m(AT_M) - right.y_m(AT_M)
+    at_edge = LineKind.EDGE in (left.kind, right.kind)
+    if width < LEAST_STRIP_M:
+        return 2.0
+    if width < LEAST_LANE_M:
+        return NO_LANE_COST
+    if width < (WIDEST_TO_EDGE_M if at_edge else WIDEST_LANE_M):
+        return 0.0
+    return WIDE_COST
+
+
+def _is_lane(left: LaneLine, right: LaneLine) -> bool:
+    """Whether the strip between two bounds is a lane."""
+    width = left.y_m(AT_M) - right.y_m(AT_M)
+    edges = (left.kind is LineKind.EDGE) + (right.kind is LineKind.EDGE)
+    if width < LEAST_LANE_M:
+        return False
+    if edges == 2:
+        return True
+    return width < WIDEST_TO_EDGE_M
+
+
+def _shape(line: LaneLine | Lane) -> Floats:
+    return np.array([line.offset_m, line.slope, line.curvature_per_m, line.curvature_rate_per_m2])
+
+
+def _bound(line: LaneLine) -> Bound:
+    return Bound.EDGE if line.kind is LineKind.EDGE else Bound.PAINT
+
+
+def _between(left: LaneLine, right: LaneLine) -> Lane:
+    """The lane between two lines: its centre is their mean, and their shapes' errors are the road's, common to both."""
+    a, b = _shape(left), _shape(right)
+    P, Q = np.array(left.cov).reshape(4, 4), np.array(right.cov).reshape(4, 4)
+    shared = _shared(P, Q)
+    cov = 0.25 * (P + Q + shared + shared.T)
+    width_cov = P + Q - shared - shared.T
+    centre = 0.5 * (a + b)
+    edges = left.kind is LineKind.EDGE and right.kind is LineKind.EDGE
+    return Lane(
+        offset_m=float(centre[0]),
+        slope=float(centre[1]),
+        curvature_per_m=float(centre[2]),
+        curvature_rate_per_m2=float(centre[3]),
+        cov=tuple(cov.ravel().tolist()),
+        width_m=float(a[0] - b[0]),
+        width_slope=float(a[1] - b[1]),
+        width_sigma_m=math.sqrt(max(0.0, float(width_cov[0, 0]))),
+        to_m=min(left.to_m, right.to_m),
+        left=left.line,
+        right=right.line,
+        left_bound=_bound(left),
+        right_bound=_bound(right),
+        carriageway=edges and a[0] - b[0] > WIDEST_LANE_M,
+    )
+
+
+def _shared(P: Floats, Q: Floats) -> Floats:
+    """(4, 4) covariance between two lines: slope, curvature and its rate are those of one road; offsets are not."""
+    shared = np.zeros((4, 4))
+    shared[1:, 1:] = np.minimum(P[1:, 1:].diagonal(), Q[1:, 1:].diagonal())[:, None] * np.eye(3)
+    return shared
+
+
+def _completed(bounds: list[LaneLine], usual_m: float, usual_sigma_m: float) -> Lane | None:
+    """The ego's lane where it has a line on one side only."""
+    left = [line for line in bounds if line.offset_m > 0.0]
+    right = [line for line in bounds if line.offset_m <= 0.0]
+    near_left, near_right = (left[-1] if left else None), (right[0] if right else None)
+    known = min(
+        (line for line in (near_left, near_right) if line is not None),
+        key=lambda line: abs(abs(line.offset_m) - 0.5 * usual_m),
+        default=None,
+    )
+    if known is None or abs(known.offset_m) > usual_m:
+        return None
+    sign = -1.0 if known is near_left else 1.0
+    shape = _shape(known)
+    shape[0] += sign * 0.5 * usual_m
+    cov = np.array(known.cov).reshape(4, 4).copy()
+    cov[0, 0] += 0.25 * usual_sigma_m**2
+    at_left = known is near_left
+    return Lane(
+        offset_m=float(shape[0]),
+        slope=float(shape[1]),
+        curvature_per_m=float(shape[2]),
+        curvature_rate_per_m2=float(shape[3]),
+        cov=tuple(cov.ravel().tolist()),
+        width_m=usual_m,
+        width_slope=0.0,
+        width_sigma_m=usual_sigma_m,
+        to_m=known.to_m,
+        left=known.line if at_left else None,
+        right=None if at_left else known.line,
+        left_bound=_bound(known) if at_left else Bound.WIDTH,
+        right_bound=Bound.WIDTH if at_left else _bound(known),
+    )

@@ -1,0 +1,139 @@
+"""map.geojson: the lines of a drive as polylines in metres of the epoch's world, each written when it has ended.
+
+A vertex is where a line was when the ego was NODE_AT_M before it: there it is in view and known best. Memory is
+bounded: only lines in sight are held, and of the others so much as a picture shows.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.se2 import SE2
+from birdslam.types import NS_PER_S, Estimate, LaneLine
+
+Floats = NDArray[np.float64]
+
+NODE_AT_M = 6.0  # ahead of the ego
+NODE_EVERY_M = 2.0
+LEAST_EXISTENCE = 0.5
+LEAST_NODES = 3
+ENDED_NS = 3 * NS_PER_S  # a line not seen for so long has ended
+MOST_DRAWN = 20_000  # vertices for the picture
+TAIL_M = 30.0  # what lies ahead when a drive ends
+
+
+@dataclass
+class _Polyline:
+    line: int
+    epoch: int
+    first_ns: int
+    T_picture_world: SE2
+    last_ns: int = 0
+    kinds: dict[str, int] = field(default_factory=dict)
+    colours: dict[str, int] = field(default_factory=dict)
+    points_m: list[tuple[float, float]] = field(default_factory=list)  # in world
+    sigmas_m: list[float] = field(default_factory=list)  # across the line, against the ego
+    widths_m: list[float | None] = field(default_factory=list)  # of the lane to its right
+
+
+class LineMap:
+    """Takes estimate after estimate; `close` ends the file."""
+
+    def __init__(self, path: Path) -> None:
+        self._file: TextIO = path.open("w", encoding="ascii")
+        self._file.write('{"type": "FeatureCollection", "birdslam": {"metres_of": "the world of each epoch"}, ')
+        self._file.write('"features": [')
+        self._first = True
+        self._open: dict[int, _Polyline] = {}
+        self._way_m = 0.0
+        self._last: Estimate | None = None
+        self._drawn: list[Floats] = []
+        self._drawn_count = 0
+
+    def add(self, estimate: Estimate, T_picture_world: SE2) -> None:
+        """One frame's estimate; `T_picture_world` puts its epoch into the picture."""
+        last, self._last = self._last, estimate
+        if last is not None and last.epoch != estimate.epoch:
+            self._end(list(self._open.values()))
+            last = None
+        if last is not None:
+            step = last.T_world_ego.between(estimate.T_world_ego)
+            self._way_m += float(np.hypot(step.x_m, step.y_m))
+        lanes = estimate.lanes
+        if lanes is None or not estimate.valid or (last is not None and self._way_m < NODE_EVERY_M):
+            return
+        self._way_m = 0.0
+        widths = {lane.left: lane.width_m for lane in lanes.lanes if lane.left is not None}
+        for line in lanes.lines:
+            if line.existence >= LEAST_EXISTENCE and line.seen_from_m < NODE_AT_M < line.seen_to_m:
+                self._add_node(estimate, line, widths.get(line.line), T_picture_world)
+        self._end([p for p in self._open.values() if estimate.t_source_ns - p.last_ns > ENDED_NS])
+
+    def _add_node(self, estimate: Estimate, line: LaneLine, width_m: float | None, T_picture_world: SE2) -> None:
+        new = _Polyline(line.line, estimate.epoch, estimate.t_source_ns, T_picture_world)
+        polyline = self._open.setdefault(line.line, new)
+        polyline.last_ns = estimate.t_source_ns
+        for votes, value in ((polyline.kinds, line.kind.value), (polyline.colours, line.colour.value)):
+            votes[value] = votes.get(value, 0) + 1
+        _extend(polyline, estimate, line, np.array([NODE_AT_M]), width_m)
+
+    def _end(self, polylines: list[_Polyline]) -> None:
+        for polyline in polylines:
+            del self._open[polyline.line]
+            if len(polyline.points_m) >= LEAST_NODES:
+                self._file.write(("\n" if self._first else ",\n") + json.dumps(_feature(polyline)))
+                self._first = False
+                if self._drawn_count < MOST_DRAWN:
+                    self._drawn.append(polyline.T_picture_world @ np.array(polyline.points_m))
+                    self._drawn_count += len(polyline.points_m)
+
+    def drawn(self) -> list[Floats]:
+        """Polylines (N, 2) for the picture, in its frame; after `close`."""
+        return self._drawn
+
+    def close(self) -> None:
+        """Writes the lines in sight, with what was seen of them ahead, and ends the file."""
+        if self._file.closed:
+            return
+        last = self._last
+        if last is not None and last.lanes is not None:
+            for line in last.lanes.lines:
+                if line.line in self._open:
+                    ahead = np.arange(NODE_AT_M + NODE_EVERY_M, min(line.seen_to_m, line.to_m, TAIL_M), NODE_EVERY_M)
+                    _extend(self._open[line.line], last, line, ahead, None)
+        self._end(list(self._open.values()))
+        self._file.write("\n]}\n")
+        self._file.close()
+
+
+def _extend(polyline: _Polyline, estimate: Estimate, line: LaneLine, x_m: Floats, width_m: float | None) -> None:
+    if not len(x_m):
+        return
+    points = np.column_stack([x_m, [line.y_m(x) for x in x_m.tolist()]])
+    polyline.points_m += [(x, y) for x, y in (estimate.T_world_ego @ points).tolist()]
+    polyline.sigmas_m += [line.sigma_m(x) for x in x_m.tolist()]
+    polyline.widths_m += [width_m] * len(x_m)
+
+
+def _feature(polyline: _Polyline) -> dict[str, object]:
+    widths = [width for width in polyline.widths_m if width is not None]
+    return {
+        "type": "Feature",
+        "geometry": {"type": "LineString", "coordinates": [[round(v, 3) for v in p] for p in polyline.points_m]},
+        "properties": {
+            "line": polyline.line,
+            "epoch": polyline.epoch,
+            "kind": max(polyline.kinds, key=lambda kind: polyline.kinds[kind]),
+            "colour": max(polyline.colours, key=lambda colour: polyline.colours[colour]),
+            "sigma_m": [round(sigma, 3) for sigma in polyline.sigmas_m],
+            "lane_right_of_it_m": round(float(np.median(widths)), 2) if widths else None,
+            "first_seen_s": round(polyline.first_ns / NS_PER_S, 3),
+            "last_seen_s": round(polyline.last_ns / NS_PER_S, 3),
+        },
+    }

@@ -1,0 +1,93 @@
+"""The ego's lane in single images with masks: scores and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from birdslam.bench.lanes.kitti_road import (
+    StillsReport,
+    camera_of,
+    draw,
+    find_lane,
+    find_pairs,
+    read_pair,
+    report_of,
+    score,
+)
+from birdslam.bench.lanes.paint_masks import PaintReport, find_images, read, score_paint
+from birdslam.bench.lanes.paint_masks import report_of as paint_report
+from birdslam.outputs.drive_files import ResultsError, claim_directory, write_json
+from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.runtime.progress import Progress
+from birdslam.sources.recording import DatasetError
+
+REPORT = "report.json"
+
+
+def evaluate_paint(configuration: Configuration, folder: Path) -> PaintReport:
+    """Scores the paint that the configured network finds in a folder's images; writes the report to the output.
+
+    Raises ConfigurationError, DatasetError, ModelError, ResultsError.
+    """
+    pairs = find_images(folder)
+    output = Path(configuration.output)
+    claim_directory(output)
+    lossless = msgspec.structs.replace(configuration.source, rate="max")
+    configuration = msgspec.structs.replace(configuration, source=lossless)
+    scores = []
+    with Inference(configuration) as inference, Progress(folder.name, len(pairs)) as progress:
+        for image_path, mask_path in pairs:
+            image, mask = read(image_path), read(mask_path)
+            if image.shape != mask.shape:
+                raise DatasetError(f"{mask_path}: is of another size than its image")
+            segmentation = inference.networks.start(0, image).result().segmentation
+            if segmentation is None:
+                raise ConfigurationError("--model: no network segments road and lanes")
+            scores.append(score_paint(image_path.name, image, segmentation.lane, mask))
+            progress.advance()
+        own = next((spec for spec in (configuration.models.segmenter,) if spec is not None), None)
+        report = paint_report("shipped" if own is None else Path(own.path).name, scores)
+    write_json(output / REPORT, report)
+    return report
+
+
+def evaluate_stills(configuration: Configuration, folder: Path, height_m: float | None) -> StillsReport:
+    """Scores all pairs of a folder, each image by itself; writes the report and a picture of each to the output.
+
+    The camera is the configuration's, or KITTI's; `height_m` overrides its height. Raises ConfigurationError,
+    DatasetError, ModelError, ResultsError.
+    """
+    pairs = find_pairs(folder)
+    output = Path(configuration.output)
+    claim_directory(output)
+    lossless = msgspec.structs.replace(configuration.source, rate="max")
+    configuration = msgspec.structs.replace(configuration, source=lossless)
+    if configuration.camera is not None and configuration.camera.distortion:
+        raise ConfigurationError("--camera: the masks are of undistorted images: a camera without distortion is needed")
+    scores = []
+    with Inference(configuration) as inference, Progress(folder.name, len(pairs)) as progress:
+        heads = inference.networks.heads
+        for pair in pairs:
+            image, mask = read_pair(pair)
+            try:
+                camera = camera_of(image, configuration.camera, height_m)
+            except DatasetError as error:
+                raise DatasetError(f"{pair.image}: {error}") from None
+            perception = inference.networks.start(0, image).result()  # frame 0 again: nothing is carried
+            if perception.segmentation is None:
+                raise ConfigurationError("--model: no network segments road and lanes")
+            boxes = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px
+            still = find_lane(camera, image, perception.segmentation, boxes)
+            scores.append(score(pair.image.name, camera, still, mask))
+            picture = output / f"lanes_{pair.number}.png"
+            if not cv2.imwrite(str(picture), draw(image, camera, still)):
+                raise ResultsError(f"{picture}: can't be written")
+            progress.advance()
+    report = report_of(scores, tuple(head.name for head in heads))
+    write_json(output / REPORT, report)
+    return report

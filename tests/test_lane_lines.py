@@ -1,0 +1,305 @@
+"""Lines as curves: their motion, single images, drives of images, lanes, who is in them, the map, real images."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.bench.lanes.kitti_road import Still, find_lane, find_pairs, iou, score
+from birdslam.bench.lanes.true_lines import LineScores, TrueLine
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.lanes.curves import basis, moved
+from birdslam.lanes.ego_lane import EgoLane
+from birdslam.lanes.line_tracker import LineTracker, still_lines
+from birdslam.lanes.occupancy import VehicleInEgo, with_vehicles
+from birdslam.lanes.outline import lane_mask
+from birdslam.lanes.topology import lane_row
+from birdslam.outputs.line_map import LineMap
+from birdslam.perception import Segmentation
+from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.evaluation.still_lanes import evaluate_stills
+from birdslam.sources.recording import DatasetError
+from birdslam.types import Bound, Estimate, LaneChange, LaneLine, Lanes, LineKind
+
+CAMERA = Camera(640, 240, 420.0, 420.0, 319.5, 90.0, height_m=1.5)
+NOBODY = np.zeros((0, 4))
+DASH_M, PERIOD_M = 3.0, 9.0
+curves = st.tuples(st.floats(-6, 6), st.floats(-0.2, 0.2), st.floats(-0.01, 0.01), st.floats(-1e-4, 1e-4))
+steps = st.tuples(st.floats(-1, 4), st.floats(-0.5, 0.5), st.floats(-0.1, 0.1))
+
+
+@given(curves, steps)
+def test_a_moved_curve_lies_where_it_lay(curve: tuple[float, ...], step: tuple[float, float, float]) -> None:
+    old, T_old_new = np.array(curve), SE2(*step)
+    new, _ = moved(old, T_old_new)
+    x = np.array([0.0, 3.0, 8.0])
+    at = T_old_new @ np.column_stack([x, basis(x) @ new])
+    assert np.abs(basis(at[:, 0]) @ old - at[:, 1]).max() < 0.03  # a cubic turned is a cubic to third order
+
+
+@given(curves, steps)
+def test_the_derivative_of_a_moved_curve(curve: tuple[float, ...], step: tuple[float, float, float]) -> None:
+    old, T_old_new = np.array(curve), SE2(*step)
+    _, J = moved(old, T_old_new)
+    size = np.array([1e-4, 1e-5, 1e-6, 1e-7])
+    for k in range(4):
+        by = np.eye(4)[k] * size[k]
+        numeric = (moved(old + by, T_old_new)[0] - moved(old - by, T_old_new)[0]) / (2.0 * size[k])
+        # In a turn of 0.1 rad the first order that the filter takes is good to some percent
+        assert np.abs((numeric - J[:, k]) * size[k] / size).max() < 0.12 * max(
+            1.0, np.abs(J[:, k] * size[k] / size).max()
+        )
+
+
+def picture(
+    T_world_ego: SE2, offsets_m: tuple[float, ...], dashed: tuple[bool, ...], bend: float = 0.0, pitch_rad: float = 0.0
+) -> tuple[np.ndarray, Segmentation]:
+    """A grey road between edges at +-8 m with lines along world's x, and what a network says of it."""
+    ground = GroundPlane(CAMERA.height_m, pitch_rad)
+    image = np.full((CAMERA.height_px, CAMERA.width_px), 150, np.uint8)
+    road, lane = (np.zeros(image.shape, np.uint8) for _ in range(2))
+    x = np.arange(2.0, 80.0, 0.5)
+
+    def band(low_m: float, high_m: float, start_m: float, end_m: float, planes: list[tuple[np.ndarray, int]]) -> None:
+        along = np.clip(np.arange(start_m, end_m + 0.25, 0.25), 2.0, 90.0)
+        world_x = along + T_world_ego.x_m
+        left, right = (
+            T_world_ego.inverse() @ np.column_stack([world_x, off + 0.5 * bend * world_x**2]) for off in (high_m, low_m)
+        )
+        px = bev.ego_to_pixel(CAMERA, ground, np.vstack([left, right[::-1]]))
+        if np.isfinite(px).all():
+            for plane, value in planes:
+                cv2.fillPoly(plane, [np.round(px * 16).astype(np.int32)], value, shift=4)
+
+    band(-8.0, 8.0, 2.0, 80.0, [(image, 90), (road, 1)])
+    for offset, gaps in zip(offsets_m, dashed, strict=True):
+        first = -(T_world_ego.x_m % PERIOD_M)
+        pieces = [(s, s + DASH_M) for s in np.arange(first, 80.0, PERIOD_M)] if gaps else [(2.0, x[-1])]
+        for start, end in pieces:
+            if end > 2.5:
+                band(offset - 0.07, offset + 0.07, max(start, 2.0), end, [(image, 220), (lane, 1)])
+    return cv2.GaussianBlur(image, (3, 3), 0), Segmentation(road=road > 0, lane=lane > 0)
+
+
+@pytest.mark.parametrize("pitch_rad", [-0.02, 0.0, 0.02])
+@pytest.mark.parametrize("bend", [0.0, 0.004])
+def test_the_lines_of_one_image_and_its_pitch(pitch_rad: float, bend: float) -> None:
+    image, masks = picture(SE2(0.0, 0.3, 0.0), (5.2, 1.7, -1.8), (False, True, False), bend, pitch_rad)
+    lines, ground = still_lines(CAMERA, image, masks, NOBODY)
+    row = lane_row(lines)
+    assert row.ego is not None
+    own = row.lanes[row.ego]
+    assert own.left_bound is own.right_bound is Bound.PAINT
+    assert math.degrees(abs(ground.pitch_rad - pitch_rad)) < 0.6  # the prior holds it back
+    assert own.width_m == pytest.approx(3.5, rel=0.06)
+    truth = 0.5 * (1.7 - 1.8) - 0.3 + 0.5 * bend * 10.0**2
+    assert own.centre_m(10.0) == pytest.approx(truth, abs=0.12)
+
+
+def drive(tracker: LineTracker, poses: list[SE2], hidden_from: int = 10**6) -> list[tuple[LaneLine, ...]]:
+    """The lines after each image; from `hidden_from` on a car covers the left line."""
+    out = []
+    for k, pose in enumerate(poses):
+        image, masks = picture(pose, (1.75, -1.75), (True, False))
+        boxes = NOBODY
+        if k >= hidden_from:
+            masks.road[:, :300], masks.lane[:, :300] = False, False
+            image[:, :300] = 60
+            boxes = np.array([[0.0, 0.0, 300.0, 240.0]])
+        tracker.update(pose, CAMERA.ground, 0.003, image, masks, boxes)
+        out.append(tracker.lines().at(pose))
+    return out
+
+
+def test_ids_last_and_dashes_are_told_from_a_solid_line() -> None:
+    poses = [SE2(2.0 * k, 0.2 * math.sin(0.2 * k), 0.02 * math.cos(0.2 * k)) for k in range(25)]
+    seen = drive(LineTracker(CAMERA), poses)
+    left = [[line for line in lines if 0.5 < line.offset_m < 3.0 and line.kind is not LineKind.EDGE] for lines in seen]
+    right = [
+        [line for line in lines if -3.0 < line.offset_m < -0.5 and line.kind is not LineKind.EDGE] for lines in seen
+    ]
+    for lines, y_m, kind in ((left, 1.75, LineKind.DASHED), (right, -1.75, LineKind.SOLID)):
+        assert all(len(found) == 1 for found in lines[3:])
+        assert len({found[0].line for found in lines[3:]}) == 1
+        assert lines[-1][0].kind is kind
+        for pose, (line,) in zip(poses[3:], lines[3:], strict=True):
+            truth = (pose.inverse() @ np.array([[pose.x_m + 10.0, y_m]]))[0]
+            assert abs(line.y_m(truth[0]) - truth[1]) < max(0.1, 3.0 * line.sigma_m(10.0))
+
+
+def test_a_line_behind_a_car_stays() -> None:
+    poses = [SE2(1.5 * k, 0.0, 0.0) for k in range(16)]
+    seen = drive(LineTracker(CAMERA), poses, hidden_from=8)
+    (before,) = (line for line in seen[7] if 1.0 < line.offset_m < 2.5)
+    (after,) = (line for line in seen[-1] if 1.0 < line.offset_m < 2.5)
+    assert after.line == before.line
+    assert after.y_m(10.0) == pytest.approx(1.75, abs=0.2)
+    assert after.sigma_m(10.0) > before.sigma_m(10.0)
+
+
+def test_nothing_is_seen_on_a_bare_road_and_nothing_breaks() -> None:
+    image = np.full((CAMERA.height_px, CAMERA.width_px), 90, np.uint8)
+    for road in (True, False):
+        masks = Segmentation(road=np.full(image.shape, road), lane=np.zeros(image.shape, bool))
+        lines, _ = still_lines(CAMERA, image, masks, NOBODY)
+        assert not [line for line in lines if line.kind is not LineKind.EDGE]
+
+
+def line(number: int, y_m: float, kind: LineKind = LineKind.SOLID, existence: float = 0.95) -> LaneLine:
+    cov = tuple(np.diag([0.01, 1e-4, 1e-7, 1e-11]).ravel().tolist())
+    return LaneLine(
+        line=number, offset_m=y_m, slope=0.0, curvature_per_m=0.0, curvature_rate_per_m2=0.0, cov=cov,
+        seen_from_m=0.0, seen_to_m=40.0, to_m=50.0, kind=kind, existence=existence,
+    )  # fmt: skip
+
+
+def test_an_arrow_is_no_bound() -> None:
+    row = lane_row((line(0, 5.2), line(1, 1.6), line(2, 0.0, existence=0.8), line(3, -1.8)))
+    assert [(lane.left, lane.right) for lane in row.lanes] == [(0, 1), (1, 3)]
+    assert row.ego == 1
+
+
+def test_a_lane_with_one_line_is_completed_and_says_so() -> None:
+    row = lane_row((line(1, 1.6),), usual_m=3.2, usual_sigma_m=0.2)
+    assert row.ego == 0
+    (own,) = row.lanes
+    assert (own.left, own.right, own.right_bound) == (1, None, Bound.WIDTH)
+    assert own.right_m(10.0) == pytest.approx(-1.6)
+    assert own.width_sigma_m == 0.2
+
+
+def test_edges_without_paint_bound_one_carriageway() -> None:
+    row = lane_row((line(1, 3.0, LineKind.EDGE), line(2, -3.5, LineKind.EDGE)))
+    assert row.ego == 0
+    assert row.lanes[0].carriageway
+    assert row.lanes[0].left_bound is row.lanes[0].right_bound is Bound.EDGE
+
+
+def test_a_lane_change_is_one_event() -> None:
+    keeper = EgoLane()
+    changes = []
+    for k in range(40):
+        y_m = -0.1 * k  # the ego moves left by 0.1 m a frame
+        lanes = keeper.lanes((line(0, 5.2 + y_m), line(1, 1.7 + y_m), line(2, -1.8 + y_m)), 0, 0.0)
+        changes.append(lanes.change)
+        assert lanes.ego is not None
+    assert changes.count(LaneChange.LEFT) == 1
+    assert changes.count(LaneChange.RIGHT) == 0
+    assert changes.index(LaneChange.LEFT) in range(19, 22)  # 0.3 m past the line
+
+
+@given(st.floats(3.0, 60.0), st.floats(-12.0, 12.0), st.floats(0.0, 4.0), st.floats(-3.1, 3.1))
+def test_places_of_a_vehicle_sum_to_one(x_m: float, y_m: float, sigma_m: float, yaw_rad: float) -> None:
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    vehicle = VehicleInEgo(7, SE2(x_m, y_m, yaw_rad), np.eye(3) * sigma_m**2, 4.0, 8.0)
+    (place,) = with_vehicles(lanes, [vehicle], 10.0).vehicles
+    assert place.ego_lane + place.left + place.right + place.oncoming + place.off_road == pytest.approx(1.0)
+
+
+def test_the_leader_is_the_nearest_in_the_egos_lane() -> None:
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    cov = np.diag([0.25, 0.01, 0.001])
+    cars = [
+        VehicleInEgo(k, SE2(x, y, 0.0), cov, 4.0, 8.0) for k, x, y in ((1, 30.0, 0.1), (2, 12.0, 3.4), (3, 20.0, -0.3))
+    ]
+    found = with_vehicles(lanes, cars, 9.0)
+    assert found.leader is not None
+    assert found.leader.vehicle == 3
+    assert found.leader.gap_m == pytest.approx(18.0)
+    assert found.leader.time_gap_s == pytest.approx(2.0)
+    assert found.leader.gap_sigma_m == pytest.approx(0.5)
+    standing = with_vehicles(lanes, cars, 0.0).leader
+    assert standing is not None
+    assert standing.time_gap_s is None
+
+
+def test_the_map_has_each_line_once(tmp_path: Path) -> None:
+    path = tmp_path / "map.geojson"
+    lines = LineMap(path)
+    for k in range(30):
+        pose = SE2(float(k), 0.0, 0.0)
+        estimate = Estimate(
+            epoch=0, frame_id=k, t_source_ns=k * 10**8, t_capture_ns=0, t_utc_ns=0, T_world_ego=pose, cov=(0.0,) * 9,
+            valid=True, lanes=Lanes(lines=(line(4, 1.75), line(5, -1.75)), age_ns=0),
+        )  # fmt: skip
+        lines.add(estimate, SE2())
+    lines.close()
+    features = json.loads(path.read_text())["features"]
+    assert [feature["properties"]["line"] for feature in features] == [4, 5]
+    for feature, y_m in zip(features, (1.75, -1.75), strict=True):
+        points = np.array(feature["geometry"]["coordinates"])
+        assert np.abs(points[:, 1] - y_m).max() < 1e-6
+        assert np.all(np.diff(points[:, 0]) > 0.0)
+        assert len(feature["properties"]["sigma_m"]) == len(points)
+        assert feature["properties"]["kind"] == "solid"
+
+
+def test_the_scores_of_known_errors() -> None:
+    x = np.arange(-2.0, 60.0, 2.0)
+    truth = tuple(TrueLine(k, "solid", np.column_stack([x, np.full(len(x), y)])) for k, y in enumerate((1.75, -1.75)))
+    scores, keeper = LineScores(), EgoLane()
+    for k in range(10):
+        scores.add(0.1 * k, keeper.lanes((line(0, 1.85), line(1, -1.65), line(2, 7.9)), 0, 0.0), truth)
+    report = scores.report("toy", 100.0)
+    assert report.ranges[1].error_median_m == pytest.approx(0.1)
+    assert report.ranges[1].bias_m == pytest.approx(0.1)
+    assert report.recall == 1.0
+    assert report.false_lines_per_km == pytest.approx(10.0)
+    assert report.ego_lane_share == 1.0
+    assert report.ego_lane_wrong == 0.0
+    assert report.width_error_rel == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_overlap_of_a_lane_with_its_mask() -> None:
+    lanes = EgoLane().lanes((line(1, 1.75), line(2, -1.75)), 0, 0.0)
+    assert lanes.ego is not None
+    area = lane_mask(CAMERA, CAMERA.ground, lanes.ego)
+    mask = np.zeros((*area.shape, 3), np.uint8)
+    mask[...] = (0, 0, 255)
+    mask[area] = (255, 0, 255)
+    still = Still(lanes.lines, lane_row(lanes.lines), CAMERA.ground, area)
+    assert score("a", CAMERA, still, mask).ego_lane_iou == 1.0
+    mask[:, :320][area[:, :320]] = (0, 0, 0)  # ignored
+    assert score("a", CAMERA, still, mask).ego_lane_iou == 1.0
+    half = msgspec.structs.replace(lanes.ego, width_m=lanes.ego.width_m / 2.0)
+    narrow = Still(lanes.lines, still.row, CAMERA.ground, lane_mask(CAMERA, CAMERA.ground, half))
+    mask[area] = (255, 0, 255)
+    assert score("a", CAMERA, narrow, mask).ego_lane_iou == pytest.approx(0.5, abs=0.05)
+    assert iou(np.zeros((2, 2), bool), np.zeros((2, 2), bool), np.ones((2, 2), bool)) == 1.0
+
+
+def test_a_folder_without_pairs_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="no pairs"):
+        find_pairs(tmp_path)
+    (tmp_path / "image_3.png").touch()
+    with pytest.raises(DatasetError, match="no mask"):
+        find_pairs(tmp_path)
+
+
+def test_the_egos_lane_in_real_images(data_dir: Path, tmp_path: Path) -> None:
+    folder = data_dir / "lanes" / "kitti_um"
+    if not folder.is_dir():
+        pytest.skip(f"{folder}: not there")
+    report = evaluate_stills(Configuration(output=str(tmp_path)), folder, None)
+    assert report.images == 5
+    assert report.ego_lane_iou_mean >= 0.85
+    assert json.loads((tmp_path / "report.json").read_bytes())["ego_lane_iou_mean"] == report.ego_lane_iou_mean
+
+
+def test_cars_on_a_lane_are_no_part_of_what_shows() -> None:
+    image, masks = picture(SE2(), (1.75, -1.75), (False, False))
+    masks.road[100:140, 290:350] = masks.lane[100:140, 290:350] = False  # a car
+    still = find_lane(CAMERA, cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), masks, np.array([[290.0, 80.0, 350.0, 140.0]]))
+    assert still.row.ego is not None
+    assert still.area.any()
+    assert not still.area[106:134, 296:344].any()
