@@ -20,6 +20,8 @@ from birdslam.loops.features import Features
 from birdslam.loops.keyframe import Floats
 from birdslam.loops.place_map import PlaceMap
 from birdslam.loops.verification import Fix, locate
+from birdslam.trajectory import ego_pose, split_pose
+from birdslam.types import Attitude
 
 CANDIDATES = 6  # places that are verified by geometry in one frame
 FOUND_INLIERS, FOUND_PLACES = 25, 7  # of a frame that nothing was known of
@@ -34,8 +36,9 @@ SEARCH_PX, MOST_SEARCH_PX = 25.0, 120.0
 LOST_SIGMA_M, LOST_SIGMA_RAD = 0.5, math.radians(1.5)  # a pose less exact than that is none
 # Odometry between fixes, 1-sigma: along and across as a share of the way, yaw by the root of it
 DRIFT_REL, DRIFT_M, DRIFT_YAW_RAD = 0.02, 0.01, 0.0012
-# What fixes of one map share: its points' scale, the camera's foot as the car tilts, and the mounting's yaw
-SHARED_SCALE_REL, SHARED_TILT_RAD, SHARED_YAW_RAD = 0.03, 0.008, 0.0006
+# What fixes of one map share: its points' scale (as odometry tells its own, docs/method.md), the camera's foot as the
+# car tilts by half a degree, and the mounting's yaw
+SHARED_SCALE_REL, SHARED_TILT_RAD, SHARED_YAW_RAD = 0.012, 0.008, 0.0006
 
 
 class MapState(enum.StrEnum):
@@ -55,6 +58,7 @@ class Localisation:
     state: MapState
     T_map_ego: SE2 | None  # None: lost
     cov: Floats  # (3, 3) of the tangent at the pose; infinite where lost
+    attitude: Attitude = Attitude()  # of the ego in the map's frame, by the last fix
     inliers: int = 0  # of this frame's own fix; 0: carried by odometry
     map_epoch: int = 0  # raised where T_map_odom jumped
 
@@ -92,6 +96,7 @@ class Localiser:
         self.map = place_map
         self.map_epoch = 0
         self.fix: Fix | None = None  # of the newest frame
+        self.attitude = Attitude()  # in the map's frame, by the last fix
         self.travelled_m = 0.0
         self._T_odom_ego: SE2 | None = None
         self._T_map_ego: SE2 | None = None
@@ -182,6 +187,7 @@ class Localiser:
         self._cov = (np.eye(3) - gain) @ self._cov
         self._cov = 0.5 * (self._cov + self._cov.T)
         self._shared = shared(fix, self._camera)
+        self.attitude = split_pose(fix.keyframe.T_map @ ego_pose(fix.T_keyframe_ego, fix.attitude))[1]
         self.fix, self.since_fix_m = fix, 0.0
 
     def _recognise(self, features: Features, among: NDArray[np.bool_] | None) -> bool:
@@ -211,6 +217,7 @@ class Localiser:
     def _believe(self, fix: Fix) -> None:
         self._T_map_ego, self._cov = fix.T_map_ego, fix.cov
         self._shared = shared(fix, self._camera)
+        self.attitude = split_pose(fix.keyframe.T_map @ ego_pose(fix.T_keyframe_ego, fix.attitude))[1]
         self.fix, self.since_fix_m = fix, 0.0
         self.map_epoch += 1
         self._hypotheses.clear()

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.se2 import SE2, wrap
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
 from birdslam.loops.keyframe import Keyframe, Link
 from birdslam.loops.place_index import PlaceIndex, index_of, learn_words
 from birdslam.loops.verification import LocalMap
@@ -16,6 +19,35 @@ from birdslam.loops.verification import LocalMap
 NEIGHBOUR_M = 9.0  # keyframes this near help each other
 NEIGHBOURS = 3
 SAME_HEADING_RAD = math.radians(60.0)
+OTHER_HEIGHT, OTHER_FOCAL_LENGTH = 0.1, 0.1  # logarithms of ratios
+
+
+class MapCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The camera that made a map."""
+
+    digest: str  # of its camera file
+    width_px: int
+    height_px: int
+    fx_px: float
+    height_m: float  # over the road: the map's metres
+
+    @staticmethod
+    def of(camera: Camera) -> MapCamera:
+        """As a map keeps it."""
+        digest = hashlib.sha256(msgspec.json.encode(camera)).hexdigest()[:16]
+        return MapCamera(digest, camera.width_px, camera.height_px, camera.fx_px, camera.height_m)
+
+    def differs(self, camera: Camera) -> str:
+        """How another camera is another one: in what a corner looks like, or in metres; "" where it is not."""
+        if abs(math.log(self.height_m / camera.height_m)) > OTHER_HEIGHT:
+            return f"it stands {camera.height_m:g} m over the road, the map's stood at {self.height_m:g} m"
+        per_px = self.fx_px / self.width_px / (camera.fx_px / camera.width_px)
+        if abs(math.log(per_px)) > OTHER_FOCAL_LENGTH:
+            return (
+                f"its focal length is {camera.fx_px:g} px of {camera.width_px}, "
+                f"the map's was {self.fx_px:g} px of {self.width_px}"
+            )
+        return ""
 
 
 class PlaceMap:
@@ -23,13 +55,13 @@ class PlaceMap:
 
     def __init__(
         self,
-        camera_digest: str,
+        camera: MapCamera,
         keyframes: Iterable[Keyframe] = (),
         links: Iterable[Link] = (),
         words: NDArray[np.uint8] | None = None,
         drives: int = 0,
     ) -> None:
-        self.camera_digest = camera_digest
+        self.camera = camera
         self.keyframes: list[Keyframe] = list(keyframes)
         self.links: list[Link] = list(links)
         self.drives = drives  # that it was made of
@@ -101,8 +133,3 @@ class PlaceMap:
         own = self.keyframes[row]
         rows = [other for other in self.near(own.T_map_keyframe, NEIGHBOUR_M, among) if other != row]
         return LocalMap.around(own, [self.keyframes[other] for other in rows[: NEIGHBOURS - 1]])
-
-
-def is_same_way(a: SE2, b: SE2) -> bool:
-    """Whether two poses head the same way, within SAME_HEADING_RAD."""
-    return abs(wrap(a.yaw_rad - b.yaw_rad)) < SAME_HEADING_RAD

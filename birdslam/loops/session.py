@@ -60,7 +60,7 @@ class MapSession:
             or (self._travelled_m > self._looked_m and estimate.t_source_ns - self._looked_ns >= LOOK_NS)
             or self._looked_m == -math.inf
         )
-        looked = image is not None and due and estimate.valid
+        looked = image is not None and due
         if looked:
             assert image is not None
             self._look(estimate, image)
@@ -73,6 +73,7 @@ class MapSession:
             localiser.state,
             None if lost else localiser.T_map_odom @ estimate.T_world_ego,  # type: ignore[operator]
             np.full((3, 3), np.inf) if lost else localiser.cov,
+            localiser.attitude,
             0 if fix is None else fix.inliers,
             localiser.map_epoch,
         )
@@ -128,7 +129,7 @@ class MapSession:
             if was_lost and self._waiting:
                 waiting, self._waiting = self._waiting, []
                 self._take(waiting)
-        if self._extend:
+        if self._extend and estimate.valid:
             self._take(self._builder.add(look))
 
     def _among(self) -> NDArray[np.bool_] | None:

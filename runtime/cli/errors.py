@@ -1,6 +1,7 @@
 """What a user can mend: each of these is one line on standard error, and exit status 2."""
 
 from birdslam.calibration.calibration import CalibrationError
+from birdslam.loops.map_file import MapError
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.perception import ModelError
 from birdslam.ros.bag import BagError
@@ -19,6 +20,7 @@ USER_ERRORS = (
     ConfigurationError,
     DatasetError,
     DownloadError,
+    MapError,
     ModelError,
     RecordingError,
     ResultsError,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from birdslam.runtime.cli.arguments import add_final_results, add_lens, add_other_odometry, add_pipeline, add_topics
+from birdslam.runtime.cli.arguments import add_final_results, add_lens, add_map, add_other_odometry, add_pipeline, add_topics
 from birdslam.runtime.cli.commands import sources_note
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.options import configuration_of
@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--record", metavar="FILE.mcap", help="record the drive; a directory: a new file in it")
     parser.add_argument("--record-images", action="store_true", default=None, help="with its frames, as JPEG")
     add_final_results(parser)
+    add_map(parser)
     parser.add_argument("--speed", metavar="FILE", help="the car's own speed over a recording: time in s, speed in m/s")
     add_other_odometry(parser, "FILE")
     add_topics(parser, "speed")
