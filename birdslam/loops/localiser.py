@@ -28,14 +28,16 @@ FOUND_INLIERS, FOUND_PLACES = 25, 7  # of a frame that nothing was known of
 FOUND_SHARE = 0.3  # of its matches that must fit
 KEPT_INLIERS, KEPT_PLACES = 18, 6  # of a frame that was foreseen
 CONFIRMATIONS = 2  # further frames that must say the same
+KIDNAPPED_CONFIRMATIONS = 12  # where odometry since the last fix contradicts them: it was cut, or the place is another
 HYPOTHESES = 4
-HYPOTHESIS_M = 25.0  # after so much way without confirmation one is given up
+HYPOTHESIS_M = 30.0  # after so much way without confirmation one is given up
 CHI2_GATE = 16.27  # of three degrees of freedom, 99.9 %
 FOLLOW_M = 12.0  # keyframes within it are looked for
 SEARCH_PX, MOST_SEARCH_PX = 25.0, 120.0
 LOST_SIGMA_M, LOST_SIGMA_RAD = 0.5, math.radians(1.5)  # a pose less exact than that is none
 # Odometry between fixes, 1-sigma: along and across as a share of the way, yaw by the root of it
 DRIFT_REL, DRIFT_M, DRIFT_YAW_RAD = 0.02, 0.01, 0.0012
+LOOP_SCALE_REL = 0.01  # by which the scale of odometry differs from one end of a way to the other
 # What fixes of one map share: its points' scale (as odometry tells its own, docs/method.md), the camera's foot as the
 # car tilts by half a degree, and the mounting's yaw
 SHARED_SCALE_REL, SHARED_TILT_RAD, SHARED_YAW_RAD = 0.012, 0.008, 0.0006
@@ -71,6 +73,7 @@ class _Hypothesis:
     cov: Floats
     travelled_m: float
     confirmed: int = 0
+    kidnapped: bool = False  # it contradicts what odometry says since the last fix
 
 
 def drift(step: SE2) -> Floats:
@@ -79,6 +82,13 @@ def drift(step: SE2) -> Floats:
     sigma_m = DRIFT_REL * way_m + DRIFT_M * math.sqrt(way_m)
     yaw_rad = DRIFT_YAW_RAD * math.sqrt(way_m) + 0.02 * abs(step.yaw_rad)
     return np.diag([sigma_m**2, sigma_m**2, yaw_rad**2]) + 1e-10 * np.eye(3)
+
+
+def drift_after(way_m: float) -> Floats:
+    """(3, 3) what odometry may be off after so much way there and back, by which a loop is judged (chi-square)."""
+    yaw_rad = DRIFT_YAW_RAD * math.sqrt(way_m) + SHARED_YAW_RAD
+    sigma_m = (DRIFT_REL + DRIFT_M) * math.sqrt(way_m) + (LOOP_SCALE_REL + yaw_rad) * way_m / 4.0
+    return np.diag([sigma_m**2, sigma_m**2, yaw_rad**2])
 
 
 def moved(cov: Floats, step: SE2) -> Floats:
@@ -104,6 +114,8 @@ class Localiser:
         self._shared: Floats = np.zeros((3, 3))
         self._hypotheses: list[_Hypothesis] = []
         self.since_fix_m = math.inf
+        self.own_way_m: dict[int, float] = {}  # rows of keyframes that this very drive made: the way at each
+        self.was_kidnapped = False  # the newest fix contradicted odometry
 
     @property
     def T_map_odom(self) -> SE2 | None:
@@ -199,20 +211,37 @@ class Localiser:
             if fix is None:
                 continue
             hypothesis.confirmed += 1
+            enough = KIDNAPPED_CONFIRMATIONS if hypothesis.kidnapped else CONFIRMATIONS
             hypothesis.T_map_odom = fix.T_map_ego @ self._T_odom_ego.inverse()
             hypothesis.cov = fix.cov + shared(fix, self._camera)
-            if hypothesis.confirmed >= CONFIRMATIONS:
+            if hypothesis.confirmed >= enough:
+                self.was_kidnapped = hypothesis.kidnapped
                 self._believe(fix)
                 return True
             return False
         for row in self.map.index().look_up(features.descriptors, CANDIDATES, among):
             found = locate(self._camera, features, self.map.around(row, among), None)
-            if found is not None and is_place(found):
-                T_map_odom = found.T_map_ego @ self._T_odom_ego.inverse()
-                cov = found.cov + shared(found, self._camera)
-                self._hypotheses = [*self._hypotheses, _Hypothesis(T_map_odom, cov, self.travelled_m)][-HYPOTHESES:]
-                break
+            if found is None or not is_place(found):
+                continue
+            kidnapped = self._contradicts(found, row)
+            if kidnapped and row in self.own_way_m:  # a street that looks like an earlier one
+                continue
+            T_map_odom = found.T_map_ego @ self._T_odom_ego.inverse()
+            cov = found.cov + shared(found, self._camera)
+            new = _Hypothesis(T_map_odom, cov, self.travelled_m, kidnapped=kidnapped)
+            self._hypotheses = [*self._hypotheses, new][-HYPOTHESES:]
+            break
         return False
+
+    def _contradicts(self, fix: Fix, row: int) -> bool:
+        """Chi-square against the drift: since the drive passed there itself, or since the last fix."""
+        if self._T_map_ego is None:
+            return False
+        way_m = self.travelled_m - self.own_way_m[row] if row in self.own_way_m else self.since_fix_m
+        if not math.isfinite(way_m):
+            return False
+        error = self._T_map_ego.between(fix.T_map_ego).log()
+        return float(error @ np.linalg.solve(drift_after(way_m) + fix.cov, error)) > CHI2_GATE
 
     def _believe(self, fix: Fix) -> None:
         self._T_map_ego, self._cov = fix.T_map_ego, fix.cov

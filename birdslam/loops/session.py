@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
+from birdslam.loops.closing import close_loops, held
 from birdslam.loops.features import FeatureExtractor
 from birdslam.loops.keyframe import Floats, Keyframe, Link
 from birdslam.loops.keyframe_builder import LOOK_M, LOOK_NS, KeyframeBuilder, Look, NewKeyframe
@@ -23,6 +24,7 @@ from birdslam.types import Estimate, Status
 COVERED_M = 2.5  # where the map has a keyframe this near, and knew the drive by it, it needs no further one
 COVERED_INLIERS = 40
 OWN_WAY_M = 60.0  # of a drive's own keyframes only older ones can close a loop
+JOINT_EVERY_M = 25.0  # a drive over known streets leaves a keyframe so often, which ties its odometry to them
 LOOP_EVERY_M = 8.0  # between two links to the map
 FIRST_COV = np.diag([1e-6, 1e-6, 1e-8])
 
@@ -48,7 +50,7 @@ class MapSession:
         self._looked_m, self._looked_ns = -math.inf, -(1 << 62)
         self._own: list[tuple[int, float]] = []  # rows of this drive's keyframes, and the way at each
         self._chain: tuple[int, SE2, float] | None = None  # the last keyframe's number, T_odom_keyframe, the way there
-        self._linked_m = -math.inf
+        self._linked_m, self._joint_m = -math.inf, -math.inf
         self._fixes: list[tuple[float, SE2, int, SE2, Floats]] = []
         self.lost_keyframes = 0  # that never found a place in the map
 
@@ -87,7 +89,15 @@ class MapSession:
         self._waiting = []
         if self._own:
             self.map.drives = self._drive + 1
+            self._optimise()
             self.map.learn()
+
+    def _optimise(self) -> None:
+        """All keyframes by all links, where loops were found."""
+        if any(link.loop for link in self.map.links):
+            poses = close_loops(self.map.keyframes, self.map.links)
+            self.map.links = held(self.map.links, poses)
+            self.map.place(poses)
 
     def _move(self, estimate: Estimate) -> None:
         if estimate.epoch != self._epoch or (
@@ -126,6 +136,8 @@ class MapSession:
         was_lost = self.localiser.state is MapState.LOST
         if self.localiser.look(features, self._among()):
             self._remember_fix(look)
+            if self.localiser.was_kidnapped:
+                self._chain, self._fixes, self.localiser.was_kidnapped = None, [], False
             if was_lost and self._waiting:
                 waiting, self._waiting = self._waiting, []
                 self._take(waiting)
@@ -160,7 +172,8 @@ class MapSession:
     def _add(self, new: NewKeyframe, T_map_keyframe: SE2) -> None:
         covered = self.map.near(T_map_keyframe, COVERED_M, self._among())
         fix = self.localiser.fix
-        if covered and fix is not None and fix.inliers >= COVERED_INLIERS:
+        joint = bool(self._fixes) and new.look.travelled_m - self._joint_m > JOINT_EVERY_M
+        if covered and fix is not None and fix.inliers >= COVERED_INLIERS and not joint:
             return
         number = self.map.next_number
         cov = self._cov_at(new)
@@ -179,6 +192,7 @@ class MapSession:
             )
         )
         self._own.append((len(self.map) - 1, new.look.travelled_m))
+        self.localiser.own_way_m[len(self.map) - 1] = new.look.travelled_m
         if self._chain is not None:
             last, T_odom_last, last_m = self._chain
             step = T_odom_last.between(new.look.T_odom_ego)
@@ -199,6 +213,7 @@ class MapSession:
             step = T_odom_ego.between(new.look.T_odom_ego)
             if abs(way_m - new.look.travelled_m) < LOOP_EVERY_M:
                 self.map.links.append(Link(seen, number, T_seen_ego @ step, moved(cov, step), loop=True))
+                self._joint_m = new.look.travelled_m
             elif way_m > new.look.travelled_m:
                 left.append((way_m, T_odom_ego, seen, T_seen_ego, cov))
         self._fixes = left
