@@ -1,7 +1,7 @@
 """Loops closed: the graph of keyframes in SE(2), solved by gtsam with robust loop factors.
 
-Loops are weighed by dynamic covariance scaling (Agarwal et al. 2013), the closed form of switchable constraints: one that
-contradicts the rest is switched off. gtsam is loaded only where a loop is there to close.
+Loops are weighed by dynamic covariance scaling (Agarwal et al. 2013), the closed form of switchable constraints: one
+that contradicts the rest is switched off. gtsam is loaded only where a loop is there to close.
 """
 
 from __future__ import annotations
@@ -18,9 +18,7 @@ ORIGIN_SIGMA = 1e-3, 1e-3, 1e-4  # the map's frame is that of its first keyframe
 LOOSE_SIGMA = 1e3, 1e3, 1e1  # of keyframes that no link ties to the first
 
 
-def close_loops(
-    keyframes: Sequence[Keyframe], links: Sequence[Link]
-) -> dict[int, tuple[SE2, Floats]]:
+def close_loops(keyframes: Sequence[Keyframe], links: Sequence[Link]) -> dict[int, tuple[SE2, Floats]]:
     """Each keyframe's pose in the map and its covariance, by number, with all links at once."""
     import gtsam  # here: only who closes a loop needs it
 

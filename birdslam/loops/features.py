@@ -63,7 +63,9 @@ class FeatureExtractor:
         if kind is FeatureKind.ORB:
             self._detector = cv2.ORB_create(MOST_FEATURES, fastThreshold=10)  # type: ignore[attr-defined]
         else:
-            self._detector = cv2.SIFT_create(MOST_FEATURES, contrastThreshold=0.02, edgeThreshold=12)
+            self._detector = cv2.SIFT_create(  # type: ignore[attr-defined]
+                MOST_FEATURES, contrastThreshold=0.02, edgeThreshold=12
+            )
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
         """Of an image (H, W) grey or (H, W, 3) BGR."""

@@ -14,10 +14,10 @@ from birdslam.loops.features import Features
 from birdslam.loops.keyframe import Floats
 from birdslam.loops.triangulation import Points, View, triangulate
 from birdslam.trajectory import ego_pose, mount_pose
-from birdslam.types import Attitude, Estimate
+from birdslam.types import Attitude
 
 SPACING_M = 4.0  # between keyframes: with MOST_POINTS below 2 MB a km
-MOST_POINTS = 170
+MOST_POINTS = 150
 LEAST_POINTS = 25  # a keyframe with fewer can't be found again
 REACH_M = 5.0  # of the frames that triangulate a keyframe's points, before and after it
 LOOK_M, LOOK_NS = 0.4, 500_000_000  # a frame is looked at after so much way, or so much time
@@ -89,9 +89,7 @@ class KeyframeBuilder:
         if len(kept) < LEAST_POINTS:
             return None
         p_ego = points.p_cam_m[kept] @ self._mount[:3, :3].T + self._mount[:3, 3]
-        return NewKeyframe(
-            look, p_ego, points.sigma_depth_rel[kept], look.features.descriptors[points.feature[kept]]
-        )
+        return NewKeyframe(look, p_ego, points.sigma_depth_rel[kept], look.features.descriptors[points.feature[kept]])
 
     def _view(self, look: Look) -> View:
         return View(look.features, ego_pose(look.T_odom_ego, look.attitude) @ self._mount)

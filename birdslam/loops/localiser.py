@@ -37,6 +37,8 @@ SEARCH_PX, MOST_SEARCH_PX = 25.0, 120.0
 LOST_SIGMA_M, LOST_SIGMA_RAD = 0.5, math.radians(1.5)  # a pose less exact than that is none
 # Odometry between fixes, 1-sigma: along and across as a share of the way, yaw by the root of it
 DRIFT_REL, DRIFT_M, DRIFT_YAW_RAD = 0.02, 0.01, 0.0012
+ODOMETRY_SCALE_REL = 0.012  # 1-sigma of its metric scale
+FARTHEST_M = 1e5
 LOOP_SCALE_REL = 0.01  # by which the scale of odometry differs from one end of a way to the other
 # What fixes of one map share: its points' scale (as odometry tells its own, docs/method.md), the camera's foot as the
 # car tilts by half a degree, and the mounting's yaw
@@ -60,7 +62,7 @@ class Localisation:
     state: MapState
     T_map_ego: SE2 | None  # None: lost
     cov: Floats  # (3, 3) of the tangent at the pose; infinite where lost
-    attitude: Attitude = Attitude()  # of the ego in the map's frame, by the last fix
+    attitude: Attitude  # of the ego in the map's frame, by the last fix
     inliers: int = 0  # of this frame's own fix; 0: carried by odometry
     map_epoch: int = 0  # raised where T_map_odom jumped
 
@@ -127,7 +129,8 @@ class Localiser:
     @property
     def cov(self) -> Floats:
         """(3, 3) of the pose in the map, with what fixes share."""
-        return self._cov + self._shared
+        scale_m = ODOMETRY_SCALE_REL * min(self.since_fix_m, FARTHEST_M)  # of odometry's own scale, all along the way
+        return self._cov + self._shared + np.diag([scale_m**2, scale_m**2, 0.0])
 
     @property
     def state(self) -> MapState:
@@ -254,9 +257,7 @@ class Localiser:
 
 def is_place(fix: Fix) -> bool:
     """Whether a frame of which nothing was known may be where the fix says."""
-    return (
-        fix.inliers >= FOUND_INLIERS and fix.places >= FOUND_PLACES and fix.inliers >= FOUND_SHARE * fix.matches
-    )
+    return fix.inliers >= FOUND_INLIERS and fix.places >= FOUND_PLACES and fix.inliers >= FOUND_SHARE * fix.matches
 
 
 def shared(fix: Fix, camera: Camera) -> Floats:

@@ -15,7 +15,7 @@ from birdslam.loops.features import DESCRIPTOR_BYTES, hamming
 from birdslam.loops.keyframe import Floats
 
 MOST_WORDS, LEAST_WORDS = 2048, 16
-DESCRIPTORS_PER_WORD = 4
+DESCRIPTORS_PER_WORD = 8
 LEARNED_FROM = 60_000  # descriptors at the most
 ROUNDS = 6
 _SEED = 39

@@ -90,7 +90,8 @@ class PlaceMap:
     def place(self, poses: dict[int, tuple[SE2, NDArray[np.float64]]]) -> None:
         """Moves keyframes, by number, to other poses with their covariances."""
         self.keyframes = [
-            keyframe.at(*poses[keyframe.number]) if keyframe.number in poses else keyframe for keyframe in self.keyframes
+            keyframe.at(*poses[keyframe.number]) if keyframe.number in poses else keyframe
+            for keyframe in self.keyframes
         ]
         self._poses = np.zeros((0, 3))
 

@@ -49,7 +49,7 @@ class MapSession:
         self._travelled_m = 0.0
         self._looked_m, self._looked_ns = -math.inf, -(1 << 62)
         self._own: list[tuple[int, float]] = []  # rows of this drive's keyframes, and the way at each
-        self._chain: tuple[int, SE2, float] | None = None  # the last keyframe's number, T_odom_keyframe, the way there
+        self._chain: tuple[int, SE2] | None = None  # the last keyframe's number and its T_odom_keyframe
         self._linked_m, self._joint_m = -math.inf, -math.inf
         self._fixes: list[tuple[float, SE2, int, SE2, Floats]] = []
         self.lost_keyframes = 0  # that never found a place in the map
@@ -194,11 +194,11 @@ class MapSession:
         self._own.append((len(self.map) - 1, new.look.travelled_m))
         self.localiser.own_way_m[len(self.map) - 1] = new.look.travelled_m
         if self._chain is not None:
-            last, T_odom_last, last_m = self._chain
+            last, T_odom_last = self._chain
             step = T_odom_last.between(new.look.T_odom_ego)
             self.map.links.append(Link(last, number, step, moved(np.zeros((3, 3)), step)))
         self._close(new, number)
-        self._chain = number, new.look.T_odom_ego, new.look.travelled_m
+        self._chain = number, new.look.T_odom_ego
 
     def _cov_at(self, new: NewKeyframe) -> Floats:
         """Of a keyframe in the map, by what the localiser knows now and the way between."""

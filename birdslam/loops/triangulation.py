@@ -81,9 +81,7 @@ def triangulate(camera: Camera, keyframe: View, others: Sequence[View]) -> Point
     return Points(kept, rays[kept] / rho[kept, None], np.maximum(sigma_rel[kept], 0.01), frames[kept])
 
 
-def _observations(
-    own: Features, others: Sequence[View]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, Floats]:
+def _observations(own: Features, others: Sequence[View]) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, Floats]:
     """(O,) the keyframe's feature, (O,) the frame, (O, 2) the pixel there and (O,) its sigma."""
     rows, views, px, sigma = [], [], [], []
     for number, view in enumerate(others):
@@ -171,9 +169,6 @@ def cross(v: Floats) -> Floats:
     out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
     out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
     return out
-
-
-
 
 
 def rotation(w: Floats) -> Floats:

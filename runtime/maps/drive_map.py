@@ -51,7 +51,8 @@ class MapChoice:
         other = found.camera.differs(camera)
         if other and self.extend:
             raise ConfigurationError(
-                f"{self.path}: is the map of another camera: {other}; localise in it by --map-only, or begin another map"
+                f"{self.path}: is the map of another camera: {other}; localise in it by --map-only, "
+                "or begin another map"
             )
         return found
 

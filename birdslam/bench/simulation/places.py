@@ -1,7 +1,7 @@
 """Streets of corners with descriptors: what a map of places sees of a world, without images, with exact truth.
 
-Facades stand along a route. A corner is a point with 256 bits, of which a share differs each time that it is seen, as it
-does in images; in another light a larger one. In look-alike streets the same house stands again and again.
+Facades stand along a route. A corner is a point with 256 bits, of which a share differs each time that it is seen, as
+it does in images; in another light a larger one. In look-alike streets the same house stands again and again.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from birdslam.types import NS_PER_S, Attitude, Estimate
 Floats = NDArray[np.float64]
 
 CAMERA = Camera(width_px=1242, height_px=375, fx_px=720.0, fy_px=720.0, cx_px=621.0, cy_px=180.0, height_m=1.65)
-CORNERS_PER_M = 6.0
+CORNERS_PER_M = 4.0
 SIGHT_M = 60.0
-MOST_SEEN = 500
+MOST_SEEN = 220
 NOISE_PX = 0.5
 SAME_BITS, OTHER_LIGHT_BITS = 0.06, 0.14  # of a descriptor, that differ when a corner is seen again
 SCALE_DRIFT, YAW_DRIFT_RAD = 0.01, 0.0008  # of the simulated odometry, by the root of a metre; scale: of a whole drive

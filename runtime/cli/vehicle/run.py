@@ -7,7 +7,14 @@ from pathlib import Path
 
 import msgspec
 
-from birdslam.runtime.cli.arguments import add_final_results, add_lens, add_map, add_other_odometry, add_pipeline, add_topics
+from birdslam.runtime.cli.arguments import (
+    add_final_results,
+    add_lens,
+    add_map,
+    add_other_odometry,
+    add_pipeline,
+    add_topics,
+)
 from birdslam.runtime.cli.commands import sources_note
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.options import configuration_of
