@@ -7,6 +7,7 @@ that contradicts the rest is switched off. gtsam is loaded only where a loop is 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def close_loops(keyframes: Sequence[Keyframe], links: Sequence[Link]) -> dict[in
             graph.add(gtsam.PriorFactorPose2(keyframe.number, _pose2(keyframe.T_map_keyframe), loose))
     robust = gtsam.noiseModel.mEstimator.DCS(DCS_PHI)
     for link in links:
-        noise = gtsam.noiseModel.Gaussian.Covariance(link.cov + 1e-12 * np.eye(3))
+        noise: Any = gtsam.noiseModel.Gaussian.Covariance(link.cov + 1e-12 * np.eye(3))
         if link.loop:
             noise = gtsam.noiseModel.Robust.Create(robust, noise)
         graph.add(gtsam.BetweenFactorPose2(link.from_number, link.to_number, _pose2(link.T_from_to), noise))
@@ -75,7 +76,7 @@ def _tied(first: int, links: Sequence[Link]) -> set[int]:
     return seen
 
 
-def _pose2(T: SE2) -> object:
+def _pose2(T: SE2) -> Any:
     import gtsam  # here: only who closes a loop needs it
 
     return gtsam.Pose2(T.x_m, T.y_m, T.yaw_rad)

@@ -1,8 +1,8 @@
 """A place on Earth: the map's frame tied to WGS 84 by GNSS fixes, with a gate against wrong ones.
 
-Fixes are joined to the drive's own way by their time. One similarity of the plane (turn, shift and scale: the metres are
-odometry's) is adjusted to all of them with Cauchy weights, together with the fixes' delay. What a wrong fix says is out
-of the gate; jumps and multipath of some seconds do not turn a way that odometry holds together.
+Fixes are joined to the drive's own way by their time. One similarity of the plane (turn, shift and scale, since metres
+are odometry's) is adjusted to all of them with Cauchy weights, together with the fixes' delay. What a wrong fix says is
+out of the gate; jumps and multipath of some seconds do not turn a way that odometry holds together.
 """
 
 from __future__ import annotations

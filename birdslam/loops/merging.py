@@ -38,7 +38,9 @@ def merged(first: PlaceMap, second: PlaceMap) -> tuple[PlaceMap, int]:
     number = {keyframe.number: first.next_number + row for row, keyframe in enumerate(second.keyframes)}
     own, fix = agreeing[len(agreeing) // 2]
     T_first_second = fix.T_map_ego @ own.T_map_keyframe.inverse()
-    moved = [_renumbered(keyframe, number[keyframe.number], first.drives, T_first_second) for keyframe in second.keyframes]
+    moved = [
+        _renumbered(keyframe, number[keyframe.number], first.drives, T_first_second) for keyframe in second.keyframes
+    ]
     links = [
         Link(number[link.from_number], number[link.to_number], link.T_from_to, link.cov, link.loop)
         for link in second.links

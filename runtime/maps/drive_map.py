@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
+from birdslam.loops.gnss_file import read_fixes
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory
 from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.maps.drive_earth import Poses, poses_of, read_gnss, write_earth
 from birdslam.runtime.maps.map_store import check_map, write_map
 from birdslam.runtime.progress import Progress
 from birdslam.types import Estimate, MapUpdate, Status
@@ -58,11 +60,26 @@ class MapChoice:
 
 
 class DriveMap:
-    """Listens to the drive (`add`), and makes the map of it (`finish`)."""
+    """Listens to the drive (`add`), and makes the map of it, or its place on Earth, or both (`finish`)."""
 
-    def __init__(self, choice: MapChoice) -> None:
-        self._choice = choice
+    def __init__(self, choice: MapChoice | None, gnss: Path | None) -> None:
+        self._choice, self._gnss = choice, gnss
         self._estimates: list[Estimate] = []
+
+    @staticmethod
+    def of(configuration: Configuration) -> DriveMap | None:
+        """What the configuration asks for; None: neither. Raises ConfigurationError."""
+        choice, gnss = MapChoice.of(configuration), configuration.results.gnss
+        if choice is None and not gnss:
+            return None
+        return DriveMap(choice, Path(gnss).expanduser() if gnss else None)
+
+    def check(self, camera: Camera) -> None:
+        """Raises MapError, GnssError or ConfigurationError for what the drive could not use in the end."""
+        if self._choice is not None:
+            self._choice.open(camera)
+        if self._gnss is not None:
+            read_fixes(read_gnss(self._gnss), str(self._gnss), 0)
 
     def add(self, estimate: Estimate) -> None:
         """Keeps what the map needs of it."""
@@ -73,24 +90,48 @@ class DriveMap:
         """Lanes and landmarks are not in the map of places."""
 
     def finish(self, camera: Camera, frames: Frames, output: Path) -> dict[str, Any]:
-        """Writes the map and `map.tum.txt`; what summary.json says. Raises MapError, OSError, ConfigurationError."""
-        place_map = self._choice.open(camera)
+        """Writes what was asked for; what summary.json says: "map", "earth".
+
+        Raises MapError, GnssError, EarthError, OSError or ConfigurationError.
+        """
+        summary: dict[str, Any] = {}
+        place_map, poses = None, poses_of(self._estimates)
+        if self._choice is not None:
+            place_map = self._choice.open(camera)
+            summary["map"], poses = self._localise(self._choice, place_map, camera, frames, output)
+        if self._gnss is not None:
+            summary["earth"] = write_earth(self._gnss, poses, camera, output, place_map)
+        if self._choice is not None and self._choice.extend and place_map is not None:
+            if len(place_map):
+                summary["map"]["bytes"] = write_map(self._choice.path, place_map)
+            else:
+                summary["map"]["file"] = None  # nothing that a later drive could be found by
+        return summary
+
+    def _localise(
+        self, choice: MapChoice, place_map: PlaceMap, camera: Camera, frames: Frames, output: Path
+    ) -> tuple[dict[str, Any], Poses]:
+        """The pass over the frames; what is said of it, and the poses in the map."""
         before = len(place_map)
-        session, trajectory = MapSession(camera, place_map, self._choice.extend), MapTrajectory()
+        session, trajectory = MapSession(camera, place_map, choice.extend), MapTrajectory()
+        poses: Poses = []
         waiting = iter(frames)
         frame_id, image = -1, None
         with Progress("map", len(self._estimates)) as progress:
             for estimate in self._estimates:
                 while frame_id < estimate.frame_id:
                     frame_id, _, image = next(waiting, (estimate.frame_id, 0, None))
-                trajectory.add(session.step(estimate, image if frame_id == estimate.frame_id else None), estimate)
+                found = session.step(estimate, image if frame_id == estimate.frame_id else None)
+                trajectory.add(found, estimate)
+                if found.T_map_ego is not None:
+                    poses.append((found.t_source_ns, found.T_map_ego))
                 progress.advance()
         session.finish()
         trajectory.write(output)
         counts = trajectory.counts
         first = next((k for k, row in enumerate(trajectory.as_found) if row == "localised"), None)
-        summary: dict[str, Any] = {
-            "file": str(self._choice.path),
+        summary = {
+            "file": str(choice.path),
             **counts,
             "time_to_localise_s": None
             if first is None
@@ -99,12 +140,7 @@ class DriveMap:
             "new_keyframes": len(place_map) - before,
             "keyframes_without_place": session.lost_keyframes,
         }
-        if self._choice.extend:
-            if len(place_map) == 0:
-                summary["file"] = None  # nothing that a later drive could be found by
-            else:
-                summary["bytes"] = write_map(self._choice.path, place_map)
-        return summary
+        return summary, poses
 
 
 def rows(found: dict[str, Any]) -> list[tuple[str, str]]:

@@ -17,6 +17,8 @@ from typing import Any
 
 import msgspec
 
+from birdslam.loops.earth import EarthError
+from birdslam.loops.gnss_file import GnssError
 from birdslam.loops.map_file import MapError
 from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
 from birdslam.perception import ModelError, load_network
@@ -41,6 +43,7 @@ from birdslam.runtime.transport.presence import VehicleLock, runtime_dir_of, soc
 from birdslam.sources.recording import DatasetError
 
 WITHOUT_MODELS = "no networks: odometry only, without vehicles and lanes"
+USER_MENDS = MapError, GnssError, EarthError, ConfigurationError  # of a map or fixes, when the drive is over
 DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come to in a long drive among lane lines
 
 
@@ -81,7 +84,7 @@ def run(configuration: Configuration) -> int:
         try:
             if logbook.recorded:
                 summary |= final.write(files.paths if files is not None else ())
-        except (ResultsError, DatasetError, RecordingError, MapError, ConfigurationError, OSError) as error:
+        except (ResultsError, DatasetError, RecordingError, *USER_MENDS, OSError) as error:
             supervisor.fail(f"final results can't be written: {error}", 1)
         except KeyboardInterrupt:
             supervisor.fail("the final results were cut short", INTERRUPTED_STATUS)
