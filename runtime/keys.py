@@ -95,13 +95,18 @@ GROUPS = (
     ),
     Group(
         "What is written",
-        "See [recording.md](recording.md). Options: `--output`, `--record`, `--record-images`, `--smooth`, `--video`.",
+        "See [recording.md](recording.md). Options: `--output`, `--record`, `--record-images`, `--smooth`, `--video`, "
+        "`--map`, `--map-only`, `--gnss`.",
         {
             "output": "Into which folder do results go?",
             "results.smooth": "Are final trajectories wanted too, smoothed over the whole drive? "
             "tracks/ID.final.tum.txt, "
             "ego.final.*",
             "results.video": 'Is a video wanted, and where? FILE.mp4, of images and bird\'s-eye view; "": none',
+            "results.map": 'Which map of places is the drive localised in, and makes longer or begins? FILE; "": none. '
+            "See [maps.md](maps.md)",
+            "results.gnss": 'Which file has GNSS fixes of the drive? CSV, NMEA or GPX; "": none',
+            "results.map_only": 'Which map is it localised in without a change to it? FILE; "": none',
             "recording.file": "Is the drive recorded, and where? FILE.mcap, which must not exist yet; a directory: a "
             "new "
             'file in it, named by the time; "": no',

@@ -41,6 +41,7 @@ def overrides_of(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]
     keys |= {"topic": "source.topics.image", "camera_info_topic": "source.topics.camera_info"}
     keys |= {"speed_topic": "source.topics.speed", "truth_topic": "source.topics.truth"}
     keys |= {"smooth": "results.smooth", "video": "results.video"}
+    keys |= {"map": "results.map", "map_only": "results.map_only", "gnss": "results.gnss"}
     for name in ("camera", "vehicle", "output", *keys):
         value = getattr(options, name, None)
         if value is not None:

@@ -237,6 +237,9 @@ class ResultsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     smooth: bool = False  # final trajectories too, by the RTS smoother: tracks/ID.final.tum.txt, ego.final.*
     video: str = ""  # FILE.mp4: the frames with the estimated boxes beside the bird's-eye view; "": none
+    map: str = ""  # FILE: the map of places, localised in and made longer; "": none
+    gnss: str = ""  # FILE: fixes, by which the drive and its map come to Earth; "": none
+    map_only: str = ""  # FILE: localised in it, and it stays as it is; "": none
 
 
 class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

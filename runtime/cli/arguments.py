@@ -62,6 +62,16 @@ def add_final_results(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--video", metavar="FILE.mp4", help=text)
 
 
+def add_map(parser: argparse.ArgumentParser) -> None:
+    """The map of places that a drive is localised in."""
+    which = parser.add_mutually_exclusive_group()
+    text = "a map of places: the drive is localised in it and makes it longer, or begins it; OUTPUT/map.tum.txt"
+    which.add_argument("--map", metavar="FILE", help=text)
+    which.add_argument("--map-only", metavar="FILE", help="localised in this map, which stays as it is")
+    text = "GNSS fixes of the drive (CSV, NMEA, GPX): its way, and the map, on Earth; ego.geojson, ego.gpx, ego.kml"
+    parser.add_argument("--gnss", metavar="FILE", help=text)
+
+
 def add_vehicle(parser: argparse.ArgumentParser) -> None:
     """Which vehicle on the bus."""
     parser.add_argument("--vehicle", metavar="NAME", default="car")

@@ -39,6 +39,7 @@ GROUPS = {
     "models": "the networks at hand: list them, check one against its manifest, install",
     "demo-drive": "the drive that ships with birdslam (--source demo)",
     "evaluate": "compare with ground truth",
+    "map": "maps of places that drives are localised in (birdslam run --map)",
 }
 COMMANDS = (
     Command("run", "capture, perceive and optimize a source, live", "vehicle.run"),
@@ -74,6 +75,12 @@ COMMANDS = (
             "models", "add", "add_install_arguments"),
     Command("demo-drive make", "render it anew in the built-in world, with its truth; needs the extra `train`",
             "drives.demo_drive"),
+    Command("map info", "what a map holds", "maps", "info", "add_map_argument"),
+    Command("map merge", "one map of two that share streets", "maps", "merge", "add_merge_arguments"),
+    Command("map trim", "a part of a map", "maps", "trim", "add_trim_arguments"),
+    Command("map picture", "a map from above, as PNG", "maps", "picture", "add_picture_arguments"),
+    Command("map export", "a map's graph as g2o, its keyframes as TUM lines, its ways on Earth",
+            "maps", "export", "add_export_arguments"),
     Command("evaluate odometry", "ego trajectories against KITTI poses, in one process, repeatable",
             "evaluate.odometry"),
     Command("evaluate car-ahead", "distance to the car ahead against LiDAR; odometry's report too",

@@ -1,6 +1,10 @@
 """What a user can mend: each of these is one line on standard error, and exit status 2."""
 
 from birdslam.calibration.calibration import CalibrationError
+from birdslam.loops.earth import EarthError
+from birdslam.loops.gnss_file import GnssError
+from birdslam.loops.map_file import MapError
+from birdslam.loops.merging import MergeError
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.perception import ModelError
 from birdslam.ros.bag import BagError
@@ -19,6 +23,10 @@ USER_ERRORS = (
     ConfigurationError,
     DatasetError,
     DownloadError,
+    EarthError,
+    GnssError,
+    MapError,
+    MergeError,
     ModelError,
     RecordingError,
     ResultsError,

@@ -21,6 +21,9 @@ from birdslam.outputs.drive_files import ResultsError, claim_directory
 from birdslam.outputs.drive_video import CODEC, DriveVideo, Floats, Image, check_video
 from birdslam.outputs.final_trajectories import FinalTracks, last_seen, write_final_ego
 from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.maps.drive_earth import rows as earth_rows
+from birdslam.runtime.maps.drive_map import DriveMap
+from birdslam.runtime.maps.drive_map import rows as map_rows
 from birdslam.runtime.nodes.sources import Source, open_source
 from birdslam.runtime.progress import Progress
 from birdslam.runtime.recording.recorded_drive import measurements_of, recorded_drive
@@ -40,6 +43,11 @@ Records = Iterable[Measurements | Estimate | MapUpdate]
 def check_results(configuration: Configuration, source: Source) -> None:
     """Raises ConfigurationError or ResultsError where what is asked for can't be made."""
     results, recording = configuration.results, configuration.recording
+    drive_map = DriveMap.of(configuration)
+    if drive_map is not None:
+        if configuration.live:
+            raise ConfigurationError("results.map: a live camera's frames are gone when the drive is over: record it")
+        drive_map.check(source.camera)
     if not results.video:
         return
     output = Path(configuration.output)
@@ -59,6 +67,7 @@ class FinalResults:
         self._config, self._demo = configuration, demo
         self._asked_video = bool(configuration.results.video)
         self._video: Path | None = None
+        self.map = DriveMap.of(configuration)
         if self._asked_video:
             self._video = Path(configuration.results.video)
         elif demo is not None:
@@ -91,6 +100,9 @@ class FinalResults:
                 if self._asked_video:
                     raise
                 summary["video"] = None
+        if self.map is not None:
+            source = open_source(self._config)
+            summary |= self.map.finish(source.camera, source_frames(source), Path(self._config.output))
         return summary
 
     def _draw(self, path: Path, files: Sequence[Path]) -> None:
@@ -189,4 +201,8 @@ def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         )
     if "video" in summary:
         out.append(("video", summary["video"] or f"none: this OpenCV can't write {CODEC}"))
+    if "map" in summary:
+        out += map_rows(summary["map"])
+    if "earth" in summary:
+        out += earth_rows(summary["earth"])
     return out

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -16,6 +17,9 @@ from typing import Any
 
 import msgspec
 
+from birdslam.loops.earth import EarthError
+from birdslam.loops.gnss_file import GnssError
+from birdslam.loops.map_file import MapError
 from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
 from birdslam.outputs.plain_words import LengthsBy
 from birdslam.perception import ModelError, load_network
@@ -42,6 +46,7 @@ from birdslam.sources.recording import DatasetError
 
 ANY_VEHICLE = Configuration().vehicle  # of one that is not named
 WITHOUT_MODELS = "no networks: odometry only, without vehicles and lanes"
+USER_MENDS = MapError, GnssError, EarthError, ConfigurationError  # of a map or fixes, when the drive is over
 DRIVE_MIB = 16.0, 8.0  # of objects and of tables: what atlas and results come to in a long drive among lane lines
 
 
@@ -78,7 +83,8 @@ def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
             recorder = Recorder(output, configuration.camera)
             recorded = final.recorded(until_written)
             files = RecordingFiles(Path(recorded.recording.file), models) if recorded.recording.file else None
-            logbook = _logbook(configuration, recorder, demo, stack)
+            listeners = [demo, final.map]
+            logbook = _logbook(configuration, recorder, [each for each in listeners if each is not None], stack)
             supervisor = Supervisor(recorded, logbook, live, files, frames)
             supervisor.run(output / "logs")
         live.clear()
@@ -94,7 +100,7 @@ def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
         try:
             if logbook.recorded:
                 summary |= final.write(files.paths if files is not None else ())
-        except (ResultsError, DatasetError, RecordingError, OSError) as error:
+        except (ResultsError, DatasetError, RecordingError, *USER_MENDS, OSError) as error:
             supervisor.fail(f"final results can't be written: {error}", 1)
         except KeyboardInterrupt:
             supervisor.fail("the final results were cut short", INTERRUPTED_STATUS)
@@ -121,7 +127,9 @@ def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
     return supervisor.exit_status
 
 
-def _logbook(configuration: Configuration, recorder: Recorder, demo: DemoReport | None, stack: ExitStack) -> Logbook:
+def _logbook(
+    configuration: Configuration, recorder: Recorder, listeners: Sequence[Results], stack: ExitStack
+) -> Logbook:
     """The supervisor on the bus: it takes the results, and answers queries about them."""
     bus = stack.enter_context(
         Bus(
@@ -132,8 +140,8 @@ def _logbook(configuration: Configuration, recorder: Recorder, demo: DemoReport 
             lossless=configuration.lossless,
         )
     )
-    listeners: list[Results] = [QueryServer(configuration, bus), *([demo] if demo else [])]
-    logbook = Logbook(bus, recorder, tolerant=configuration.restarts, listeners=listeners)
+    every = [QueryServer(configuration, bus), *listeners]
+    logbook = Logbook(bus, recorder, tolerant=configuration.restarts, listeners=every)
     stack.callback(logbook.close)
     bus.declare_alive()
     return logbook

@@ -60,8 +60,8 @@ class BatchTiming:
 
 
 ABOUT_MOVERS = (
-    "A track is one id on one labelled vehicle, of five sights or more. It is reported to drive where the live estimate "
-    "says so with over 1.5 m/s. Standing: its label is slower than 0.5 m/s at every sight. Driving: for a second "
+    "A track is one id on one labelled vehicle, of five sights or more. It is reported to drive where the live estimate"
+    " says so with over 1.5 m/s. Standing: its label is slower than 0.5 m/s at every sight. Driving: for a second "
     "or longer over 2 m/s; soon: reported within a second of that."
 )
 

@@ -14,6 +14,7 @@ from birdslam.runtime.cli.arguments import (
     add_detections,
     add_final_results,
     add_lens,
+    add_map,
     add_other_odometry,
     add_pipeline,
     add_topics,
@@ -39,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--record", metavar="FILE.mcap", help="record the drive; a directory: a new file in it")
     parser.add_argument("--record-images", action="store_true", default=None, help="with its frames, as JPEG")
     add_final_results(parser)
+    add_map(parser)
     text = "the car's own speed over a recording: time in s, speed in m/s, or a GPS table with named columns"
     parser.add_argument("--speed", metavar="FILE", help=text)
     add_other_odometry(parser, "FILE")

@@ -1,0 +1,180 @@
+"""A place on Earth: the map's frame tied to WGS 84 by GNSS fixes, with a gate against wrong ones.
+
+Fixes are joined to the drive's own way by their time. One similarity of the plane (turn, shift and scale, since metres
+are odometry's) is adjusted to all of them with Cauchy weights, together with the fixes' delay. What a wrong fix says is
+out of the gate; jumps and multipath of some seconds do not turn a way that odometry holds together.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.se2 import SE2
+from birdslam.types import NS_PER_S
+
+Floats = NDArray[np.float64]
+
+LEAST_FIXES, LEAST_WAY_M = 3, 20.0
+GATE = 3.0  # standard deviations
+DELAYS_S = np.arange(-2.0, 2.01, 0.1)
+ITERATIONS = 30
+DEFAULT_SIGMA_M = 5.0  # of a fix that does not say its own
+HINT_SIGMAS, HINT_REL = 3.0, 0.02  # a wrong height is told where it is that sure, and that large
+
+
+class GnssFix(msgspec.Struct, frozen=True, kw_only=True):
+    """One fix, by the recording's clock."""
+
+    t_source_ns: int
+    latitude_deg: float
+    longitude_deg: float
+    sigma_m: float = DEFAULT_SIGMA_M  # 1-sigma, across the ground
+    speed_mps: float | None = None
+
+
+class EarthError(ValueError):
+    """The fixes can't place the drive; the message says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Earth:
+    """East and north in metres from the origin: `scale` R(`yaw_rad`) p + (`east_m`, `north_m`)."""
+
+    latitude_deg: float  # of the origin
+    longitude_deg: float
+    east_m: float
+    north_m: float
+    yaw_rad: float  # of the map's x axis from east, counter-clockwise
+    scale: float  # of Earth's metres over the map's
+    cov: Floats  # (4, 4) of east_m, north_m, yaw_rad, log scale
+    delay_s: float  # by which the fixes' times lie behind the images'
+    fixes: int
+    outliers: int
+    rms_m: float  # of the inliers
+    speed_ratio: float | None  # of the drive's speed over the fixes' own, the median; None: they have none
+
+    def enu(self, xy_m: Floats) -> Floats:
+        """(N, 2) east and north of points of the map (N, 2)."""
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        return self.scale * (xy_m @ np.array([[c, s], [-s, c]])) + (self.east_m, self.north_m)
+
+    def wgs84(self, xy_m: Floats) -> Floats:
+        """(N, 2) latitude and longitude in degrees of points of the map (N, 2)."""
+        import pymap3d  # here: only who goes to Earth needs it
+
+        enu = self.enu(np.asarray(xy_m, np.float64).reshape(-1, 2))
+        zero = np.zeros(len(enu))
+        lat, lon, _ = pymap3d.enu2geodetic(enu[:, 0], enu[:, 1], zero, self.latitude_deg, self.longitude_deg, 0.0)
+        return np.column_stack([np.atleast_1d(lat), np.atleast_1d(lon)])
+
+    def height_hint(self, height_m: float) -> str:
+        """What the metres of the fixes say of the camera's height; "" where they say nothing against it."""
+        sigma = math.sqrt(self.cov[3, 3])
+        if abs(math.log(self.scale)) < max(HINT_SIGMAS * sigma, HINT_REL):
+            return ""
+        return (
+            f"camera height {height_m * self.scale:.2f} m instead of {height_m:.2f} m fits GNSS "
+            f"(within {height_m * self.scale * 2.0 * sigma:.2f} m)"
+        )
+
+
+def place_on_earth(t_ns: NDArray[np.int64], poses: list[SE2], fixes: list[GnssFix]) -> Earth:
+    """The map's frame on Earth, by a drive's poses in it (times growing) and its fixes. Raises EarthError."""
+    import pymap3d  # here: only who goes to Earth needs it
+
+    if not fixes or len(poses) < 2:
+        raise EarthError("there are no fixes within the drive")
+    xy = np.array([(pose.x_m, pose.y_m) for pose in poses])
+    seconds = (t_ns - t_ns[0]) / NS_PER_S
+    times = np.array([(fix.t_source_ns - int(t_ns[0])) / NS_PER_S for fix in fixes])
+    origin = fixes[0].latitude_deg, fixes[0].longitude_deg
+    degrees = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes])
+    east, north, _ = pymap3d.geodetic2enu(degrees[:, 0], degrees[:, 1], 0.0, *origin, 0.0)
+    enu, sigma = np.column_stack([east, north]), np.array([max(fix.sigma_m, 0.01) for fix in fixes])
+    best = None
+    for delay_s in DELAYS_S:
+        at = times - delay_s
+        inside = (at >= seconds[0]) & (at <= seconds[-1])
+        if inside.sum() < LEAST_FIXES:
+            continue
+        here = np.column_stack([np.interp(at[inside], seconds, column) for column in xy.T])
+        fit = _fit(here, enu[inside], sigma[inside])
+        cost = float(np.log1p(fit[2]).sum() + (inside.size - inside.sum()) * math.log1p(GATE**2))
+        # Delays are told apart by the speed's changes alone: a prior of half a second keeps those that say nothing at 0
+        cost += 0.5 * (delay_s / 0.5) ** 2
+        if best is None or cost < best[0]:
+            best = cost, float(delay_s), here, inside, fit
+    if best is None:
+        raise EarthError(f"{len(fixes)} fixes, and fewer than {LEAST_FIXES} of them within the drive's time")
+    _, delay_s, here, inside, (parameters, cov, chi2) = best
+    way_m = float(np.linalg.norm(np.ptp(here, axis=0)))
+    if way_m < LEAST_WAY_M:
+        raise EarthError(f"the drive goes {way_m:.0f} m between its fixes: {LEAST_WAY_M:g} m are needed for a heading")
+    good = chi2 < GATE**2
+    if good.sum() < LEAST_FIXES:
+        raise EarthError(f"only {int(good.sum())} of {len(chi2)} fixes fit the drive's way")
+    error_m = np.sqrt(chi2[good]) * sigma[inside][good]
+    return Earth(
+        *origin,
+        float(parameters[0]),
+        float(parameters[1]),
+        float(parameters[2]),
+        float(math.exp(parameters[3])),
+        cov,
+        delay_s,
+        int(inside.sum()),
+        int((~good).sum()),
+        float(np.sqrt((error_m**2).mean())),
+        _speed_ratio(seconds, xy, times - delay_s, fixes),
+    )
+
+
+def _fit(xy: Floats, enu: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats]:
+    """(east, north, yaw, log scale), their covariance, and each fix's chi-square; Gauss-Newton with Cauchy weights.
+
+    The start is a line through a robust pair of distant medians: Umeyama's closed form (1991) on all.
+    """
+    centre, there = np.median(xy, axis=0), np.median(enu, axis=0)
+    a, b = xy - centre, enu - there
+    turned = complex((a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]).sum(), (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
+    yaw, log_scale = math.atan2(turned.imag, turned.real), 0.0
+    shift = there.copy()
+    H, chi2 = np.eye(4), np.zeros(len(xy))
+    for iteration in range(ITERATIONS):
+        c, s, scale = math.cos(yaw), math.sin(yaw), math.exp(log_scale)
+        rotated = a @ np.array([[c, s], [-s, c]]) * scale
+        error = enu - rotated - shift
+        chi2 = (error**2).sum(axis=1) / sigma**2
+        weight = 1.0 / (1.0 + chi2 / (9.0 if iteration < ITERATIONS // 2 else 2.0)) / sigma**2
+        J = np.zeros((len(xy), 2, 4))
+        J[:, 0, 0] = J[:, 1, 1] = 1.0
+        J[:, 0, 2], J[:, 1, 2] = -rotated[:, 1], rotated[:, 0]
+        J[:, :, 3] = rotated
+        H = np.einsum("nai,n,naj->ij", J, weight, J)
+        H[3, 3] += 0.1**-2  # the scale is within a tenth, 1-sigma
+        g = np.einsum("nai,n,na->i", J, weight, error)
+        g[3] -= log_scale * 0.1**-2
+        step = np.linalg.solve(H + 1e-9 * np.eye(4), g)
+        shift, yaw, log_scale = shift + step[:2], yaw + float(np.clip(step[2], -0.5, 0.5)), log_scale + float(step[3])
+        log_scale = float(np.clip(log_scale, -0.7, 0.7))
+    c, s, scale = math.cos(yaw), math.sin(yaw), math.exp(log_scale)
+    moved = shift - scale * (centre @ np.array([[c, s], [-s, c]]))
+    return np.array([*moved, yaw, log_scale]), np.linalg.inv(H + 1e-9 * np.eye(4)), chi2
+
+
+def _speed_ratio(seconds: Floats, xy: Floats, at: Floats, fixes: list[GnssFix]) -> float | None:
+    """Over each second around a fix that tells its speed."""
+    ratios = []
+    for t, fix in zip(at, fixes, strict=True):
+        if fix.speed_mps is None or fix.speed_mps < 3.0 or t - 0.5 < seconds[0] or t + 0.5 > seconds[-1]:
+            continue
+        inside = (seconds >= t - 0.5) & (seconds <= t + 0.5)
+        if inside.sum() > 1:
+            way = np.hypot(*np.diff(xy[inside], axis=0).T).sum()
+            ratios.append(float(way / (seconds[inside][-1] - seconds[inside][0]) / fix.speed_mps))
+    return float(np.median(ratios)) if ratios else None

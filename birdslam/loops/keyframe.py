@@ -1,0 +1,52 @@
+"""A keyframe: a place of the map, with points that were triangulated on the way past it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.se2 import SE2
+from birdslam.trajectory import Transform, ego_pose
+from birdslam.types import Attitude
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """Points are in the keyframe's ego frame: x forward, y left, z up, metres, from the camera's foot on the road."""
+
+    number: int  # unique in its map
+    drive: int  # the drive that it is of: 0 made the map, further ones extended it
+    t_source_ns: int
+    T_map_keyframe: SE2
+    cov: Floats  # (3, 3) of T_map_keyframe, of the tangent at the pose
+    attitude: Attitude
+    points_m: Floats  # (N, 3)
+    sigma_depth_rel: Floats  # (N,) 1-sigma of each point's depth from the keyframe's camera, as a fraction
+    descriptors: NDArray[np.uint8]  # (N, 32)
+    camera_height_m: float
+    latitude_deg: float = field(default=float("nan"))
+    longitude_deg: float = field(default=float("nan"))
+
+    @property
+    def T_map(self) -> Transform:
+        """(4, 4) with height and tilt."""
+        return ego_pose(self.T_map_keyframe, self.attitude)
+
+    def at(self, T_map_keyframe: SE2, cov: Floats | None = None) -> Keyframe:
+        """The same, elsewhere in the map: its points move along."""
+        return replace(self, T_map_keyframe=T_map_keyframe, cov=self.cov if cov is None else cov)
+
+
+@dataclass(frozen=True)
+class Link:
+    """A drive's own motion between two keyframes that followed one another, or a place recognised."""
+
+    from_number: int
+    to_number: int
+    T_from_to: SE2
+    cov: Floats  # (3, 3)
+    loop: bool = False

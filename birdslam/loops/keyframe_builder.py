@@ -1,0 +1,107 @@
+"""Keyframes of a drive, every few metres, made once the frames around each of them are there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.features import Features
+from birdslam.loops.keyframe import Floats
+from birdslam.loops.triangulation import Points, View, triangulate
+from birdslam.trajectory import ego_pose, mount_pose
+from birdslam.types import Attitude
+
+SPACING_M = 4.0  # between keyframes: with MOST_POINTS below 2 MB a km
+MOST_POINTS = 150
+LEAST_POINTS = 25  # a keyframe with fewer can't be found again
+REACH_M = 5.0  # of the frames that triangulate a keyframe's points, before and after it
+LOOK_M, LOOK_NS = 0.4, 500_000_000  # a frame is looked at after so much way, or so much time
+GRID_CELLS = 8, 4
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A frame whose features were extracted."""
+
+    frame_id: int
+    t_source_ns: int
+    travelled_m: float
+    T_odom_ego: SE2
+    attitude: Attitude
+    features: Features
+
+
+@dataclass(frozen=True, eq=False)
+class NewKeyframe:
+    """What a keyframe is before it has a place in the map."""
+
+    look: Look
+    points_m: Floats
+    sigma_depth_rel: Floats
+    descriptors: NDArray[np.uint8]
+
+
+class KeyframeBuilder:
+    """Of one epoch: poses are in its odometry frame."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._mount = mount_pose(camera.ground)
+        self._window: list[Look] = []
+        self._next_m = 0.0  # the way at which the next keyframe is due
+        self._open = False
+
+    def add(self, look: Look) -> list[NewKeyframe]:
+        """The keyframes that this look completes."""
+        if not self._open:
+            self._next_m, self._open = look.travelled_m, True
+        if self._window and look.travelled_m - self._window[-1].travelled_m < LOOK_M:
+            return []
+        self._window.append(look)
+        return self._due(look.travelled_m - REACH_M)
+
+    def finish(self) -> list[NewKeyframe]:
+        """Those at the end of the drive, with the frames before them alone."""
+        return self._due(math.inf)
+
+    def _due(self, until_m: float) -> list[NewKeyframe]:
+        out = []
+        for look in self._window:
+            if self._next_m <= look.travelled_m <= until_m:
+                made = self._make(look)
+                self._next_m = look.travelled_m + (SPACING_M if made is not None else 0.5 * SPACING_M)
+                if made is not None:
+                    out.append(made)
+        oldest_m = min(self._next_m, until_m) - REACH_M
+        self._window = [look for look in self._window if look.travelled_m >= oldest_m]
+        return out
+
+    def _make(self, look: Look) -> NewKeyframe | None:
+        around = [o for o in self._window if o is not look and abs(o.travelled_m - look.travelled_m) <= REACH_M]
+        others = around[:: max(1, -(-len(around) // 12))]  # a dozen are enough
+        points = triangulate(self._camera, self._view(look), [self._view(other) for other in others])
+        kept = _spread(points, look.features.px[points.feature], (self._camera.width_px, self._camera.height_px))
+        if len(kept) < LEAST_POINTS:
+            return None
+        p_ego = points.p_cam_m[kept] @ self._mount[:3, :3].T + self._mount[:3, 3]
+        return NewKeyframe(look, p_ego, points.sigma_depth_rel[kept], look.features.descriptors[points.feature[kept]])
+
+    def _view(self, look: Look) -> View:
+        return View(look.features, ego_pose(look.T_odom_ego, look.attitude) @ self._mount)
+
+
+def _spread(points: Points, px: Floats, size_px: tuple[int, int]) -> NDArray[np.int64]:
+    """At most MOST_POINTS rows: in turn the best of each cell of the image, by frames that saw it and depth."""
+    cells = np.floor(px / size_px * GRID_CELLS).astype(int) @ (1, GRID_CELLS[0])
+    quality = np.minimum(points.frames, 8) - 20.0 * points.sigma_depth_rel - points.p_cam_m[:, 2] / 30.0
+    order = np.lexsort((-quality, cells))
+    rank = np.zeros(len(order), np.int64)  # of each point in its cell
+    for cell in np.unique(cells):
+        mine = order[cells[order] == cell]
+        rank[mine] = np.arange(len(mine))
+    return np.sort(np.lexsort((-quality, rank))[:MOST_POINTS])

@@ -1,0 +1,268 @@
+"""Where the ego is in a map, frame by frame: recognised, confirmed, followed, lost.
+
+A place is believed once two further frames, looked at where odometry says that they are, confirm it. From then on each
+frame's fix corrects what odometry foresees, in a Kalman filter of the map's motion against odometry; fixes of one map
+share its errors, so those are added to what is reported and not averaged away (a consider state, Schmidt 1966).
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.features import Features
+from birdslam.loops.keyframe import Floats
+from birdslam.loops.place_map import PlaceMap
+from birdslam.loops.verification import Fix, locate
+from birdslam.trajectory import ego_pose, split_pose
+from birdslam.types import Attitude
+
+CANDIDATES = 6  # places that are verified by geometry in one frame
+FOUND_INLIERS, FOUND_PLACES = 25, 7  # of a frame that nothing was known of
+FOUND_SHARE = 0.3  # of its matches that must fit
+KEPT_INLIERS, KEPT_PLACES = 18, 6  # of a frame that was foreseen
+CONFIRMATIONS = 2  # further frames that must say the same
+KIDNAPPED_CONFIRMATIONS = 12  # where odometry since the last fix contradicts them: it was cut, or the place is another
+HYPOTHESES = 4
+HYPOTHESIS_M = 30.0  # after so much way without confirmation one is given up
+CHI2_GATE = 16.27  # of three degrees of freedom, 99.9 %
+FOLLOW_M = 12.0  # keyframes within it are looked for
+SEARCH_PX, MOST_SEARCH_PX = 25.0, 120.0
+LOST_SIGMA_M, LOST_SIGMA_RAD = 0.5, math.radians(1.5)  # a pose less exact than that is none
+# Odometry between fixes, 1-sigma: along and across as a share of the way, yaw by the root of it
+DRIFT_REL, DRIFT_M, DRIFT_YAW_RAD = 0.02, 0.01, 0.0012
+ODOMETRY_SCALE_REL = 0.012  # 1-sigma of its metric scale
+FARTHEST_M = 1e5
+LOOP_SCALE_REL = 0.01  # by which the scale of odometry differs from one end of a way to the other
+# What fixes of one map share: its points' scale (as odometry tells its own, docs/method.md), the camera's foot as the
+# car tilts by half a degree, and the mounting's yaw
+SHARED_SCALE_REL, SHARED_TILT_RAD, SHARED_YAW_RAD = 0.012, 0.008, 0.0006
+
+
+class MapState(enum.StrEnum):
+    """What a pose in the map rests on."""
+
+    LOCALISED = "localised"  # on the map: the pose is within its covariance
+    ODOMETRY_ONLY = "odometry_only"  # on odometry since the last fix, or since the beginning of a new map
+    LOST = "lost"  # there is no pose
+
+
+@dataclass(frozen=True, eq=False)
+class Localisation:
+    """Of one frame."""
+
+    frame_id: int
+    t_source_ns: int
+    state: MapState
+    T_map_ego: SE2 | None  # None: lost
+    cov: Floats  # (3, 3) of the tangent at the pose; infinite where lost
+    attitude: Attitude  # of the ego in the map's frame, by the last fix
+    inliers: int = 0  # of this frame's own fix; 0: carried by odometry
+    map_epoch: int = 0  # raised where T_map_odom jumped
+
+
+@dataclass(eq=False)
+class _Hypothesis:
+    """A place that the ego may be at, still to be confirmed."""
+
+    T_map_odom: SE2
+    cov: Floats
+    travelled_m: float
+    confirmed: int = 0
+    kidnapped: bool = False  # it contradicts what odometry says since the last fix
+
+
+def drift(step: SE2) -> Floats:
+    """(3, 3) covariance of a step of odometry, of the tangent at its end."""
+    way_m = math.hypot(step.x_m, step.y_m)
+    sigma_m = DRIFT_REL * way_m + DRIFT_M * math.sqrt(way_m)
+    yaw_rad = DRIFT_YAW_RAD * math.sqrt(way_m) + 0.02 * abs(step.yaw_rad)
+    return np.diag([sigma_m**2, sigma_m**2, yaw_rad**2]) + 1e-10 * np.eye(3)
+
+
+def drift_after(way_m: float) -> Floats:
+    """(3, 3) what odometry may be off after so much way there and back, by which a loop is judged (chi-square)."""
+    yaw_rad = DRIFT_YAW_RAD * math.sqrt(way_m) + SHARED_YAW_RAD
+    sigma_m = (DRIFT_REL + DRIFT_M) * math.sqrt(way_m) + (LOOP_SCALE_REL + yaw_rad) * way_m / 4.0
+    return np.diag([sigma_m**2, sigma_m**2, yaw_rad**2])
+
+
+def moved(cov: Floats, step: SE2) -> Floats:
+    """A covariance at the beginning of a step, at its end, with the step's own."""
+    Ad = step.inverse().adjoint()
+    out: Floats = Ad @ cov @ Ad.T + drift(step)
+    return out
+
+
+class Localiser:
+    """In one map; poses in odometry come with each frame."""
+
+    def __init__(self, camera: Camera, place_map: PlaceMap) -> None:
+        self._camera = camera
+        self.map = place_map
+        self.map_epoch = 0
+        self.fix: Fix | None = None  # of the newest frame
+        self.attitude = Attitude()  # in the map's frame, by the last fix
+        self.travelled_m = 0.0
+        self._T_odom_ego: SE2 | None = None
+        self._T_map_ego: SE2 | None = None
+        self._cov: Floats = np.zeros((3, 3))
+        self._shared: Floats = np.zeros((3, 3))
+        self._hypotheses: list[_Hypothesis] = []
+        self.since_fix_m = math.inf
+        self.own_way_m: dict[int, float] = {}  # rows of keyframes that this very drive made: the way at each
+        self.was_kidnapped = False  # the newest fix contradicted odometry
+
+    @property
+    def T_map_odom(self) -> SE2 | None:
+        """Joins the two frames (REP-105); None where lost."""
+        if self._T_map_ego is None or self._T_odom_ego is None:
+            return None
+        return self._T_map_ego @ self._T_odom_ego.inverse()
+
+    @property
+    def cov(self) -> Floats:
+        """(3, 3) of the pose in the map, with what fixes share."""
+        scale_m = ODOMETRY_SCALE_REL * min(self.since_fix_m, FARTHEST_M)  # of odometry's own scale, all along the way
+        return self._cov + self._shared + np.diag([scale_m**2, scale_m**2, 0.0])
+
+    @property
+    def state(self) -> MapState:
+        if self._T_map_ego is None:
+            return MapState.LOST
+        cov = self.cov
+        exact = max(cov[0, 0], cov[1, 1]) < LOST_SIGMA_M**2 and cov[2, 2] < LOST_SIGMA_RAD**2
+        return MapState.LOCALISED if exact and self.since_fix_m < math.inf else MapState.ODOMETRY_ONLY
+
+    def place(self, T_map_ego: SE2, T_odom_ego: SE2, cov: Floats) -> None:
+        """Begins at a known pose: of a new map, its origin."""
+        self._T_map_ego, self._T_odom_ego, self._cov = T_map_ego, T_odom_ego, cov
+
+    def lose(self) -> None:
+        """Odometry began anew: nothing is known any more."""
+        self._T_map_ego, self._T_odom_ego = None, None
+        self._hypotheses.clear()
+        self.since_fix_m = math.inf
+
+    def move(self, T_odom_ego: SE2) -> None:
+        """By odometry."""
+        if self._T_odom_ego is not None:
+            step = self._T_odom_ego.between(T_odom_ego)
+            way_m = math.hypot(step.x_m, step.y_m)
+            self.travelled_m += way_m
+            self.since_fix_m += way_m
+            if self._T_map_ego is not None:
+                self._T_map_ego = self._T_map_ego @ step
+                self._cov = moved(self._cov, step)
+            for hypothesis in self._hypotheses:
+                hypothesis.cov = moved(hypothesis.cov, step)
+        self._T_odom_ego = T_odom_ego
+
+    def look(self, features: Features, among: NDArray[np.bool_] | None = None) -> bool:
+        """Corrects the pose by a frame at the pose that it has moved to; `among`: keyframes that may be used.
+
+        Says whether a fix came of it.
+        """
+        self.fix = None
+        if self._T_odom_ego is None or not len(self.map):
+            return False
+        if self._T_map_ego is not None and self.state is MapState.LOCALISED:
+            fix = self._follow(features, self._T_map_ego, self.cov, among)
+            if fix is not None:
+                self._correct(fix)
+                return True
+        return self._recognise(features, among)
+
+    def _follow(self, features: Features, guess: SE2, cov: Floats, among: NDArray[np.bool_] | None) -> Fix | None:
+        """A fix where the ego is thought to be, if it is one by inliers and by chi-square."""
+        rows = self.map.near(guess, FOLLOW_M, among)
+        if not rows:
+            return None
+        local = self.map.around(rows[0], among)
+        sigma_rad = math.sqrt(cov[2, 2]) + math.sqrt(max(cov[0, 0], cov[1, 1])) / 10.0  # of a point 10 m away
+        radius_px = min(SEARCH_PX + 3.0 * sigma_rad * self._camera.fx_px, MOST_SEARCH_PX)
+        fix = locate(self._camera, features, local, local.keyframe.T_map_keyframe.between(guess), radius_px)
+        if fix is None or fix.inliers < KEPT_INLIERS or fix.places < KEPT_PLACES:
+            return None
+        error = guess.between(fix.T_map_ego).log()
+        total = cov + fix.cov + shared(fix, self._camera)
+        return fix if float(error @ np.linalg.solve(total, error)) < CHI2_GATE else None
+
+    def _correct(self, fix: Fix) -> None:
+        assert self._T_map_ego is not None
+        error = self._T_map_ego.between(fix.T_map_ego).log()
+        gain = self._cov @ np.linalg.inv(self._cov + fix.cov)
+        self._T_map_ego = self._T_map_ego @ SE2.exp(gain @ error)
+        self._cov = (np.eye(3) - gain) @ self._cov
+        self._cov = 0.5 * (self._cov + self._cov.T)
+        self._shared = shared(fix, self._camera)
+        self.attitude = split_pose(fix.keyframe.T_map @ ego_pose(fix.T_keyframe_ego, fix.attitude))[1]
+        self.fix, self.since_fix_m = fix, 0.0
+
+    def _recognise(self, features: Features, among: NDArray[np.bool_] | None) -> bool:
+        """Confirms hypotheses, or makes new ones of places that look alike."""
+        assert self._T_odom_ego is not None
+        self._hypotheses = [h for h in self._hypotheses if self.travelled_m - h.travelled_m < HYPOTHESIS_M]
+        for hypothesis in sorted(self._hypotheses, key=lambda h: -h.confirmed):
+            fix = self._follow(features, hypothesis.T_map_odom @ self._T_odom_ego, hypothesis.cov, among)
+            if fix is None:
+                continue
+            hypothesis.confirmed += 1
+            enough = KIDNAPPED_CONFIRMATIONS if hypothesis.kidnapped else CONFIRMATIONS
+            hypothesis.T_map_odom = fix.T_map_ego @ self._T_odom_ego.inverse()
+            hypothesis.cov = fix.cov + shared(fix, self._camera)
+            if hypothesis.confirmed >= enough:
+                self.was_kidnapped = hypothesis.kidnapped
+                self._believe(fix)
+                return True
+            return False
+        for row in self.map.index().look_up(features.descriptors, CANDIDATES, among):
+            found = locate(self._camera, features, self.map.around(row, among), None)
+            if found is None or not is_place(found):
+                continue
+            kidnapped = self._contradicts(found, row)
+            if kidnapped and row in self.own_way_m:  # a street that looks like an earlier one
+                continue
+            T_map_odom = found.T_map_ego @ self._T_odom_ego.inverse()
+            cov = found.cov + shared(found, self._camera)
+            new = _Hypothesis(T_map_odom, cov, self.travelled_m, kidnapped=kidnapped)
+            self._hypotheses = [*self._hypotheses, new][-HYPOTHESES:]
+            break
+        return False
+
+    def _contradicts(self, fix: Fix, row: int) -> bool:
+        """Chi-square against the drift: since the drive passed there itself, or since the last fix."""
+        if self._T_map_ego is None:
+            return False
+        way_m = self.travelled_m - self.own_way_m[row] if row in self.own_way_m else self.since_fix_m
+        if not math.isfinite(way_m):
+            return False
+        error = self._T_map_ego.between(fix.T_map_ego).log()
+        return float(error @ np.linalg.solve(drift_after(way_m) + fix.cov, error)) > CHI2_GATE
+
+    def _believe(self, fix: Fix) -> None:
+        self._T_map_ego, self._cov = fix.T_map_ego, fix.cov
+        self._shared = shared(fix, self._camera)
+        self.attitude = split_pose(fix.keyframe.T_map @ ego_pose(fix.T_keyframe_ego, fix.attitude))[1]
+        self.fix, self.since_fix_m = fix, 0.0
+        self.map_epoch += 1
+        self._hypotheses.clear()
+
+
+def is_place(fix: Fix) -> bool:
+    """Whether a frame of which nothing was known may be where the fix says."""
+    return fix.inliers >= FOUND_INLIERS and fix.places >= FOUND_PLACES and fix.inliers >= FOUND_SHARE * fix.matches
+
+
+def shared(fix: Fix, camera: Camera) -> Floats:
+    """(3, 3) covariance of what further fixes here will be wrong by as well."""
+    x_m, y_m = fix.T_keyframe_ego.x_m, fix.T_keyframe_ego.y_m
+    scale_m = SHARED_SCALE_REL * math.hypot(x_m, y_m)
+    foot_m = SHARED_TILT_RAD * camera.height_m
+    return np.diag([scale_m**2 + foot_m**2, scale_m**2 + foot_m**2, SHARED_YAW_RAD**2])

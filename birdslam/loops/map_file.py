@@ -1,0 +1,195 @@
+"""A map as bytes: a mark, the version, the length and the CRC-32 of what follows, and MessagePack.
+
+Points are rounded to a centimetre and their depths' sigmas to 4 %; descriptors are as they are. No images. A file of
+another version is refused, not guessed at. Whatever the bytes, `decode_map` gives a whole map or raises MapError.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.features import DESCRIPTOR_BYTES
+from birdslam.loops.keyframe import Keyframe, Link
+from birdslam.loops.place_map import MapCamera, PlaceMap
+from birdslam.types import Attitude, Cov3
+
+VERSION = 1
+MAGIC = b"BirdSLAM map\n"
+HEAD = struct.Struct("<HQI")  # version, bytes, CRC-32
+MOST_BYTES = 1 << 31  # 1,000 km
+MOST_KEYFRAMES, MOST_KEYFRAME_POINTS = 1_000_000, 2048
+POINT_M = 0.01  # what a point's coordinate is rounded to, in 16 bits
+SIGMA_STEP = 0.04  # of the logarithm of a sigma, from LEAST_SIGMA on, in 8 bits
+LEAST_SIGMA = 1e-4
+_POINT_BYTES = 6 + 1 + DESCRIPTOR_BYTES
+
+_Number = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+
+
+class MapError(ValueError):
+    """The bytes are no map that can be used; the message says why."""
+
+
+class KeyframeRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A keyframe in the file; `points` holds x, y, z (int16, cm), then sigmas (uint8), then descriptors."""
+
+    number: _Number
+    drive: _Number
+    t_source_ns: int
+    T_map_keyframe: SE2
+    cov: Cov3
+    attitude: tuple[float, float, float]  # z_m, pitch_rad, roll_rad
+    camera_height_m: float
+    points: bytes
+    latitude_longitude_deg: tuple[float, float] | None = None
+
+
+class LinkRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A link in the file."""
+
+    from_number: _Number
+    to_number: _Number
+    T_from_to: SE2
+    cov: Cov3
+    loop: bool
+
+
+class MapRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """All of the file behind its head."""
+
+    camera: MapCamera
+    drives: _Number
+    words: bytes
+    keyframes: list[KeyframeRecord]
+    links: list[LinkRecord]
+
+
+def encode_map(place_map: PlaceMap) -> bytes:
+    """The bytes of a map's file."""
+    words = b"" if place_map.words is None else place_map.words.tobytes()
+    record = MapRecord(
+        place_map.camera,
+        place_map.drives,
+        words,
+        [_keyframe_record(keyframe) for keyframe in place_map.keyframes],
+        [
+            LinkRecord(link.from_number, link.to_number, link.T_from_to, _cov(link.cov), link.loop)
+            for link in place_map.links
+        ],
+    )
+    body = msgspec.msgpack.encode(record)
+    return MAGIC + HEAD.pack(VERSION, len(body), zlib.crc32(body)) + body
+
+
+def decode_map(data: bytes) -> PlaceMap:
+    """The map of these bytes. Raises MapError."""
+    if not data:
+        raise MapError("is empty")
+    head = len(MAGIC) + HEAD.size
+    if data[: len(MAGIC)] != MAGIC:
+        raise MapError("is no map of BirdSLAM")
+    if len(data) < head:
+        raise MapError("is cut off in its head")
+    version, length, crc = HEAD.unpack(data[len(MAGIC) : head])
+    if version != VERSION:
+        raise MapError(f"is of version {version}, and this BirdSLAM reads version {VERSION}: drive it anew")
+    if length > MOST_BYTES:
+        raise MapError(f"says that it has {length} bytes: more than {MOST_BYTES}")
+    if len(data) - head != length:
+        raise MapError(f"is torn: it has {len(data) - head} bytes behind its head in place of {length}")
+    body = data[head:]
+    if zlib.crc32(body) != crc:
+        raise MapError("is damaged: its CRC-32 differs")
+    try:
+        record = msgspec.msgpack.decode(body, type=MapRecord)
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        raise MapError(f"holds something that is no map: {error}") from None
+    return _map_of(record)
+
+
+def _map_of(record: MapRecord) -> PlaceMap:
+    camera = record.camera
+    if not (math.isfinite(camera.fx_px) and camera.fx_px > 0.0 and 0.1 < camera.height_m < 10.0):
+        raise MapError("was made with numbers that are no camera's")
+    if not (0 < camera.width_px <= 1 << 16 and 0 < camera.height_px <= 1 << 16):
+        raise MapError("was made with numbers that are no camera's")
+    if len(record.keyframes) > MOST_KEYFRAMES:
+        raise MapError(f"has {len(record.keyframes)} keyframes: more than {MOST_KEYFRAMES}")
+    if len(record.words) % DESCRIPTOR_BYTES or len(record.words) > DESCRIPTOR_BYTES * (1 << 16):
+        raise MapError("has words that are none")
+    keyframes = [_keyframe(each) for each in record.keyframes]
+    numbers = {keyframe.number for keyframe in keyframes}
+    if len(numbers) != len(keyframes):
+        raise MapError("has two keyframes of one number")
+    links = []
+    for link in record.links:
+        if link.from_number not in numbers or link.to_number not in numbers:
+            raise MapError("links keyframes that it does not have")
+        cov = _matrix(link.cov)
+        links.append(Link(link.from_number, link.to_number, link.T_from_to, cov, link.loop))
+    words = np.frombuffer(record.words, np.uint8).reshape(-1, DESCRIPTOR_BYTES) if record.words else None
+    return PlaceMap(camera, keyframes, links, words, record.drives)
+
+
+def _keyframe_record(keyframe: Keyframe) -> KeyframeRecord:
+    points = np.clip(np.round(keyframe.points_m / POINT_M), -32768, 32767).astype("<i2")
+    steps = np.log(np.maximum(keyframe.sigma_depth_rel, LEAST_SIGMA) / LEAST_SIGMA) / SIGMA_STEP
+    sigmas = np.clip(np.ceil(steps), 0, 255).astype(np.uint8)
+    attitude, place = keyframe.attitude, (keyframe.latitude_deg, keyframe.longitude_deg)
+    return KeyframeRecord(
+        keyframe.number,
+        keyframe.drive,
+        keyframe.t_source_ns,
+        keyframe.T_map_keyframe,
+        _cov(keyframe.cov),
+        (attitude.z_m, attitude.pitch_rad, attitude.roll_rad),
+        keyframe.camera_height_m,
+        points.tobytes() + sigmas.tobytes() + keyframe.descriptors.tobytes(),
+        place if math.isfinite(sum(place)) else None,
+    )
+
+
+def _keyframe(record: KeyframeRecord) -> Keyframe:
+    count, rest = divmod(len(record.points), _POINT_BYTES)
+    if rest or count > MOST_KEYFRAME_POINTS:
+        raise MapError(f"keyframe {record.number}: its points are none")
+    if not math.isfinite(sum(record.attitude)) or max(map(abs, record.attitude[1:])) > 1.5:
+        raise MapError(f"keyframe {record.number}: its attitude is none")
+    if not 0.1 < record.camera_height_m < 10.0:
+        raise MapError(f"keyframe {record.number}: its camera's height is none")
+    place = record.latitude_longitude_deg or (math.nan, math.nan)
+    if record.latitude_longitude_deg and not (abs(place[0]) <= 90.0 and abs(place[1]) <= 180.0):
+        raise MapError(f"keyframe {record.number}: its place on Earth is none")
+    points = np.frombuffer(record.points, "<i2", 3 * count).reshape(-1, 3) * POINT_M
+    sigmas = LEAST_SIGMA * np.exp(SIGMA_STEP * np.frombuffer(record.points, np.uint8, count, 6 * count))
+    descriptors = np.frombuffer(record.points, np.uint8, DESCRIPTOR_BYTES * count, 7 * count)
+    return Keyframe(
+        record.number,
+        record.drive,
+        record.t_source_ns,
+        record.T_map_keyframe,
+        _matrix(record.cov),
+        Attitude(z_m=record.attitude[0], pitch_rad=record.attitude[1], roll_rad=record.attitude[2]),
+        points,
+        sigmas,
+        descriptors.reshape(-1, DESCRIPTOR_BYTES),
+        record.camera_height_m,
+        *place,
+    )
+
+
+def _cov(cov: np.ndarray) -> tuple[float, ...]:
+    return tuple(float(number) for number in cov.ravel())
+
+
+def _matrix(cov: tuple[float, ...]) -> np.ndarray:
+    if not math.isfinite(sum(cov)) or min(cov[::4]) < 0.0:
+        raise MapError("has a covariance that is none")
+    return np.array(cov).reshape(3, 3)

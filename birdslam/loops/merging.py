@@ -1,0 +1,122 @@
+"""Two maps of the same streets as one, and parts of a map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.closing import close_loops, held
+from birdslam.loops.features import Features
+from birdslam.loops.keyframe import Keyframe, Link
+from birdslam.loops.localiser import SHARED_SCALE_REL, SHARED_TILT_RAD, SHARED_YAW_RAD, is_place
+from birdslam.loops.place_map import PlaceMap
+from birdslam.loops.verification import Fix, locate
+
+CANDIDATES = 4
+LEAST_MEETINGS = 3  # keyframes that must agree on how the maps lie to each other
+AGREE_M, AGREE_RAD = 3.0, math.radians(4.0)
+POINT_SIGMA_PX = 1.0
+
+
+class MergeError(ValueError):
+    """The maps can't be made one; the message says why."""
+
+
+def merged(first: PlaceMap, second: PlaceMap) -> tuple[PlaceMap, int]:
+    """One map in the frame of `first`, and how many keyframes of `second` were found in it. Raises MergeError."""
+    meetings = [(own, fix) for own in second.keyframes for fix in [_found(own, first)] if fix is not None]
+    agreeing = _agreeing(meetings)
+    if len(agreeing) < LEAST_MEETINGS:
+        raise MergeError(
+            f"the maps share no street that was recognised: {len(agreeing)} of {len(second)} keyframes agree, "
+            f"{LEAST_MEETINGS} are needed"
+        )
+    number = {keyframe.number: first.next_number + row for row, keyframe in enumerate(second.keyframes)}
+    own, fix = agreeing[len(agreeing) // 2]
+    T_first_second = fix.T_map_ego @ own.T_map_keyframe.inverse()
+    moved = [
+        _renumbered(keyframe, number[keyframe.number], first.drives, T_first_second) for keyframe in second.keyframes
+    ]
+    links = [
+        Link(number[link.from_number], number[link.to_number], link.T_from_to, link.cov, link.loop)
+        for link in second.links
+    ]
+    loops = [
+        Link(fix.keyframe.number, number[own.number], fix.T_keyframe_ego, fix.cov + _shared(fix), loop=True)
+        for own, fix in agreeing
+    ]
+    keyframes, every = [*first.keyframes, *moved], [*first.links, *links, *loops]
+    poses = close_loops(keyframes, every)
+    out = PlaceMap(first.camera, keyframes, held(every, poses), None, first.drives + second.drives)
+    out.place(poses)
+    out.learn()
+    return out, len(agreeing)
+
+
+def part(place_map: PlaceMap, keeps: Callable[[Keyframe], bool]) -> PlaceMap:
+    """The keyframes that `keeps` says yes to, with the links between them."""
+    keyframes = [keyframe for keyframe in place_map.keyframes if keeps(keyframe)]
+    numbers = {keyframe.number for keyframe in keyframes}
+    links = [link for link in place_map.links if {link.from_number, link.to_number} <= numbers]
+    out = PlaceMap(place_map.camera, keyframes, links, None, place_map.drives)
+    out.learn()
+    return out
+
+
+def _camera(keyframe: Keyframe, other: PlaceMap) -> Camera:
+    """A camera that stood where the keyframe's did; its points are seen again without an image."""
+    own = other.camera
+    width_px, height_px = own.width_px, own.height_px
+    return Camera(
+        width_px=width_px,
+        height_px=height_px,
+        fx_px=own.fx_px,
+        fy_px=own.fx_px,
+        cx_px=width_px / 2.0,
+        cy_px=height_px / 2.0,
+        height_m=keyframe.camera_height_m,
+    )
+
+
+def _found(own: Keyframe, other: PlaceMap) -> Fix | None:
+    camera = _camera(own, other)
+    p = own.points_m - (0.0, 0.0, own.camera_height_m)
+    px = camera.to_px(np.column_stack([-p[:, 1], -p[:, 2]]) / np.maximum(p[:, :1], 0.5))
+    seen = Features(px, np.full(len(px), POINT_SIGMA_PX), own.descriptors)
+    for row in other.index().look_up(own.descriptors, CANDIDATES):
+        fix = locate(camera, seen, other.around(row), None)
+        if fix is not None and is_place(fix):
+            return fix
+    return None
+
+
+def _agreeing(meetings: list[tuple[Keyframe, Fix]]) -> list[tuple[Keyframe, Fix]]:
+    """The largest set of meetings that say the same of how the maps lie to each other."""
+    between = [fix.T_map_ego @ own.T_map_keyframe.inverse() for own, fix in meetings]
+    best: list[int] = []
+    for here, T in zip(meetings, between, strict=True):
+        agreeing = []
+        for row, (own, fix) in enumerate(meetings):
+            foreseen = T @ own.T_map_keyframe
+            error = foreseen.between(fix.T_map_ego)
+            apart = here[0].T_map_keyframe.between(own.T_map_keyframe)
+            slack_m = AGREE_M + 0.05 * math.hypot(apart.x_m, apart.y_m)  # both maps drift
+            if math.hypot(error.x_m, error.y_m) < slack_m and abs(error.yaw_rad) < AGREE_RAD:
+                agreeing.append(row)
+        best = max(best, agreeing, key=len)
+    return [meetings[row] for row in best]
+
+
+def _shared(fix: Fix) -> np.ndarray:
+    x_m, y_m = fix.T_keyframe_ego.x_m, fix.T_keyframe_ego.y_m
+    sigma2 = (SHARED_SCALE_REL * math.hypot(x_m, y_m)) ** 2 + (SHARED_TILT_RAD * fix.keyframe.camera_height_m) ** 2
+    return np.diag([sigma2, sigma2, SHARED_YAW_RAD**2])
+
+
+def _renumbered(keyframe: Keyframe, number: int, drives: int, T_first_second: SE2) -> Keyframe:
+    placed = keyframe.at(T_first_second @ keyframe.T_map_keyframe)
+    return Keyframe(**{**placed.__dict__, "number": number, "drive": keyframe.drive + drives})

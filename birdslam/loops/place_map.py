@@ -1,0 +1,136 @@
+"""A map: keyframes, the links between them, and the index by which they are found."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.keyframe import Keyframe, Link
+from birdslam.loops.place_index import PlaceIndex, index_of, learn_words
+from birdslam.loops.verification import LocalMap
+
+NEIGHBOUR_M = 9.0  # keyframes this near help each other
+NEIGHBOURS = 3
+SAME_HEADING_RAD = math.radians(60.0)
+OTHER_HEIGHT, OTHER_FOCAL_LENGTH = 0.1, 0.1  # logarithms of ratios
+
+
+class MapCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The camera that made a map."""
+
+    digest: str  # of its camera file
+    width_px: int
+    height_px: int
+    fx_px: float
+    height_m: float  # over the road: the map's metres
+
+    @staticmethod
+    def of(camera: Camera) -> MapCamera:
+        """As a map keeps it."""
+        digest = hashlib.sha256(msgspec.json.encode(camera)).hexdigest()[:16]
+        return MapCamera(digest, camera.width_px, camera.height_px, camera.fx_px, camera.height_m)
+
+    def differs(self, camera: Camera) -> str:
+        """How another camera is another one: in what a corner looks like, or in metres; "" where it is not."""
+        if abs(math.log(self.height_m / camera.height_m)) > OTHER_HEIGHT:
+            return f"it stands {camera.height_m:g} m over the road, the map's stood at {self.height_m:g} m"
+        per_px = self.fx_px / self.width_px / (camera.fx_px / camera.width_px)
+        if abs(math.log(per_px)) > OTHER_FOCAL_LENGTH:
+            return (
+                f"its focal length is {camera.fx_px:g} px of {camera.width_px}, "
+                f"the map's was {self.fx_px:g} px of {self.width_px}"
+            )
+        return ""
+
+
+class PlaceMap:
+    """Keyframes by their number, in the map's frame."""
+
+    def __init__(
+        self,
+        camera: MapCamera,
+        keyframes: Iterable[Keyframe] = (),
+        links: Iterable[Link] = (),
+        words: NDArray[np.uint8] | None = None,
+        drives: int = 0,
+    ) -> None:
+        self.camera = camera
+        self.keyframes: list[Keyframe] = list(keyframes)
+        self.links: list[Link] = list(links)
+        self.drives = drives  # that it was made of
+        self.words = words
+        self._index: PlaceIndex | None = None
+        self._poses = np.zeros((0, 3))
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+    @property
+    def next_number(self) -> int:
+        return 1 + max((keyframe.number for keyframe in self.keyframes), default=-1)
+
+    @property
+    def length_m(self) -> float:
+        """Of the drives' way between keyframes."""
+        return float(sum(math.hypot(link.T_from_to.x_m, link.T_from_to.y_m) for link in self.links if not link.loop))
+
+    def add(self, keyframe: Keyframe) -> None:
+        """A further keyframe; it can be found from now on."""
+        self.keyframes.append(keyframe)
+        if self._index is not None:
+            self._index.add(keyframe.descriptors)
+
+    def place(self, poses: dict[int, tuple[SE2, NDArray[np.float64]]]) -> None:
+        """Moves keyframes, by number, to other poses with their covariances."""
+        self.keyframes = [
+            keyframe.at(*poses[keyframe.number]) if keyframe.number in poses else keyframe
+            for keyframe in self.keyframes
+        ]
+        self._poses = np.zeros((0, 3))
+
+    def index(self) -> PlaceIndex:
+        """Made when it is first asked for."""
+        if self._index is None:
+            if self.words is None or not len(self.words):
+                every = [keyframe.descriptors for keyframe in self.keyframes]
+                self.words = learn_words(np.concatenate(every) if every else np.zeros((0, 32), np.uint8))
+            self._index = index_of([keyframe.descriptors for keyframe in self.keyframes], self.words)
+        return self._index
+
+    def learn(self) -> None:
+        """Words anew from what the map holds now."""
+        self.words, self._index = None, None
+        self.index()
+
+    def poses(self) -> NDArray[np.float64]:
+        """(N, 3): x, y and yaw of every keyframe."""
+        if len(self._poses) != len(self.keyframes):
+            placed = [keyframe.T_map_keyframe for keyframe in self.keyframes]
+            self._poses = np.array([(T.x_m, T.y_m, T.yaw_rad) for T in placed]).reshape(-1, 3)
+        return self._poses
+
+    def near(self, T_map_ego: SE2, radius_m: float, among: NDArray[np.bool_] | None = None) -> list[int]:
+        """Rows of keyframes within the radius that look the same way, the nearest first."""
+        poses = self.poses()
+        if not len(poses):
+            return []
+        distance = np.hypot(poses[:, 0] - T_map_ego.x_m, poses[:, 1] - T_map_ego.y_m)
+        turned = np.abs((poses[:, 2] - T_map_ego.yaw_rad + math.pi) % (2.0 * math.pi) - math.pi)
+        fits = (distance < radius_m) & (turned < SAME_HEADING_RAD)
+        if among is not None:
+            fits &= among
+        rows = np.flatnonzero(fits)
+        return [int(row) for row in rows[np.argsort(distance[rows], kind="stable")]]
+
+    def around(self, row: int, among: NDArray[np.bool_] | None = None) -> LocalMap:
+        """A keyframe with those beside it."""
+        own = self.keyframes[row]
+        rows = [other for other in self.near(own.T_map_keyframe, NEIGHBOUR_M, among) if other != row]
+        return LocalMap.around(own, [self.keyframes[other] for other in rows[: NEIGHBOURS - 1]])

@@ -1,0 +1,219 @@
+"""One drive and a map: localised in it, and the map made or made longer by it. Off the hot path.
+
+Two frames (REP-105): odometry's, which never jumps, and the map's; `T_map_odom` joins them, with an epoch of its own.
+Keyframes of a drive that is not in the map yet wait until it is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.closing import close_loops, held
+from birdslam.loops.features import FeatureExtractor
+from birdslam.loops.keyframe import Floats, Keyframe, Link
+from birdslam.loops.keyframe_builder import LOOK_M, LOOK_NS, KeyframeBuilder, Look, NewKeyframe
+from birdslam.loops.localiser import Localisation, Localiser, MapState, moved, shared
+from birdslam.loops.place_map import PlaceMap
+from birdslam.types import Estimate, Status
+
+COVERED_M = 2.5  # where the map has a keyframe this near, and knew the drive by it, it needs no further one
+COVERED_INLIERS = 40
+OWN_WAY_M = 60.0  # of a drive's own keyframes only older ones can close a loop
+JOINT_EVERY_M = 25.0  # a drive over known streets leaves a keyframe so often, which ties its odometry to them
+LOOP_EVERY_M = 8.0  # between two links to the map
+FIRST_COV = np.diag([1e-6, 1e-6, 1e-8])
+
+
+class MapSession:
+    """`step` takes each frame with its estimate, in order; `finish` ends the drive."""
+
+    def __init__(
+        self, camera: Camera, place_map: PlaceMap, extend: bool, extract: FeatureExtractor | None = None
+    ) -> None:
+        self.map = place_map
+        self._camera = camera
+        self._extend = extend
+        self._extract = extract or FeatureExtractor()
+        self._new_map = not len(place_map)
+        self._drive = place_map.drives
+        self.localiser = Localiser(camera, place_map)
+        self._builder = KeyframeBuilder(camera)
+        self._waiting: list[NewKeyframe] = []
+        self._epoch: int | None = None
+        self._last: Estimate | None = None
+        self._travelled_m = 0.0
+        self._looked_m, self._looked_ns = -math.inf, -(1 << 62)
+        self._own: list[tuple[int, float]] = []  # rows of this drive's keyframes, and the way at each
+        self._chain: tuple[int, SE2] | None = None  # the last keyframe's number and its T_odom_keyframe
+        self._linked_m, self._joint_m = -math.inf, -math.inf
+        self._fixes: list[tuple[float, SE2, int, SE2, Floats]] = []
+        self.lost_keyframes = 0  # that never found a place in the map
+
+    def step(self, estimate: Estimate, image: NDArray[np.uint8] | None) -> Localisation:
+        """Where the ego of this frame is in the map."""
+        self._move(estimate)
+        due = (
+            self._travelled_m - self._looked_m >= LOOK_M
+            or (self._travelled_m > self._looked_m and estimate.t_source_ns - self._looked_ns >= LOOK_NS)
+            or self._looked_m == -math.inf
+        )
+        looked = image is not None and due
+        if looked:
+            assert image is not None
+            self._look(estimate, image)
+        localiser = self.localiser
+        fix = localiser.fix if looked else None
+        lost = localiser.state is MapState.LOST
+        return Localisation(
+            estimate.frame_id,
+            estimate.t_source_ns,
+            localiser.state,
+            None if lost else localiser.T_map_odom @ estimate.T_world_ego,  # type: ignore[operator]
+            np.full((3, 3), np.inf) if lost else localiser.cov,
+            localiser.attitude,
+            0 if fix is None else fix.inliers,
+            localiser.map_epoch,
+        )
+
+    def finish(self) -> None:
+        """The last keyframes, and the index of all."""
+        if not self._extend:
+            return
+        self._take(self._builder.finish())
+        self.lost_keyframes += len(self._waiting)
+        self._waiting = []
+        if self._own:
+            self.map.drives = self._drive + 1
+            self._optimise()
+            self.map.learn()
+
+    def _optimise(self) -> None:
+        """All keyframes by all links, where loops were found."""
+        if any(link.loop for link in self.map.links):
+            poses = close_loops(self.map.keyframes, self.map.links)
+            self.map.links = held(self.map.links, poses)
+            self.map.place(poses)
+
+    def _move(self, estimate: Estimate) -> None:
+        if estimate.epoch != self._epoch or (
+            self._last is not None and Status.GRAPH_RESET in estimate.status and estimate.epoch != self._last.epoch
+        ):
+            self._begin(estimate)
+        elif self._last is not None:
+            step = self._last.T_world_ego.between(estimate.T_world_ego)
+            self._travelled_m += math.hypot(step.x_m, step.y_m)
+        self._last = estimate
+        self.localiser.move(estimate.T_world_ego)
+
+    def _begin(self, estimate: Estimate) -> None:
+        """Odometry's frame begins; a new map's frame is that of its first drive."""
+        if self._epoch is not None:
+            self._take(self._builder.finish())
+            self.lost_keyframes += len(self._waiting)
+            self._waiting, self._chain = [], None
+            self._builder = KeyframeBuilder(self._camera)
+            self.localiser.lose()
+        elif self._new_map and self._extend:
+            self.localiser.place(estimate.T_world_ego, estimate.T_world_ego, FIRST_COV)
+        self._epoch = estimate.epoch
+
+    def _look(self, estimate: Estimate, image: NDArray[np.uint8]) -> None:
+        self._looked_m, self._looked_ns = self._travelled_m, estimate.t_source_ns
+        features = self._extract(image)
+        look = Look(
+            estimate.frame_id,
+            estimate.t_source_ns,
+            self._travelled_m,
+            estimate.T_world_ego,
+            estimate.attitude,
+            features,
+        )
+        was_lost = self.localiser.state is MapState.LOST
+        if self.localiser.look(features, self._among()):
+            self._remember_fix(look)
+            if self.localiser.was_kidnapped:
+                self._chain, self._fixes, self.localiser.was_kidnapped = None, [], False
+            if was_lost and self._waiting:
+                waiting, self._waiting = self._waiting, []
+                self._take(waiting)
+        if self._extend and estimate.valid:
+            self._take(self._builder.add(look))
+
+    def _among(self) -> NDArray[np.bool_] | None:
+        """Keyframes that the drive may be found by: all but those that it has just made itself."""
+        recent = [row for row, way_m in self._own if self._travelled_m - way_m < OWN_WAY_M]
+        if not recent:
+            return None
+        out = np.ones(len(self.map), bool)
+        out[recent] = False
+        return out
+
+    def _remember_fix(self, look: Look) -> None:
+        """For the pose graph: this drive's pose in odometry against a keyframe of the map."""
+        fix = self.localiser.fix
+        if fix is not None and self._travelled_m - self._linked_m >= LOOP_EVERY_M:
+            self._linked_m = self._travelled_m
+            cov = fix.cov + shared(fix, self._camera)
+            self._fixes.append((look.travelled_m, look.T_odom_ego, fix.keyframe.number, fix.T_keyframe_ego, cov))
+
+    def _take(self, made: list[NewKeyframe]) -> None:
+        for new in made:
+            T_map_odom = self.localiser.T_map_odom
+            if T_map_odom is None:
+                self._waiting.append(new)
+            else:
+                self._add(new, T_map_odom @ new.look.T_odom_ego)
+
+    def _add(self, new: NewKeyframe, T_map_keyframe: SE2) -> None:
+        covered = self.map.near(T_map_keyframe, COVERED_M, self._among())
+        fix = self.localiser.fix
+        joint = bool(self._fixes) and new.look.travelled_m - self._joint_m > JOINT_EVERY_M
+        if covered and fix is not None and fix.inliers >= COVERED_INLIERS and not joint:
+            return
+        number = self.map.next_number
+        cov = self._cov_at(new)
+        self.map.add(
+            Keyframe(
+                number,
+                self._drive,
+                new.look.t_source_ns,
+                T_map_keyframe,
+                cov,
+                new.look.attitude,
+                new.points_m,
+                new.sigma_depth_rel,
+                new.descriptors,
+                self._camera.height_m,
+            )
+        )
+        self._own.append((len(self.map) - 1, new.look.travelled_m))
+        self.localiser.own_way_m[len(self.map) - 1] = new.look.travelled_m
+        if self._chain is not None:
+            last, T_odom_last = self._chain
+            step = T_odom_last.between(new.look.T_odom_ego)
+            self.map.links.append(Link(last, number, step, moved(np.zeros((3, 3)), step)))
+        self._close(new, number)
+        self._chain = number, new.look.T_odom_ego
+
+    def _cov_at(self, new: NewKeyframe) -> Floats:
+        """Of a keyframe in the map, by what the localiser knows now and the way between."""
+        assert self._last is not None
+        step = self._last.T_world_ego.between(new.look.T_odom_ego)
+        return moved(self.localiser.cov, step)
+
+    def _close(self, new: NewKeyframe, number: int) -> None:
+        """Links of the keyframe to those of the map that fixes near it found."""
+        left = []
+        for way_m, T_odom_ego, seen, T_seen_ego, cov in self._fixes:
+            step = T_odom_ego.between(new.look.T_odom_ego)
+            if abs(way_m - new.look.travelled_m) < LOOP_EVERY_M:
+                self.map.links.append(Link(seen, number, T_seen_ego @ step, moved(cov, step), loop=True))
+                self._joint_m = new.look.travelled_m
+            elif way_m > new.look.travelled_m:
+                left.append((way_m, T_odom_ego, seen, T_seen_ego, cov))
+        self._fixes = left

@@ -1,0 +1,186 @@
+"""A keyframe's points: its features matched in the frames around it, triangulated over the metric ego-motion.
+
+Points are inverse depths along the keyframe's rays (Civera et al. 2008). Poses and depths are refined in turn: depths
+given the poses, then each pose given the depths with the odometry as its prior, which keeps the metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.loops.features import Features, hamming, match
+from birdslam.trajectory import Transform, inverse
+
+Floats = NDArray[np.float64]
+
+MATCH_BITS = 60  # neighbouring frames look alike
+MATCH_RATIO = 0.85
+LEAST_FRAMES = 3  # besides the keyframe, that see a point
+REFINEMENTS = 3
+NEAREST_M, FARTHEST_M = 1.5, 120.0
+MOST_SIGMA_REL = 0.25
+GATE = 3.0  # standard deviations of a coordinate
+PRIOR_ROTATION_RAD = 0.002  # of odometry between the frames of a keyframe's window
+PRIOR_TRANSLATION_REL, PRIOR_TRANSLATION_M = 0.01, 0.01
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame of the window."""
+
+    features: Features
+    T_odom_cam: Transform  # (4, 4) by odometry
+
+
+@dataclass(frozen=True)
+class Points:
+    """Of a keyframe, in its camera's axes; `feature` is the row of each in the keyframe's features."""
+
+    feature: NDArray[np.int64]
+    p_cam_m: Floats  # (N, 3)
+    sigma_depth_rel: Floats  # (N,)
+    frames: NDArray[np.int64]  # (N,) that saw it
+
+
+def triangulate(camera: Camera, keyframe: View, others: Sequence[View]) -> Points:
+    """The keyframe's points that the other frames confirm."""
+    rays = np.column_stack([camera.to_xy(keyframe.features.px), np.ones(len(keyframe.features))])
+    poses = np.array([inverse(view.T_odom_cam) @ keyframe.T_odom_cam for view in others])  # T_other_keyframe
+    rows, views, px, sigma_px = _observations(keyframe.features, others)
+    if not len(rows):
+        return Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
+    xy, sigma = camera.to_xy(px), sigma_px / camera.fx_px
+    priors, rho = poses.copy(), np.full(len(rays), 1.0 / 15.0)
+    good = np.ones(len(rows), bool)
+    for refinement in range(REFINEMENTS + 1):
+        rho, information = _depths(rays, rho, poses, rows, views, xy, sigma, good)
+        error = _residuals(rays, rho, poses, rows, views, xy) / sigma[:, None]
+        good = (np.abs(error).max(axis=1) < (GATE if refinement else 3.0 * GATE)) & (rho[rows] > 1.0 / FARTHEST_M)
+        if refinement == REFINEMENTS:
+            break
+        counts = np.bincount(rows[good], minlength=len(rays))
+        used = good & (counts[rows] >= 2)
+        for view in range(len(others)):
+            mine = used & (views == view)
+            poses[view] = _refined(poses[view], priors[view], rays[rows[mine]], rho[rows[mine]], xy[mine], sigma[mine])
+    frames = np.bincount(rows[good], minlength=len(rays))
+    sigma_rel = 1.0 / (np.sqrt(np.maximum(information, 1e-12)) * np.maximum(rho, 1e-6))
+    # A corner that the keyframe itself saw by a pixel wrong: as one more observation of each depth
+    kept = np.flatnonzero(
+        (frames >= LEAST_FRAMES)
+        & (rho > 1.0 / FARTHEST_M)
+        & (rho < 1.0 / NEAREST_M)
+        & (sigma_rel < MOST_SIGMA_REL)
+        & (frames >= 0.6 * np.bincount(rows, minlength=len(rays)))
+    )
+    return Points(kept, rays[kept] / rho[kept, None], np.maximum(sigma_rel[kept], 0.01), frames[kept])
+
+
+def _observations(own: Features, others: Sequence[View]) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, Floats]:
+    """(O,) the keyframe's feature, (O,) the frame, (O, 2) the pixel there and (O,) its sigma."""
+    rows, views, px, sigma = [], [], [], []
+    for number, view in enumerate(others):
+        pairs = match(hamming(own.descriptors, view.features.descriptors), MATCH_BITS, MATCH_RATIO)
+        rows.append(pairs[:, 0])
+        views.append(np.full(len(pairs), number))
+        px.append(view.features.px[pairs[:, 1]])
+        sigma.append(np.hypot(own.sigma_px[pairs[:, 0]], view.features.sigma_px[pairs[:, 1]]))
+    if not rows:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0)
+    return np.concatenate(rows), np.concatenate(views), np.concatenate(px), np.concatenate(sigma)
+
+
+def _projected(rays: Floats, rho: Floats, T: Transform) -> tuple[Floats, Floats]:
+    """Homogeneous points (O, 3), scaled by the inverse depth, and their z bounded from below; `T` (O, 4, 4)."""
+    p = np.einsum("oij,oj->oi", T[:, :3, :3], rays) + rho[:, None] * T[:, :3, 3]
+    return p, np.maximum(p[:, 2], 1e-3)
+
+
+def _residuals(
+    rays: Floats, rho: Floats, poses: Transform, rows: NDArray[np.int64], views: NDArray[np.int64], xy: Floats
+) -> Floats:
+    p, z = _projected(rays[rows], rho[rows], poses[views])
+    out: Floats = xy - p[:, :2] / z[:, None]
+    return out
+
+
+def _depths(
+    rays: Floats,
+    rho: Floats,
+    poses: Transform,
+    rows: NDArray[np.int64],
+    views: NDArray[np.int64],
+    xy: Floats,
+    sigma: Floats,
+    good: NDArray[np.bool_],
+) -> tuple[Floats, Floats]:
+    """Inverse depths by Gauss-Newton with Cauchy weights, and their information."""
+    T = poses[views]
+    information = np.zeros(len(rho))
+    for _ in range(6):
+        p, z = _projected(rays[rows], rho[rows], T)
+        predicted = p[:, :2] / z[:, None]
+        J = (T[:, :2, 3] - predicted * T[:, 2:3, 3]) / z[:, None]  # of the prediction, by rho
+        error = (xy - predicted) / sigma[:, None]
+        weight = good / (1.0 + (error**2).sum(axis=1) / 4.0) / sigma**2
+        information = np.bincount(rows, weight * (J**2).sum(axis=1), len(rho))
+        gradient = np.bincount(rows, weight * (J * (xy - predicted)).sum(axis=1), len(rho))
+        step = gradient / np.maximum(information, 1e-9)
+        rho = np.clip(rho + np.clip(step, -0.1, 0.1), 1e-4, 1.0)
+    return rho, information
+
+
+def _refined(T: Transform, prior: Transform, rays: Floats, rho: Floats, xy: Floats, sigma: Floats) -> Transform:
+    """One frame's pose `T_other_keyframe` by Gauss-Newton on its points, with the odometry as prior."""
+    if len(rays) < 10:
+        return T
+    length_m = float(np.linalg.norm(prior[:3, 3]))
+    sigma_t = PRIOR_TRANSLATION_M + PRIOR_TRANSLATION_REL * length_m
+    prior_information = np.diag([sigma_t**-2] * 3 + [PRIOR_ROTATION_RAD**-2] * 3)
+    for _ in range(3):
+        p, z = _projected(rays, rho, np.broadcast_to(T, (len(rays), 4, 4)))
+        predicted = p[:, :2] / z[:, None]
+        # p = R ray + rho t; a step (dt, w) turns R by w and moves t, in the other camera's axes
+        turned = p - rho[:, None] * T[:3, 3]
+        Jp = np.zeros((len(rays), 3, 6))
+        Jp[:, :, :3] = rho[:, None, None] * np.eye(3)
+        Jp[:, :, 3:] = -cross(turned)
+        J = (Jp[:, :2] - predicted[:, :, None] * Jp[:, 2:3]) / z[:, None, None]
+        error = xy - predicted
+        weight = 1.0 / (1.0 + ((error / sigma[:, None]) ** 2).sum(axis=1) / 4.0) / sigma**2
+        H = np.einsum("nai,n,naj->ij", J, weight, J) + prior_information
+        deviation = np.concatenate([T[:3, 3] - prior[:3, 3], _rotation_vector(T[:3, :3] @ prior[:3, :3].T)])
+        g = np.einsum("nai,n,na->i", J, weight, error) - prior_information @ deviation
+        step = np.linalg.solve(H, g)
+        T = T.copy()
+        T[:3, :3] = rotation(step[3:]) @ T[:3, :3]
+        T[:3, 3] += step[:3]
+    return T
+
+
+def cross(v: Floats) -> Floats:
+    """(N, 3, 3) matrices of the cross product by `v` (N, 3)."""
+    out = np.zeros((len(v), 3, 3))
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
+    return out
+
+
+def rotation(w: Floats) -> Floats:
+    """(3, 3) of a rotation vector in rad."""
+    from scipy.spatial.transform import Rotation  # here: few processes need it
+
+    out: Floats = Rotation.from_rotvec(w).as_matrix()
+    return out
+
+
+def _rotation_vector(R: Floats) -> Floats:
+    from scipy.spatial.transform import Rotation  # here: few processes need it
+
+    out: Floats = Rotation.from_matrix(R).as_rotvec()
+    return out

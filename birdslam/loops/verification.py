@@ -1,0 +1,203 @@
+"""Where a frame is against points of the map: matches, PnP with RANSAC, and a pose in SE(2) with its covariance.
+
+The camera's six degrees of freedom are adjusted, with height and tilt held near the road; the covariance is that of
+(x, y, yaw) with the others marginalised. Each residual is weighed by the corner's own noise and by the uncertain depth
+of its point, as seen from here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.features import Features, hamming, match
+from birdslam.loops.keyframe import Keyframe
+from birdslam.loops.triangulation import cross, rotation
+from birdslam.trajectory import Transform, ego_pose, inverse, mount_pose, split_pose
+from birdslam.types import Attitude
+
+Floats = NDArray[np.float64]
+
+MATCH_BITS, MATCH_RATIO = 72, 0.85  # where nothing is known of the pose
+GUIDED_BITS, GUIDED_RATIO = 80, 0.9  # where the pose says where to look
+LEAST_PLACES = 6  # cells of the image, of GRID_PX, that the inliers must lie in
+GRID_CELLS = 8, 4  # across and down the image
+RANSAC_PX, RANSAC_LOOKS = 4.0, 400
+GATE = 3.0  # standard deviations of a coordinate
+SIGMA_Z_M, SIGMA_TILT_RAD = 0.15, 0.03  # of a car on a road that another drive mapped
+ITERATIONS = 8
+OTHER_VIEW_PX = 1.0  # 1-sigma of a corner found anew from another place and at another time, besides its own noise
+
+
+@dataclass(frozen=True, eq=False)
+class LocalMap:
+    """Points of keyframes near one of them, in its ego frame."""
+
+    keyframe: Keyframe
+    points_m: Floats  # (N, 3)
+    along_m: Floats  # (N, 3) each point's sigma of depth, as a vector along the ray that it was seen by
+    descriptors: NDArray[np.uint8]  # (N, 32)
+
+    @staticmethod
+    def around(keyframe: Keyframe, neighbours: Sequence[Keyframe]) -> LocalMap:
+        """`neighbours`: those whose points are to be looked for too, without `keyframe` itself."""
+        points, along, descriptors = [], [], []
+        back = inverse(keyframe.T_map)
+        for other in (keyframe, *neighbours):
+            T = back @ other.T_map
+            points.append(other.points_m @ T[:3, :3].T + T[:3, 3])
+            from_camera = other.points_m - np.array([0.0, 0.0, other.camera_height_m])
+            along.append((from_camera * other.sigma_depth_rel[:, None]) @ T[:3, :3].T)
+            descriptors.append(other.descriptors)
+        return LocalMap(keyframe, np.concatenate(points), np.concatenate(along), np.concatenate(descriptors))
+
+
+@dataclass(frozen=True, eq=False)
+class Fix:
+    """Where an ego is against a keyframe, by one frame."""
+
+    keyframe: Keyframe
+    T_keyframe_ego: SE2
+    cov: Floats  # (3, 3) of the tangent at the pose, of this frame's noise alone
+    inliers: int
+    matches: int
+    places: int  # cells of the image that the inliers lie in
+    attitude: Attitude  # of the ego in the keyframe's frame
+
+    @property
+    def T_map_ego(self) -> SE2:
+        return self.keyframe.T_map_keyframe @ self.T_keyframe_ego
+
+
+def locate(
+    camera: Camera, features: Features, local: LocalMap, guess: SE2 | None, radius_px: float = 60.0
+) -> Fix | None:
+    """The ego of `features` against the local map; None where too little fits.
+
+    `guess` is T_keyframe_ego where it is known to `radius_px` in the image; without it the pose comes from RANSAC.
+    """
+    if len(features) < 8 or len(local.points_m) < 8:
+        return None
+    if guess is None:
+        pairs = match(hamming(local.descriptors, features.descriptors), MATCH_BITS, MATCH_RATIO)
+        pose, pairs = _ransac(camera, features, local, pairs)
+    else:
+        pose = ego_pose(guess, Attitude())
+        pairs = _guided(camera, features, local, pose, radius_px)
+    if pose is None or len(pairs) < 8:
+        return None
+    if guess is None:  # again, with what the pose foresees
+        first = _adjust(camera, features, local, pairs, pose)
+        pose = first[0] if first is not None else pose
+        pairs = _guided(camera, features, local, pose, 12.0)
+    found = _adjust(camera, features, local, pairs, pose)
+    if found is None:
+        return None
+    pose, cov, good = found
+    T_keyframe_ego, attitude = split_pose(pose)
+    cells = np.floor(features.px[pairs[good, 1]] / (camera.width_px, camera.height_px) * GRID_CELLS).astype(int)
+    places = len(np.unique(cells, axis=0))
+    return Fix(local.keyframe, T_keyframe_ego, cov, int(good.sum()), len(pairs), places, attitude)
+
+
+def _camera_pose(camera: Camera, T_keyframe_ego: Transform) -> Transform:
+    """`T_cam_keyframe`."""
+    return inverse(T_keyframe_ego @ mount_pose(camera.ground))
+
+
+def _ransac(
+    camera: Camera, features: Features, local: LocalMap, pairs: NDArray[np.int64]
+) -> tuple[Transform | None, NDArray[np.int64]]:
+    if len(pairs) < 8:
+        return None, pairs
+    found, rotated, moved, inliers = cv2.solvePnPRansac(
+        local.points_m[pairs[:, 0]],
+        features.px[pairs[:, 1]],
+        camera.K,
+        None,
+        iterationsCount=RANSAC_LOOKS,
+        reprojectionError=RANSAC_PX * max(1.0, float(np.median(features.sigma_px))),
+        confidence=0.999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not found or inliers is None or len(inliers) < 8:
+        return None, pairs
+    T_cam_keyframe = np.eye(4)
+    T_cam_keyframe[:3, :3] = rotation(rotated.ravel())
+    T_cam_keyframe[:3, 3] = moved.ravel()
+    if not np.isfinite(T_cam_keyframe).all():
+        return None, pairs
+    pose = inverse(mount_pose(camera.ground) @ T_cam_keyframe)
+    tilt = abs(split_pose(pose)[1].pitch_rad) + abs(split_pose(pose)[1].roll_rad)
+    if tilt > 6.0 * SIGMA_TILT_RAD or abs(pose[2, 3]) > 1.0:  # no car on this road
+        return None, pairs
+    return pose, pairs[inliers.ravel()]
+
+
+def _guided(
+    camera: Camera, features: Features, local: LocalMap, pose: Transform, radius_px: float
+) -> NDArray[np.int64]:
+    """Matches within `radius_px` of where the pose puts each point."""
+    T = _camera_pose(camera, pose)
+    p = local.points_m @ T[:3, :3].T + T[:3, 3]
+    ahead = p[:, 2] > 1.0
+    px = camera.to_px(p[:, :2] / np.maximum(p[:, 2:], 1e-3))
+    near = ((px[:, None, :] - features.px[None, :, :]) ** 2).sum(axis=2) < radius_px**2
+    distance = hamming(local.descriptors, features.descriptors)
+    pairs = match(distance, GUIDED_BITS, GUIDED_RATIO, near & ahead[:, None])
+    return pairs
+
+
+def _adjust(
+    camera: Camera, features: Features, local: LocalMap, pairs: NDArray[np.int64], pose: Transform
+) -> tuple[Transform, Floats, NDArray[np.bool_]] | None:
+    """Gauss-Newton with Cauchy weights: T_keyframe_ego (4, 4), the covariance of (x, y, yaw), and the inliers."""
+    if len(pairs) < 8:
+        return None
+    mount = mount_pose(camera.ground)
+    R_cam_ego = mount[:3, :3].T
+    points, along = local.points_m[pairs[:, 0]], local.along_m[pairs[:, 0]]
+    xy = camera.to_xy(features.px[pairs[:, 1]])
+    noise = (features.sigma_px[pairs[:, 1]] ** 2 + OTHER_VIEW_PX**2) / camera.fx_px**2
+    prior = np.array([0.0, 0.0, SIGMA_Z_M**-2, SIGMA_TILT_RAD**-2, SIGMA_TILT_RAD**-2, 0.0])
+    good, H = np.ones(len(pairs), bool), np.eye(6)
+    for _ in range(ITERATIONS):
+        p_ego = (points - pose[:3, 3]) @ pose[:3, :3]
+        p = (p_ego - mount[:3, 3]) @ R_cam_ego.T
+        z = np.maximum(p[:, 2], 0.3)
+        predicted = p[:, :2] / z[:, None]
+        J_ego = np.zeros((len(p), 3, 6))  # of p_ego, by a step of the ego in its own frame
+        J_ego[:, :, :3], J_ego[:, :, 3:] = -np.eye(3), cross(p_ego)
+        J_cam = R_cam_ego @ J_ego
+        J = (J_cam[:, :2] - predicted[:, :, None] * J_cam[:, 2:3]) / z[:, None, None]
+        depth = along @ pose[:3, :3] @ R_cam_ego.T  # its sigma, in this camera's axes
+        blur = (depth[:, :2] - predicted * depth[:, 2:3]) / z[:, None]
+        W = np.linalg.inv(noise[:, None, None] * np.eye(2) + blur[:, :, None] * blur[:, None, :])
+        error = xy - predicted
+        chi2 = np.einsum("na,nab,nb->n", error, W, error)
+        good = (chi2 < GATE**2) & (p[:, 2] > 0.5)
+        weight = (p[:, 2] > 0.5) / (1.0 + chi2 / 4.0)
+        H = np.einsum("nai,n,nab,nbj->ij", J, weight, W, J)
+        g = np.einsum("nai,n,nab,nb->i", J, weight, W, error)
+        state = split_pose(pose)[1]
+        g -= prior * np.array([0.0, 0.0, pose[2, 3], state.roll_rad, state.pitch_rad, 0.0])
+        H += np.diag(prior)
+        if not np.isfinite(H).all() or np.linalg.cond(H) > 1e14:
+            return None
+        step = np.linalg.solve(H, g)
+        pose = pose.copy()
+        pose[:3, 3] += pose[:3, :3] @ np.clip(step[:3], -2.0, 2.0)
+        pose[:3, :3] = pose[:3, :3] @ rotation(step[3:])
+        if float(np.abs(step).max()) < 1e-5:
+            break
+    if not good.any() or abs(pose[2, 3]) > 1.5 or math.hypot(*pose[:2, 3]) > 60.0:
+        return None
+    cov = np.linalg.inv(H)[np.ix_([0, 1, 5], [0, 1, 5])]
+    return pose, cov, good

@@ -1,0 +1,180 @@
+"""A place on Earth: fixes read, a drive tied to them, and files that other programs open."""
+
+import io
+import json
+import math
+from pathlib import Path
+
+import geojson
+import gpxpy
+import numpy as np
+import pymap3d
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.earth import Earth, EarthError, GnssFix, place_on_earth
+from birdslam.loops.gnss_file import GnssError, read_fixes
+from birdslam.outputs.earth_files import Way, write_ways
+
+ORIGIN = 51.05, -114.05
+YAW_RAD = 0.7  # of the drive's x axis from east
+
+
+def a_drive(scale: float = 1.0) -> tuple[np.ndarray, list[SE2], np.ndarray]:
+    """Times, odometry's poses in an L, and the true east and north of each; odometry is too short by `scale`."""
+    t_ns = np.arange(400, dtype=np.int64) * 100_000_000
+    way = np.column_stack([np.minimum(np.arange(400), 250.0), np.maximum(np.arange(400) - 250.0, 0.0)])
+    poses = [SE2(float(x) / scale, float(y) / scale, 0.0) for x, y in way]
+    c, s = math.cos(YAW_RAD), math.sin(YAW_RAD)
+    return t_ns, poses, way @ np.array([[c, s], [-s, c]])
+
+
+def fixes_of(t_ns: np.ndarray, enu: np.ndarray, noise_m: float, seed: int = 0) -> list[GnssFix]:
+    chance = np.random.default_rng(seed)
+    out = []
+    for row in range(0, len(t_ns), 10):
+        east, north = enu[row] + noise_m * chance.standard_normal(2)
+        lat, lon, _ = pymap3d.enu2geodetic(east, north, 0.0, *ORIGIN, 0.0)
+        fix = GnssFix(
+            t_source_ns=int(t_ns[row]), latitude_deg=float(lat), longitude_deg=float(lon), sigma_m=noise_m or 1
+        )
+        out.append(fix)
+    return out
+
+
+def worst_m(earth: Earth, poses: list[SE2], enu: np.ndarray) -> float:
+    degrees = earth.wgs84(np.array([(pose.x_m, pose.y_m) for pose in poses]))
+    east, north, _ = pymap3d.geodetic2enu(degrees[:, 0], degrees[:, 1], 0.0, *ORIGIN, 0.0)
+    return float(np.hypot(east - enu[:, 0], north - enu[:, 1]).max())
+
+
+def test_a_drive_comes_to_its_place_on_earth() -> None:
+    t_ns, poses, enu = a_drive()
+    earth = place_on_earth(t_ns, poses, fixes_of(t_ns, enu, 1.0))
+    assert worst_m(earth, poses, enu) < 1.5
+    assert earth.yaw_rad == pytest.approx(YAW_RAD, abs=0.02)
+    assert earth.height_hint(1.65) == ""
+
+
+def test_fixes_fifteen_metres_off_for_ten_seconds_do_not_bend_it() -> None:
+    t_ns, poses, enu = a_drive()
+    wrong = enu.copy()
+    wrong[120:220] += (12.0, -9.0)
+    earth = place_on_earth(t_ns, poses, fixes_of(t_ns, wrong, 1.0))
+    assert earth.outliers == 10
+    assert worst_m(earth, poses, enu) < 2.0
+
+
+def test_a_wrong_camera_height_is_told() -> None:
+    t_ns, poses, enu = a_drive(scale=0.94)
+    earth = place_on_earth(t_ns, poses, fixes_of(t_ns, enu, 1.0))
+    assert earth.scale == pytest.approx(0.94, abs=0.01)
+    assert "1.55 m instead of 1.65 m" in earth.height_hint(1.65)
+
+
+def test_late_fixes_are_found_out_by_the_turn() -> None:
+    t_ns, poses, enu = a_drive()
+    late = [
+        GnssFix(**{**{n: getattr(fix, n) for n in fix.__struct_fields__}, "t_source_ns": fix.t_source_ns + 600_000_000})
+        for fix in fixes_of(t_ns, enu, 0.3)
+    ]
+    earth = place_on_earth(t_ns, poses, late)
+    assert earth.delay_s == pytest.approx(0.6, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("take", "why"), [(slice(0, 0), "no fixes"), (slice(0, 2), "fewer than 3"), (slice(0, 3), "are needed")]
+)
+def test_too_little_is_an_error(take: slice, why: str) -> None:
+    t_ns, poses, enu = a_drive()
+    with pytest.raises(EarthError, match=why):
+        place_on_earth(t_ns[:], [SE2()] * 400 if why == "are needed" else poses, fixes_of(t_ns, enu, 1.0)[take])
+
+
+# --- files in ---
+
+CSV = b"time_s,latitude_deg,longitude_deg,speed_mps\n0.5,51.04933,-114.05395,12.778\n1.5,51.04928,-114.05411,\n"
+RMC = "GPRMC,123519.50,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W"
+GPX = (
+    b'<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>'
+    b'<trkpt lat="48.1" lon="11.5"><time>2020-01-01T00:00:00Z</time></trkpt>'
+    b'<trkpt lat="48.2" lon="11.6"><time>2020-01-01T00:00:02Z</time><hdop>2</hdop></trkpt></trkseg></trk></gpx>'
+)
+
+
+def sentence(body: str) -> bytes:
+    total = 0
+    for byte in body.encode():
+        total ^= byte
+    return f"${body}*{total:02X}\r\n".encode()
+
+
+def test_csv_nmea_and_gpx_are_read() -> None:
+    first, second = read_fixes(CSV, "a.csv", 0)
+    assert (first.t_source_ns, first.latitude_deg, first.speed_mps) == (500_000_000, 51.04933, 12.778)
+    assert second.speed_mps is None
+    gga = "GPGGA,123519.50,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"
+    (fix,) = read_fixes(sentence(gga) + sentence(RMC) + b"$GPRMC,cut off", "a.nmea", 7)
+    assert fix.t_source_ns == 7  # UTC of another year: it begins with the recording
+    assert fix.latitude_deg == pytest.approx(48.0 + 7.038 / 60.0)
+    assert fix.speed_mps == pytest.approx(22.4 * 0.514444)
+    assert fix.sigma_m == pytest.approx(3.6)
+    one, two = read_fixes(GPX, "a.gpx", 0)
+    assert (one.t_source_ns, two.t_source_ns, two.sigma_m) == (0, 2_000_000_000, 8.0)
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"", "empty"),
+        (b"\xff\xfe", "no text"),
+        (b"t,lat\n", "name the columns"),
+        (b"time_s,latitude_deg,longitude_deg\n", "no fix"),
+        (b"time_s,latitude_deg,longitude_deg\n0,91,0\n", "line 2"),
+        (b"time_s,latitude_deg,longitude_deg\n0,x,0\n", "line 2"),
+        (b"<gpx>", "no XML"),
+        (b'<!DOCTYPE a [<!ENTITY b "c">]><gpx/>', "DOCTYPE"),
+    ],
+)
+def test_what_holds_no_fixes_is_refused(data: bytes, why: str) -> None:
+    with pytest.raises(GnssError, match=why):
+        read_fixes(data, "a", 0)
+
+
+@given(st.sampled_from([CSV, sentence(RMC), GPX]), st.integers(0, 400), st.binary(max_size=6))
+def test_mutated_files_give_fixes_or_the_error(good: bytes, place: int, noise: bytes) -> None:
+    try:
+        fixes = read_fixes(good[:place] + noise + good[place + len(noise) :], "a", 0)
+    except GnssError:
+        return
+    assert all(abs(fix.latitude_deg) <= 90.0 and math.isfinite(fix.sigma_m) for fix in fixes)
+
+
+# --- files out ---
+
+
+def test_the_files_are_valid_and_hold_the_way(tmp_path: Path) -> None:
+    degrees = np.array([(51.0, -114.0), (51.1, -114.1), (51.2, -114.3)])
+    way = Way("ego & <more>", degrees, [0, 1_500_000_000, 3_000_000_000], {"rms_m": 1.5})
+    for suffix in (".geojson", ".gpx", ".kml"):
+        write_ways(tmp_path / f"way{suffix}", [way])
+    found = geojson.loads((tmp_path / "way.geojson").read_text())
+    assert found.is_valid, found.errors()
+    assert json.loads(geojson.dumps(found))["features"][0]["geometry"]["coordinates"][1] == [-114.1, 51.1]
+    track = gpxpy.parse(io.StringIO((tmp_path / "way.gpx").read_text())).tracks[0]
+    assert track.name == "ego & <more>"
+    assert [(p.latitude, p.longitude) for p in track.segments[0].points] == [tuple(row) for row in degrees]
+    assert "-114.30000000,51.20000000" in (tmp_path / "way.kml").read_text()
+    with pytest.raises(ValueError, match="is written as"):
+        write_ways(tmp_path / "way.shp", [way])
+
+
+def test_the_dashcams_own_fixes_are_read(data_dir: Path) -> None:
+    path = data_dir / "dashcam" / "town_gps.csv"
+    if not path.exists():
+        pytest.skip(f"{path}: is not there")
+    fixes = read_fixes(path.read_bytes(), str(path), 0)
+    assert len(fixes) == 20
+    assert all(7.0 < fix.speed_mps < 13.0 for fix in fixes if fix.speed_mps)

@@ -1,0 +1,300 @@
+"""The same road twice: places found, maps kept, loops closed; in simulated streets with exact truth."""
+
+import math
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.bench.simulation.places import CAMERA, OTHER_LIGHT_BITS, Street, along, block, build, drive
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.closing import close_loops, held
+from birdslam.loops.features import hamming, match
+from birdslam.loops.keyframe import Link
+from birdslam.loops.localiser import Localisation, MapState
+from birdslam.loops.map_file import HEAD, MAGIC, MapError, decode_map, encode_map
+from birdslam.loops.place_index import PlaceIndex, learn_words
+from birdslam.loops.place_map import MapCamera, PlaceMap
+from birdslam.loops.session import MapSession
+from birdslam.outputs.map_trajectory import MapTrajectory
+from birdslam.runtime.configuration import ConfigurationError, load
+from birdslam.runtime.maps.drive_map import MapChoice
+from birdslam.runtime.maps.map_store import read_map, write_map
+
+STREET = build(along([0.0] * 70 + [0.004] * 90), seed=1)
+OTHER = build(along([0.0] * 200), seed=2)
+
+
+def session(place_map: PlaceMap, extend: bool) -> MapSession:
+    """Features come ready-made in place of images."""
+    return MapSession(CAMERA, place_map, extend, extract=lambda features: features)  # type: ignore[arg-type,return-value]
+
+
+def driven(
+    place_map: PlaceMap, street: Street, rows: range, extend: bool = False, seed: int = 1, **how: float
+) -> list[tuple[Localisation, SE2]]:
+    """What the session says of each frame, and where the ego truly is in the frame of the route."""
+    running = session(place_map, extend)
+    out = [
+        (running.step(estimate, seen), T)  # type: ignore[arg-type]
+        for estimate, seen, T in drive(street, rows, seed, **how)  # type: ignore[arg-type]
+    ]
+    running.finish()
+    return out
+
+
+@pytest.fixture(scope="module")
+def mapped() -> bytes:
+    place_map = PlaceMap(MapCamera.of(CAMERA))
+    driven(place_map, STREET, range(120), extend=True)
+    return encode_map(place_map)
+
+
+def errors(found: list[tuple[Localisation, SE2]]) -> np.ndarray:
+    return np.array(
+        [T.between(here.T_map_ego).log() for here, T in found if here.state is MapState.LOCALISED and here.T_map_ego]
+    )
+
+
+@pytest.mark.parametrize("how", [{}, {"lateral_m": 1.5}, {"bits": OTHER_LIGHT_BITS}], ids=["same", "lane", "light"])
+def test_a_second_drive_is_localised(mapped: bytes, how: dict[str, float]) -> None:
+    found = driven(decode_map(mapped), STREET, range(20, 80), seed=7, **how)
+    error = errors(found)
+    assert len(error) >= 0.9 * len(found)
+    position = np.hypot(error[:, 0], error[:, 1])
+    assert np.median(position) < 0.4  # the map itself drifts by 1 % of its 80 m
+    assert position.max() < 1.0
+    assert np.degrees(np.abs(error[:, 2])).max() < 1.5
+
+
+def test_another_street_is_never_this_one(mapped: bytes) -> None:
+    assert {here.state for here, _ in driven(decode_map(mapped), OTHER, range(60))} == {MapState.LOST}
+
+
+def test_who_is_lost_has_no_pose_and_no_small_covariance(mapped: bytes) -> None:
+    for here, _ in driven(decode_map(mapped), OTHER, range(5)):
+        assert here.T_map_ego is None
+        assert np.isinf(here.cov).all()
+
+
+def test_the_covariance_grows_while_nothing_is_seen_until_it_is_no_localisation(mapped: bytes) -> None:
+    running = session(decode_map(mapped), extend=False)
+    states, sigma = [], []
+    for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 70), 3)):
+        here = running.step(estimate, seen if number < 20 else None)  # type: ignore[arg-type]
+        states.append(here.state)
+        sigma.append(math.sqrt(here.cov[0, 0]) if here.T_map_ego else math.inf)
+    assert states[19] is MapState.LOCALISED
+    assert states[-1] is MapState.ODOMETRY_ONLY
+    assert np.all(np.diff(sigma[20:]) > 0.0)
+
+
+def test_a_kidnapped_car_is_found_again(mapped: bytes) -> None:
+    """Odometry goes on as if nothing had been, 50 m further along the street."""
+    running = session(decode_map(mapped), extend=False)
+    first = list(drive(STREET, range(0, 20), 3))
+    then = list(drive(STREET, range(70, 120), 4, first_frame=20))
+    T_odom = first[-1][0].T_world_ego
+    for estimate, seen, _ in first:
+        running.step(estimate, seen)  # type: ignore[arg-type]
+    found = []
+    for estimate, seen, T in then:
+        moved = type(estimate)(
+            **{name: getattr(estimate, name) for name in estimate.__struct_fields__}
+            | {"T_world_ego": T_odom @ estimate.T_world_ego}
+        )
+        found.append((running.step(moved, seen), T))  # type: ignore[arg-type]
+    assert errors(found[-1:])[0, :2] == pytest.approx([0.0, 0.0], abs=1.0)
+    wrong = [np.hypot(*error[:2]) for error in errors(found[20:])]
+    assert max(wrong) < 1.0
+
+
+def test_an_extended_map_covers_what_the_second_drive_saw(mapped: bytes) -> None:
+    place_map = decode_map(mapped)
+    before = len(place_map)
+    driven(place_map, STREET, range(80, 140), extend=True, seed=5)
+    added = place_map.keyframes[before:]
+    assert place_map.drives == 2
+    assert {keyframe.drive for keyframe in added} == {1}
+    farthest = STREET.route[140 - 1]
+    near = min(np.hypot(k.T_map_keyframe.x_m - farthest[0], k.T_map_keyframe.y_m - farthest[1]) for k in added)
+    assert near < 10.0
+    found = driven(decode_map(encode_map(place_map)), STREET, range(110, 135), seed=6)
+    assert len(errors(found)) > 15
+
+
+def test_a_drive_that_never_meets_the_map_leaves_it_as_it_is(mapped: bytes) -> None:
+    place_map = decode_map(mapped)
+    running = session(place_map, extend=True)
+    for estimate, seen, _ in drive(OTHER, range(40), 3):
+        running.step(estimate, seen)  # type: ignore[arg-type]
+    running.finish()
+    assert encode_map(place_map) == mapped
+    assert running.lost_keyframes > 3
+
+
+def test_a_loop_is_closed_and_the_end_lies_on_the_beginning() -> None:
+    street = build(block(50.0), seed=4)
+    around = len(street.route)
+    place_map = PlaceMap(MapCamera.of(CAMERA))
+    found = driven(place_map, street, range(around + 40), extend=True, seed=11)
+    assert found[-1][0].state is MapState.LOCALISED
+    assert any(link.loop for link in place_map.links)
+    assert np.abs(errors(found[-1:])[0, :2]).max() < 0.5
+
+
+def test_a_street_of_equal_houses_closes_no_loop() -> None:
+    street = build(along([0.0] * 300), seed=3, house_m=20.0)
+    place_map = PlaceMap(MapCamera.of(CAMERA))
+    found = driven(place_map, street, range(200), extend=True)
+    assert not any(here.state is MapState.LOCALISED for here, _ in found)
+    assert not any(link.loop for link in place_map.links)
+
+
+def test_a_false_loop_is_switched_off() -> None:
+    place_map = PlaceMap(MapCamera.of(CAMERA))
+    driven(place_map, STREET, range(60), extend=True)
+    last = place_map.keyframes[-1].number
+    false = Link(0, last, SE2(1.0, 5.0, 0.5), np.diag([0.01, 0.01, 1e-4]), loop=True)
+    poses = close_loops(place_map.keyframes, [*place_map.links, false])
+    for keyframe in place_map.keyframes:
+        assert np.hypot(*keyframe.T_map_keyframe.between(poses[keyframe.number][0]).log()[:2]) < 0.3
+    assert false not in held([*place_map.links, false], poses)
+
+
+# --- the file ---
+
+
+def test_a_map_comes_back_as_it_was_written(mapped: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "street.map"
+    assert write_map(path, decode_map(mapped)) == len(mapped)
+    assert encode_map(read_map(path)) == mapped
+    assert [entry.name for entry in tmp_path.iterdir()] == ["street.map"]
+    assert len(mapped) / decode_map(mapped).length_m < 2000.0  # 2 MB a km
+
+
+def test_the_same_drive_gives_the_same_bytes(mapped: bytes) -> None:
+    place_map = PlaceMap(MapCamera.of(CAMERA))
+    driven(place_map, STREET, range(120), extend=True)
+    assert encode_map(place_map) == mapped
+
+
+def test_what_is_no_whole_map_is_refused(mapped: bytes) -> None:
+    version, length, crc = HEAD.unpack(mapped[len(MAGIC) : len(MAGIC) + HEAD.size])
+    body = mapped[len(MAGIC) + HEAD.size :]
+    newer = MAGIC + HEAD.pack(version + 1, length, crc) + body
+    flipped = bytearray(mapped)
+    flipped[-5] ^= 1
+    for data, why in (
+        (b"", "empty"),
+        (b"PNG", "no map"),
+        (mapped[:16], "cut off"),
+        (mapped[:-100], "torn"),
+        (bytes(flipped), "CRC"),
+        (newer, "version 2"),
+        (MAGIC + HEAD.pack(version, 1, zlib.crc32(b"\xc1")) + b"\xc1", "something that is no map"),
+    ):
+        with pytest.raises(MapError, match=why):
+            decode_map(data)
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_with_a_right_sum_do_harm(body: bytes) -> None:
+    with pytest.raises(MapError):
+        decode_map(MAGIC + struct.pack("<HQI", 1, len(body), zlib.crc32(body)) + body)
+
+
+def test_a_map_that_can_not_be_written_leaves_the_old_one(mapped: bytes, tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="can't be written"):
+        write_map(tmp_path / "none" / "street.map", decode_map(mapped))
+    with pytest.raises(MapError, match="can't be read"):
+        read_map(tmp_path / "street.map")
+
+
+def test_a_run_refuses_what_it_can_not_use(mapped: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "street.map"
+    path.write_bytes(mapped)
+    writes = MapChoice.of(load(None, {"results.map": str(path)}))
+    assert writes is not None
+    assert len(writes.open(CAMERA)) > 20
+    other = replace_camera(height_m=1.2)
+    with pytest.raises(ConfigurationError, match="another camera"):
+        writes.open(other)
+    reads = MapChoice.of(load(None, {"results.map_only": str(path)}))
+    assert reads is not None
+    assert len(reads.open(other)) > 20
+    path.write_bytes(mapped[:-1])
+    with pytest.raises(MapError, match="torn"):
+        writes.open(CAMERA)
+    with pytest.raises(ConfigurationError, match="name one"):
+        MapChoice.of(load(None, {"results.map": "a", "results.map_only": "b"}))
+    with pytest.raises(MapError, match="no such folder"):
+        MapChoice(tmp_path / "none" / "a.map", True).open(CAMERA)
+
+
+def replace_camera(**changes: float):  # type: ignore[no-untyped-def]
+    return type(CAMERA)(**({name: getattr(CAMERA, name) for name in CAMERA.__struct_fields__} | changes))
+
+
+# --- what is written of a drive ---
+
+
+def test_frames_before_a_place_was_confirmed_are_led_back_to(mapped: bytes, tmp_path: Path) -> None:
+    running, trajectory = session(decode_map(mapped), extend=False), MapTrajectory()
+    for estimate, seen, _ in drive(STREET, range(20, 50), 3):
+        trajectory.add(running.step(estimate, seen), estimate)  # type: ignore[arg-type]
+    assert trajectory.as_found[0] is MapState.LOST
+    assert trajectory.counts == {"localised": 30, "odometry_only": 0, "lost": 0}
+    trajectory.write(tmp_path)
+    assert len((tmp_path / "map.tum.txt").read_text().splitlines()) == 30
+    rows = (tmp_path / "localisation.csv").read_text().splitlines()
+    assert len(rows) == 31
+    assert rows[1].split(",")[1] == "localised"
+
+
+def test_without_a_place_the_trajectory_is_an_empty_file(tmp_path: Path) -> None:
+    trajectory = MapTrajectory()
+    place_map = PlaceMap(MapCamera.of(CAMERA))
+    running = session(place_map, extend=False)
+    for estimate, seen, _ in drive(STREET, range(5), 3):
+        trajectory.add(running.step(estimate, seen), estimate)  # type: ignore[arg-type]
+    trajectory.write(tmp_path)
+    assert (tmp_path / "map.tum.txt").read_bytes() == b""
+
+
+# --- its parts ---
+
+
+def test_matches_are_each_others_nearest() -> None:
+    chance = np.random.default_rng(0)
+    a = chance.integers(0, 256, (40, 32), dtype=np.uint8)
+    order = chance.permutation(40)
+    pairs = match(hamming(a, a[order]), 60, 0.8)
+    assert len(pairs) == 40
+    assert (order[pairs[:, 1]] == pairs[:, 0]).all()
+
+
+def test_the_index_finds_a_noisy_copy_and_only_among_those_allowed() -> None:
+    chance = np.random.default_rng(0)
+    places = [chance.integers(0, 256, (60, 32), dtype=np.uint8) for _ in range(50)]
+    index = PlaceIndex(learn_words(np.concatenate(places)))
+    for place in places:
+        index.add(place)
+    seen = places[17] ^ np.packbits(chance.random((60, 256)) < 0.05, axis=1)
+    assert index.look_up(seen, 3)[0] == 17
+    among = np.ones(50, bool)
+    among[17] = False
+    assert 17 not in index.look_up(seen, 50, among)
+
+
+def test_a_keyframe_moves_with_its_points(mapped: bytes) -> None:
+    place_map = decode_map(mapped)
+    keyframe = place_map.keyframes[3]
+    place_map.place({keyframe.number: (SE2(5.0, 6.0, 0.1), keyframe.cov)})
+    assert place_map.keyframes[3].T_map[:2, 3] == pytest.approx([5.0, 6.0])
+    assert (place_map.keyframes[3].points_m == keyframe.points_m).all()
+    assert place_map.near(SE2(5.0, 6.0, 0.1), 1.0)[0] == 3
