@@ -60,9 +60,9 @@ class BatchTiming:
 
 
 ABOUT_MOVERS = (
-    "A track is one id on one labelled vehicle, of five sights or more. It is told to drive where the live estimate has "
-    "decided so with over 1.5 m/s. Standing: its label is slower than 0.5 m/s at every sight. Driving: for a second "
-    "or longer over 2 m/s; soon: told within a second of that."
+    "A track is one id on one labelled vehicle, of five sights or more. It is told to drive where the live estimate "
+    "has decided so with over 1.5 m/s. Standing: its label is slower than 0.5 m/s at every sight. Driving: for a "
+    "second or longer over 2 m/s; soon: told within a second of that."
 )
 
 
