@@ -33,7 +33,8 @@ README = ROOT / "README.md"
 REAL = "--model detector={models}/yolox_nano_416.onnx --model segmenter={models}/twinlitenet_640x360.onnx"
 SEQUENCES = "{data}/kitti_odometry/sequences"
 TRACKING = "{data}/kitti_tracking/training"
-PLACES = f"localisation {TRACKING} --sequences 0000,0001,0002,0003,0004,0005,0006,0008 --detections rrc"
+EIGHT = "--sequences 0000,0001,0002,0003,0004,0005,0006,0008"  # that chose constants of the places
+PLACES = f"localisation {TRACKING} --detections rrc"
 ODOMETRY_FIELDS = (
     *("sequence", "frames", "path_m", "ate_m", "ate_pct", "ate_se3_m", "scale_error", "rpe_t_m", "rpe_r_deg"),
     *("segment_t_pct", "standing_drift_m"),
@@ -91,7 +92,7 @@ def _localisation(report: Sequence[Mapping[str, Any]]) -> Kept:
         row["range"]: max(
             other["depth_error_median_rel"] or 0.0
             for other in report
-            if other["range"] == row["range"] and other["sequence"] != "all"
+            if other["range"] == row["range"] and other["sequence"].isdigit()
         )
         for row in whole
     }
