@@ -168,6 +168,6 @@ def marginalise_yaw(
     """
     if not seen:
         return np.zeros((0, 2)), np.zeros((0, 2, 2))
-    yaws = fan_of(yaws_prior, np.arange(config.fan) * (math.pi / config.fan))
+    yaws = fan_of(yaws_prior, np.arange(config.fan, dtype=np.float64) * (math.pi / config.fan))
     fan = look_at_yaws(seen, log_depth, yaws, localisation.reach_rel)
     return fan.marginalised(weigh_yaws(fan, variance, yaws_prior, config))

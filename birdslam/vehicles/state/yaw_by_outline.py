@@ -38,7 +38,9 @@ class YawByOutline:
 
     def __init__(self, config: HeadingConfig) -> None:
         self.config = config
-        self.grid_rad = np.arange(config.fan) * (math.pi / config.fan)  # in the odometry's world
+        self.grid_rad: Floats = np.arange(config.fan, dtype=np.float64) * (
+            math.pi / config.fan
+        )  # in the odometry's world
         self._squares = np.zeros((0, config.fan))  # sum of r^2 / w
         self._sums = np.zeros((0, config.fan))  # of r / w
         self._information = np.zeros(0)  # of 1 / w
