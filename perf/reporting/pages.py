@@ -116,7 +116,7 @@ PAGES: tuple[Derived | Page, ...] = (
     *_evaluations(),
     Page(
         "leave_one_out",
-        (f"birdslam evaluate {results.PLACES} {results.EIGHT} {leave_one_out.OPTIONS} --output {{out}}",),
+        (f"birdslam evaluate {results.PLACES} {leave_one_out.OPTIONS} --output {{out}}",),
         {leave_one_out.KEPT: ("leave_one_out.json", leave_one_out.kept)},
         (localisation.evaluate_left_out, leave_one_out.kept),
     ),

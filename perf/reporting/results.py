@@ -33,8 +33,7 @@ README = ROOT / "README.md"
 REAL = "--model detector={models}/yolox_nano_416.onnx --model segmenter={models}/twinlitenet_640x360.onnx"
 SEQUENCES = "{data}/kitti_odometry/sequences"
 TRACKING = "{data}/kitti_tracking/training"
-EIGHT = "--sequences 0000,0001,0002,0003,0004,0005,0006,0008"  # that chose constants of the places
-PLACES = f"localisation {TRACKING} --detections rrc"
+PLACES = f"localisation {TRACKING} --sequences 0000,0001,0002,0003,0004,0005,0006,0008 --detections rrc"
 ODOMETRY_FIELDS = (
     *("sequence", "frames", "path_m", "ate_m", "ate_pct", "ate_se3_m", "scale_error", "rpe_t_m", "rpe_r_deg"),
     *("segment_t_pct", "standing_drift_m"),
