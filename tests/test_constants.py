@@ -112,7 +112,7 @@ def test_a_constant_to_choose_is_a_number_of_the_front_end() -> None:
     key, as_it_is, found = read_sweep("slam.frontend.ground_size.sigma_kerb_m=0.02,0.08", Configuration())
     assert (key, as_it_is, [*found]) == ("slam.frontend.ground_size.sigma_kerb_m", "0.018", ["0.018", "0.02", "0.08"])
     assert found["0.08"].ground_size.sigma_kerb_m == 0.08
-    assert found["0.04"] == FrontEndConfig()
+    assert found["0.018"] == FrontEndConfig()
     for text in ("sigma_kerb_m=1", "slam.frontend.none=1", "slam.frontend.ground_size.cues=1", "slam.frontend.x"):
         with pytest.raises(ConfigurationError, match="--leave-one-out"):
             read_sweep(text, Configuration())

@@ -91,7 +91,7 @@ def _localisation(report: Sequence[Mapping[str, Any]]) -> Kept:
         row["range"]: max(
             other["depth_error_median_rel"] or 0.0
             for other in report
-            if other["range"] == row["range"] and other["sequence"] != "all"
+            if other["range"] == row["range"] and other["sequence"].isdigit()
         )
         for row in whole
     }

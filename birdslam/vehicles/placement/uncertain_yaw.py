@@ -38,7 +38,8 @@ class HeadingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # to 0020 43 of 343 do
     across: Share = 0.1
     fan: Annotated[int, msgspec.Meta(ge=4, le=90)] = 36  # yaws over half a turn: the opposite has the same outline
-    # Of a vehicle at its first sight, by its labels: 46 of 297 are headed neither along the ego's way nor across it
+    # Of the vehicles: along the ego's way no more than across it. By the labels of KITTI tracking 31 of 296 cars are
+    # turned by 10 to 70 degrees at their first sight of 25 px
     oblique: Share = 0.1
     sigma_across_rad: float = 0.2  # of those across the ego's way
     bend_m: float = 5.0  # of the way, over which its bend is told
@@ -167,6 +168,6 @@ def marginalise_yaw(
     """
     if not seen:
         return np.zeros((0, 2)), np.zeros((0, 2, 2))
-    yaws = fan_of(yaws_prior, np.arange(config.fan) * (math.pi / config.fan))
+    yaws = fan_of(yaws_prior, np.arange(config.fan, dtype=np.float64) * (math.pi / config.fan))
     fan = look_at_yaws(seen, log_depth, yaws, localisation.reach_rel)
     return fan.marginalised(weigh_yaws(fan, variance, yaws_prior, config))

@@ -38,12 +38,15 @@ class YawByOutline:
 
     def __init__(self, config: HeadingConfig) -> None:
         self.config = config
-        self.grid_rad = np.arange(config.fan) * (math.pi / config.fan)  # in the odometry's world
+        self.grid_rad: Floats = np.arange(config.fan, dtype=np.float64) * (
+            math.pi / config.fan
+        )  # in the odometry's world
         self._squares = np.zeros((0, config.fan))  # sum of r^2 / w
         self._sums = np.zeros((0, config.fan))  # of r / w
         self._information = np.zeros(0)  # of 1 / w
         self._way_rad, self._sigma_way_rad = np.zeros(0), np.zeros(0)
         self._weight = np.zeros((0, config.fan))  # of the last sight
+        self._modes = np.zeros((0, config.fan))  # summed over NEIGHBOURS on both sides
         self._bend_per_m = 0.0  # of the ego's way
         self._last = SE2()
         self._dt_s = _MIN_DT_S
@@ -56,12 +59,13 @@ class YawByOutline:
         blank = np.zeros((1, self.config.fan))
         self._squares, self._sums = np.concatenate([self._squares, blank]), np.concatenate([self._sums, blank])
         self._weight = np.concatenate([self._weight, blank + 1.0 / self.config.fan])
+        self._modes = np.concatenate([self._modes, blank])
         self._information, self._way_rad = np.append(self._information, 0.0), np.append(self._way_rad, 0.0)
         self._sigma_way_rad = np.append(self._sigma_way_rad, _UNSEEN_RAD)
 
     def keep_rows(self, rows: Sequence[int]) -> None:
         """Forget the vehicles of all other rows."""
-        for name in ("_squares", "_sums", "_information", "_way_rad", "_sigma_way_rad", "_weight"):
+        for name in ("_squares", "_sums", "_information", "_way_rad", "_sigma_way_rad", "_weight", "_modes"):
             setattr(self, name, getattr(self, name)[rows])
 
     def predict(self, dt_s: float, T_world_ego: SE2) -> None:
@@ -98,6 +102,7 @@ class YawByOutline:
         log_weight = likelihood + np.log(self._prior(at))
         weight: Floats = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
         self._weight[at] = weight / weight.sum(axis=1, keepdims=True)
+        self._modes[at] = sum(np.roll(self._weight[at], k, axis=1) for k in range(-NEIGHBOURS, NEIGHBOURS + 1))
         return self._weight[at]
 
     def _prior(self, at: NDArray[np.intp]) -> Floats:
@@ -119,7 +124,7 @@ class YawByOutline:
         """
         weight = self._weight[row]
         span = np.arange(-NEIGHBOURS, NEIGHBOURS + 1)
-        modes = sum(np.roll(weight, k) for k in span)
+        modes = self._modes[row]
         here = round(yaw_rad / math.pi * len(weight)) % len(weight)
         best = int(np.argmax(modes))
         near = max(range(here - NEIGHBOURS, here + NEIGHBOURS + 1), key=lambda k: float(modes[k % len(weight)]))

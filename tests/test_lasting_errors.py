@@ -1,0 +1,119 @@
+"""What is wrong with a vehicle while it is seen is not averaged away; a box of another vehicle is no motion."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera, GroundPlane
+from birdslam.geometry.se2 import SE2
+from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
+from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, observe_boxes
+from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.track import EgoFrame, TrackingConfig
+from birdslam.vehicles.tracking import Tracker
+
+CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
+CAR, LOCALISATION = DIMENSIONS["car"], LocalisationConfig()
+CONFIG = GroundSizeConfig()
+DT_S, STEP_M = 0.1, 1.0
+
+
+def box_of(x_m: float, y_m: float, ground: GroundPlane, height_m: float, edge_m: float = 0.0) -> np.ndarray:
+    """Of a car headed like the ego with its centre there; its lower edge is drawn `edge_m` below the road."""
+    corners = np.array([(x_m + sl * CAR.length_m / 2, y_m + sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)])
+    points = np.vstack([np.column_stack([corners, np.full(4, z)]) for z in (0.0, height_m)])
+    px = bev.ego_to_pixel(CAMERA, ground, points)
+    near_m = float(corners[:, 0].min())
+    return np.array([*px.min(axis=0), px.max(axis=0)[0], px.max(axis=0)[1] + 721.5 * edge_m / near_m])
+
+
+def test_errors_that_last_for_a_track_are_in_its_sigma_after_many_frames() -> None:
+    """Cars are followed past, each with a height, a lower edge and a road of its own, which all its boxes share."""
+    rng, squares = np.random.default_rng(5), {"young": [], "old": []}
+    for _ in range(25):
+        ground_size = GroundSizeFilter(CAMERA, CONFIG)
+        pitch_rad = rng.normal(0.0, CONFIG.sigma_pitch_rad)
+        tracker = Tracker(CAMERA, TrackingConfig(), LOCALISATION, ground_size)
+        cars = [(55.0, 4.0), (60.0, -4.0), (68.0, 4.5)]
+        heights = CAR.height_m * np.exp(rng.normal(0.0, CAR.sigma_height_rel, len(cars)))
+        edges = rng.normal(0.0, math.hypot(CONFIG.sigma_kerb_m, CONFIG.sigma_edge_rel * CAR.height_m), len(cars))
+        tilts = rng.normal(0.0, CONFIG.sigma_tilt_rad, len(cars))
+        for k in range(40):
+            ground_size.predict(DT_S, 0.0, None, 0.0, STEP_M)
+            boxes = np.array(
+                [
+                    box_of(x - STEP_M * k, y, GroundPlane(1.65, pitch_rad + tilt, 0.0), h, e)
+                    for (x, y), h, e, tilt in zip(cars, heights, edges, tilts, strict=True)
+                ]
+            )
+            boxes += rng.normal(0.0, 0.6, boxes.shape)
+            frame = EgoFrame(k, round(k * DT_S * 1e9), SE2(STEP_M * k, 0.0, 0.0), np.diag([1e-4, 1e-4, 1e-8]))
+            seen = observe_boxes(boxes, np.ones(3), ("car",) * 3, CAMERA, ground_size.ground, LOCALISATION)
+            for track in tracker.follow(frame, seen):
+                truth = np.array(min(cars, key=lambda car, t=track: abs(car[1] - float(t.place.centre_m[1]))))
+                truth = truth - [STEP_M * k, 0.0]
+                error = track.place.centre_m - truth
+                if 2 <= k < 8 or k >= 30:
+                    square = float(error @ np.linalg.solve(track.place.cov, error)) / 2.0
+                    squares["young" if k < 8 else "old"].append(min(square, 12.5))
+    young, old = (float(np.mean(squares[age])) for age in ("young", "old"))
+    assert 0.2 < young < 1.6
+    assert 0.2 < old < 1.6  # without the states of what lasts it grows with the frames
+
+
+def test_the_lower_edge_of_a_vehicle_is_never_learned_from_itself() -> None:
+    """A car alone on a road that is known: a thousand boxes leave the depth as uncertain as its edge and tilt are."""
+    exact = GroundSizeConfig(sigma_pitch_rad=1e-6, sigma_roll_rad=1e-6, sigma_pitch_step_rad=1e-6)
+    ground_size = GroundSizeFilter(CAMERA, exact)
+    spread = []
+    for k in range(200):
+        ground_size.predict(DT_S, 0.0, None, 0.0, STEP_M)
+        (seen,) = observe_boxes(
+            box_of(30.0, 0.0, CAMERA.ground, CAR.height_m)[None],
+            np.ones(1),
+            ("car",),
+            CAMERA,
+            CAMERA.ground,
+            LOCALISATION,
+        )
+        if not k:
+            ground_size.begin(seen)
+        depths = ground_size.estimate_depths(
+            [0], [seen], np.array([CAR.width_m]), np.array([CAR.length_m]), np.zeros(1)
+        )
+        spread.append(math.sqrt(float(depths.variance[0])))
+    by_edge = math.hypot(exact.sigma_kerb_m, exact.sigma_edge_rel * CAR.height_m) / CAMERA.height_m
+    by_tilt = exact.sigma_tilt_rad * 28.0 / CAMERA.height_m
+    assert spread[-1] > 0.7 * math.hypot(by_edge, by_tilt)
+    assert spread[-1] == pytest.approx(spread[50], rel=0.1)
+
+
+def test_a_parked_car_whose_box_becomes_its_neighbours_still_stands() -> None:
+    ground_size = GroundSizeFilter(CAMERA, CONFIG)
+    tracker = Tracker(CAMERA, TrackingConfig(), LOCALISATION, ground_size, PseudoLidarConfig())
+    standing = []
+    for k in range(30):
+        ground_size.predict(DT_S, 0.0, None, 0.0, 0.8)
+        x_m = 44.0 - 0.8 * k + (0.0 if k < 12 else 4.5)  # the next one in the row
+        box = box_of(x_m, 3.8, CAMERA.ground, CAR.height_m)[None]
+        frame = EgoFrame(k, round(k * DT_S * 1e9), SE2(0.8 * k, 0.0, 0.0), np.diag([1e-4, 1e-4, 1e-8]))
+        tracker.follow(frame, observe_boxes(box, np.ones(1), ("car",), CAMERA, ground_size.ground, LOCALISATION))
+        standing.append(tracker.placing.parallax.standing(0))
+    assert len(tracker.tracks) == 1  # it is one track: the box leapt within the gate
+    assert min(standing[10:]) > 0.3
+    assert standing[-1] > 0.8
+
+
+def test_a_car_that_drives_off_is_not_taken_for_ever_new_neighbours() -> None:
+    ground_size = GroundSizeFilter(CAMERA, CONFIG)
+    tracker = Tracker(CAMERA, TrackingConfig(), LOCALISATION, ground_size)
+    for k in range(30):
+        ground_size.predict(DT_S, 0.0, None, 0.0, 0.8)
+        box = box_of(20.0 + 0.4 * k, 3.8, CAMERA.ground, CAR.height_m)[None]
+        frame = EgoFrame(k, round(k * DT_S * 1e9), SE2(0.8 * k, 0.0, 0.0), np.diag([1e-4, 1e-4, 1e-8]))
+        tracker.follow(frame, observe_boxes(box, np.ones(1), ("car",), CAMERA, ground_size.ground, LOCALISATION))
+    assert tracker.placing.parallax.standing(0) < 0.1

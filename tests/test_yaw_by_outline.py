@@ -1,0 +1,101 @@
+"""The yaw that the widths of boxes tell, seen from all around, of a car that neither motion nor body has told."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from birdslam.geometry import bev
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, observe_boxes
+from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, look_at_yaws
+from birdslam.vehicles.state.yaw_by_outline import YawByOutline
+
+CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
+CAR, CONFIG, LOCALISATION = DIMENSIONS["car"], HeadingConfig(), LocalisationConfig()
+SIGMA_DEPTH = 0.05
+
+
+def look(outline: YawByOutline, T_world_ego: SE2, centre_m: tuple[float, float], yaw_rad: float, scale: float) -> None:
+    """One frame, in which the car in row 0 is seen; `scale` of its outline lasts."""
+    T_ego_car = T_world_ego.between(SE2(*centre_m, yaw_rad))
+    half = [(sl * CAR.length_m / 2, sw * CAR.width_m / 2) for sl in (-1, 1) for sw in (-1, 1)]
+    corners = T_ego_car @ (np.array(half) * scale)
+    px = bev.ego_to_pixel(
+        CAMERA, CAMERA.ground, np.vstack([np.column_stack([corners, np.full(4, z)]) for z in (0.0, CAR.height_m)])
+    )
+    (seen,) = observe_boxes(
+        np.array([[*px.min(axis=0), *px.max(axis=0)]]), np.ones(1), ("car",), CAMERA, CAMERA.ground, LOCALISATION
+    )
+    depth: NDArray[np.float64] = np.array([math.log(corners[:, 0].min())])
+    outline.predict(0.1, T_world_ego)
+    fan = look_at_yaws([seen], depth, (outline.grid_rad - T_world_ego.yaw_rad)[None], LOCALISATION.reach_rel)
+    outline.weigh([0], fan.residual, fan.box_variance, np.array([SIGMA_DEPTH**2]), np.exp(depth))
+
+
+def turned(a_rad: float, b_rad: float) -> float:
+    """Between two axes: a heading and its opposite are one."""
+    return abs(math.remainder(a_rad - b_rad, math.pi))
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 50.0, 70.0, 90.0])
+@pytest.mark.parametrize("scale", [0.95, 1.0, 1.05])
+def test_driving_past_a_parked_car_tells_how_it_stands(yaw_deg: float, scale: float) -> None:
+    outline, yaw_rad, told = YawByOutline(CONFIG), math.radians(yaw_deg), 0.0
+    outline.begin()
+    for k in range(30):
+        look(outline, SE2(0.8 * k, 0.0, 0.0), (34.0, 6.0), yaw_rad, scale)
+        told, sigma_rad = outline.estimate(0, told)
+    assert turned(told, yaw_rad) < math.radians(12.0)
+    assert turned(told, yaw_rad) < 3.0 * sigma_rad
+
+
+@pytest.mark.parametrize("yaw_deg", [-60.0, -50.0, -40.0])
+def test_a_yaw_that_looks_like_its_mirrored_one_is_told_uncertain(yaw_deg: float) -> None:
+    """Across the line of sight all outlines are as wide: driving by does not tell such a yaw from its mirror image."""
+    outline, yaw_rad, told, sigma_rad = YawByOutline(CONFIG), math.radians(yaw_deg), 0.0, 0.0
+    outline.begin()
+    for k in range(30):
+        look(outline, SE2(0.8 * k, 0.0, 0.0), (34.0, 6.0), yaw_rad, 1.0)
+        told, sigma_rad = outline.estimate(0, told)
+    assert turned(told, yaw_rad) < 3.0 * sigma_rad
+
+
+def test_the_same_sight_a_thousand_times_tells_no_more_than_ten_times() -> None:
+    weights = []
+    for frames in (20, 1000):
+        outline = YawByOutline(CONFIG)
+        outline.begin()
+        for _ in range(frames):
+            look(outline, SE2(), (20.0, 4.0), 0.7, 1.0)
+        weights.append(outline.estimate(0, 0.0)[1])
+    assert weights[1] == pytest.approx(weights[0], rel=0.2)
+    assert weights[1] > math.radians(5.0)
+
+
+def test_a_car_in_front_of_a_turning_ego_stands_along_the_way_that_follows() -> None:
+    """It is first seen out of a turn, and taken to stand as the ego is headed only once the way is straight."""
+    outline, told = YawByOutline(CONFIG), 0.0
+    outline.begin()
+    pose = SE2(0.0, 0.0, math.radians(-40.0))
+    for k in range(30):
+        look(outline, pose, (30.0, 4.0), 0.0, 1.0)
+        told, sigma_rad = outline.estimate(0, pose.yaw_rad if k == 0 else told)
+        pose = pose @ SE2(0.6, 0.0, math.radians(4.0) if k < 10 else 0.0)
+    assert turned(told, 0.0) < math.radians(5.0)
+    assert sigma_rad < math.radians(15.0)
+
+
+def test_rows_are_those_that_are_kept() -> None:
+    outline = YawByOutline(CONFIG)
+    for _ in range(3):
+        outline.begin()
+    look(outline, SE2(), (20.0, 4.0), 1.2, 1.0)
+    before = outline.estimate(0, 1.2)
+    outline.keep_rows([0, 2])
+    assert len(outline) == 2
+    assert outline.estimate(0, 1.2) == before
