@@ -83,7 +83,8 @@ class NearRoadStillness:
         if min(self._size) < 2:
             return
         self._newest = grey[self._top_px :]
-        cells = cv2.resize(grey[self._top_px :].astype(np.float32), self._size, interpolation=cv2.INTER_AREA)
+        area = cv2.resize(self._newest.astype(np.float32), self._size, interpolation=cv2.INTER_AREA)
+        cells = np.asarray(area, np.float32)
         shown = np.ones(cells.shape, bool)
         for x1, y1, x2, y2 in (boxes_px - np.tile([0.0, self._top_px], 2)) / self._cell_px:
             shown[max(int(y1) - 1, 0) : max(int(y2) + 2, 0), max(int(x1) - 1, 0) : max(int(x2) + 2, 0)] = False
