@@ -175,8 +175,11 @@ def test_the_motion_of_the_foot_is_planar() -> None:
     assert [motion.x_m, motion.y_m, motion.yaw_rad] == pytest.approx([2.0, 0.3, 0.1])
 
 
+BRAKING = [(0.5, 0.0)] * 5 + [(0.38, 0.0), (0.26, 0.0), (0.14, 0.0)]  # as hard as tyres can, at 10 Hz
+
+
 def test_standing_holds_exactly_and_goes_on_afterwards() -> None:
-    steps = [(0.5, 0.0)] * 8 + [(0.0, 0.0)] * 10 + [(0.5, 0.0)] * 6
+    steps = [*BRAKING, *[(0.0, 0.0)] * 10, *[(0.5, 0.0)] * 6]
     truth = street(steps)
     chained, motions = drive(truth)
     held = [chained[k].p for k in range(10, 19)]
@@ -273,7 +276,7 @@ def _lorry(image: np.ndarray, left_px: float, width_px: int) -> tuple[np.ndarray
 
 
 def test_a_lorry_that_passes_a_standing_car_does_not_move_it() -> None:
-    truth = street([(0.5, 0.0)] * 8 + [(0.0, 0.0)] * 14)
+    truth = street([*BRAKING, *[(0.0, 0.0)] * 14])
     at_px = {k: -260.0 + 45.0 * (k - 8) for k in range(9, 23)}  # it hides up to 40 % of the view
     chained, motions = drive(
         truth,

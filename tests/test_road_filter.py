@@ -93,3 +93,55 @@ def test_corners_that_err_alike_for_metres_do_not_make_a_tilt_sure() -> None:
     assert off_rad[0.02] < 0.7 * off_rad[0.0]
     filter_ = filters[0.02]
     assert off_rad[0.02] < float(np.sqrt(filter_.cov[1, 1]))
+
+
+def _of_the_length(sigma_log: float) -> RoadFit:
+    """An alignment that knows the tilt and the length to `sigma_log`."""
+    return RoadFit(np.zeros(4), np.diag([sigma_log**2, 1e-6, 1e-6, 1e-8]), 0.9, 1000)
+
+
+def test_an_alignment_that_tells_little_of_the_length_takes_back_little_of_what_is_carried() -> None:
+    config = RoadScaleConfig()
+    left = []
+    for sigma_log in (0.03, 0.15, 0.5, 1.0):
+        filter_ = RoadFilter(CAMERA, config)
+        for _ in range(20):
+            filter_.predict(np.eye(3), 1.0)
+        filter_.update_alignment(_of_the_length(sigma_log))
+        left.append(filter_.carried_m / 20.0)
+    assert left == sorted(left)
+    assert left[0] == 0.0
+    assert left[1] < 0.1
+    assert left[2] > 0.85
+    assert left[3] > 0.95
+
+
+def test_many_vague_alignments_tell_what_they_hold_together_and_no_more() -> None:
+    filter_ = RoadFilter(CAMERA, RoadScaleConfig())
+    for _ in range(20):
+        filter_.predict(np.eye(3), 1.0)
+        filter_.update_alignment(_of_the_length(0.6))
+    assert filter_.carried_m > RoadScaleConfig().carried_after_m
+    assert math.sqrt(filter_.cov[0, 0]) > 0.12  # 0.6 over the root of 20
+
+
+def test_a_tilt_that_is_not_known_hides_the_length() -> None:
+    """The same alignment, of a steep trade of length against pitch: it tells the length where the pitch is known."""
+    steep = np.array([1.0, 0.1, 0.0, 0.0])  # a tenth of a radian of pitch for all of the length
+    fit = RoadFit(np.zeros(4), np.diag([1e-4, 1e-6, 1e-6, 1e-8]) + np.outer(steep, steep), 0.9, 1000)
+    unsure, sure = RoadFilter(CAMERA, RoadScaleConfig()), RoadFilter(CAMERA, RoadScaleConfig())
+    sure.cov[1:, 1:] = np.diag([1e-6, 1e-6, 1e-8, 1e-6, 1e-6])
+    assert unsure.information(fit) < 0.7 * sure.information(fit)
+
+
+def test_a_carried_scale_is_known_the_worse_the_longer_it_is_carried() -> None:
+    """Its errors go together: twice the way is more than the root of two of the sigma."""
+    sigma_rel = []
+    for metres in (100, 200):
+        filter_ = RoadFilter(CAMERA, RoadScaleConfig())
+        filter_.reset_scale(0.0)
+        for _ in range(metres):
+            filter_.predict(np.eye(3), 1.0)
+        sigma_rel.append(math.sqrt(filter_.cov[0, 0]))
+    assert 0.06 < sigma_rel[0] < 0.12
+    assert sigma_rel[1] > 1.7 * sigma_rel[0]

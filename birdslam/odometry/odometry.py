@@ -180,7 +180,8 @@ class Odometry:
         stationary = located is not None and self._is_stationary(
             self._pose.between(located[0]), corners, flow_px, dt_s, car
         )
-        if self._needs_proof(car) and (stationary or self._seems_still(corners)):
+        seems_still = stationary or self._seems_still(corners)
+        if seems_still and self._needs_proof(stationary, dt_s, car):
             if not self._stillness.proven:
                 return self._hold(tracks, frame_id, t_source_ns, boxes_px, dt_s, car)
             stationary, located = True, (self._pose, _TWO_VIEW_INFORMATION)
@@ -331,14 +332,17 @@ class Odometry:
             and quantile(displacement_px, 0.8) < _STILL_OUTER_PX
         )
 
-    def _needs_proof(self, car: CarMotion | None) -> bool:
+    def _needs_proof(self, stationary: bool, dt_s: float, car: CarMotion | None) -> bool:
         """Whether corners that stand are no evidence of a car that stands: they may be on the glass.
 
-        Where the scale is known and nothing was found on the glass, they are the street's, which has moved before.
+        Where the scale is known, nothing was found on the glass and brakes could have stopped the car, they are the
+        street's, which has moved before; those that are not `stationary` are far away.
         """
-        if car is not None and car.agreed and not car.is_moving(self.config.zero_velocity.length_m):
+        standing = self.config.zero_velocity
+        if car is not None and car.agreed and not car.is_moving(standing.length_m):
             return False
-        return self._scale.unknown or self._selector.obstructed
+        too_fast = self._model.speed_mps > standing.braking_mps2 * dt_s + standing.speed_mps
+        return self._scale.unknown or self._selector.obstructed or (stationary and too_fast)
 
     def _hold(
         self, tracks: Tracks, frame_id: int, t_source_ns: int, boxes_px: Floats, dt_s: float, car: CarMotion | None

@@ -23,7 +23,8 @@ from birdslam.perf.reporting.arguments import add_data, add_networks
 from birdslam.runtime.configuration import Configuration, SourceConfig, load
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.sources.opening import open_recording
-from birdslam.sources.recording import DatasetError
+from birdslam.sources.recording import DatasetError, Recording
+from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.status import INVALIDATING
 from birdslam.trajectory import as_poses, inverse
 from birdslam.types import Frame, Status
@@ -85,7 +86,20 @@ def networks_of(options: argparse.Namespace) -> Configuration | None:
 
 
 def uri_of(sequence: str, data: Path) -> str:
-    return sequence if ":" in sequence else f"kitti:{data / sequence}"
+    """Of a recording's URI, a folder with a rendered `drive.npz`, or a KITTI folder of the data."""
+    rendered = (Path(sequence) / "drive.npz").is_file()
+    return sequence if ":" in sequence or rendered else f"kitti:{data / sequence}"
+
+
+def _open(task: Task) -> Recording:
+    """Raises DatasetError."""
+    if ":" in task.uri:
+        return open_recording(task.uri, stride=task.stride)
+    if task.stride != 1:
+        raise DatasetError(f"{task.uri}: a rendered drive is read whole")
+    recording = DemoRecording(Path(task.uri))
+    recording.name = Path(task.uri).resolve().name
+    return recording
 
 
 def read(task: Task, edit: Edit | None = None) -> tuple[str, Drive]:
@@ -93,7 +107,7 @@ def read(task: Task, edit: Edit | None = None) -> tuple[str, Drive]:
 
     `edit` takes an image's index, the number of images, and the image.
     """
-    recording = open_recording(task.uri, stride=task.stride)
+    recording = _open(task)
     truth = recording.truth_poses()
     if truth is None:
         raise DatasetError(f"{task.uri}: has no true poses to compare with")

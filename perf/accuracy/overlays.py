@@ -3,6 +3,7 @@
     python -m perf overlays [SEQUENCE ...] [--kinds KIND ...] [--seeds N ...] [--output FILE.json] [--data DIR]
         [--networks] [--model ROLE=PATH ...]
 
+SEQUENCE is kitti:DIR, a folder of --data, or one with a rendered `drive.npz` (tests/roads/*).
 Each is drawn over each sequence from its first image on and from its middle on, seeded, and stands still in the image
 (`windscreen.Overlay`); `night` blackens all but the end of the street, over 30 images from the middle on, after which
 the road is back. Counts the frames since then that were called valid with a speed off by more than a tenth (and how

@@ -8,6 +8,7 @@ with that over a tenth of it (noise), and with the image's own contrast, without
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Annotated
@@ -32,6 +33,8 @@ _CELLS_PER_RAD = 180.0  # 0.3 degrees a cell: noise of single pixels averages ou
 _CONTRAST_RAD = 0.05  # over which a cell's brightness is compared with its surroundings'
 _MIN_CELLS = 200  # of the near road outside vehicles, for a comparison: 4 by 4 degrees
 _QUANTILE = 0.75  # of the changes: drops and the bonnet, which never change, may hide most of the road
+_NORMAL_QUANTILE = 1.15  # of a normal distribution's absolute values, in sigmas
+_NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # no gradient or edge passes it
 _ROUNDING_GREY = 0.29  # 1-sigma of a grey level's rounding: an encoder that repeats blocks shows no other noise
 _TIME_TOLERANCE = 0.9  # of a lag, for images that come a little early
 
@@ -66,6 +69,7 @@ class NearRoadStillness:
         height_px = camera.height_px - self._top_px
         self._size = (round(camera.width_px / self._cell_px), round(height_px / self._cell_px))
         self._samples: deque[_Sample] = deque()
+        self._newest: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)  # the near road's part of the newest image
 
     def reset(self) -> None:
         """The images before can't be compared with those to come."""
@@ -78,7 +82,9 @@ class NearRoadStillness:
             samples.clear()
         if min(self._size) < 2:
             return
-        cells = cv2.resize(grey[self._top_px :].astype(np.float32), self._size, interpolation=cv2.INTER_AREA)
+        self._newest = grey[self._top_px :]
+        area = cv2.resize(self._newest.astype(np.float32), self._size, interpolation=cv2.INTER_AREA)
+        cells = np.asarray(area, np.float32)
         shown = np.ones(cells.shape, bool)
         for x1, y1, x2, y2 in (boxes_px - np.tile([0.0, self._top_px], 2)) / self._cell_px:
             shown[max(int(y1) - 1, 0) : max(int(y2) + 2, 0), max(int(x1) - 1, 0) : max(int(x2) + 2, 0)] = False
@@ -112,9 +118,22 @@ class NearRoadStillness:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the near road is seen to have changed by more than noise."""
-        changes = self.changes
-        return changes is not None and changes[0] >= self.config.growth * max(changes[1], _ROUNDING_GREY)
+        """Whether the near road is seen to have changed by more than noise, slowly or from one image to the next."""
+        changes, cfg = self.changes, self.config
+        if changes is None:
+            return False
+        long, short, contrast = changes
+        another_image = long > cfg.contrast_share * contrast and long > cfg.growth * self._noise_of_cells()
+        return bool(another_image or long >= cfg.growth * max(short, _ROUNDING_GREY))
+
+    def _noise_of_cells(self) -> float:
+        """The change of cells' brightness by the newest image's own noise (Immerkaer 1996), grey levels.
+
+        Grain of the road counts as noise, so that it is rather too large.
+        """
+        by_pixel = np.abs(cv2.filter2D(self._newest, cv2.CV_32F, _NOISE_KERNEL)).ravel().astype(np.float64)
+        sigma_grey = 1.4826 / 6.0 * quantile(by_pixel, 0.5)
+        return _NORMAL_QUANTILE * math.hypot(sigma_grey, _ROUNDING_GREY) * math.sqrt(2.0) / self._cell_px
 
     @property
     def proven(self) -> bool:
