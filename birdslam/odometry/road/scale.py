@@ -222,10 +222,6 @@ class RoadScale:
                 return
             driven_m = np.inf
         if self._bonnet.update(view.grey, self._aligner.top_px, driven_m):
-            self._fixed_pattern = FixedPattern(
-                self.config.fixed_pattern
-            )  # it was judged with the bonnet among the road
-            self._keyframes.clear()
             self._filter.reset_scale(1.0)
             self._filter.lose_tilt()
             self._confirmations = 0
