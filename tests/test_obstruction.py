@@ -136,3 +136,25 @@ def test_a_bonnet_that_is_gone_is_forgotten() -> None:
     for _ in range(30):
         bonnet.update(road_image(rng), TOP_PX, 1.0)
     assert not bonnet.present
+
+
+def test_a_line_across_the_windscreen_is_no_bonnet() -> None:
+    """A reflection is brighter than both its sides."""
+    rng = np.random.default_rng(1)
+    bonnet = Bonnet(BonnetConfig())
+    for _ in range(12):
+        image = road_image(rng)
+        cv2.line(image, (0, 160), (639, 164), 200, 3)
+        bonnet.update(image, TOP_PX, 1.0)
+    assert not bonnet.present
+
+
+def test_a_bonnet_with_writing_on_it_begins_at_its_edge() -> None:
+    rng = np.random.default_rng(1)
+    bonnet = Bonnet(BonnetConfig())
+    for _ in range(12):
+        image = with_bonnet(road_image(rng), 150, rng)
+        cv2.putText(image, "CAMERA 2020-01-01 12:00:00 51.0000 -114.0000", (8, 188), cv2.FONT_HERSHEY_PLAIN, 1.2, 235)
+        bonnet.update(image, TOP_PX, 1.0)
+    assert bonnet.rows is not None
+    assert abs(int(bonnet.rows[320]) - 150) < 10

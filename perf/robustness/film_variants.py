@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -98,9 +99,10 @@ def _encoded(film: Iterator[Timed], crf: int | None, folder: Path) -> Iterator[T
         return
     import av  # only here: nothing else needs an encoder
 
-    path, times_ns = folder / "encoded.mp4", []
+    path = folder / "encoded.mp4"
+    times_ns: list[tuple[int, tuple[int, int]]] = []
     with av.open(str(path), "w") as out:
-        stream = None
+        stream: Any = None
         for t_ns, image in film:
             if stream is None:
                 stream = out.add_stream(_ENCODER, rate=Fraction(30), options={"crf": str(crf), "preset": "veryfast"})
@@ -108,7 +110,7 @@ def _encoded(film: Iterator[Timed], crf: int | None, folder: Path) -> Iterator[T
                 stream.pix_fmt = "yuv420p"
             even = np.ascontiguousarray(image[: stream.height, : stream.width])
             out.mux(stream.encode(av.VideoFrame.from_ndarray(even, "gray" if even.ndim == 2 else "bgr24")))
-            times_ns.append((t_ns, image.shape[:2]))
+            times_ns.append((t_ns, (image.shape[0], image.shape[1])))
         if stream is not None:
             out.mux(stream.encode(None))
     with av.open(str(path)) as encoded:

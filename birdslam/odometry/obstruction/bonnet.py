@@ -21,9 +21,14 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Share = Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)]
 
 _DOWNSCALE = 2  # the edge is detected in images of half the size
-_FIT_ITERATIONS = 4  # of the fit, each with the edges near the last curve
+_LOWEST = 0.4  # of the rows that can show road: a bonnet ends in the lower ones
+_LINE_SHARE = 0.7  # of the columns with an edge, those with one of the other sign beside it: more is a line
+_FIT_ITERATIONS = 2  # of the fit, each with the edges near the last curve
+_SAMPLES = 200  # curves that are tried
+_EACH = 4  # every fourth column judges them
+_ALIKE = 0.85  # of the best curve's share
 _MIN_COLUMNS = 8  # for a fit
-_MAX_OFFSET = 0.1  # from the median row, of the image's height: an edge farther off is another one
+_MAX_OFFSET = 0.1  # of the image's height: half of what a curve spans, at the most, less a quarter
 _MAX_ACROSS = 0.4  # gradient of the slope across over the slope downwards: lane lines have more
 _MARGIN_PX = 6  # above the edge, for the smoothing of the road's image
 
@@ -33,7 +38,7 @@ class BonnetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     step_m: Positive = 0.5  # driven from one image of the mean to the next
     images: Annotated[int, msgspec.Meta(ge=3)] = 6  # of the mean; the edge is detected from half of them on
-    edge_grey: Positive = 4.0  # per pixel, of a fixed edge in the mean
+    edge_grey: Positive = 1.5  # per pixel, of a fixed edge in the mean: at dusk a bonnet's has 2
     changes: Share = 0.4  # of the edge's strength, its mean deviation from image to image
     on_threshold: Share = 0.5  # of the columns with such an edge, for a bonnet to be there
     off_threshold: Share = 0.1  # ... below which it is gone
@@ -89,36 +94,76 @@ class Bonnet:
     def _edge(self, top_px: int, height: int, width: int) -> Ints | None:
         """(W,) rows of the curve that most columns agree on, less a margin; None: no bonnet."""
         cfg = self.config
-        found, row = max((self._level_edge(sign) for sign in (1.0, -1.0)), key=lambda edge: int(edge[0].sum()))
-        columns = np.arange(len(row))
-        x = columns / len(columns) - 0.5
-        powers = np.stack([x * x, x, np.ones(len(x))])
-        near = found.copy()
-        if found.any():
-            near &= np.abs(row - np.median(row[found])) * _DOWNSCALE < _MAX_OFFSET * height
-        for _ in range(_FIT_ITERATIONS):
-            if near.sum() < _MIN_COLUMNS:
-                return None
-            curve = _parabola(x[near], row[near]) @ powers
-            near = found & (np.abs(row - curve) * _DOWNSCALE < cfg.smooth_px)
-        share = float(near.mean())
-        if np.ptp(curve) * _DOWNSCALE > 1.5 * _MAX_OFFSET * height or share < (
-            cfg.off_threshold if self.present else cfg.on_threshold
-        ):
+        most = 1.5 * _MAX_OFFSET * height / _DOWNSCALE  # of a curve's own span
+        above = round(_LOWEST * (height - top_px) / _DOWNSCALE)  # rows in which no bonnet ends
+        edges = [self._level_edges(sign)[above:] for sign in (1.0, -1.0)]
+        smooth = cfg.smooth_px / _DOWNSCALE
+        curves = [_curve(each, smooth, most) for each in edges]
+        (share, curve), other = max(zip(curves, reversed(edges), strict=True), key=lambda found: found[0][0])
+        if curve is None or share < (cfg.off_threshold if self.present else cfg.on_threshold):
             return None
-        fine = np.interp(np.arange(width), _DOWNSCALE * (columns + 0.5), curve)
-        return np.clip(top_px + _DOWNSCALE * fine - _MARGIN_PX, 0, height).astype(np.int64)
+        if _share(_thick(other, smooth), curve) > _LINE_SHARE * share:
+            return None  # a line, brighter or darker than both its sides: a reflection, or writing
+        fine = np.interp(np.arange(width), _DOWNSCALE * (np.arange(len(curve)) + 0.5), curve)
+        return np.clip(top_px + _DOWNSCALE * (above + fine) - _MARGIN_PX, 0, height).astype(np.int64)
 
-    def _level_edge(self, sign: float) -> tuple[Bools, Ints]:
-        """Of each column, whether there is a fixed edge, brighter below times `sign`, and its lowest row."""
+    def _level_edges(self, sign: float) -> Bools:
+        """Where there is a fixed edge, brighter below times `sign`."""
         cfg, mean, deviation = self.config, self._mean, self._deviation
         assert mean is not None
         assert deviation is not None
         across = np.abs(cv2.Scharr(mean, cv2.CV_32F, 1, 0, scale=1.0 / 32.0))
         strength = sign * mean
-        fixed = (strength > cfg.edge_grey) & (deviation < cfg.changes * strength) & (across < _MAX_ACROSS * strength)
-        row = len(fixed) - 1 - fixed[::-1].argmax(axis=0)
-        return fixed[row, np.arange(len(row))], row
+        out: Bools = (
+            (strength > cfg.edge_grey) & (deviation < cfg.changes * strength) & (across < _MAX_ACROSS * strength)
+        )
+        return out
+
+
+def _curve(edges: Bools, smooth: float, most: float) -> tuple[float, NDArray[np.float64] | None]:
+    """The share of the columns that one parabola through the edges (rows, W) crosses at an edge, and its rows (W,).
+
+    By random sample consensus, seeded: a point of each third of the columns. Of curves with nearly the same share the
+    highest: a caption or a reflection below the bonnet's edge is on the bonnet. `smooth` rows are near, `most` is the
+    curve's span; both in rows.
+    """
+    columns = edges.shape[1]
+    rows, at = np.nonzero(edges)
+    thirds = [np.flatnonzero((at >= third * columns // 3) & (at < (third + 1) * columns // 3)) for third in range(3)]
+    if min(len(third) for third in thirds) < _MIN_COLUMNS // 2:
+        return 0.0, None
+    x = np.arange(columns) / columns - 0.5
+    rng = np.random.default_rng(0)
+    chosen = np.stack([third[rng.integers(0, len(third), _SAMPLES)] for third in thirds], axis=1)
+    powers = np.stack([x[at[chosen]] ** 2, x[at[chosen]], np.ones(chosen.shape)], axis=-1)
+    tried = np.linalg.solve(powers, rows[chosen][..., None].astype(np.float64))[..., 0]  # of columns that differ
+    some = slice(_EACH // 2, None, _EACH)
+    place = tried @ np.stack([x[some] ** 2, x[some], np.ones(len(x[some]))])  # (samples, columns)
+    thick = _thick(edges, smooth)
+    row = np.round(place).astype(np.int64)
+    inside = (row >= 0) & (row < len(edges))
+    hit = inside & (thick[np.clip(row, 0, len(edges) - 1), np.arange(columns)[some]] > 0)
+    share = np.where(np.ptp(place, axis=1) <= most, hit.mean(axis=1), 0.0)
+    alike = np.flatnonzero(share >= _ALIKE * share.max())
+    best = alike[np.argmin(np.median(place[alike], axis=1))]
+    curve: NDArray[np.float64] = tried[best] @ np.stack([x * x, x, np.ones(columns)])
+    for _ in range(_FIT_ITERATIONS):
+        near = np.abs(rows - curve[at]) < smooth
+        if near.sum() < _MIN_COLUMNS:
+            return 0.0, None
+        curve = _parabola(x[at[near]], rows[near]) @ np.stack([x * x, x, np.ones(columns)])
+    return _share(thick, curve), curve
+
+
+def _thick(edges: Bools, smooth: float) -> NDArray[np.uint8]:
+    """Edges with what is near them."""
+    return np.asarray(cv2.dilate(edges.astype(np.uint8), np.ones((2 * round(smooth) + 1, 1), np.uint8)), np.uint8)
+
+
+def _share(thick: NDArray[np.uint8], curve: NDArray[np.float64]) -> float:
+    """Of the columns, those in which the curve (W,) runs near an edge."""
+    row = np.clip(np.round(curve).astype(np.int64), 0, len(thick) - 1)
+    return float(thick[row, np.arange(len(curve))].mean())
 
 
 def _parabola(x: NDArray[np.float64], y: Ints) -> NDArray[np.float64]:

@@ -1,0 +1,67 @@
+"""Films at other sizes, rates and compressions show the same places at the same times."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.geometry.camera import Camera
+from birdslam.perf.robustness.film_variants import Timed, Variant, variants
+
+CAMERA = Camera(640, 360, 500.0, 500.0, 318.0, 181.0, height_m=1.4)
+
+
+def film(images: int = 6) -> list[Timed]:
+    """Colour images of a slope of brightness, each brighter than the one before, 0.1 s apart."""
+    slope = np.linspace(0, 150, 640)[None, :, None] + np.zeros((360, 1, 3))
+    return [(k * 100_000_000, np.asarray(slope + 10 * k, np.uint8)) for k in range(images)]
+
+
+@given(st.floats(0.5, 3.0), st.floats(0.0, 639.0), st.floats(0.0, 359.0))
+def test_a_pixel_of_another_size_is_the_same_ray(size: float, u: float, v: float) -> None:
+    camera = Variant("", size=size).camera(CAMERA)
+    x, y = camera.width_px / CAMERA.width_px, camera.height_px / CAMERA.height_px
+    there = (np.array([[u, v]]) + 0.5) * [x, y] - 0.5
+    np.testing.assert_allclose(camera.to_xy(there), CAMERA.to_xy(np.array([[u, v]])), atol=1e-9)
+
+
+def test_widths_that_no_film_has_are_left_out() -> None:
+    sizes = {variant.size for variant in variants(CAMERA)}
+    assert min(sizes) == 0.5
+    assert all(320 <= 640 * size <= 3840 for size in sizes)
+    assert variants(CAMERA)[0].name == "unchanged"
+
+
+def test_rates(tmp_path: Path) -> None:
+    every = list(Variant("", every=2).images(iter(film()), tmp_path))
+    assert [t_ns for t_ns, _ in every] == [0, 200_000_000, 400_000_000]
+    twice = list(Variant("", repeats=2).images(iter(film(3)), tmp_path))
+    assert [t_ns for t_ns, _ in twice] == [0, 50_000_000, 100_000_000, 150_000_000, 200_000_000]
+    assert np.array_equal(twice[0][1], twice[1][1])
+    assert not np.array_equal(twice[1][1], twice[2][1])
+
+
+@pytest.mark.parametrize("variant", variants(CAMERA), ids=lambda variant: variant.name)
+def test_images_keep_their_size_and_times(variant: Variant, tmp_path: Path) -> None:
+    if variant.crf is not None:
+        pytest.importorskip("av", reason="PyAV is not installed")
+    camera, given_film = variant.camera(CAMERA), film()
+    brightness = {t_ns: image.mean() for t_ns, image in given_film}
+    for t_ns, image in variant.images(iter(given_film), tmp_path):
+        assert image.shape == (camera.height_px, camera.width_px, 3)
+        if variant.shown is None and t_ns in brightness:
+            assert image.mean() == pytest.approx(brightness[t_ns], abs=4.0)  # colours lose a little in an encoder
+
+
+def test_what_is_in_the_way_is_seen(tmp_path: Path) -> None:
+    for variant in variants(CAMERA):
+        if variant.shown is not None:
+            changed = [
+                np.abs(np.asarray(shown, float) - raw).max()
+                for (_, shown), (_, raw) in zip(variant.images(iter(film()), tmp_path), film(), strict=True)
+            ]
+            assert max(changed) > 10.0, variant.name
