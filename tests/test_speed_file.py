@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -169,3 +170,47 @@ def test_bad_speed_files_of_an_evaluation_are_one_line(tmp_path: Path, capsys: p
     ):
         assert main(["evaluate", "odometry", "demo", "--speed", str(speed), *out]) == 2
         assert wanted in capsys.readouterr().err
+
+
+# --- tables with named columns ---
+
+
+@given(st.permutations(["time_s", "speed_kmh", "sigma_mps", "note"]), st.floats(0.0, 200.0))
+def test_named_columns_may_stand_in_any_order(columns: list[str], kmh: float) -> None:
+    cells = {"time_s": "1.5", "speed_kmh": repr(kmh), "sigma_mps": "0.25", "note": "wet"}
+    with tempfile.TemporaryDirectory() as folder:
+        path = file(Path(folder), f"{','.join(columns)}\n{','.join(cells[name] for name in columns)}\n")
+        (found,) = read_speeds(path).readings
+    assert (found.t_ns, found.sigma_mps) == (1_500_000_000, 0.25)
+    assert found.speed_mps == pytest.approx(kmh / 3.6)
+
+
+def test_a_gps_of_1_hz_is_filled_up_and_says_how_sure_it_is(tmp_path: Path) -> None:
+    text = (
+        "time_s,latitude_deg,longitude_deg,speed_mps\n0.5,51.0,-114.0,10.0\n1.5,51.0,-114.0,12.0\n9.5,51.0,-114.0,12\n"
+    )
+    curve = read_speed_curve(file(tmp_path, text))
+    assert curve[:, 0] == pytest.approx([*np.linspace(0.5, 1.5, 11), 9.5])  # over eight seconds nothing is known
+    assert curve[:11, 1] == pytest.approx(np.linspace(10.0, 12.0, 11))
+    sigmas = [reading.sigma_mps for reading in read_speeds(tmp_path / "speed.csv").readings]
+    assert sigmas[0] == 0.3
+    assert min(sigmas[1:10]) > 0.4  # between two readings a car may have braked
+
+
+def test_fixes_alone_give_the_speed(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{51.0 + k * 1e-4:.6f},-114.0\n" for k in range(5))  # 11.1 m north each second
+    curve = read_speed_curve(file(tmp_path, f"time,lat,lon\n{rows}"))
+    assert curve[:, 1] == pytest.approx(11.12, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("time_s,colour\n1,2\n", "line 1: names neither a speed"),
+        ("time_s,speed_mps\n1,2\nx,3\n", "line 3 does not hold what the first line names"),
+        ("time_s,speed_mps\n1\n", "line 2 does not hold"),
+    ],
+)
+def test_a_table_that_is_none_is_named(text: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=said):
+        read_speeds(file(tmp_path, text))

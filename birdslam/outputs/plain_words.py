@@ -107,11 +107,11 @@ def _validity(drive: DriveCounts) -> Iterable[str]:
         share = _share(valid, drive.frames)
         yield f"{share} is valid: {valid} of {drive.frames} frames, over {drive.valid_path_m:.0f} m."
     for name, frames in sorted(drive.invalid_by.items(), key=lambda item: -item[1]):
-        yield f"Not valid: {frames} frames, since {meaning(name)} ({name})."
+        yield f"Not valid: {_frames(frames)}, since {meaning(name)} ({name})."
     for status in WORTH_TELLING:
         frames = drive.statuses.get(status.value, 0)
         if frames and status not in INVALIDATING:
-            yield f"On {frames} frames {MEANINGS[status]} ({status.value})."
+            yield f"On {_frames(frames)} {MEANINGS[status]} ({status.value})."
 
 
 def _lengths(drive: DriveCounts) -> Iterable[str]:
@@ -121,7 +121,7 @@ def _lengths(drive: DriveCounts) -> Iterable[str]:
     by_car = drive.speed_sources.get(SpeedSource.CAR.value, 0)
     if by_car:
         by += f", on {_share(by_car, drive.frames)} of the frames on the car's own speed"
-    yield f"Lengths are known to {drive.scale_sigma_rel:.0%} (1 sigma; twice that is sure). They rest on {by}."
+    yield f"Lengths are known to {drive.scale_sigma_rel:.0%} (1 sigma; twice that is all but sure). They rest on {by}."
     if not drive.camera_sigma_rel:
         yield "In that the height counts as exact: an error of 5 % in it is an error of 5 % in all lengths."
 
@@ -151,6 +151,10 @@ def _next_steps(drive: DriveCounts) -> Iterable[str]:
 def meaning(status: str) -> str:
     """The plain words of a status by its name."""
     return MEANINGS[Status(status)]
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame{'s' * (count != 1)}"
 
 
 def _share(part: int, whole: int) -> str:

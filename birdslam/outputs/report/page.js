@@ -10,10 +10,11 @@ const here = { name: "now", type: "scatter", mode: "markers", x: [data.x[0]], y:
 
 function layout(more) {
   const style = getComputedStyle(document.documentElement);
-  const [ink, line] = ["--ink", "--line"].map((name) => style.getPropertyValue(name).trim());
-  const axis = { gridcolor: line, zerolinecolor: line };
+  const [ink, line, faint] = ["--ink", "--line", "--faint"].map((name) => style.getPropertyValue(name).trim());
+  const axis = { gridcolor: line, zerolinecolor: line, automargin: true };
   const out = { paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: ink },
-    margin: { l: 60, r: 15, t: 35, b: 45 }, ...more };
+    margin: { l: 60, r: 15, t: 40, b: 50 }, modebar: { bgcolor: "rgba(0,0,0,0)", color: faint, activecolor: ink }, ...more };
+  out.title = { text: more.title, font: { size: 14 }, x: 0.01, xanchor: "left" };
   out.xaxis = { ...axis, ...more.xaxis };
   out.yaxis = { ...axis, ...more.yaxis };
   return out;
@@ -26,14 +27,14 @@ const moment = (t) => [{ type: "line", x0: t, x1: t, yref: "paper", y0: 0, y1: 1
 function draw() {
   const time = { title: { text: "time (s)" }, range: [0, last] };
   Plotly.react("map", [...data.map, here], layout({
-    title: { text: "from above", font: { size: 14 } }, legend: { orientation: "h", y: -0.12 },
+    title: "from above", legend: { orientation: "h", y: -0.26 },
     xaxis: { title: { text: "right of the start (m)" } },
     yaxis: { title: { text: "ahead of the start (m)" }, scaleanchor: "x", scaleratio: 1 } }), config);
   Plotly.react("speed", data.speeds, layout({
-    title: { text: "speed (m/s)", font: { size: 14 } }, legend: { orientation: "h", y: 1.15, x: 0.2 },
+    title: "speed (m/s)", legend: { orientation: "h", y: -0.32 },
     xaxis: time, yaxis: { rangemode: "tozero" }, shapes: moment(data.t[slider.value]) }), config);
   Plotly.react("statuses", data.statuses, layout({
-    title: { text: "statuses", font: { size: 14 } }, xaxis: time, shapes: moment(data.t[slider.value]),
+    title: "statuses", xaxis: time, shapes: moment(data.t[slider.value]),
     yaxis: { automargin: true, autorange: "reversed", type: "category" } }), config);
 }
 
@@ -54,7 +55,7 @@ function move() {
 slider.max = String(data.t.length - 1);
 slider.addEventListener("input", move);
 dark.addEventListener("change", draw);
-document.getElementById("statuses").style.height = `${110 + 26 * Math.max(1, data.statuses.length)}px`;
+document.getElementById("statuses").style.height = `${130 + 26 * Math.max(1, data.statuses.length)}px`;
 draw();
 move();
 for (const name of ["map", "speed"]) {

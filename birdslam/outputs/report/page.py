@@ -80,7 +80,7 @@ def _map_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
     traces = [
         _points("road landmarks", drive.landmarks_m, "#8b95a5", 2),
         _points("lanes", drive.lanes_m, "#b48a00", 3),
-        *(_track(track) for track in drive.tracks),
+        *(_track(track, first=track is drive.tracks[0]) for track in drive.tracks),
     ]
     kinds = np.array([_kind(drive, k) for k in shown])
     for number, (name, colour) in enumerate(KINDS):
@@ -108,13 +108,13 @@ def _points(name: str, xy_m: NDArray[np.float64], colour: str, size: int) -> Tra
     }
 
 
-def _track(track: TrackTable) -> Trace:
+def _track(track: TrackTable, first: bool) -> Trace:
     rows = _thinned(len(track.t_s), 200)
     label = html.escape(f"{track.label} {track.name}")
     return {
         "name": "vehicles",
         "legendgroup": "vehicles",
-        "showlegend": False,
+        "showlegend": first,
         "type": "scatter",
         "mode": "lines+markers",
         "x": _rounded(-track.xy_m[rows, 1]),
@@ -138,10 +138,10 @@ def _speed_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
             "y": _rounded(np.where(sure, speed - sigma, np.nan)),
             "fill": "tonexty",
             "fillcolor": "rgba(31,157,107,0.25)",
-            "name": "1 sigma, by the length of a metre",
+            "name": "1 sigma",
         },
         _speed_line("speed", t_s, np.where(sure, speed, np.nan), "#1f9d6b"),
-        _speed_line("speed, not valid", t_s, np.where(sure, np.nan, speed), "#d1342f"),
+        _speed_line("not valid", t_s, np.where(sure, np.nan, speed), "#d1342f"),
     ]
 
 
@@ -235,10 +235,11 @@ def _invalidates(name: str) -> bool:
 def _status_rows(drive: DriveTable) -> str:
     rows = []
     for name in _names(drive):
-        frames = sum(name in statuses for statuses in drive.statuses)
+        count = sum(name in statuses for statuses in drive.statuses)
+        frames = f"{count} frame{'s' * (count != 1)}"
         effect = "not valid" if _invalidates(name) else "told only"
         words = html.escape(MEANINGS[Status(name)])
-        rows.append(f"<tr><td>{html.escape(name)}</td><td>{frames} frames</td><td>{effect}</td><td>{words}</td></tr>")
+        rows.append(f"<tr><td>{html.escape(name)}</td><td>{frames}</td><td>{effect}</td><td>{words}</td></tr>")
     return "".join(rows) or "<tr><td>none: all is well</td></tr>"
 
 
