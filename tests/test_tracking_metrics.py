@@ -9,7 +9,16 @@ import pytest
 from evo.core import metrics
 from evo.core.trajectory import PosePath3D
 
-from birdslam.bench.tracking.metrics import BoxFrame, count_boxes, hota, idf1, match_vehicles, path_errors
+from birdslam.bench.tracking.metrics import (
+    BoxFrame,
+    clear_mot,
+    count_boxes,
+    hota,
+    hota_parts,
+    idf1,
+    match_vehicles,
+    path_errors,
+)
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.label_projection import Label
 from birdslam.trajectory import ego_pose
@@ -119,3 +128,17 @@ def test_what_counts_follows_kitti() -> None:
     np.testing.assert_allclose(counted.overlap, [[1.0, 0.0]])
     empty = count_boxes([], [], np.zeros((0, 4)))
     assert empty.overlap.shape == (0, 0)
+
+
+def test_clear_mot_counts_misses_false_alarms_and_switches() -> None:
+    frames = [exact([1, 2], [7, 8])] * 3 + [exact([1, 2], [8, 7])] * 2 + [exact([1], []), exact([], [7])]
+    counted = clear_mot(frames)
+    assert (counted.found, counted.missed, counted.false_alarms) == (10, 1, 1)
+    assert counted.switches == 2
+    assert counted.mota == pytest.approx((10 - 1 - counted.switches) / 11)
+
+
+def test_hota_has_its_parts() -> None:
+    parts = hota_parts([exact([1], [7])] * 4)
+    assert parts is not None
+    assert (parts.hota, parts.det_a, parts.ass_a, parts.loc_a) == pytest.approx((1.0,) * 4)

@@ -43,7 +43,7 @@ class PeopleBoxesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     cut_margin_px: float = 4.0  # an edge so near to the image's border counts as cut
     hidden: float = 0.003  # prior probability that feet are hidden though no box covers them: behind what has no box
     hidden_covered: float = 0.03  # and where a nearer box covers them
-    hidden_cut: float = 0.98  # and where the image's border cuts the box
+    hidden_cut: float = 0.8  # and where the image's border cuts the box
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ def _observe(
     rel = (config.sigma_edge_rel,) * 2 if stated is None else stated.rel[2:]
     px = config.sigma_edge_px if stated is None else stated.px
     upper, lower = (factor * math.hypot(height_px * max(r, config.sigma_edge_rel), px) / camera.fy_px for r in rel)
-    margin_px = config.cut_margin_px + 0.05 * height_px
+    margin_px = config.cut_margin_px + 0.02 * height_px
     cut_bottom = y2 > camera.height_px - margin_px
     cut_top = y1 < config.cut_margin_px
     cut_side = x1 < config.cut_margin_px or x2 > camera.width_px - config.cut_margin_px

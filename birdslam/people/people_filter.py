@@ -101,7 +101,7 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         sigma_width_rel=0.5,
         length_m=1.75,
         footprint_m=0.6,
-        reach_m=0.35,
+        reach_m=0.6,
         along_mps=4.5,
         sigma_along_mps=2.0,
         sigma_beside_mps=0.5,
