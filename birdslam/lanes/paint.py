@@ -132,8 +132,9 @@ def _symbols(view: RoadView, response: NDArray[np.float32], usable: Bools, least
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(bright.view(np.uint8), connectivity=8)
     row, first, past = _runs(bright)
     width, label = (past - first) * LATTICE_M, labels[row, first]
+    beyond_blur = np.asarray(width - 2.0 * view.sigma_y_m[row], np.float64)
     widest = np.zeros(count)
-    np.maximum.at(widest, label, (width - 2.0 * view.sigma_y_m[row]).astype(np.float64))
+    np.maximum.at(widest, np.asarray(label, np.int64), beyond_blur)
     mean = np.bincount(label, width, count) / np.maximum(np.bincount(label, minlength=count), 1)
     found = (widest > SYMBOL_M) | ((widest > HEAD_M) & (widest > HEAD_RATIO * mean))
     found[0] = False
