@@ -40,6 +40,8 @@ INDEPENDENT_M = 6.0  # images of the same paint err alike: so much travel makes 
 GATE_SIGMAS, LEAST_GATE_M, WIDEST_GATE_M = 3.0, 0.25, 0.7
 KERNEL_SIGMAS = 2.0  # Cauchy
 ITERATIONS = 4
+FARTHEST_M, STEEPEST = 40.0, 2.0  # of a line's offset and slope: what is beyond has got lost
+_JITTER = 1e-9  # of a correlation
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,15 @@ class LineFilter:
         self.cov += np.outer(sideways, sideways) * STEP_SIGMA_M**2 * step_m
         self.cov += np.outer(turned, turned) * STEP_SIGMA_RAD**2 * step_m
 
+    def sound(self) -> NDArray[np.bool_]:
+        """(n,) which curves are those of a line still; none where the covariance is not."""
+        variances = self.cov.diagonal()
+        if not (np.isfinite(self.cov).all() and np.all(variances > 0.0)):
+            return np.zeros(len(self.curves), bool)
+        out: NDArray[np.bool_] = np.isfinite(self.curves).all(axis=1)
+        out &= (np.abs(self.curves[:, 0]) < FARTHEST_M) & (np.abs(self.curves[:, 1]) < STEEPEST)
+        return out
+
     def across_sigma_m(self, k: int, x_m: Floats) -> Floats:
         """(N,) 1-sigma of a line's y at x (N,)."""
         at = basis(x_m)
@@ -132,7 +143,9 @@ class LineFilter:
         count = len(self.curves)
         size = 4 * count + 1
         prior = np.zeros((size, size))
-        prior[:-1, :-1] = np.linalg.inv(self.cov + 1e-14 * np.eye(4 * count))
+        scale = np.sqrt(self.cov.diagonal())  # metres beside 1e-5 / m^2: inverted as correlations
+        correlated = self.cov / np.outer(scale, scale) + _JITTER * np.eye(4 * count)
+        prior[:-1, :-1] = np.linalg.inv(correlated) / np.outer(scale, scale)
         prior[-1, -1] = 1.0 / max(sigma_tilt_rad, 1e-5) ** 2
         mean = np.concatenate([self.curves.ravel(), [0.0]])
         state = mean.copy()
