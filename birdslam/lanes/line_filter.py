@@ -117,8 +117,8 @@ class LineFilter:
         variances = self.cov.diagonal()
         if not (np.isfinite(self.cov).all() and np.all(variances > 0.0)):
             return np.zeros(len(self.curves), bool)
-        out: NDArray[np.bool_] = np.isfinite(self.curves).all(axis=1)
-        out &= (np.abs(self.curves[:, 0]) < FARTHEST_M) & (np.abs(self.curves[:, 1]) < STEEPEST)
+        near = (np.abs(self.curves[:, 0]) < FARTHEST_M) & (np.abs(self.curves[:, 1]) < STEEPEST)
+        out: NDArray[np.bool_] = np.isfinite(self.curves).all(axis=1) & near
         return out
 
     def across_sigma_m(self, k: int, x_m: Floats) -> Floats:
