@@ -155,6 +155,26 @@ def test_nothing_is_seen_on_a_bare_road_and_nothing_breaks() -> None:
         assert not [line for line in lines if line.kind is not LineKind.EDGE]
 
 
+def test_noise_and_jumps_end_nothing() -> None:
+    """Whatever images and motions come, the lines are finite, or there are none."""
+    rng = np.random.default_rng(7)
+    tracker, pose = LineTracker(CAMERA), SE2()
+    for k in range(22):
+        image, masks = picture(SE2(2.0 * k, 0.0, 0.0), (1.75, -1.75), (True, False))
+        if k % 3:
+            image = np.asarray(rng.integers(0, 256, image.shape), np.uint8)
+            masks = Segmentation(road=rng.random(image.shape) < rng.random(), lane=rng.random(image.shape) < 0.1)
+        size = 30.0 if k % 7 == 0 else 2.0
+        pose = pose @ SE2(
+            float(rng.normal(1.0, size)), float(rng.normal(0.0, size)), float(rng.normal(0.0, 0.3 * size))
+        )
+        tracker.update(pose, CAMERA.ground, 0.003, image, masks, NOBODY)
+        lines = tracker.lines().at(pose @ SE2(0.5, 0.0, 0.02))
+        lanes = EgoLane().lanes(lines, 0, tracker.tilt_rad)
+        assert msgspec.json.decode(msgspec.json.encode(lanes), type=Lanes) == lanes
+        assert all(lane.width_m > 0.0 for lane in lanes.lanes)
+
+
 def line(number: int, y_m: float, kind: LineKind = LineKind.SOLID, existence: float = 0.95) -> LaneLine:
     cov = tuple(np.diag([0.01, 1e-4, 1e-7, 1e-11]).ravel().tolist())
     return LaneLine(

@@ -19,13 +19,18 @@ Floats = NDArray[np.float64]
 def basis(x_m: Floats) -> Floats:
     """(N, 4) by which a curve gives y at x (N,)."""
     x = np.asarray(x_m, dtype=np.float64)
-    return np.stack([np.ones_like(x), x, x * x / 2.0, x * x * x / 6.0], axis=-1)
+    out: Floats = np.empty((*x.shape, 4))
+    out[..., 0], out[..., 1], out[..., 2] = 1.0, x, x * x / 2.0
+    out[..., 3] = out[..., 2] * x / 3.0
+    return out
 
 
 def slope_basis(x_m: Floats) -> Floats:
     """(N, 4) by which a curve gives dy/dx at x (N,)."""
     x = np.asarray(x_m, dtype=np.float64)
-    return np.stack([np.zeros_like(x), np.ones_like(x), x, x * x / 2.0], axis=-1)
+    out: Floats = np.empty((*x.shape, 4))
+    out[..., 0], out[..., 1], out[..., 2], out[..., 3] = 0.0, 1.0, x, x * x / 2.0
+    return out
 
 
 def moved(curve: Floats, T_old_new: SE2) -> tuple[Floats, Floats]:

@@ -40,6 +40,9 @@ INDEPENDENT_M = 6.0  # images of the same paint err alike: so much travel makes 
 GATE_SIGMAS, LEAST_GATE_M, WIDEST_GATE_M = 3.0, 0.25, 0.7
 KERNEL_SIGMAS = 2.0  # Cauchy
 ITERATIONS = 4
+FARTHEST_M, STEEPEST = 40.0, 2.0  # of a line's offset and slope: what is beyond has got lost
+_CELLS = 1 << 16  # bins of one line, for keys
+_JITTER = 1e-9  # of a correlation
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,15 @@ class LineFilter:
         self.cov += np.outer(sideways, sideways) * STEP_SIGMA_M**2 * step_m
         self.cov += np.outer(turned, turned) * STEP_SIGMA_RAD**2 * step_m
 
+    def sound(self) -> NDArray[np.bool_]:
+        """(n,) which curves are those of a line still; none where the covariance is not."""
+        variances = self.cov.diagonal()
+        if not (np.isfinite(self.cov).all() and np.all(variances > 0.0)):
+            return np.zeros(len(self.curves), bool)
+        near = (np.abs(self.curves[:, 0]) < FARTHEST_M) & (np.abs(self.curves[:, 1]) < STEEPEST)
+        out: NDArray[np.bool_] = np.isfinite(self.curves).all(axis=1) & near
+        return out
+
     def across_sigma_m(self, k: int, x_m: Floats) -> Floats:
         """(N,) 1-sigma of a line's y at x (N,)."""
         at = basis(x_m)
@@ -132,44 +144,27 @@ class LineFilter:
         count = len(self.curves)
         size = 4 * count + 1
         prior = np.zeros((size, size))
-        prior[:-1, :-1] = np.linalg.inv(self.cov + 1e-14 * np.eye(4 * count))
+        scale = np.sqrt(self.cov.diagonal())  # metres beside 1e-5 / m^2: inverted as correlations
+        correlated = self.cov / np.outer(scale, scale) + _JITTER * np.eye(4 * count)
+        prior[:-1, :-1] = np.linalg.inv(correlated) / np.outer(scale, scale)
         prior[-1, -1] = 1.0 / max(sigma_tilt_rad, 1e-5) ** 2
         mean = np.concatenate([self.curves.ravel(), [0.0]])
         state = mean.copy()
         state[-1] = first_tilt_rad  # the curves of an image without a past are those of this tilt
-        information, seen = prior, [Support(np.zeros(0, np.int64), np.zeros(0, np.int64))] * count
+        information, owner = prior, np.zeros(0, np.int64)
+        x = points.x_m
         inflation = max(1.0, INDEPENDENT_M / max(travelled_m, 0.5))
         for _ in range(ITERATIONS):
             curves, tilt = state[:-1].reshape(count, 4), float(state[-1])
             x, y = tilted(points.x_m, points.y_m, height_m, tilt)
             owner = self._owners(x, y, points, curves, of, classes)
-            information, gradient = prior.copy(), prior @ (mean - state)
-            for k in range(count):
-                mine = np.flatnonzero(owner == k)
-                seen[k] = Support(np.zeros(0, np.int64), mine)
-                if not len(mine):
-                    continue
-                cells = np.floor(x[mine] / BIN_M).astype(np.int64)
-                bins, index, counts = np.unique(cells, return_inverse=True, return_counts=True)
-                seen[k] = Support(bins, mine)
-                weight = points.weight[mine] / points.sigma_m[mine] ** 2
-                total = np.bincount(index, weight)
-                x_bin = np.bincount(index, weight * x[mine]) / total
-                slope = slope_basis(x[mine]) @ curves[k]
-                residual = y[mine] - basis(x[mine]) @ curves[k]
-                r_bin = np.bincount(index, weight * residual) / total
-                by_tilt = (slope * x[mine] - y[mine]) * x[mine] / height_m
-                tilt_bin = np.bincount(index, weight * by_tilt) / total
-                variance = np.bincount(index, points.sigma_m[mine] ** 2) / counts / np.minimum(counts, MOST_IN_BIN)
-                variance = (variance + SIGMA_BIN_M**2) * inflation
-                robust = 1.0 / (1.0 + r_bin**2 / (variance / inflation) / KERNEL_SIGMAS**2)
-                H = np.zeros((len(bins), size))
-                H[:, 4 * k : 4 * k + 4] = basis(x_bin)
-                H[:, -1] = -tilt_bin
-                scaled = H * (robust / variance)[:, None]
-                information += scaled.T @ H
-                gradient += scaled.T @ r_bin
-            state = state + np.linalg.solve(information, gradient)
+            H, r, variance = _bins(x, y, points, owner, curves, height_m)
+            robust = 1.0 / (1.0 + r**2 / variance / KERNEL_SIGMAS**2)
+            scaled = H * (robust / (variance * inflation))[:, None]
+            information = prior + scaled.T @ H
+            state = state + np.linalg.solve(information, prior @ (mean - state) + scaled.T @ r)
+        cells = np.floor(x / BIN_M).astype(np.int64)
+        seen = [Support(np.unique(cells[owner == k]), np.flatnonzero(owner == k)) for k in range(count)]
         cov = np.linalg.inv(information)
         self.curves = state[:-1].reshape(count, 4)
         self.cov = 0.5 * (cov + cov.T)[:-1, :-1]
@@ -181,11 +176,35 @@ class LineFilter:
         """(N,) the line that each point is on, -1: none."""
         at = basis(x)
         gap = np.abs(y[:, None] - at @ curves.T)
-        spread = np.stack([self.across_sigma_m(k, x) for k in range(len(curves))], axis=1)
+        blocks = np.stack([self.block(k) for k in range(len(curves))])
+        spread = np.sqrt(np.maximum(((at @ blocks) * at).sum(axis=2), 0.0)).T
         gate = np.clip(GATE_SIGMAS * np.hypot(spread, points.sigma_m[:, None]), LEAST_GATE_M, WIDEST_GATE_M)
         gap = np.where((gap < gate) & (of[:, None] == classes[None]), gap, np.inf)
         nearest = np.argmin(gap, axis=1)
         return np.where(np.isfinite(gap[np.arange(len(x)), nearest]), nearest, -1)
+
+
+def _bins(
+    x: Floats, y: Floats, points: LinePoints, owner: Ids, curves: Floats, height_m: float
+) -> tuple[Floats, Floats, Floats]:
+    """The observations, one for a metre of a line: H (B, 4 n + 1), residuals (B,) and variances (B,)."""
+    on = np.flatnonzero(owner >= 0)
+    line, x, y, sigma = owner[on], x[on], y[on], points.sigma_m[on]
+    key, index = np.unique(line * _CELLS + np.floor(x / BIN_M).astype(np.int64) % _CELLS, return_inverse=True)
+    counts = np.bincount(index, minlength=len(key))
+    weight = points.weight[on] / sigma**2
+    total = np.bincount(index, weight, len(key))
+    at, curve = basis(x), curves[line]
+    residual = y - (at * curve).sum(axis=1)
+    slope = (slope_basis(x) * curve).sum(axis=1)
+    by_tilt = (slope * x - y) * x / height_m
+    x_bin, r, tilt = (np.bincount(index, weight * value, len(key)) / total for value in (x, residual, by_tilt))
+    variance = np.bincount(index, sigma**2, len(key)) / counts / np.minimum(counts, MOST_IN_BIN) + SIGMA_BIN_M**2
+    H = np.zeros((len(key), 4 * len(curves) + 1))
+    column = 4 * (key // _CELLS)
+    H[np.arange(len(key))[:, None], column[:, None] + np.arange(4)] = basis(x_bin)
+    H[:, -1] = -tilt
+    return H, r, variance
 
 
 def _together(common: Floats, own: Floats, count: int) -> Floats:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis, moved
-from birdslam.lanes.line_filter import LineFilter, Support
+from birdslam.lanes.line_filter import FARTHEST_M, STEEPEST, LineFilter, Support
 from birdslam.lanes.paint import LinePoints, edge_points, paint_points
 from birdslam.lanes.parallel_search import Peak, find_lines, find_shape
 from birdslam.lanes.road_view import RoadView, road_view
@@ -116,6 +116,9 @@ class LineTracker:
         seen, self.tilt_rad = self._filter.update(
             points, of, classes, ground.height_m, sigma_pitch_rad, travelled_m, first_tilt_rad
         )
+        if not self._filter.sound().all():
+            self._keep_sound()
+            return
         self._judge(view, points, seen)
         self._add_lines(points, of, seen, ground.height_m)
         self._drop_lines()
@@ -133,10 +136,18 @@ class LineTracker:
         self._standing = 0
         self._filter.predict(step)
         self._T_world_filter = T_world_ego
+        self._keep_sound()
         for track in self._tracks:
             track.seen_from_m -= step.x_m
             track.seen_to_m -= step.x_m
         return distance
+
+    def _keep_sound(self) -> None:
+        """Drops lines that a wrong motion has carried off."""
+        kept = np.flatnonzero(self._filter.sound())
+        if len(kept) < len(self._tracks):
+            self._filter.keep(kept)
+            self._tracks = [self._tracks[k] for k in kept.tolist()]
 
     def _begin(
         self, view: RoadView, paint: LinePoints, ground: GroundPlane, sigma_pitch_rad: float, search_tilt: bool
@@ -298,7 +309,7 @@ class TrackedLines:
             cov = J @ seen_cov @ J.T + _systematic(curve)
             sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", _AHEAD, cov, _AHEAD), 0.0))
             known = _AHEAD_M[sigma < WORST_SIGMA_M]
-            if not len(known) or not np.isfinite(cov).all():
+            if not len(known) or not np.isfinite(cov).all() or abs(curve[0]) > FARTHEST_M or abs(curve[1]) > STEEPEST:
                 continue
             line = LaneLine(
                 line=track.line,

@@ -68,9 +68,8 @@ def _placed(v: VehicleInEgo, lanes: Lanes) -> VehicleLane:
         # Who comes towards us drives on a road, also beyond the lanes that are known
         oncoming = drives * (left + right + off)
         left, right, off = ((1.0 - drives) * share for share in (left, right, off))
-    return VehicleLane(
-        vehicle=v.vehicle, ego_lane=min(ego, 1.0), left=left, right=right, oncoming=oncoming, off_road=off
-    )
+    ego, left, right, oncoming, off = (min(share, 1.0) for share in (ego, left, right, oncoming, off))  # of rounding
+    return VehicleLane(vehicle=v.vehicle, ego_lane=ego, left=left, right=right, oncoming=oncoming, off_road=off)
 
 
 def _share(lane: Lane, x_m: float, y_m: float, variance: float) -> float:

@@ -84,7 +84,8 @@ def paint_points(view: RoadView) -> LinePoints:
     share = np.where(by_mask, 2.0, PIXEL_SHARE)
     yellow = np.full(len(rows), np.nan)
     if view.excess is not None and len(rows):
-        level = float(np.median(view.excess[view.road])) if view.road.any() else 0.0
+        road = view.road[::2, ::3]
+        level = float(np.median(view.excess[::2, ::3][road])) if road.any() else 0.0
         column = np.clip(np.searchsorted(view.y_m, y_m), 0, len(view.y_m) - 1)
         yellow = view.excess[rows, column].astype(np.float64) - level
     return LinePoints(
@@ -111,7 +112,7 @@ def _bar(view: RoadView, response: NDArray[np.float32]) -> tuple[float, Bools]:
     reach = 2 * round(ROAD_REACH_M / LATTICE_M) + 1
     on_road = cv2.dilate(view.road.view(np.uint8), np.ones((1, reach), np.uint8)) > 0
     usable = on_road & ~view.hidden & ~view.outside
-    bare = response[usable]
+    bare = response[::2, ::3][usable[::2, ::3]]  # a sixth shows the spread as well
     if not len(bare):
         return LEAST_CONTRAST, usable
     # A bare road's response is negative, its spread that of the texture
@@ -132,8 +133,9 @@ def _symbols(view: RoadView, response: NDArray[np.float32], usable: Bools, least
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(bright.view(np.uint8), connectivity=8)
     row, first, past = _runs(bright)
     width, label = (past - first) * LATTICE_M, labels[row, first]
+    beyond_blur = np.asarray(width - 2.0 * view.sigma_y_m[row], np.float64)
     widest = np.zeros(count)
-    np.maximum.at(widest, label, (width - 2.0 * view.sigma_y_m[row]).astype(np.float64))
+    np.maximum.at(widest, np.asarray(label, np.int64), beyond_blur)
     mean = np.bincount(label, width, count) / np.maximum(np.bincount(label, minlength=count), 1)
     found = (widest > SYMBOL_M) | ((widest > HEAD_M) & (widest > HEAD_RATIO * mean))
     found[0] = False
@@ -205,13 +207,15 @@ def edge_points(view: RoadView, middle_m: Floats) -> tuple[LinePoints, LinePoint
     free = (closed > 0) & ~view.outside
     start = np.clip(np.searchsorted(view.y_m, middle_m), 0, len(view.y_m) - 1)
     count = len(view.y_m)
-    index = np.arange(count)
+    index = np.arange(count, dtype=np.int32)
     out = []
     on = free[np.arange(len(start)), start]
     for side in (1, -1):
-        beyond = (index[None] - start[:, None]) * side
-        stops = ~free & (beyond > 0)
-        at = np.where(stops, beyond, count).min(axis=1)  # lattice steps to the first that is no road
+        stops = ~free & ((index > start[:, None]) if side > 0 else (index < start[:, None]))
+        ordered = stops if side > 0 else stops[:, ::-1]
+        first = ordered.argmax(axis=1)  # lattice steps to the first that is no road
+        first = first if side > 0 else count - 1 - first
+        at = np.where(stops.any(axis=1), np.abs(first - start), count)
         column = start + side * at
         inside = on & (column >= 0) & (column < count) & (at < count)
         past = np.clip(column, 0, count - 1)

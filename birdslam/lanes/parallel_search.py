@@ -82,8 +82,7 @@ def _histograms(offsets: Floats, weight: Floats, bins: int) -> Floats:
     smooth = 0.5 * votes
     smooth[:, 1:] += 0.25 * votes[:, :-1]
     smooth[:, :-1] += 0.25 * votes[:, 1:]
-    out: Floats = smooth
-    return out
+    return np.asarray(smooth, np.float64)
 
 
 def find_lines(points: LinePoints, curve: Floats, least_m: float, apart_m: float, most: int) -> list[Peak]:

@@ -92,7 +92,7 @@ def _is_lane(left: LaneLine, right: LaneLine) -> bool:
     """Whether the strip between two bounds is a lane."""
     width = left.y_m(AT_M) - right.y_m(AT_M)
     edges = (left.kind is LineKind.EDGE) + (right.kind is LineKind.EDGE)
-    if width < LEAST_LANE_M:
+    if width < LEAST_LANE_M or left.offset_m - right.offset_m < LEAST_STRIP_M:
         return False
     if edges == 2:
         return True

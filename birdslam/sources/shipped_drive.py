@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -146,7 +147,7 @@ def write_drive(
     joined = np.frombuffer(b"".join(images), np.uint8)
     ends = np.cumsum([len(image) for image in images], dtype=np.int64)
     with (directory / "drive.npz").open("wb") as file:
-        np.savez_compressed(
-            file, images=joined, ends=ends, rate_hz=np.float64(rate_hz), poses=poses, ground=ground,
-            bodies=bodies.astype(np.float32), **({} if lines is None else {"lines": lines.astype(np.float32)}),
-        )  # fmt: skip
+        arrays: Any = {"poses": poses, "ground": ground, "bodies": bodies.astype(np.float32)}
+        if lines is not None:
+            arrays["lines"] = lines.astype(np.float32)
+        np.savez_compressed(file, images=joined, ends=ends, rate_hz=np.float64(rate_hz), **arrays)
