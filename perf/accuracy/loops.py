@@ -3,9 +3,10 @@
     python -m perf loops [--data DIR] [--output FILE.json] [--part recorded|simulated|size ...]
 
 `recorded`: the two passes of one KITTI street by cameras 0.537 m apart, each in the other's map, and three other
-streets against both; the whole pipeline offline with the shipped networks gives the estimates, and `--features` compares kinds.
+streets against both; the whole pipeline offline with the shipped networks gives the estimates, and `--features`
+compares kinds.
 `simulated`: streets of corners with exact truth, a loop driven twice, other light and lane, and equal houses.
-`size`: bytes and look-up time of maps of 1, 10 and 100 km of simulated descriptors.
+`size`: bytes and processor time of a look-up in maps of 1, 10 and 100 km of simulated descriptors.
 """
 
 from __future__ import annotations
@@ -81,8 +82,8 @@ def estimated(path: Path) -> tuple[Camera, Seen]:
     configuration = load(None, {"source.uri": f"kitti:{path}"})
     with pipeline(configuration) as through:
         estimates = [record for record in through(recording) if isinstance(record, Estimate)]
-    images = {frame.frame_id: frame.image for frame in recording.undistorted_frames()}
-    return recording.camera, [(each, images[each.frame_id]) for each in estimates if images[each.frame_id] is not None]
+    images = {frame.frame_id: frame.image for frame in recording.undistorted_frames() if frame.image is not None}
+    return recording.camera, [(each, images[each.frame_id]) for each in estimates if each.frame_id in images]
 
 
 def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:
@@ -212,7 +213,7 @@ def simulated(ledger: Ledger, way_m: float, equal_m: float) -> None:
 
 
 def _session(place_map: PlaceMap, extend: bool) -> MapSession:
-    return MapSession(CAMERA, place_map, extend, lambda features: features)  # type: ignore[arg-type,return-value]
+    return MapSession(CAMERA, place_map, extend, lambda features: features)  # type: ignore[arg-type]
 
 
 def _apart(a: SE2, b: SE2) -> float:
@@ -251,17 +252,17 @@ def size(ledger: Ledger) -> None:
                     *(np.full(MOST_POINTS, 0.05), descriptors, CAMERA.height_m),
                 )
             )
-        begun = time.perf_counter()
+        begun = time.process_time()
         index = place_map.index()
         index.look_up(place_map.keyframes[0].descriptors, 6)
-        built_s = time.perf_counter() - begun
+        built_s = time.process_time() - begun
         took_ms, right = [], 0
         for number in range(0, count, max(1, count // LOOK_UPS)):
             own = place_map.keyframes[number].descriptors
             seen = own ^ np.packbits(chance.random((MOST_POINTS, 8 * DESCRIPTOR_BYTES)) < SAME_BITS, axis=1)
-            begun = time.perf_counter()
+            begun = time.process_time()
             found = index.look_up(seen, 6)
-            took_ms.append(1e3 * (time.perf_counter() - begun))
+            took_ms.append(1e3 * (time.process_time() - begun))
             right += number in found
         data = len(encode_map(place_map))
         p50_ms, worst_ms = float(np.median(took_ms)), max(took_ms)
