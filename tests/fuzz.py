@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 import tomllib
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,7 +28,12 @@ import numpy as np
 import zenoh
 
 from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
+from birdslam.loops.gnss_file import GnssError, read_fixes
+from birdslam.loops.keyframe import Keyframe, Link
+from birdslam.loops.map_file import HEAD, MAGIC, MapError, decode_map, encode_map
+from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.perception.manifest import Manifest, ModelError
 from birdslam.perception.manifest_file import read_manifest, shipped_manifests
 from birdslam.runtime.client import reading_of
@@ -41,12 +47,17 @@ from birdslam.sources.camera_file import load_camera
 from birdslam.sources.kitti import read_image, read_projection, read_times
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.speed_file import read_speeds
-from birdslam.types import INVALIDATING, FrameRef, Measurements
+from birdslam.types import INVALIDATING, Attitude, FrameRef, Measurements
 from tests.mutations import Chance, mutated, mutated_text, with_other_fields
 from tests.test_wire import BY_NAME, EXAMPLES
 
 ROOT = Path(__file__).resolve().parent.parent
 SPEEDS = "# t v\n0 12.5\n0.02, 12.6, 0.05\n0.04, 12.7, , -0.01, 0.002\n0.06, nan\n"
+FIXES = [
+    "time_s,latitude_deg,longitude_deg,speed_mps\n0.5,51.0,-114.1,12.5\n1.5,51.1,-114.2,\n",
+    "$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A\n",
+    '<gpx><trk><trkseg><trkpt lat="48.1" lon="11.5"><time>2020-01-01T00:00:00Z</time></trkpt></trkseg></trk></gpx>',
+]
 Target = Callable[[Chance], bool]  # makes a case and tries it; whether it was let in
 
 
@@ -249,6 +260,11 @@ def _read_speeds(path: Path) -> None:
     assert log.until(max(reading.t_ns for reading in log.readings))
 
 
+def _read_fixes(path: Path) -> None:
+    fixes = read_fixes(path.read_bytes(), path.name, 0)
+    assert all(abs(fix.latitude_deg) <= 90.0 and abs(fix.longitude_deg) <= 180.0 for fix in fixes)
+
+
 def _read_manifest(path: Path) -> None:
     assert isinstance(read_manifest(path), Manifest)
 
@@ -292,6 +308,38 @@ def images(folder: Path) -> Iterator[Target]:
         os.close(quiet)
 
 
+def maps() -> Target:
+    """loops.map_file on mutated maps, most of them with a right sum; what is let in can be written and looked into."""
+    keyframe = Keyframe(
+        *(0, 0, 0, SE2(1.0, 2.0, 0.3), np.eye(3), Attitude(), np.ones((9, 3)), np.full(9, 0.1)),
+        *(np.arange(288, dtype=np.uint8).reshape(9, 32), 1.65, 51.0, 7.0),
+    )
+    links = [Link(0, 0, SE2(), np.eye(3), loop=True)]
+    camera = MapCamera("0" * 16, 640, 480, 500.0, 1.65)
+    good = encode_map(PlaceMap(camera, [keyframe], links, np.zeros((2, 32), np.uint8), 1))
+    head = len(MAGIC) + HEAD.size
+    plain = msgpack.unpackb(good[head:])
+
+    def target(chance: Chance) -> bool:
+        if chance.random() < 0.2:
+            data = mutated(chance, good, good)
+        else:
+            if chance.random() < 0.5:
+                body = msgpack.packb(with_other_fields(chance, plain))
+            else:
+                body = mutated(chance, good[head:], good)
+            data = MAGIC + HEAD.pack(1, len(body), zlib.crc32(body)) + body
+        try:
+            found = decode_map(data)
+        except MapError:
+            return False
+        decode_map(encode_map(found))
+        found.index()
+        return True
+
+    return target
+
+
 def _configurations() -> list[str]:
     texts = [path.read_text() for path in sorted((ROOT / "configs").glob("*.toml"))]
     return [*texts, "[runtime]\nwatchdog_ms = 800\n[perceive]\ndeadline_ms = 20.0\n[source]\nrate = 33\nloop = true\n"]
@@ -304,16 +352,18 @@ def _cameras() -> list[str]:
 
 def targets(folder: Path) -> Iterator[tuple[str, float, Callable[[], object]]]:
     """Name, share of all cases, and what makes the target."""
-    yield "bytes of messages", 0.575, bytes_of_messages
+    yield "bytes of messages", 0.555, bytes_of_messages
     yield "fields of messages", 0.17, fields_of_messages
     yield "optimizer", 0.02, optimizer
     yield "subscribers and planner", 0.13, subscribers
     yield "references to frames", 0.02, references
     manifests = [path.read_text() for path in shipped_manifests().values()]
     yield "images", 0.005, lambda: images(folder)
+    yield "maps", 0.01, maps
     times = "".join(f"{0.1 * i:e}\n" for i in range(8))
     projections = "".join(f"P{i}: 700 0 300 {-i} 0 700 100 0 0 0 1 0\n" for i in range(2))
     for name, share, goods, read, refusal in (
+        ("GNSS fixes", 0.01, FIXES, _read_fixes, GnssError),
         ("speed files", 0.01, [SPEEDS], _read_speeds, DatasetError),
         ("recordings' text files", 0.01, [times, projections], _read_recording, DatasetError),
         ("configuration files", 0.02, _configurations(), _read_configuration, ConfigurationError),

@@ -220,7 +220,7 @@ def test_every_hook_is_local() -> None:
     assert {hook["id"] for hook in hooks["repos"][0]["hooks"]} == {"ruff", "ruff-format", "mypy", "commit-subject"}
 
 
-NESTED = ("evaluate", "models", "demo-drive")  # commands that have commands
+NESTED = ("evaluate", "map", "models", "demo-drive")  # commands that have commands
 WORDS: list[tuple[str, ...]] = [(), *((word,) for word in NESTED)]
 
 

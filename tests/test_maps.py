@@ -17,10 +17,12 @@ from birdslam.loops.features import hamming, match
 from birdslam.loops.keyframe import Link
 from birdslam.loops.localiser import Localisation, MapState
 from birdslam.loops.map_file import HEAD, MAGIC, MapError, decode_map, encode_map
+from birdslam.loops.merging import MergeError, merged
 from birdslam.loops.place_index import PlaceIndex, learn_words
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory
+from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.runtime.maps.drive_map import MapChoice
 from birdslam.runtime.maps.map_store import read_map, write_map
@@ -298,3 +300,57 @@ def test_a_keyframe_moves_with_its_points(mapped: bytes) -> None:
     assert place_map.keyframes[3].T_map[:2, 3] == pytest.approx([5.0, 6.0])
     assert (place_map.keyframes[3].points_m == keyframe.points_m).all()
     assert place_map.near(SE2(5.0, 6.0, 0.1), 1.0)[0] == 3
+
+
+# --- what `birdslam map` does ---
+
+
+@pytest.fixture(scope="module")
+def files(mapped: bytes, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A map, one of the same street by another drive from further on, and one of another street."""
+    folder = tmp_path_factory.mktemp("maps")
+    beside, other = PlaceMap(MapCamera.of(CAMERA)), PlaceMap(MapCamera.of(CAMERA))
+    driven(beside, STREET, range(60, 140), extend=True, seed=21)
+    driven(other, OTHER, range(60), extend=True, seed=22)
+    out = {"own": folder / "own.map", "beside": folder / "beside.map", "other": folder / "other.map"}
+    for path, data in zip(out.values(), (mapped, encode_map(beside), encode_map(other)), strict=True):
+        path.write_bytes(data)
+    return out
+
+
+def test_two_maps_of_a_street_become_one(files: dict[str, Path]) -> None:
+    own, beside = read_map(files["own"]), read_map(files["beside"])
+    out, found = merged(own, beside)
+    assert found >= 5
+    assert len(out) == len(own) + len(beside)
+    start = STREET.route[60]
+    first = next(keyframe for keyframe in out.keyframes if keyframe.drive == 1)
+    assert np.hypot(first.T_map_keyframe.x_m - start[0], first.T_map_keyframe.y_m - start[1]) < 2.0
+    assert len(errors(driven(out, STREET, range(100, 130), seed=6))) > 20
+
+
+def test_maps_that_share_no_street_stay_two(files: dict[str, Path]) -> None:
+    with pytest.raises(MergeError, match="share no street"):
+        merged(read_map(files["own"]), read_map(files["other"]))
+
+
+def test_the_commands(files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def told(*words: str) -> str:
+        options = parse(["map", *words])
+        assert options.call(options) == 0
+        return capsys.readouterr().out
+
+    own = str(files["own"])
+    assert "keyframes" in told("info", own)
+    part = tmp_path / "part.map"
+    told("trim", own, "--within", "0", "0", "30", "--output", str(part))
+    assert 3 < len(read_map(part)) < len(read_map(files["own"]))
+    told("picture", own, "--output", str(tmp_path / "map.png"))
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+    told("export", own, "--output", str(tmp_path / "map.g2o"))
+    assert (tmp_path / "map.g2o").read_text().startswith("VERTEX_SE2 0")
+    told("export", own, "--output", str(tmp_path / "map.tum.txt"))
+    assert len((tmp_path / "map.tum.txt").read_text().splitlines()) == len(read_map(files["own"]))
+    options = parse(["map", "export", own, "--output", str(tmp_path / "map.kml")])
+    with pytest.raises(MapError, match="not on Earth"):
+        options.call(options)

@@ -144,7 +144,8 @@ def _fit(xy: Floats, enu: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats
     turned = complex((a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]).sum(), (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
     yaw, log_scale = math.atan2(turned.imag, turned.real), 0.0
     shift = there.copy()
-    H, chi2 = np.eye(4), np.zeros(len(xy))
+    H: Floats = np.eye(4)
+    chi2: Floats = np.zeros(len(xy))
     for iteration in range(ITERATIONS):
         c, s, scale = math.cos(yaw), math.sin(yaw), math.exp(log_scale)
         rotated = a @ np.array([[c, s], [-s, c]]) * scale
@@ -164,7 +165,8 @@ def _fit(xy: Floats, enu: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats
         log_scale = float(np.clip(log_scale, -0.7, 0.7))
     c, s, scale = math.cos(yaw), math.sin(yaw), math.exp(log_scale)
     moved = shift - scale * (centre @ np.array([[c, s], [-s, c]]))
-    return np.array([*moved, yaw, log_scale]), np.linalg.inv(H + 1e-9 * np.eye(4)), chi2
+    cov: Floats = np.linalg.inv(H + 1e-9 * np.eye(4)).astype(np.float64)
+    return np.array([*moved, yaw, log_scale]), cov, chi2
 
 
 def _speed_ratio(seconds: Floats, xy: Floats, at: Floats, fixes: list[GnssFix]) -> float | None:

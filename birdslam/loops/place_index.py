@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from birdslam.loops.features import DESCRIPTOR_BYTES, hamming
 from birdslam.loops.keyframe import Floats
 
-MOST_WORDS, LEAST_WORDS = 2048, 16
+MOST_WORDS, LEAST_WORDS = 1024, 16
 DESCRIPTORS_PER_WORD = 8
-LEARNED_FROM = 60_000  # descriptors at the most
-ROUNDS = 6
+LEARNED_FROM = 20_000  # descriptors at the most
+ROUNDS = 5
 _SEED = 39
 
 

@@ -121,14 +121,14 @@ def _depths(
 ) -> tuple[Floats, Floats]:
     """Inverse depths by Gauss-Newton with Cauchy weights, and their information."""
     T = poses[views]
-    information = np.zeros(len(rho))
+    information: Floats = np.zeros(len(rho))
     for _ in range(6):
         p, z = _projected(rays[rows], rho[rows], T)
         predicted = p[:, :2] / z[:, None]
         J = (T[:, :2, 3] - predicted * T[:, 2:3, 3]) / z[:, None]  # of the prediction, by rho
         error = (xy - predicted) / sigma[:, None]
         weight = good / (1.0 + (error**2).sum(axis=1) / 4.0) / sigma**2
-        information = np.bincount(rows, weight * (J**2).sum(axis=1), len(rho))
+        information = np.bincount(rows, weight * (J**2).sum(axis=1), len(rho)).astype(np.float64)
         gradient = np.bincount(rows, weight * (J * (xy - predicted)).sum(axis=1), len(rho))
         step = gradient / np.maximum(information, 1e-9)
         rho = np.clip(rho + np.clip(step, -0.1, 0.1), 1e-4, 1.0)

@@ -130,7 +130,7 @@ def _ransac(
     if not found or inliers is None or len(inliers) < 8:
         return None, pairs
     T_cam_keyframe = np.eye(4)
-    T_cam_keyframe[:3, :3] = rotation(rotated.ravel())
+    T_cam_keyframe[:3, :3] = rotation(rotated.ravel().astype(np.float64))
     T_cam_keyframe[:3, 3] = moved.ravel()
     if not np.isfinite(T_cam_keyframe).all():
         return None, pairs
@@ -167,7 +167,8 @@ def _adjust(
     xy = camera.to_xy(features.px[pairs[:, 1]])
     noise = (features.sigma_px[pairs[:, 1]] ** 2 + OTHER_VIEW_PX**2) / camera.fx_px**2
     prior = np.array([0.0, 0.0, SIGMA_Z_M**-2, SIGMA_TILT_RAD**-2, SIGMA_TILT_RAD**-2, 0.0])
-    good, H = np.ones(len(pairs), bool), np.eye(6)
+    good: NDArray[np.bool_] = np.ones(len(pairs), bool)
+    H: Floats = np.eye(6)
     for _ in range(ITERATIONS):
         p_ego = (points - pose[:3, 3]) @ pose[:3, :3]
         p = (p_ego - mount[:3, 3]) @ R_cam_ego.T
@@ -199,5 +200,5 @@ def _adjust(
             break
     if not good.any() or abs(pose[2, 3]) > 1.5 or math.hypot(*pose[:2, 3]) > 60.0:
         return None
-    cov = np.linalg.inv(H)[np.ix_([0, 1, 5], [0, 1, 5])]
+    cov: Floats = np.linalg.inv(H)[np.ix_([0, 1, 5], [0, 1, 5])].astype(np.float64)
     return pose, cov, good

@@ -1,0 +1,277 @@
+"""The same road twice: how well places are found again, how exact poses in a map are, what closing a loop brings.
+
+    python -m perf loops [--data DIR] [--output FILE.json] [--part recorded|simulated|size ...]
+
+`recorded`: the two passes of one KITTI street by cameras 0.537 m apart, each in the other's map, and three other
+streets against both; the whole pipeline offline with the shipped networks gives the estimates, and `--features`
+compares kinds.
+`simulated`: streets of corners with exact truth, a loop driven twice, other light and lane, and equal houses.
+`size`: bytes and processor time of a look-up in maps of 1, 10 and 100 km of simulated descriptors.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.bench.simulation.places import CAMERA, OTHER_LIGHT_BITS, SAME_BITS, Street, along, block, build, drive
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.features import DESCRIPTOR_BYTES, FeatureExtractor, FeatureKind
+from birdslam.loops.keyframe import Keyframe
+from birdslam.loops.keyframe_builder import MOST_POINTS, SPACING_M
+from birdslam.loops.localiser import Localisation, MapState
+from birdslam.loops.map_file import decode_map, encode_map
+from birdslam.loops.place_map import MapCamera, PlaceMap
+from birdslam.loops.session import MapSession
+from birdslam.outputs.map_trajectory import MapTrajectory
+from birdslam.perf.errors import PerfError
+from birdslam.perf.reporting.arguments import add_data, benchmark_parser
+from birdslam.perf.reporting.figures import Ledger
+from birdslam.runtime.batch.offline import pipeline
+from birdslam.runtime.configuration import load
+from birdslam.runtime.nodes.sources import open_recorded
+from birdslam.sources.recording import DatasetError
+from birdslam.types import Attitude, Estimate
+
+label = "places found again, poses in a kept map, loops closed; a map's size and look-up time"
+
+PARTS = "recorded", "simulated", "size"
+BASE_M = 0.537  # between the cameras of the two passes
+OTHERS = (
+    "kitti_odometry/sequences/00",
+    "kitti_odometry/sequences/06",
+    "kitti_tracking/training/image_03/0005",
+)
+LENGTHS_KM = 1, 10, 100
+LOOK_UPS = 20
+
+Seen = list[tuple[Estimate, NDArray[np.uint8]]]
+
+
+def run(arguments: list[str]) -> None:
+    parser = benchmark_parser("loops", label)
+    add_data(parser)
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--features", nargs="+", choices=list(FeatureKind), default=[FeatureKind.SIFT])
+    parser.add_argument("--way", type=float, default=2000.0, metavar="M", help="of the simulated loop")
+    parser.add_argument("--equal-houses", type=float, default=1000.0, metavar="M", help="of the look-alike street")
+    options = parser.parse_args(arguments)
+    cv2.setNumThreads(1)
+    with Ledger(options.output, label, features=[str(kind) for kind in options.features], way_m=options.way) as ledger:
+        if "recorded" in options.part:
+            try:
+                recorded(ledger, options.data, [FeatureKind(kind) for kind in options.features])
+            except DatasetError as error:
+                raise PerfError(str(error)) from error
+        if "simulated" in options.part:
+            simulated(ledger, options.way, options.equal_houses)
+        if "size" in options.part:
+            size(ledger)
+
+
+def estimated(path: Path) -> tuple[Camera, Seen]:
+    """A recording's frames with their estimates, by the whole pipeline."""
+    recording = open_recorded(f"kitti:{path}")
+    configuration = load(None, {"source.uri": f"kitti:{path}"})
+    with pipeline(configuration) as through:
+        estimates = [record for record in through(recording) if isinstance(record, Estimate)]
+    images = {frame.frame_id: frame.image for frame in recording.undistorted_frames() if frame.image is not None}
+    return recording.camera, [(each, images[each.frame_id]) for each in estimates if each.frame_id in images]
+
+
+def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:
+    """The two passes, and other streets against their maps."""
+    passes = {name: estimated(data / "two_passes" / name) for name in ("left", "right")}
+    others = {Path(name).name: estimated(data / name) for name in OTHERS if (data / name).exists()}
+    for kind in kinds:
+        for name, other, side in (("left", "right", -1.0), ("right", "left", 1.0)):
+            camera, frames = passes[name]
+            kept = encode_map(mapped(camera, frames, kind))
+            found = localised(passes[other], kept, kind)
+            truth = [estimate.T_world_ego @ SE2(0.0, side * BASE_M, 0.0) for estimate, _ in frames]
+            row = judged(found, truth) | {"MB_a_km": round(len(kept) / 1e3 / max(decode_map(kept).length_m, 1.0), 2)}
+            ledger.add(f"{kind}: {other} in the map of {name}", row_text(row), **row)
+            for street, drive_ in others.items():
+                states = [each.state for each in localised(drive_, kept, kind).localised()]
+                ledger.add(
+                    f"{kind}: {street} in the map of {name}",
+                    f"{len(states)} of {len(drive_[1])} frames localised: all of them would be false",
+                    false=len(states),
+                    frames=len(drive_[1]),
+                )
+
+
+def mapped(camera: Camera, frames: Seen, kind: FeatureKind) -> PlaceMap:
+    """The map of a drive."""
+    place_map = PlaceMap(MapCamera.of(camera))
+    session = MapSession(camera, place_map, True, FeatureExtractor(kind))
+    for estimate, image in frames:
+        session.step(estimate, image)
+    session.finish()
+    return place_map
+
+
+def localised(through: tuple[Camera, Seen], kept: bytes, kind: FeatureKind) -> MapTrajectory:
+    """A drive in a kept map, as `birdslam run --map-only` writes it."""
+    camera, frames = through
+    session, trajectory = MapSession(camera, decode_map(kept), False, FeatureExtractor(kind)), MapTrajectory()
+    for estimate, image in frames:
+        trajectory.add(session.step(estimate, image), estimate)
+    return trajectory
+
+
+def judged(trajectory: MapTrajectory, truth: Sequence[SE2]) -> dict[str, Any]:
+    """The localised frames against where the map's own drive says that they are."""
+    found = trajectory.localised()
+    counts = trajectory.counts
+    row: dict[str, Any] = {"frames": sum(counts.values()), "localised": len(found)}
+    first = [place for place, state in enumerate(trajectory.as_found) if state is MapState.LOCALISED]
+    row["frames_to_localise"] = first[0] if first else None
+    if found:
+        error = np.array([truth[each.frame_id].between(each.T_map_ego).log() for each in found if each.T_map_ego])
+        sigma = np.array([np.sqrt(np.diag(each.cov)) for each in found])
+        position = np.hypot(error[:, 0], error[:, 1])
+        row |= {
+            "median_m": round(float(np.median(position)), 4),
+            "worst_m": round(float(position.max()), 4),
+            "median_deg": round(float(np.degrees(np.median(np.abs(error[:, 2])))), 4),
+            "within_2_sigma": [round(float(share), 3) for share in (np.abs(error) < 2.0 * sigma).mean(axis=0)],
+        }
+    return row
+
+
+def row_text(row: dict[str, Any]) -> str:
+    if not row["localised"]:
+        return f"0 of {row['frames']} localised"
+    x, y, yaw = row["within_2_sigma"]
+    size = f", {row['MB_a_km']} MB a km" if "MB_a_km" in row else ""
+    return (
+        f"{row['localised']} of {row['frames']} localised (first as frame {row['frames_to_localise']}), "
+        f"median {row['median_m']:.3f} m {row['median_deg']:.3f} deg, worst {row['worst_m']:.3f} m, "
+        f"within 2 sigma {x:.2f} {y:.2f} {yaw:.2f}{size}"
+    )
+
+
+def simulated(ledger: Ledger, way_m: float, equal_m: float) -> None:
+    """A loop driven twice, then localised in; and a street of equal houses."""
+    street = build(block(way_m / 4.0), seed=1)
+    around = len(street.route)
+    place_map = PlaceMap(MapCamera.of(CAMERA))
+    session = _session(place_map, extend=True)
+    ends: list[tuple[SE2, SE2, Localisation]] = []
+    truth: dict[int, SE2] = {}
+    first: SE2 | None = None
+    for estimate, seen, T in drive(street, range(2 * around), seed=5):
+        first = first or T
+        truth[estimate.t_source_ns] = first.between(T)
+        ends.append((truth[estimate.t_source_ns], estimate.T_world_ego, session.step(estimate, seen)))  # type: ignore[arg-type]
+    T_true, T_odom, last = ends[-1]
+    before_m = _apart(T_true, T_odom)
+    open_m = max(_apart(truth[each.t_source_ns], each.T_map_keyframe) for each in place_map.keyframes)
+    session.finish()
+    closed_m = max(_apart(truth[each.t_source_ns], each.T_map_keyframe) for each in place_map.keyframes)
+    # Scale is no loop's to find: the frame is the first drive's, whose metres are off by a share of the way
+    end_m = _apart(T_true, last.T_map_ego or T_odom)
+    row: dict[str, Any] = {
+        "way_m": 2 * around,
+        "end_by_odometry_m": round(before_m, 3),
+        "end_in_the_map_m": round(end_m, 3),
+        "worst_keyframe_open_m": round(open_m, 3),
+        "worst_keyframe_closed_m": round(closed_m, 3),
+        "loops": sum(link.loop for link in place_map.links),
+    }
+    ledger.add(
+        f"loop of {around} m, twice",
+        f"end {before_m:.2f} m off by odometry ({before_m / around * 50.0:.2f} % of the way), {end_m:.2f} m in the map "
+        f"({end_m / around * 50.0:.2f} %); worst keyframe {open_m:.2f} m before, {closed_m:.2f} m after closing",
+        **row,
+    )
+    kept = encode_map(place_map)
+    rows = range(around // 4, around // 4 + 300)
+    for name, lateral_m, bits in (
+        ("same lane and light", 0.0, SAME_BITS),
+        ("other lane, 3 m", 3.0, SAME_BITS),
+        ("other light", 0.0, OTHER_LIGHT_BITS),
+        ("other light and lane", 3.0, OTHER_LIGHT_BITS),
+    ):
+        share, worst_m = _again(kept, street, rows, lateral_m, bits, first or SE2())
+        ledger.add(name, f"{100 * share:.0f} % localised, worst {worst_m:.2f} m", localised=share, worst_m=worst_m)
+    houses = build(along([0.0] * round(equal_m + 70.0)), seed=3, house_m=20.0)
+    session = _session(PlaceMap(MapCamera.of(CAMERA)), extend=True)
+    for estimate, seen, _ in drive(houses, range(round(equal_m)), seed=5):
+        session.step(estimate, seen)  # type: ignore[arg-type]
+    session.finish()
+    false = sum(link.loop for link in session.map.links)
+    ledger.add("equal houses", f"{false} false closures in {equal_m / 1e3:g} km", false=false, way_m=equal_m)
+
+
+def _session(place_map: PlaceMap, extend: bool) -> MapSession:
+    return MapSession(CAMERA, place_map, extend, lambda features: features)  # type: ignore[arg-type]
+
+
+def _apart(a: SE2, b: SE2) -> float:
+    return float(np.hypot(a.x_m - b.x_m, a.y_m - b.y_m))
+
+
+def _again(kept: bytes, street: Street, rows: range, lateral_m: float, bits: float, first: SE2) -> tuple[float, float]:
+    """The share of frames that are localised, and the worst of them against the nearest keyframe's own error."""
+    session = _session(decode_map(kept), extend=False)
+    frames, errors = 0, [0.0]
+    localised_frames = 0
+    for estimate, seen, T in drive(street, rows, 9, lateral_m, bits):
+        found = session.step(estimate, seen)  # type: ignore[arg-type]
+        frames += 1
+        if found.state is MapState.LOCALISED and found.T_map_ego is not None:
+            localised_frames += 1
+            errors.append(_apart(found.T_map_ego, first.between(T)))
+    return round(localised_frames / frames, 3), round(max(errors), 3)
+
+
+def size(ledger: Ledger) -> None:
+    """Descriptors of streets that share some, as those of houses do, in place of drives."""
+    chance = np.random.default_rng(0)
+    common = chance.integers(0, 256, (4000, DESCRIPTOR_BYTES), dtype=np.uint8)
+    for length_km in LENGTHS_KM:
+        place_map = PlaceMap(MapCamera.of(CAMERA))
+        count = round(1000.0 * length_km / SPACING_M)
+        for number in range(count):
+            flips = np.packbits(chance.random((MOST_POINTS, 8 * DESCRIPTOR_BYTES)) < 0.2, axis=1)
+            descriptors = common[chance.integers(0, len(common), MOST_POINTS)] ^ flips
+            points = chance.uniform(-20.0, 20.0, (MOST_POINTS, 3))
+            T = SE2(SPACING_M * number, 0.0, 0.0)
+            place_map.add(
+                Keyframe(
+                    *(number, 0, number, T, np.zeros((3, 3)), Attitude(), points),
+                    *(np.full(MOST_POINTS, 0.05), descriptors, CAMERA.height_m),
+                )
+            )
+        begun = time.process_time()
+        index = place_map.index()
+        index.look_up(place_map.keyframes[0].descriptors, 6)
+        built_s = time.process_time() - begun
+        took_ms, right = [], 0
+        for number in range(0, count, max(1, count // LOOK_UPS)):
+            own = place_map.keyframes[number].descriptors
+            seen = own ^ np.packbits(chance.random((MOST_POINTS, 8 * DESCRIPTOR_BYTES)) < SAME_BITS, axis=1)
+            begun = time.process_time()
+            found = index.look_up(seen, 6)
+            took_ms.append(1e3 * (time.process_time() - begun))
+            right += number in found
+        data = len(encode_map(place_map))
+        p50_ms, worst_ms = float(np.median(took_ms)), max(took_ms)
+        ledger.add(
+            f"{length_km} km",
+            f"{count} keyframes, {data / 1e6:.1f} MB ({data / 1e6 / length_km:.2f} a km); look-up {p50_ms:.1f} ms, "
+            f"worst {worst_ms:.1f}; index made in {built_s:.1f} s; right place among six {right} of {len(took_ms)}",
+            keyframes=count,
+            bytes=data,
+            look_up_ms=[round(each, 3) for each in took_ms],
+            built_s=round(built_s, 2),
+        )
