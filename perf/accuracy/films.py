@@ -32,7 +32,7 @@ from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import add_data, add_networks, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.perf.robustness.film_variants import Timed, Variant, variants
-from birdslam.runtime.calibration import Given, calibrate_drive, write_camera_file
+from birdslam.runtime.calibration import ROUGH, Given, calibrate_drive, write_camera_file
 from birdslam.runtime.configuration import Configuration, complete, load
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.sources.camera_file import load_camera
@@ -128,10 +128,10 @@ def camera_of(name: str, film: Film, data: Path, output: Path | None) -> Camera 
     kept = None if output is None else output / f"{name}.toml"
     if kept is not None and kept.is_file():
         return load_camera(kept)
-    camera, report = calibrate_drive(load(None, {}), film.uri.format(data=data), film.given(data))
+    found = calibrate_drive(load(None, {}), film.uri.format(data=data), film.given(data), config=ROUGH)
     if kept is not None:
-        write_camera_file(kept, camera, report)
-    return camera
+        write_camera_file(kept, found.camera, found.report)
+    return found.camera
 
 
 @dataclass
