@@ -24,6 +24,7 @@ from birdslam.calibration.lens import (
     followed_corners,
     self_calibrate,
 )
+from birdslam.calibration.lens_adjustment import IMAGES
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError
@@ -47,6 +48,7 @@ WINDSCREEN_M, WINDSCREEN_SIGMA_REL = 1.35, 0.2
 AGREES_SIGMA = 2.0
 # For a drive that follows at once: it looks for the tilt itself, and begins from what the first pass knows
 ROUGH = CalibrationConfig(max_sigma_rad=0.05, max_sigma_roll_rad=0.1)
+LEVEL_SIGMA_RAD = 0.035  # of pitch and roll where the drive shows neither: two degrees, by judgement
 METADATA_SIGMA_REL = 0.1  # of a focal length by metadata: a film often shows less than the sensor sees; by judgement
 _LENS_S = 120.0  # of a film, from which its lens is found
 _MOUNT_S = 180.0  # of a film, from which pitch, roll and height are found
@@ -81,17 +83,19 @@ def calibrate_drive(
     given: Given,
     stride: int = 1,
     config: CalibrationConfig = CalibrationConfig(),  # noqa: B008
+    must_show: bool = True,
 ) -> Calibrated:
     """The camera of a drive. `source`: a KITTI directory or a source's URI.
 
-    Raises CalibrationError, ConfigurationError, DatasetError.
+    Without `must_show` what the drive does not show (rain, a truck ahead) is assumed, with its sigma, and the report
+    says so. Raises CalibrationError, ConfigurationError, DatasetError.
     """
     uri = recording_uri(source)
     topics = configuration.source.topics
     lens, height_m = lens_of(given, uri, topics)
     size = _frame_size(uri, topics)
     if lens is None and size is not None and parsed(uri)[0].camera in ("frame size", "nothing"):
-        lens = lens_of_drive(configuration, uri, given, size, stride)
+        lens = lens_of_drive(configuration, uri, given, size, stride, must_show)
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
     recording = _open(uri, lens, height_m, stride, topics)
@@ -115,7 +119,9 @@ def calibrate_drive(
                 _lengths(recording, given.speed),
             )
         except CalibrationError as error:
-            raise CalibrationError(f"{uri}: {error}") from None
+            if must_show:
+                raise CalibrationError(f"{uri}: {error}") from None
+            found = _level(recording.camera, str(error))
     camera, height_by = _with_height(found, known_height, lens, uri)
     return Calibrated(camera, [*_report(found, camera, height_by, uri, lens)], _lengths_by(camera, height_by, lens))
 
@@ -145,9 +151,17 @@ def lens_of(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | Non
 
 
 def lens_of_drive(
-    configuration: Configuration, uri: str, given: Given, size_px: tuple[int, int], stride: int
+    configuration: Configuration,
+    uri: str,
+    given: Given,
+    size_px: tuple[int, int],
+    stride: int,
+    must_show: bool = True,
 ) -> Intrinsics:
-    """The lens of a film that says nothing of its camera, by what its images show. Raises CalibrationError."""
+    """The lens of a film that says nothing of its camera, by what its images show.
+
+    Raises CalibrationError where they do not show it; without `must_show` it is then what is known beforehand.
+    """
     width_px, height_px = size_px
     focal_px, sigma_rel, by = focal_length_of(given, uri, width_px)
     middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
@@ -164,7 +178,21 @@ def lens_of_drive(
                     found = inference.start(frame).result().detections
                     yield frame.image, np.zeros((0, 4)) if found is None else found.boxes_px
 
-        lens = self_calibrate(followed_corners(images(), camera), size_px, focal_px, sigma_rel)
+        corners = followed_corners(images(), camera)
+    lens = self_calibrate(corners, size_px, focal_px, sigma_rel)
+    if lens is None and not must_show and len(corners) >= IMAGES:
+        return Intrinsics(
+            fx_px=focal_px,
+            fy_px=focal_px,
+            cx_px=middle[0],
+            cy_px=middle[1],
+            distortion=(),
+            width_px=width_px,
+            height_px=height_px,
+            source=f"assumed, since the drive does not show it: focal length {focal_px:.0f} px +- {sigma_rel:.0%}, "
+            f"{by}; no distortion",
+            sigma_focal_px=focal_px * sigma_rel,
+        )
     if lens is None:
         raise CalibrationError(
             f"{uri}: its images do not show its lens: the car hardly drives in its first {_LENS_S:g} s, or little is "
@@ -204,6 +232,22 @@ def focal_length_of(given: Given, uri: str, width_px: int) -> tuple[float, float
         return stated_px, METADATA_SIGMA_REL, f"that of the film's own metadata, {stated_px:.0f} px"
     fov_deg, sigma_rel = FIELD_OF_VIEW_DEG[given.kind]
     return focal_by_field_of_view(width_px, fov_deg), sigma_rel, f"that of a {given.kind}, {fov_deg:g} deg across"
+
+
+def _level(camera: Camera, why: str) -> Calibration:
+    """A camera that looks level, since the drive does not show how it is mounted."""
+    camera = msgspec.structs.replace(camera, pitch_rad=0.0, roll_rad=0.0, tilt_sigma_rad=LEVEL_SIGMA_RAD)
+    var = LEVEL_SIGMA_RAD**2
+    return Calibration(
+        camera=camera,
+        cov=(var, 0.0, 0.0, var),
+        estimates=(),
+        height_checks=(),
+        yaw_rad=None,
+        path_m=0.0,
+        frames=0,
+        assumed=why,
+    )
 
 
 def _lossless(configuration: Configuration) -> Configuration:
@@ -342,7 +386,10 @@ def _lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None) -> Length
 def _report(
     found: Calibration, camera: Camera, height_by: HeightBy, uri: str, lens: Intrinsics | None
 ) -> Iterator[str]:
-    yield f"from {uri}: {found.frames} frames, {found.path_m:.0f} m"
+    if found.assumed:
+        yield f"from {uri}: assumed to look level, since the drive does not show its tilt: {found.assumed}"
+    else:
+        yield f"from {uri}: {found.frames} frames, {found.path_m:.0f} m"
     source = "the recording" if lens is None else lens.source
     error = "" if lens is None or lens.reprojection_px is None else f", reprojection {lens.reprojection_px:.2f} px"
     yield f"intrinsics: {source}{error}"

@@ -204,7 +204,7 @@ def test_what_is_no_film_is_one_clear_line(tmp_path: Path, capfd: pytest.Capture
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mov"])
-def test_a_phones_metadata_state_thefocal_length_of(suffix: str, tmp_path: Path) -> None:
+def test_a_phones_metadata_state_the_focal_length(suffix: str, tmp_path: Path) -> None:
     path = film(tmp_path / f"phone.{suffix}", range(0, 200, 40), metadata={FOCAL_KEY: "26", "title": "a drive"})
     assert VideoRecording.stated_focal_px(path) == pytest.approx(WIDTH * 26 / 36)
     focal_px, sigma_rel, by = focal_length_of(Given(), f"video:{path}", WIDTH)
@@ -218,7 +218,7 @@ def test_a_phones_metadata_state_thefocal_length_of(suffix: str, tmp_path: Path)
 
 @settings(max_examples=60)
 @given(st.data())
-def test_damaged_metadata_say_nothing_or_afocal_length_of(data: st.DataObject) -> None:
+def test_damaged_metadata_say_nothing_or_a_focal_length(data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = film(Path(folder) / "f.mp4", [0, 40], metadata={FOCAL_KEY: "26"})
         whole = bytearray(path.read_bytes())

@@ -89,6 +89,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     yaw_rad: float | None  # of the optical axis, to the left of the direction of travel; not in the camera file
     path_m: float
     frames: int
+    assumed: str = ""  # why the tilt is none that the drive shows
 
 
 class _RecordingOdometry(Odometry):

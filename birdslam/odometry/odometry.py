@@ -91,6 +91,7 @@ class Odometry:
         self._selector = CornerSelector(self.camera, cfg.fixed_corners, cfg.below_plane)
         self._stillness = NearRoadStillness(self.camera, cfg.stillness)
         self._obstructed = False  # fixed corners were left out of the newest motion
+        self._fixed = 0  # corners of the newest image that are fixed to it
         self._searched: Pose | None = None  # the step to the present image, where it was searched for
         self._road_tracks: tuple[Ints, Floats] = _NO_TRACKS
 
@@ -248,6 +249,7 @@ class Odometry:
         limits = InlierLimits(cfg.min_fitting, cfg.min_fitting_fraction, cfg.max_speed_mps * dt_s + 0.1)
         corners, located = pose_without_fixed_corners(self._window, selected, self._pose, guesses, limits)
         self._obstructed = corners is not selected
+        self._fixed = int(selected.fixed.sum())
         return corners, located if located is not None else self._two_view_pose(corners, dt_s, car)
 
     def _two_view_pose(self, corners: Corners, dt_s: float, car: CarMotion | None) -> PoseEstimate | None:
@@ -327,6 +329,8 @@ class Odometry:
     def _seems_still(self, corners: Corners) -> bool:
         """Whether the corners have hardly moved, be they of the street or on the glass."""
         displacement_px = corners.displacement_px
+        if len(displacement_px) < self.config.min_fitting <= self._fixed:
+            return True  # all that is seen stands
         return len(displacement_px) >= self.config.min_fitting and (
             quantile(displacement_px, 0.5) < self.config.zero_velocity.still_px
             and quantile(displacement_px, 0.8) < _STILL_OUTER_PX

@@ -34,7 +34,7 @@ class KeyframeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     keyframe_parallax_px: Positive = 60.0  # median parallax of a new keyframe, rotation compensated
     # With the road's comparisons left out, the town dashcam film's unit drifts from 0.97 to 1.27 of GPS in 17 s at
     # 0.7 m, from 0.96 to 1.05 at 1.5, from 0.92 to 1.06 at 3; KITTI odometry 01, 06 and the motorway clip hardly notice
-    keyframe_distance_m: Positive = 1.5  # distance of a new keyframe, whatever the parallax
+    keyframe_distance_m: Positive = 1.2  # distance of a new keyframe, whatever the parallax
     sigma_track_px: Positive = 0.35  # 1-sigma of a tracked corner
     reject_px: Positive = 2.2  # a landmark's reprojection error past it is an outlier
 

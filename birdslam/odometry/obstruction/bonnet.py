@@ -30,6 +30,7 @@ _ALIKE = 0.85  # of the best curve's share
 _MIN_COLUMNS = 8  # for a fit
 _MAX_OFFSET = 0.1  # of the image's height: half of what a curve spans, at the most, less a quarter
 _MAX_ACROSS = 0.4  # gradient of the slope across over the slope downwards: lane lines have more
+_SHARP = 4  # rows: so far from an edge's middle it has less than half of its strength
 _MARGIN_PX = 6  # above the edge, for the smoothing of the road's image
 
 
@@ -55,6 +56,7 @@ class Bonnet:
         self._images = 0
         self._driven_m = np.inf
         self.rows: Ints | None = None  # (W,) the first row that shows bonnet; None: there is none
+        self._known: NDArray[np.float64] | None = None  # the same curve, in the rows of the detection
 
     def update(self, grey: NDArray[np.uint8], top_px: int, driven_m: float) -> bool:
         """Takes (H, W) grey, `driven_m` after the image before, rows from `top_px` on; whether it has come or gone."""
@@ -98,12 +100,14 @@ class Bonnet:
         above = round(_LOWEST * (height - top_px) / _DOWNSCALE)  # rows in which no bonnet ends
         edges = [self._level_edges(sign)[above:] for sign in (1.0, -1.0)]
         smooth = cfg.smooth_px / _DOWNSCALE
-        curves = [_curve(each, smooth, most) for each in edges]
+        known = self._known if self.present else None
+        curves = [_curve(each, smooth, most, known) for each in edges]
         (share, curve), other = max(zip(curves, reversed(edges), strict=True), key=lambda found: found[0][0])
         if curve is None or share < (cfg.off_threshold if self.present else cfg.on_threshold):
             return None
         if _share(_thick(other, smooth), curve) > _LINE_SHARE * share:
             return None  # a line, brighter or darker than both its sides: a reflection, or writing
+        self._known = curve
         fine = np.interp(np.arange(width), _DOWNSCALE * (np.arange(len(curve)) + 0.5), curve)
         return np.clip(top_px + _DOWNSCALE * (above + fine) - _MARGIN_PX, 0, height).astype(np.int64)
 
@@ -117,29 +121,33 @@ class Bonnet:
         out: Bools = (
             (strength > cfg.edge_grey) & (deviation < cfg.changes * strength) & (across < _MAX_ACROSS * strength)
         )
-        return out
+        # The rim of the lamps' light by night stands as still, but it is broad
+        beside = np.full_like(strength, np.inf)
+        beside[_SHARP:-_SHARP] = np.maximum(strength[: -2 * _SHARP], strength[2 * _SHARP :])
+        return out & (beside < 0.5 * strength)
 
 
-def _curve(edges: Bools, smooth: float, most: float) -> tuple[float, NDArray[np.float64] | None]:
+def _curve(
+    edges: Bools, smooth: float, most: float, known: NDArray[np.float64] | None
+) -> tuple[float, NDArray[np.float64] | None]:
     """The share of the columns that one parabola through the edges (rows, W) crosses at an edge, and its rows (W,).
 
     By random sample consensus, seeded: a point of each third of the columns. Of curves with nearly the same share the
     highest: a caption or a reflection below the bonnet's edge is on the bonnet. `smooth` rows are near, `most` is the
-    curve's span; both in rows.
+    curve's span; both in rows. `known` (W,) is the bonnet's edge so far: where shade hides a third of it, it goes on.
     """
     columns = edges.shape[1]
     rows, at = np.nonzero(edges)
     thirds = [np.flatnonzero((at >= third * columns // 3) & (at < (third + 1) * columns // 3)) for third in range(3)]
+    x, thick = np.arange(columns) / columns - 0.5, _thick(edges, smooth)
     if min(len(third) for third in thirds) < _MIN_COLUMNS // 2:
-        return 0.0, None
-    x = np.arange(columns) / columns - 0.5
+        return (0.0, None) if known is None else (_share(thick, known), known)
     rng = np.random.default_rng(0)
     chosen = np.stack([third[rng.integers(0, len(third), _SAMPLES)] for third in thirds], axis=1)
     powers = np.stack([x[at[chosen]] ** 2, x[at[chosen]], np.ones(chosen.shape)], axis=-1)
     tried = np.linalg.solve(powers, rows[chosen][..., None].astype(np.float64))[..., 0]  # of columns that differ
     some = slice(_EACH // 2, None, _EACH)
     place = tried @ np.stack([x[some] ** 2, x[some], np.ones(len(x[some]))])  # (samples, columns)
-    thick = _thick(edges, smooth)
     row = np.round(place).astype(np.int64)
     inside = (row >= 0) & (row < len(edges))
     hit = inside & (thick[np.clip(row, 0, len(edges) - 1), np.arange(columns)[some]] > 0)

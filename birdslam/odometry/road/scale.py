@@ -342,7 +342,7 @@ class RoadScale:
         self.fit = fit
         filter_.cov = prior_cov
         tells = filter_.information(fit)
-        self._rejected *= 1.0 - tells
+        self._rejected = 0.0  # in a row: one that agrees ends it, whatever it tells of the length
         self._informed = tells >= _TOLD
         if self._informed:
             self._rejections, self._predicted = 0, False

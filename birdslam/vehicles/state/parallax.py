@@ -238,13 +238,14 @@ class Parallax:
         S = J @ PJt
         noise = self._noise(boxes, innovation, S, of_box, of_face * of_view)
         S = S + noise
-        changed = self._with_another(P, J, S, noise, innovation, boxes, T_world_ego)
-        if changed.any():
-            PJt = P @ J.swapaxes(-1, -2)
-            S = J @ PJt + noise
         shift = side_outlier_shift(boxes, innovation, config.sigma_side_outlier_rel * np.sqrt(of_box))
         share = np.minimum(config.side_outlier + self._side_outlier[rows], MAX_SIDE_OUTLIER).T
         after = update_with_side_outliers(P, PJt, S, innovation, shift, share)
+        changed = self._with_another(P, J, S, noise, innovation, boxes, T_world_ego, after.log_likelihood)
+        if changed.any():
+            PJt = P @ J.swapaxes(-1, -2)
+            S = J @ PJt + noise
+            after = update_with_side_outliers(P, PJt, S, innovation, shift, share)
         self._x[rows] = x + after.step
         self._P[rows] = after.cov
 
@@ -269,15 +270,17 @@ class Parallax:
         innovation: Floats,
         boxes: ParallaxMeasurements,
         T_world_ego: SE2,
+        log_likelihood: Floats,
     ) -> NDArray[np.bool_]:
-        """(N, FILTERS): where the box is likelier of another standing vehicle. P (N, FILTERS, 8, 8) grows there.
+        """(N, FILTERS): where the box is likelier of another standing vehicle than `log_likelihood` (N, FILTERS) has it
+        of this one, with a side that is an outlier or without. P (N, FILTERS, 8, 8) grows there.
 
         Along a row of parked vehicles boxes are mistaken for a neighbour's: what stands then seems to leap once, and
         that is no motion. Its place and its size are its own.
         """
         config, changed = self.config, np.zeros(P.shape[:2], np.bool_)
         stand = np.array([*STATIONARY, *WITHOUT_GROUND])
-        fits = _log_likelihood(innovation[:, stand], S[:, stand])
+        fits = log_likelihood[:, stand]
         at = np.flatnonzero(
             _squared_mahalanobis(innovation[:, [STANDING]], S[:, [STANDING]])[:, 0] > config.leap_sigma**2
         )

@@ -105,7 +105,7 @@ def _calibrated(configuration: Configuration, options: argparse.Namespace) -> tu
         )
     speed = Path(source.speed).expanduser() if source.speed else None
     given = Given(height_m=options.height, fov_deg=options.fov, kind=options.kind, speed=speed)
-    found = calibrate_drive(configuration, source.uri, given, source.stride, ROUGH)
+    found = calibrate_drive(configuration, source.uri, given, source.stride, ROUGH, must_show=False)
     path = Path(configuration.output) / "camera.toml"
     write_camera_file(path, found.camera, found.report)
     print("\n".join((*found.report, f"camera file: {path}")), flush=True)
