@@ -290,7 +290,7 @@ def test_evaluate_twice_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         evaluate_recordings([Drive("00", truth, 40)], lambda _: perfect(shaken(truth, 2)), tmp_path / name)
     files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
-    assert len(files) == 6
+    assert len(files) == 9
     for path in files:
         assert (tmp_path / "a" / path).read_bytes() == (tmp_path / "b" / path).read_bytes(), path
 

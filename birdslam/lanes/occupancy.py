@@ -59,8 +59,8 @@ def _placed(v: VehicleInEgo, lanes: Lanes) -> VehicleLane:
         shares = [share / total for share in shares]
     index = lanes.ego_index
     ego = 0.0 if index is None else shares[index]
-    left = sum(shares[:index] if index is not None else ())
-    right = sum(shares[index + 1 :] if index is not None else ())
+    left = sum(shares[:index] if index is not None else (), 0.0)
+    right = sum(shares[index + 1 :] if index is not None else (), 0.0)
     off = max(0.0, 1.0 - ego - left - right)
     oncoming = 0.0
     drives = 1.0 if abs(v.speed_mps) > SLOW_MPS else 1.0 - v.standing

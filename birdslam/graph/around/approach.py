@@ -15,12 +15,14 @@ from birdslam.types import Approach
 HORIZON_S = 30.0  # a later approach is told as it would be then
 NEARBY_S, NEARBY_M, NEARBY_SIGMA = 5.0, 2.0, 2.0
 SLOWEST_MPS2 = 0.01  # a squared velocity below it is none
+MOST = 1e9  # of any number: a message may hold one whose square overflows
 
 
 def approaches(p: Floats, v: Floats, p_cov: Floats, v_cov: Floats) -> list[Approach]:
     """Of N road users, p and v (N, 2) against the ego's, in m and m/s, with covariances (N, 2, 2), all in one frame."""
     if not len(p):
         return []
+    p, v, p_cov, v_cov = (np.clip(numbers, -MOST, MOST) for numbers in (p, v, p_cov, v_cov))
     square = np.maximum((v * v).sum(axis=1), SLOWEST_MPS2)
     along = (p * v).sum(axis=1)
     free = -along / square
@@ -34,10 +36,10 @@ def approaches(p: Floats, v: Floats, p_cov: Floats, v_cov: Floats) -> list[Appro
     there = p_cov + v_cov * np.square(time)[:, None, None]
     sigma_m = np.sqrt(np.maximum(_form(towards, there), 0.0))
     soon = (time <= NEARBY_S) & (distance - NEARBY_SIGMA * sigma_m <= NEARBY_M)
-    numbers = np.minimum(np.stack([time, sigma, distance, sigma_m], axis=1), 1e6).tolist()
+    rows = np.minimum(np.stack([time, sigma, distance, sigma_m], axis=1), MOST).tolist()
     return [
         Approach(time_s=t, sigma_s=s, distance_m=d, sigma_m=e, nearby=near)
-        for (t, s, d, e), near in zip(numbers, soon.tolist(), strict=True)
+        for (t, s, d, e), near in zip(rows, soon.tolist(), strict=True)
     ]
 
 

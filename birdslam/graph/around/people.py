@@ -21,6 +21,7 @@ MOST = 60  # the nearest; a message and a frame's time have their limits
 YAW_UNKNOWN = math.pi**2 / 3.0  # the variance of a direction of which nothing is known
 CHANGE_MPS = 0.8  # 1-sigma by which a velocity changes within a second, as in `people_filter.Sizes`
 TURNS_MPS = 0.5  # who moves slower has no yaw
+FARTHEST_M, FASTEST_MPS = 1e4, 1e3  # somebody beyond is no person, but numbers that no front end made
 
 
 def people_estimates(
@@ -30,6 +31,7 @@ def people_estimates(
 
     `world` is T_world_ego when they were told of, `ego_cov` (3, 3) of its tangent; `ego_mps` is the ego's velocity.
     """
+    people = [f for f in people if _is_person(f)]
     if not people:
         return ()
     if len(people) > MOST:
@@ -87,3 +89,8 @@ def people_estimates(
             people, in_world, velocity, own, velocity_cov, yaws, yaw_var, near, strict=True
         )
     )
+
+
+def _is_person(f: FollowedPerson) -> bool:
+    near = max(abs(f.x_m), abs(f.y_m)) < FARTHEST_M and max(abs(f.vx_mps), abs(f.vy_mps)) < FASTEST_MPS
+    return near and max(map(abs, f.cov)) < FARTHEST_M**2 and max(map(abs, f.velocity_cov)) < FASTEST_MPS**2
