@@ -15,18 +15,17 @@ from birdslam.types import Approach
 HORIZON_S = 30.0  # a later approach is told as it would be then
 NEARBY_S, NEARBY_M, NEARBY_SIGMA = 5.0, 2.0, 2.0
 SLOWEST_MPS2 = 0.01  # a squared velocity below it is none
-MOST = 1e9  # of any number: a message may hold one whose square overflows
+MOST = 1e9  # of any number that is told
 
 
 def approaches(p: Floats, v: Floats, p_cov: Floats, v_cov: Floats) -> list[Approach]:
     """Of N road users, p and v (N, 2) against the ego's, in m and m/s, with covariances (N, 2, 2), all in one frame."""
     if not len(p):
         return []
-    p, v, p_cov, v_cov = (np.clip(numbers, -MOST, MOST) for numbers in (p, v, p_cov, v_cov))
     square = np.maximum((v * v).sum(axis=1), SLOWEST_MPS2)
     along = (p * v).sum(axis=1)
     free = -along / square
-    time = np.clip(free, 0.0, HORIZON_S)
+    time = np.minimum(np.maximum(free, 0.0), HORIZON_S)
     at = p + v * time[:, None]
     distance = np.sqrt((at * at).sum(axis=1))
     by_p, by_v = -v / square[:, None], (-p - 2.0 * free[:, None] * v) / square[:, None]
