@@ -9,6 +9,7 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Sequence
+from operator import itemgetter
 
 from birdslam.geometry.se2 import SE2
 from birdslam.types import HiddenFan, RoadUser
@@ -22,22 +23,27 @@ LEAST_M = 0.3  # a fan that is shorter hides nobody
 def hidden_fans(vehicles: Sequence[RoadUser], world: SE2, camera_m: float) -> tuple[HiddenFan, ...]:
     """Of the vehicles ahead, the nearest first; `world` is T_world_ego, `camera_m` the camera's height."""
     back, origin = cmath.rect(1.0, -world.yaw_rad), complex(world.x_m, world.y_m)
-    fans = []
+    fans: list[tuple[float, HiddenFan]] = []
     for vehicle in vehicles:
         T = vehicle.T_world_vehicle
-        at, heading = (complex(T.x_m, T.y_m) - origin) * back, cmath.rect(1.0, T.yaw_rad - world.yaw_rad)
-        if at.real <= NEAREST_M or abs(at) > FARTHEST_M or not vehicle.in_sight:
+        at = (complex(T.x_m, T.y_m) - origin) * back
+        away_m = abs(at)
+        if at.real <= NEAREST_M or away_m > FARTHEST_M or not vehicle.in_sight:
             continue
-        ahead, left = heading * vehicle.length_m / 2.0, heading * 1j * vehicle.width_m / 2.0
-        corners = [at + ahead + left, at - ahead + left, at - ahead - left, at + ahead - left]
-        if min(c.real for c in corners) <= NEAREST_M:
+        ahead = cmath.rect(0.5 * vehicle.length_m, T.yaw_rad - world.yaw_rad)
+        left = 1j * ahead * (vehicle.width_m / max(vehicle.length_m, LEAST_M))
+        corners = (at + ahead + left, at - ahead + left, at - ahead - left, at + ahead - left)
+        if min(corners[0].real, corners[1].real, corners[2].real, corners[3].real) <= NEAREST_M:
             continue
-        first, last = (pick(corners, key=cmath.phase) for pick in (min, max))  # its right and its left outline
+        slopes = [c.imag / c.real for c in corners]  # in the order of the angles, since all lie ahead
+        right, left = corners[slopes.index(min(slopes))], corners[slopes.index(max(slopes))]  # its outline
+        right_m, left_m = abs(right), abs(left)
         over_m = camera_m - (vehicle.height_m or USUAL_HEIGHT_M)
-        reach = math.inf if over_m <= 0.0 else camera_m / over_m
-        ends = [c * min(reach, FARTHEST_M / abs(c)) for c in (first, last)]
-        if all(abs(e) > abs(c) + LEAST_M for e, c in zip(ends, (first, last), strict=True)):
-            polygon = (first, ends[0], ends[1], last)
-            x_m, y_m = tuple(c.real for c in polygon), tuple(c.imag for c in polygon)
-            fans.append((abs(at), HiddenFan(vehicle=vehicle.vehicle, x_m=x_m, y_m=y_m)))
-    return tuple(fan for _, fan in sorted(fans, key=lambda fan: fan[0]))
+        reach = camera_m / over_m if over_m > 0.0 else math.inf
+        beyond_right, beyond_left = right * min(reach, FARTHEST_M / right_m), left * min(reach, FARTHEST_M / left_m)
+        if abs(beyond_right) > right_m + LEAST_M and abs(beyond_left) > left_m + LEAST_M:
+            x_m = right.real, beyond_right.real, beyond_left.real, left.real
+            y_m = right.imag, beyond_right.imag, beyond_left.imag, left.imag
+            fans.append((away_m, HiddenFan(vehicle=vehicle.vehicle, x_m=x_m, y_m=y_m)))
+    fans.sort(key=itemgetter(0))
+    return tuple(fan for _, fan in fans)
