@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from birdslam.bench.tracking.leave_one_out import LeftOut
@@ -87,6 +87,11 @@ def _table_of_left_out(rows: Sequence[LeftOut]) -> str:
     return "\n".join([f"{'sequence':10}{titles}  constant", *lines])
 
 
+def _in_columns(cells: Iterable[tuple[float | None, str]]) -> str:
+    """Each value by its format; one that there is not keeps its column."""
+    return "".join("-".rjust(len(format(0.0, form))) if value is None else format(value, form) for value, form in cells)
+
+
 def _table_of_people(rows: Sequence[PeopleRow]) -> str:
     titles = f"{'depth':>9}{'bias':>9}{'across m':>10}{'1 sigma':>9}{'2 sigma':>9}{'walking':>9}{'standing':>9}"
     lines = [f"{'sequence':11}{'range m':>9}{'n':>7}{titles}  (m/s: error of who walks, speed of who stands)"]
@@ -100,7 +105,7 @@ def _table_of_people(rows: Sequence[PeopleRow]) -> str:
             (row.walking_speed_error_median_mps, "9.2f"),
             (row.standing_speed_median_mps, "9.2f"),
         )
-        numbers = "".join(f"{'-':>9}" if value is None else format(value, form) for value, form in cells)
+        numbers = _in_columns(cells)
         lines.append(f"{row.sequence:11}{row.range:>9}{row.n:>7}{numbers}")
     return "\n".join(lines)
 
@@ -128,7 +133,7 @@ def _table(rows: Sequence[LocalisationRow]) -> str:
             (row.nees, "7.2f"),
             (row.yaw_off_10_deg, "9.0%"),
         )
-        numbers = "".join(format(value, form) for value, form in cells if value is not None)
+        numbers = _in_columns(cells)
         lines.append(f"{row.sequence:12}{row.range:>9}{row.cars:>6}{row.n:>7}{numbers}")
     return "\n".join(lines)
 
@@ -136,7 +141,6 @@ def _table(rows: Sequence[LocalisationRow]) -> str:
 def _table_of_tilts(rows: Sequence[TiltRow]) -> str:
     lines = [f"{'sequence':12}{'frames':>8}{'pitch mrad':>12}{'roll mrad':>11}  median errors against the labels' road"]
     for row in rows:
-        cells = (row.pitch_error_median_mrad, "12.1f"), (row.roll_error_median_mrad, "11.1f")
-        numbers = "".join(format(value, form) for value, form in cells if value is not None)
+        numbers = _in_columns([(row.pitch_error_median_mrad, "12.1f"), (row.roll_error_median_mrad, "11.1f")])
         lines.append(f"{row.sequence:12}{row.n:>8}{numbers}")
     return "\n".join(lines)
