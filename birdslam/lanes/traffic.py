@@ -53,9 +53,10 @@ class Traffic:
             self._counted[line.line, user.vehicle] = None
             odds = self._log_odds.pop(line.line, 0.0) + (EVIDENCE if along < 0.0 else -EVIDENCE)
             self._log_odds[line.line] = min(max(odds, -MOST), MOST)
-        for kept in (self._log_odds, self._counted):
-            while len(kept) > MEMORY_LINES:
-                del kept[next(iter(kept))]
+        while len(self._log_odds) > MEMORY_LINES:
+            del self._log_odds[next(iter(self._log_odds))]
+        while len(self._counted) > MEMORY_LINES:
+            del self._counted[next(iter(self._counted))]
 
     def against(self, lanes: Lanes, user: UserInEgo) -> float:
         """The probability that a road user moves against the ego's direction, were it to move."""
