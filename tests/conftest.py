@@ -1,4 +1,5 @@
-"""Where real recordings and networks lie, how property tests are run, and which tests may start processes.
+"""Where real recordings and networks lie, how property tests are run, which tests may start processes, and that these
+end with them.
 
 `BIRDSLAM_DATA` and `BIRDSLAM_MODELS` name the folders of real recordings and networks; without them they lie in
 ../shared beside the project.
@@ -17,6 +18,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from birdslam.runtime.environment import ENVIRONMENT
+from tests.leftovers import end_with_this_process
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -68,6 +70,7 @@ def join(base: Path) -> Iterator[Any]:
         yield lambda node, **options: stack.enter_context(Bus("car", node, runtime_dir=base, **options))
 
 
+_watcher = end_with_this_process()  # and one for each process of pytest
 _may_start_processes = True
 
 
