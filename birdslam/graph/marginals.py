@@ -98,11 +98,11 @@ def _approaches(
     back, origin = cmath.rect(1.0, -window.world.yaw_rad), complex(window.world.x_m, window.world.y_m)
     numbers: list[complex] = []
     for pose, ((x, y), (xx, xy, _, yy)), node in zip(poses, told, vehicles, strict=True):
-        p = (complex(pose.x_m, pose.y_m) - origin) * back
-        v = complex(x, y) * back - ego_mps
+        at = (complex(pose.x_m, pose.y_m) - origin) * back
+        velocity = complex(x, y) * back - ego_mps
         turned = complex(0.5 * (xx - yy), xy) * back * back
-        by_size = node.size_bias_rel * p
-        numbers += (p, v, 0.5 * (xx + yy), turned, 0.5 * abs(by_size) ** 2, 0.5 * by_size * by_size)
+        by_size = node.size_bias_rel * at
+        numbers += (at, velocity, 0.5 * (xx + yy), turned, 0.5 * abs(by_size) ** 2, 0.5 * by_size * by_size)
     p, v, u_mean, u_deviator, size_mean, size_deviator = np.array(numbers).reshape(-1, 6).T
     xx, xy, yy = window.P.take(window.layout.places)
     means = np.array([0.5 * (xx + yy) + size_mean.real, u_mean.real])
