@@ -30,6 +30,8 @@ from birdslam.outputs.line_map import LineMap
 from birdslam.perception import Segmentation
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.evaluation.still_lanes import evaluate_stills
+from birdslam.runtime.recording import scene
+from birdslam.runtime.recording.foxglove import SceneUpdate
 from birdslam.sources.recording import DatasetError
 from birdslam.types import Bound, Estimate, FollowedPerson, LaneChange, LaneLine, Lanes, LineKind
 
@@ -319,6 +321,21 @@ def test_the_map_has_each_line_once(tmp_path: Path) -> None:
         assert np.all(np.diff(points[:, 0]) > 0.0)
         assert len(feature["properties"]["sigma_m"]) == len(points)
         assert feature["properties"]["kind"] == "solid"
+
+
+def test_foxglove_draws_lines_where_they_are() -> None:
+    lanes = EgoLane().lanes((line(4, 1.75), line(5, -1.75, LineKind.EDGE)), 0, 0.0)
+    estimate = Estimate(
+        epoch=0, frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, T_world_ego=SE2(5.0, 1.0, 0.3), cov=(0.0,) * 9,
+        valid=True, lanes=lanes,
+    )  # fmt: skip
+    (drawn,) = (message for channel, message in scene.from_estimate(estimate, 0) if channel == "/scene")
+    assert isinstance(drawn, SceneUpdate)
+    (entity,) = (entity for entity in drawn.entities if entity.id == "lanes")
+    assert entity.frame_id == "ego"
+    assert [{point.y for point in strip.points} for strip in entity.lines] == [{1.75}, {-1.75}, {0.0}]
+    assert [strip.color for strip in entity.lines] == [scene.WHITE_LINE, scene.UNSEEN, scene.OWN_LANE]
+    assert entity.lines[0].points[-1].x >= 50.0
 
 
 def test_the_scores_of_known_errors() -> None:
