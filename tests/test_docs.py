@@ -231,9 +231,10 @@ WORDS: list[tuple[str, ...]] = [(), *((word,) for word in NESTED)]
 @cache
 def help_of(*words: str) -> str:
     """What `birdslam WORDS --help` prints, on long lines."""
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out, pytest.raises(SystemExit):
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out:
         patch.setenv("COLUMNS", "400")
-        main([*words, "--help"])
+        with pytest.raises(SystemExit):
+            main([*words, "--help"])
     return out.getvalue()
 
 
