@@ -30,10 +30,10 @@ browser:
 			&& apt-get update -q && apt-get install -qy --no-install-recommends chromium; } \
 		|| echo "no Chromium: tests of pages in a browser will skip (Debian, as root: apt-get install chromium)"
 
-# First the tests that compute, one on each core; then those that start processes and wait for them, two at a time
+# First the tests that compute, one on each core; then those that start processes and wait for them, three at a time
 test: browser setup
 	$(BIN)/python -m pytest -n $(CORES) --dist worksteal -m 'not processes and $(ON_EACH_CHANGE)'
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'processes and $(ON_EACH_CHANGE)'
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m 'processes and $(ON_EACH_CHANGE)'
 
 # Then property tests with examples that are new each time
 test-slow: setup

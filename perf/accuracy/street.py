@@ -76,7 +76,7 @@ def street_loop() -> NDArray[np.uint8]:
     """
     u_px, v_px = np.arange(WIDTH_PX) - WIDTH_PX / 2, np.arange(HEIGHT_PX) - HEIGHT_PX / 2
     out = np.full((LOOP_FRAMES, HEIGHT_PX, WIDTH_PX), SKY, dtype=np.uint8)
-    driven_m = FRAME_M * np.arange(LOOP_FRAMES)
+    driven_m = np.arange(LOOP_FRAMES, dtype=np.float64) * FRAME_M
 
     def draw(rows: Any, columns: Any, texture: Texture, depth_m: list[float], across_m: list[Floats]) -> None:
         """Pixels of one depth, in all frames; `depth_m` and `across_m` of the edges of what each covers."""
