@@ -28,7 +28,12 @@ os.environ.update(ENVIRONMENT, OPENCV_FOR_THREADS_NUM="1")
 # No time limits, since machines are shared. `make test` draws the same examples each time; `make test-slow` draws new
 # ones by the profile "explore", and prints how to repeat one that fails.
 settings.register_profile(
-    "repeat", deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
+    "repeat",
+    max_examples=50,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.too_slow],
 )
 settings.register_profile(
     "explore", settings.get_profile("repeat"), derandomize=False, max_examples=1000, print_blob=True
