@@ -74,7 +74,7 @@ class Recovered:
 class HiddenCells:
     """Collects the segmented frames of a drive."""
 
-    def __init__(self, camera: Camera, config: LanesConfig, complete: Completion) -> None:
+    def __init__(self, camera: Camera, config: LanesConfig, complete: Completion | None) -> None:
         self.camera, self.config = camera, config
         self._amodal = AmodalLanes(config, complete)
         self._centres_m = cell_centres_m(np.ones(config.shape, bool), config)
@@ -91,8 +91,8 @@ class HiddenCells:
         looked_m, _ = points_of(Segmentation(everywhere, everywhere), self.camera, ground, boxes_px, self.config)
         self._amodal.add(T_world_ego, road_m, line_m)
         view = lane_view(self._amodal, T_world_ego)
-        clouds = tuple(points.astype(np.float32)[:, None] for points in (road_m, line_m, looked_m))
-        self._looks.append(_Look(T_world_ego, clouds, view, self._hidden(ground, boxes_px, view.seen)))
+        road, line, looked = (points.astype(np.float32)[:, None] for points in (road_m, line_m, looked_m))
+        self._looks.append(_Look(T_world_ego, (road, line, looked), view, self._hidden(ground, boxes_px, view.seen)))
         return len(self._looks) - 1
 
     def _hidden(self, ground: GroundPlane, boxes_px: NDArray[np.float64], seen: Grids) -> Bools:
@@ -134,8 +134,9 @@ class HiddenCells:
             if not judged.any():
                 continue
             frames, known_cells = frames + 1, known_cells + int(judged.sum())
-            closed = np.stack(
-                [cv2.morphologyEx(g, cv2.MORPH_CLOSE, np.ones((CLOSING_CELLS,) * 2)) for g in look.view.seen]
+            kernel = np.ones((CLOSING_CELLS, CLOSING_CELLS))
+            closed: Grids = np.stack(
+                [np.asarray(cv2.morphologyEx(g, cv2.MORPH_CLOSE, kernel), np.float32) for g in look.view.seen]
             )
             for name, grids in zip(METHODS, (look.view.seen, closed, look.view.completed), strict=True):
                 cells[name] += self._overlap(grids, later, judged)
