@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
 from birdslam.ros.bag import BagTopics
-from birdslam.runtime.calibration import METADATA_SIGMA_REL, Given, focal_length_of
+from birdslam.runtime.calibration.given import METADATA_SIGMA_REL, Given, focal_length_of
 from birdslam.runtime.cli.main import main
 from birdslam.sources.films.video import VideoRecording
 from birdslam.sources.opening import open_recording
