@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -54,22 +55,30 @@ def lens_of(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | Non
     return None, height_m
 
 
-def focal_length_of(given: Given, uri: str, width_px: int) -> tuple[float, float, str]:
-    """What is known of it before the drive: as stated, by the film's metadata, or by the kind of camera.
+class FocalLength(NamedTuple):
+    """What is known of a focal length before the drive, with its 1-sigma as a fraction, and by what."""
 
-    In pixels, its 1-sigma as a fraction, and where it comes from. Raises ConfigurationError.
-    """
+    px: float
+    sigma_rel: float
+    by: str
+    by_view: bool = True  # of the image across, of which nobody says whether the lens's distortion is counted
+
+
+def focal_length_of(given: Given, uri: str, width_px: int) -> FocalLength:
+    """As stated, by the film's metadata, or by the kind of camera. Raises ConfigurationError."""
     if given.fov_deg is not None:
         if not 10.0 <= given.fov_deg <= 150.0:
             raise ConfigurationError(f"--fov {given.fov_deg:g}: is no field of view of a camera here (10 to 150 deg)")
         focal_px = focal_by_field_of_view(width_px, given.fov_deg)
-        return focal_px, STATED_SIGMA_REL, f"as stated, {given.fov_deg:g} deg across"
+        return FocalLength(focal_px, STATED_SIGMA_REL, f"as stated, {given.fov_deg:g} deg across")
     kind, path = class_and_path(uri)
     stated_px = kind.stated_focal_px(path)
     if stated_px is not None and focal_by_field_of_view(width_px, 150.0) < stated_px:
-        return stated_px, METADATA_SIGMA_REL, f"that of the film's own metadata, {stated_px:.0f} px"
+        by = f"that of the film's own metadata, {stated_px:.0f} px"
+        return FocalLength(stated_px, METADATA_SIGMA_REL, by, by_view=False)
     fov_deg, sigma_rel = FIELD_OF_VIEW_DEG[given.kind]
-    return focal_by_field_of_view(width_px, fov_deg), sigma_rel, f"that of a {given.kind}, {fov_deg:g} deg across"
+    focal_px = focal_by_field_of_view(width_px, fov_deg)
+    return FocalLength(focal_px, sigma_rel, f"that of a {given.kind}, {fov_deg:g} deg across")
 
 
 def lossless(configuration: Configuration) -> Configuration:

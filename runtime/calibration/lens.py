@@ -36,7 +36,8 @@ def lens_of_drive(
     Raises CalibrationError where they do not show it; without `must_show` it is then what is known beforehand.
     """
     width_px, height_px = size_px
-    focal_px, sigma_rel, by = focal_length_of(given, uri, width_px)
+    known = focal_length_of(given, uri, width_px)
+    focal_px, sigma_rel, by = known.px, known.sigma_rel, known.by
     middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
     camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
     recording = open_recorded(uri, camera, stride, configuration.source.topics)
@@ -52,7 +53,7 @@ def lens_of_drive(
                     yield frame.image, np.zeros((0, 4)) if found is None else found.boxes_px
 
         corners = followed_corners(images(), camera)
-    lens = self_calibrate(corners, size_px, focal_px, sigma_rel)
+    lens = self_calibrate(corners, size_px, focal_px, sigma_rel, known.by_view)
     if lens is None and not must_show and len(corners) >= IMAGES:
         return Intrinsics(
             fx_px=focal_px,
