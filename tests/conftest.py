@@ -75,7 +75,7 @@ def join(base: Path) -> Iterator[Any]:
         yield lambda node, **options: stack.enter_context(Bus("car", node, runtime_dir=base, **options))
 
 
-_watcher = end_with_this_process()  # and one for each process of pytest
+end_with_this_process()
 _may_start_processes = True
 
 
