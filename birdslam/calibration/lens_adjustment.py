@@ -209,7 +209,7 @@ def _reduced(system: _System, damping: float) -> tuple[Floats, Floats, Floats, F
     Information (2, 2) and gradient (2,) of the lens; how poses follow it (W, V - 2, 2) and what they are without it
     (W, V - 2); inverse of the corners' (P, 3, 3).
     """
-    inverse = np.linalg.inv(system.corner * (1.0 + damping * np.eye(3)))
+    inverse = np.asarray(np.linalg.inv(system.corner * (1.0 + damping * np.eye(3))), np.float64)
     part = inverse @ system.corner_by_view
     begin = np.flatnonzero(np.diff(system.of, prepend=-1))
     view = system.view * (1.0 + damping * np.eye(system.view.shape[-1]))
@@ -219,7 +219,9 @@ def _reduced(system: _System, damping: float) -> tuple[Floats, Floats, Floats, F
     poses, lens = slice(None, -2), slice(-2, None)
     solved = np.linalg.solve(view[:, poses, poses], np.concatenate([view[:, poses, lens], gradient[:, poses, None]], 2))
     by_lens, alone = solved[..., :2], solved[..., 2]
-    information = (view[:, lens, lens] - view[:, lens, poses] @ by_lens).sum(axis=0) + system.prior
+    information = np.asarray(
+        (view[:, lens, lens] - view[:, lens, poses] @ by_lens).sum(axis=0) + system.prior, np.float64
+    )
     of_lens = gradient[:, lens] - np.einsum("wij,wj->wi", view[:, lens, poses], alone)
     return information, of_lens.sum(axis=0) + system.prior_gradient, by_lens, alone, inverse
 
@@ -227,8 +229,8 @@ def _reduced(system: _System, damping: float) -> tuple[Floats, Floats, Floats, F
 def _solve(system: _System, damping: float) -> tuple[Floats, Floats, Floats]:
     """Steps of the poses (W, IMAGES - 1, 6), of the lens (2,) and of the corners (P, 3)."""
     information, gradient, by_lens, alone, inverse = _reduced(system, damping)
-    lens: Floats = -np.linalg.solve(information, gradient)
-    poses = -alone - by_lens @ lens
+    lens = np.asarray(-np.linalg.solve(information, gradient), np.float64)
+    poses = np.asarray(-alone - by_lens @ lens, np.float64)
     windows = len(poses)
     steps = np.concatenate([poses, np.tile(lens, (windows, 1))], axis=1)[system.of]
     corner = -np.einsum(
