@@ -30,7 +30,7 @@ import zenoh
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
-from birdslam.loops.gnss_file import GnssError, read_fixes
+from birdslam.loops.gnss.files import GnssError, read_fixes
 from birdslam.loops.keyframe import Keyframe, Link
 from birdslam.loops.map_file import HEAD, MAGIC, MapError, decode_map, encode_map
 from birdslam.loops.place_map import MapCamera, PlaceMap

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,25 @@ from birdslam.trajectory import Transform, ego_pose
 from birdslam.types import Attitude
 
 Floats = NDArray[np.float64]
+
+
+class Placed(Protocol):
+    """A node of the graph."""
+
+    @property
+    def number(self) -> int: ...
+    @property
+    def T_map_keyframe(self) -> SE2: ...
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Where a keyframe is by the fix of GNSS nearest to it, brought there along the drive's way."""
+
+    latitude_deg: float
+    longitude_deg: float
+    sigma_m: float  # 1-sigma of the fix by itself
+    weighed_m: float  # with what it shares with those before and after it
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +48,7 @@ class Keyframe:
     sigma_depth_rel: Floats  # (N,) 1-sigma of each point's depth from the keyframe's camera, as a fraction
     descriptors: NDArray[np.uint8]  # (N, 32)
     camera_height_m: float
-    latitude_deg: float = field(default=float("nan"))
-    longitude_deg: float = field(default=float("nan"))
+    gnss: Fixed | None = None
 
     @property
     def T_map(self) -> Transform:

@@ -1,4 +1,4 @@
-"""A place on Earth: the map's frame tied to WGS 84 by GNSS fixes, with a gate against wrong ones.
+"""Where a drive is on Earth: its frame tied to WGS 84 by GNSS fixes, with a gate against wrong ones.
 
 Fixes are joined to the drive's own way by their time. One similarity of the plane (turn, shift and scale, since metres
 are odometry's) is adjusted to all of them with Cauchy weights, together with the fixes' delay. What a wrong fix says is
@@ -8,13 +8,14 @@ out of the gate; jumps and multipath of some seconds do not turn a way that odom
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.se2 import SE2
+from birdslam.geometry.se2 import SE2, wrap
+from birdslam.loops.map_pose import EarthPose
 from birdslam.types import NS_PER_S
 
 Floats = NDArray[np.float64]
@@ -35,6 +36,11 @@ class GnssFix(msgspec.Struct, frozen=True, kw_only=True):
     longitude_deg: float
     sigma_m: float = DEFAULT_SIGMA_M  # 1-sigma, across the ground
     speed_mps: float | None = None
+
+
+def is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:
+    """Whether there is such a place; NaN is none."""
+    return abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0
 
 
 class EarthError(ValueError):
@@ -72,6 +78,43 @@ class Earth:
         lat, lon, _ = pymap3d.enu2geodetic(enu[:, 0], enu[:, 1], zero, self.latitude_deg, self.longitude_deg, 0.0)
         return np.column_stack([np.atleast_1d(lat), np.atleast_1d(lon)])
 
+    def xy(self, degrees: Floats) -> Floats:
+        """(N, 2) in the map of latitudes and longitudes in degrees (N, 2)."""
+        import pymap3d  # here: only who comes from Earth needs it
+
+        east, north, _ = pymap3d.geodetic2enu(
+            degrees[:, 0], degrees[:, 1], 0.0, self.latitude_deg, self.longitude_deg, 0.0
+        )
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        enu = np.column_stack([east, north]) - (self.east_m, self.north_m)
+        out: Floats = enu @ np.array([[c, -s], [s, c]]) / self.scale
+        return out
+
+    def seen_from(self, T_other_map: SE2) -> Earth:
+        """The same place in another map's frame."""
+        T = T_other_map.inverse()
+        east, north = (float(number) for number in self.enu(np.array([[T.x_m, T.y_m]]))[0])
+        return replace(self, east_m=east, north_m=north, yaw_rad=wrap(self.yaw_rad + T.yaw_rad))
+
+    def pose(self, T_map_ego: SE2, cov: Floats) -> EarthPose:
+        """An ego of the map with its covariance (3, 3) of the tangent there, on Earth."""
+        p = np.array([T_map_ego.x_m, T_map_ego.y_m])
+        latitude_deg, longitude_deg = (float(number) for number in self.wgs84(p[None])[0])
+        yaw_rad = wrap(self.yaw_rad + T_map_ego.yaw_rad)
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        lever = self.scale * np.array([[c, -s], [s, c]]) @ p
+        J = np.array([[1.0, 0.0, -lever[1], lever[0]], [0.0, 1.0, lever[0], lever[1]]])
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        R = self.scale * np.array([[c, -s], [s, c]])
+        place = J @ self.cov @ J.T + R @ cov[:2, :2] @ R.T
+        return EarthPose(
+            latitude_deg=latitude_deg,
+            longitude_deg=longitude_deg,
+            cov=tuple(float(number) for number in place.ravel()),
+            yaw_rad=yaw_rad,
+            yaw_sigma_rad=math.sqrt(self.cov[2, 2] + cov[2, 2]),
+        )
+
     def height_hint(self, height_m: float) -> str:
         """What the metres of the fixes say of the camera's height; "" where they say nothing against it."""
         sigma = math.sqrt(self.cov[3, 3])
@@ -103,12 +146,12 @@ def place_on_earth(t_ns: NDArray[np.int64], poses: list[SE2], fixes: list[GnssFi
         if inside.sum() < LEAST_FIXES:
             continue
         here = np.column_stack([np.interp(at[inside], seconds, column) for column in xy.T])
-        fit = _fit(here, enu[inside], sigma[inside])
-        cost = float(np.log1p(fit[2]).sum() + (inside.size - inside.sum()) * math.log1p(GATE**2))
+        found = fit(here, enu[inside], sigma[inside])
+        cost = float(np.log1p(found[2]).sum() + (inside.size - inside.sum()) * math.log1p(GATE**2))
         # Delays are told apart by the speed's changes alone: a prior of half a second keeps those that say nothing at 0
         cost += 0.5 * (delay_s / 0.5) ** 2
         if best is None or cost < best[0]:
-            best = cost, float(delay_s), here, inside, fit
+            best = cost, float(delay_s), here, inside, found
     if best is None:
         raise EarthError(f"{len(fixes)} fixes, and fewer than {LEAST_FIXES} of them within the drive's time")
     _, delay_s, here, inside, (parameters, cov, chi2) = best
@@ -134,7 +177,7 @@ def place_on_earth(t_ns: NDArray[np.int64], poses: list[SE2], fixes: list[GnssFi
     )
 
 
-def _fit(xy: Floats, enu: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats]:
+def fit(xy: Floats, enu: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats]:
     """(east, north, yaw, log scale), their covariance, and each fix's chi-square; Gauss-Newton with Cauchy weights.
 
     The start is a line through a robust pair of distant medians: Umeyama's closed form (1991) on all.
