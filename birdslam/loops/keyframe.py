@@ -42,7 +42,7 @@ class Keyframe:
     drive: int  # the drive that it is of: 0 made the map, further ones extended it
     t_source_ns: int
     T_map_keyframe: SE2
-    cov: Floats  # (3, 3) of T_map_keyframe, of the tangent at the pose
+    cov: Floats  # (3, 3) of T_map_keyframe, of the tangent at the pose; where fixes placed the map, of its place there
     attitude: Attitude
     points_m: Floats  # (N, 3)
     sigma_depth_rel: Floats  # (N,) 1-sigma of each point's depth from the keyframe's camera, as a fraction

@@ -75,6 +75,7 @@ class EarthRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_f
     fixes: _Number
     outliers: _Number
     rms_m: float
+    late_m: float
 
 
 class MapRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -159,11 +160,11 @@ def _map_of(record: MapRecord) -> PlaceMap:
 
 def _earth_record(earth: Earth) -> EarthRecord:
     at = earth.latitude_deg, earth.longitude_deg, earth.east_m, earth.north_m, earth.yaw_rad, earth.scale
-    return EarthRecord(*at, _cov(earth.cov), earth.fixes, earth.outliers, earth.rms_m)
+    return EarthRecord(*at, _cov(earth.cov), earth.fixes, earth.outliers, earth.rms_m, earth.late_m)
 
 
 def _earth(record: EarthRecord) -> Earth:
-    numbers = (record.east_m, record.north_m, record.yaw_rad, record.rms_m)
+    numbers = (record.east_m, record.north_m, record.yaw_rad, record.rms_m, record.late_m)
     if not (math.isfinite(sum(numbers)) and is_on_earth(record.latitude_deg, record.longitude_deg)):
         raise MapError("its place on Earth is none")
     if not (0.5 < record.scale < 2.0 and max(map(abs, numbers)) < 1e7):
@@ -173,7 +174,7 @@ def _earth(record: EarthRecord) -> Earth:
         raise MapError("the covariance of its place on Earth is none")
     return Earth(
         *(record.latitude_deg, record.longitude_deg, record.east_m, record.north_m, record.yaw_rad, record.scale, cov),
-        *(0.0, record.fixes, record.outliers, record.rms_m, None),
+        *(0.0, record.fixes, record.outliers, record.rms_m, None, record.late_m),
     )
 
 

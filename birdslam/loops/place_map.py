@@ -16,11 +16,13 @@ from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.earth import Earth
 from birdslam.loops.gnss.factors import OnEarth
 from birdslam.loops.keyframe import Fixed, Keyframe, Link
+from birdslam.loops.map_pose import EarthPose
 from birdslam.loops.place_index import LEARNED_FROM, PlaceIndex, index_of, learn_words
 from birdslam.loops.verification import LocalMap
 
 NEIGHBOUR_M = 9.0  # keyframes this near help each other
 NEIGHBOURS = 3
+EARTH_REACH_M = 100.0  # a place on Earth is that of the keyframes around it
 SAME_HEADING_RAD = math.radians(60.0)
 OTHER_HEIGHT, OTHER_FOCAL_LENGTH = 0.1, 0.1  # logarithms of ratios
 
@@ -113,6 +115,15 @@ class PlaceMap:
         self.place(found.poses)
         self.keyframes = [replace(each, gnss=found.fixed.get(each.number)) for each in self.keyframes]
         self.earth = found.earth
+
+    def on_earth(self, T_map_ego: SE2, cov: NDArray[np.float64]) -> EarthPose | None:
+        """An ego with its covariance (3, 3) of the tangent; None: the map is not on Earth, or not where the ego is."""
+        rows = self.near(T_map_ego, EARTH_REACH_M)
+        if self.earth is None or not rows:
+            return None
+        nearest = self.keyframes[rows[0]]
+        Ad = T_map_ego.between(nearest.T_map_keyframe).adjoint()
+        return self.earth.pose(T_map_ego, cov + Ad @ nearest.cov @ Ad.T)
 
     def index(self) -> PlaceIndex:
         """Made when it is first asked for."""

@@ -108,9 +108,7 @@ class MapDrive:
 
     def on_earth(self, found: Localisation) -> EarthPose | None:
         """The ego on Earth, where the map is."""
-        if self.map.earth is None or found.T_map_ego is None:
-            return None
-        return self.map.earth.pose(found.T_map_ego, found.cov)
+        return None if found.T_map_ego is None else self.map.on_earth(found.T_map_ego, found.cov)
 
     @property
     def unsaved(self) -> bool:

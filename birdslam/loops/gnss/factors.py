@@ -130,6 +130,5 @@ def _fitted(earth: Earth, poses: dict[int, tuple[SE2, Floats]], fixed: dict[int,
         north_m=float(parameters[1]),
         yaw_rad=float(parameters[2]),
         scale=float(math.exp(parameters[3])),
-        cov=cov,
-    )
+    ).with_cov(cov)
     return replace(found, rms_m=float(np.sqrt(((found.enu(xy) - enu) ** 2).sum(axis=1).mean())))

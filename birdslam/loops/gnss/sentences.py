@@ -38,10 +38,10 @@ class NmeaReader:
         elif kind == "GGA" and len(words) > 8 and words[8]:
             self._accuracy.setdefault(words[1], SIGMA_PER_HDOP_M * float(words[8]))
         elif kind == "RMC" and len(words) > 9 and words[2] == "A":
-            before = self.finish()
             speed_mps = float(words[7]) * KNOT_MPS if words[7] else None
             place = _degrees(words[3], words[4]), _degrees(words[5], words[6])
-            self._waiting = words[1], _utc(words[9], words[1]), *place, speed_mps
+            here = words[1], _utc(words[9], words[1]), *place, speed_mps
+            before, self._waiting = self.finish(), here
             return before
         return None
 
