@@ -23,6 +23,7 @@ from birdslam.loops.place_index import PlaceIndex, learn_words
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory, TrajectoryFiles
+from birdslam.runtime.batch.one_map import DRIVE_MAP, join
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.runtime.maps.map_drive import MapChoice
@@ -332,6 +333,22 @@ def test_two_maps_of_a_street_become_one(files: dict[str, Path]) -> None:
     first = next(keyframe for keyframe in out.keyframes if keyframe.drive == 1)
     assert np.hypot(first.T_map_keyframe.x_m - start[0], first.T_map_keyframe.y_m - start[1]) < 2.0
     assert len(errors(driven(out, STREET, range(100, 130), seed=6))) > 20
+
+
+def test_the_maps_of_many_drives_become_one(files: dict[str, Path], tmp_path: Path) -> None:
+    folders = []
+    for name in ("own", "beside", "other"):
+        folders.append(tmp_path / name)
+        folders[-1].mkdir()
+        (folders[-1] / DRIVE_MAP).write_bytes(files[name].read_bytes())
+    (tmp_path / "without").mkdir()  # a drive that failed
+    found = join([*folders, tmp_path / "without"], tmp_path / "town.map")
+    assert found is not None
+    assert set(found.inside) == {"own", "beside"}
+    assert found.outside == ("other",)
+    whole = read_map(tmp_path / "town.map")
+    assert len(whole) == len(read_map(files["own"])) + len(read_map(files["beside"])) == found.keyframes
+    assert join([tmp_path / "without"], tmp_path / "none.map") is None
 
 
 def test_maps_that_share_no_street_stay_two(files: dict[str, Path]) -> None:

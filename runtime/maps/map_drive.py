@@ -72,6 +72,7 @@ class MapDrive:
         self._session = MapSession(camera, self.map, choice.extend)
         self._trajectory, self._files = MapTrajectory(), TrajectoryFiles(output)
         self._begin_ns: int | None = None
+        self._frame_id = -1
         self.unwritten: OSError | None = None  # the disk is full: the drive's files end here, the map goes on
 
     def resume(self, pose: MapPose) -> None:
@@ -79,11 +80,13 @@ class MapDrive:
         self._session.resume(pose)
 
     def step(self, estimate: Estimate, image: NDArray[np.uint8] | None) -> Localisation:
-        """One frame, undistorted; None: it is not looked at."""
+        """One frame, undistorted; None: it is not looked at. One that is told again, corrected, has its row already."""
         if self._begin_ns is None:
             self._begin_ns = estimate.t_source_ns
         found = self._session.step(estimate, image)
-        self._write(self._trajectory.add(found, estimate))
+        if estimate.frame_id != self._frame_id:
+            self._write(self._trajectory.add(found, estimate))
+        self._frame_id = estimate.frame_id
         if found.T_map_ego is not None and self._is_further(found.T_map_ego):
             self.poses.append((found.t_source_ns, found.T_map_ego))
         return found

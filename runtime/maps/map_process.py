@@ -107,7 +107,7 @@ class LiveMap:
             estimate: Estimate = message.record
             if Status.END_OF_SOURCE in estimate.status:
                 self.ended = True
-            elif Status.PERCEPTION_LATE not in estimate.status:  # its measurements may still come, as another estimate
+            else:
                 self._step(estimate)
             message = self._estimates.recv(0.0)
         now_ns = time.monotonic_ns()
