@@ -32,6 +32,7 @@ from birdslam.bench.tracking.benchmark import (
     ours,
     run_trial,
     summarise,
+    within,
 )
 from birdslam.bench.tracking.tables import Published, read_published
 from birdslam.frontend import FrontEnd, FrontEndConfig
@@ -144,6 +145,14 @@ def noisy_log(sequence: TrackingSequence, tmp_path_factory: pytest.TempPathFacto
     """With landmarks beyond every threshold of Table 4."""
     root = tracking_world.write(tmp_path_factory.mktemp("noisy"))
     return log_of(sequence, root, SimulationConfig(), 1, ablation.FARTHEST_LANDMARK_M)
+
+
+def test_a_log_with_far_landmarks_has_the_nearer_one_in_it(
+    sequence: TrackingSequence, noisy_log: list[Measurements], tmp_path: Path
+) -> None:
+    nearer = log_of(sequence, tracking_world.write(tmp_path), SimulationConfig(), 1, 12.0)
+    assert within(noisy_log, 12.0) == nearer
+    assert sum(len(m.cp) for m in nearer) < 0.8 * sum(len(m.cp) for m in noisy_log)
 
 
 def shift_m(one: Trajectories, other: Trajectories) -> tuple[float, float]:

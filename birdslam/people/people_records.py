@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from birdslam.people.people_filter import HEIGHT, VX
+from birdslam.people.people_state import HEIGHT, VX
 from birdslam.people.people_tracker import PeopleTracker
 from birdslam.types import FollowedPerson, Moves
 from birdslam.vehicles.track import EgoFrame

@@ -10,11 +10,10 @@ from collections.abc import Callable
 from types import FrameType
 from typing import TypeVar
 
-import cv2
 import msgspec
 
 from birdslam.runtime.configuration import Configuration
-from birdslam.runtime.process.child import LOG_FORMAT, end_with_parent
+from birdslam.runtime.process.child import begin
 from birdslam.runtime.process.vitals import Vitals
 
 DISK_STATUS = 3  # the disk failed it
@@ -40,16 +39,10 @@ def run_beside(work: Callable[[Configuration, _Order, Vitals, Stop], int], order
 
     Ends the process with what `work` gives; 0: all is done, and it counts as ended. 1 for a bug.
     """
-    name, vitals_fd, parent_pid = sys.argv[1:]
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=LOG_FORMAT)
     stop = Stop()
-    end_with_parent(int(parent_pid))
+    name, configuration, vitals = begin(sys.argv[1:])
     os.nice(niceness)
-    cv2.setNumThreads(1)
-    configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
     asked = msgspec.json.decode(sys.stdin.buffer.readline(), type=order)
-    sys.setswitchinterval(configuration.runtime.switch_interval_s)
-    vitals = Vitals(int(vitals_fd))
     try:
         status = work(configuration, asked, vitals, stop)
     except Exception:
