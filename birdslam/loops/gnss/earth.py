@@ -24,8 +24,8 @@ LEAST_FIXES, LEAST_WAY_M = 3, 20.0
 GATE = 3.0  # standard deviations
 DELAYS_S = np.arange(-2.0, 2.01, 0.1)
 DELAY_SIGMA_S = 0.5
-WINDOW_S, MOST_WINDOWS = 30.0, 20  # in which fixes are compared with odometry for their delay
-ITERATIONS, WINDOW_ITERATIONS = 30, 6
+WINDOW_S, MOST_WINDOWS = 60.0, 10  # in which fixes are compared with odometry for their delay
+ITERATIONS, WINDOW_ITERATIONS = 30, 16
 DEFAULT_SIGMA_M = 5.0  # of a fix that does not say its own
 HINT_SIGMAS, HINT_REL = 3.0, 0.02  # a wrong height is told where it is that sure, and that large
 
@@ -178,7 +178,7 @@ def place_on_earth(t_ns: NDArray[np.int64], poses: list[SE2], fixes: list[GnssFi
 
 
 def _delay(seconds: Floats, xy: Floats, times: Floats, enu: Floats, sigma: Floats) -> tuple[float, float]:
-    """By how much fixes come late, and its 1-sigma: what fits best over short windows, before odometry drifts.
+    """By how much fixes come late, and its 1-sigma: what fits best over short windows, before odometry drifts far.
 
     Curves and changes of speed tell delays apart; where there are none the prior keeps them at 0.
     """
@@ -202,7 +202,7 @@ def _delay(seconds: Floats, xy: Floats, times: Floats, enu: Floats, sigma: Float
                 cost += float(np.log1p(chi2).sum())
         costs.append(cost)
     weight = np.exp(min(costs) - np.array(costs))
-    mean_s = float(weight @ DELAYS_S / weight.sum())
+    mean_s = round(float(weight @ DELAYS_S / weight.sum()), 3)
     return mean_s, math.sqrt(float(weight @ (DELAYS_S - mean_s) ** 2 / weight.sum()))
 
 
