@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
+from birdslam.bench.tracking.classes import IMAGE, KINDS, METRES, TracksRow, class_tracks, tracks_row
 from birdslam.bench.tracking.leave_one_out import LeftOut, left_out
 from birdslam.bench.tracking.localisation import (
     CAMERA_OF_BOXES,
@@ -22,9 +23,8 @@ from birdslam.bench.tracking.localisation import (
 from birdslam.bench.tracking.movers import MoversRow, movers_row
 from birdslam.bench.tracking.people import (
     PeopleRow,
-    PeopleTracks,
     boxes_of_hulls,
-    has_people,
+    has_labels,
     judge,
     summarise_people,
 )
@@ -35,6 +35,7 @@ from birdslam.runtime.progress import Progress
 from birdslam.slam import SlamConfig
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.sources.recording import DatasetError
+from birdslam.types import Measurements
 
 
 class Sweep(NamedTuple):
@@ -76,26 +77,50 @@ def evaluate_people(
     config: FrontEndConfig,
     kind: str,
     tilt_from_images: bool = False,
-) -> tuple[list[PeopleRow], list[PeopleTracks]]:
-    """The errors of placed pedestrians or cyclists by range, and their tracks in bird's-eye view. Raises DatasetError.
+) -> tuple[list[PeopleRow], list[TracksRow]]:
+    """The errors of placed pedestrians or cyclists by range, and their tracks in bird's-eye view.
 
-    Sequences without labels of the kind are left out. No detector's boxes of cyclists were recorded: those of the
-    labels' hulls stand in.
+    Sequences without labels of the kind are left out. Raises DatasetError.
+    """
+    logs = _logs_of_people(root, names, detections, config, kind, tilt_from_images)
+    return summarise_people([judge(sequence, log, kind) for sequence, log in logs])
+
+
+def evaluate_classes(
+    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, tilt_from_images: bool = False
+) -> list[TracksRow]:
+    """How good the tracks of each class are, in bird's-eye view and in the image. Raises DatasetError."""
+    rows: list[TracksRow] = []
+    for kind in KINDS:
+        tracks = [
+            class_tracks(sequence, log, kind)
+            for sequence, log in _logs_of_people(root, names, detections, config, kind, tilt_from_images)
+        ]
+        for view in (METRES, IMAGE):
+            rows += [tracks_row(of.sequence, view, [of]) for of in tracks]
+            rows.append(tracks_row("all", view, tracks))
+    return rows
+
+
+def _logs_of_people(
+    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, kind: str, tilt_from_images: bool
+) -> Iterator[tuple[TrackingSequence, list[Measurements]]]:
+    """The sequences with labels of a kind, with the front end's records of them.
+
+    No detector's boxes of cyclists were recorded: those of the labels' hulls stand in.
     """
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
-    sequences = [sequence for sequence in sequences if has_people(sequence, kind)]
+    sequences = [sequence for sequence in sequences if has_labels(sequence, kind)]
     if not sequences:
         raise DatasetError(f"{root}: none of these sequences has labels of a {kind}")
-    folder, results = _folder(root, detections), []
-    with Progress("people", sum(map(len, sequences))) as progress:
+    with Progress(kind, sum(map(len, sequences))) as progress:
         progress.reach(0)
         for sequence in sequences:
-            found = read_detections(folder, sequence.name, len(sequence))
+            found = read_detections(_folder(root, detections), sequence.name, len(sequence))
             if kind == "cyclist" and detections == "rrc":
                 found = boxes_of_hulls(sequence, found, kind)
-            results.append(judge(sequence, measure(sequence, found, config, tilt_from_images), kind))
+            yield sequence, measure(sequence, found, config, tilt_from_images)
             progress.advance(len(sequence))
-    return summarise_people(results)
 
 
 def evaluate_left_out(
