@@ -37,6 +37,7 @@ class PeopleBoxesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
     sigma_edge_rel: float = 0.03  # 1-sigma of lower and upper edge: RRC's boxes of people on KITTI tracking
     sigma_edge_px: float = 0.5  # and beside it
+    sigma_covered_rel: float = 0.06  # of a lower edge that a nearer box covers, beside it
     sigma_side_rel: float = 0.035  # of the middle column: arms and legs swing
     sigma_growth: float = 2.0  # as `LocalisationConfig.sigma_growth`
     sure_score: float = 0.85  # from it on nothing grows
@@ -211,6 +212,8 @@ def _observe(
     rel = (config.sigma_edge_rel,) * 2 if stated is None else stated.rel[2:]
     px = config.sigma_edge_px if stated is None else stated.px
     upper, lower = (factor * math.hypot(height_px * max(r, config.sigma_edge_rel), px) / camera.fy_px for r in rel)
+    if covered:
+        lower = math.hypot(lower, height_px * config.sigma_covered_rel / camera.fy_px)
     margin_px = config.cut_margin_px + 0.02 * height_px
     cut_bottom = y2 > camera.height_px - margin_px
     cut_top = y1 < config.cut_margin_px

@@ -208,19 +208,30 @@ class PeopleFilter:
         R[:, WIDTH, WIDTH] = np.where(uses, self._sizes[at, 3], UNUSED) ** 2
         return z, R
 
-    def moments(self, after_s: float = 0.0) -> Moments:
-        """Of everybody, `after_s` later, as they move."""
+    def moments(self, after_s: float = 0.0, stands: NDArray[np.bool_] | None = None) -> Moments:
+        """Of everybody, `after_s` later, as they move.
+
+        The velocity is the one of whoever moves, or none of whom `stands` (N,); its covariance is about that, with the
+        probability of the other in it.
+        """
         mean, cov = merged(self._x, self._P, self._weight)
+        standing = self._weight[:, STANDING_FILTERS].sum(axis=1)
+        moving = self._weight.copy()
+        moving[:, STANDING_FILTERS] = 0.0
+        velocity = (moving[..., None] * self._x[..., VELOCITY]).sum(axis=1) / moving.sum(axis=1)[:, None]
+        if stands is not None:
+            velocity[stands] = 0.0
+        off = mean[:, VELOCITY] - velocity
+        mean[:, VELOCITY] = velocity
+        cov[:, VELOCITY, VELOCITY] += off[:, :, None] * off[:, None, :]
         if after_s > 0.0 and len(mean):
             F = np.eye(len(STATES))
             F[X, VX] = F[Y, VY] = after_s
             mean, cov = mean @ F.T, F @ cov @ F.T
-            q = (1.0 - self._weight[:, STANDING_FILTERS].sum(axis=1)) * np.square(self._sizes[:, 1])
+            q = (1.0 - standing) * np.square(self._sizes[:, 1])
             cov[:, [X, Y], [X, Y]] += (q * after_s**3 / 3.0)[:, None]
             cov[:, [VX, VY], [VX, VY]] += (q * after_s)[:, None]
-        return Moments(
-            mean, cov, self._weight[:, STANDING_FILTERS].sum(axis=1), self._weight[:, CHILD_FILTERS].sum(axis=1)
-        )
+        return Moments(mean, cov, standing, self._weight[:, CHILD_FILTERS].sum(axis=1))
 
     def expect_tilt(self, rows: Sequence[int], tilt_prior: Floats) -> None:
         """What the next frames draw the tilts in `rows` to, (M, 2)."""
