@@ -49,21 +49,22 @@ def child_steps_out(ego_mps: float = 8.0) -> Scenario:
 
 
 def crowd(people: int = 25, ego_mps: float = 2.0, vehicles: int = 0) -> Scenario:
-    """So many people before a slow ego: most walk along the street or across it, some stand and set out, one in six
-    cycles; and so many parked and waiting vehicles.
+    """So many people before a slow ego, and so many standing vehicles.
+
+    People walk along the street or across it and turn back after some seconds, some wait before they set out, one in
+    six cycles.
     """
     rng, street = _street()
     movers: list[Mover] = []
     for k in range(people):
         s, d = EGO_M + 8.0 + 24.0 * k / max(people, 1), float(rng.uniform(street.right_m - 1.5, street.left_m + 1.5))
         turn = float(rng.choice([0.0, math.pi, _ACROSS, -_ACROSS])) + float(rng.normal(0.0, 0.15))
-        if k % 6 == 5:
-            cycling = float(rng.uniform(3.0, 5.0))
-            movers.append(Mover(draw_cyclist(rng), s, d, turn, cycling, cycling, phase_per_m=_CYCLE))
-            continue
-        speed = float(rng.uniform(0.9, 1.6))
-        waits = [(float(rng.uniform(1.0, 4.0)), turn, speed)] if k % 4 == 0 else []
-        movers.append(Mover(draw_pedestrian(rng), s, d, turn, 0.0 if waits else speed, phase_per_m=_WALK, walks=waits))
+        cycles, waits_s = k % 6 == 5, float(rng.uniform(1.0, 4.0)) if k % 4 == 0 else 0.0
+        speed = float(rng.uniform(2.5, 4.0) if cycles else rng.uniform(0.9, 1.6))
+        goes_s = float(rng.uniform(3.0, 5.0))
+        walks = [(waits_s + goes_s * leg, turn + math.pi * (leg % 2), speed) for leg in range(20)]
+        body, phase = (draw_cyclist(rng), _CYCLE) if cycles else (draw_pedestrian(rng), _WALK)
+        movers.append(Mover(body, s, d, turn, 0.0, phase_per_m=phase, walks=walks))
     for k in range(vehicles):
         side = street.right_m + 1.0 if k % 2 else street.left_m - 1.0
         movers.append(Mover(draw_shape(rng, "hatchback" if k % 3 else "van"), EGO_M + 14.0 + 5.6 * k, side, 0.0))
