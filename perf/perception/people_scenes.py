@@ -126,7 +126,7 @@ def true_place(truth: WorldFrame, body: WorldObject) -> tuple[Floats, Floats]:
 
 def in_a_fan(estimate: Estimate, at_m: Floats) -> bool:
     """Whether the road there is told to be hidden."""
-    return any(Outline(fan.corners_m).contains_point(at_m) for fan in estimate.hidden)
+    return any(Outline(fan.corners_m).contains_points(at_m[None])[0] for fan in estimate.hidden)
 
 
 def of_child(steps: list[Step], rate_hz: float) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def of_child(steps: list[Step], rate_hz: float) -> dict[str, Any]:
     first = recorded = near = None
     held, rel, off_mps, sure = list[bool](), list[float](), list[float](), list[bool]()
     for k, step in enumerate(steps):
-        (child,) = [body for body in step.truth.objects if body.label in PEOPLE] or [None]
+        child = next((body for body in step.truth.objects if body.label in PEOPLE), None)
         if child is None:
             continue
         at, velocity = true_place(step.truth, child)

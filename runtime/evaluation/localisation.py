@@ -9,7 +9,7 @@ from typing import NamedTuple
 import msgspec
 
 from birdslam.bench.tracking.classes import IMAGE, KINDS, METRES, TracksRow, class_tracks, tracks_row
-from birdslam.bench.tracking.leave_one_out import LeftOut, left_out
+from birdslam.bench.tracking.leave_one_out import LeftOut, PlaceError, left_out
 from birdslam.bench.tracking.localisation import (
     CAMERA_OF_BOXES,
     CarError,
@@ -30,6 +30,7 @@ from birdslam.bench.tracking.people import (
 )
 from birdslam.frontend import FrontEndConfig
 from birdslam.graph.pose_graph import PoseGraph
+from birdslam.perception import Detections
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.progress import Progress
 from birdslam.slam import SlamConfig
@@ -105,10 +106,7 @@ def evaluate_classes(
 def _logs_of_people(
     root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, kind: str, tilt_from_images: bool
 ) -> Iterator[tuple[TrackingSequence, list[Measurements]]]:
-    """The sequences with labels of a kind, with the front end's records of them.
-
-    No detector's boxes of cyclists were recorded: those of the labels' hulls stand in.
-    """
+    """The sequences with labels of a kind, with the front end's records of them."""
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
     sequences = [sequence for sequence in sequences if has_labels(sequence, kind)]
     if not sequences:
@@ -116,10 +114,7 @@ def _logs_of_people(
     with Progress(kind, sum(map(len, sequences))) as progress:
         progress.reach(0)
         for sequence in sequences:
-            found = read_detections(_folder(root, detections), sequence.name, len(sequence))
-            if kind == "cyclist" and detections == "rrc":
-                found = boxes_of_hulls(sequence, found, kind)
-            yield sequence, measure(sequence, found, config, tilt_from_images)
+            yield sequence, measure(sequence, _boxes(root, detections, sequence, kind), config, tilt_from_images)
             progress.advance(len(sequence))
 
 
@@ -130,16 +125,18 @@ def evaluate_left_out(
     config: FrontEndConfig,
     sweeps: Sequence[Sweep],
     tilt_from_images: bool = False,
+    kind: str = "car",
 ) -> list[LeftOut]:
     """How each sequence fares by the value that the others choose, for each sweep. Raises ConfigurationError."""
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
+    sequences = [sequence for sequence in sequences if has_labels(sequence, kind)]
     drives = 1 + sum(len(sweep.by_value) - 1 for sweep in sweeps)
     rows: list[LeftOut] = []
     with Progress("localisation", drives * sum(map(len, sequences))) as progress:
-        as_they_are = _errors(root, sequences, detections, config, progress.advance, tilt_from_images)
+        as_they_are = _errors(root, sequences, detections, config, progress.advance, kind, tilt_from_images)
         for key, as_it_is, by_value in sweeps:
             found = {
-                value: _errors(root, sequences, detections, varied, progress.advance, tilt_from_images)
+                value: _errors(root, sequences, detections, varied, progress.advance, kind, tilt_from_images)
                 for value, varied in by_value.items()
                 if value != as_it_is
             }
@@ -156,14 +153,21 @@ def _errors(
     detections: str,
     config: FrontEndConfig,
     advance: Callable[[int], None],
+    kind: str,
     tilt_from_images: bool = False,
-) -> dict[str, list[CarError]]:
-    folder, out = _folder(root, detections), {}
+) -> dict[str, Sequence[PlaceError]]:
+    out: dict[str, Sequence[PlaceError]] = {}
     for sequence in sequences:
-        found = read_detections(folder, sequence.name, len(sequence))
-        out[sequence.name] = match_cars(sequence, measure(sequence, found, config, tilt_from_images))
+        log = measure(sequence, _boxes(root, detections, sequence, kind), config, tilt_from_images)
+        out[sequence.name] = match_cars(sequence, log) if kind == "car" else judge(sequence, log, kind).errors
         advance(len(sequence))
     return out
+
+
+def _boxes(root: Path, detections: str, sequence: TrackingSequence, kind: str) -> list[Detections]:
+    """No detector's boxes of cyclists were recorded: those of the labels' hulls stand in."""
+    found = read_detections(_folder(root, detections), sequence.name, len(sequence))
+    return boxes_of_hulls(sequence, found, kind) if kind == "cyclist" and detections == "rrc" else found
 
 
 def _folder(root: Path, detections: str) -> Path:

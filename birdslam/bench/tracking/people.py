@@ -46,6 +46,7 @@ class PersonError:
     depth_m: float
     error_m: Floats
     mahalanobis2: float
+    log_det_cov: float
     true_mps: Floats  # (2,) in ego
     told_mps: Floats
     stands: bool
@@ -176,6 +177,7 @@ def _error(
         depth_m=truth.x_m,
         error_m=error,
         mahalanobis2=float(error @ np.linalg.solve(np.reshape(told.cov, (2, 2)), error)),
+        log_det_cov=float(np.linalg.slogdet(np.reshape(told.cov, (2, 2)))[1]),
         true_mps=_true_velocity(places[label.track], label.frame) @ R,
         told_mps=np.array([told.vx_mps, told.vy_mps]),
         stands=told.moves is Moves.STANDING,

@@ -50,19 +50,21 @@ def run(options: argparse.Namespace) -> int:
     claim_directory(output)
     names = sequences_of(options.root, options.sequences)
     config, tilt_from_images = configuration.slam.frontend, options.tilt == "images"
-    if options.kind != "car":
-        if sweeps or options.mode == "paper":
-            raise ConfigurationError("--class: --leave-one-out and --mode paper are of cars alone")
+    if options.kind != "car" and options.mode == "paper":
+        raise ConfigurationError("--class: --mode paper is of cars alone")
+    if sweeps:
+        left = evaluate_left_out(
+            options.root, names, options.detections, config, sweeps, tilt_from_images, options.kind
+        )
+        write_json(output / "leave_one_out.json", left)
+        print(_table_of_left_out(left))
+    elif options.kind != "car":
         people, tracks = evaluate_people(
             options.root, names, options.detections, config, options.kind, tilt_from_images
         )
         write_json(output / "report.json", {"places": people, "tracks": tracks})
         print(_table_of_people(people))
         print(table_of_tracks(tracks))
-    elif sweeps:
-        left = evaluate_left_out(options.root, names, options.detections, config, sweeps, tilt_from_images)
-        write_json(output / "leave_one_out.json", left)
-        print(_table_of_left_out(left))
     else:
         used = PAPER if options.mode == "paper" else configuration.slam
         rows, tilts, movers = evaluate_localisation(options.root, names, options.detections, used, tilt_from_images)
