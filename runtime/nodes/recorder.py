@@ -21,7 +21,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import cv2
 import msgspec
 import psutil
 
@@ -30,7 +29,7 @@ from birdslam.runtime.environment import LIBRARIES, USER_ERROR_STATUS
 from birdslam.runtime.latency import stages
 from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest_checkpoint
 from birdslam.runtime.process import realtime
-from birdslam.runtime.process.child import LOG_FORMAT, end_with_parent
+from birdslam.runtime.process.child import begin
 from birdslam.runtime.process.restarts import FIRST, Assignment
 from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.recording import scene
@@ -283,22 +282,16 @@ def record(configuration: Configuration, order: RecorderAssignment, vitals: Vita
 
 def main(arguments: list[str]) -> int:
     """Entry point of the recorder's process."""
-    _, vitals_fd, parent_pid = arguments
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=LOG_FORMAT)
     stop: list[int] = []
 
     def ask(number: int, frame: FrameType | None) -> None:
         stop.append(number)
 
     signal.signal(signal.SIGTERM, ask)
-    end_with_parent(int(parent_pid))
+    _, configuration, vitals = begin(arguments)
     os.nice(NICENESS)
-    cv2.setNumThreads(1)
-    configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
     order = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderAssignment)
-    sys.setswitchinterval(configuration.runtime.switch_interval_s)
     realtime.reserve(*INDEX_MIB)
-    vitals = Vitals(int(vitals_fd))
     try:
         reason = record(configuration, order, vitals, stop)
     except OSError as error:

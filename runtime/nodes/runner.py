@@ -18,7 +18,6 @@ from collections.abc import Callable
 from types import FrameType
 from typing import TypeGuard
 
-import cv2
 import msgspec
 
 from birdslam.perception import ModelError
@@ -29,7 +28,7 @@ from birdslam.runtime.nodes.meter import Meter
 from birdslam.runtime.nodes.nodes import Node, prepare
 from birdslam.runtime.nodes.sources import SourceError
 from birdslam.runtime.process import realtime
-from birdslam.runtime.process.child import LOG_FORMAT, end_with_parent, give_back_memory
+from birdslam.runtime.process.child import begin, give_back_memory
 from birdslam.runtime.process.restarts import Assignment
 from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.topology import NODES, RECORDER, TOPICS
@@ -158,14 +157,8 @@ def _loop(
 
 def main(arguments: list[str]) -> int:
     """Entry point of a node's process."""
-    name, vitals_fd, parent_pid = arguments
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=LOG_FORMAT)
     stop = Stop()
-    end_with_parent(int(parent_pid))
-    configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
-    sys.setswitchinterval(configuration.runtime.switch_interval_s)
-    cv2.setNumThreads(1)  # perceive sets its own
-    vitals = Vitals(int(vitals_fd))
+    name, configuration, vitals = begin(arguments)
     try:
         make = prepare(name, configuration)
         give_back_memory()

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.bench.ego.trajectory_errors import rms, rpe
+from birdslam.bench.ego.trajectory_errors import rms
+from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS
 from birdslam.sources.label_projection import Label
 from birdslam.sources.recording import DatasetError
-from birdslam.trajectory import ego_pose
-from birdslam.types import Attitude
 from birdslam.vehicles.placement.localisation import iou
 
 Floats = NDArray[np.float64]
@@ -212,20 +211,15 @@ def path_errors(truth: dict[int, SE2], found: dict[int, SE2]) -> PathErrors | No
     frames = sorted(truth.keys() & found.keys())
     if not frames:
         return None
-    goal, seen = (np.array([[p[f].x_m, p[f].y_m] for f in frames]) for p in (truth, found))
+    goal, seen = (np.array([[p[f].x_m, p[f].y_m, p[f].yaw_rad] for f in frames]) for p in (truth, found))
     steps = np.flatnonzero(np.diff(frames) == 1)
-    pairs = [(frames[k], frames[k + 1]) for k in steps]
-    relative = [
-        rpe(
-            *(np.array([ego_pose(SE2(), Attitude()), ego_pose(p[a].between(p[b]), Attitude())]) for p in (truth, found))
-        )
-        for a, b in pairs
-    ]
+    error = between(between(goal[steps], goal[steps + 1]), between(seen[steps], seen[steps + 1]))
     moved = (seen[steps + 1] - seen[steps]) - (goal[steps + 1] - goal[steps])
+    any_step = len(steps) > 0
     return PathErrors(
         frames=len(frames),
-        ate_m=rms(np.linalg.norm(seen - goal, axis=1)),
-        rpe_t_m=rms(np.array([t for t, _ in relative])) if pairs else None,
-        rpe_r_deg=rms(np.array([r for _, r in relative])) if pairs else None,
-        motion_error_m=rms(np.linalg.norm(moved, axis=1)) if pairs else None,
+        ate_m=rms(np.hypot(*(seen - goal)[:, :2].T)),
+        rpe_t_m=rms(np.hypot(error[:, 0], error[:, 1])) if any_step else None,
+        rpe_r_deg=float(np.rad2deg(rms(error[:, 2]))) if any_step else None,
+        motion_error_m=rms(np.hypot(moved[:, 0], moved[:, 1])) if any_step else None,
     )
