@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
-from birdslam.bench.tracking.classes import HALF_AT_M
+from birdslam.bench.tracking.by_class.class_tracks import HALF_AT_M
 from birdslam.bench.tracking.localisation import INSIDE_1_SIGMA, INSIDE_2_SIGMA
 from birdslam.bench.tracking.metrics import BoxFrame, assign, hota_parts, identities
 from birdslam.perception.external import external_detections

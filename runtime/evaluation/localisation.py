@@ -8,7 +8,14 @@ from typing import NamedTuple
 
 import msgspec
 
-from birdslam.bench.tracking.classes import IMAGE, KINDS, METRES, TracksRow, class_tracks, tracks_row
+from birdslam.bench.tracking.by_class.class_tracks import IMAGE, KINDS, METRES, TracksRow, class_tracks, tracks_row
+from birdslam.bench.tracking.by_class.people import (
+    PeopleRow,
+    boxes_of_hulls,
+    has_labels,
+    judge,
+    summarise_people,
+)
 from birdslam.bench.tracking.leave_one_out import LeftOut, PlaceError, left_out
 from birdslam.bench.tracking.localisation import (
     CAMERA_OF_BOXES,
@@ -21,13 +28,6 @@ from birdslam.bench.tracking.localisation import (
     tilt_row,
 )
 from birdslam.bench.tracking.movers import MoversRow, movers_row
-from birdslam.bench.tracking.people import (
-    PeopleRow,
-    boxes_of_hulls,
-    has_labels,
-    judge,
-    summarise_people,
-)
 from birdslam.frontend import FrontEndConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.perception import Detections

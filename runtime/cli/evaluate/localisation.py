@@ -6,10 +6,10 @@ import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from birdslam.bench.tracking.classes import table_of_tracks
+from birdslam.bench.tracking.by_class.class_tracks import table_of_tracks
+from birdslam.bench.tracking.by_class.people import PEOPLE, PeopleRow
 from birdslam.bench.tracking.leave_one_out import LeftOut
 from birdslam.bench.tracking.localisation import LocalisationRow, TiltRow
-from birdslam.bench.tracking.people import PEOPLE, PeopleRow
 from birdslam.bench.tracking.tables import movers_table
 from birdslam.outputs.drive_files import claim_directory, write_json
 from birdslam.paper import PAPER

@@ -7,7 +7,7 @@ import os
 import sys
 from pathlib import Path
 
-from birdslam.bench.tracking.classes import table_of_tracks
+from birdslam.bench.tracking.by_class.class_tracks import table_of_tracks
 from birdslam.bench.tracking.report import Outcome
 from birdslam.outputs.drive_files import claim_directory, write_json
 from birdslam.runtime.cli.arguments import add_config, add_settings, add_speeds, add_tracking_root

@@ -2,7 +2,7 @@
 
 Each matched, untruncated person's place is compared with the label's as cars' are (localisation.py): along (depth,
 ego's x) and across, with the share of errors inside the ellipses of 68.3 and 95.4 %. Speeds are compared with those of
-the labels' places over a second. Tracks are judged in bird's-eye view (classes.py).
+the labels' places over a second. Tracks are judged in bird's-eye view (class_tracks.py).
 """
 
 from __future__ import annotations
@@ -15,7 +15,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.bench.tracking.classes import KINDS, METRES, ClassTracks, TracksRow, class_tracks, tracks_row
+from birdslam.bench.tracking.by_class.class_tracks import (
+    KINDS,
+    METRES,
+    ClassTracks,
+    TracksRow,
+    class_tracks,
+    tracks_row,
+)
 from birdslam.bench.tracking.localisation import INSIDE_1_SIGMA, INSIDE_2_SIGMA
 from birdslam.bench.tracking.metrics import assign
 from birdslam.perception import Detections
