@@ -5,8 +5,7 @@ message that it answers, so the order is known. Measurements without an estimate
 their estimate was lost, perhaps the first of an epoch. After a restart the optimizer began a new epoch, or went on from
 its last checkpoint, as a rule with the measurements since: where it did not get them, or where the recording lacks
 measurements that it had, nothing is compared until a new epoch begins. A file that begins in the middle of a drive has
-the graph of its first frame. `estimates` replays with
-another configuration.
+the graph of its first frame. `estimates` replays with another configuration.
 """
 
 from __future__ import annotations
