@@ -353,6 +353,9 @@ class Lane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     left_bound: Bound = Bound.PAINT
     right_bound: Bound = Bound.PAINT
     carriageway: bool = False  # no paint divides it: all of the road between its edges, for both directions perhaps
+    oncoming: Probability | None = None  # that its traffic comes towards the ego; None: nothing showed it
+    ends_m: float | None = None  # x where its lines leave no room for a car: it ends or merges; None: not in sight
+    splits_m: float | None = None  # x where it is as wide as two lanes; None: not in sight
 
     def centre_m(self, x_m: float) -> float:
         """y of the centre line `x_m` ahead of the ego."""
@@ -390,9 +393,9 @@ class LaneChange(enum.StrEnum):
 
 
 class VehicleLane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """In which lane a vehicle is: probabilities that sum to one, from the covariances of both."""
+    """In which lane a road user is: probabilities that sum to one, from the covariances of both."""
 
-    vehicle: BodyId
+    vehicle: BodyId  # its number, of a vehicle or a person
     ego_lane: Probability = 0.0
     left: Probability = 0.0  # in a lane to the left of the ego's that goes the ego's way
     right: Probability = 0.0
@@ -401,7 +404,7 @@ class VehicleLane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class Leader(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """The next vehicle ahead in the ego's lane."""
+    """The next vehicle or cyclist ahead in the ego's lane."""
 
     vehicle: BodyId
     gap_m: float  # along the lane, from the camera's foot to the vehicle's rear

@@ -21,15 +21,19 @@ from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis, moved
 from birdslam.lanes.ego_lane import EgoLane
 from birdslam.lanes.line_tracker import LineTracker, still_lines
-from birdslam.lanes.occupancy import VehicleInEgo, with_vehicles
+from birdslam.lanes.occupancy import with_users
 from birdslam.lanes.outline import lane_mask
 from birdslam.lanes.topology import lane_row
+from birdslam.lanes.traffic import Traffic, TrafficState
+from birdslam.lanes.users import UserInEgo, person_in_ego
 from birdslam.outputs.line_map import LineMap
 from birdslam.perception import Segmentation
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.evaluation.still_lanes import evaluate_stills
+from birdslam.runtime.recording import scene
+from birdslam.runtime.recording.foxglove import SceneUpdate
 from birdslam.sources.recording import DatasetError
-from birdslam.types import Bound, Estimate, LaneChange, LaneLine, Lanes, LineKind
+from birdslam.types import Bound, Estimate, FollowedPerson, LaneChange, LaneLine, Lanes, LineKind
 
 CAMERA = Camera(640, 240, 420.0, 420.0, 319.5, 90.0, height_m=1.5)
 NOBODY = np.zeros((0, 4))
@@ -116,7 +120,7 @@ def drive(tracker: LineTracker, poses: list[SE2], hidden_from: int = 10**6) -> l
             masks.road[:, :300], masks.lane[:, :300] = False, False
             image[:, :300] = 60
             boxes = np.array([[0.0, 0.0, 300.0, 240.0]])
-        tracker.update(pose, CAMERA.ground, 0.003, image, masks, boxes)
+        tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, boxes)
         out.append(tracker.lines().at(pose))
     return out
 
@@ -168,7 +172,7 @@ def test_noise_and_jumps_end_nothing() -> None:
         pose = pose @ SE2(
             float(rng.normal(1.0, size)), float(rng.normal(0.0, size)), float(rng.normal(0.0, 0.3 * size))
         )
-        tracker.update(pose, CAMERA.ground, 0.003, image, masks, NOBODY)
+        tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, NOBODY)
         lines = tracker.lines().at(pose @ SE2(0.5, 0.0, 0.02))
         lanes = EgoLane().lanes(lines, 0, tracker.tilt_rad)
         assert msgspec.json.decode(msgspec.json.encode(lanes), type=Lanes) == lanes
@@ -221,8 +225,8 @@ def test_a_lane_change_is_one_event() -> None:
 @given(st.floats(3.0, 60.0), st.floats(-12.0, 12.0), st.floats(0.0, 4.0), st.floats(-3.1, 3.1))
 def test_places_of_a_vehicle_sum_to_one(x_m: float, y_m: float, sigma_m: float, yaw_rad: float) -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
-    vehicle = VehicleInEgo(7, SE2(x_m, y_m, yaw_rad), np.eye(3) * sigma_m**2, 4.0, 8.0)
-    (place,) = with_vehicles(lanes, [vehicle], 10.0).vehicles
+    vehicle = UserInEgo(7, SE2(x_m, y_m, yaw_rad), np.eye(3) * sigma_m**2, 4.0, 8.0)
+    (place,) = with_users(lanes, [vehicle], 10.0, Traffic()).vehicles
     assert place.ego_lane + place.left + place.right + place.oncoming + place.off_road == pytest.approx(1.0)
 
 
@@ -230,17 +234,72 @@ def test_the_leader_is_the_nearest_in_the_egos_lane() -> None:
     lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
     cov = np.diag([0.25, 0.01, 0.001])
     cars = [
-        VehicleInEgo(k, SE2(x, y, 0.0), cov, 4.0, 8.0) for k, x, y in ((1, 30.0, 0.1), (2, 12.0, 3.4), (3, 20.0, -0.3))
+        UserInEgo(k, SE2(x, y, 0.0), cov, 4.0, 8.0) for k, x, y in ((1, 30.0, 0.1), (2, 12.0, 3.4), (3, 20.0, -0.3))
     ]
-    found = with_vehicles(lanes, cars, 9.0)
+    found = with_users(lanes, cars, 9.0, Traffic())
     assert found.leader is not None
     assert found.leader.vehicle == 3
     assert found.leader.gap_m == pytest.approx(18.0)
     assert found.leader.time_gap_s == pytest.approx(2.0)
     assert found.leader.gap_sigma_m == pytest.approx(0.5)
-    standing = with_vehicles(lanes, cars, 0.0).leader
+    standing = with_users(lanes, cars, 0.0, Traffic()).leader
     assert standing is not None
     assert standing.time_gap_s is None
+
+
+def test_who_walks_is_in_a_lane_and_leads_nobody_who_cycles_does() -> None:
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    walker = FollowedPerson(person=5, x_m=9.0, y_m=-0.5, cov=(0.2, 0.0, 0.0, 0.05), vx_mps=-1.4, vy_mps=0.0,
+                            velocity_cov=(0.1, 0.0, 0.0, 0.1))  # fmt: skip
+    cyclist = msgspec.structs.replace(walker, person=6, x_m=25.0, vx_mps=4.0, label="cyclist")
+    found = with_users(lanes, [person_in_ego(walker), person_in_ego(cyclist)], 8.0, Traffic())
+    assert [(place.vehicle, place.ego_lane > 0.9) for place in found.vehicles] == [(5, True), (6, True)]
+    assert found.vehicles[0].oncoming == 0.0  # who walks has no direction of traffic
+    assert found.leader is not None
+    assert found.leader.vehicle == 6
+
+
+def test_traffic_tells_which_way_a_lane_runs() -> None:
+    lanes = EgoLane().lanes((line(0, 5.2), line(1, 1.7), line(2, -1.8)), 0, 0.0)
+    cov = np.diag([1.0, 0.04, 0.01])
+    unknown = UserInEgo(9, SE2(40.0, 3.4, 0.0), np.diag([1.0, 0.04, 3.0]), 4.0, 2.0)
+    traffic = Traffic()
+    before = with_users(lanes, [unknown], 10.0, traffic)
+    assert before.lanes[0].oncoming is None
+    assert before.lanes[1].oncoming == 0.0
+    assert before.vehicles[0].left == pytest.approx(0.75, abs=0.01)
+    for _ in range(3):  # one car counts once
+        told = with_users(lanes, [UserInEgo(1, SE2(30.0, 3.4, math.pi), cov, 4.0, 9.0), unknown], 10.0, traffic)
+    assert told.lanes[0].oncoming == pytest.approx(1.0 / (1.0 + math.exp(-2.0)))
+    assert told.vehicles[1].oncoming > 0.8 > told.vehicles[1].left
+    again = Traffic(msgspec.msgpack.decode(msgspec.msgpack.encode(traffic.state()), type=TrafficState))
+    for k in range(4):  # cars that drive the ego's way there
+        users = [UserInEgo(20 + k, SE2(30.0, 3.4, 0.0), cov, 4.0, 9.0)]
+        assert with_users(lanes, users, 10.0, again) == with_users(lanes, users, 10.0, traffic)
+    (after, _) = with_users(lanes, users, 10.0, traffic).lanes
+    assert after.oncoming is not None
+    assert after.oncoming < 0.01
+    far = UserInEgo(2, SE2(30.0, 3.4, 0.0), np.diag([1.0, 4.0, 0.01]), 4.0, 9.0)
+    unsure = Traffic()
+    with_users(lanes, [far], 10.0, unsure)  # it may be in the ego's lane
+    assert unsure.state() == TrafficState()
+
+
+def test_a_lane_that_merges_says_where_it_ends() -> None:
+    sharp = tuple(np.diag([1e-4, 1e-6, 1e-9, 1e-12]).ravel().tolist())
+    right = msgspec.structs.replace(line(2, -1.75), cov=sharp)
+
+    def merging(slope: float) -> LaneLine:
+        return msgspec.structs.replace(line(1, 1.75), slope=slope, cov=sharp)
+
+    (narrow,) = lane_row((merging(-0.06), right)).lanes
+    (wide,) = lane_row((merging(0.06), right)).lanes
+    (straight,) = lane_row((merging(0.0), right)).lanes
+    assert narrow.ends_m is not None
+    assert 24.0 <= narrow.ends_m <= 34.0  # 1.6 m narrower
+    assert wide.splits_m is not None
+    assert 16.0 <= wide.splits_m <= 28.0
+    assert (narrow.splits_m, wide.ends_m, straight.ends_m, straight.splits_m) == (None,) * 4
 
 
 def test_the_map_has_each_line_once(tmp_path: Path) -> None:
@@ -262,6 +321,21 @@ def test_the_map_has_each_line_once(tmp_path: Path) -> None:
         assert np.all(np.diff(points[:, 0]) > 0.0)
         assert len(feature["properties"]["sigma_m"]) == len(points)
         assert feature["properties"]["kind"] == "solid"
+
+
+def test_foxglove_draws_lines_where_they_are() -> None:
+    lanes = EgoLane().lanes((line(4, 1.75), line(5, -1.75, LineKind.EDGE)), 0, 0.0)
+    estimate = Estimate(
+        epoch=0, frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, T_world_ego=SE2(5.0, 1.0, 0.3), cov=(0.0,) * 9,
+        valid=True, lanes=lanes,
+    )  # fmt: skip
+    (drawn,) = (message for channel, message in scene.from_estimate(estimate, 0) if channel == "/scene")
+    assert isinstance(drawn, SceneUpdate)
+    (entity,) = (entity for entity in drawn.entities if entity.id == "lanes")
+    assert entity.frame_id == "ego"
+    assert [{point.y for point in strip.points} for strip in entity.lines] == [{1.75}, {-1.75}, {0.0}]
+    assert [strip.color for strip in entity.lines] == [scene.WHITE_LINE, scene.UNSEEN, scene.OWN_LANE]
+    assert entity.lines[0].points[-1].x >= 50.0
 
 
 def test_the_scores_of_known_errors() -> None:

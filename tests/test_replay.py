@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import tempfile
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from birdslam.perf.latency import replay as perf_replay
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.cli.drives import replay as replay_command
 from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.nodes.capture import stamps
 from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest_checkpoint
 from birdslam.runtime.nodes.recorder import about
 from birdslam.runtime.recording.recording import Alive, GraphCheckpoint, Recording, RecordingError, RecordingWriter
@@ -25,7 +27,7 @@ from birdslam.runtime.replay import replay
 from birdslam.runtime.replay.replay import compare
 from birdslam.runtime.replay.report import report
 from birdslam.runtime.replay.verdict import Verdict
-from birdslam.types import Estimate, FrameRef, Status
+from birdslam.types import Estimate, FrameRef, Measurements, Status
 from tests.taped_drive import CAMERA, Tape, measured
 
 
@@ -140,6 +142,32 @@ def test_measurements_of_a_frame_published_before_the_restart_enter_the_restored
     assert (verdict.restarts, verdict.epochs, verdict.unanswered) == (1, 1, 1)
 
 
+def test_a_graph_that_went_on_from_an_old_checkpoint_is_not_compared_until_a_new_epoch(tmp_path: Path) -> None:
+    """Perceive was too busy to send what came since: that checkpoint is in no recording."""
+    tape, frames = Tape(tmp_path), iter(measured(40))
+    for measurements in itertools.islice(frames, 15):
+        tape.step(measurements)
+    old = checkpoint_path(tape.configuration).read_bytes()
+    for measurements in itertools.islice(frames, 5):
+        tape.step(measurements)
+    checkpoint_path(tape.configuration).write_bytes(old)
+    tape.perceive.forget(0)
+    tape.restart(with_checkpoint=True)
+    for measurements in itertools.islice(frames, 2):  # perceive had no time: a motion that is predicted
+        coasting = Measurements(**stamps(measurements), status=(Status.COASTING,))
+        tape.step(coasting)
+    assert Status.GRAPH_RESTORED in tape.estimates[20].status
+    assert tape.estimates[21].epoch == 0
+    for measurements in frames:
+        tape.step(measurements)
+    tape.end(measurements)
+    assert Status.GRAPH_RESET in tape.estimates[22].status
+    verdict = verdict_of(tape)
+    assert verdict.difference is None, verdict.difference.frame_id
+    assert (verdict.unknown, verdict.restarts, verdict.epochs) == (2, 1, 2)
+    assert verdict.equal == len(tape.estimates) - 2
+
+
 def test_a_restart_that_took_longer_than_perceive_keeps_measurements(tmp_path: Path) -> None:
     """The checkpoint is whole, but nothing ties it to the oldest of them: a new world, and nothing was restored."""
     tape, frames = Tape(tmp_path), measured(60)
@@ -218,6 +246,34 @@ def test_a_new_epoch_whose_first_estimate_was_lost_is_no_difference(
         assert (verdict.equal, verdict.unknown) == (10, len(tape.estimates) - 11)
 
 
+@pytest.mark.parametrize("lost", [1, 2])
+@pytest.mark.parametrize("dead", [0, 1])
+def test_an_epoch_that_began_in_a_process_killed_before_its_estimates_left(
+    tmp_path: Path, lost: int, dead: int
+) -> None:
+    """The next process goes on from the checkpoint of an epoch that nobody has heard of."""
+    tape, frames = Tape(tmp_path), iter(measured(40))
+    for measurements in itertools.islice(frames, 10):
+        tape.step(measurements)
+    tape.restart(with_checkpoint=False)
+    for measurements in itertools.islice(frames, lost):
+        tape.frame(measurements)
+        tape.take(tape.send(measurements), recorded=False)
+    for measurements in itertools.islice(frames, dead):  # between the two
+        tape.frame(measurements)
+        tape.send(measurements)
+    tape.restart(with_checkpoint=True)
+    for measurements in frames:
+        tape.step(measurements)
+    tape.end(measurements)
+    heard = [estimate.status for estimate in tape.estimates if estimate.frame_id > 10 + lost]
+    assert Status.GRAPH_RESET not in {status for each in heard for status in each}
+    verdict = verdict_of(tape)
+    assert verdict.difference is None, verdict.difference.frame_id
+    assert (verdict.restarts, verdict.epochs, verdict.unknown) == (2, 2, 0)
+    assert verdict.equal == len(tape.estimates) - lost
+
+
 def test_an_estimate_that_cannot_be_compared_is_not_replayed_twice(tmp_path: Path) -> None:
     """The frame that was coasted over as the world began anew is not in the recording."""
     tape, frames = Tape(tmp_path), measured(40)
@@ -235,7 +291,8 @@ def test_an_estimate_that_cannot_be_compared_is_not_replayed_twice(tmp_path: Pat
     assert (verdict.equal, verdict.unknown) == (len(tape.estimates) - 2, 2)
 
 
-EVENTS = ("well", "well", "well", "dropped", "estimate lost", "late", "restored", "new world", "new world lost")
+NEW_WORLDS = ("new world", "new world lost", "new world killed")
+EVENTS = ("well", "well", "well", "dropped", "estimate lost", "late", "restored", *NEW_WORLDS)
 
 
 @settings(max_examples=25)
@@ -251,11 +308,13 @@ def test_whatever_happens_nothing_differs(events: list[str], seed: int) -> None:
             if event == "dropped":  # by the optimizer's queue
                 tape.frame(last)
                 tape.send(last)
-            elif event in ("estimate lost", "new world lost"):  # on its way to the recorder
-                if event == "new world lost":
+            elif event in ("estimate lost", "new world lost", "new world killed"):  # on its way to the recorder
+                if event in NEW_WORLDS:
                     tape.restart(with_checkpoint=False)
                 tape.frame(last)
                 tape.take(tape.send(last), recorded=False)
+                if event == "new world killed":
+                    tape.restart(with_checkpoint=True)
             elif event == "late":
                 newer = next(frames)
                 refs = tape.frame(last), tape.frame(newer)
@@ -270,8 +329,10 @@ def test_whatever_happens_nothing_differs(events: list[str], seed: int) -> None:
         tape.end(last)
         verdict = verdict_of(tape)
         assert verdict.difference is None, (verdict.difference, verdict)
-        assert verdict.equal + sum("lost" in event for event in events) == len(tape.estimates)
-        assert verdict.restarts == sum(event in ("restored", "new world", "new world lost") for event in events)
+        unheard = ("estimate lost", "new world lost", "new world killed")
+        assert verdict.equal + sum(event in unheard for event in events) == len(tape.estimates)
+        killed = sum(event == "new world killed" for event in events)  # two processes
+        assert verdict.restarts == sum(event in ("restored", *NEW_WORLDS) for event in events) + killed
         assert verdict.unknown == 0
 
 

@@ -12,10 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_networks as tiny
-import tracking_world
 from msgspec.structs import replace
-from test_label_projection import with_right_camera
 
 from birdslam.bench.baselines.trajectories import Trajectories
 from birdslam.bench.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig, Walk, fit_drift
@@ -32,6 +29,7 @@ from birdslam.bench.tracking.benchmark import (
     ours,
     run_trial,
     summarise,
+    within,
 )
 from birdslam.bench.tracking.tables import Published, read_published
 from birdslam.frontend import FrontEnd, FrontEndConfig
@@ -50,6 +48,9 @@ from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, rea
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.speed_log import SpeedLog
 from birdslam.types import Frame, Measurements, SpeedReading
+from tests import tiny_networks as tiny
+from tests import tracking_world
+from tests.test_label_projection import with_right_camera
 
 FRAMES = range(40)
 
@@ -144,6 +145,14 @@ def noisy_log(sequence: TrackingSequence, tmp_path_factory: pytest.TempPathFacto
     """With landmarks beyond every threshold of Table 4."""
     root = tracking_world.write(tmp_path_factory.mktemp("noisy"))
     return log_of(sequence, root, SimulationConfig(), 1, ablation.FARTHEST_LANDMARK_M)
+
+
+def test_a_log_with_far_landmarks_has_the_nearer_one_in_it(
+    sequence: TrackingSequence, noisy_log: list[Measurements], tmp_path: Path
+) -> None:
+    nearer = log_of(sequence, tracking_world.write(tmp_path), SimulationConfig(), 1, 12.0)
+    assert within(noisy_log, 12.0) == nearer
+    assert sum(len(m.cp) for m in nearer) < 0.8 * sum(len(m.cp) for m in noisy_log)
 
 
 def shift_m(one: Trajectories, other: Trajectories) -> tuple[float, float]:

@@ -16,9 +16,10 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.pending_map import PendingState
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import WindowState
+from birdslam.lanes.traffic import TrafficState
 from birdslam.types import FollowedPerson
 
-VERSION = 8
+VERSION = 9
 _MAGIC = b"BirdSLAM graph\n"
 _SUM_BYTES = 16
 _KINDS = {"<f8": np.float64, "<c16": np.complex128, "<i8": np.int64}
@@ -38,6 +39,7 @@ class Epoch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     t_before_ns: int
     motion: SE2
     people: list[FollowedPerson]  # as the newest measurements have them
+    traffic: TrafficState  # which way the lanes run
 
 
 class Checkpoint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

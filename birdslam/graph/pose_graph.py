@@ -33,7 +33,9 @@ from birdslam.graph.pending_map import PendingMap
 from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edge
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
-from birdslam.lanes.occupancy import VehicleInEgo, with_vehicles
+from birdslam.lanes.occupancy import with_users
+from birdslam.lanes.traffic import Traffic
+from birdslam.lanes.users import UserInEgo, person_in_ego
 from birdslam.types import (
     INVALIDATING,
     BodyId,
@@ -85,6 +87,7 @@ class PoseGraph:
         self._camera_sigma_rel = 0.0  # of the last frame that said it
         self.window: Window | None = None  # None before the first frame
         self._people: tuple[FollowedPerson, ...] = ()  # in the newest frame's ego
+        self._traffic = Traffic()
         solver()
 
     def optimise(self, measurements: Measurements, records: Sequence[object] = ()) -> Estimate:
@@ -155,6 +158,7 @@ class PoseGraph:
                 t_before_ns=self._t_before_ns,
                 motion=self._motion,
                 people=list(self._people),
+                traffic=self._traffic.state(),
             )
         return pack(Checkpoint(settings=self.settings, epoch=self.epoch, begun=begun, pending=self._map.state()))
 
@@ -192,6 +196,7 @@ class PoseGraph:
         graph._vehicles.resume(begun.vehicles)
         graph._t_ns, graph._t_before_ns, graph._motion = begun.t_ns, begun.t_before_ns, begun.motion
         graph._people = tuple(begun.people)
+        graph._traffic = Traffic(begun.traffic)
         return graph
 
     def _begin(self, m: Measurements, reset: bool) -> Window:
@@ -305,9 +310,11 @@ class PoseGraph:
             yaw_rad = estimate.T_world_vehicle.yaw_rad
             speed_mps = estimate.velocity_mps[0] * math.cos(yaw_rad) + estimate.velocity_mps[1] * math.sin(yaw_rad)
             size = estimate.length_m
-            seen.append(VehicleInEgo(estimate.vehicle, T_ego_vehicle, cov, size, speed_mps, estimate.standing))
+            sigma_mps = math.sqrt(max(estimate.velocity_cov[0], estimate.velocity_cov[3], 0.0))
+            seen.append(UserInEgo(estimate.vehicle, T_ego_vehicle, cov, size, speed_mps, sigma_mps, estimate.standing))
         passed_s = max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
-        return with_vehicles(lanes, seen, self._motion.x_m / passed_s)
+        seen += [person_in_ego(person) for person in self._people]
+        return with_users(lanes, seen, self._motion.x_m / passed_s, self._traffic)
 
     def _vehicle_estimates(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
         return vehicle_estimates(

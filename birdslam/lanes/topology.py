@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.lanes.curves import basis
 from birdslam.types import Bound, Lane, LaneLine, LineKind
 
 Floats = NDArray[np.float64]
@@ -26,6 +27,8 @@ NO_LANE_COST = 0.6  # of a strip that is no lane
 WIDE_COST = 0.4  # of a lane wider than most
 PAINT_AT_EDGE_M = 0.6  # nearer to the road's edge than this a painted line is that edge's
 WIDTH_M, WIDTH_SIGMA_M = 3.4, 0.4  # of a lane nobody has measured
+NARROWEST_M = 1.9  # where no car fits between a lane's lines any more
+STEP_M, SURE_SIGMAS = 2.0, 2.0  # along a lane, in search of its end
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,7 @@ def _between(left: LaneLine, right: LaneLine) -> Lane:
     width_cov = P + Q - shared - shared.T
     centre = 0.5 * (a + b)
     edges = left.kind is LineKind.EDGE and right.kind is LineKind.EDGE
+    ends_m, splits_m = (None, None) if edges else _ends(a - b, width_cov, min(left.seen_to_m, right.seen_to_m))
     return Lane(
         offset_m=float(centre[0]),
         slope=float(centre[1]),
@@ -131,7 +135,24 @@ def _between(left: LaneLine, right: LaneLine) -> Lane:
         left_bound=_bound(left),
         right_bound=_bound(right),
         carriageway=edges and a[0] - b[0] > WIDEST_LANE_M,
+        ends_m=ends_m,
+        splits_m=splits_m,
     )
+
+
+def _ends(width: Floats, cov: Floats, seen_to_m: float) -> tuple[float | None, float | None]:
+    """Where a lane surely is too narrow for a car, and where as wide as two lanes, as far as its lines were seen.
+
+    `width` (4,) is the difference of its lines' curves, `cov` (4, 4) that of it.
+    """
+    x = np.arange(STEP_M, seen_to_m, STEP_M)
+    at = basis(x)
+    metres = at @ width
+    sure = SURE_SIGMAS * np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", at, cov, at), 0.0))
+    narrow, wide = metres + sure < NARROWEST_M, metres - sure > 2.0 * LEAST_LANE_M
+    ends_m = float(x[np.argmax(narrow)]) if narrow.any() else None
+    splits_m = float(x[np.argmax(wide)]) if wide.any() and width[0] < WIDEST_LANE_M else None
+    return ends_m, splits_m
 
 
 def _shared(P: Floats, Q: Floats) -> Floats:

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.people.people_boxes import BICYCLE, CYCLIST, PEDESTRIAN, PeopleBoxesConfig, PersonBox, people_boxes
-from birdslam.people.people_filter import PeopleConfig, PeopleFilter
+from birdslam.people.people_config import PeopleConfig
+from birdslam.people.people_filter import PeopleFilter
+from birdslam.people.road_tilt import tilts_of
 from birdslam.perception import Detections
 from birdslam.types import FIRST_PERSON
 from birdslam.vehicles.out_of_sequence import OpenFrame
@@ -32,7 +34,7 @@ SIDE_MARGIN = 0.03  # of the image's width: who is predicted farther outside has
 UNKNOWN_MPS = 10.0  # an ego of unknown motion is taken to drive
 LEAVES_S = 0.3  # until who left the image is forgotten
 
-STANDS, WALKS = 0.85, 0.5  # probability of standing: hysteresis of what is reported
+STANDS, WALKS = 0.7, 0.4  # probability of standing: hysteresis of what is reported
 
 
 class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -100,7 +102,7 @@ class PeopleTracker:
         if detections is not None:
             boxes = people_boxes(detections, self.camera, ground, self.config.boxes)
             pairs = self._associate(boxes, ego.T_world_ego, ground.height_m)
-            tilts = self.filter.tilts_of(boxes, road.sigma_pitch_rad, ground.height_m)
+            tilts = tilts_of(boxes, road.sigma_pitch_rad, ground.height_m, self.config.people)
             rows = [row for row, _ in pairs]
             self.filter.expect_tilt(rows, tilts[[k for _, k in pairs]])
             self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, ground.height_m)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from birdslam.bench.baselines import batch_se3, nair
 from birdslam.bench.baselines.posegraph3 import solve_batch
-from birdslam.bench.baselines.trajectories import Method
+from birdslam.bench.baselines.trajectories import Method, Trajectories
 from birdslam.bench.simulation.odometry import EXACT, SimulatedOdometry, SimulationConfig
 from birdslam.bench.tracking import ablation
 from birdslam.bench.tracking.benchmark import (
@@ -29,6 +29,7 @@ from birdslam.bench.tracking.benchmark import (
     ours,
     run_trial,
     summarise,
+    within,
 )
 from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
 from birdslam.bench.tracking.movers import movers_row
@@ -103,7 +104,7 @@ def frames_of(text: str, sequence: TrackingSequence, published: Published) -> ra
 def frames_to_make(job: Job) -> int:
     """How many frames the front end goes through for a job, seeds and logs together."""
     frames = frames_of(job.frames, open_tracking(job.root, job.sequence, job.camera), job.published)
-    logs = 1 + bool(_variants(job)) + bool(_ideas(job))
+    logs = 1 + bool(_ideas(job))
     return len(frames) * job.seeds * logs
 
 
@@ -122,15 +123,21 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
     trials, ablations, worth, nees, log = [], [], [], [], []
     with ExitStack() as stack:
         make = _log_maker(job, sequence, frames, stack, frame_made)
+        static_map = slam.frontend.static_map
+        far = msgspec.structs.replace(static_map, landmark_range_m=ablation.FARTHEST_LANDMARK_M)
         for seed in range(job.seeds):
-            log = make(seed, slam.frontend)
+            far_log = make(seed, msgspec.structs.replace(slam.frontend, static_map=far))
+            log = within(far_log, static_map.landmark_range_m)
+            solved: dict[Method, Trajectories] = {}
             nees.append(nees_rows(sequence, log, ours(slam), job.odometry))
             if chosen:
-                trials.append(run_trial(sequence, log, chosen))
+                trials.append(run_trial(sequence, log, chosen, solved=solved))
             if variants:
-                far = msgspec.structs.replace(slam.frontend.static_map, landmark_range_m=ablation.FARTHEST_LANDMARK_M)
-                far_log = make(seed, msgspec.structs.replace(slam.frontend, static_map=far))
-                ablations.append(run_trial(sequence, far_log, variants, named))
+                beyond = {name: m for name, m in variants.items() if ablation.depth_of(m) > static_map.landmark_range_m}
+                near = {name: method for name, method in variants.items() if name not in beyond}
+                trial = run_trial(sequence, log, near, named, solved)
+                deep = run_trial(sequence, far_log, beyond, named)
+                ablations.append(replace(trial, errors={**trial.errors, **deep.errors}))
             if ideas:
                 placing = (
                     AS_PUBLISHED.frontend
@@ -139,14 +146,14 @@ def run_sequence(job: Job, frame_made: Callable[[], object] = lambda: None) -> O
                 )
                 theirs = run_trial(sequence, make(seed, placing), ideas, named)
                 placed = {f"ideas/{name}": m for name, m in ablation.placed_variants(ours(slam)).items()}
-                own = run_trial(sequence, log, placed, named)
+                own = run_trial(sequence, log, placed, named, solved)
                 worth.append(replace(theirs, errors={**theirs.errors, **own.errors}))
                 if chosen:
                     alone = {name: theirs.errors[idea] for name, idea in EQ_1.items()}
                     trials[-1] = replace(trials[-1], errors={**trials[-1].errors, **alone})
     if chosen:
         name = next(iter(chosen))
-        truth, result = Truth.of(sequence, log), chosen[name].run(log, sequence.camera)
+        truth, result = Truth.of(sequence, log), solved[chosen[name]]
         title = f"KITTI tracking {sequence.name}, {chosen[name].label}, odometry: {job.odometry}"
         of_images = "_images" if job.odometry == "images" else ""
         draw_sequence(title, truth, result, job.output / f"bev_{sequence.name}{of_images}.png")

@@ -1,11 +1,11 @@
 """A recording's measurements through the back end alone, without a network or a camera.
 
 `compare` gives the recorded estimates bit for bit, or the first that differs: each estimate bears the trace of the
-message that it answers, so the order is known. Measurements that no estimate answers the optimizer never had, or its
-estimate was lost, and an epoch may have begun with it. After a restart it began a new epoch, or went on from its last
-checkpoint with the measurements since. Where measurements are missing that it had, nothing is compared until a new
-epoch begins. A file that begins in the middle of a drive has the graph of its first frame. `estimates` replays with
-another configuration.
+message that it answers, so the order is known. Measurements without an estimate either did not reach the optimizer, or
+their estimate was lost, perhaps the first of an epoch. After a restart the optimizer began a new epoch, or went on from
+its last checkpoint, as a rule with the measurements since: where it did not get them, or where the recording lacks
+measurements that it had, nothing is compared until a new epoch begins. A file that begins in the middle of a drive has
+the graph of its first frame. `estimates` replays with another configuration.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class Comparison:
         """
         likeliest: Estimate | None = None
         unseen = self._began_unseen(estimate)
-        for state, given, restarted in self._hypotheses(estimate, open_, answered):
+        for state, given, restarts in self._hypotheses(estimate, open_, answered):
             replayed = self._replayed(state, given, estimate)
             if replayed is None:
                 continue
@@ -177,23 +177,34 @@ class Comparison:
                 self._maps |= {gained.frame_id: gained for gained in state.maps}
                 self.verdict.equal += 1
                 self.verdict.coasted += answered is None
-                self.verdict.restarts += restarted
+                self.verdict.restarts += restarts
                 return len(given) - (answered is not None)
         now = self._state
-        if unseen or (now is not None and (open_ or now.graph.epoch != estimate.epoch)):
+        behind = self._came_back and Status.GRAPH_RESTORED in estimate.status  # its checkpoint is older than that state
+        if behind:  # and it did not get what came since
+            self.verdict.restarts += self._came_back
+        if unseen or behind or (now is not None and (open_ or now.graph.epoch != estimate.epoch)):
             self._state = None
         elif now is not None:
             now.unreported = ()  # this estimate has reported it
-        if likeliest is None or unseen:
+        if likeliest is None or unseen or behind:
             self.verdict.unknown += 1
         else:
             self.verdict.difference = Difference(estimate.frame_id, differing(estimate, likeliest))
         return 0
 
+    @property
+    def _came_back(self) -> int:
+        """How often the optimizer has come back since the last estimate that was equal."""
+        return max(0, self._alive - 1 - self.verdict.restarts)
+
     def _began_unseen(self, estimate: Estimate) -> bool:
-        """Whether this estimate is of an epoch that began with one that was lost on its way to the recorder."""
+        """Whether this estimate's epoch began with one that the recorder never had: it was lost on its way, or the
+        process that sent it was killed meanwhile and the next one went on from its checkpoint.
+        """
         began = self._state is not None and estimate.epoch > self._state.graph.epoch
-        return self._lost and began and Status.GRAPH_RESET not in estimate.status
+        killed = self._came_back > 1 and Status.GRAPH_RESTORED in estimate.status
+        return began and (self._lost or killed) and Status.GRAPH_RESET not in estimate.status
 
     def _reported_before(self, estimate: Estimate) -> list[Measurements]:
         """The next measurements, of frames that were reported already: a restored graph may have them."""
@@ -204,8 +215,8 @@ class Comparison:
 
     def _hypotheses(
         self, estimate: Estimate, open_: list[Measurements], answered: Measurements | None
-    ) -> Iterator[tuple[_State, list[Measurements], bool]]:
-        """(state before, measurements given to it, whether the optimizer was restarted)."""
+    ) -> Iterator[tuple[_State, list[Measurements], int]]:
+        """(state before, measurements given to it, how often the optimizer was restarted)."""
         now = [] if answered is None else [answered]
         new_world = Status.GRAPH_RESET in estimate.status
         checkpoint = self._checkpoint
@@ -215,31 +226,32 @@ class Comparison:
                 self._since += [m for m in (*open_, *now) if m.frame_id > checkpoint.frame_id]
                 answered_in_time = bool(now and self._since) and self._since[-1].frame_id == estimate.frame_id
                 if answered_in_time and estimate.epoch == checkpoint.epoch:
-                    yield _State(PoseGraph.restore(checkpoint.data, *self._back_end)), self._since, False
+                    yield _State(PoseGraph.restore(checkpoint.data, *self._back_end)), self._since, 0
             if new_world or at_first:
-                yield self._fresh(estimate), now, False
+                yield self._fresh(estimate), now, 0
             return
-        came_back = self._alive - 1 > self.verdict.restarts
+        came_back = self._came_back
+        restored = (Status.GRAPH_RESTORED,) if came_back and Status.GRAPH_RESTORED in estimate.status else ()
         if came_back and new_world:
-            yield self._fresh(estimate), now, True
-            yield self._copy(), now, True  # from its checkpoint, which nothing ties to what perceive still had
-        if came_back and Status.GRAPH_RESTORED in estimate.status:
+            yield self._fresh(estimate), now, 1
+            yield self._copy(), now, 1  # from its checkpoint, which nothing ties to what perceive still had
+        if restored:
             for last, given in itertools.product((self._state.last, None), ([*open_, *now], now)):
-                restored = self._copy()
-                restored.last, restored.unreported = last, (Status.GRAPH_RESTORED,)
-                yield restored, given, True
+                yield self._copy(last, restored), given, 1
         if self._began_unseen(estimate):
+            begun = min(came_back, 2 if restored else 1)  # the process that began the epoch, and the one after it
             for start in range(len(open_)):
-                yield _State(PoseGraph(*self._back_end, estimate.epoch)), [*open_[start:], *now], came_back
+                graph = PoseGraph(*self._back_end, estimate.epoch)
+                yield _State(graph, unreported=restored), [*open_[start:], *now], begun
         if open_:
-            yield self._copy(), now, False
-        yield self._state, [*open_, *now], False
+            yield self._copy(), now, 0
+        yield self._state, [*open_, *now], 0
 
-    def _copy(self) -> _State:
-        """The state at hand, so that it can be gone on from in several ways."""
+    def _copy(self, *changed: Any) -> _State:
+        """The state at hand, so that it can be gone on from in several ways; with another `last` and `unreported`."""
         assert self._state is not None
         graph = PoseGraph.restore(self._state.graph.checkpoint(), *self._back_end)
-        return _State(graph, self._state.last, self._state.unreported)
+        return _State(graph, *(changed or (self._state.last, self._state.unreported)))
 
     def _fresh(self, estimate: Estimate) -> _State:
         """A new graph; its first estimate says so where planners may know an older one."""

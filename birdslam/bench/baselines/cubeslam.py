@@ -57,17 +57,13 @@ def cuboid(edge: VehicleEdge, camera: Camera, config: CuboidConfig) -> VehicleEd
     near_m = camera.fy_px * config.height_m / height_px
     bearing = (camera.cx_px - 0.5 * (x1 + x2)) / camera.fx_px
     sigma_px = config.sigma_box_px + config.sigma_box_rel * width_px
-    best = (math.inf, edge.T_ego_vehicle)
-    for k in range(config.headings):
-        turn_rad = 2.0 * math.pi * k / config.headings
-        turn_rad -= 2.0 * math.pi * (turn_rad > math.pi)
-        yaw_rad = edge.T_ego_vehicle.yaw_rad + turn_rad
-        centre, width_rad = _place(near_m, bearing, yaw_rad, edge.length_m, edge.width_m)
-        misfit_px = width_rad * camera.fx_px - width_px
-        cost = (misfit_px / sigma_px) ** 2 + (turn_rad / config.sigma_prior_rad) ** 2
-        if cost < best[0]:
-            best = (cost, SE2(float(centre[0]), float(centre[1]), yaw_rad))
-    pose = best[1]
+    turns_rad = 2.0 * math.pi * np.arange(config.headings) / config.headings
+    turns_rad -= 2.0 * math.pi * (turns_rad > math.pi)
+    yaws_rad = edge.T_ego_vehicle.yaw_rad + turns_rad
+    centres, widths_rad = _places(near_m, bearing, yaws_rad, edge.length_m, edge.width_m)
+    misfit_px = widths_rad * camera.fx_px - width_px
+    best = int(np.argmin((misfit_px / sigma_px) ** 2 + (turns_rad / config.sigma_prior_rad) ** 2))
+    pose = SE2(float(centres[best, 0]), float(centres[best, 1]), float(yaws_rad[best]))
     away_m = math.hypot(pose.x_m, pose.y_m)
     sigma_px = config.sigma_box_px + config.sigma_box_rel * height_px
     along = away_m * math.hypot(sigma_px / height_px, config.sigma_height_rel)
@@ -81,15 +77,14 @@ def cuboid(edge: VehicleEdge, camera: Camera, config: CuboidConfig) -> VehicleEd
     return msgspec.structs.replace(edge, T_ego_vehicle=pose, cov=tuple(cov.ravel().tolist()))
 
 
-def _place(near_m: float, bearing: float, yaw_rad: float, length_m: float, width_m: float) -> tuple[Floats, float]:
-    """The centre (2,) of a cuboid from the distance of its nearest edge and the middle of its outline, a bearing (y/x);
-    and how wide the outline is (difference of y/x)."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    halves = np.array([[sl * length_m, sw * width_m] for sl in (-0.5, 0.5) for sw in (-0.5, 0.5)])
-    corners = halves @ np.array([[c, s], [-s, c]])
-    centre = np.array([near_m - corners[:, 0].min(), 0.0])
-    centre[1] = bearing * centre[0]
+def _places(near_m: float, bearing: float, yaws_rad: Floats, length_m: float, width_m: float) -> tuple[Floats, Floats]:
+    """Of cuboids with N headings the centres (N, 2), from the distance of the nearest edge and the middle of the
+    outline, a bearing (y/x); and how wide the outlines are (N,), as differences of y/x."""
+    halves = np.array([0.5 * sl * length_m + 0.5j * sw * width_m for sl in (-1, 1) for sw in (-1, 1)])
+    corners = halves * np.exp(1j * yaws_rad)[:, None]
+    x = near_m - corners.real.min(axis=1)
+    y = bearing * x
     for _ in range(4):  # each step leaves about a tenth of the error
-        outline = (centre[1] + corners[:, 1]) / np.maximum(centre[0] + corners[:, 0], 0.5)
-        centre[1] += (bearing - 0.5 * (outline.max() + outline.min())) * centre[0]
-    return centre, float(np.ptp(outline))
+        outline = (y[:, None] + corners.imag) / np.maximum(x[:, None] + corners.real, 0.5)
+        y += (bearing - 0.5 * (outline.max(axis=1) + outline.min(axis=1))) * x
+    return np.column_stack([x, y]), np.ptp(outline, axis=1)

@@ -39,7 +39,9 @@ class BatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     iterations: int = 500  # at the most; `Convergence` says whether they were enough
 
 
-_SCALE = gtsam.symbol("s", 0)
+_WIDE_SCALE = 1e3  # 1-sigma of an unknown scale, so that a log without any vehicle can be solved
+_SCALE_STEP = 1e-4  # for its derivative
+_SCALE_TOLERANCE = 1e-7  # of it
 _LARGEST_STEP = 0.01  # m or rad: farther no node may want to go from an answer that is one
 
 
@@ -68,9 +70,8 @@ def solve_batch(
     """The same, and how the solver ended; without `check` the step is not taken, and is NaN."""
     log = [weighted(m, config.weights) for m in log]
     builder = _Builder(config)
-    unit_m = 1.0 if config.metric else _mean_step_m(log)
     for m in log:
-        builder.add_frame(m, unit_m)
+        builder.add_frame(m, 1.0 if config.metric else _mean_step_m(log))
     if config.landmarks:
         builder.add_landmarks([edge for m in log for edge in m.cp if edge.frame in builder.poses])
     if config.steady_motion is not None:
@@ -93,11 +94,7 @@ class _Builder:
         self._seen: dict[int, set[int]] = {}  # vehicle -> frames
         self._sights: dict[int, dict[int, SE2]] = {}  # frame -> vehicle -> T_ego_vehicle
         self._last: int | None = None
-        if not config.metric:
-            self.values.insert(_SCALE, np.array([1.0]))
-            # Nothing but a wide prior, so that a log without any vehicle can be solved
-            loose = gtsam.noiseModel.Isotropic.Sigma(1, 1e3)
-            self.graph.add(gtsam.CustomFactor(loose, [_SCALE], _scale_prior))
+        self._unscaled: list[tuple[int, int, Floats, gtsam.noiseModel.Base]] = []  # CC edges whose unit is not known
 
     def add_frame(self, m: Measurements, unit_m: float) -> None:
         key = gtsam.symbol("x", m.frame_id)
@@ -109,11 +106,11 @@ class _Builder:
             step[:3, 3] /= unit_m
             pose = self.poses[m.cc.from_frame] @ step
             noise = _noise6(np.array(m.cc.cov).reshape(3, 3), _diagonal(m.cc.cov))
-            keys = [gtsam.symbol("x", m.cc.from_frame), key]
+            start = gtsam.symbol("x", m.cc.from_frame)
             if self.config.metric:
-                self.graph.add(gtsam.BetweenFactorPose3(keys[0], key, gtsam.Pose3(step), noise))
+                self.graph.add(gtsam.BetweenFactorPose3(start, key, gtsam.Pose3(step), noise))
             else:
-                self.graph.add(gtsam.CustomFactor(noise, [*keys, _SCALE], _scaled_motion(gtsam.Pose3(step))))
+                self._unscaled.append((start, key, step, noise))
         else:
             pose = np.eye(4) if self._last is None else self.poses[self._last]
             sigma = self.config.sigma_start if self._last is None else 1.0
@@ -180,20 +177,28 @@ class _Builder:
                     self.graph.add(gtsam.CustomFactor(noise, keys, _changed_motion))
 
     def solve(self, check: bool) -> tuple[Trajectories, Convergence]:
+        """The minimum over all poses, and over the scale where that is unknown."""
         out = Trajectories()
         if not self.poses:
             return out, Convergence(0, False, 0.0)
-        # Not Levenberg-Marquardt: a change of the scale moves every node, which its damping forbids to each
-        params = gtsam.DoglegParams()
-        params.setMaxIterations(self.config.iterations)
-        # A tolerance of 1e-8 ends 2 cm (0020) and 6 cm (0004) short of the minimum; this one, 0.9 and 0.5 cm
-        params.setRelativeErrorTol(1e-10)
-        optimizer = gtsam.DoglegOptimizer(self.graph, self.values, params)
-        solution = optimizer.optimize()
+        graph, solution, used = self._scaled(1.0), self.values, 0
+        scale, before = 1.0, None  # the one that is tried, and the one tried before with the slope of the cost there
+        while used < self.config.iterations:
+            optimizer = self._optimizer(graph, solution, self.config.iterations - used)
+            solution = optimizer.optimize()
+            used += optimizer.iterations()
+            if not self._unscaled:
+                break
+            slope = self._slope(scale, solution)
+            change = 0.1 * scale if before is None else -slope * (scale - before[0]) / (slope - before[1])  # secant
+            if abs(change) < _SCALE_TOLERANCE * abs(scale):
+                break
+            scale, before = scale + change, (scale, slope)
+            graph = self._scaled(scale)
         step = math.nan
         if check:
-            step = float(np.abs(self.graph.linearize(solution).optimize().vector()).max())
-        convergence = Convergence(optimizer.iterations(), optimizer.iterations() >= self.config.iterations, step)
+            step = float(np.abs(graph.linearize(solution).optimize().vector()).max())
+        convergence = Convergence(used, used >= self.config.iterations, step)
         for frame in self.poses:
             out.ego[frame] = split_pose(solution.atPose3(gtsam.symbol("x", frame)).matrix())[0]
         for vehicle, frames in self._seen.items():
@@ -201,6 +206,33 @@ class _Builder:
                 pose = solution.atPose3(_vehicle_key(vehicle, frame)).matrix()
                 out.put_vehicle(vehicle, frame, split_pose(pose)[0])
         return out, convergence
+
+    def _optimizer(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, most: int) -> gtsam.DoglegOptimizer:
+        # Not Levenberg-Marquardt: what is far off moves every node after it, which its damping forbids to each
+        params = gtsam.DoglegParams()
+        params.setMaxIterations(most)
+        # A tolerance of 1e-8 ends 2 cm (0020) and 6 cm (0004) short of the minimum; this one, 0.9 and 0.5 cm
+        params.setRelativeErrorTol(1e-10)
+        return gtsam.DoglegOptimizer(graph, start, params)
+
+    def _scaled(self, scale: float) -> gtsam.NonlinearFactorGraph:
+        """The graph with CC edges of this scale."""
+        graph = gtsam.NonlinearFactorGraph(self.graph)
+        graph.push_back(self._motions(scale))
+        return graph
+
+    def _motions(self, scale: float) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph()
+        for start, end, step, noise in self._unscaled:
+            T = step.copy()
+            T[:3, 3] *= scale
+            graph.add(gtsam.BetweenFactorPose3(start, end, gtsam.Pose3(T), noise))
+        return graph
+
+    def _slope(self, scale: float, solution: gtsam.Values) -> float:
+        """The derivative by the scale of the least cost: where the poses are best, that of the CC edges alone."""
+        ahead, behind = (self._motions(scale + side * _SCALE_STEP).error(solution) for side in (1.0, -1.0))
+        return float((ahead - behind) / (2.0 * _SCALE_STEP) + (scale - 1.0) / _WIDE_SCALE**2)
 
 
 def _vehicle_key(vehicle: int, frame: int) -> int:
@@ -220,12 +252,6 @@ def _noise6(cov: Floats, level: Floats) -> gtsam.noiseModel.Base:
     return gtsam.noiseModel.Gaussian.Covariance(full)
 
 
-def _scale_prior(factor: gtsam.CustomFactor, values: gtsam.Values, H: list[Floats] | None) -> Floats:
-    if H is not None:
-        H[0] = np.eye(1)
-    return np.asarray(values.atVector(factor.keys()[0])) - 1.0
-
-
 def _changed_motion(factor: gtsam.CustomFactor, values: gtsam.Values, H: list[Floats] | None) -> Floats:
     """Error of three poses in a row: the second motion as seen from the first."""
     a, b, c = (values.atPose3(key) for key in list(factor.keys()))
@@ -235,24 +261,3 @@ def _changed_motion(factor: gtsam.CustomFactor, values: gtsam.Values, H: list[Fl
     if H is not None:  # the change is small: its logarithm is nearly flat
         H[0], H[1], H[2] = M_ab @ H_a, M_ab @ H_b + M_bc @ K_b, M_bc @ K_c
     return np.asarray(gtsam.Pose3.Logmap(change))
-
-
-def _scaled_motion(measured: gtsam.Pose3):  # type: ignore[no-untyped-def]
-    """Error of a motion whose length is in unknown units: (rotation, translation - scale * measured translation)."""
-    R_measured, t_measured = measured.rotation(), np.asarray(measured.translation())
-
-    def error(factor: gtsam.CustomFactor, values: gtsam.Values, H: list[Floats] | None) -> Floats:
-        from_key, to_key, scale_key = factor.keys()
-        H_from, H_to = np.zeros((6, 6), order="F"), np.zeros((6, 6), order="F")
-        step = values.atPose3(from_key).between(values.atPose3(to_key), H_from, H_to)
-        R = step.rotation().matrix()
-        if H is not None:
-            along = np.zeros((6, 6))
-            along[:3, :3], along[3:, 3:] = np.eye(3), R  # the rotation's error is small: its logarithm is nearly flat
-            H[0], H[1] = along @ H_from, along @ H_to
-            H[2] = np.concatenate([np.zeros(3), -t_measured])[:, None]
-        turned = gtsam.Rot3.Logmap(R_measured.between(step.rotation()))
-        scale = float(np.asarray(values.atVector(scale_key))[0])
-        return np.concatenate([turned, np.asarray(step.translation()) - scale * t_measured])
-
-    return error

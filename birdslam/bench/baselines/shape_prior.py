@@ -10,7 +10,7 @@ shape varies in length, width and height alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
@@ -50,7 +50,7 @@ class ShapePriorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Initialised:
     """A baseline on the log's vehicles as the shape prior places them."""
 
-    label: str
+    label: str = field(compare=False)
     method: Method
 
     def run(self, log: Sequence[Measurements], camera: Camera) -> Trajectories:

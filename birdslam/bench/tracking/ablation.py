@@ -7,8 +7,9 @@ vehicle, as nothing else says where they are.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import msgspec
@@ -97,9 +98,15 @@ def lane_variants(images: bool = False) -> dict[str, Method]:
     return out
 
 
+def depth_of(method: Method) -> float:
+    """How far away (m) the landmarks are that a method takes."""
+    depth_m = method.weights.depth_threshold_m if isinstance(method, Live) else 0.0
+    return math.inf if depth_m is None else depth_m
+
+
 @dataclass(frozen=True)
 class _Batch:
-    label: str
+    label: str = field(compare=False)
     landmarks: bool = True
     of: LandmarkKind | None = None  # lanes are the completed ones then
 

@@ -7,7 +7,7 @@ differ in nothing else. Track ids are our own tracker's; a label's track in a fr
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
@@ -38,7 +38,7 @@ from birdslam.slam import SlamConfig
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
 from birdslam.sources.speed_log import SpeedLog
-from birdslam.types import NS_PER_S, Frame, Measurements
+from birdslam.types import NS_PER_S, Frame, LandmarkKind, Measurements
 from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
 
 EGO = "ego"
@@ -51,7 +51,7 @@ NO_IMAGE = np.zeros((1, 1), dtype=np.uint8)  # for an odometry that needs none
 class Live:
     """Our incremental pose graph: the live estimate of each frame, which knows nothing of later ones."""
 
-    label: str
+    label: str = field(compare=False)
     weights: WeightsConfig
     graph: GraphConfig
     cv_inflation: float = 1.0  # of the variances in the log
@@ -80,7 +80,7 @@ class Final:
     A batch, and the paper's graph, which keeps every pose, estimate each frame from the whole log: so does this.
     """
 
-    label: str
+    label: str = field(compare=False)
     live: Live
     smoother: SmootherConfig
 
@@ -149,6 +149,16 @@ def make_log(
             m = replace(m, cp=odometry.landmarks(index, ground, config.static_map))
         log.append(m)
     return log
+
+
+def within(log: Sequence[Measurements], range_m: float) -> list[Measurements]:
+    """The log as the front end makes it with landmarks of the road as far as `range_m`, of one that has them farther.
+
+    The nearest count in either, so that these are all.
+    """
+    return [
+        replace(m, cp=tuple(e for e in m.cp if e.kind is not LandmarkKind.ROAD_POINT or e.x_m < range_m)) for m in log
+    ]
 
 
 def most_labelled(sequence: TrackingSequence, cars: Iterable[int], frames: int) -> range:
@@ -253,11 +263,19 @@ def run_trial(
     log: Sequence[Measurements],
     chosen: Mapping[str, Method],
     bodies: Sequence[str] | None = None,
+    solved: dict[Method, Trajectories] | None = None,
 ) -> Trial:
-    """Every method on one log; the errors of the labelled vehicles `bodies` alone, where these are named."""
+    """Every method on one log; the errors of the labelled vehicles `bodies` alone, where these are named.
+
+    `solved` are trajectories of this very log, which equal methods share; those of the others are added to it.
+    """
+    solved = {} if solved is None else solved
+    for method in chosen.values():
+        if method not in solved:
+            solved[method] = method.run(log, sequence.camera)
     truth = Truth.of(sequence, log)
     labelled = {EGO: len(truth.ego)} | {str(label): len(poses) for label, poses in truth.vehicles.items()}
-    errors = {name: truth.errors(method.run(log, sequence.camera), bodies) for name, method in chosen.items()}
+    errors = {name: truth.errors(solved[method], bodies) for name, method in chosen.items()}
     return Trial(errors, labelled, truth.tracks(), hota(truth.boxes), idf1(truth.boxes))
 
 

@@ -1,8 +1,8 @@
 """How good tracks are: boxes matched to labels, HOTA and IDF1 in the image, ATE, RPE and motion in bird's-eye view.
 
 HOTA is Luiten et al. (IJCV 2021), IDF1 Ristani et al. (ECCVW 2016), both with TrackEval's formulas and KITTI's rules of
-what counts (`count_boxes`). The paper's ATE is the root mean square of a body's position errors in the global SE(2)
-frame, nothing aligned.
+what counts (`count_boxes`); CLEAR MOT is motmetrics'. The paper's ATE is the root mean square of a body's position
+errors in the global SE(2) frame, nothing aligned.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.bench.ego.trajectory_errors import rms, rpe
+from birdslam.bench.ego.trajectory_errors import rms
+from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS
 from birdslam.sources.label_projection import Label
-from birdslam.trajectory import ego_pose
-from birdslam.types import Attitude
+from birdslam.sources.recording import DatasetError
 from birdslam.vehicles.placement.localisation import iou
 
 Floats = NDArray[np.float64]
@@ -83,14 +83,15 @@ def count_boxes(labels: Sequence[Label], tracks: Sequence[int], boxes_px: Floats
         if j in matched:
             keep.append(bool(asked[matched[j]]))
         else:
-            keep.append(box[3] - box[1] > LEAST_HEIGHT_PX and not _mostly_inside(box, regions))
+            keep.append(box[3] - box[1] > LEAST_HEIGHT_PX and not mostly_inside(box, regions))
     ids = np.array(tracks, dtype=np.int64).reshape(-1)
     names = np.array([label.track for label in vehicles], dtype=np.int64).reshape(-1)
     kept = np.array(keep, dtype=np.bool_)
     return BoxFrame(names[asked], ids[kept], overlap[asked][:, kept])
 
 
-def _mostly_inside(box: Floats, regions: Floats) -> bool:
+def mostly_inside(box: Floats, regions: Floats) -> bool:
+    """Whether more than half of a box (4,) lies in one of the regions (N, 4)."""
     span = np.clip(np.minimum(box[2:], regions[:, 2:]) - np.maximum(box[:2], regions[:, :2]), 0.0, None)
     area = max((box[2] - box[0]) * (box[3] - box[1]), 1e-9)
     return bool((span[:, 0] * span[:, 1] > 0.5 * area).any())
@@ -143,37 +144,31 @@ def hota_parts(frames: Sequence[BoxFrame]) -> Hota | None:
 
 
 @dataclass(frozen=True)
-class ClearMot:
-    """CLEAR MOT (Bernardin and Stiefelhagen 2008) at one threshold."""
+class Identities:
+    """CLEAR MOT (Bernardin and Stiefelhagen 2008) and IDF1 at one threshold."""
 
     mota: float
-    found: int
-    missed: int
-    false_alarms: int
+    idf1: float
     switches: int
 
 
-def clear_mot(frames: Sequence[BoxFrame], least: float = MATCH_IOU) -> ClearMot:
-    """TrackEval's CLEAR: who was matched in the frame before stays so where the pair still overlaps by `least`."""
-    last: dict[int, int] = {}  # label -> its last track
-    matched_before: dict[int, int] = {}
-    found = missed = false_alarms = switches = 0
+def identities(frames: Sequence[BoxFrame], least: float = MATCH_IOU) -> Identities:
+    """By motmetrics: a pair is possible where it overlaps by `least`, who was matched before stays so where it can.
+
+    Without labels MOTA and IDF1 are 0. Raises DatasetError where motmetrics is not installed.
+    """
+    try:
+        import motmetrics  # with pandas: the extra `evaluate`
+    except ImportError:
+        raise DatasetError("tracks are judged by motmetrics: pip install 'birdslam[evaluate]'") from None
+    events = motmetrics.MOTAccumulator(auto_id=True)
     for frame in frames:
-        stays = np.array(
-            [[matched_before.get(int(label)) == int(track) for track in frame.tracks] for label in frame.labels],
-            dtype=np.bool_,
-        ).reshape(frame.overlap.shape)
-        score = np.where(frame.overlap >= least - 1e-9, 1000.0 * stays + frame.overlap, 0.0)
-        rows, columns = least_cost(-score)
-        pairs = {int(frame.labels[i]): int(frame.tracks[j]) for i, j in zip(rows, columns, strict=True) if score[i, j]}
-        switches += sum(last.get(label, track) != track for label, track in pairs.items())
-        last.update(pairs)
-        matched_before = pairs
-        found += len(pairs)
-        missed += len(frame.labels) - len(pairs)
-        false_alarms += len(frame.tracks) - len(pairs)
-    mota = (found - false_alarms - switches) / max(1, found + missed)
-    return ClearMot(mota, found, missed, false_alarms, switches)
+        distance = np.where(frame.overlap >= least - 1e-9, 1.0 - frame.overlap, np.nan)
+        events.update(frame.labels.tolist(), frame.tracks.tolist(), distance)
+    asked = ["mota", "idf1", "num_switches"]
+    found = motmetrics.metrics.create().compute(events, metrics=asked, return_dataframe=False)
+    mota, idf1 = (float(found[name]) if np.isfinite(found[name]) else 0.0 for name in asked[:2])
+    return Identities(mota, idf1, int(found["num_switches"]))
 
 
 def idf1(frames: Sequence[BoxFrame]) -> float | None:
@@ -216,20 +211,15 @@ def path_errors(truth: dict[int, SE2], found: dict[int, SE2]) -> PathErrors | No
     frames = sorted(truth.keys() & found.keys())
     if not frames:
         return None
-    goal, seen = (np.array([[p[f].x_m, p[f].y_m] for f in frames]) for p in (truth, found))
+    goal, seen = (np.array([[p[f].x_m, p[f].y_m, p[f].yaw_rad] for f in frames]) for p in (truth, found))
     steps = np.flatnonzero(np.diff(frames) == 1)
-    pairs = [(frames[k], frames[k + 1]) for k in steps]
-    relative = [
-        rpe(
-            *(np.array([ego_pose(SE2(), Attitude()), ego_pose(p[a].between(p[b]), Attitude())]) for p in (truth, found))
-        )
-        for a, b in pairs
-    ]
+    error = between(between(goal[steps], goal[steps + 1]), between(seen[steps], seen[steps + 1]))
     moved = (seen[steps + 1] - seen[steps]) - (goal[steps + 1] - goal[steps])
+    any_step = len(steps) > 0
     return PathErrors(
         frames=len(frames),
-        ate_m=rms(np.linalg.norm(seen - goal, axis=1)),
-        rpe_t_m=rms(np.array([t for t, _ in relative])) if pairs else None,
-        rpe_r_deg=rms(np.array([r for _, r in relative])) if pairs else None,
-        motion_error_m=rms(np.linalg.norm(moved, axis=1)) if pairs else None,
+        ate_m=rms(np.hypot(*(seen - goal)[:, :2].T)),
+        rpe_t_m=rms(np.hypot(error[:, 0], error[:, 1])) if any_step else None,
+        rpe_r_deg=float(np.rad2deg(rms(error[:, 2]))) if any_step else None,
+        motion_error_m=rms(np.hypot(moved[:, 0], moved[:, 1])) if any_step else None,
     )

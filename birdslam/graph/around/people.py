@@ -19,7 +19,7 @@ from birdslam.types import FollowedPerson, RoadUser
 
 MOST = 60  # the nearest; a message and a frame's time have their limits
 YAW_UNKNOWN = math.pi**2 / 3.0  # the variance of a direction of which nothing is known
-CHANGE_MPS = 0.8  # 1-sigma by which a velocity changes within a second, as in `people_filter.Sizes`
+CHANGE_MPS = 0.8  # 1-sigma by which a velocity changes within a second, as in `people_config.Sizes`
 TURNS_MPS = 0.5  # who moves slower has no yaw
 FARTHEST_M, FASTEST_MPS = 1e4, 1e3  # somebody beyond is no person, but numbers that no front end made
 
