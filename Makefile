@@ -11,7 +11,7 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: setup test test-slow wheel-test pages wheels fuzz faults onroad perf lint train demo demo-kitti clean
+.PHONY: setup browser test test-slow wheel-test pages wheels fuzz faults onroad perf lint train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -23,10 +23,17 @@ $(VENV)/.ready: pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	@touch $@
 
-# First the tests that compute, one on each core; then those that start processes and wait for them, two at a time
-test: setup
+# For the tests of pages that a browser draws: Debian's, which root may install; without one they skip, and say so
+browser:
+	@command -v chromium >/dev/null || command -v chromium-browser >/dev/null \
+		|| { test "$$(id -u)" = 0 && command -v apt-get >/dev/null \
+			&& apt-get update -q && apt-get install -qy --no-install-recommends chromium; } \
+		|| echo "no Chromium: tests of pages in a browser will skip (Debian, as root: apt-get install chromium)"
+
+# First the tests that compute, one on each core; then those that start processes and wait for them, three at a time
+test: browser setup
 	$(BIN)/python -m pytest -n $(CORES) --dist worksteal -m 'not processes and $(ON_EACH_CHANGE)'
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'processes and $(ON_EACH_CHANGE)'
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m 'processes and $(ON_EACH_CHANGE)'
 
 # Then property tests with examples that are new each time
 test-slow: setup

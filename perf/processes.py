@@ -1,4 +1,4 @@
-"""Processes that benchmarks start: `birdslam` and its nodes, and busy cores beside them."""
+"""Processes that benchmarks start: `birdslam` and its nodes."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ import contextlib
 import socket
 import subprocess
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 
 import psutil
 
 from birdslam.perf.errors import PerfError
-
-_SPIN = "while True: pass"
 
 
 def birdslam_command(*arguments: str) -> list[str]:
@@ -40,18 +38,6 @@ def processes_of(pid: int, names: Collection[str]) -> dict[str, psutil.Process]:
             if name in command:
                 found[f"{name} spare" if name in found else name] = child
     return found
-
-
-@contextlib.contextmanager
-def loaded(cores: int) -> Iterator[None]:
-    """So many cores are busy meanwhile."""
-    hogs = [subprocess.Popen([sys.executable, "-c", _SPIN], start_new_session=True) for _ in range(cores)]
-    try:
-        yield
-    finally:
-        for hog in hogs:
-            hog.kill()
-            hog.wait()
 
 
 def free_port() -> int:

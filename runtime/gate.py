@@ -21,12 +21,11 @@ import zenoh
 from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.runtime.environment import USER_ERROR_STATUS
 from birdslam.runtime.process import signals
-from birdslam.runtime.process.notify import Notifier
+from birdslam.runtime.process.notify import serve
 from birdslam.runtime.topology import CAR, PROCESSES, VERSION
 from birdslam.runtime.transport.presence import runtime_dir_of, socket_path
 from birdslam.runtime.wire import MAX_MESSAGE_BYTES
 
-_LOOK_S = 1.0
 _RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2}
 _MUST_BE = {  # key -> its only value
     "mode": "peer",
@@ -129,14 +128,12 @@ def run(path: Path, vehicle: str, runtime_dir: Path | None) -> None:
         session = zenoh.open(config)
     except zenoh.ZError as error:
         raise GateError(f"{path}: the gate can't be opened: {error}") from error
-    notifier = Notifier()
     with session:
         listen = ", ".join(json.loads(config.get_json("listen/endpoints")))
-        print(f"the gate of vehicle {vehicle!r} is open: {listen}", flush=True)
-        notifier.once("READY=1")
-        while not signals.asked_to_end(notifier.period_s or _LOOK_S):
-            notifier.alive(f"{len(session.info.peers_zid())} nodes of the vehicle reached, open at {listen}")
-        notifier.once("STOPPING=1")
+        serve(
+            f"the gate of vehicle {vehicle!r} is open: {listen}",
+            lambda: f"{len(session.info.peers_zid())} nodes of the vehicle reached, open at {listen}",
+        )
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import io
 import re
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import redirect_stdout
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -225,20 +228,17 @@ NESTED = ("evaluate", "map", "models", "demo-drive")  # commands that have comma
 WORDS: list[tuple[str, ...]] = [(), *((word,) for word in NESTED)]
 
 
-@pytest.fixture
-def help_of(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+@cache
+def help_of(*words: str) -> str:
     """What `birdslam WORDS --help` prints, on long lines."""
-    monkeypatch.setenv("COLUMNS", "400")
-
-    def asked(*words: str) -> str:
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out:
+        patch.setenv("COLUMNS", "400")
         with pytest.raises(SystemExit):
             main([*words, "--help"])
-        return capsys.readouterr().out
-
-    return asked
+    return out.getvalue()
 
 
-def test_every_command_that_a_page_shows_is_one(help_of: Callable[..., str]) -> None:
+def test_every_command_that_a_page_shows_is_one() -> None:
     """`birdslam WORD`, `python -m perf WORD` and `make WORD`, in the words of the programs."""
     commands = {words: set(re.findall(r"^    ([a-z][a-z-]+)", help_of(*words), re.MULTILINE)) for words in WORDS}
     benchmarks = benchmark_modules()
@@ -255,7 +255,7 @@ def test_every_command_that_a_page_shows_is_one(help_of: Callable[..., str]) -> 
             assert word in targets, f"{page}: make {word}"
 
 
-def test_every_option_that_a_page_shows_is_one(help_of: Callable[..., str]) -> None:
+def test_every_option_that_a_page_shows_is_one() -> None:
     for page in PAGES:
         text = page.read_text().replace("\\\n", " ")
         shown = re.findall(r"^    (?:\.venv/bin/)?birdslam ([^#\n]+)", text, re.MULTILINE)

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from birdslam.perf.robustness.faults import markdown, measure, survived
-from birdslam.perf.robustness.faulty_vehicle import Vehicle, model_options, record_options
+from birdslam.perf.robustness.faulty_vehicle import WITHOUT_SPARES, Vehicle, model_options, record_options
 from birdslam.perf.robustness.injection import FAULTS
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.presence import ring_path
@@ -112,7 +112,7 @@ def test_nothing_leaks_over_a_hundred_restarts(place: Path) -> None:
 
 
 def test_a_node_that_keeps_dying_ends_the_run_with_its_name(place: Path) -> None:
-    with Vehicle(place, *PATIENT, "--set", "runtime.restarts_max=1") as vehicle:
+    with Vehicle(place, *PATIENT, *WITHOUT_SPARES, "--set", "runtime.restarts_max=1") as vehicle:
         vehicle.node("optimize").send_signal(signal.SIGKILL)
         vehicle.settle(0.3)
         vehicle.node("optimize").send_signal(signal.SIGKILL)

@@ -259,7 +259,7 @@ def test_the_doctor_measures_what_settings_cost(monkeypatch: pytest.MonkeyPatch)
     assert "ms" in rows["every core wanted"]
     monkeypatch.setattr(os, "sched_setscheduler", refused)
     assert "not permitted" in dict(doctor_costs.costs(1))["the same, SCHED_FIFO"]
-    with doctor_costs.others(1):
+    with doctor_costs.busy_cores(1):
         assert len(doctor_costs.lateness_ms()) == 10
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import re
 import shlex
+import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -74,6 +76,38 @@ def test_the_containerfile_is_one() -> None:
     commands.append(containerfile.Instruction("CMD", last["HEALTHCHECK"].text.partition("CMD ")[2]).words)
     assert [parse(words[1:]).command for words in commands] == ["run", "run", "top"]
     assert {words[0] for words in commands} == {"birdslam"}
+
+
+@pytest.mark.parametrize(
+    ("user", "apt_status", "says"),
+    [
+        (1000, 0, "no Chromium: tests of pages in a browser will skip"),
+        (0, 0, ""),
+        (0, 100, "no Chromium: tests of pages in a browser will skip"),  # as where there is no network
+    ],
+)
+def test_root_installs_a_browser_and_others_are_told(tmp_path: Path, user: int, apt_status: int, says: str) -> None:
+    """On a machine without one; whatever comes of it, the tests run."""
+    make, shell = shutil.which("make"), shutil.which("sh")
+    assert make is not None
+    assert shell is not None
+    asked = tmp_path / "asked"
+    for name, line in (("id", f"echo {user}"), ("apt-get", f'echo "$*" >> {asked}; exit {apt_status}')):
+        (tmp_path / name).write_text(f"#!{shell}\n{line}\n")
+        (tmp_path / name).chmod(0o755)
+    done = subprocess.run(
+        [make, "-C", wheels.ROOT, "--silent", "browser", f"SHELL={shell}"],
+        env={"PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(says)
+    assert bool(done.stdout) == bool(says)
+    assert asked.exists() == (user == 0)
+    if user == apt_status == 0:
+        assert asked.read_text().splitlines()[-1].endswith("chromium")
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from birdslam.perf.robustness.faulty_vehicle import Vehicle
+from birdslam.perf.robustness.faulty_vehicle import WITHOUT_SPARES, Vehicle
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.pages.interface import page
 from birdslam.runtime.topology import QUERIES, TOPICS
@@ -79,7 +79,7 @@ def until_said(process: subprocess.Popen[str], *wanted: str) -> None:
 def test_the_examples_against_a_drive(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Alive, then without a vehicle: neither falls silent."""
     place = tmp_path_factory.mktemp("i")
-    with Vehicle(place, "--set", "runtime.watchdog_ms=20000") as vehicle:
+    with Vehicle(place, "--set", "runtime.watchdog_ms=20000", *WITHOUT_SPARES) as vehicle:
         hub = socket_path(vehicle.runtime_dir / vehicle.vehicle, "hub")
         name, folder = vehicle.vehicle, str(vehicle.runtime_dir)
         with (

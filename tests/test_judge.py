@@ -54,17 +54,13 @@ def judged(estimates: list[Estimate]) -> Judge:
 def test_each_pixel_of_the_street_is_the_mean_of_what_it_covers() -> None:
     texture = street.Texture(3)
     y, x = np.linspace(-700.25, 3000.5, 301), np.linspace(17.3, 2100.1, 201)  # over several turns, off the grid
-    parts = texture.mean(*np.broadcast_arrays(y[:-1, None], y[1:, None], x[:-1], x[1:]))
+    parts = texture.mean(y[:-1], y[1:], x[:-1], x[1:])
     whole = texture.mean(*(np.array([edge]) for edge in (y[0], y[-1], x[0], x[-1])))
-    assert whole[0] == pytest.approx(parts.mean(), abs=1e-6)
+    assert whole[0, 0] == pytest.approx(parts.mean(), abs=1e-6)
     assert parts.std() > 10.0
-    texel = texture.mean(*np.broadcast_arrays(np.arange(9.0)[:, None], np.arange(1.0, 10.0)[:, None], 5.0, 6.0))
-    turned = texture.mean(
-        *np.broadcast_arrays(
-            np.arange(9.0)[:, None] - street.TEXELS, np.arange(1.0, 10.0)[:, None] - street.TEXELS, 5.0, 6.0
-        )
-    )
-    assert turned == pytest.approx(texel, abs=1e-6)
+    rows, column = (np.arange(9.0), np.arange(1.0, 10.0)), (np.array([5.0]), np.array([6.0]))
+    turned = (edge - street.TEXELS for edge in rows)
+    assert texture.mean(*turned, *column) == pytest.approx(texture.mean(*rows, *column), abs=1e-6)
 
 
 def test_the_end_of_the_street_meets_its_beginning(loop: NDArray[np.uint8]) -> None:

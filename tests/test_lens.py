@@ -50,7 +50,7 @@ def calibrated(images: list[CornersOfImage], focal_px: float = FOCAL_PX, sigma_r
     return lens
 
 
-@pytest.mark.parametrize("k1", [-0.3, 0.0])
+@pytest.mark.parametrize("k1", [-0.3, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_a_turning_drive_shows_focal_length_and_distortion(k1: float) -> None:
     lens = calibrated(drive(k1, math.radians(120.0)), 1.1 * FOCAL_PX)
     assert lens.focal_shown

@@ -231,6 +231,7 @@ def test_lateness_is_against_the_frame_that_kept_the_pace_best() -> None:
     assert system.lateness(messages, 1e3 / 30.0) == pytest.approx([0.0, 0.0, 0.0, 4.0, 0.0], abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.processes
 def test_the_shipped_drive_is_the_source_of_everything(tmp_path: Path) -> None:
     """One short run of the real processes: its keys are those that a report and a CI read."""

@@ -25,9 +25,10 @@ from birdslam.bench.tracking.benchmark import EGO as EGO_BODY
 from birdslam.perf.errors import PerfError
 from birdslam.perf.latency.live import Ask, add_run_options, drive, setting_options
 from birdslam.perf.latency.system import age_of
-from birdslam.perf.processes import loaded, run_birdslam
+from birdslam.perf.processes import run_birdslam
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
 from birdslam.perf.reporting.figures import Ledger, spread
+from birdslam.runtime.doctor.costs import busy_cores
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.trajectory import as_poses, read_kitti
@@ -74,7 +75,7 @@ def _source(ledger: Ledger, options: argparse.Namespace, source: str) -> None:
     )
     rates = sorted({round(recording.rate_hz), *options.rates})
     for rate, load in [(rate, 0) for rate in rates] + ([(rates[-1], options.load)] if options.load else []):
-        with loaded(load), drive(_ask(options, source, recording, rate)) as result:
+        with busy_cores(load), drive(_ask(options, source, recording, rate)) as result:
             row = graded(recording, result.place / "out", result.summary)
             ages_ms = [age_of(message) for message in result.messages]
             row |= {"epochs": len({m.record.epoch for m in result.messages}), "age_ms": spread(ages_ms)}

@@ -7,6 +7,7 @@ would be judged by motions that are in no street. The mean of a rectangle of tex
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,25 +40,33 @@ class Texture:
         self._sums = np.zeros((TEXELS + 1, TEXELS + 1))  # [i, j]: over the first i rows and j columns, less the mean
         self._sums[1:, 1:] = (texture - self._mean).cumsum(0).cumsum(1)
 
-    def _integral(self, y: Floats, x: Floats) -> Floats:
-        """Over all up to (y, x), in texels, of the texture laid side by side without end."""
-        turns_y, y = np.divmod(y, TEXELS)
-        turns_x, x = np.divmod(x, TEXELS)
-        i, j = (np.minimum(at.astype(np.int64), TEXELS - 1) for at in (y, x))  # a turn less a rounding error is a turn
-        fy, fx = y - i, x - j
-        sums = self._sums
-        upper = (1.0 - fx) * sums[i, j] + fx * sums[i, j + 1]
-        lower = (1.0 - fx) * sums[i + 1, j] + fx * sums[i + 1, j + 1]
-        rows = (1.0 - fx) * sums[-1, j] + fx * sums[-1, j + 1]  # of a whole turn in y; in x and y together it is 0
-        columns = (1.0 - fy) * sums[i, -1] + fy * sums[i + 1, -1]
-        whole: Floats = (1.0 - fy) * upper + fy * lower + turns_y * rows + turns_x * columns
-        return whole
-
     def mean(self, y0: Floats, y1: Floats, x0: Floats, x1: Floats) -> Floats:
-        """Over each rectangle, in texels."""
-        total = self._integral(y1, x1) - self._integral(y0, x1) - self._integral(y1, x0) + self._integral(y0, x0)
-        mean: Floats = self._mean + total / ((y1 - y0) * (x1 - x0))
+        """(K, P): over each rectangle from y0 (K,) to y1 and from x0 (P,) to x1, in texels; the texture is laid side by
+        side without end.
+        """
+        places = [_place(x) for x in (x0, x1)]
+        first, last = min(j.min() for _, j, _ in places), max(j.max() for _, j, _ in places) + 2
+        band = self._rows(y1, first, last) - self._rows(y0, first, last)
+        turn = self._rows(y1, TEXELS, TEXELS + 1) - self._rows(y0, TEXELS, TEXELS + 1)
+        left, right = (
+            (1.0 - f) * band[:, j - first] + f * band[:, j + 1 - first] + turns * turn for turns, j, f in places
+        )
+        mean: Floats = self._mean + (right - left) / ((y1 - y0)[:, None] * (x1 - x0))
         return mean
+
+    def _rows(self, y: Floats, first: int, last: int) -> Floats:
+        """(K, last - first): over all up to each y (K,) and up to these columns of texels."""
+        turns, i, f = (each[:, None] for each in _place(y))
+        sums = self._sums[:, first:last]
+        rows: Floats = (1.0 - f) * sums[i[:, 0]] + f * sums[i[:, 0] + 1] + turns * sums[-1]
+        return rows
+
+
+def _place(at: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
+    """Turns of the texture, the texel in it, and the share of that one."""
+    turns, at = np.divmod(at, TEXELS)
+    i = np.minimum(at.astype(np.int64), TEXELS - 1)  # a turn less a rounding error is a turn
+    return turns, i, at - i
 
 
 @functools.cache
@@ -65,31 +74,29 @@ def street_loop() -> NDArray[np.uint8]:
     """(LOOP_FRAMES, HEIGHT_PX, WIDTH_PX), read-only: FRAME_M further from each to the next, and from the last to the
     first.
     """
-    u, v = np.meshgrid(np.arange(WIDTH_PX) - WIDTH_PX / 2, np.arange(HEIGHT_PX) - HEIGHT_PX / 2)
+    u_px, v_px = np.arange(WIDTH_PX) - WIDTH_PX / 2, np.arange(HEIGHT_PX) - HEIGHT_PX / 2
     out = np.full((LOOP_FRAMES, HEIGHT_PX, WIDTH_PX), SKY, dtype=np.uint8)
+    driven_m = np.arange(LOOP_FRAMES, dtype=np.float64) * FRAME_M
 
-    below = v > 1.0
-    road_px, depth_m = v[below], F_PX * HEIGHT_M / v[below]
-    road_depth_m = F_PX * HEIGHT_M / (road_px + 0.5), F_PX * HEIGHT_M / (road_px - 0.5)
-    road_side_m = (u[below] - 0.5) * depth_m / F_PX, (u[below] + 0.5) * depth_m / F_PX
+    def draw(rows: Any, columns: Any, texture: Texture, depth_m: list[float], across_m: list[Floats]) -> None:
+        """Pixels of one depth, in all frames; `depth_m` and `across_m` of the edges of what each covers."""
+        y, x = (TEXELS_PER_M * (at_m + driven_m) for at_m in depth_m), (TEXELS_PER_M * at_m for at_m in across_m)
+        shade = texture.mean(*y, *x)
+        out[:, rows, columns] = np.clip(shade + 0.5, 0.0, 255.0).astype(np.uint8)
 
-    away_px = np.maximum(np.abs(u), 1.0)
-    front_m = F_PX * FRONT_AT_M / away_px
-    high_m = HEIGHT_M - v * front_m / F_PX
-    front = (away_px > 3.0) & (high_m > 0.0) & (high_m < FRONT_HIGH_M)
-    front_depth_m = F_PX * FRONT_AT_M / (away_px[front] + 0.5), F_PX * FRONT_AT_M / (away_px[front] - 0.5)
-    other_side_m = np.where(u[front] > 0.0, TEXELS / 2 / TEXELS_PER_M, 0.0)
-    front_high_m = tuple(high_m[front] + other_side_m + half * front_m[front] / F_PX for half in (-0.5, 0.5))
-
-    surfaces = (
-        (Texture(5), below, road_depth_m, road_side_m),
-        (Texture(7), front, front_depth_m, front_high_m),  # before the road behind it
-    )
-    for texture, seen, (near_m, far_m), (left_m, right_m) in surfaces:
-        left, right = TEXELS_PER_M * left_m, TEXELS_PER_M * right_m
-        for number in range(LOOP_FRAMES):
-            driven_m = number * FRAME_M
-            shade = texture.mean(TEXELS_PER_M * (near_m + driven_m), TEXELS_PER_M * (far_m + driven_m), left, right)
-            out[number][seen] = np.clip(shade + 0.5, 0.0, 255.0).astype(np.uint8)
+    road, fronts = Texture(5), Texture(7)
+    for row in np.flatnonzero(v_px > 1.0):
+        below_px = v_px[row]
+        m_per_px = HEIGHT_M / below_px
+        depth_m = [F_PX * HEIGHT_M / (below_px + half) for half in (0.5, -0.5)]
+        draw(row, slice(None), road, depth_m, [(u_px + half) * m_per_px for half in (-0.5, 0.5)])
+    for column in np.flatnonzero(np.abs(u_px) > 3.0):  # before the road behind it
+        away_px = abs(u_px[column])
+        m_per_px = FRONT_AT_M / away_px
+        high_m = HEIGHT_M - v_px * m_per_px
+        rows = np.flatnonzero((high_m > 0.0) & (high_m < FRONT_HIGH_M))
+        other_side_m = TEXELS / 2 / TEXELS_PER_M if u_px[column] > 0.0 else 0.0
+        depth_m = [F_PX * FRONT_AT_M / (away_px + half) for half in (0.5, -0.5)]
+        draw(rows, column, fronts, depth_m, [high_m[rows] + other_side_m + half * m_per_px for half in (-0.5, 0.5)])
     out.setflags(write=False)  # it is rendered once for all who ask
     return out

@@ -17,9 +17,9 @@ from typing import Any
 from birdslam.perf.accuracy.accuracy import graded
 from birdslam.perf.latency.live import Ask, add_run_options, drive
 from birdslam.perf.latency.system import figures
-from birdslam.perf.processes import loaded
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
 from birdslam.perf.reporting.figures import Ledger
+from birdslam.runtime.doctor.costs import busy_cores
 from birdslam.sources.opening import open_recording
 
 label = "rate, drops, age, vehicles found and the ego's error on 1, 2 and 4 cores, by affinity"
@@ -54,7 +54,7 @@ def run(arguments: list[str]) -> None:
                 reason = f"{there} cores are at hand"
                 ledger.add(name, f"missing: {reason}", cores=cores, missing=reason)
                 continue
-            with on_first(cores), loaded(options.load):
+            with on_first(cores), busy_cores(options.load):
                 row, complete = measure(options)
             ledger.add(name, summary(row), cores=cores, **row)
             if not complete:

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from birdslam.perf.latency import convoy
 from birdslam.perf.latency.live import Ask, Run, add_run_options, drive
-from birdslam.perf.processes import loaded
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
 from birdslam.perf.reporting.figures import BLOCKS, Ledger, curve, noise, spread, spread_text
 from birdslam.perf.reporting.machine import Steal
 from birdslam.runtime.configuration import BudgetsConfig
+from birdslam.runtime.doctor.costs import busy_cores
 from birdslam.runtime.latency import key_of, queue_of, stages
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Message
@@ -62,7 +62,7 @@ def run(arguments: list[str]) -> int:
     settings = {**msgspec.to_builtins(ask, enc_hook=str), "seconds": options.seconds, "load": options.load}
     with Ledger(options.output, label, **settings) as ledger:
         steal = Steal()
-        with loaded(options.load), drive(ask) as result:
+        with busy_cores(options.load), drive(ask) as result:
             ledger.set(**figures(result, WARM_UP_S), steal_during_percent=steal.percent())
         print(table(ledger.content))
         if not result.complete:
@@ -72,7 +72,7 @@ def run(arguments: list[str]) -> int:
 
 def _with_vehicles(options: argparse.Namespace) -> None:
     settings = {"rate": options.rate, "seconds": options.seconds, "load": options.load}
-    with Ledger(options.output, label, vehicles=options.vehicles, **settings) as ledger, loaded(options.load):
+    with Ledger(options.output, label, vehicles=options.vehicles, **settings) as ledger, busy_cores(options.load):
         for vehicles in options.vehicles:
             row = convoy.measure(vehicles, options.rate, options.seconds, WARM_UP_S, tuple(options.set))
             ledger.add(f"{vehicles} vehicles", convoy.summary(row), **row)

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from birdslam.perf.latency.carriers import CARRIERS
-from birdslam.perf.processes import loaded
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
 from birdslam.perf.reporting.figures import Ledger, curve, noise, spread, spread_text
 from birdslam.perf.reporting.machine import Steal
+from birdslam.runtime.doctor.costs import busy_cores
 
 label = "pixels and messages across processes, by our ring and by its peers"
 
@@ -58,7 +58,7 @@ def run(arguments: list[str]) -> None:
         parser.error(f"there is no carrier {unknown[0]!r}: {', '.join(CARRIERS)}")
     with Ledger(options.output, label, seconds=options.seconds) as ledger:
         for load in options.loads:
-            with loaded(load):
+            with busy_cores(load):
                 for case in cases(carriers, options.bytes, options.rates, load):
                     row = measure(case, options.seconds)
                     cpu = f"cpu {row['cpu_percent']['sender']:.1f} + {row['cpu_percent']['receiver']:.1f} %"

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import psutil
 
-from birdslam.perf.processes import loaded
 from birdslam.perf.robustness.faulty_vehicle import ROOT, Vehicle
+from birdslam.runtime.doctor.costs import busy_cores
 from birdslam.runtime.topology import NODES, QUERIES, key_of
 from birdslam.runtime.transport.presence import ring_path
 
@@ -66,7 +66,7 @@ def camera(name: str) -> Injection:
 @contextlib.contextmanager
 def cpu_hog(vehicle: Vehicle) -> Iterator[None]:
     """Two busy processes for each core."""
-    with loaded(2 * (os.cpu_count() or 1)):
+    with busy_cores(2 * (os.cpu_count() or 1)):
         yield
 
 

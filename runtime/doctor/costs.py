@@ -43,8 +43,8 @@ def lateness_ms(fifo: bool = False) -> list[float]:
 
 
 @contextlib.contextmanager
-def others(cores: int, nice: int = 0) -> Iterator[None]:
-    """So many processes that want a core each."""
+def busy_cores(cores: int, nice: int = 0) -> Iterator[None]:
+    """So many processes that want a core each, meanwhile."""
     command = [sys.executable, "-c", f"import os; os.nice({nice})\n{_SPIN}"]
     hogs = [subprocess.Popen(command, start_new_session=True) for _ in range(cores)]
     try:
@@ -89,13 +89,13 @@ def _percentiles(late_ms: list[float]) -> str:
 def costs(cores: int) -> Iterator[tuple[str, str]]:
     """(what, what it costs), a row each."""
     yield "as it is", _percentiles(lateness_ms())
-    with others(cores):
+    with busy_cores(cores):
         yield "every core wanted", _percentiles(lateness_ms())
         try:
             yield "the same, SCHED_FIFO", _percentiles(lateness_ms(fifo=True))
         except PermissionError:
             yield "the same, SCHED_FIFO", "not permitted (LimitRTPRIO=, CAP_SYS_NICE): not measured"
-    with others(cores, nice=19):
+    with busy_cores(cores, nice=19):
         yield "wanted at nice 19", _percentiles(lateness_ms())
     in_a_row, rested = work_ms(0.0), work_ms(REST_S)
     yield (

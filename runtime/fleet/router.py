@@ -14,10 +14,9 @@ import zenoh
 from birdslam.runtime.configuration import ConfigurationError, RouterConfig
 from birdslam.runtime.fleet.link import BUFFERS, check, settings_of, zenoh_config
 from birdslam.runtime.process import signals
-from birdslam.runtime.process.notify import Notifier
+from birdslam.runtime.process.notify import serve
 from birdslam.runtime.topology import QUERIES, VERSION, every_key
 
-_LOOK_S = 1.0
 _ACCEPT_MS = 2_000  # who connects and then says nothing is let go
 PUBLISHED = ("estimate", "health/*")  # by a vehicle; no images, no measurements
 QUERYABLE = (*PUBLISHED, *QUERIES)  # a vehicle answers queries of these
@@ -117,10 +116,9 @@ def run(config: RouterConfig) -> None:
         session = zenoh.open(settings)
     except zenoh.ZError as error:
         raise ConfigurationError(f"router.listen {config.listen}: the router can't be opened: {error}") from error
-    notifier = Notifier()
     with session:
-        print(f"the router is open for {len(config.vehicles)} vehicles: {config.listen}", flush=True)
-        notifier.once("READY=1")
-        while not signals.asked_to_end(notifier.period_s or _LOOK_S):
-            notifier.alive(f"{len(config.vehicles)} vehicles may publish, open at {config.listen}")
-        notifier.once("STOPPING=1")
+        vehicles = f"{len(config.vehicles)} vehicles"
+        serve(
+            f"the router is open for {vehicles}: {config.listen}",
+            lambda: f"{vehicles} may publish, open at {config.listen}",
+        )

@@ -22,7 +22,7 @@ import zenoh
 from birdslam.runtime.configuration import Configuration, ConfigurationError, FleetConfig
 from birdslam.runtime.fleet.link import check, open_link
 from birdslam.runtime.process import signals
-from birdslam.runtime.process.notify import Notifier
+from birdslam.runtime.process.notify import LOOK_S, Notifier
 from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, key_of
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, Publisher, Subscriber
 from birdslam.runtime.transport.closing import Closing
@@ -35,7 +35,6 @@ _NODE = "uplink"
 _MOST_STAGES = 7  # of a trace that comes in, so that one more fits
 _TRY_S = 2.0  # one attempt to reach the router
 _REPORT_S = 60.0  # between two lines that say that there is none
-_LOOK_S = 1.0
 
 
 class Uplink(Closing):
@@ -156,7 +155,7 @@ def run(configuration: Configuration) -> None:
                 state = f"is connected to {config.router}" if now else f"has lost {config.router} and looks for it"
                 print(f"the uplink of vehicle {vehicle!r} {state}", flush=True)
             notifier.alive(f"router {'reached' if reached else 'GONE'}, {len(uplink.alive)} nodes alive")
-            if signals.asked_to_end(notifier.period_s or _LOOK_S):
+            if signals.asked_to_end(notifier.period_s or LOOK_S):
                 break
         notifier.once("STOPPING=1")
 
@@ -172,5 +171,5 @@ def _wait_for_router(config: FleetConfig, notifier: Notifier) -> zenoh.Session |
                 reported_s = time.monotonic()
                 print(f"birdslam: uplink: {error}", file=sys.stderr, flush=True)
         notifier.alive(f"looks for {config.router}")
-        if signals.asked_to_end(_LOOK_S):  # a refusal may come at once
+        if signals.asked_to_end(LOOK_S):  # a refusal may come at once
             return None

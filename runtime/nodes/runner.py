@@ -18,7 +18,6 @@ from collections.abc import Callable
 from types import FrameType
 from typing import TypeGuard
 
-import cv2
 import msgspec
 
 from birdslam.perception import ModelError
@@ -29,10 +28,10 @@ from birdslam.runtime.nodes.meter import Meter
 from birdslam.runtime.nodes.nodes import Node, prepare
 from birdslam.runtime.nodes.sources import SourceError
 from birdslam.runtime.process import realtime
-from birdslam.runtime.process.child import LOG_FORMAT, end_with_parent, give_back_memory
+from birdslam.runtime.process.child import begin, give_back_memory
 from birdslam.runtime.process.restarts import Assignment
 from birdslam.runtime.process.vitals import Vitals
-from birdslam.runtime.topology import NODES, RECORDER, TOPICS
+from birdslam.runtime.topology import MAP, NODES, RECORDER, TOPICS
 from birdslam.runtime.transport.bus import Bus, Publisher
 from birdslam.runtime.wire import Health
 from birdslam.sources.recording import DatasetError
@@ -41,7 +40,7 @@ from birdslam.types import Estimate, FrameRef, Measurements, Status
 log = logging.getLogger(__name__)
 
 USER_ERRORS = (ConfigurationError, DatasetError, ModelError, SourceError)
-RECORDER_PATIENCE_S = 0.2  # of a restarted node: longer than this its first records are not held back
+BESIDE_PATIENCE_S = 0.2  # of a restarted node: longer than this its first records are not held back
 DOWNSTREAM = {"capture": "perceive", "perceive": "optimize", "optimize": "supervisor"}  # who must be there to receive
 
 
@@ -88,9 +87,8 @@ def run(
         try:
             publishers = {TOPICS[topic].record: bus.publisher(topic) for topic in NODES[name].sends}
             _await_downstream(name, bus, publishers, runtime.ready_timeout_s)
-            if configuration.recording.file:
-                first_s = configuration.recording.ready_timeout_s
-                bus.wait_alive({RECORDER.name}, RECORDER_PATIENCE_S if assignment.restarts else first_s)
+            first_s = configuration.recording.ready_timeout_s
+            bus.wait_alive(_beside(configuration), BESIDE_PATIENCE_S if assignment.restarts else first_s)
             realtime.freeze_objects()
             stop.at_work = True
             vitals.beat()  # before it is ready: who is ready without a beat is stalled
@@ -99,6 +97,12 @@ def run(
             _loop(node, publishers, Meter(name, configuration, assignment), vitals, stop, configuration)
         finally:
             node.close()
+
+
+def _beside(configuration: Configuration) -> set[str]:
+    """Who is to miss no frame at the beginning of a drive."""
+    there = {RECORDER.name: bool(configuration.recording.file), MAP.name: configuration.maps_live}
+    return {name for name, is_there in there.items() if is_there}
 
 
 def _await_downstream(name: str, bus: Bus, publishers: dict[type, Publisher], timeout_s: float) -> None:
@@ -158,14 +162,8 @@ def _loop(
 
 def main(arguments: list[str]) -> int:
     """Entry point of a node's process."""
-    name, vitals_fd, parent_pid = arguments
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=LOG_FORMAT)
     stop = Stop()
-    end_with_parent(int(parent_pid))
-    configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
-    sys.setswitchinterval(configuration.runtime.switch_interval_s)
-    cv2.setNumThreads(1)  # perceive sets its own
-    vitals = Vitals(int(vitals_fd))
+    name, configuration, vitals = begin(arguments)
     try:
         make = prepare(name, configuration)
         give_back_memory()

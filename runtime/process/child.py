@@ -3,11 +3,33 @@
 from __future__ import annotations
 
 import ctypes
+import logging
 import os
 import signal
+import sys
+from collections.abc import Sequence
 
-LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
+import cv2
+import msgspec
+
+from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.process.vitals import Vitals
+
 _PR_SET_PDEATHSIG = 1
+
+
+def begin(arguments: Sequence[str]) -> tuple[str, Configuration, Vitals]:
+    """Its name, its configuration (a line of JSON on standard input) and its vital signs, by NODE VITALS_FD PARENT_PID.
+
+    It logs to standard error, where the supervisor keeps it, and ends with the supervisor.
+    """
+    name, vitals_fd, parent_pid = arguments
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
+    end_with_parent(int(parent_pid))
+    configuration = msgspec.json.decode(sys.stdin.buffer.readline(), type=Configuration)
+    sys.setswitchinterval(configuration.runtime.switch_interval_s)
+    cv2.setNumThreads(1)  # perceive sets its own
+    return name, configuration, Vitals(int(vitals_fd))
 
 
 def end_with_parent(parent_pid: int) -> None:

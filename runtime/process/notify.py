@@ -1,11 +1,15 @@
-"""Notifications to systemd (sd_notify(3)): ready, alive, the status line, stopping."""
+"""Notifications to systemd (sd_notify(3)): ready, alive, the status line, stopping; and a service's work until then."""
 
 from __future__ import annotations
 
 import os
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+
+from birdslam.runtime.process import signals
+
+LOOK_S = 1.0  # how often the status line is written where systemd watches nothing
 
 
 class Notifier:
@@ -45,3 +49,13 @@ class Notifier:
                 out.sendto(message.encode(), self._address)
             except (BlockingIOError, ConnectionError, FileNotFoundError):
                 return
+
+
+def serve(said: str, status: Callable[[], str]) -> None:
+    """What a service does whose work goes on by itself: it says that it is open, and waits to be asked to end."""
+    notifier = Notifier()
+    print(said, flush=True)
+    notifier.once("READY=1")
+    while not signals.asked_to_end(notifier.period_s or LOOK_S):
+        notifier.alive(status())
+    notifier.once("STOPPING=1")

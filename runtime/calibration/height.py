@@ -1,0 +1,152 @@
+"""The height of a camera, which all metres rest on: as stated, or by what is known best; and how sure it is."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from birdslam.calibration.calibration import Calibration, CalibrationError
+from birdslam.calibration.height_check import VEHICLES, HeightCheck, KnownLength
+from birdslam.calibration.intrinsics import Intrinsics
+from birdslam.geometry.camera import Camera
+from birdslam.outputs.plain_words import LengthsBy
+from birdslam.sources.recording import Recording, check_times
+from birdslam.sources.speed_file import read_speed_curve
+from birdslam.types import NS_PER_S
+
+UNKNOWN_HEIGHT_M = 1.5  # where none was given: all lengths are in proportion to it, and it is replaced
+# Of the height by the size of cars, beside the estimate's own sigma: how much taller cars are from country to country.
+# Its own sigma alone is honest on KITTI's sequences, which are of one town (docs/calibration.md)
+COUNTRY_SIGMA_REL = 0.08
+# Where nothing shows the height: behind a car's windscreen, 1.1 to 1.6 m; by judgement
+WINDSCREEN_M, WINDSCREEN_SIGMA_REL = 1.35, 0.2
+AGREES_SIGMA = 2.0
+# Readouts of 0 to 30 ms are usual, and no film tells its own; root mean square of an even spread
+_READOUT_SIGMA_S = 0.017
+_SHUTTER_PER_M2 = 0.066  # by rendered films of one street, with 0, 15 and 30 ms (docs/constants.md)
+
+
+def known_lengths(recording: Recording, speed_file: Path | None) -> dict[str, KnownLength]:
+    """What else knows the way between two frames: the recording's poses, a speed file."""
+    out: dict[str, KnownLength] = {}
+    truth = recording.truth_poses()
+    if truth is not None and np.isfinite(truth).all():
+        at = truth[:, :, 3]
+
+        def by_poses(start: int, end: int, start_ns: int, end_ns: int) -> float:
+            return float(np.linalg.norm(np.diff(at[start : end + 1], axis=0), axis=1).sum())
+
+        out["poses"] = by_poses
+    if speed_file is not None:
+        t_s, speed_mps = read_speed_curve(speed_file).T
+        way_m = np.concatenate([[0.0], np.cumsum(np.diff(t_s) * 0.5 * (speed_mps[1:] + speed_mps[:-1]))])
+
+        def by_speed(start: int, end: int, start_ns: int, end_ns: int) -> float | None:
+            if start_ns * 1e-9 < t_s[0] or end_ns * 1e-9 > t_s[-1]:
+                return None
+            return float(np.interp(end_ns * 1e-9, t_s, way_m) - np.interp(start_ns * 1e-9, t_s, way_m))
+
+        check_times(recording, speed_file, round(t_s[0] * NS_PER_S), round(t_s[-1] * NS_PER_S))
+        out["speed"] = by_speed
+    return out
+
+
+class HeightBy(NamedTuple):
+    """Where the camera's height comes from; `check` is the cue that gave it, None where it was stated."""
+
+    words: str
+    check: HeightCheck | None
+    sigma_rel: float  # of all lengths along the road, by this height and the focal length
+    contradicted_by: str = ""  # what says another height than the one that was stated, and which
+    shutter_rel: float = 0.0  # 1-sigma of the same lengths by rows that are read in turn
+
+
+def with_height(
+    found: Calibration, known: bool, lens: Intrinsics | None, uri: str, is_film: bool = False
+) -> tuple[Camera, HeightBy]:
+    """The camera with the height that was stated, else with the surest that was estimated.
+
+    A stated height (and focal length) that something else contradicts is kept, but its sigma covers both.
+    """
+    focal_rel = focal_sigma_rel(lens)
+    if known:
+        height_m, by = found.camera.height_m, _stated_height(found, focal_rel)
+    else:
+        height_m, by = _estimated_height(found, focal_rel)
+    held_together = by.check is not None and by.check.cue != VEHICLES  # by a known length, the shutter's share too
+    if is_film and not held_together:
+        by = by._replace(shutter_rel=shutter_rel(found.camera, height_m, found.speed_mps))
+    sigma_rel = min(math.hypot(by.sigma_rel, by.shutter_rel), 1.0)
+    try:
+        return msgspec.structs.replace(found.camera, height_m=height_m, scale_sigma_rel=sigma_rel), by
+    except ValueError as error:
+        raise CalibrationError(f"{uri}: height {by.words}: {error}") from None
+
+
+def shutter_rel(camera: Camera, height_m: float, speed_mps: float) -> float:
+    """1-sigma of lengths along the road by rows that are read in turn, in a time that no film tells.
+
+    Near road is read later in an image than far road, and moves down meanwhile: its motion is seen over a longer time
+    than that between two images. A point of the road at depth z moves by f h V / z^2 rows a second.
+    """
+    return _SHUTTER_PER_M2 * _READOUT_SIGMA_S * speed_mps * height_m * camera.fy_px / camera.height_px
+
+
+def _sigma_rel(check: HeightCheck) -> float:
+    return math.hypot(check.sigma_m / check.height_m, COUNTRY_SIGMA_REL * (check.cue == VEHICLES))
+
+
+def _stated_height(found: Calibration, focal_rel: float) -> HeightBy:
+    """With what is farthest from it for its sigma, where that is too far."""
+
+    def away_sigma(check: HeightCheck) -> float:
+        return abs(math.log(check.height_m / found.camera.height_m)) / math.hypot(_sigma_rel(check), focal_rel)
+
+    check = max(found.height_checks, key=away_sigma, default=None)
+    if check is None or away_sigma(check) < AGREES_SIGMA:
+        return HeightBy("as stated", None, focal_rel)
+    said = f"the size of {check.samples} cars" if check.cue == VEHICLES else f"the {check.cue}"
+    contradicted = f"{said} says {check.height_m:.2f} m +- {_sigma_rel(check):.0%}"
+    between_rel = abs(math.log(check.height_m / found.camera.height_m))
+    return HeightBy("as stated", None, math.hypot(focal_rel, between_rel), contradicted)
+
+
+def _estimated_height(found: Calibration, focal_rel: float) -> tuple[float, HeightBy]:
+    """By a known length, by the size of cars, or by where cameras are."""
+    sigmas = {check.cue: _sigma_rel(check) for check in found.height_checks}
+    check = min(found.height_checks, key=lambda check: sigmas[check.cue], default=None)
+    if check is None or sigmas[check.cue] > WINDSCREEN_SIGMA_REL:
+        sigma_rel = math.hypot(WINDSCREEN_SIGMA_REL, focal_rel)
+        words = f"of most windscreens, +- {WINDSCREEN_SIGMA_REL:.0%}, since nothing here tells it"
+        return WINDSCREEN_M, HeightBy(words, None, sigma_rel)
+    own_rel = sigmas[check.cue]
+    if check.cue == VEHICLES:
+        by = HeightBy(f"by the size of {check.samples} cars, +- {own_rel:.0%}", check, math.hypot(own_rel, focal_rel))
+    else:  # a known length holds height and focal length together
+        by = HeightBy(f"by {check.cue} along {found.path_m:.0f} m, +- {own_rel:.0%}", check, own_rel)
+    return check.height_m, by
+
+
+def focal_sigma_rel(lens: Intrinsics | None) -> float:
+    """As a fraction of the focal length, where it is an estimate; a chessboard's is measured."""
+    if lens is None or lens.sigma_focal_px is None or lens.reprojection_px is not None:
+        return 0.0
+    return lens.sigma_focal_px / lens.fx_px
+
+
+def lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None) -> LengthsBy:
+    """What the metres of a camera rest on, for people."""
+    words = f"the camera's height of {camera.height_m:.2f} m ({by.words})"
+    focal_rel = focal_sigma_rel(lens)
+    if by.check is not None and by.check.cue != VEHICLES:  # a known length holds both together
+        return LengthsBy(words, by.sigma_rel)
+    if focal_rel:
+        words += f" and its focal length of {camera.fx_px:.0f} px, +- {focal_rel:.0%}"
+    if by.shutter_rel >= 0.005:
+        words += f"; rows that the camera reads one after the other leave +- {by.shutter_rel:.0%} at this speed"
+    height_rel = math.sqrt(max(by.sigma_rel**2 - focal_rel**2, 0.0))
+    return LengthsBy(words, height_rel, focal_rel, by.contradicted_by)
