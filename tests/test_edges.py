@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import tracking_world
 from msgspec.structs import replace
 
 from birdslam.bench.simulation.drive import DriveConfig, drive
@@ -21,6 +20,7 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.perception import Perception, Ready
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking
 from birdslam.types import EgoEdge, LandmarkEdge, Measurements
+from tests import tracking_world
 
 # Of KITTI tracking 0002's images by the whole front end, as `python -m perf edges` prints it: 87 spans
 REAL = EdgeStatistics(
