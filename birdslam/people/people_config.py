@@ -85,7 +85,7 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     outline_memory_s: float = 2.0  # errors that last: a box that is drawn too low or too high, by
     sigma_outline_rel: float = 0.04  # of its height
     sure_feet: float = 0.01  # a box whose feet are hidden with less probability tells of the road
-    sigma_common_rel: float = 0.03  # of the mean height of those who are there
+    sigma_common_rel: float = 0.055  # of the mean height of those who are there
 
     def sizes(self, label: str) -> Sizes:
         """Of a kind."""
