@@ -127,9 +127,8 @@ def test_a_faster_camera_learns_no_more_of_a_size_in_the_same_time() -> None:
         road = Road()
         for _ in range(round(2.0 * hz)):
             road.see({0: road.box(20.0, 0.0, 1.5), 1: road.box(30.0, 4.0, 1.55)}, 1.0 / hz)
-        sigmas.append(
-            math.sqrt(road.ground_size._P[COMMON, COMMON])
-        )  # private: a height's sigma alone; out comes a depth's
+        P = road.ground_size._P  # private: a height's sigma alone; out comes a depth's
+        sigmas.append(math.sqrt(P[COMMON, COMMON]))
     assert sigmas[0] == pytest.approx(sigmas[1], rel=0.1)
 
 
