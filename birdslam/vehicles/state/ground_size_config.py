@@ -48,9 +48,9 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     image_pitch_sigma_rel: float = 0.5  # of the images' own sigma of the pitch, which is too cautious
     # By how much the images' tilt is off for long: they see the road before the ego, vehicles stand beside it too
     sigma_image_pitch_rad: float = 0.002
-    sigma_image_roll_rad: float = 0.009
+    sigma_image_roll_rad: float = 0.009  # the same of the roll
     image_pitch_memory_s: float = 1.5  # of driving: for how long
-    image_roll_memory_s: float = 5.0
+    image_roll_memory_s: float = 5.0  # the same of the roll
     box_memory_s: float = 0.5  # for so long a box has the same error: this time of driving counts as one box
 
     @property
