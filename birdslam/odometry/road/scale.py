@@ -89,8 +89,8 @@ class RoadScale:
         return self.sigma_rel > self.config.invalid_sigma_rel
 
     @property
-    def pitch_sigma_rad(self) -> float:
-        """1-sigma of the ground's pitch."""
+    def tilt_cov(self) -> NDArray[np.float64]:
+        """(2, 2) of the ground's pitch and roll."""
         return self._filter.chord[1]
 
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:
@@ -222,7 +222,7 @@ class RoadScale:
             self.vanishing_point = found
 
     def _update_bonnet(self, view: RoadView, travelled_m: float) -> None:
-        """Where a bonnet turns out to have been taken for road, scale and tilt are dropped."""
+        """Where a bonnet has been taken for road until it was found, scale and tilt are dropped."""
         driven_m = travelled_m
         if not self._has_begun:  # the length is not known: optical flow tells whether the car has moved
             if view.flow_px < _MOVING_PX:
@@ -342,7 +342,7 @@ class RoadScale:
         self.fit = fit
         filter_.cov = prior_cov
         tells = filter_.information(fit)
-        self._rejected = 0.0  # in a row: one that agrees ends it, whatever it tells of the length
+        self._rejected *= 1.0 - tells  # one that agrees ends the row by as much as it tells of the length
         self._informed = tells >= _TOLD
         if self._informed:
             self._rejections, self._predicted = 0, False
