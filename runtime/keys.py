@@ -127,6 +127,7 @@ GROUPS = (
             "learned",
             "slam.frontend.odometry.road.car.sigma_delay_s": "How late may its readings be (1-sigma)? That is learned "
             "too",
+            "source.topics.gnss": 'Which topic of a source `ros:/TOPIC` has satellite fixes (NavSatFix)? "": none',
             "source.odometry": "Which file has another odometry, in place of the images'? TUM lines or KITTI rows, in "
             'metres; "": none',
             "slam.frontend.external.ego": "Are its poses the ego's on the road (x forward)? false: the camera's (z "
@@ -212,6 +213,17 @@ GROUPS = (
             "realtime.lock_memory": 'Does their memory stay in RAM? "auto": with a live camera',
             "realtime.NODE.priority": "Which priority has a node, under SCHED_FIFO?",
             "realtime.NODE.cpus": "On which cores may it run? none: all",
+        },
+    ),
+    Group(
+        "ROS 2, live",
+        "See [ros.md](ros.md). Of `birdslam ros`, and of a source `ros:/TOPIC`.",
+        {
+            "ros.router": "Where is the router of rmw_zenoh?",
+            "ros.domain": "Which domain? none: as the variable ROS_DOMAIN_ID says, else 0",
+            "ros.namespace": 'What stands before the names of our topics and frames, where there are several cars? "": '
+            "nothing",
+            "ros.release": "Which release of ROS 2 do the others run? Humble has no hashes of types; jazzy: any later",
         },
     ),
     Group(

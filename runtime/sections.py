@@ -254,6 +254,16 @@ class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     vehicles: tuple[VehicleName, ...] = ()
 
 
+class RosConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How this computer is a node of ROS 2: of `birdslam ros`, and of the source `ros:/TOPIC`."""
+
+    router: str = "tcp/localhost:7447"  # of rmw_zenoh
+    domain: Annotated[int, msgspec.Meta(ge=0, le=232)] | None = None  # None: that of ROS_DOMAIN_ID, else 0
+    # "" or /NAME: before the names of our own topics, and of our frames, where several cars are in one domain
+    namespace: str = ""
+    release: Literal["humble", "jazzy"] = "jazzy"  # of the others; jazzy: since Iron types have hashes
+
+
 class RouterConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The router of a fleet: who may say something there, who may listen, and how much of it passes."""
 

@@ -42,10 +42,11 @@ def test_an_entry_is_written_as_it_is_read(scheme: Scheme) -> None:
 @EVERY
 def test_a_schemes_camera_facts_are_those_of_its_class(scheme: Scheme) -> None:
     kind = scheme.load()
-    assert issubclass(kind, LiveCamera if scheme.live else Recording)
     if scheme.live:
-        assert scheme.camera == "nothing"
+        assert kind.live
+        assert issubclass(kind, LiveCamera) == (scheme.camera == "nothing")  # of a device or a stream
     else:
+        assert issubclass(kind, Recording)
         assert (kind.own_lens.__func__ is not Recording.own_lens.__func__) == (scheme.camera == "intrinsics")
         assert kind.frame_size.__func__ is not Recording.frame_size.__func__ or scheme.camera == "calibration"
 
