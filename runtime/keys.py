@@ -76,6 +76,7 @@ GROUPS = (
             "models.ROLE.every": "On one image in how many does it run? none: as its manifest says",
             "models.ROLE.threads": "On how many threads? none: as its manifest says",
             "models.ROLE.awaited": "Does an image wait for it, up to its deadline? none: as its manifest says",
+            "models.ROLE.provider": "What computes this one? As perceive.provider; none: as that says",
             "models.shipped": "Does the package's own network run where no other finds vehicles or the road?",
             "models.bodies": "Does the multi-task network look beside another detector, for the depth, length and yaw "
             "of the vehicles that this one finds?",
@@ -157,6 +158,8 @@ GROUPS = (
             "perceive.schedule.lanes.every": "On one image in how many are they made out? In place of hz",
             "perceive.looks.adaptive": "Do networks look as often as the computer can? false: as their manifests say",
             "perceive.looks.least_hz": "How often a second do they look at the least?",
+            "perceive.provider": "What computes the networks: cpu, openvino, cuda, tensorrt, or auto, what is fastest "
+            'here and gives the same? At rate "max" auto is cpu, so that a run repeats. See [networks.md](networks.md)',
             "perceive.opencv_threads": "How many threads has OpenCV?",
             "budgets.end_to_end_ms": "How old may an estimate be when the planner has it, from its image's capture on?",
             "budgets.percentile": "Of how many images in a hundred must this hold, and the limits of the parts?",

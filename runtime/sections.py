@@ -8,6 +8,7 @@ import msgspec
 
 from birdslam.perception import ModelSpec
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS, Role
+from birdslam.perception.network import Provider
 from birdslam.ros.bag import BagTopics
 
 VehicleName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")]
@@ -132,6 +133,7 @@ class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     deadline_periods: Positive = 0.75
     period_ms: Positive | None = None  # from one frame of the source to the next; None: by the frame rate
     opencv_threads: PositiveInt = 2  # of OpenCV in perceive
+    provider: Provider = "auto"  # what computes the networks (runtime/models/providers.py)
     schedule: ScheduleConfig = ScheduleConfig()
     looks: LooksConfig = LooksConfig()
 

@@ -9,10 +9,8 @@ optimizer's graph, so that it can be replayed.
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
 import os
-import platform
 import signal
 import sys
 import time
@@ -25,7 +23,7 @@ import msgspec
 import psutil
 
 from birdslam.runtime.configuration import Configuration, dump, without_passwords
-from birdslam.runtime.environment import LIBRARIES, USER_ERROR_STATUS
+from birdslam.runtime.environment import USER_ERROR_STATUS, library_versions
 from birdslam.runtime.latency import stages
 from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest_checkpoint
 from birdslam.runtime.process import realtime
@@ -246,7 +244,7 @@ def _latency(estimate: Estimate, message: Message) -> Latency:
 
 def about(configuration: Configuration, models: dict[str, Any], restarts: int = 0) -> About:
     """Of a recording that begins now."""
-    versions = {"python": platform.python_version(), **{name: importlib.metadata.version(name) for name in LIBRARIES}}
+    versions = library_versions()
     utc_offset_ns = time.time_ns() - time.monotonic_ns()
     return About(
         configuration=dump(without_passwords(configuration)),
