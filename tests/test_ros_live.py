@@ -25,7 +25,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
-from birdslam.loops.gnss_file import read_fixes
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.gnss_file import GNSS_FILE, read_fixes
 from birdslam.perf.latency.ros import estimate, peer
 from birdslam.perf.processes import free_port
 from birdslam.ros.bag import BagTopics
@@ -46,8 +47,9 @@ from birdslam.ros.rmw_zenoh import (
 from birdslam.ros.sensor import FIX_SIGMA_M
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import Configuration, ConfigurationError, RosConfig, SourceConfig
+from birdslam.runtime.maps.drive_map import DriveMap
 from birdslam.runtime.nodes.sources import SourceError, open_source
-from birdslam.runtime.ros.camera import CLOCK_FRAMES, GNSS_FILE, SenderClock
+from birdslam.runtime.ros.camera import CLOCK_FRAMES, GNSS_HEAD, SenderClock
 from birdslam.runtime.ros.publisher import RosBridge
 from birdslam.runtime.ros.session import NoRouter, RosNode
 from birdslam.runtime.supervision.query_server import QueryServer
@@ -438,6 +440,24 @@ def test_images_of_a_topic_are_a_source_with_their_camera_speed_and_fixes(tmp_pa
     assert [fix.sigma_m for fix in fixes] == [FIX_SIGMA_M] * len(fixes)
     assert 49.0 < fixes[-1].latitude_deg < 49.1
     assert times[0] - 10**10 < fixes[0].t_source_ns < times[-1]
+
+
+def test_a_live_drive_comes_to_earth_by_the_fixes_that_came(tmp_path: Path) -> None:
+    live = msgspec.structs.replace(configuration(1, tmp_path), camera=CAMERA)
+    drive = DriveMap.of(live)
+    assert drive is not None
+    drive.check(CAMERA)  # there is no file yet
+    for k in range(60):
+        told = estimate(k, vehicles=0)
+        drive.add(msgspec.structs.replace(told, t_source_ns=k * 10**8, T_world_ego=SE2(float(k), 0.0, 0.0)))
+    assert drive.finish(CAMERA, iter(()), tmp_path) == {}  # none came
+    east = 1.0 / 73_055.0  # degrees of longitude in a metre, at 49 degrees
+    rows = [f"{0.1 * k:.9f},49.0,{8.4 + east * k:.9f},1.000" for k in range(60)]
+    (tmp_path / GNSS_FILE).write_text("\n".join((GNSS_HEAD, *rows)) + "\n")
+    earth = drive.finish(CAMERA, iter(()), tmp_path)["earth"]
+    assert earth["fixes"] >= 59
+    assert earth["x_axis_from_east_rad"] == pytest.approx(0.0, abs=0.01)
+    assert (tmp_path / "ego.gpx").is_file()
 
 
 @processes

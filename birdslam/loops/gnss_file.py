@@ -20,6 +20,7 @@ MOST_S = 4e9  # of a time in seconds, either way
 SIGMA_PER_HDOP_M = 4.0
 KNOT_MPS = 0.514444
 DAY_S = 86_400.0
+GNSS_FILE = "gnss.csv"  # of the fixes that came while a car drove, in the drive's folder
 COLUMNS = "time_s, latitude_deg, longitude_deg, and where known sigma_m, speed_mps"
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.loops.gnss_file import read_fixes
+from birdslam.loops.gnss_file import GNSS_FILE, read_fixes
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory
@@ -62,23 +62,24 @@ class MapChoice:
 class DriveMap:
     """Listens to the drive (`add`), and makes the map of it, or its place on Earth, or both (`finish`)."""
 
-    def __init__(self, choice: MapChoice | None, gnss: Path | None) -> None:
-        self._choice, self._gnss = choice, gnss
+    def __init__(self, choice: MapChoice | None, gnss: Path | None, live: bool = False) -> None:
+        self._choice, self._gnss, self._live = choice, gnss, live
         self._estimates: list[Estimate] = []
 
     @staticmethod
     def of(configuration: Configuration) -> DriveMap | None:
         """What the configuration asks for; None: neither. Raises ConfigurationError."""
-        choice, gnss = MapChoice.of(configuration), configuration.results.gnss
-        if choice is None and not gnss:
-            return None
-        return DriveMap(choice, Path(gnss).expanduser() if gnss else None)
+        choice, results = MapChoice.of(configuration), configuration.results
+        gnss = Path(results.gnss).expanduser() if results.gnss else None
+        if gnss is None and configuration.source.topics.gnss and configuration.live:
+            gnss = Path(configuration.output) / GNSS_FILE  # it grows while the car drives
+        return None if choice is None and gnss is None else DriveMap(choice, gnss, configuration.live)
 
     def check(self, camera: Camera) -> None:
         """Raises MapError, GnssError or ConfigurationError for what the drive could not use in the end."""
         if self._choice is not None:
             self._choice.open(camera)
-        if self._gnss is not None:
+        if self._gnss is not None and not self._live:
             read_fixes(read_gnss(self._gnss), str(self._gnss), 0)
 
     def add(self, estimate: Estimate) -> None:
@@ -99,7 +100,7 @@ class DriveMap:
         if self._choice is not None:
             place_map = self._choice.open(camera)
             summary["map"], poses = self._localise(self._choice, place_map, camera, frames, output)
-        if self._gnss is not None:
+        if self._gnss is not None and (self._gnss.is_file() or not self._live):  # live there may have been no fix
             summary["earth"] = write_earth(self._gnss, poses, camera, output, place_map)
         if self._choice is not None and self._choice.extend and place_map is not None:
             if len(place_map):

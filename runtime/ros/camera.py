@@ -21,6 +21,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
+from birdslam.loops.gnss_file import GNSS_FILE
 from birdslam.ros.bag import stamp_ns
 from birdslam.ros.frames import TF_STATIC, StaticFrames
 from birdslam.ros.message_types import MessageTypes
@@ -55,7 +56,7 @@ from birdslam.sources.speed_log import KEPT_NS, KEPT_READINGS
 from birdslam.types import NS_PER_S, SpeedReading
 
 NODE = "birdslam_camera"
-GNSS_FILE = "gnss.csv"  # of the fixes that came, in the drive's folder: the columns of loops/gnss_file.py
+# Of loops/gnss_file.py
 GNSS_HEAD = "time_s,latitude_deg,longitude_deg,sigma_m"
 SAME_CLOCK_NS = NS_PER_S  # a header that is within so much of this computer's UTC is of its clock
 CLOCK_FRAMES = 100  # of another clock: the least delay of so many frames tells how far off it is

@@ -45,7 +45,7 @@ def check_results(configuration: Configuration, source: Source) -> None:
     results, recording = configuration.results, configuration.recording
     drive_map = DriveMap.of(configuration)
     if drive_map is not None:
-        if configuration.live:
+        if configuration.live and (results.map or results.map_only):
             raise ConfigurationError("results.map: a live camera's frames are gone when the drive is over: record it")
         drive_map.check(source.camera)
     if not results.video:
@@ -100,7 +100,10 @@ class FinalResults:
                 if self._asked_video:
                     raise
                 summary["video"] = None
-        if self.map is not None:
+        if self.map is not None and self._config.live:  # its frames are gone, and it may be gone itself
+            assert self._config.camera is not None
+            summary |= self.map.finish(self._config.camera, iter(()), Path(self._config.output))
+        elif self.map is not None:
             source = open_source(self._config)
             summary |= self.map.finish(source.camera, source_frames(source), Path(self._config.output))
         return summary
