@@ -234,7 +234,7 @@ class FrontEnd:
             frame.frame_id,
             self._dead_reckoning.T_world_ego,
             road.ground,
-            road.sigma_pitch_rad,
+            (road.sigma_pitch_rad, road.sigma_roll_rad),
             perception.segmentation,
             frame.frame_id - age,
             _boxes_px(perception),

@@ -24,7 +24,7 @@ from birdslam.runtime.wire import Health, Trace
 from birdslam.types import INVALIDATING, Estimate
 
 _NO_TRACE = Trace()
-_number = itertools.count()  # tells the planners of one process apart
+_number = itertools.count()  # distinguishes the planners of one process
 
 
 @dataclass(frozen=True)

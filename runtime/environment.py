@@ -7,7 +7,7 @@ Imports nothing: numpy's libraries read the environment when they are loaded.
 # In `evaluate` too, which must compute as the nodes do.
 ENVIRONMENT = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
-    "OPENCV_FFMPEG_LOGLEVEL": "-8",  # FFmpeg tells a torn film's every block on standard error; a status tells it too
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",  # FFmpeg prints every damaged block of a film; a status reports the frame
     "ORT_DISABLE_TELEMETRY": "1",  # onnxruntime's wheels come with it on
     # glibc: what a frame's images leave is for those of the next, in place of going back to the kernel, which hands out
     # each page anew with a fault (docs/realtime.md)

@@ -245,14 +245,14 @@ class ResultsConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How this computer reaches the router of a fleet: as a vehicle that says its estimates, or who listens to all."""
+    """How this computer reaches the router of a fleet: as a vehicle that publishes, or as a listener to all of them."""
 
     router: str = ""  # tls/HOST:PORT; "": there is none
     ca: str = ""  # FILE.pem: the fleet's authority
     certificate: str = ""  # FILE.pem: this computer's own
     key: str = ""  # FILE: its private key
     estimates_hz: Positive | None = None  # of the vehicle's estimates at most so many a second are sent; None: all
-    # Whom a listener expects: it tells of them also where they have never said anything
+    # The vehicles that a listener expects: it lists them even before they have published anything
     vehicles: tuple[VehicleName, ...] = ()
 
 
@@ -267,7 +267,7 @@ class RosConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class RouterConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The router of a fleet: who may say something there, who may listen, and how much of it passes."""
+    """The router of a fleet: who may publish, who may listen, and how much of it passes."""
 
     listen: str = "tls/127.0.0.1:7448"  # where vehicles and listeners connect to
     ca: str = ""  # FILE.pem: the fleet's authority

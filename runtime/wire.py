@@ -52,7 +52,7 @@ class Trace(msgspec.Struct, frozen=True):
 
     stages: Annotated[tuple[Stage, ...], msgspec.Meta(max_length=8)] = ()  # in the order of the way
     left_ns: int | None = None  # of the budget end to end when an estimate was done; negative: it is late
-    number: _Count = 0  # of this message among its publisher's, from 1 on: a gap tells that some were lost
+    number: _Count = 0  # of this message among its publisher's, from 1 on: a gap means that some were lost
 
     def after(self, node: str, received_ns: int, done_ns: int, arrived_ns: int = 0) -> Trace:
         """The trace of what `node` made of this message: one stage more."""

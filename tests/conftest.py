@@ -75,7 +75,7 @@ def join(base: Path) -> Iterator[Any]:
         yield lambda node, **options: stack.enter_context(Bus("car", node, runtime_dir=base, **options))
 
 
-_watcher = end_with_this_process()  # and one for each process of pytest
+end_with_this_process()
 _may_start_processes = True
 
 
@@ -91,3 +91,20 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Only tests with the marker `processes` start any: the others compute, and fill a core each."""
     global _may_start_processes
     _may_start_processes = item.get_closest_marker("processes") is not None
+
+
+def _starts_processes(file: Path) -> bool:
+    return "mark.processes" in file.read_text(encoding="utf-8")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Where only tests that start processes run, files without any are not loaded, in each of pytest's processes."""
+    only = config.option.markexpr.startswith("processes") and collection_path.suffix == ".py"
+    return True if only and not _starts_processes(collection_path) else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What that takes for granted: a file has the marker in its own text."""
+    marked = {item.path for item in items if item.get_closest_marker("processes") is not None}
+    if wrong := [path.name for path in marked if not _starts_processes(path)]:
+        raise pytest.UsageError(f"the marker `processes` must stand in the file itself: {', '.join(wrong)}")

@@ -11,19 +11,18 @@ import contextlib
 import os
 import select
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
 VARIABLE = "BIRDSLAM_TESTS"
 
 
-def end_with_this_process() -> subprocess.Popen[bytes]:
+def end_with_this_process() -> int:
     """What this process and its children start from now on ends with it. Gives the process that sees to it."""
     mark = f"{os.getpid()}-{os.urandom(8).hex()}"
     command = [sys.executable, "-S", __file__, str(os.getpid()), mark]
-    nowhere = subprocess.DEVNULL
-    watcher = subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere, start_new_session=True)
+    nowhere = [(os.POSIX_SPAWN_OPEN, fd, os.devnull, os.O_RDWR, 0) for fd in range(3)]
+    watcher = os.posix_spawn(sys.executable, command, os.environ, file_actions=nowhere, setsid=True)
     os.environ[VARIABLE] = mark  # after it: it outlives what it kills
     return watcher
 

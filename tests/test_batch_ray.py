@@ -9,13 +9,13 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from test_batch import contents, kitti, made
 
 from birdslam.runtime.batch.drive import DRIVES, Job, run_drive
 from birdslam.runtime.batch.drives import find_drives
 from birdslam.runtime.batch.fetch import local_copy
 from birdslam.runtime.cli.main import main
 from birdslam.sources.recording import DatasetError
+from tests.test_batch import contents, kitti, made
 
 DRIVES_OF_ALL, FRAMES = 6, 150
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tiny_networks as tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from birdslam.perception import Detections, ModelError, ModelSpec, load_network
 from birdslam.perception.decoding.box_lists import BoxListDecoder, SsdDecoder
 from birdslam.perception.manifest import BoxList, Input, Ssd, Stretch
 from birdslam.perception.views import make_views
+from tests import tiny_networks as tiny
 
 INPUT = """
 role = "detector"

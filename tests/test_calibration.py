@@ -182,12 +182,13 @@ def test_a_bad_chessboard_is_named(boards: Path, tmp_path: Path) -> None:
         cv2.imwrite(str(flat / f"{k}.png"), _board((0.0, 0.0, 0.01 * k), (0.01 * k, 0.0, 0.4)))
     with pytest.raises(DatasetError, match="tilt the board more"):
         from_chessboard(flat, COLUMNS, ROWS, SQUARE_M)
-    cv2.imwrite(str(flat / "7.png"), np.zeros((100, 100), np.uint8))
-    with pytest.raises(DatasetError, match=r"7\.png: is 100x100"):
-        from_chessboard(flat, COLUMNS, ROWS, SQUARE_M)
-    (flat / "7.png").write_bytes(b"torn")
-    with pytest.raises(DatasetError, match=r"7\.png: torn"):
-        from_chessboard(flat, COLUMNS, ROWS, SQUARE_M)
+    (two / "1.png").unlink()
+    cv2.imwrite(str(two / "1.png"), np.zeros((100, 100), np.uint8))
+    with pytest.raises(DatasetError, match=r"1\.png: is 100x100"):
+        from_chessboard(two, COLUMNS, ROWS, SQUARE_M)
+    (two / "1.png").write_bytes(b"torn")
+    with pytest.raises(DatasetError, match=r"1\.png: torn"):
+        from_chessboard(two, COLUMNS, ROWS, SQUARE_M)
 
 
 # --- the mounting by the vehicles ---
@@ -337,7 +338,7 @@ def test_bad_input_is_one_line(data_dir: Path, tmp_path: Path, capsys: pytest.Ca
         ((sequence, "--output", out, "--speed", str(tmp_path / "speed.csv")), "lie outside the recording's"),
         ((sequence, "--output", out, "--speed", str(tmp_path / "torn.csv")), "torn.csv: line 2 is no time"),
         ((sequence, "--output", out, "--chessboard", str(tmp_path), "--board", "nine"), "expected COLSxROWS"),
-        ((str(data_dir / "kitti_raw_clip"), "--output", out), "too little motion"),
+        ((str(data_dir / "kitti_raw_clip"), "--stride", "4", "--output", out), "too little motion"),
     ):
         status, told = _said(capsys, *arguments)
         assert status == 2, arguments

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_odometry import CAMERA, NO_BOXES, path_m, render, street
 
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.se2 import SE2
@@ -21,6 +20,7 @@ from birdslam.odometry.road.kalman_filter import CAR_DELAY, CAR_FACTOR, STATES, 
 from birdslam.odometry.speed.readings import CarSpeedConfig, SpeedReadings
 from birdslam.odometry.speed.scale import SpeedScale
 from birdslam.types import INVALIDATING, NS_PER_S, EgoEdge, Measurements, SpeedReading, SpeedSource, Status
+from tests.test_odometry import CAMERA, NO_BOXES, path_m, render, street
 
 Speed = Callable[[float], float]
 CONFIG = CarSpeedConfig()

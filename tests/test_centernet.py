@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_networks as tiny
 from numpy.typing import NDArray
 
 from birdslam.perception import ModelError, ModelSpec, load_network
@@ -14,6 +13,7 @@ from birdslam.perception.decoding.centernet import CenterNetDecoder
 from birdslam.perception.decoding.detection import EdgeSigma
 from birdslam.perception.manifest import CenterNet, FitPad, Input, Stretch, Tiles
 from birdslam.perception.views import make_views
+from tests import tiny_networks as tiny
 
 MANIFEST = """
 role = "detector"

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_networks import echo
 
 from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig
 from birdslam.perception.completion import SHIPPED, GridCompletion
 from birdslam.perception.manifest import ModelError
+from tests.tiny_networks import echo
 
 SHAPE = LanesConfig().shape
 

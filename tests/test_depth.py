@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_networks as tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.perception import ModelError, ModelSpec, load_network
 from birdslam.perception.decoding.depth import DepthMap
 from birdslam.perception.manifest import Disparity, MetricDepth
+from tests import tiny_networks as tiny
 
 INPUT = tiny.SEGMENTER.partition("[segmenter]")[0].replace("segmenter", "depth")
 DISPARITY = INPUT + '[depth]\ndecoding = "disparity"\noutput = "disp"\n'

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
 from birdslam.ros.bag import BagTopics
-from birdslam.runtime.calibration import METADATA_SIGMA_REL, Given, focal_length_of
+from birdslam.runtime.calibration.given import METADATA_SIGMA_REL, Given, focal_length_of
 from birdslam.runtime.cli.main import main
 from birdslam.sources.films.video import VideoRecording
 from birdslam.sources.opening import open_recording
@@ -207,7 +207,7 @@ def test_what_is_no_film_is_one_clear_line(tmp_path: Path, capfd: pytest.Capture
 def test_a_phones_metadata_state_the_focal_length(suffix: str, tmp_path: Path) -> None:
     path = film(tmp_path / f"phone.{suffix}", range(0, 200, 40), metadata={FOCAL_KEY: "26", "title": "a drive"})
     assert VideoRecording.stated_focal_px(path) == pytest.approx(WIDTH * 26 / 36)
-    focal_px, sigma_rel, by = focal_length_of(Given(), f"video:{path}", WIDTH)
+    focal_px, sigma_rel, by, _ = focal_length_of(Given(), f"video:{path}", WIDTH)
     assert (focal_px, sigma_rel) == (pytest.approx(WIDTH * 26 / 36), METADATA_SIGMA_REL)
     assert "metadata" in by
     assert "as stated, 60 deg" in focal_length_of(Given(fov_deg=60.0), f"video:{path}", WIDTH)[2]  # goes before it

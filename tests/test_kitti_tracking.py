@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tracking_world
 
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.kitti_tracking import open_tracking, read_detections
 from birdslam.sources.recording import DatasetError
+from tests import tracking_world
 
 
 def test_oxts_and_pose_rows_say_the_same(tmp_path: Path) -> None:

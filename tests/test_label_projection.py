@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import tracking_world
 
 from birdslam.sources.kitti_tracking import camera_with_images, open_tracking
 from birdslam.sources.label_projection import hull_px, project_labels
+from tests import tracking_world
 
 BASELINE_M = 0.532
 KITTI = Path(os.environ.get("BIRDSLAM_DATA", Path(__file__).parents[2] / "shared" / "data")) / "kitti_tracking/training"

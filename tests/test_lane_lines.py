@@ -30,6 +30,8 @@ from birdslam.outputs.line_map import LineMap
 from birdslam.perception import Segmentation
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.evaluation.still_lanes import evaluate_stills
+from birdslam.runtime.recording import scene
+from birdslam.runtime.recording.foxglove import SceneUpdate
 from birdslam.sources.recording import DatasetError
 from birdslam.types import Bound, Estimate, FollowedPerson, LaneChange, LaneLine, Lanes, LineKind
 
@@ -118,7 +120,7 @@ def drive(tracker: LineTracker, poses: list[SE2], hidden_from: int = 10**6) -> l
             masks.road[:, :300], masks.lane[:, :300] = False, False
             image[:, :300] = 60
             boxes = np.array([[0.0, 0.0, 300.0, 240.0]])
-        tracker.update(pose, CAMERA.ground, 0.003, image, masks, boxes)
+        tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, boxes)
         out.append(tracker.lines().at(pose))
     return out
 
@@ -170,7 +172,7 @@ def test_noise_and_jumps_end_nothing() -> None:
         pose = pose @ SE2(
             float(rng.normal(1.0, size)), float(rng.normal(0.0, size)), float(rng.normal(0.0, 0.3 * size))
         )
-        tracker.update(pose, CAMERA.ground, 0.003, image, masks, NOBODY)
+        tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, NOBODY)
         lines = tracker.lines().at(pose @ SE2(0.5, 0.0, 0.02))
         lanes = EgoLane().lanes(lines, 0, tracker.tilt_rad)
         assert msgspec.json.decode(msgspec.json.encode(lanes), type=Lanes) == lanes
@@ -265,7 +267,7 @@ def test_traffic_tells_which_way_a_lane_runs() -> None:
     before = with_users(lanes, [unknown], 10.0, traffic)
     assert before.lanes[0].oncoming is None
     assert before.lanes[1].oncoming == 0.0
-    assert before.vehicles[0].left > 0.9
+    assert before.vehicles[0].left == pytest.approx(0.75, abs=0.01)
     for _ in range(3):  # one car counts once
         told = with_users(lanes, [UserInEgo(1, SE2(30.0, 3.4, math.pi), cov, 4.0, 9.0), unknown], 10.0, traffic)
     assert told.lanes[0].oncoming == pytest.approx(1.0 / (1.0 + math.exp(-2.0)))
@@ -319,6 +321,21 @@ def test_the_map_has_each_line_once(tmp_path: Path) -> None:
         assert np.all(np.diff(points[:, 0]) > 0.0)
         assert len(feature["properties"]["sigma_m"]) == len(points)
         assert feature["properties"]["kind"] == "solid"
+
+
+def test_foxglove_draws_lines_where_they_are() -> None:
+    lanes = EgoLane().lanes((line(4, 1.75), line(5, -1.75, LineKind.EDGE)), 0, 0.0)
+    estimate = Estimate(
+        epoch=0, frame_id=0, t_source_ns=0, t_capture_ns=0, t_utc_ns=0, T_world_ego=SE2(5.0, 1.0, 0.3), cov=(0.0,) * 9,
+        valid=True, lanes=lanes,
+    )  # fmt: skip
+    (drawn,) = (message for channel, message in scene.from_estimate(estimate, 0) if channel == "/scene")
+    assert isinstance(drawn, SceneUpdate)
+    (entity,) = (entity for entity in drawn.entities if entity.id == "lanes")
+    assert entity.frame_id == "ego"
+    assert [{point.y for point in strip.points} for strip in entity.lines] == [{1.75}, {-1.75}, {0.0}]
+    assert [strip.color for strip in entity.lines] == [scene.WHITE_LINE, scene.UNSEEN, scene.OWN_LANE]
+    assert entity.lines[0].points[-1].x >= 50.0
 
 
 def test_the_scores_of_known_errors() -> None:

@@ -23,6 +23,7 @@ CAMERA = Camera(
     width_px=640, height_px=192, fx_px=370.0, fy_px=370.0, cx_px=320.0, cy_px=88.0, height_m=1.6, pitch_rad=0.02
 )
 NOBODY = np.zeros((0, 4))
+SIGMA_TILT = (0.003, 0.003)  # of pitch and roll
 STEP_M = 0.5
 
 
@@ -76,7 +77,9 @@ class Driver:
     def step(self, segmentation: Segmentation | None = MASKS) -> LaneOutput:
         self.frame += 1
         T_world_ego = SE2(STEP_M * self.frame)
-        return self.mapper.map_lanes(self.frame, T_world_ego, CAMERA.ground, 0.003, segmentation, self.frame, NOBODY)
+        return self.mapper.map_lanes(
+            self.frame, T_world_ego, CAMERA.ground, SIGMA_TILT, segmentation, self.frame, NOBODY
+        )
 
 
 @pytest.mark.parametrize("every", [1, 4, 7])

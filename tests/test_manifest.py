@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import onnxruntime as ort
 import pytest
-import tiny_networks as tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto
@@ -16,6 +15,7 @@ from onnx import TensorProto
 from birdslam.perception import ModelError, ModelSpec, load_network, shipped_manifests
 from birdslam.perception.manifest_file import find_manifest, read_manifest
 from birdslam.perception.onnx_files.subnormal import without_tiny_weights
+from tests import tiny_networks as tiny
 from tests.tiny_networks import DETECTOR, SEGMENTER
 
 

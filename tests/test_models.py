@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tiny_networks as tiny
 from onnx import TensorProto, helper, numpy_helper
 from onnx.external_data_helper import set_external_data
 
@@ -27,6 +26,7 @@ from birdslam.runtime.models import catalogue as catalogue_module
 from birdslam.runtime.models import store as model_store
 from birdslam.runtime.models.download import DownloadError, download
 from birdslam.runtime.options import configuration_of
+from tests import tiny_networks as tiny
 from tests.tiny_networks import DETECTOR, SEGMENTER
 
 

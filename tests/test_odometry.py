@@ -60,7 +60,13 @@ def _sample(seed: int, a_m: np.ndarray, b_m: np.ndarray, footprint_m: np.ndarray
 
 
 def render(pose: Pose, noise_seed: int = 0) -> np.ndarray:
-    """A street between two house fronts, seen from `pose` (camera axes; the road is the plane y = 1.65 m)."""
+    """A street between two house fronts, from `pose` (camera axes; the road is the plane y = 1.65 m)."""
+    return _rendered(pose.R.tobytes(), pose.p.tobytes(), noise_seed).copy()
+
+
+@functools.lru_cache(maxsize=256)  # many drives begin alike
+def _rendered(R: bytes, p_m: bytes, noise_seed: int) -> np.ndarray:
+    pose = Pose(np.frombuffer(R).reshape(3, 3), np.frombuffer(p_m))
     v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX].astype(np.float64)
     rays = np.stack([(u - CAMERA.cx_px) / CAMERA.fx_px, (v - CAMERA.cy_px) / CAMERA.fy_px, np.ones_like(u)], -1)
     d, p = rays @ pose.R.T, pose.p

@@ -11,11 +11,8 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 import pytest
-import tiny_ir
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
-from test_models import left_in, refused, serve_files
-from tiny_ir import Ir, Port
 
 from birdslam.perception import ModelSpec, load_network
 from birdslam.perception.onnx_files.openvino_ir import IrError
@@ -23,6 +20,9 @@ from birdslam.perception.onnx_files.openvino_onnx import convert, weights_sha256
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.models import catalogue as catalogue_module
 from birdslam.runtime.models.catalogue import probing_image
+from tests import tiny_ir
+from tests.test_models import left_in, refused, serve_files
+from tests.tiny_ir import Ir, Port
 
 MODELS = Path(os.environ.get("BIRDSLAM_MODELS", Path(__file__).parents[2] / "shared" / "models"))
 NETWORKS = {"vehicle_adas": "vehicle_detection_adas_0002_640x192", "road_adas": "road_segmentation_adas_0001_640x192"}

@@ -13,7 +13,6 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-import tiny_networks as tiny
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -32,6 +31,7 @@ from birdslam.perception.decoding.detection import MOST_CANDIDATES, YoloxDecoder
 from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, Schedule, Stretch, Tiles, Yolox
 from birdslam.perception.views import Preparation, View, make_views
 from birdslam.types import Status
+from tests import tiny_networks as tiny
 
 SIZE_PX = 128
 STRIDES = (8, 16, 32)

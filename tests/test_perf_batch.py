@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from test_batch import PLAIN, kitti
 
 from birdslam.perf.latency import batch
 from birdslam.runtime.batch.drives import find_drives, tasks
+from tests.test_batch import PLAIN, kitti
 
 
 def row(engine: str, workers: int, number: int, wall_s: float) -> dict:

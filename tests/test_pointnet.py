@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_networks as tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.perception import ModelError, ModelSpec
 from birdslam.perception.pointnet import frustum_of, load_pointnet
 from birdslam.perception.pointnet_manifest import Points
+from tests import tiny_networks as tiny
 
 CAMERA = Camera(width_px=640, height_px=192, fx_px=400.0, fy_px=400.0, cx_px=320.0, cy_px=96.0, height_m=1.6)
 BODY = """

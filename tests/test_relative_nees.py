@@ -8,11 +8,9 @@ from dataclasses import replace as with_
 import msgspec
 import numpy as np
 import pytest
-import tracking_world
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from test_tracking_evaluation import log_of
 
 from birdslam.bench.ego.motion_consistency import nees_of_length
 from birdslam.bench.simulation.odometry import EXACT
@@ -23,6 +21,8 @@ from birdslam.geometry.se2 import SE2
 from birdslam.slam import SlamConfig
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking
 from birdslam.types import Measurements
+from tests import tracking_world
+from tests.test_tracking_evaluation import log_of
 
 SIGMA = np.array([0.3, 0.2, 0.05])  # m, m, rad, of a vehicle's edge
 LIVE = ours(SlamConfig())

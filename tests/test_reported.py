@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 import pytest
-import tracking_world
 from msgspec.structs import replace
 
 from birdslam.bench.tracking.reported import HALF_SPAN, Sight, motion_row, range_rows, sights
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking
 from birdslam.types import Estimate, VehicleEstimate
+from tests import tracking_world
 
 EYE = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 RATE_HZ = 10.0

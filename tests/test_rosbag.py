@@ -11,7 +11,6 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-import ros_bags as ros
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -30,6 +29,7 @@ from birdslam.sources.rosbag import RosbagRecording
 from birdslam.sources.rosbag_truth import east_north_up
 from birdslam.trajectory import as_poses, mount_pose
 from birdslam.types import Estimate
+from tests import ros_bags as ros
 
 WIDTH, HEIGHT = 64, 32
 PERIOD_NS = 100_000_000

@@ -11,7 +11,6 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-import ros_bags as ros
 
 from birdslam.bench.ego.trajectory_errors import evaluate_recordings
 from birdslam.geometry.camera import AXES_EGO_CAM, Camera
@@ -27,6 +26,7 @@ from birdslam.sources.recording import Recording
 from birdslam.sources.rosbag_truth import WGS84_A_M, WGS84_E2
 from birdslam.trajectory import Transform, as_poses, inverse, mount_pose
 from birdslam.types import Estimate
+from tests import ros_bags as ros
 
 DISTORTION = (-0.28, 0.09, 0.0006, -0.0004, -0.012)  # about that of KITTI's unrectified cameras
 

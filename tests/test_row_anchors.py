@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_networks as tiny
 
 from birdslam.perception import ModelError, ModelSpec, load_network
+from tests import tiny_networks as tiny
 
 COLUMNS, ROWS = 20, (0.9, 0.75, 0.6, 0.45)
 MANIFEST = f"""

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_networks as tiny
 
 from birdslam.perception import ModelError, ModelSpec, Segmentation, load_network
+from tests import tiny_networks as tiny
 
 MANIFEST = (
     re.sub(r"(width|height)_px = \d+", r"\1_px = 8", tiny.SEGMENTER)

@@ -12,10 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_networks as tiny
-import tracking_world
 from msgspec.structs import replace
-from test_label_projection import with_right_camera
 
 from birdslam.bench.baselines.trajectories import Trajectories
 from birdslam.bench.simulation.odometry import EXACT, Drift, SimulatedOdometry, SimulationConfig, Walk, fit_drift
@@ -51,6 +48,9 @@ from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, rea
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.speed_log import SpeedLog
 from birdslam.types import Frame, Measurements, SpeedReading
+from tests import tiny_networks as tiny
+from tests import tracking_world
+from tests.test_label_projection import with_right_camera
 
 FRAMES = range(40)
 

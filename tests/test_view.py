@@ -70,7 +70,14 @@ def test_everything_of_a_drive_is_sent(tape: Tape) -> None:
     logged = stream.logged
     for entity in ("camera", "camera/boxes", "bev/lanes", "latency/age", "latency/left"):
         assert logged[entity] == 30, entity
-    for entity in ("world/ego", "world/ego_ellipse", "world/vehicles", "world/vehicles/ellipse", "bev/bodies"):
+    for entity in (
+        "world/ego",
+        "world/ego_ellipse",
+        "world/vehicles",
+        "world/vehicles/ellipse",
+        "bev/bodies",
+        "bev/lines",
+    ):
         assert logged[entity] == 30, entity
     assert logged["world"] == 3  # its axes, and two epochs that begin
     assert any(entity.startswith("world/map/") for entity in logged)

@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 from birdslam.calibration.lens_adjustment import (
     IMAGES,
     SIGMA_K1,
+    FocalPrior,
     LensProblem,
     adjust,
     at_focal_length,
-    costs,
-    some_windows,
+    cost_of,
+    shared_by,
+    some_corners,
 )
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_log
@@ -41,16 +43,17 @@ _FIXED_RAD = 0.003  # a corner that moves by less over a window is far off, or o
 _MOST_WINDOWS = 40
 _LEAST_WINDOWS = 4
 _LEAST_CORNERS = 20  # of a window
-_MOST_CORNERS = 160
+_MOST_CORNERS = 100
 _TWO_VIEW_PX = 1.5  # outliers' limit of the first poses, by pixels of a lens of _FOCAL_PX
 _FOCAL_PX = 720.0
 _SIGMA_PX = 0.5  # of a corner, by the same pixels
 _MOST_TURN_RAD = 0.8  # of a window
 _LEAST_TURN_RAD = math.radians(30.0)  # a drive that turns less shows no focal length: of 19 real ones eleven did not
 _FARTHEST = 80.0  # of a corner that begins the adjustment, in baselines of its window
-# Focal lengths that are tried, as the log of their ratio to the best one so far; after the first round finer ones
-_TRIED_LOG = (np.linspace(-0.4, 0.4, 9), np.linspace(-0.12, 0.12, 7))
-_FOLDS = 5  # of the windows, for the sigma
+_BEGUN = -1.0, 0.0, 1.0  # where the focal length is looked for from, in sigmas of what is known of it
+_ROUGHLY = 1e-4  # how far each is adjusted
+_BLOCKS = 8  # of the windows, for the sigma
+_SHOWN = 0.7  # of the sigma beforehand: a focal length that is known no better is kept
 # How wide cameras see, across, and 1-sigma of their focal length as a fraction: by judgement
 FIELD_OF_VIEW_DEG = {"dashcam": (75.0, 0.25), "phone": (65.0, 0.1)}
 STATED_SIGMA_REL = 0.03  # of a focal length by a field of view that somebody states
@@ -113,12 +116,17 @@ class _Window:
 
 
 def self_calibrate(
-    images: Sequence[CornersOfImage], size_px: tuple[int, int], focal_px: float, focal_sigma_rel: float
+    images: Sequence[CornersOfImage],
+    size_px: tuple[int, int],
+    focal_px: float,
+    focal_sigma_rel: float,
+    by_view: bool = False,
 ) -> Lens | None:
     """The lens that the corners of a drive's raw images show; None where there is too little to see.
 
-    `focal_px` with its 1-sigma is what is known beforehand, by the kind of camera or by its field of view. The focal
-    length trades against turns and lateral motion in a narrow valley: so it is tried, and the rest adjusted for each.
+    `focal_px` with its 1-sigma is what is known beforehand. Where it is `by_view` across the image, nobody knows
+    whether the view was counted with the lens's distortion or without: the sigma covers both. The focal length trades
+    against turns and lateral motion in a narrow valley: so it is looked for from several.
     """
     middle = 0.5 * (np.array(size_px, dtype=np.float64) - 1.0)
     windows: list[_Window] = []
@@ -132,19 +140,26 @@ def self_calibrate(
     fitted = adjust(begun)
     again = _begin(windows, focal_px, fitted.k1, sigma_px)
     fitted = fitted if again is None else adjust(again)
-    turned_rad, sigma_rel = _turned_rad(fitted), focal_sigma_rel
+    if by_view:
+        half = 0.5 * size_px[0] / focal_px
+        focal_sigma_rel = math.hypot(focal_sigma_rel, math.log(max(1.0 + fitted.k1 * half**2, 0.3)))
+    prior = FocalPrior(math.log(focal_px), focal_sigma_rel)
+    turned_rad, sigmas = _turned_rad(fitted), _sigmas(fitted, prior)
+    shown = False
     if turned_rad > _LEAST_TURN_RAD:
-        fitted, sigma_rel = _with_focal_length(windows, fitted, focal_px, focal_sigma_rel)
-    k1s = [adjust(some_windows(fitted, some)).k1 for some in _folds(fitted)]
+        found = _with_focal_length(windows, fitted, prior)
+        sigmas_found = _sigmas(found, prior)
+        shown = bool(max(sigmas_found[1], LEAST_SIGMA_REL) < _SHOWN * focal_sigma_rel)
+        fitted, sigmas = (found, sigmas_found) if shown else (fitted, sigmas)
     return Lens(
         focal_px=math.exp(fitted.log_focal),
         k1=fitted.k1,
-        focal_sigma_rel=sigma_rel,
-        k1_sigma=min(max(LEAST_SIGMA_K1, _jackknife(k1s)), SIGMA_K1),
+        focal_sigma_rel=max(float(sigmas[1]), LEAST_SIGMA_REL) if shown else focal_sigma_rel,
+        k1_sigma=min(max(LEAST_SIGMA_K1, float(sigmas[0])), SIGMA_K1),
         windows=len(fitted.R),
         corners=len(fitted.px),
         turned_rad=turned_rad,
-        focal_shown=sigma_rel < 0.7 * focal_sigma_rel,
+        focal_shown=shown,
     )
 
 
@@ -153,60 +168,41 @@ def _turned_rad(problem: LensProblem) -> float:
     return sum(float(np.linalg.norm(rotation_log(R[IMAGES // 2]))) for R in problem.R)
 
 
-def _with_focal_length(
-    windows: Sequence[_Window], fitted: LensProblem, focal_px: float, focal_sigma_rel: float
-) -> tuple[LensProblem, float]:
-    """The problem with the focal length that costs least, and its 1-sigma as a fraction."""
-    for tried in _TRIED_LOG:
-        begun = _begin(windows, math.exp(fitted.log_focal), fitted.k1, fitted.sigma_px)
-        if begun is None:
-            return fitted, focal_sigma_rel
-        at = fitted.log_focal + tried
-        profile = _profile(begun, at)
-        prior = 0.5 * np.square((at - math.log(focal_px)) / focal_sigma_rel)
-        fitted = adjust(at_focal_length(begun, _lowest(at, profile.sum(axis=1) + prior)))
-    without = [_lowest(at, profile[:, some].sum(axis=1) + prior) for some in _folds(fitted)]
-    own = _curvature(at, profile.sum(axis=1) + prior) ** -0.5
-    return fitted, min(max(LEAST_SIGMA_REL, _jackknife(without), own), focal_sigma_rel)
+def _with_focal_length(windows: Sequence[_Window], fitted: LensProblem, prior: FocalPrior) -> LensProblem:
+    """The problem with the focal length that costs least, of those that are found from several."""
+    begun = (at_focal_length(fitted, prior.log_focal + by * prior.sigma) for by in _BEGUN)
+    found = [adjust(problem, prior, _ROUGHLY) for problem in begun]
+    best = min(found, key=lambda problem: cost_of(problem, prior))
+    # Which corners are outliers was told by another lens
+    again = _begin(windows, math.exp(best.log_focal), best.k1, best.sigma_px)
+    return best if again is None else adjust(again, prior)
 
 
-def _folds(problem: LensProblem) -> list[NDArray[np.bool_]]:
-    """Which windows (W,) stay where each fold of them is left out."""
+def _sigmas(problem: LensProblem, prior: FocalPrior | None) -> Floats:
+    """(2,) 1-sigma of k1 and of the log of the focal length.
+
+    What the lens is without each part of the drive, and without each part of the image, in one step from here. Windows
+    beside each other share images and bends, so parts of the drive are whole; a lens that is no such lens (a second
+    term, another middle, rows read in turn) shows by parts of the image that disagree.
+    """
     W = len(problem.R)
-    folds = min(_FOLDS, W)
-    return [np.arange(W) % folds != fold for fold in range(folds)]
+    blocks = (np.arange(W) * min(_BLOCKS, W) // W)[problem.of]
+    middle = problem.px[:, IMAGES // 2]
+    ring = np.searchsorted(
+        np.quantile(np.linalg.norm(middle, axis=1), [1.0 / 3.0, 2.0 / 3.0]), np.linalg.norm(middle, axis=1)
+    )
+    side = 2 * (middle[:, 0] > 0.0) + (middle[:, 1] > 0.0)
+    own = np.diag(np.linalg.inv(shared_by(problem, prior)[1]))
+    return np.sqrt(np.max([own, *(_jackknife(problem, prior, parts) for parts in (blocks, ring, side))], axis=0))
 
 
-def _lowest(at: Floats, cost: Floats) -> float:
-    """Where a cost is least, by the parabola through the least of its values and its neighbours; within them."""
-    k = int(np.clip(np.argmin(cost), 1, len(at) - 2))
-    a, b, _ = np.polyfit(at[k - 1 : k + 2] - at[k], cost[k - 1 : k + 2], 2)
-    step = -0.5 * b / a if a > 0.0 else 0.0
-    return float(np.clip(at[k] + step, at[0], at[-1]))
-
-
-def _curvature(at: Floats, cost: Floats) -> float:
-    k = int(np.clip(np.argmin(cost), 1, len(at) - 2))
-    return max(2.0 * float(np.polyfit(at[k - 1 : k + 2] - at[k], cost[k - 1 : k + 2], 2)[0]), 1e-9)
-
-
-def _jackknife(values: Sequence[float]) -> float:
-    """1-sigma of an estimate by what it is without each fold of the data."""
-    n = len(values)
-    return math.sqrt((n - 1) / n * float(np.square(np.array(values) - np.mean(values)).sum()))
-
-
-def _profile(problem: LensProblem, log_focals: Floats) -> Floats:
-    """(F, W) what each window costs at each focal length, the rest adjusted; from the middle outwards."""
-    out = np.zeros((len(log_focals), len(problem.R)))
-    middle = len(log_focals) // 2
-    for ways in (range(middle, len(log_focals)), range(middle - 1, -1, -1)):
-        there = problem
-        for k in ways:
-            there = adjust(at_focal_length(there, float(log_focals[k])))
-            if k == middle:
-                problem = there
-            out[k] = costs(there)
+def _jackknife(problem: LensProblem, prior: FocalPrior | None, parts: Ints) -> Floats:
+    """(2,) variance by what the lens is without each part (P,) of the corners."""
+    each = np.unique(parts)
+    if len(each) < 2:
+        return np.zeros(2)
+    without = np.array([shared_by(some_corners(problem, parts != one), prior)[0] for one in each])
+    out: Floats = (len(each) - 1) / len(each) * np.square(without - without.mean(axis=0)).sum(axis=0)
     return out
 
 

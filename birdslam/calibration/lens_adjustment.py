@@ -1,7 +1,7 @@
-"""Bundle adjustment of short windows of images together with the distortion of the lens that they share.
+"""Bundle adjustment of short windows of images together with the lens that they share: focal length and distortion.
 
 Each corner has three numbers, so that no image's noise is taken for the truth. Normal equations are reduced twice: by
-the corners, and by each window's poses, since windows share the distortion alone.
+the corners, and by each window's poses, since windows share the lens alone.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ Ints = NDArray[np.int64]
 IMAGES = 6  # of a window
 SIGMA_K1 = 0.3  # beforehand: dashboard cameras have -0.4 to 0
 _HUBER = 1.5  # sigmas
-_ITERATIONS = 20
+_ITERATIONS = 30
 _CONVERGED = 1e-6  # relative change of the cost
+_HELD = 1e-6  # 1-sigma of a focal length that is held
 _NEAREST, _BEHIND_COST = 1e-3, 1e3  # a corner is no nearer; what one behind the camera costs
 
 
@@ -37,6 +38,19 @@ class LensProblem:
     log_focal: float
     k1: float
     sigma_px: float  # of a corner: a larger image has it in more pixels, whatever its lens turns out to be
+
+    @property
+    def shared(self) -> Floats:
+        """(2,) what all windows share: k1, and the log of the focal length."""
+        return np.array([self.k1, self.log_focal])
+
+
+@dataclass(frozen=True)
+class FocalPrior:
+    """What is known of the log of the focal length beside the images, with its 1-sigma."""
+
+    log_focal: float
+    sigma: float
 
 
 def at_focal_length(problem: LensProblem, log_focal: float) -> LensProblem:
@@ -56,41 +70,56 @@ def at_focal_length(problem: LensProblem, log_focal: float) -> LensProblem:
     )
 
 
-def some_windows(problem: LensProblem, some: NDArray[np.bool_]) -> LensProblem:
-    """The problem of some of the windows (W,) alone."""
-    corners, number = some[problem.of], np.cumsum(some) - 1
+def some_corners(problem: LensProblem, some: NDArray[np.bool_]) -> LensProblem:
+    """The problem of some of the corners (P,) alone; windows that are left without any are left out."""
+    windows = np.unique(problem.of[some])
     return replace(
         problem,
-        px=problem.px[corners],
-        of=number[problem.of[corners]],
-        R=problem.R[some],
-        t=problem.t[some],
-        corner=problem.corner[corners],
+        px=problem.px[some],
+        of=np.searchsorted(windows, problem.of[some]),
+        R=problem.R[windows],
+        t=problem.t[windows],
+        corner=problem.corner[some],
     )
 
 
-def adjust(problem: LensProblem) -> LensProblem:
-    """Levenberg-Marquardt on robust reprojection errors, the focal length held."""
+def adjust(problem: LensProblem, prior: FocalPrior | None = None, converged: float = _CONVERGED) -> LensProblem:
+    """Levenberg-Marquardt on robust reprojection errors; without a prior the focal length is held.
+
+    It ends with a step that lowers the cost by less than a fraction of `converged`.
+    """
     damping = 1e-4
-    cost, system = _linearise(problem)
+    cost, system = _linearise(problem, prior)
     for _ in range(_ITERATIONS):
-        tried = _moved(problem, *_solve(system, damping, len(problem.R)))
-        new_cost, new_system = _linearise(tried)
+        tried = _moved(problem, *_solve(system, damping))
+        new_cost, new_system = _linearise(tried, prior)
         if not new_cost < cost:
             damping *= 10.0
             if damping > 1e3:
                 break
             continue
-        settled = cost - new_cost < _CONVERGED * cost
+        settled = cost - new_cost < converged * cost
         problem, cost, system, damping = tried, new_cost, new_system, max(0.2 * damping, 1e-9)
         if settled:
             break
     return problem
 
 
+def cost_of(problem: LensProblem, prior: FocalPrior) -> float:
+    """What is least after `adjust`."""
+    return _linearise(problem, prior)[0]
+
+
+def shared_by(problem: LensProblem, prior: FocalPrior | None) -> tuple[Floats, Floats]:
+    """(k1, log of the focal length) by one step of Gauss and Newton from here, and their information (2, 2)."""
+    system = _linearise(problem, prior)[1]
+    information, gradient, *_ = _reduced(system, 0.0)
+    return problem.shared - np.linalg.solve(information, gradient), information
+
+
 @dataclass(frozen=True)
 class _System:
-    """Normal equations of the corners, and of each window's poses with k1 last, V = 6 (IMAGES - 1) + 1."""
+    """Normal equations of the corners, and of each window's poses with the lens last, V = 6 (IMAGES - 1) + 2."""
 
     of: Ints  # (P,) window of each corner
     corner: Floats  # (P, 3, 3)
@@ -98,7 +127,8 @@ class _System:
     view: Floats  # (W, V, V)
     corner_gradient: Floats  # (P, 3)
     view_gradient: Floats  # (W, V)
-    k1_gradient: float  # of what is known of k1 beforehand
+    prior: Floats  # (2, 2) information of what is known of the lens beforehand
+    prior_gradient: Floats  # (2,)
 
 
 def _project(problem: LensProblem) -> tuple[Floats, Floats, Floats, Floats]:
@@ -120,18 +150,15 @@ def _huber(problem: LensProblem, q: Floats, d: Floats) -> tuple[Floats, Floats, 
     return r, weight, np.where(ahead, cost, _BEHIND_COST)
 
 
-def costs(problem: LensProblem) -> Floats:
-    """(W,) what each window costs."""
-    _, q, _, d = _project(problem)
-    return np.asarray(np.bincount(problem.of, _huber(problem, q, d)[2].sum(axis=1), len(problem.R)), np.float64)
-
-
-def _linearise(problem: LensProblem) -> tuple[float, _System]:
+def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _System]:
     """The cost and the normal equations at the present values."""
+    prior = prior or FocalPrior(problem.log_focal, _HELD)
     turned, q, u, d = _project(problem)
     r, weight, each = _huber(problem, q, d)
     focal_px, sigma_px = math.exp(problem.log_focal), problem.sigma_px
-    cost = float(each.sum()) + 0.5 * (problem.k1 / SIGMA_K1) ** 2
+    known = np.array([0.0, prior.log_focal]), np.array([SIGMA_K1, prior.sigma]) ** -2.0
+    away = problem.shared - known[0]
+    cost = float(each.sum()) + 0.5 * float(known[1] @ away**2)
 
     r2 = np.square(u).sum(axis=-1)[..., None, None]
     d_u = (1.0 + problem.k1 * r2) * np.eye(2) + 2.0 * problem.k1 * u[..., :, None] * u[..., None, :]
@@ -146,13 +173,13 @@ def _linearise(problem: LensProblem) -> tuple[float, _System]:
     )
     J_turn = np.cross(turned[:, :, None, :], J_q)  # d q / d w = -[turned]x
     J_pose = np.concatenate([J_turn, J_q * problem.corner[:, 2, None, None, None]], axis=-1)[:, 1:]
-    J_k1 = focal_px / sigma_px * u * r2[..., 0]
+    J_lens = focal_px / sigma_px * np.stack([u * r2[..., 0], d], axis=-1)
 
     P, poses = len(r), 6 * (IMAGES - 1)
-    by_image = np.zeros((P, IMAGES, 2, poses + 1))
+    by_image = np.zeros((P, IMAGES, 2, poses + 2))
     for k in range(1, IMAGES):
         by_image[:, k, :, 6 * (k - 1) : 6 * k] = J_pose[:, k - 1]
-    by_image[..., poses] = J_k1
+    by_image[..., poses:] = J_lens
     J_view, J_corner, r = (x.reshape(P, 2 * IMAGES, -1) for x in (by_image, J_corner, r))
     w = np.repeat(weight, 2, axis=1)[..., None]
     by_view = (J_view * w).transpose(0, 2, 1) @ J_view
@@ -171,34 +198,48 @@ def _linearise(problem: LensProblem) -> tuple[float, _System]:
         view=view,
         corner_gradient=np.einsum("pni,pn->pi", J_corner * w, r[..., 0]),
         view_gradient=gradient,
-        k1_gradient=problem.k1 / SIGMA_K1**2,
+        prior=np.diag(known[1]),
+        prior_gradient=known[1] * away,
     )
 
 
-def _solve(system: _System, damping: float, windows: int) -> tuple[Floats, float, Floats]:
-    """Steps of the poses (W, IMAGES - 1, 6), of k1 and of the corners (P, 3), which are eliminated first (Schur)."""
-    inverse = np.linalg.inv(system.corner * (1.0 + damping * np.eye(3)))
+def _reduced(system: _System, damping: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Corners are eliminated first (Schur), then each window's poses by themselves, since windows share the lens alone.
+
+    Information (2, 2) and gradient (2,) of the lens; how poses follow it (W, V - 2, 2) and what they are without it
+    (W, V - 2); inverse of the corners' (P, 3, 3).
+    """
+    inverse = np.asarray(np.linalg.inv(system.corner * (1.0 + damping * np.eye(3))), np.float64)
     part = inverse @ system.corner_by_view
     begin = np.flatnonzero(np.diff(system.of, prepend=-1))
     view = system.view * (1.0 + damping * np.eye(system.view.shape[-1]))
     view = view - np.add.reduceat(system.corner_by_view.transpose(0, 2, 1) @ part, begin, axis=0)
     taken = np.einsum("pij,pi->pj", part, system.corner_gradient)
     gradient = system.view_gradient - np.add.reduceat(taken, begin, axis=0)
-    # Windows share k1 alone, so their poses go next, each window's by itself
-    solved = np.linalg.solve(view[:, :-1, :-1], np.concatenate([view[:, :-1, -1:], gradient[:, :-1, None]], axis=2))
-    by_k1, by_gradient = solved[..., 0], solved[..., 1]
-    information = float((view[:, -1, -1] - (view[:, -1, :-1] * by_k1).sum(axis=1)).sum()) + SIGMA_K1**-2.0
-    slope = float((gradient[:, -1] - (view[:, -1, :-1] * by_gradient).sum(axis=1)).sum()) + system.k1_gradient
-    k1 = -slope / information
-    poses = -by_gradient - by_k1 * k1
-    steps = np.concatenate([poses, np.full((windows, 1), k1)], axis=1)[system.of]
+    poses, lens = slice(None, -2), slice(-2, None)
+    solved = np.linalg.solve(view[:, poses, poses], np.concatenate([view[:, poses, lens], gradient[:, poses, None]], 2))
+    by_lens, alone = solved[..., :2], solved[..., 2]
+    information = np.asarray(
+        (view[:, lens, lens] - view[:, lens, poses] @ by_lens).sum(axis=0) + system.prior, np.float64
+    )
+    of_lens = gradient[:, lens] - np.einsum("wij,wj->wi", view[:, lens, poses], alone)
+    return information, of_lens.sum(axis=0) + system.prior_gradient, by_lens, alone, inverse
+
+
+def _solve(system: _System, damping: float) -> tuple[Floats, Floats, Floats]:
+    """Steps of the poses (W, IMAGES - 1, 6), of the lens (2,) and of the corners (P, 3)."""
+    information, gradient, by_lens, alone, inverse = _reduced(system, damping)
+    lens = np.asarray(-np.linalg.solve(information, gradient), np.float64)
+    poses = np.asarray(-alone - by_lens @ lens, np.float64)
+    windows = len(poses)
+    steps = np.concatenate([poses, np.tile(lens, (windows, 1))], axis=1)[system.of]
     corner = -np.einsum(
         "pij,pj->pi", inverse, system.corner_gradient + np.einsum("pij,pj->pi", system.corner_by_view, steps)
     )
-    return poses.reshape(windows, IMAGES - 1, 6), k1, corner
+    return poses.reshape(windows, IMAGES - 1, 6), lens, corner
 
 
-def _moved(problem: LensProblem, poses: Floats, k1: float, corner: Floats) -> LensProblem:
+def _moved(problem: LensProblem, poses: Floats, lens: Floats, corner: Floats) -> LensProblem:
     R, t = problem.R.copy(), problem.t.copy()
     t[:, 1:] += poses[..., 3:]
     for window, steps in zip(R, poses, strict=True):
@@ -206,4 +247,5 @@ def _moved(problem: LensProblem, poses: Floats, k1: float, corner: Floats) -> Le
             window[k] = rotation_exp(step[:3]) @ window[k]
     moved = problem.corner + corner
     moved[:, 2] = np.maximum(moved[:, 2], 0.0)
-    return replace(problem, R=R, t=t, corner=moved, k1=problem.k1 + float(np.clip(k1, -0.2, 0.2)))
+    k1, log_focal = problem.shared + np.clip(lens, -0.2, 0.2)
+    return replace(problem, R=R, t=t, corner=moved, k1=float(k1), log_focal=float(log_focal))

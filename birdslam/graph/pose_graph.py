@@ -310,7 +310,8 @@ class PoseGraph:
             yaw_rad = estimate.T_world_vehicle.yaw_rad
             speed_mps = estimate.velocity_mps[0] * math.cos(yaw_rad) + estimate.velocity_mps[1] * math.sin(yaw_rad)
             size = estimate.length_m
-            seen.append(UserInEgo(estimate.vehicle, T_ego_vehicle, cov, size, speed_mps, estimate.standing))
+            sigma_mps = math.sqrt(max(estimate.velocity_cov[0], estimate.velocity_cov[3], 0.0))
+            seen.append(UserInEgo(estimate.vehicle, T_ego_vehicle, cov, size, speed_mps, sigma_mps, estimate.standing))
         passed_s = max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
         seen += [person_in_ego(person) for person in self._people]
         return with_users(lanes, seen, self._motion.x_m / passed_s, self._traffic)

@@ -42,7 +42,7 @@ NEAR_M, FAR_M = 5.0, 25.0  # where a line that is there has to be seen
 PAST_EDGE_M, MOST_ROAD_PAST = 0.8, 0.35  # so far past an edge there is no road along so much of it
 WORST_SIGMA_M = 0.6  # to which range a line is predicted
 SIGMA_HEIGHT_REL = 0.02  # of the camera's height, as of landmarks (mapping.StaticMapConfig)
-SIGMA_OFFSET_M = 0.03  # of the camera's roll, 0.01 rad at 1.5 m, and of the paint's middle
+SIGMA_OFFSET_M = 0.025  # of the paint's middle
 SOLID, DASHED = 0.8, 0.6  # share of a line that is painted
 LEAST_PAINTED = 0.2  # of a dashed line; less of it is an arrow, or a scrap
 LEAST_EXISTENCE, LOOKS_OF_A_SCRAP = 0.4, 4.0  # what has less after so many images is dropped
@@ -86,12 +86,13 @@ class LineTracker:
         self._T_world_filter: SE2 | None = None
         self._standing = 0
         self.tilt_rad = 0.0  # of the last image against its pitch
+        self._height_m, self._sigma_roll_rad = self.camera.height_m, self.camera.tilt_sigma_rad  # of the last image
 
     def update(
         self,
         T_world_ego: SE2,
         ground: GroundPlane,
-        sigma_pitch_rad: float,
+        sigma_tilt_rad: tuple[float, float],
         image: NDArray[np.uint8],
         segmentation: Segmentation,
         boxes_px: Floats,
@@ -99,8 +100,11 @@ class LineTracker:
     ) -> None:
         """One image: `ground` under its camera, its masks, and the boxes (B, 4) of vehicles in it.
 
-        `search_tilt`: the pitch is as uncertain as sigma says, and this image alone has to show it.
+        `sigma_tilt_rad`: 1-sigma of the ground's pitch and roll. `search_tilt`: the pitch is as uncertain as that says,
+        and this image alone has to show it.
         """
+        sigma_pitch_rad, self._sigma_roll_rad = sigma_tilt_rad
+        self._height_m = ground.height_m
         travelled_m = self._advance(T_world_ego)
         if travelled_m is None:
             return
@@ -288,6 +292,8 @@ class LineTracker:
             self._filter.curves[sure].copy(),
             tuple(self._filter.block(k).copy() for k in sure),
             self.tilt_rad,
+            self._height_m,
+            self._sigma_roll_rad,
         )
 
 
@@ -300,13 +306,15 @@ class TrackedLines:
     curves: Floats
     covs: tuple[Floats, ...]
     tilt_rad: float  # of their image against its pitch
+    height_m: float  # of its camera
+    sigma_roll_rad: float  # of its ground
 
     def at(self, T_world_ego: SE2) -> tuple[LaneLine, ...]:
         """The lines in the ego's frame at `T_world_ego`, moved by the ego's motion, from left to right."""
         step, out = self.T_world_seen.between(T_world_ego), []
         for track, seen, seen_cov in zip(self.tracks, self.curves, self.covs, strict=True):
             curve, J = moved(seen, step)
-            cov = J @ seen_cov @ J.T + _systematic(curve)
+            cov = J @ seen_cov @ J.T + _systematic(curve, self.height_m, self.sigma_roll_rad)
             sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", _AHEAD, cov, _AHEAD), 0.0))
             known = _AHEAD_M[sigma < WORST_SIGMA_M]
             if not len(known) or not np.isfinite(cov).all() or abs(curve[0]) > FARTHEST_M or abs(curve[1]) > STEEPEST:
@@ -329,10 +337,16 @@ class TrackedLines:
         return tuple(sorted(out, key=lambda line: -line.y_m(8.0)))
 
 
-def _systematic(curve: Floats) -> Floats:
-    """(4, 4) what no number of images lessens: errors of the camera's height, which scales a curve, and its roll."""
-    by_height = np.array([curve[0], 0.0, -curve[2], -2.0 * curve[3]])
-    out: Floats = SIGMA_HEIGHT_REL**2 * np.outer(by_height, by_height)
+def _systematic(curve: Floats, height_m: float, sigma_roll_rad: float) -> Floats:
+    """(4, 4) what no number of images lessens: errors of the camera's height, which scales a curve, and of its roll.
+
+    A roll moves a point of the road at y sideways by the height and y^2 over it (Eq. 1): outer lines most.
+    """
+    a, h, c, d = curve.tolist()
+    by_height = np.array([a, 0.0, -c, -2.0 * d])
+    by_roll = np.array([a * a, 2.0 * a * h, 2.0 * (h * h + a * c), 6.0 * h * c + 2.0 * a * d]) / height_m
+    by_roll[0] += height_m
+    out: Floats = SIGMA_HEIGHT_REL**2 * np.outer(by_height, by_height) + sigma_roll_rad**2 * np.outer(by_roll, by_roll)
     out[0, 0] += SIGMA_OFFSET_M**2
     return out
 
@@ -372,6 +386,6 @@ def still_lines(
 ) -> tuple[tuple[LaneLine, ...], GroundPlane]:
     """The lines of a single image, and the ground under its camera with the pitch that makes them parallel."""
     tracker = LineTracker(camera, certain_m=LEAST_PAINT_M)  # there will be no other
-    tracker.update(SE2(), camera.ground, camera.tilt_sigma_rad, image, segmentation, boxes_px, search_tilt=True)
+    tracker.update(SE2(), camera.ground, (camera.tilt_sigma_rad,) * 2, image, segmentation, boxes_px, search_tilt=True)
     ground = GroundPlane(camera.height_m, camera.pitch_rad + tracker.tilt_rad, camera.roll_rad)
     return tracker.lines().at(SE2()), ground

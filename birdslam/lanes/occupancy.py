@@ -14,6 +14,9 @@ from birdslam.types import Lane, Lanes, Leader, VehicleLane
 LEAST_LEADER = 0.5  # probability of the ego's lane
 FARTHEST_M = 120.0
 BEND_SIGMA_PER_M = 0.002  # 1-sigma of a lane's curvature beyond where it was seen
+# The share of those who drive that comes towards the ego, where nothing has shown it yet: beside the ego's lane, and
+# beyond all that are known, where the other carriageway is as likely as a lane nobody has found
+AGAINST_BESIDE, AGAINST_BEYOND = 0.25, 0.6
 
 
 def with_users(lanes: Lanes, users: Sequence[UserInEgo], ego_mps: float, traffic: Traffic) -> Lanes:
@@ -48,10 +51,12 @@ def _placed(user: UserInEgo, lanes: Lanes, traffic: Traffic) -> VehicleLane:
     left = sum(shares[:index] if index is not None else (), 0.0)
     right = sum(shares[index + 1 :] if index is not None else (), 0.0)
     off = max(0.0, 1.0 - ego - left - right)
-    against = 0.0 if user.walks else traffic.against(lanes, user) * user.drives
+    against = 0.0 if user.walks else traffic.against(lanes, user)
+    beside, beyond = (AGAINST_BESIDE, AGAINST_BEYOND) if against is None else (against, against)
+    beside, beyond = beside * user.drives, beyond * user.drives
     # Who comes towards us drives on a road, also beyond the lanes that are known
-    oncoming = against * (left + right + off)
-    left, right, off = ((1.0 - against) * share for share in (left, right, off))
+    oncoming = beside * (left + right) + beyond * off
+    left, right, off = (1.0 - beside) * left, (1.0 - beside) * right, (1.0 - beyond) * off
     ego, left, right, oncoming, off = (min(share, 1.0) for share in (ego, left, right, oncoming, off))  # of rounding
     return VehicleLane(vehicle=user.vehicle, ego_lane=ego, left=left, right=right, oncoming=oncoming, off_road=off)
 

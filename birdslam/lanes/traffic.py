@@ -16,7 +16,6 @@ from birdslam.lanes.users import UserInEgo
 from birdslam.types import Lane, LaneLine, Lanes
 
 AGAINST = -0.3  # cosine of a direction to the ego's, below which traffic comes towards the ego
-DRIVES_MPS = 3.0  # slower vehicles park, turn or cross
 EVIDENCE = 2.0  # log odds that one vehicle adds: one in eight turns, overtakes or is misjudged
 MOST = 6.0  # log odds
 BEYOND_SIGMAS = 2.0  # so surely beyond a line
@@ -45,7 +44,7 @@ class Traffic:
         """What the road users of a frame show of the lines between them and the ego."""
         for user in users:
             along = user.cos_along
-            if user.walks or along is None or abs(user.speed_mps) < DRIVES_MPS or abs(along) < -AGAINST:
+            if user.walks or along is None or abs(along) < -AGAINST:
                 continue
             line = _between(lanes, user)
             if line is None or (line.line, user.vehicle) in self._counted:
@@ -58,14 +57,14 @@ class Traffic:
         while len(self._counted) > MEMORY_LINES:
             del self._counted[next(iter(self._counted))]
 
-    def against(self, lanes: Lanes, user: UserInEgo) -> float:
-        """The probability that a road user moves against the ego's direction, were it to move."""
+    def against(self, lanes: Lanes, user: UserInEgo) -> float | None:
+        """The probability that a road user moves against the ego's direction, were it to move; None: nothing shows."""
         along = user.cos_along
         if along is not None:
             return 1.0 if along < AGAINST else 0.0
         line = _between(lanes, user)
         odds = None if line is None else self._log_odds.get(line.line)
-        return 0.0 if odds is None else 1.0 / (1.0 + math.exp(-odds))
+        return None if odds is None else 1.0 / (1.0 + math.exp(-odds))
 
     def with_directions(self, lanes: Lanes) -> Lanes:
         """The lanes with the probability that their traffic is oncoming, where something showed it."""

@@ -14,7 +14,9 @@ from birdslam.types import FollowedPerson
 Floats = NDArray[np.float64]
 
 SLOW_MPS = 1.0  # below it a road user may stand, and a time gap is no number
-KNOWN_YAW_RAD = 0.6  # 1-sigma below which front and back can't be exchanged
+DRIVES_MPS = 3.0  # slower vehicles park, turn or cross
+KNOWN_YAW_RAD = 0.6  # 1-sigma of a direction
+MOVES_SIGMAS = 2.0  # so surely it drives
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class UserInEgo:
     cov: Floats
     length_m: float
     speed_mps: float
+    speed_sigma_mps: float = 0.0
     standing: float = 0.0
     walks: bool = False  # a pedestrian, who keeps to no direction of traffic and leads nobody
 
@@ -36,10 +39,15 @@ class UserInEgo:
 
     @property
     def cos_along(self) -> float | None:
-        """Cosine of the angle between its direction and the ego's; None where its heading is not known."""
-        if self.cov[2, 2] > KNOWN_YAW_RAD**2:
+        """Cosine of the angle between its direction and the ego's; None where it is not known.
+
+        A box has the same shape from behind, so only who drives forward along its yaw has a known direction: a new
+        vehicle that seems to drive fast backwards has the wrong yaw or the wrong speed.
+        """
+        least_mps = max(DRIVES_MPS, MOVES_SIGMAS * self.speed_sigma_mps)
+        if self.speed_mps < least_mps or self.cov[2, 2] > KNOWN_YAW_RAD**2:
             return None
-        return math.cos(self.T_ego_vehicle.yaw_rad) * (-1.0 if self.speed_mps < -SLOW_MPS else 1.0)
+        return math.cos(self.T_ego_vehicle.yaw_rad)
 
 
 def person_in_ego(person: FollowedPerson) -> UserInEgo:
@@ -51,5 +59,6 @@ def person_in_ego(person: FollowedPerson) -> UserInEgo:
     cov[:2, :2] = np.reshape(person.cov, (2, 2))
     cov[2, 2] = across @ np.reshape(person.velocity_cov, (2, 2)) @ across / max(speed_mps, 1e-3) ** 2
     pose = SE2(person.x_m, person.y_m, math.atan2(velocity[1], velocity[0]))
+    sigma_mps = float(np.sqrt(max(person.velocity_cov[0], person.velocity_cov[3], 0.0)))
     walks = person.label != "cyclist"
-    return UserInEgo(person.person, pose, cov, person.length_m, speed_mps, person.standing, walks)
+    return UserInEgo(person.person, pose, cov, person.length_m, speed_mps, sigma_mps, person.standing, walks)

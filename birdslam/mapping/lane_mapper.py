@@ -82,7 +82,7 @@ class _PastFrame:
     frame_id: int
     T_world_ego: SE2
     ground: GroundPlane
-    sigma_pitch_rad: float
+    sigma_tilt_rad: tuple[float, float]  # of the pitch and the roll
     t_source_ns: int = 0
 
 
@@ -153,7 +153,7 @@ class LaneMapper:
         frame_id: int,
         T_world_ego: SE2,
         ground: GroundPlane,
-        sigma_pitch_rad: float,
+        sigma_tilt_rad: tuple[float, float],
         segmentation: Segmentation | None,
         segmented_frame: int,
         boxes_px: Floats,
@@ -162,10 +162,11 @@ class LaneMapper:
     ) -> LaneOutput:
         """Lane points and edges of the segmentation of `segmented_frame`, if it is new and the ego has moved.
 
-        `boxes_px` (N, 4) are the vehicles' latest boxes, within which nothing is used. Lines are found in the images,
-        (H, W) grey or (H, W, 3) BGR, of which this frame's is kept for its segmentation.
+        `sigma_tilt_rad` are those of the pitch and the roll of `ground`. `boxes_px` (N, 4) are the vehicles' latest
+        boxes, within which nothing is used. Lines are found in the images, (H, W) grey or (H, W, 3) BGR, of which this
+        frame's is kept for its segmentation.
         """
-        self._frames.append(_PastFrame(frame_id, T_world_ego, ground, sigma_pitch_rad, t_source_ns))
+        self._frames.append(_PastFrame(frame_id, T_world_ego, ground, sigma_tilt_rad, t_source_ns))
         if image is not None:
             self._images.append((frame_id, image))
         earlier = self._take_result()
@@ -244,7 +245,7 @@ class LaneMapper:
     ) -> _LaneResult:
         lines = None
         if image is not None:
-            self._tracker.update(then.T_world_ego, then.ground, then.sigma_pitch_rad, image, segmentation, boxes_px)
+            self._tracker.update(then.T_world_ego, then.ground, then.sigma_tilt_rad, image, segmentation, boxes_px)
             lines = self._tracker.lines()
         road_m, boundary_m = points_of(segmentation, self.camera, then.ground, boxes_px, self._amodal.config)
         on_world_m = then.T_world_ego @ boundary_m
@@ -254,7 +255,7 @@ class LaneMapper:
             then.T_world_ego,
             self.camera,
             then.ground,
-            then.sigma_pitch_rad,
+            then.sigma_tilt_rad[0],
             self.config.sigma_height_rel,
             self.edges,
         )

@@ -16,12 +16,24 @@ TITLES = (
     "lane boundary, completed",
     "road, completed",
     "lanes",
+    "lane boundary, later",
+    "road, later",
 )
 HIDDEN_ALPHA = 0.25  # of cells, behind lanes
 
 
-def draw_lanes(title: str, image: NDArray[np.uint8], view: LaneView, config: LanesConfig, path: Path) -> None:
-    """`image` (H, W) grey or (H, W, 3) BGR above; below it the grids from above, forward up and left to the left."""
+def draw_lanes(
+    title: str,
+    image: NDArray[np.uint8],
+    view: LaneView,
+    config: LanesConfig,
+    path: Path,
+    later: NDArray[np.float32] | None = None,
+) -> None:
+    """`image` (H, W) grey or (H, W, 3) BGR above; below it the grids from above, forward up and left to the left.
+
+    `later` (2, rows, columns): what later frames saw of the same place.
+    """
     # Here, since matplotlib takes half a second to import
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -30,14 +42,17 @@ def draw_lanes(title: str, image: NDArray[np.uint8], view: LaneView, config: Lan
     above = width * image.shape[0] / image.shape[1]
     figure = Figure(figsize=(width, above + 2.9), dpi=80, layout="constrained")
     FigureCanvasAgg(figure)
-    rows = figure.add_gridspec(2, 6, height_ratios=(above, 2.4))
+    shown = 6 if later is None else 8
+    rows = figure.add_gridspec(2, shown, height_ratios=(above, 2.4))
     top = figure.add_subplot(rows[0, :])
     top.imshow(image if image.ndim == 2 else image[:, :, ::-1], cmap="gray")
     top.set_axis_off()
     top.set_title(title)
     extent = (config.half_width_m, -config.half_width_m, -config.behind_m, config.ahead_m)
-    grids = (view.seen[BOUNDARY], view.seen[ROAD], view.seen[BOUNDARY], view.completed[BOUNDARY], view.completed[ROAD])
-    for k, (name, grid) in enumerate(zip(TITLES, (*grids, view.completed[BOUNDARY]), strict=True)):
+    seen, completed = view.seen, view.completed
+    grids = [seen[BOUNDARY], seen[ROAD], seen[BOUNDARY], completed[BOUNDARY], completed[ROAD], completed[BOUNDARY]]
+    grids += [] if later is None else [later[BOUNDARY], later[ROAD]]
+    for k, (name, grid) in enumerate(zip(TITLES[:shown], grids, strict=True)):
         axes = figure.add_subplot(rows[1, k])
         lanes = {2: view.lanes_seen, 5: view.lanes}.get(k)
         alpha = 1.0 if lanes is None else HIDDEN_ALPHA
@@ -47,7 +62,7 @@ def draw_lanes(title: str, image: NDArray[np.uint8], view: LaneView, config: Lan
             axes.scatter(cloud[:, 1], cloud[:, 0], s=4, color=f"C{j % 10}")
         axes.plot(0.0, 0.0, "^", color="#35a0d0")
         axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
-        axes.set_title(name, fontsize=9)
+        axes.set_title(name, fontsize=9 if later is None else 7)
         axes.tick_params(labelsize=7)
     figure.supxlabel("left of the ego (m)", fontsize=9)
     figure.savefig(path)

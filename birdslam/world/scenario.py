@@ -82,35 +82,62 @@ def draw_scenario(rng: np.random.Generator, kind: str, ego_s_m: float) -> Scenar
     return Scenario(street, standing, movers, ego, draw_sky(rng), draw_lens(rng), int(rng.integers(0, 2**31)))
 
 
-def drive(scenario: Scenario, camera: Camera, count: int, rate_hz: float, samples: int = 2) -> Iterator[WorldFrame]:
-    """`count` frames of the scenario from its begin, at `rate_hz`."""
-    street = scenario.street
-    movers, ego = copy.deepcopy(list(scenario.movers)), copy.deepcopy(scenario.ego)
-    renderer, shake = Renderer(street, scenario.sky, samples), Shake(scenario.shake_seed)
-    dt_s = 1.0 / rate_hz
-    for frame_id in range(count):
-        t_s = frame_id * dt_s
-        bend = street.curvature(ego.s_m)
-        T_world_ego = ego_pose(street, ego.s_m, ego.d_m, ego.turn_rad - scenario.camera_ahead_m * bend)
-        pitch, roll, heave = shake.at(t_s, ego.speed_mps, ego.acceleration_mps2)
-        shaken = msgspec.structs.replace(
+@dataclass(frozen=True)
+class Moment:
+    """The world at the time of one frame: the ego's pose and how its body is moved, and everybody in sight."""
+
+    frame_id: int
+    t_s: float
+    T_world_ego: Floats  # (4, 4)
+    s_m: float  # of the ego along the street
+    speed_mps: float
+    bend_per_m: float
+    shake: tuple[float, float, float]  # pitch and roll in rad, heave in m
+    movers: list[Mover]
+    scene: Bodies
+
+    def shaken(self, camera: Camera) -> Camera:
+        """The camera as its car's springs hold it now."""
+        pitch, roll, heave = self.shake
+        return msgspec.structs.replace(
             camera,
             height_m=camera.height_m + heave,
             pitch_rad=camera.pitch_rad + pitch,
             roll_rad=camera.roll_rad + roll,
         )
+
+
+def moments(scenario: Scenario, count: int, rate_hz: float) -> Iterator[Moment]:
+    """The world at each of `count` frames from its begin, at `rate_hz`; the movers' list is of that moment alone."""
+    street = scenario.street
+    movers, ego = copy.deepcopy(list(scenario.movers)), copy.deepcopy(scenario.ego)
+    shake, dt_s = Shake(scenario.shake_seed), 1.0 / rate_hz
+    for frame_id in range(count):
+        t_s = frame_id * dt_s
+        bend = street.curvature(ego.s_m)
+        T_world_ego = ego_pose(street, ego.s_m, ego.d_m, ego.turn_rad - scenario.camera_ahead_m * bend)
         near = np.linalg.norm(scenario.standing.position_m[:, :2] - T_world_ego[:2, 3], axis=1) < SIGHT_M
         everybody = moving(street, movers)
         close = np.linalg.norm(everybody.position_m[:, :2] - T_world_ego[:2, 3], axis=1) < SIGHT_M
         scene = scenario.standing.subset(near).plus(everybody.subset(close))
-        rendered = renderer.render(scene, shaken, T_world_ego, ego.s_m)
-        light = rendered.light
-        if scenario.night is not None:
-            light = lit(scenario.night, rendered, scene, shaken, T_world_ego, ego.speed_mps, bend * ego.speed_mps)
-        image = develop(light, scenario.lens, np.random.default_rng([scenario.shake_seed, frame_id]))
-        yield frame_of(
-            image, rendered, scene, movers, street, shaken, T_world_ego, ego.s_m, frame_id,
-            round(frame_id * NS_PER_S / rate_hz),
-        )  # fmt: skip
+        shaken = shake.at(t_s, ego.speed_mps, ego.acceleration_mps2)
+        yield Moment(frame_id, t_s, T_world_ego, ego.s_m, ego.speed_mps, bend, shaken, movers, scene)
         for step in range(_STEPS):
             advance(movers, ego, street, t_s + step * dt_s / _STEPS, dt_s / _STEPS)
+
+
+def drive(scenario: Scenario, camera: Camera, count: int, rate_hz: float, samples: int = 2) -> Iterator[WorldFrame]:
+    """`count` frames of the scenario from its begin, at `rate_hz`."""
+    renderer = Renderer(scenario.street, scenario.sky, samples)
+    for now in moments(scenario, count, rate_hz):
+        shaken = now.shaken(camera)
+        rendered = renderer.render(now.scene, shaken, now.T_world_ego, now.s_m)
+        light = rendered.light
+        if scenario.night is not None:
+            yaw_rate = now.bend_per_m * now.speed_mps
+            light = lit(scenario.night, rendered, now.scene, shaken, now.T_world_ego, now.speed_mps, yaw_rate)
+        image = develop(light, scenario.lens, np.random.default_rng([scenario.shake_seed, now.frame_id]))
+        yield frame_of(
+            image, rendered, now.scene, now.movers, scenario.street, shaken, now.T_world_ego, now.s_m, now.frame_id,
+            round(now.frame_id * NS_PER_S / rate_hz),
+        )  # fmt: skip

@@ -32,7 +32,9 @@ from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import add_data, add_networks, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.perf.robustness.film_variants import Timed, Variant, variants
-from birdslam.runtime.calibration import ROUGH, Given, calibrate_drive, write_camera_file
+from birdslam.runtime.calibration.drive import ROUGH, calibrate_drive
+from birdslam.runtime.calibration.given import Given
+from birdslam.runtime.calibration.report import write_camera_file
 from birdslam.runtime.configuration import Configuration, complete, load
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.sources.camera_file import load_camera

@@ -1,7 +1,7 @@
 """The optimize process with a chosen number of vehicles in sight: `python -m perf system --vehicles 0,5,10,15`.
 
-The shipped drive has the vehicles that it has, and rendering another one needs the extra [train]. So what perceive says
-of a seeded world with so many vehicles (birdslam/bench/simulation/drive.py, the log of the `optimizer` benchmark) goes
+The shipped drive has few vehicles, and rendering another one needs the extra [train]. So what perceive would publish in
+a seeded world with so many vehicles (birdslam/bench/simulation/drive.py, the log of the `optimizer` benchmark) goes
 over the real bus at the rate, to the very process that `birdslam run` starts, with its configuration: announced frames,
 checkpoints, map, checks of the wire. This process stands for capture, perceive and the planner. The networks' time does
 not depend on who is in the image.

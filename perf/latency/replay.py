@@ -110,7 +110,7 @@ def _cost(options: argparse.Namespace, place: Path) -> dict[str, Any]:
 
 
 def _recorder(recording: Recording) -> dict[str, float]:
-    """What its process took, by what it says of itself once a second."""
+    """Processor time and memory of the recorder, by its health records."""
     said = [msgspec.json.decode(message.data, type=Health) for message in recording.messages(("/health/record",))]
     if not said:
         return {"cpu_percent": float("nan"), "rss_mb": float("nan")}

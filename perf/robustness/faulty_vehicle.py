@@ -36,7 +36,7 @@ VITALS = "memfd:birdslam-vitals"
 
 
 def ends_with_its_vehicle() -> None:
-    """A suite that gets SIGTERM ends its vehicle too, as on Ctrl-C."""
+    """SIGTERM ends the suite as Ctrl-C does, and its vehicle with it."""
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
 
 

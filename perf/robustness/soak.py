@@ -40,7 +40,7 @@ WATCHDOG_S = 5.0  # of the supervisor, as in deploy/birdslam.service
 
 
 class Systemd(Closing):
-    """Takes what the supervisor says of itself (sd_notify), and measures its silences; a context manager."""
+    """Receives the supervisor's notifications (sd_notify), and measures the gaps between them; a context manager."""
 
     def __init__(self, place: Path) -> None:
         self.longest_s, self.missed = 0.0, 0

@@ -68,7 +68,7 @@ clock too, and beside a paced recording capture puts readings into the recording
 it sends `t_ns` 0, and the reading bears the time when it came. Each frame bears
 the readings of the second before it, {kept} at the most and then the newest; what is lost beyond is counted in the
 health of capture (`speeds_dropped`), as are messages that are no readings (`malformed`). Numbers that no car has, NaN
-among them, are no malformed message: an estimate's status tells of them. `Estimate.speed_sources` says what the metres
+among them, are no malformed message: the estimate's status reports them. `Estimate.speed_sources` says what the metres
 rest on. [speed.md](speed.md) has files, recordings and the rest.
 
 ## What may be driven by

@@ -23,8 +23,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of mallopt(3)
 _OBJECT_BYTES, _ANCHORED = 400, 256  # of Python's small objects, and how many in a row have one that stays
 _MIB = 1 << 20
 
-# Nodes that compute for 2 ms of a frame and then wait: they take a core from networks, not networks from them. On two
-# cores, beside perceive alone, a step of the optimizer took p99 2.3 to 4.6 ms at SCHED_FIFO, 4.5 to 11.8 at nice -5
+# Nodes that compute for 2 ms of a frame and then wait: they may preempt the networks, and never the other way round. On
+# two cores, beside perceive alone, a step of the optimizer took p99 2.3 to 4.6 ms at SCHED_FIFO, 4.5 to 11.8 at nice -5
 _FIRST, _FIRST_NICE = ("capture", "optimize"), -5
 _LEAST_PERIOD_MS = 10.0  # of frames, for SCHED_FIFO: at more than 100 Hz they would leave no core to the others
 _LOWER_NICE = 5  # nicer: a third of the time that one gets that wants the same core and is not

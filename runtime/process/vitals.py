@@ -1,7 +1,7 @@
 """A node's heartbeat and counters, in memory that it shares with the supervisor.
 
 The memory is an anonymous file whose descriptor the supervisor hands down: it has no name to clean up, and what a
-killed node counted can still be read. Each counter has one writer; an aligned 8-byte store is never seen by halves.
+killed node counted can still be read. Each counter has one writer; an aligned 8-byte store is never read half written.
 """
 
 from __future__ import annotations

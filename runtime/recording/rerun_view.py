@@ -24,7 +24,7 @@ from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.latency import key_of, stages
 from birdslam.runtime.recording.foxglove import CompressedImage
 from birdslam.runtime.recording.recording import Latency, Recording
-from birdslam.runtime.recording.scene import VEHICLE_HEIGHT_M, between_looks, ellipse
+from birdslam.runtime.recording.scene import VEHICLE_HEIGHT_M, between_looks, curve_points, ellipse
 from birdslam.runtime.transport.bus import Bus, BusError
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameReader
@@ -178,6 +178,11 @@ class Viewer:
         self._stream.log("bev/bodies", rr.LineStrips2D(shown, colors=colors, labels=labels))
         around = [_above(np.vstack([outline, outline[:1]])) for outline in ellipses]
         self._stream.log("bev/ellipses", rr.LineStrips2D(around, colors=UNSEEN))
+        lines = () if estimate.lanes is None else estimate.lanes.lines
+        kinds = [f"{line.kind} {line.line}" for line in lines]
+        self._stream.log(
+            "bev/lines", rr.LineStrips2D([_above(curve_points(line)) for line in lines], colors=ROAD, labels=kinds)
+        )
 
     def _plots(self, estimate: Estimate) -> None:
         if self._last is not None and estimate.t_source_ns > self._last.t_source_ns:

@@ -42,12 +42,27 @@ from birdslam.runtime.recording.foxglove import (
     Vector3,
 )
 from birdslam.trajectory import Transform, ego_pose, mount_pose
-from birdslam.types import NS_PER_S, Attitude, Estimate, MapUpdate, Measurements, Status, VehicleEstimate
+from birdslam.types import (
+    NS_PER_S,
+    Attitude,
+    Estimate,
+    Lane,
+    LaneLine,
+    Lanes,
+    LineColour,
+    LineKind,
+    MapUpdate,
+    Measurements,
+    Status,
+    VehicleEstimate,
+)
 
 VEHICLE_HEIGHT_M = 1.5  # drawn; no height is estimated
 ELLIPSE_POINTS = 24
 _BOXES_STAY_FRAMES = 8  # after the last look: a quarter of a second at 33 Hz
 EGO, VEHICLE, UNSEEN = Color(0.1, 0.4, 0.9), Color(0.9, 0.4, 0.1), Color(0.6, 0.6, 0.6)
+WHITE_LINE, YELLOW_LINE, OWN_LANE = Color(1.0, 1.0, 1.0), Color(1.0, 0.8, 0.1), Color(0.3, 0.7, 0.4)
+LINE_STEP_M = 2.0  # from point to point of a line
 
 CHANNELS: dict[str, type[msgspec.Struct]] = {
     "/tf": FrameTransform,
@@ -84,8 +99,32 @@ def from_estimate(estimate: Estimate, t_ns: int) -> Iterator[Drawn]:
     outline = _ellipse(estimate.T_world_ego, estimate.cov, z_m, EGO if estimate.valid else UNSEEN)
     entities = [SceneEntity(timestamp=t, frame_id="world", id="ego", lines=(outline,))]
     entities += [_entity(vehicle, t, z_m) for vehicle in estimate.road_users]
+    if estimate.lanes is not None:
+        entities.append(_lanes(estimate.lanes, t))
     gone = SceneEntityDeletion(timestamp=t, type=ALL)
     yield "/scene", SceneUpdate(deletions=(gone,), entities=tuple(entities))
+
+
+def curve_points(curve: LaneLine | Lane, from_m: float = 0.0) -> NDArray[np.float64]:
+    """(N, 2) in ego: a line, or a lane's centre line, as far as it is known."""
+    x = np.arange(from_m, max(curve.to_m, from_m) + LINE_STEP_M, LINE_STEP_M)
+    a, h, c, d = curve.offset_m, curve.slope, curve.curvature_per_m, curve.curvature_rate_per_m2
+    return np.column_stack([x, a + x * (h + x * (c / 2.0 + x * d / 6.0))])
+
+
+def _lanes(lanes: Lanes, t: Time) -> SceneEntity:
+    """Lines in their colours, edges of the road in grey, the middle of the ego's lane in green."""
+    strips = []
+    for line in lanes.lines:
+        painted = YELLOW_LINE if line.colour is LineColour.YELLOW else WHITE_LINE
+        strips.append((curve_points(line), UNSEEN if line.kind is LineKind.EDGE else painted))
+    if lanes.ego is not None:
+        strips.append((curve_points(lanes.ego), OWN_LANE))
+    drawn = (
+        LinePrimitive(type=LINE_STRIP, points=tuple(Vector3(x, y, 0.0) for x, y in points.tolist()), color=color)
+        for points, color in strips
+    )
+    return SceneEntity(timestamp=t, frame_id="ego", id="lanes", lines=tuple(drawn))
 
 
 def between_looks(measurements: Measurements) -> bool:

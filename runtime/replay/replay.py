@@ -1,10 +1,11 @@
 """A recording's measurements through the back end alone, without a network or a camera.
 
 `compare` gives the recorded estimates bit for bit, or the first that differs: each estimate bears the trace of the
-message that it answers, so the order is known. Measurements that no estimate answers the optimizer never had, or its
-estimate was lost, and an epoch may have begun with it. After a restart it began a new epoch, or went on from its last
-checkpoint with the measurements since. Where measurements are missing that it had, nothing is compared until a new
-epoch begins. A file that begins in the middle of a drive has the graph of its first frame. `estimates` replays with
+message that it answers, so the order is known. Measurements without an estimate either did not reach
+the optimizer, or their estimate was lost, perhaps the first of an epoch. After a restart the optimizer began a new
+epoch, or went on from its last checkpoint with the measurements since. Where the recording lacks measurements that the
+optimizer had, nothing is compared until a new epoch begins. A file that begins in the middle of a drive has the graph
+of its first frame. `estimates` replays with
 another configuration.
 """
 

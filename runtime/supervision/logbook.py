@@ -1,4 +1,4 @@
-"""The supervisor's subscriber: every estimate and map update goes to the results, and the figures of the run stay."""
+"""The supervisor's subscriber: it hands every estimate and map update to the results, and counts."""
 
 from __future__ import annotations
 

@@ -111,6 +111,11 @@ class GroundSizeFilter:
         return GroundPlane(self._image_ground.height_m, float(self._x[0]), float(self._x[1]))
 
     @property
+    def sigma_roll_rad(self) -> float:
+        """1-sigma of the ground's roll."""
+        return float(np.sqrt(self._P[1, 1]))
+
+    @property
     def sigma_pitch_rad(self) -> float:
         """1-sigma of its pitch."""
         return math.sqrt(float(self._P[0, 0]))

@@ -90,7 +90,7 @@ def draw_lens(rng: np.random.Generator) -> Lens:
     )
 
 
-def _metered(light: Floats32, whole: float) -> float:
+def metered(light: Floats32, whole: float) -> float:
     """The light that becomes middle grey: of the lower image without its brightest, or of all of it."""
     height, width = light.shape[:2]
     if height <= 8:
@@ -123,8 +123,8 @@ def _expose(image, bank, i, j, k, shot, noise, coloured, table, out):  # type: i
 def develop(light: Floats32, lens: Lens, rng: np.random.Generator) -> NDArray[np.uint8]:
     """(H, W, 3) linear BGR light to the image that the camera delivers."""
     height, width = light.shape[:2]
-    metered = lens.fixed or _metered(light, lens.whole)
-    image = light * np.float32(0.2 * lens.exposure / max(metered, 1e-3))
+    middle = lens.fixed or metered(light, lens.whole)
+    image = light * np.float32(0.2 * lens.exposure / max(middle, 1e-3))
     image *= np.array(lens.tint, np.float32)
     if lens.bloom > 0.02:
         small = cv2.resize(np.minimum(image, 6.0), (width // 4, height // 4), interpolation=cv2.INTER_AREA)

@@ -6,7 +6,9 @@ import argparse
 import re
 from pathlib import Path
 
-from birdslam.runtime.calibration import Given, calibrate_drive, write_camera_file
+from birdslam.runtime.calibration.drive import calibrate_drive
+from birdslam.runtime.calibration.given import Given
+from birdslam.runtime.calibration.report import write_camera_file
 from birdslam.runtime.cli.arguments import add_config, add_lens, add_settings, add_topics
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.options import configuration_of

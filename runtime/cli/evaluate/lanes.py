@@ -5,14 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from birdslam.bench.lanes.hidden_cells import METHODS, HiddenReport
 from birdslam.bench.lanes.paint_masks import PaintReport
 from birdslam.runtime.cli.arguments import add_config, add_pipeline
 from birdslam.runtime.evaluation.drive_lanes import DriveReport, evaluate_drive
+from birdslam.runtime.evaluation.hidden_lanes import evaluate_hidden
 from birdslam.runtime.evaluation.lanes import draw_frame_lanes
 from birdslam.runtime.evaluation.still_lanes import REPORT, evaluate_paint, evaluate_stills
 from birdslam.runtime.options import configuration_of
 
-KITTI_ROAD, LINES, PAINT = "kitti-road", "lines", "paint"
+KITTI_ROAD, LINES, PAINT, LATER = "kitti-road", "lines", "paint", "later"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,8 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frame", type=int, metavar="N", help="which one; default: the last")
     text = "kitti-road: DIR holds single images image_N.png with masks ego_lane_N.png of the ego's lane; "
     text += "lines: DRIVE is a rendered one, demo:DIR, with its true lines; "
-    text += "paint: DIR holds imgs/NAME.png and masks/NAME.png of lane markings, as comma10k has them"
-    parser.add_argument("--truth", choices=(KITTI_ROAD, LINES, PAINT), help=text)
+    text += "paint: DIR holds imgs/NAME.png and masks/NAME.png of lane markings, as comma10k has them; "
+    text += "later: what later frames of DRIVE show of the road behind vehicles"
+    parser.add_argument("--truth", choices=(KITTI_ROAD, LINES, PAINT, LATER), help=text)
     parser.add_argument(
         "--height", type=float, metavar="M", help="of the camera over the road, with --truth kitti-road"
     )
@@ -38,6 +41,9 @@ def run(options: argparse.Namespace) -> int:
         return 0
     if options.truth == PAINT:
         print(_paint_text(evaluate_paint(configuration, Path(options.drive))))
+        return 0
+    if options.truth == LATER:
+        print(_hidden_text(evaluate_hidden(configuration, options.drive)))
         return 0
     if options.truth is None:
         print(draw_frame_lanes(configuration, options.drive, options.frame))
@@ -64,6 +70,15 @@ def _paint_text(report: PaintReport) -> str:
         f"{report.network}: {report.images} images, at 5 px: precision {said(report.precision)}, "
         f"recall {said(report.recall)}, by night {said(report.recall_by_night)}"
     )
+    return "\n".join(out)
+
+
+def _hidden_text(report: HiddenReport) -> str:
+    out = [f"{report.drive}: {report.cells} cells behind vehicles in {report.frames} frames that later frames saw"]
+    for name in METHODS:
+        road, line = report.road_iou[name], report.line_iou[name]
+        said = (f"{what} {'-' if iou is None else f'{iou:.3f}'}" for what, iou in (("road", road), ("lines", line)))
+        out.append(f"  {name:8} IoU of {', of '.join(said)}")
     return "\n".join(out)
 
 

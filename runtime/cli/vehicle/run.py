@@ -94,7 +94,9 @@ def _calibrated(configuration: Configuration, options: argparse.Namespace) -> tu
     """With the camera that a first pass over the film finds, whose file lies with the results; and what its lengths
     rest on."""
     # Only where it is asked for: the whole front end comes with it
-    from birdslam.runtime.calibration import ROUGH, Given, calibrate_drive, write_camera_file
+    from birdslam.runtime.calibration.drive import ROUGH, calibrate_drive
+    from birdslam.runtime.calibration.given import Given
+    from birdslam.runtime.calibration.report import write_camera_file
 
     source = configuration.source
     if configuration.camera is not None:

@@ -1,0 +1,1 @@
+"""`birdslam calibrate`: a camera file from a drive. Read `drive` first."""

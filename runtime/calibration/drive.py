@@ -1,0 +1,135 @@
+"""A camera from a drive: intrinsics read or measured, pitch and roll estimated, the height checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+from typing import NamedTuple
+
+import cv2
+import msgspec
+
+from birdslam.calibration.calibration import Calibration, CalibrationConfig, CalibrationError, calibrate
+from birdslam.calibration.intrinsics import Intrinsics
+from birdslam.frontend import Pending
+from birdslam.geometry.camera import Camera
+from birdslam.outputs.plain_words import LengthsBy
+from birdslam.ros.bag import BagTopics
+from birdslam.runtime.calibration.given import Given, frame_size, lens_of, lossless
+from birdslam.runtime.calibration.height import UNKNOWN_HEIGHT_M, known_lengths, lengths_by, with_height
+from birdslam.runtime.calibration.lens import lens_of_drive
+from birdslam.runtime.calibration.report import report
+from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded, parsed, recording_uri
+from birdslam.runtime.progress import with_progress
+from birdslam.sources.recording import DatasetError, Recording
+from birdslam.types import Frame
+
+# For a drive that follows at once: it looks for the tilt itself, and begins from what the first pass knows
+ROUGH = CalibrationConfig(max_sigma_rad=0.05, max_sigma_roll_rad=0.1)
+LEVEL_SIGMA_RAD = 0.035  # of pitch and roll where the drive shows neither: two degrees, by judgement
+_MOUNT_S = 180.0  # of a film, from which pitch, roll and height are found
+
+
+class Calibrated(NamedTuple):
+    """A camera, and what it rests on, a line each; `lengths_by` is what its metres rest on."""
+
+    camera: Camera
+    report: list[str]
+    lengths_by: LengthsBy
+
+
+def calibrate_drive(
+    configuration: Configuration,
+    source: str,
+    given: Given,
+    stride: int = 1,
+    config: CalibrationConfig = CalibrationConfig(),  # noqa: B008
+    must_show: bool = True,
+) -> Calibrated:
+    """The camera of a drive. `source`: a KITTI directory or a source's URI.
+
+    Without `must_show` what the drive does not show (rain, a truck ahead) is assumed, with its sigma, and the report
+    says so. Raises CalibrationError, ConfigurationError, DatasetError.
+    """
+    uri = recording_uri(source)
+    topics = configuration.source.topics
+    lens, height_m = lens_of(given, uri, topics)
+    size = frame_size(uri, topics)
+    if lens is None and size is not None and parsed(uri)[0].camera in ("frame size", "nothing"):
+        lens = lens_of_drive(configuration, uri, given, size, stride, must_show)
+    if lens is not None and size is not None:
+        lens = lens.for_size(*size)
+    recording = _open(uri, lens, height_m, stride, topics)
+    known_height = height_m is not None or lens is None  # a recording with a calibration of its own says the height
+    cv2.setNumThreads(configuration.perceive.opencv_threads)
+    configuration = lossless(configuration)
+    with Inference(configuration) as inference:
+
+        def drive() -> Iterator[tuple[Frame, Pending]]:
+            most = round(_MOUNT_S * recording.rate_hz)
+            frames = islice(offline_frames(RecordedSource(recording, configuration.source)), most)
+            for frame in with_progress(frames, "calibrate", min(most, len(recording)) or None):
+                yield frame, inference.start(frame)
+
+        try:
+            found = calibrate(
+                drive,
+                recording.camera,
+                configuration.slam.frontend,
+                config,
+                known_lengths(recording, given.speed),
+            )
+        except CalibrationError as error:
+            if must_show:
+                raise CalibrationError(f"{uri}: {error}") from None
+            found = _level(recording.camera, str(error))
+    camera, height_by = with_height(found, known_height, lens, uri)
+    return Calibrated(camera, [*report(found, camera, height_by, uri, lens)], lengths_by(camera, height_by, lens))
+
+
+def _level(camera: Camera, why: str) -> Calibration:
+    """A camera that looks level, since the drive does not show how it is mounted."""
+    camera = msgspec.structs.replace(camera, pitch_rad=0.0, roll_rad=0.0, tilt_sigma_rad=LEVEL_SIGMA_RAD)
+    var = LEVEL_SIGMA_RAD**2
+    return Calibration(
+        camera=camera,
+        cov=(var, 0.0, 0.0, var),
+        estimates=(),
+        height_checks=(),
+        yaw_rad=None,
+        path_m=0.0,
+        frames=0,
+        assumed=why,
+    )
+
+
+def _open(uri: str, lens: Intrinsics | None, height_m: float | None, stride: int, topics: BagTopics) -> Recording:
+    if lens is None:
+        recording = open_recorded(uri, stride=stride)
+        if height_m is not None:
+            recording.camera = msgspec.structs.replace(recording.camera, height_m=height_m)
+        return recording
+    width_px, height_px = lens.width_px, lens.height_px
+    if width_px is None or height_px is None:
+        calibrated = parsed(uri)[0].camera in ("calibration", "intrinsics")  # of a film it could be any size
+        size = frame_size(uri, topics) if calibrated else None
+        if size is None:
+            raise DatasetError(f"{lens.source}: does not say for which size of image it is")
+        width_px, height_px = size
+    try:
+        camera = Camera(
+            width_px,
+            height_px,
+            lens.fx_px,
+            lens.fy_px,
+            lens.cx_px,
+            lens.cy_px,
+            height_m=height_m or UNKNOWN_HEIGHT_M,
+            distortion=lens.distortion,
+            fisheye=lens.fisheye,
+        )
+    except ValueError as error:
+        raise DatasetError(f"{lens.source}: {error}") from None
+    return open_recorded(uri, camera, stride, topics)

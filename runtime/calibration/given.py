@@ -1,0 +1,101 @@
+"""What is known of a camera beside its drive: intrinsics, lengths, and how wide it may see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
+from birdslam.calibration.lens import FIELD_OF_VIEW_DEG, STATED_SIGMA_REL, focal_by_field_of_view
+from birdslam.ros.bag import BagTopics
+from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.nodes.sources import parsed
+from birdslam.sources.camera_file import load_camera
+from birdslam.sources.recording import DatasetError, Recording
+
+METADATA_SIGMA_REL = 0.1  # of a focal length by metadata: a film often shows less than the sensor sees; by judgement
+
+
+@dataclass(frozen=True)
+class Given:
+    """What is known of the camera beside the drive: intrinsics from at most one of the first three, and lengths."""
+
+    camera: Path | None = None  # an older camera file
+    intrinsics: Path | None = None  # KITTI's calib.txt, or ROS or OpenCV YAML
+    chessboard: Path | None = None  # a directory of images
+    board: tuple[int, int] = (9, 6)  # the chessboard's inner corners: columns, rows
+    square_m: float = 0.025
+    height_m: float | None = None
+    fov_deg: float | None = None  # across the image, of a lens that nothing else tells
+    kind: str = "dashcam"  # of the camera, where not even that is known
+    speed: Path | None = None  # lines of time in s, speed in m/s
+
+
+def lens_of(given: Given, uri: str, topics: BagTopics) -> tuple[Intrinsics | None, float | None]:
+    """Intrinsics from elsewhere than the recording, and the height that the user states."""
+    height_m = given.height_m
+    if height_m is not None and not 0.2 < height_m < 5.0:
+        raise ConfigurationError(f"--height {height_m:g}: is no height of a camera over the road (0.2 to 5 m)")
+    if given.camera is not None:
+        old = load_camera(given.camera)
+        numbers = {name: getattr(old, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "fisheye")}
+        lens = Intrinsics(**numbers, width_px=old.width_px, height_px=old.height_px, source=str(given.camera))
+        return lens, height_m or old.height_m
+    if given.intrinsics is not None:
+        return read_intrinsics(given.intrinsics), height_m
+    if given.chessboard is not None:
+        return from_chessboard(given.chessboard, *given.board, given.square_m), height_m
+    kind, path = class_and_path(uri)
+    own = kind.own_lens(path, topics)
+    if own is not None:
+        return Intrinsics(**own.lens._asdict(), source=own.source), height_m or own.height_m
+    return None, height_m
+
+
+class FocalLength(NamedTuple):
+    """What is known of a focal length before the drive, with its 1-sigma as a fraction, and by what."""
+
+    px: float
+    sigma_rel: float
+    by: str
+    by_view: bool = True  # of the image across, of which nobody says whether the lens's distortion is counted
+
+
+def focal_length_of(given: Given, uri: str, width_px: int) -> FocalLength:
+    """As stated, by the film's metadata, or by the kind of camera. Raises ConfigurationError."""
+    if given.fov_deg is not None:
+        if not 10.0 <= given.fov_deg <= 150.0:
+            raise ConfigurationError(f"--fov {given.fov_deg:g}: is no field of view of a camera here (10 to 150 deg)")
+        focal_px = focal_by_field_of_view(width_px, given.fov_deg)
+        return FocalLength(focal_px, STATED_SIGMA_REL, f"as stated, {given.fov_deg:g} deg across")
+    kind, path = class_and_path(uri)
+    stated_px = kind.stated_focal_px(path)
+    if stated_px is not None and focal_by_field_of_view(width_px, 150.0) < stated_px:
+        by = f"that of the film's own metadata, {stated_px:.0f} px"
+        return FocalLength(stated_px, METADATA_SIGMA_REL, by, by_view=False)
+    fov_deg, sigma_rel = FIELD_OF_VIEW_DEG[given.kind]
+    focal_px = focal_by_field_of_view(width_px, fov_deg)
+    return FocalLength(focal_px, sigma_rel, f"that of a {given.kind}, {fov_deg:g} deg across")
+
+
+def lossless(configuration: Configuration) -> Configuration:
+    """Every frame of the source, however long it takes."""
+    return msgspec.structs.replace(configuration, source=msgspec.structs.replace(configuration.source, rate="max"))
+
+
+def class_and_path(uri: str) -> tuple[type[Recording], Path]:
+    """Of a source's URI: what reads it, and where it lies."""
+    scheme, address = parsed(uri)
+    return scheme.load(), Path(address).expanduser()
+
+
+def frame_size(uri: str, topics: BagTopics) -> tuple[int, int] | None:
+    """(width, height) in pixels of the recording's frames; None where it is unknown."""
+    kind, path = class_and_path(uri)
+    try:
+        return kind.frame_size(path, topics)
+    except DatasetError:  # opening it says what is wrong
+        return None

@@ -1,0 +1,90 @@
+"""The lens of a film that says nothing of its camera, by what its images show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.calibration.calibration import CalibrationError
+from birdslam.calibration.intrinsics import Intrinsics
+from birdslam.calibration.lens import followed_corners, self_calibrate
+from birdslam.calibration.lens_adjustment import IMAGES
+from birdslam.geometry.camera import Camera
+from birdslam.runtime.calibration.given import Given, focal_length_of, lossless
+from birdslam.runtime.calibration.height import UNKNOWN_HEIGHT_M
+from birdslam.runtime.configuration import Configuration, complete
+from birdslam.runtime.nodes.inference import Inference
+from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_recorded
+from birdslam.runtime.progress import with_progress
+
+_LENS_S = 120.0  # of a film, from which its lens is found
+
+
+def lens_of_drive(
+    configuration: Configuration,
+    uri: str,
+    given: Given,
+    size_px: tuple[int, int],
+    stride: int,
+    must_show: bool = True,
+) -> Intrinsics:
+    """The lens of a film that says nothing of its camera, by what its images show.
+
+    Raises CalibrationError where they do not show it; without `must_show` it is then what is known beforehand.
+    """
+    width_px, height_px = size_px
+    known = focal_length_of(given, uri, width_px)
+    focal_px, sigma_rel, by = known.px, known.sigma_rel, known.by
+    middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
+    camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
+    recording = open_recorded(uri, camera, stride, configuration.source.topics)
+    configuration = lossless(configuration)
+    frames = max(1, round(_LENS_S * recording.rate_hz))
+    with Inference(complete(configuration, camera, recording.rate_hz)) as inference:
+
+        def images() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float64]]]:
+            seen = islice(offline_frames(RecordedSource(recording, configuration.source)), frames)
+            for frame in with_progress(seen, "lens", min(frames, len(recording)) or None):
+                if frame.image is not None:
+                    found = inference.start(frame).result().detections
+                    yield frame.image, np.zeros((0, 4)) if found is None else found.boxes_px
+
+        corners = followed_corners(images(), camera)
+    lens = self_calibrate(corners, size_px, focal_px, sigma_rel, known.by_view)
+    if lens is None and not must_show and len(corners) >= IMAGES:
+        return Intrinsics(
+            fx_px=focal_px,
+            fy_px=focal_px,
+            cx_px=middle[0],
+            cy_px=middle[1],
+            distortion=(),
+            width_px=width_px,
+            height_px=height_px,
+            source=f"assumed, since the drive does not show it: focal length {focal_px:.0f} px +- {sigma_rel:.0%}, "
+            f"{by}; no distortion",
+            sigma_focal_px=focal_px * sigma_rel,
+        )
+    if lens is None:
+        raise CalibrationError(
+            f"{uri}: its images do not show its lens: the car hardly drives in its first {_LENS_S:g} s, or little is "
+            "to be seen; --intrinsics, --chessboard or --camera name a lens"
+        )
+    focal = f"focal length {lens.focal_px:.0f} px +- {lens.focal_sigma_rel:.0%}"
+    shown = "by the drive" if lens.focal_shown else f"{by}; the drive turns too little to show it"
+    return Intrinsics(
+        fx_px=lens.focal_px,
+        fy_px=lens.focal_px,
+        cx_px=middle[0],
+        cy_px=middle[1],
+        distortion=(lens.k1, 0.0, 0.0, 0.0),
+        width_px=width_px,
+        height_px=height_px,
+        source=(
+            f"the drive: {focal}, {shown}; k1 {lens.k1:+.3f} +- {lens.k1_sigma:.3f} "
+            f"(of {lens.windows} windows, {np.degrees(lens.turned_rad):.0f} deg turned)"
+        ),
+        sigma_focal_px=lens.focal_px * lens.focal_sigma_rel,
+    )

@@ -1,0 +1,62 @@
+"""The camera file and its report: what was found of a camera, a line each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from birdslam.calibration.calibration import Calibration
+from birdslam.calibration.intrinsics import Intrinsics
+from birdslam.geometry.camera import Camera
+from birdslam.outputs.drive_files import ResultsError
+from birdslam.runtime.calibration.height import HeightBy
+from birdslam.sources.camera_file import camera_text
+
+AGREES_SIGMA = 2.0
+
+
+def report(found: Calibration, camera: Camera, height_by: HeightBy, uri: str, lens: Intrinsics | None) -> Iterator[str]:
+    if found.assumed:
+        yield f"from {uri}: assumed to look level, since the drive does not show its tilt: {found.assumed}"
+    else:
+        yield f"from {uri}: {found.frames} frames, {found.path_m:.0f} m"
+    source = "the recording" if lens is None else lens.source
+    error = "" if lens is None or lens.reprojection_px is None else f", reprojection {lens.reprojection_px:.2f} px"
+    yield f"intrinsics: {source}{error}"
+    for reason in () if lens is None else lens.left_out:
+        yield f"  left out: {reason}"
+    sigma = np.degrees(np.sqrt(np.diag(np.reshape(found.cov, (2, 2)))))
+    pitch_deg, roll_deg = np.degrees([camera.pitch_rad, camera.roll_rad])
+    yield f"pitch {pitch_deg:+.2f} +- {sigma[0]:.2f} deg, roll {roll_deg:+.2f} +- {sigma[1]:.2f} deg"
+    for estimate in found.estimates:
+        own = np.degrees(np.sqrt(np.diag(np.reshape(estimate.cov, (2, 2)))))
+        roll = "" if estimate.roll_rad is None else f", roll {np.degrees(estimate.roll_rad):+.2f} +- {own[1]:.2f} deg"
+        yield (
+            f"  by {estimate.cue}: pitch {np.degrees(estimate.pitch_rad):+.2f} +- {own[0]:.2f} deg{roll} "
+            f"(of {estimate.samples}, chi2 {estimate.chi2:.1f})"
+        )
+    if found.yaw_rad is not None:
+        yield f"optical axis {np.degrees(found.yaw_rad):+.2f} deg left of the way driven (for information)"
+    yield f"height {camera.height_m:.3f} m, {height_by.words}"
+    if height_by.sigma_rel:
+        yield f"all lengths +- {height_by.sigma_rel:.0%}, by height and focal length (scale_sigma_rel)"
+    for check in found.height_checks:
+        if check is height_by.check:
+            continue
+        away = abs(check.height_m - camera.height_m) / check.sigma_m
+        verdict = "agrees" if away < AGREES_SIGMA else f"DISAGREES ({away:.1f} sigma)"
+        yield f"  by {check.cue}: {check.height_m:.2f} +- {check.sigma_m:.2f} m (of {check.samples}): {verdict}"
+    if not found.height_checks:
+        yield "  not checked: neither poses nor a speed nor enough vehicles were there"
+
+
+def write_camera_file(path: Path, camera: Camera, report: Sequence[str]) -> None:
+    """Writes the camera, with the report as comment. Raises ResultsError."""
+    text = camera_text(camera, ("A camera file of BirdSLAM, by `birdslam calibrate`", *report))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ResultsError(f"camera file {path}: {error.strerror}") from None
