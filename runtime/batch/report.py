@@ -18,7 +18,7 @@ from typing import IO, Any
 import msgspec
 import numpy as np
 
-from birdslam.outputs.drive_files import ResultsError
+from birdslam.outputs.drive_files import FRAMES_FILE, ResultsError
 from birdslam.outputs.report.drive_table import read_drive
 from birdslam.outputs.report.page import REPORT, plotly_script, report_page
 from birdslam.runtime.batch.drive import DRIVES, RESULT, DriveResult, Failure, failure_file
@@ -79,23 +79,22 @@ def write_report(tasks: Sequence[Task], output: Path) -> None:
         _whole(output / "report.csv", lambda file: _write_csv(file, tasks, output))
         names, numbers, statuses = _numbers(tasks, output)
         _plot(names, numbers, statuses, output / "report.png")
-        linked = _write_drives(tasks, output)
-        _whole(output / "report.html", lambda file: _write_page(file, tasks, output, linked))
+        _write_drives(tasks, output)
+        _whole(output / "report.html", lambda file: _write_page(file, tasks, output))
     except OSError as error:
         raise ResultsError(f"report in {output}: {error.strerror}") from None
 
 
-def _write_drives(tasks: Sequence[Task], output: Path) -> bool:
+def _write_drives(tasks: Sequence[Task], output: Path) -> None:
     """A page of each drive, where plotly is installed; they share its text, which lies beside them."""
     if importlib.util.find_spec("plotly") is None:
-        return False
+        return
     _whole(output / PLOTLY, lambda file: file.write(plotly_script()))
     for outcome in outcomes(tasks, output):
         folder = output / DRIVES / outcome.drive
-        if isinstance(outcome, DriveResult) and not (folder / REPORT).is_file():
+        if (folder / FRAMES_FILE).is_file() and not (folder / REPORT).is_file():
             page = report_page(read_drive(folder), plotly=f"../../{PLOTLY}")
             _whole(folder / REPORT, lambda file, page=page: file.write(page))  # type: ignore[misc]
-    return True
 
 
 def _whole(path: Path, write: Callable[[IO[str]], None]) -> None:
@@ -166,7 +165,7 @@ def _plot(names: list[str], numbers: np.ndarray, statuses: Counter[str], path: P
     os.replace(partial, path)
 
 
-def _write_page(file: IO[str], tasks: Sequence[Task], output: Path, linked: bool) -> None:
+def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
     head = '<!doctype html><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
     file.write(f"{head}<title>BirdSLAM: drives</title><style>{STYLE}</style>\n")
     file.write('<h1>Drives</h1>\n<p><img src="report.png" alt="plots"></p>\n')
@@ -198,7 +197,8 @@ def _write_page(file: IO[str], tasks: Sequence[Task], output: Path, linked: bool
         cells = [found[column] for column in (*columns, "ate_m", "ate_pct", "scale_error")]
         most = sorted(outcome.statuses.items(), key=lambda one: -one[1])[:MOST_IN_A_CELL]
         cells.append(", ".join(f"{name} {count}" for name, count in most))
-        link = f'<a href="{DRIVES}/{name}/{REPORT if linked else "bev.png"}">{name}</a>'
+        page = REPORT if (output / DRIVES / outcome.drive / REPORT).is_file() else "bev.png"
+        link = f'<a href="{DRIVES}/{name}/{page}">{name}</a>'
         file.write(f"<tr><td>{link}</td>" + "".join(f"<td>{_text(cell)}</td>" for cell in cells) + "</tr>\n")
     file.write("</table>\n")
 
