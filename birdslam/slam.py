@@ -98,7 +98,8 @@ class BirdSLAM:
         if detections is None:
             return measurements, estimate
         tracks = self.frontend.vehicles.tracker.tracks
-        return measurements, estimate, place_boxes(len(detections), frame.frame_id, tracks, estimate)
+        people = [(p.person, p.box.rows) for p in self.frontend.people.tracks if p.seen_frame == frame.frame_id]
+        return measurements, estimate, place_boxes(len(detections), frame.frame_id, tracks, people, estimate)
 
     def map_update(self) -> MapUpdate | None:
         """The map's new points since the last call, in world: landmarks that left the window, and points of lanes.

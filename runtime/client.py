@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from birdslam.loops.map_pose import NOWHERE, InMap, in_map
 from birdslam.queries import MapSnapshot, Nearby, Trajectory
 from birdslam.runtime.transport.bus import Bus, BusClosed, Message
 from birdslam.runtime.transport.closing import Closing
@@ -78,11 +79,14 @@ class Planner(Closing):
     def __init__(self, vehicle: str = "car", runtime_dir: Path | None = None) -> None:
         self._bus = Bus(vehicle, f"planner-{os.getpid()}-{next(_number)}", runtime_dir=runtime_dir)
         self._subscriber = self._bus.subscriber("estimate")
+        self._map_poses = self._bus.subscriber("map_pose")
         self._bus.on_alive(self._catch_up)
 
     def _catch_up(self, node: str, alive: bool) -> None:
         if node == "optimize" and alive and self._subscriber.newest is None:
             self._bus.catch_up("estimate", self._subscriber)
+        if node == "map" and alive and self._map_poses.newest is None:
+            self._bus.catch_up("map_pose", self._map_poses)
 
     def latest(self, max_age_ms: float = 200.0) -> Reading:
         """The newest estimate so far, at once; `on_time` where it is no older than `max_age_ms`."""
@@ -120,6 +124,16 @@ class Planner(Closing):
                 yield self._reading(message, max_age_ms)
             elif not (reading := self.latest(max_age_ms)).on_time:
                 yield reading
+
+    def in_map(self, estimate: Estimate | None = None) -> InMap:
+        """The newest estimate, or another one, in the map of places (REP-105's map frame), at once.
+
+        `lost`, with an infinite covariance, where the map process does not know, was never there, or knows another
+        epoch. Its pose may jump where `map_epoch` rises; the estimate itself never does.
+        """
+        newest, pose = self._subscriber.newest, self._map_poses.newest
+        estimate = estimate or (newest.record if newest is not None else None)
+        return NOWHERE if estimate is None else in_map(pose.record if pose is not None else None, estimate)
 
     def map(self, timeout_s: float = 2.0) -> MapSnapshot | None:
         """The whole map of the newest epoch; None where no reply comes.

@@ -121,6 +121,11 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return is_live(self.source.uri)
 
     @property
+    def maps_live(self) -> bool:
+        """Whether a process localises the drive in its map while it goes on; else that is done when it is over."""
+        return not self.lossless and bool(self.results.map or self.results.map_only)
+
+    @property
     def spares(self) -> bool:
         """Whether processes stand by."""
         return self.runtime.spares and self.restarts
@@ -256,7 +261,10 @@ def _anchor_paths(tree: dict[str, Any], base: Path) -> None:
 
     anchor(tree, "camera", "output")
     anchor(tree.get("runtime"), "runtime_dir", "models_dir")
-    anchor(tree.get("results"), "video")
+    anchor(tree.get("results"), "video", "map", "map_only")
+    results = tree.get("results")
+    if isinstance(results, dict) and not str(results.get("gnss", "")).startswith(("topic:", "/dev/")):
+        anchor(results, "gnss")
     for name in ("fleet", "router"):
         anchor(tree.get(name), "ca", "certificate", "key")
     models = tree.get("models")

@@ -106,7 +106,8 @@ GROUPS = (
             "results.video": 'Is a video wanted, and where? FILE.mp4, of images and bird\'s-eye view; "": none',
             "results.map": 'Which map of places is the drive localised in, and makes longer or begins? FILE; "": none. '
             "See [maps.md](maps.md)",
-            "results.gnss": 'Which file has GNSS fixes of the drive? CSV, NMEA or GPX; "": none',
+            "results.gnss": "Where do GNSS fixes come from? A file (CSV, NMEA, GPX), topic:/NAME of a ROS bag, or a "
+            'receiver /dev/TTY[@BAUD]; "": from nowhere',
             "results.map_only": 'Which map is it localised in without a change to it? FILE; "": none',
             "recording.file": "Is the drive recorded, and where? FILE.mcap, which must not exist yet; a directory: a "
             "new "
@@ -128,7 +129,6 @@ GROUPS = (
             "learned",
             "slam.frontend.odometry.road.car.sigma_delay_s": "How late may its readings be (1-sigma)? That is learned "
             "too",
-            "source.topics.gnss": 'Which topic of a source `ros:/TOPIC` has satellite fixes (NavSatFix)? "": none',
             "source.odometry": "Which file has another odometry, in place of the images'? TUM lines or KITTI rows, in "
             'metres; "": none',
             "slam.frontend.external.ego": "Are its poses the ego's on the road (x forward)? false: the camera's (z "

@@ -48,6 +48,8 @@ def overrides_of(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]
         value = getattr(options, name, None)
         if value is not None:
             overrides[keys.get(name, name)] = _number(value) if name == "rate" else value
+    if getattr(options, "no_map", False):
+        overrides |= {"results.map": "", "results.map_only": ""}
     return overrides, named
 
 

@@ -3,6 +3,7 @@
     the car's own speed, if it says it
               v
     camera -> [capture] -- frame --> [perceive] -- measurements --> [optimize] -- estimate, map --> planners
+                                 frame, estimate --> [map] -- map_pose --> planners
 
 A topic's key is `birdslam/<vehicle>/v1/<topic>`, its payload one record as plain MessagePack (runtime/wire.py). Each
 node declares the liveliness token `birdslam/<vehicle>/v1/alive/<node>` once it is ready for work.
@@ -16,6 +17,7 @@ from typing import Any
 
 import msgspec
 
+from birdslam.loops.map_pose import MapPose
 from birdslam.queries import MapSnapshot, Nearby, Trajectory
 from birdslam.runtime.wire import Health
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, SpeedReading
@@ -62,9 +64,11 @@ NODES = {
         Node("optimize", receives=("frame", "measurements"), sends=("estimate", "map", "health/optimize")),
     )
 }
-RECORDER = Node("record", receives=("frame", "measurements", "estimate", "map"), sends=("health/record",))
+RECORDER = Node("record", receives=("frame", "measurements", "estimate", "map", "map_pose"), sends=("health/record",))
 CAR = Node("car", receives=(), sends=("speed",))  # no process of ours: what knows the speed of the wheels, if any does
-PROCESSES = {**NODES, RECORDER.name: RECORDER}  # the recorder is there only where a drive is recorded
+MAP = Node("map", receives=("frame", "estimate"), sends=("map_pose", "health/map"))
+# The last two are there only where a drive is recorded, or driven in a map of places; no node waits for them
+PROCESSES = {**NODES, RECORDER.name: RECORDER, MAP.name: MAP}
 
 TOPICS = {
     topic.name: topic
@@ -76,6 +80,9 @@ TOPICS = {
         Topic("measurements", Measurements, "perceive", depth=8, retained=96),
         Topic("estimate", Estimate, "optimize", depth=1, hot=True, retained=1),
         Topic("map", MapUpdate, "optimize", depth=256, pace="each frame in which the map gained something"),
+        Topic(
+            "map_pose", MapPose, "map", depth=1, hot=True, urgent=False, retained=1, pace="each frame, some time later"
+        ),
         *(
             Topic(f"health/{name}", Health, name, depth=4, urgent=False, retained=1, pace="once a second")
             for name in PROCESSES

@@ -30,9 +30,10 @@ import zenoh
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
-from birdslam.loops.gnss_file import GnssError, read_fixes
-from birdslam.loops.keyframe import Keyframe, Link
-from birdslam.loops.map_file import HEAD, MAGIC, MapError, decode_map, encode_map
+from birdslam.loops.gnss.earth import Earth
+from birdslam.loops.gnss.files import GnssError, read_fixes
+from birdslam.loops.keyframe import Fixed, Keyframe, Link
+from birdslam.loops.map_file import HEAD, MAGIC, VERSION, MapError, decode_map, encode_map
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.perception.manifest import Manifest, ModelError
 from birdslam.perception.manifest_file import read_manifest, shipped_manifests
@@ -312,11 +313,12 @@ def maps() -> Target:
     """loops.map_file on mutated maps, most of them with a right sum; what is let in can be written and looked into."""
     keyframe = Keyframe(
         *(0, 0, 0, SE2(1.0, 2.0, 0.3), np.eye(3), Attitude(), np.ones((9, 3)), np.full(9, 0.1)),
-        *(np.arange(288, dtype=np.uint8).reshape(9, 32), 1.65, 51.0, 7.0),
+        *(np.arange(288, dtype=np.uint8).reshape(9, 32), 1.65, Fixed(51.0, 7.0, 2.0, 5.0)),
     )
     links = [Link(0, 0, SE2(), np.eye(3), loop=True)]
     camera = MapCamera("0" * 16, 640, 480, 500.0, 1.65)
-    good = encode_map(PlaceMap(camera, [keyframe], links, np.zeros((2, 32), np.uint8), 1))
+    earth = Earth(51.0, 7.0, 3.0, 4.0, 0.5, 1.01, np.eye(4), 0.1, 40, 2, 1.5, None, 0.3)
+    good = encode_map(PlaceMap(camera, [keyframe], links, np.zeros((2, 32), np.uint8), 1, earth))
     head = len(MAGIC) + HEAD.size
     plain = msgpack.unpackb(good[head:])
 
@@ -328,13 +330,14 @@ def maps() -> Target:
                 body = msgpack.packb(with_other_fields(chance, plain))
             else:
                 body = mutated(chance, good[head:], good)
-            data = MAGIC + HEAD.pack(1, len(body), zlib.crc32(body)) + body
+            data = MAGIC + HEAD.pack(VERSION, len(body), zlib.crc32(body)) + body
         try:
             found = decode_map(data)
         except MapError:
             return False
         decode_map(encode_map(found))
         found.index()
+        found.on_earth(SE2(1.0, 2.0, 0.3), np.eye(3))
         return True
 
     return target

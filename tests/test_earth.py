@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.earth import Earth, EarthError, GnssFix, place_on_earth
-from birdslam.loops.gnss_file import GnssError, read_fixes
+from birdslam.loops.gnss.earth import Earth, EarthError, GnssFix, place_on_earth
+from birdslam.loops.gnss.files import GnssError, read_fixes
 from birdslam.outputs.earth_files import Way, write_ways
 
 ORIGIN = 51.05, -114.05

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from birdslam.geometry.camera import Camera
-from birdslam.perf.robustness.film_variants import Timed, Variant, variants
+from birdslam.perf.robustness.film_variants import PARTS, Timed, Variant, variants
 
 CAMERA = Camera(640, 360, 500.0, 500.0, 318.0, 181.0, height_m=1.4)
+EVERY = list({variant.name: variant for part in PARTS for variant in variants(CAMERA, part)}.values())
 
 
 def film(images: int = 6) -> list[Timed]:
@@ -30,10 +32,17 @@ def test_a_pixel_of_another_size_is_the_same_ray(size: float, u: float, v: float
 
 
 def test_widths_that_no_film_has_are_left_out() -> None:
-    sizes = {variant.size for variant in variants(CAMERA)}
+    sizes = {variant.size for variant in EVERY}
     assert min(sizes) == 0.5
     assert all(320 <= 640 * size <= 3840 for size in sizes)
-    assert variants(CAMERA)[0].name == "unchanged"
+    assert 0.5 not in {variant.size for variant in variants(replace(CAMERA, width_px=600), "sizes")}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_begins_with_the_unchanged_film_and_names_each_variant_once(part: str) -> None:
+    names = [variant.name for variant in variants(CAMERA, part)]
+    assert names[0] == "unchanged"
+    assert len(set(names)) == len(names) > 1
 
 
 def test_rates(tmp_path: Path) -> None:
@@ -45,7 +54,7 @@ def test_rates(tmp_path: Path) -> None:
     assert not np.array_equal(twice[1][1], twice[2][1])
 
 
-@pytest.mark.parametrize("variant", variants(CAMERA), ids=lambda variant: variant.name)
+@pytest.mark.parametrize("variant", EVERY, ids=lambda variant: variant.name)
 def test_images_keep_their_size_and_times(variant: Variant, tmp_path: Path) -> None:
     if variant.crf is not None:
         pytest.importorskip("av", reason="PyAV is not installed")
@@ -58,7 +67,7 @@ def test_images_keep_their_size_and_times(variant: Variant, tmp_path: Path) -> N
 
 
 def test_what_is_in_the_way_is_seen(tmp_path: Path) -> None:
-    for variant in variants(CAMERA):
+    for variant in EVERY:
         if variant.shown is not None:
             changed = [
                 np.abs(np.asarray(shown, float) - raw).max()

@@ -15,16 +15,18 @@ from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops, held
 from birdslam.loops.features import hamming, match
 from birdslam.loops.keyframe import Link
-from birdslam.loops.localiser import Localisation, MapState
+from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_file import HEAD, MAGIC, MapError, decode_map, encode_map
+from birdslam.loops.map_pose import MapState
 from birdslam.loops.merging import MergeError, merged
 from birdslam.loops.place_index import PlaceIndex, learn_words
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
-from birdslam.outputs.map_trajectory import MapTrajectory
+from birdslam.outputs.map_trajectory import MapTrajectory, TrajectoryFiles
+from birdslam.runtime.batch.one_map import DRIVE_MAP, join
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.configuration import ConfigurationError, load
-from birdslam.runtime.maps.drive_map import MapChoice
+from birdslam.runtime.maps.map_drive import MapChoice
 from birdslam.runtime.maps.map_store import read_map, write_map
 
 STREET = build(along([0.0] * 70 + [0.004] * 90), seed=1)
@@ -197,7 +199,7 @@ def test_what_is_no_whole_map_is_refused(mapped: bytes) -> None:
         (mapped[:16], "cut off"),
         (mapped[:-100], "torn"),
         (bytes(flipped), "CRC"),
-        (newer, "version 2"),
+        (newer, "version 3"),
         (MAGIC + HEAD.pack(version, 1, zlib.crc32(b"\xc1")) + b"\xc1", "something that is no map"),
     ):
         with pytest.raises(MapError, match=why):
@@ -247,11 +249,12 @@ def replace_camera(**changes: float):  # type: ignore[no-untyped-def]
 
 def test_frames_before_a_place_was_confirmed_are_led_back_to(mapped: bytes, tmp_path: Path) -> None:
     running, trajectory = session(decode_map(mapped), extend=False), MapTrajectory()
-    for estimate, seen, _ in drive(STREET, range(20, 50), 3):
-        trajectory.add(running.step(estimate, seen), estimate)  # type: ignore[arg-type]
-    assert trajectory.as_found[0] is MapState.LOST
+    with TrajectoryFiles(tmp_path) as files:
+        for estimate, seen, _ in drive(STREET, range(20, 50), 3):
+            files.write(trajectory.add(running.step(estimate, seen), estimate))  # type: ignore[arg-type]
+        files.write(trajectory.finish())
+    assert trajectory.frames_before > 0
     assert trajectory.counts == {"localised": 30, "odometry_only": 0, "lost": 0}
-    trajectory.write(tmp_path)
     assert len((tmp_path / "map.tum.txt").read_text().splitlines()) == 30
     rows = (tmp_path / "localisation.csv").read_text().splitlines()
     assert len(rows) == 31
@@ -262,9 +265,12 @@ def test_without_a_place_the_trajectory_is_an_empty_file(tmp_path: Path) -> None
     trajectory = MapTrajectory()
     place_map = PlaceMap(MapCamera.of(CAMERA))
     running = session(place_map, extend=False)
-    for estimate, seen, _ in drive(STREET, range(5), 3):
-        trajectory.add(running.step(estimate, seen), estimate)  # type: ignore[arg-type]
-    trajectory.write(tmp_path)
+    with TrajectoryFiles(tmp_path) as files:
+        for estimate, seen, _ in drive(STREET, range(40), 3):
+            files.write(trajectory.add(running.step(estimate, seen), estimate))  # type: ignore[arg-type]
+        assert trajectory.counts["lost"] > 10  # too far back by now: no memory is kept of them
+        files.write(trajectory.finish())
+    assert trajectory.counts["lost"] == 40
     assert (tmp_path / "map.tum.txt").read_bytes() == b""
 
 
@@ -327,6 +333,22 @@ def test_two_maps_of_a_street_become_one(files: dict[str, Path]) -> None:
     first = next(keyframe for keyframe in out.keyframes if keyframe.drive == 1)
     assert np.hypot(first.T_map_keyframe.x_m - start[0], first.T_map_keyframe.y_m - start[1]) < 2.0
     assert len(errors(driven(out, STREET, range(100, 130), seed=6))) > 20
+
+
+def test_the_maps_of_many_drives_become_one(files: dict[str, Path], tmp_path: Path) -> None:
+    folders = []
+    for name in ("own", "beside", "other"):
+        folders.append(tmp_path / name)
+        folders[-1].mkdir()
+        (folders[-1] / DRIVE_MAP).write_bytes(files[name].read_bytes())
+    (tmp_path / "without").mkdir()  # a drive that failed
+    found = join([*folders, tmp_path / "without"], tmp_path / "town.map")
+    assert found is not None
+    assert set(found.inside) == {"own", "beside"}
+    assert found.outside == ("other",)
+    whole = read_map(tmp_path / "town.map")
+    assert len(whole) == len(read_map(files["own"])) + len(read_map(files["beside"])) == found.keyframes
+    assert join([tmp_path / "without"], tmp_path / "none.map") is None
 
 
 def test_maps_that_share_no_street_stay_two(files: dict[str, Path]) -> None:

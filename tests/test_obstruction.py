@@ -138,6 +138,21 @@ def test_a_bonnet_that_is_gone_is_forgotten() -> None:
     assert not bonnet.present
 
 
+def test_a_bonnet_that_mirrors_now_the_sky_and_now_the_road_stays() -> None:
+    """Its edge is brighter than the road in one part and darker in another, and hardly there between them."""
+    rng = np.random.default_rng(4)
+    across = np.linspace(-1.0, 1.0, 640)
+    edge, changes = np.arange(192)[:, None] >= 150.0 + 12.0 * across**2, []
+    bonnet = Bonnet(BonnetConfig())
+    for k in range(60):
+        mirrored = 45.0 if k < 10 else 110.0 + 90.0 * np.sin(3.0 * across + k / 20.0)
+        changes.append(bonnet.update(np.where(edge, mirrored, road_image(rng)).astype(np.uint8), TOP_PX, 1.0))
+        assert bonnet.present or k < 10
+    assert sum(changes) == 1  # it comes once
+    assert bonnet.rows is not None
+    assert 135 <= bonnet.rows[320] <= 150
+
+
 def test_a_line_across_the_windscreen_is_no_bonnet() -> None:
     """A reflection is brighter than both its sides."""
     rng = np.random.default_rng(1)

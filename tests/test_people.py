@@ -37,6 +37,7 @@ from birdslam.types import (
     Status,
 )
 from birdslam.vehicles.out_of_sequence import OpenFrame
+from birdslam.vehicles.placed_boxes import place_boxes
 from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame
 
@@ -91,6 +92,7 @@ def test_a_rider_and_the_bicycle_are_one_and_a_motorcycles_rider_is_no_pedestria
     person, mount = (600.0, 150.0, 640.0, 250.0), (595.0, 200.0, 645.0, 265.0)
     (whole,) = people_boxes(found([person, mount], ["person", "bicycle"]), CAMERA, CAMERA.ground, PeopleBoxesConfig())
     assert whole.label == "cyclist"
+    assert whole.rows == (0, 1)
     assert whole.box_px == (595.0, 150.0, 645.0, 265.0)
     assert observed([person, mount], ["person", "motorcycle"]) == []
     beside = (660.0, 150.0, 700.0, 262.0)
@@ -171,6 +173,18 @@ def test_covariances_hold_what_boxes_and_heights_really_err() -> None:
 
 
 # --- motion and ids ---
+
+
+@pytest.mark.parametrize(("walks_mps", "seed"), [(1.5, 0), (1.5, 1), (-1.2, 0), (-1.2, 1)])
+def test_who_walks_along_the_road_of_a_driving_ego_is_not_taken_to_stand(walks_mps: float, seed: int) -> None:
+    """Boxes whose error lasts are evidence of one: else whoever expects least, who stands, wins by being repeated."""
+    rng, scene, error, told = np.random.default_rng(seed), Scene(ego_mps=6.0), np.zeros(4), list[float]()
+    while (x_m := 27.0 + walks_mps * scene.k / HZ - scene.ego_m) > 8.0:
+        box = np.array(box_of(x_m, 3.0, 1.65))
+        error = 0.7 * error + math.sqrt(1.0 - 0.7**2) * rng.normal(0.0, 0.02, 4)
+        people = scene.see(found([tuple((box + error * (box[3] - box[1])).tolist())]))
+        told += [p.vx_mps for p in people if x_m < 16.0]
+    assert np.median(told) / walks_mps > 0.55
 
 
 def test_a_standing_person_stands_while_the_ego_drives() -> None:
@@ -270,6 +284,17 @@ def test_people_stand_in_world_with_the_egos_covariance_and_vehicles_stay_apart_
     assert user.T_world_vehicle.yaw_rad == pytest.approx(-math.pi / 2.0, abs=0.01)
     assert user.velocity_mps == pytest.approx((0.0, -1.0), abs=0.01)
     assert user.cov[0] + user.cov[4] > 0.05  # its own, and the ego's
+
+
+def test_the_boxes_of_a_person_are_placed_where_the_person_is_told_to_be() -> None:
+    _, estimate = driven(20, person_at(10.0, 2.0, vy=-1.0))
+    nobody, rider, bicycle = place_boxes(3, 19, [], [(FIRST_PERSON, (1, 2)), (FIRST_PERSON + 7, (0,))], estimate)
+    assert nobody is None
+    assert rider is not None
+    assert rider == bicycle
+    assert (rider.track, rider.label) == (FIRST_PERSON, "pedestrian")
+    assert (rider.x_m, rider.y_m) == pytest.approx((10.0, 2.0), abs=1e-6)
+    assert rider.velocity_mps == pytest.approx((0.0, -1.0), abs=0.01)
 
 
 def test_people_go_on_while_no_picture_comes_and_through_a_checkpoint() -> None:

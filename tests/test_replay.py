@@ -19,6 +19,7 @@ from birdslam.perf.latency import replay as perf_replay
 from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.cli.drives import replay as replay_command
 from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.nodes.capture import stamps
 from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest_checkpoint
 from birdslam.runtime.nodes.recorder import about
 from birdslam.runtime.recording.recording import Alive, GraphCheckpoint, Recording, RecordingError, RecordingWriter
@@ -26,7 +27,7 @@ from birdslam.runtime.replay import replay
 from birdslam.runtime.replay.replay import compare
 from birdslam.runtime.replay.report import report
 from birdslam.runtime.replay.verdict import Verdict
-from birdslam.types import Estimate, FrameRef, Status
+from birdslam.types import Estimate, FrameRef, Measurements, Status
 from tests.taped_drive import CAMERA, Tape, measured
 
 
@@ -139,6 +140,32 @@ def test_measurements_of_a_frame_published_before_the_restart_enter_the_restored
     assert verdict.same, verdict.difference
     assert verdict.equal == len(tape.estimates)
     assert (verdict.restarts, verdict.epochs, verdict.unanswered) == (1, 1, 1)
+
+
+def test_a_graph_that_went_on_from_an_old_checkpoint_is_not_compared_until_a_new_epoch(tmp_path: Path) -> None:
+    """Perceive was too busy to send what came since: that checkpoint is in no recording."""
+    tape, frames = Tape(tmp_path), iter(measured(40))
+    for measurements in itertools.islice(frames, 15):
+        tape.step(measurements)
+    old = checkpoint_path(tape.configuration).read_bytes()
+    for measurements in itertools.islice(frames, 5):
+        tape.step(measurements)
+    checkpoint_path(tape.configuration).write_bytes(old)
+    tape.perceive.forget(0)
+    tape.restart(with_checkpoint=True)
+    for measurements in itertools.islice(frames, 2):  # perceive had no time: a motion that is predicted
+        coasting = Measurements(**stamps(measurements), status=(Status.COASTING,))
+        tape.step(coasting)
+    assert Status.GRAPH_RESTORED in tape.estimates[20].status
+    assert tape.estimates[21].epoch == 0
+    for measurements in frames:
+        tape.step(measurements)
+    tape.end(measurements)
+    assert Status.GRAPH_RESET in tape.estimates[22].status
+    verdict = verdict_of(tape)
+    assert verdict.difference is None, verdict.difference.frame_id
+    assert (verdict.unknown, verdict.restarts, verdict.epochs) == (2, 1, 2)
+    assert verdict.equal == len(tape.estimates) - 2
 
 
 def test_a_restart_that_took_longer_than_perceive_keeps_measurements(tmp_path: Path) -> None:

@@ -41,8 +41,8 @@ pytestmark = pytest.mark.processes
 ROOT = Path(__file__).resolve().parent.parent
 DEPLOY = ROOT / "deploy"
 LIMIT_S = 60.0
-ASKABLE = {*QUERIES, "estimate", *(f"health/{node}" for node in PROCESSES)}
-READABLE = {"estimate", "map", *(f"health/{node}" for node in PROCESSES)}
+ASKABLE = {*QUERIES, "estimate", "map_pose", *(f"health/{node}" for node in PROCESSES)}
+READABLE = {"estimate", "map", "map_pose", *(f"health/{node}" for node in PROCESSES)}
 
 needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
 

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from evo.core import metrics
 from evo.core.trajectory import PosePath3D
+from hypothesis import given
+from hypothesis import strategies as st
 
 from birdslam.bench.tracking.metrics import (
     BoxFrame,
-    clear_mot,
     count_boxes,
     hota,
     hota_parts,
+    identities,
     idf1,
     match_vehicles,
     path_errors,
@@ -132,10 +134,20 @@ def test_what_counts_follows_kitti() -> None:
 
 def test_clear_mot_counts_misses_false_alarms_and_switches() -> None:
     frames = [exact([1, 2], [7, 8])] * 3 + [exact([1, 2], [8, 7])] * 2 + [exact([1], []), exact([], [7])]
-    counted = clear_mot(frames)
-    assert (counted.found, counted.missed, counted.false_alarms) == (10, 1, 1)
+    counted = identities(frames)
     assert counted.switches == 2
-    assert counted.mota == pytest.approx((10 - 1 - counted.switches) / 11)
+    assert counted.mota == pytest.approx(1.0 - (1 + 1 + counted.switches) / 11)  # a miss, a false alarm, switches
+    assert counted.idf1 == pytest.approx(idf1(frames))
+
+
+@given(seed=st.integers(0, 1000))
+def test_idf1_of_the_papers_tables_is_that_of_motmetrics(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    frames = []
+    for _ in range(12):
+        labels, tracks = (rng.permutation(5)[: rng.integers(0, 5)] for _ in range(2))
+        frames.append(BoxFrame(labels, tracks, rng.uniform(0.0, 1.0, (len(labels), len(tracks)))))
+    assert identities(frames).idf1 == pytest.approx(idf1(frames) or 0.0)
 
 
 def test_hota_has_its_parts() -> None:

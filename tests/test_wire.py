@@ -20,8 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
+from birdslam.loops.map_pose import EarthPose, MapPose, MapState
 from birdslam.queries import MapSnapshot, Nearby, NearbyUser, TimedPose, Trajectory, VehiclePath
-from birdslam.runtime.topology import CAR, NODES, PROCESSES, QUERIES, TOPICS, alive_key, check_name, key_of
+from birdslam.runtime.topology import CAR, MAP, NODES, PROCESSES, QUERIES, TOPICS, alive_key, check_name, key_of
 from birdslam.runtime.wire import (
     MAX_MESSAGE_BYTES,
     MAX_TRACE_BYTES,
@@ -140,6 +141,24 @@ _LANES = Lanes(
 )
 # Every field holds something else than its default.
 EXAMPLES: tuple[msgspec.Struct, ...] = (
+    MapPose(
+        **_TIMES,
+        epoch=3,
+        state=MapState.LOCALISED,
+        map_epoch=2,
+        T_map_odom=SE2(12.5, -3.25, 0.125),
+        T_odom_ego=SE2(120.0, 4.5, 0.25),
+        cov=_COV3,
+        inliers=57,
+        keyframes=412,
+        earth=EarthPose(
+            latitude_deg=51.04933,
+            longitude_deg=-114.05395,
+            cov=_COV2,
+            yaw_rad=0.5,
+            yaw_sigma_rad=0.0078125,
+        ),
+    ),
     _READING,
     FrameRef(
         **_TIMES,
@@ -609,7 +628,7 @@ def test_the_topology_is_closed() -> None:
     """Each topic has the producer that sends it, and every node receives what some node sends."""
     for node in (*PROCESSES.values(), CAR):
         assert all(TOPICS[topic].producer == node.name for topic in node.sends)
-        assert all(TOPICS[topic].producer in {*NODES, CAR.name} for topic in node.receives)
+        assert all(TOPICS[topic].producer in {*NODES, MAP.name, CAR.name} for topic in node.receives)
     assert sorted(topic for node in (*PROCESSES.values(), CAR) for topic in node.sends) == sorted(TOPICS)
     assert TOPICS["speed"].depth == KEPT_READINGS
     assert all(topic.depth == 1 for topic in TOPICS.values() if topic.hot)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,25 @@ from birdslam.types import Attitude
 Floats = NDArray[np.float64]
 
 
+class Placed(Protocol):
+    """A node of the graph."""
+
+    @property
+    def number(self) -> int: ...
+    @property
+    def T_map_keyframe(self) -> SE2: ...
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Where a keyframe is by the fix of GNSS nearest to it, brought there along the drive's way."""
+
+    latitude_deg: float
+    longitude_deg: float
+    sigma_m: float  # 1-sigma of the fix by itself
+    weighed_m: float  # with what it shares with those before and after it
+
+
 @dataclass(frozen=True, eq=False)
 class Keyframe:
     """Points are in the keyframe's ego frame: x forward, y left, z up, metres, from the camera's foot on the road."""
@@ -22,14 +42,13 @@ class Keyframe:
     drive: int  # the drive that it is of: 0 made the map, further ones extended it
     t_source_ns: int
     T_map_keyframe: SE2
-    cov: Floats  # (3, 3) of T_map_keyframe, of the tangent at the pose
+    cov: Floats  # (3, 3) of T_map_keyframe, of the tangent at the pose; where fixes placed the map, of its place there
     attitude: Attitude
     points_m: Floats  # (N, 3)
     sigma_depth_rel: Floats  # (N,) 1-sigma of each point's depth from the keyframe's camera, as a fraction
     descriptors: NDArray[np.uint8]  # (N, 32)
     camera_height_m: float
-    latitude_deg: float = field(default=float("nan"))
-    longitude_deg: float = field(default=float("nan"))
+    gnss: Fixed | None = None
 
     @property
     def T_map(self) -> Transform:

@@ -7,7 +7,6 @@ share its errors, so those are added to what is reported and not averaged away (
 
 from __future__ import annotations
 
-import enum
 import math
 from dataclasses import dataclass
 
@@ -16,8 +15,10 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
+from birdslam.loops.drift import LOOP_YAW_RAD, ODOMETRY_SCALE_REL, drift_after, is_exact, moved
 from birdslam.loops.features import Features
 from birdslam.loops.keyframe import Floats
+from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import PlaceMap
 from birdslam.loops.verification import Fix, locate
 from birdslam.trajectory import ego_pose, split_pose
@@ -34,23 +35,10 @@ HYPOTHESIS_M = 30.0  # after so much way without confirmation one is given up
 CHI2_GATE = 16.27  # of three degrees of freedom, 99.9 %
 FOLLOW_M = 12.0  # keyframes within it are looked for
 SEARCH_PX, MOST_SEARCH_PX = 25.0, 120.0
-LOST_SIGMA_M, LOST_SIGMA_RAD = 0.5, math.radians(1.5)  # a pose less exact than that is none
-# Odometry between fixes, 1-sigma: along and across as a share of the way, yaw by the root of it
-DRIFT_REL, DRIFT_M, DRIFT_YAW_RAD = 0.02, 0.01, 0.0012
-ODOMETRY_SCALE_REL = 0.012  # 1-sigma of its metric scale
 FARTHEST_M = 1e5
-LOOP_SCALE_REL = 0.01  # by which the scale of odometry differs from one end of a way to the other
 # What fixes of one map share: its points' scale (as odometry tells its own, docs/method.md), the camera's foot as the
 # car tilts by half a degree, and the mounting's yaw
-SHARED_SCALE_REL, SHARED_TILT_RAD, SHARED_YAW_RAD = 0.012, 0.008, 0.0006
-
-
-class MapState(enum.StrEnum):
-    """What a pose in the map rests on."""
-
-    LOCALISED = "localised"  # on the map: the pose is within its covariance
-    ODOMETRY_ONLY = "odometry_only"  # on odometry since the last fix, or since the beginning of a new map
-    LOST = "lost"  # there is no pose
+SHARED_SCALE_REL, SHARED_TILT_RAD, SHARED_YAW_RAD = 0.012, 0.008, LOOP_YAW_RAD
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,28 +64,6 @@ class _Hypothesis:
     travelled_m: float
     confirmed: int = 0
     kidnapped: bool = False  # it contradicts what odometry says since the last fix
-
-
-def drift(step: SE2) -> Floats:
-    """(3, 3) covariance of a step of odometry, of the tangent at its end."""
-    way_m = math.hypot(step.x_m, step.y_m)
-    sigma_m = DRIFT_REL * way_m + DRIFT_M * math.sqrt(way_m)
-    yaw_rad = DRIFT_YAW_RAD * math.sqrt(way_m) + 0.02 * abs(step.yaw_rad)
-    return np.diag([sigma_m**2, sigma_m**2, yaw_rad**2]) + 1e-10 * np.eye(3)
-
-
-def drift_after(way_m: float) -> Floats:
-    """(3, 3) what odometry may be off after so much way there and back, by which a loop is judged (chi-square)."""
-    yaw_rad = DRIFT_YAW_RAD * math.sqrt(way_m) + SHARED_YAW_RAD
-    sigma_m = (DRIFT_REL + DRIFT_M) * math.sqrt(way_m) + (LOOP_SCALE_REL + yaw_rad) * way_m / 4.0
-    return np.diag([sigma_m**2, sigma_m**2, yaw_rad**2])
-
-
-def moved(cov: Floats, step: SE2) -> Floats:
-    """A covariance at the beginning of a step, at its end, with the step's own."""
-    Ad = step.inverse().adjoint()
-    out: Floats = Ad @ cov @ Ad.T + drift(step)
-    return out
 
 
 class Localiser:
@@ -136,13 +102,21 @@ class Localiser:
     def state(self) -> MapState:
         if self._T_map_ego is None:
             return MapState.LOST
-        cov = self.cov
-        exact = max(cov[0, 0], cov[1, 1]) < LOST_SIGMA_M**2 and cov[2, 2] < LOST_SIGMA_RAD**2
-        return MapState.LOCALISED if exact and self.since_fix_m < math.inf else MapState.ODOMETRY_ONLY
+        exact = self.since_fix_m < math.inf and is_exact(self.cov)
+        return MapState.LOCALISED if exact else MapState.ODOMETRY_ONLY
 
-    def place(self, T_map_ego: SE2, T_odom_ego: SE2, cov: Floats) -> None:
-        """Begins at a known pose: of a new map, its origin."""
+    def place(self, T_map_ego: SE2, T_odom_ego: SE2, cov: Floats, since_fix_m: float = math.inf) -> None:
+        """Begins at a known pose: of a new map its origin, or where another process had come to."""
         self._T_map_ego, self._T_odom_ego, self._cov = T_map_ego, T_odom_ego, cov
+        self.since_fix_m = since_fix_m
+
+    def shift(self, T_new_old: SE2) -> None:
+        """The map was optimised: what lay at T lies at T_new_old @ T now."""
+        if self._T_map_ego is not None:
+            self._T_map_ego = T_new_old @ self._T_map_ego
+        for hypothesis in self._hypotheses:
+            hypothesis.T_map_odom = T_new_old @ hypothesis.T_map_odom
+        self.map_epoch += 1
 
     def lose(self) -> None:
         """Odometry began anew: nothing is known any more."""

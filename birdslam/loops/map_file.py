@@ -16,11 +16,12 @@ import numpy as np
 
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import DESCRIPTOR_BYTES
-from birdslam.loops.keyframe import Keyframe, Link
+from birdslam.loops.gnss.earth import Earth, is_on_earth
+from birdslam.loops.keyframe import Fixed, Keyframe, Link
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.types import Attitude, Cov3
 
-VERSION = 1
+VERSION = 2
 MAGIC = b"BirdSLAM map\n"
 HEAD = struct.Struct("<HQI")  # version, bytes, CRC-32
 MOST_BYTES = 1 << 31  # 1,000 km
@@ -48,7 +49,7 @@ class KeyframeRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     attitude: tuple[float, float, float]  # z_m, pitch_rad, roll_rad
     camera_height_m: float
     points: bytes
-    latitude_longitude_deg: tuple[float, float] | None = None
+    gnss: tuple[float, float, float, float] | None = None  # latitude_deg, longitude_deg, sigma_m, weighed_m
 
 
 class LinkRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -61,6 +62,22 @@ class LinkRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
     loop: bool
 
 
+class EarthRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """Where the map is on Earth."""
+
+    latitude_deg: float
+    longitude_deg: float
+    east_m: float
+    north_m: float
+    yaw_rad: float
+    scale: float
+    cov: Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)]
+    fixes: _Number
+    outliers: _Number
+    rms_m: float
+    late_m: float
+
+
 class MapRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """All of the file behind its head."""
 
@@ -69,6 +86,7 @@ class MapRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     words: bytes
     keyframes: list[KeyframeRecord]
     links: list[LinkRecord]
+    earth: EarthRecord | None = None
 
 
 def encode_map(place_map: PlaceMap) -> bytes:
@@ -83,6 +101,7 @@ def encode_map(place_map: PlaceMap) -> bytes:
             LinkRecord(link.from_number, link.to_number, link.T_from_to, _cov(link.cov), link.loop)
             for link in place_map.links
         ],
+        None if place_map.earth is None else _earth_record(place_map.earth),
     )
     body = msgspec.msgpack.encode(record)
     return MAGIC + HEAD.pack(VERSION, len(body), zlib.crc32(body)) + body
@@ -135,14 +154,35 @@ def _map_of(record: MapRecord) -> PlaceMap:
         cov = _matrix(link.cov)
         links.append(Link(link.from_number, link.to_number, link.T_from_to, cov, link.loop))
     words = np.frombuffer(record.words, np.uint8).reshape(-1, DESCRIPTOR_BYTES) if record.words else None
-    return PlaceMap(camera, keyframes, links, words, record.drives)
+    earth = None if record.earth is None else _earth(record.earth)
+    return PlaceMap(camera, keyframes, links, words, record.drives, earth)
+
+
+def _earth_record(earth: Earth) -> EarthRecord:
+    at = earth.latitude_deg, earth.longitude_deg, earth.east_m, earth.north_m, earth.yaw_rad, earth.scale
+    return EarthRecord(*at, _cov(earth.cov), earth.fixes, earth.outliers, earth.rms_m, earth.late_m)
+
+
+def _earth(record: EarthRecord) -> Earth:
+    numbers = (record.east_m, record.north_m, record.yaw_rad, record.rms_m, record.late_m)
+    if not (math.isfinite(sum(numbers)) and is_on_earth(record.latitude_deg, record.longitude_deg)):
+        raise MapError("its place on Earth is none")
+    if not (0.5 < record.scale < 2.0 and max(map(abs, numbers)) < 1e7):
+        raise MapError("its place on Earth is none")
+    cov = np.array(record.cov).reshape(4, 4)
+    if not math.isfinite(sum(record.cov)) or np.linalg.eigvalsh(cov)[0] < -1e-9:
+        raise MapError("the covariance of its place on Earth is none")
+    return Earth(
+        *(record.latitude_deg, record.longitude_deg, record.east_m, record.north_m, record.yaw_rad, record.scale, cov),
+        *(0.0, record.fixes, record.outliers, record.rms_m, None, record.late_m),
+    )
 
 
 def _keyframe_record(keyframe: Keyframe) -> KeyframeRecord:
     points = np.clip(np.round(keyframe.points_m / POINT_M), -32768, 32767).astype("<i2")
     steps = np.log(np.maximum(keyframe.sigma_depth_rel, LEAST_SIGMA) / LEAST_SIGMA) / SIGMA_STEP
     sigmas = np.clip(np.ceil(steps), 0, 255).astype(np.uint8)
-    attitude, place = keyframe.attitude, (keyframe.latitude_deg, keyframe.longitude_deg)
+    attitude, fixed = keyframe.attitude, keyframe.gnss
     return KeyframeRecord(
         keyframe.number,
         keyframe.drive,
@@ -152,7 +192,7 @@ def _keyframe_record(keyframe: Keyframe) -> KeyframeRecord:
         (attitude.z_m, attitude.pitch_rad, attitude.roll_rad),
         keyframe.camera_height_m,
         points.tobytes() + sigmas.tobytes() + keyframe.descriptors.tobytes(),
-        place if math.isfinite(sum(place)) else None,
+        None if fixed is None else (fixed.latitude_deg, fixed.longitude_deg, fixed.sigma_m, fixed.weighed_m),
     )
 
 
@@ -164,8 +204,10 @@ def _keyframe(record: KeyframeRecord) -> Keyframe:
         raise MapError(f"keyframe {record.number}: its attitude is none")
     if not 0.1 < record.camera_height_m < 10.0:
         raise MapError(f"keyframe {record.number}: its camera's height is none")
-    place = record.latitude_longitude_deg or (math.nan, math.nan)
-    if record.latitude_longitude_deg and not (abs(place[0]) <= 90.0 and abs(place[1]) <= 180.0):
+    fixed = None if record.gnss is None else Fixed(*record.gnss)
+    if fixed is not None and not (
+        is_on_earth(fixed.latitude_deg, fixed.longitude_deg) and 0.0 < fixed.sigma_m <= fixed.weighed_m < 1e9
+    ):
         raise MapError(f"keyframe {record.number}: its place on Earth is none")
     points = np.frombuffer(record.points, "<i2", 3 * count).reshape(-1, 3) * POINT_M
     sigmas = LEAST_SIGMA * np.exp(SIGMA_STEP * np.frombuffer(record.points, np.uint8, count, 6 * count))
@@ -181,7 +223,7 @@ def _keyframe(record: KeyframeRecord) -> Keyframe:
         sigmas,
         descriptors.reshape(-1, DESCRIPTOR_BYTES),
         record.camera_height_m,
-        *place,
+        fixed,
     )
 
 

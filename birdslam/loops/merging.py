@@ -11,6 +11,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops, held
 from birdslam.loops.features import Features
+from birdslam.loops.gnss.factors import tie
 from birdslam.loops.keyframe import Keyframe, Link
 from birdslam.loops.localiser import SHARED_SCALE_REL, SHARED_TILT_RAD, SHARED_YAW_RAD, is_place
 from birdslam.loops.place_map import PlaceMap
@@ -51,9 +52,13 @@ def merged(first: PlaceMap, second: PlaceMap) -> tuple[PlaceMap, int]:
     ]
     keyframes, every = [*first.keyframes, *moved], [*first.links, *links, *loops]
     poses = close_loops(keyframes, every)
-    out = PlaceMap(first.camera, keyframes, held(every, poses), None, first.drives + second.drives)
+    out = PlaceMap(first.camera, keyframes, held(every, poses), None, first.drives + second.drives, first.earth)
     out.place(poses)
     out.learn()
+    if out.earth is None and second.earth is not None:
+        out.earth = second.earth.seen_from(T_first_second)
+    if out.earth is not None:
+        out.come_to_earth(tie(out.earth, out.keyframes, out.links, out.fixed()))
     return out, len(agreeing)
 
 
@@ -62,7 +67,7 @@ def part(place_map: PlaceMap, keeps: Callable[[Keyframe], bool]) -> PlaceMap:
     keyframes = [keyframe for keyframe in place_map.keyframes if keeps(keyframe)]
     numbers = {keyframe.number for keyframe in keyframes}
     links = [link for link in place_map.links if {link.from_number, link.to_number} <= numbers]
-    out = PlaceMap(place_map.camera, keyframes, links, None, place_map.drives)
+    out = PlaceMap(place_map.camera, keyframes, links, None, place_map.drives, place_map.earth)
     out.learn()
     return out
 

@@ -7,6 +7,7 @@ and a map of one town has the words of that town. A look-up is one product of a 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ MOST_WORDS, LEAST_WORDS = 1024, 16
 DESCRIPTORS_PER_WORD = 8
 LEARNED_FROM = 20_000  # descriptors at the most
 ROUNDS = 5
+STALE_REL = 1 / 32  # of the keyframes may be missing in the matrix: a drive's own last ones are none of its loops
 _SEED = 39
 
 
@@ -63,7 +65,8 @@ class PlaceIndex:
     def __init__(self, words: NDArray[np.uint8]) -> None:
         self.words = words
         self._counts: list[tuple[NDArray[np.int64], Floats]] = []
-        self._matrix = None
+        self._matrix: Any = None
+        self._built = 0  # keyframes in the matrix
         self._idf: Floats = np.zeros(len(words))
 
     def __len__(self) -> int:
@@ -73,20 +76,19 @@ class PlaceIndex:
         """The next keyframe."""
         present, count = np.unique(words_of(descriptors, self.words), return_counts=True)
         self._counts.append((present, np.sqrt(count)))
-        self._matrix = None
 
     def look_up(self, descriptors: NDArray[np.uint8], most: int, among: NDArray[np.bool_] | None = None) -> list[int]:
         """The numbers of the `most` keyframes most like these descriptors, the best first; `among` (N,): only those."""
         if not self._counts or not len(descriptors) or not len(self.words):
             return []
-        if self._matrix is None:
+        if len(self._counts) - self._built > STALE_REL * self._built:
             self._build()
         present, count = np.unique(words_of(descriptors, self.words), return_counts=True)
         query = np.zeros(len(self.words), np.float32)
         query[present] = np.sqrt(count) * self._idf[present]
-        scores = self._matrix @ query  # type: ignore[operator]
+        scores = self._matrix @ query
         if among is not None:
-            scores = np.where(among, scores, -1.0)
+            scores = np.where(among[: len(scores)], scores, -1.0)
         most = min(most, len(scores))
         best = np.argpartition(-scores, most - 1)[:most]
         order = best[np.lexsort((best, -scores[best]))]
@@ -102,6 +104,7 @@ class PlaceIndex:
         begin = np.concatenate([[0], np.cumsum([len(row) for row in rows])])
         columns = np.concatenate([present for present, _ in self._counts])
         data = np.concatenate(rows).astype(np.float32)
+        self._built = len(rows)
         self._matrix = csr_matrix((data, columns, begin), shape=(len(rows), len(self.words)))
 
 

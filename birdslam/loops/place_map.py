@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -12,12 +13,16 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.keyframe import Keyframe, Link
-from birdslam.loops.place_index import PlaceIndex, index_of, learn_words
+from birdslam.loops.gnss.earth import Earth
+from birdslam.loops.gnss.factors import OnEarth
+from birdslam.loops.keyframe import Fixed, Keyframe, Link
+from birdslam.loops.map_pose import EarthPose
+from birdslam.loops.place_index import LEARNED_FROM, PlaceIndex, index_of, learn_words
 from birdslam.loops.verification import LocalMap
 
 NEIGHBOUR_M = 9.0  # keyframes this near help each other
 NEIGHBOURS = 3
+EARTH_REACH_M = 100.0  # a place on Earth is that of the keyframes around it
 SAME_HEADING_RAD = math.radians(60.0)
 OTHER_HEIGHT, OTHER_FOCAL_LENGTH = 0.1, 0.1  # logarithms of ratios
 
@@ -60,12 +65,15 @@ class PlaceMap:
         links: Iterable[Link] = (),
         words: NDArray[np.uint8] | None = None,
         drives: int = 0,
+        earth: Earth | None = None,
     ) -> None:
         self.camera = camera
         self.keyframes: list[Keyframe] = list(keyframes)
         self.links: list[Link] = list(links)
         self.drives = drives  # that it was made of
+        self.earth = earth  # where it is on Earth; None: no fixes yet
         self.words = words
+        self._learned_from = len(self.keyframes)  # keyframes whose words are known
         self._index: PlaceIndex | None = None
         self._poses = np.zeros((0, 3))
 
@@ -82,9 +90,12 @@ class PlaceMap:
         return float(sum(math.hypot(link.T_from_to.x_m, link.T_from_to.y_m) for link in self.links if not link.loop))
 
     def add(self, keyframe: Keyframe) -> None:
-        """A further keyframe; it can be found from now on."""
+        """A further keyframe; it can be found soon. A young map's words are learned anew each time that it doubles."""
         self.keyframes.append(keyframe)
-        if self._index is not None:
+        young = self._learned_from * len(keyframe.descriptors) < LEARNED_FROM
+        if young and len(self.keyframes) >= 2 * self._learned_from:
+            self.words, self._index = None, None
+        elif self._index is not None:
             self._index.add(keyframe.descriptors)
 
     def place(self, poses: dict[int, tuple[SE2, NDArray[np.float64]]]) -> None:
@@ -95,12 +106,32 @@ class PlaceMap:
         ]
         self._poses = np.zeros((0, 3))
 
+    def fixed(self) -> dict[int, Fixed]:
+        """The fixes of its keyframes, by number."""
+        return {keyframe.number: keyframe.gnss for keyframe in self.keyframes if keyframe.gnss is not None}
+
+    def come_to_earth(self, found: OnEarth) -> None:
+        """Its keyframes lie where fixes put them."""
+        self.place(found.poses)
+        self.keyframes = [replace(each, gnss=found.fixed.get(each.number)) for each in self.keyframes]
+        self.earth = found.earth
+
+    def on_earth(self, T_map_ego: SE2, cov: NDArray[np.float64]) -> EarthPose | None:
+        """An ego with its covariance (3, 3) of the tangent; None: the map is not on Earth, or not where the ego is."""
+        rows = self.near(T_map_ego, EARTH_REACH_M)
+        if self.earth is None or not rows:
+            return None
+        nearest = self.keyframes[rows[0]]
+        Ad = T_map_ego.between(nearest.T_map_keyframe).adjoint()
+        return self.earth.pose(T_map_ego, cov + Ad @ nearest.cov @ Ad.T)
+
     def index(self) -> PlaceIndex:
         """Made when it is first asked for."""
         if self._index is None:
             if self.words is None or not len(self.words):
                 every = [keyframe.descriptors for keyframe in self.keyframes]
                 self.words = learn_words(np.concatenate(every) if every else np.zeros((0, 32), np.uint8))
+                self._learned_from = len(self.keyframes)
             self._index = index_of([keyframe.descriptors for keyframe in self.keyframes], self.words)
         return self._index
 

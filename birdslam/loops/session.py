@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops, held
+from birdslam.loops.drift import moved
 from birdslam.loops.features import FeatureExtractor
 from birdslam.loops.keyframe import Floats, Keyframe, Link
 from birdslam.loops.keyframe_builder import LOOK_M, LOOK_NS, KeyframeBuilder, Look, NewKeyframe
-from birdslam.loops.localiser import Localisation, Localiser, MapState, moved, shared
+from birdslam.loops.localiser import Localisation, Localiser, shared
+from birdslam.loops.map_pose import MapPose, MapState
 from birdslam.loops.place_map import PlaceMap
 from birdslam.types import Estimate, Status
 
@@ -26,6 +28,7 @@ COVERED_INLIERS = 40
 OWN_WAY_M = 60.0  # of a drive's own keyframes only older ones can close a loop
 JOINT_EVERY_M = 25.0  # a drive over known streets leaves a keyframe so often, which ties its odometry to them
 LOOP_EVERY_M = 8.0  # between two links to the map
+CLOSE_EVERY_M = 50.0  # of way, from one optimisation of the map to the next where loops were found since
 FIRST_COV = np.diag([1e-6, 1e-6, 1e-8])
 
 
@@ -52,20 +55,19 @@ class MapSession:
         self._chain: tuple[int, SE2] | None = None  # the last keyframe's number and its T_odom_keyframe
         self._linked_m, self._joint_m = -math.inf, -math.inf
         self._fixes: list[tuple[float, SE2, int, SE2, Floats]] = []
+        self._open_loops, self._closed_m = 0, -math.inf  # loops since the last optimisation, and the way there
+        self._resumed: MapPose | None = None
         self.lost_keyframes = 0  # that never found a place in the map
 
     def step(self, estimate: Estimate, image: NDArray[np.uint8] | None) -> Localisation:
         """Where the ego of this frame is in the map."""
         self._move(estimate)
-        due = (
-            self._travelled_m - self._looked_m >= LOOK_M
-            or (self._travelled_m > self._looked_m and estimate.t_source_ns - self._looked_ns >= LOOK_NS)
-            or self._looked_m == -math.inf
-        )
-        looked = image is not None and due
+        looked = image is not None and self._due(estimate)
         if looked:
             assert image is not None
             self._look(estimate, image)
+        if self._open_loops and self._travelled_m - self._closed_m >= CLOSE_EVERY_M:
+            self._optimise()
         localiser = self.localiser
         fix = localiser.fix if looked else None
         lost = localiser.state is MapState.LOST
@@ -80,6 +82,14 @@ class MapSession:
             localiser.map_epoch,
         )
 
+    def resume(self, pose: MapPose) -> None:
+        """Before the first step: goes on where another session of the same drive had come to, in odometry's epoch."""
+        self._resumed = pose
+
+    def _due(self, estimate: Estimate) -> bool:
+        way_m = self._travelled_m - self._looked_m
+        return way_m >= LOOK_M or (way_m > 0.0 and estimate.t_source_ns - self._looked_ns >= LOOK_NS)
+
     def finish(self) -> None:
         """The last keyframes, and the index of all."""
         if not self._extend:
@@ -88,16 +98,20 @@ class MapSession:
         self.lost_keyframes += len(self._waiting)
         self._waiting = []
         if self._own:
-            self.map.drives = self._drive + 1
             self._optimise()
             self.map.learn()
 
     def _optimise(self) -> None:
-        """All keyframes by all links, where loops were found."""
-        if any(link.loop for link in self.map.links):
-            poses = close_loops(self.map.keyframes, self.map.links)
-            self.map.links = held(self.map.links, poses)
-            self.map.place(poses)
+        """All keyframes by all links, where loops were found; the ego moves with the newest of them."""
+        self._open_loops, self._closed_m = 0, self._travelled_m
+        if not any(link.loop for link in self.map.links):
+            return
+        newest = self.map.keyframes[-1]
+        poses = close_loops(self.map.keyframes, self.map.links)
+        self.map.links = held(self.map.links, poses)
+        self.map.place(poses)
+        if newest.drive == self._drive:
+            self.localiser.shift(poses[newest.number][0] @ newest.T_map_keyframe.inverse())
 
     def _move(self, estimate: Estimate) -> None:
         if estimate.epoch != self._epoch or (
@@ -118,9 +132,23 @@ class MapSession:
             self._waiting, self._chain = [], None
             self._builder = KeyframeBuilder(self._camera)
             self.localiser.lose()
+        elif self._resumed is not None and self._resumed.epoch == estimate.epoch:
+            self._go_on(self._resumed)
         elif self._new_map and self._extend:
             self.localiser.place(estimate.T_world_ego, estimate.T_world_ego, FIRST_COV)
         self._epoch = estimate.epoch
+
+    def _go_on(self, pose: MapPose) -> None:
+        """From a pose of this epoch; the last keyframe's link to the next one is odometry's, as ever."""
+        if pose.T_map_odom is None or pose.T_odom_ego is None or pose.cov is None:
+            return
+        since_fix_m = math.inf if pose.state is MapState.ODOMETRY_ONLY else 0.0
+        cov = np.array(pose.cov).reshape(3, 3)
+        self.localiser.place(pose.T_map_odom @ pose.T_odom_ego, pose.T_odom_ego, cov, since_fix_m)
+        self.localiser.map_epoch = pose.map_epoch
+        if len(self.map):
+            last = self.map.keyframes[-1]
+            self._chain = last.number, pose.T_map_odom.inverse() @ last.T_map_keyframe
 
     def _look(self, estimate: Estimate, image: NDArray[np.uint8]) -> None:
         self._looked_m, self._looked_ns = self._travelled_m, estimate.t_source_ns
@@ -191,6 +219,7 @@ class MapSession:
                 self._camera.height_m,
             )
         )
+        self.map.drives = self._drive + 1
         self._own.append((len(self.map) - 1, new.look.travelled_m))
         self.localiser.own_way_m[len(self.map) - 1] = new.look.travelled_m
         if self._chain is not None:
@@ -214,6 +243,7 @@ class MapSession:
             if abs(way_m - new.look.travelled_m) < LOOP_EVERY_M:
                 self.map.links.append(Link(seen, number, T_seen_ego @ step, moved(cov, step), loop=True))
                 self._joint_m = new.look.travelled_m
+                self._open_loops += 1
             elif way_m > new.look.travelled_m:
                 left.append((way_m, T_odom_ego, seen, T_seen_ego, cov))
         self._fixes = left

@@ -6,83 +6,113 @@ as localised: the drive is over when this is written.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
-from collections import Counter
+from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.localiser import (
-    LOST_SIGMA_M,
-    LOST_SIGMA_RAD,
-    Localisation,
-    MapState,
-    moved,
-)
+from birdslam.loops.drift import is_exact, moved
+from birdslam.loops.localiser import Localisation
+from birdslam.loops.map_pose import MapState
 from birdslam.trajectory import ego_pose, tum_row
 from birdslam.types import NS_PER_S, Estimate
 
 FILES = "map.tum.txt", "localisation.csv"
 MOST_BACK_M = 15.0  # of way by odometry alone, back from where a place was confirmed
+MOST_WAITING = 3000  # frames of an ego that stands somewhere unknown
 HEADER = "t_s,state,x_m,y_m,yaw_rad,cov_xx,cov_xy,cov_xyaw,cov_yy,cov_yyaw,cov_yawyaw,inliers,map_epoch"
 
 
 class MapTrajectory:
-    """`add` takes every frame in order; `write` makes the files."""
+    """`add` takes every frame in order and gives those that are settled; `finish` gives the rest.
+
+    A frame without a place waits for one until the ego is too far on to be led back from there.
+    """
 
     def __init__(self) -> None:
-        self._rows: list[tuple[Localisation, SE2, int]] = []  # with T_odom_ego and the epoch of odometry
-        self.as_found: list[MapState] = []  # the frames' states as they were known while driving
+        self._waiting: deque[tuple[Localisation, SE2, int]] = deque()  # with T_odom_ego and the epoch of odometry
+        self.counts = {state.value: 0 for state in MapState}  # settled frames by their state
+        self.first_ns: int | None = None  # source time of the first frame that was localised while driving
+        self.frames_before = 0  # that came before it
 
-    def add(self, localisation: Localisation, estimate: Estimate) -> None:
+    def add(self, localisation: Localisation, estimate: Estimate) -> list[Localisation]:
         """One frame."""
-        self.as_found.append(localisation.state)
-        first = bool(self._rows) and self._rows[-1][0].state is not MapState.LOCALISED
-        self._rows.append((localisation, estimate.T_world_ego, estimate.epoch))
-        if localisation.state is MapState.LOCALISED and first:
+        localised = localisation.state is MapState.LOCALISED
+        if localised and self.first_ns is None:
+            self.first_ns = localisation.t_source_ns
+        self.frames_before += self.first_ns is None
+        self._waiting.append((localisation, estimate.T_world_ego, estimate.epoch))
+        if localised:
             self._lead_back()
+            return self.finish()
+        out = []
+        while len(self._waiting) > MOST_WAITING or self._too_far(estimate):
+            out.append(self._waiting.popleft()[0])
+        return self._settled(out)
+
+    def finish(self) -> list[Localisation]:
+        """All that wait, as they are."""
+        out = [localisation for localisation, _, _ in self._waiting]
+        self._waiting.clear()
+        return self._settled(out)
+
+    def _too_far(self, estimate: Estimate) -> bool:
+        _, T_odom_ego, epoch = self._waiting[0]
+        step = T_odom_ego.between(estimate.T_world_ego)
+        return epoch != estimate.epoch or math.hypot(step.x_m, step.y_m) > MOST_BACK_M
+
+    def _settled(self, rows: list[Localisation]) -> list[Localisation]:
+        for row in rows:
+            self.counts[row.state.value] += 1
+        return rows
 
     def _lead_back(self) -> None:
-        found, T_odom_found, epoch = self._rows[-1]
+        found, T_odom_found, epoch = self._waiting[-1]
         assert found.T_map_ego is not None
         cov, way_m, T_later = found.cov, 0.0, T_odom_found
-        for place in range(len(self._rows) - 2, -1, -1):
-            lost, T_odom_ego, of_epoch = self._rows[place]
+        for place in range(len(self._waiting) - 2, -1, -1):
+            lost, T_odom_ego, of_epoch = self._waiting[place]
             step = T_later.between(T_odom_ego)
             way_m += math.hypot(step.x_m, step.y_m)
             cov = moved(cov, step)
-            exact = max(cov[0, 0], cov[1, 1]) < LOST_SIGMA_M**2 and cov[2, 2] < LOST_SIGMA_RAD**2
-            if lost.state is MapState.LOCALISED or of_epoch != epoch or way_m > MOST_BACK_M or not exact:
+            if of_epoch != epoch or way_m > MOST_BACK_M or not is_exact(cov):
                 return
             T_map_ego = found.T_map_ego @ T_odom_found.between(T_odom_ego)
             led = Localisation(
                 *(lost.frame_id, lost.t_source_ns, MapState.LOCALISED, T_map_ego, cov, found.attitude),
                 map_epoch=found.map_epoch,
             )
-            self._rows[place], T_later = (led, T_odom_ego, of_epoch), T_odom_ego
+            self._waiting[place], T_later = (led, T_odom_ego, of_epoch), T_odom_ego
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """Frames by their state."""
-        counted = Counter(localisation.state.value for localisation, _, _ in self._rows)
-        return {state.value: counted[state.value] for state in MapState}
 
-    def localised(self) -> list[Localisation]:
-        """The frames with a pose in the map."""
-        return [localisation for localisation, _, _ in self._rows if localisation.state is MapState.LOCALISED]
+class TrajectoryFiles(contextlib.AbstractContextManager["TrajectoryFiles"]):
+    """`map.tum.txt` and `localisation.csv`, row by row, until `close`. Raises OSError."""
 
-    def write(self, directory: Path) -> None:
-        """Raises OSError."""
-        with (directory / FILES[0]).open("w", encoding="ascii") as tum:
-            for found in self.localised():
-                assert found.T_map_ego is not None
-                tum.write(tum_row(found.t_source_ns, ego_pose(found.T_map_ego, found.attitude)) + "\n")
-        with (directory / FILES[1]).open("w", encoding="ascii", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(HEADER.split(","))
-            writer.writerows(_row(localisation) for localisation, _, _ in self._rows)
+    def __init__(self, directory: Path) -> None:
+        self._tum = (directory / FILES[0]).open("w", encoding="ascii")
+        self._csv = (directory / FILES[1]).open("w", encoding="ascii", newline="")
+        self._rows = csv.writer(self._csv, lineterminator="\n")
+        self._rows.writerow(HEADER.split(","))
+
+    def write(self, settled: Sequence[Localisation]) -> None:
+        """The next frames."""
+        for found in settled:
+            if found.state is MapState.LOCALISED and found.T_map_ego is not None:
+                self._tum.write(tum_row(found.t_source_ns, ego_pose(found.T_map_ego, found.attitude)) + "\n")
+            self._rows.writerow(_row(found))
+
+    def close(self) -> None:
+        """All is written."""
+        self._tum.close()
+        self._csv.close()
+
+    def __exit__(self, *failure: object) -> None:
+        self.close()
 
 
 def _row(found: Localisation) -> list[str]:

@@ -37,6 +37,7 @@ class PeopleBoxesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
     sigma_edge_rel: float = 0.03  # 1-sigma of lower and upper edge: RRC's boxes of people on KITTI tracking
     sigma_edge_px: float = 0.5  # and beside it
+    sigma_covered_rel: float = 0.06  # of a lower edge that a nearer box covers, beside it
     sigma_side_rel: float = 0.035  # of the middle column: arms and legs swing
     sigma_growth: float = 2.0  # as `LocalisationConfig.sigma_growth`
     sure_score: float = 0.85  # from it on nothing grows
@@ -66,6 +67,7 @@ class PersonBox:
     log_width: float
     hidden: float
     whole: bool = True
+    rows: tuple[int, ...] = ()  # of the detections that it is made of
 
     @property
     def tan_height(self) -> float:
@@ -80,7 +82,7 @@ def people_boxes(
 
     A motorcycle is a vehicle: whoever rides it is part of it, and no pedestrian.
     """
-    boxes, labels, whole = _joined(detections)
+    boxes, labels, whole, rows = _joined(detections)
     if not len(boxes):
         return []
     scores = boxes[:, 4]
@@ -90,14 +92,19 @@ def people_boxes(
     sigma = detections.edge_sigma
     order = np.argsort(-scores, kind="stable")
     return [
-        _observe(boxes[i], float(scores[i]), labels[i], whole[i], bool(covered[i]), slopes[i], sigma, camera, config)
+        _observe(
+            boxes[i], float(scores[i]), labels[i], whole[i], rows[i], bool(covered[i]), slopes[i], sigma, camera, config
+        )
         for i in order.tolist()
     ]
 
 
-def _joined(detections: Detections) -> tuple[Floats, list[str], list[bool]]:
-    """(boxes and scores (N, 5), labels, which are whole): riders and their bicycles as one, without occupants."""
-    found = np.column_stack([detections.boxes_px, detections.scores])
+def _joined(detections: Detections) -> tuple[Floats, list[str], list[bool], list[tuple[int, ...]]]:
+    """(boxes and scores (N, 5), labels, which are whole, of which detections): riders and their bicycles as one.
+
+    Occupants of vehicles are left out.
+    """
+    found = np.column_stack([detections.boxes_px, detections.scores, np.arange(len(detections))])
     sizes = found[:, 2:4] - found[:, :2]
     solid = np.flatnonzero((sizes >= 1.0).all(axis=1)).tolist()
 
@@ -112,32 +119,36 @@ def _joined(detections: Detections) -> tuple[Floats, list[str], list[bool]]:
     people = people[~_occupants(people, of(*CARS))]
     mounts = np.vstack([bicycles, motorcycles])
     rider_of = _riders(people, mounts)
-    rows, labels, whole = [], [], []
+    rows, labels, whole, made_of = [], list[str](), list[bool](), list[tuple[int, ...]]()
     for i, person in enumerate(people):
         mount = rider_of.get(i)
         if mount is None:
-            rows.append(person)
+            rows.append(person[:5])
             labels.append(PEDESTRIAN)
             whole.append(True)
+            made_of.append((int(person[5]),))
         elif mount < len(bicycles):
             bike = mounts[mount]
-            rows.append(np.concatenate([np.minimum(person[:2], bike[:2]), np.maximum(person[2:], bike[2:])]))
+            rows.append(np.concatenate([np.minimum(person[:2], bike[:2]), np.maximum(person[2:5], bike[2:5])]))
             labels.append(CYCLIST)
             whole.append(True)
+            made_of.append((int(person[5]), int(bike[5])))
     ridden = set(rider_of.values())
     for k, bike in enumerate(bicycles):
         if k not in ridden:
-            rows.append(bike)
+            rows.append(bike[:5])
             labels.append(BICYCLE)
             whole.append(False)
-    rows += list(cyclists)
+            made_of.append((int(bike[5]),))
+    rows += list(cyclists[:, :5])
     labels += [CYCLIST] * len(cyclists)
     whole += [True] * len(cyclists)
-    return np.array(rows).reshape(-1, 5), labels, whole
+    made_of += [(int(row),) for row in cyclists[:, 5]]
+    return np.array(rows).reshape(-1, 5), labels, whole, made_of
 
 
 def _without_copies(boxes: Floats) -> Floats:
-    """Boxes (N, 5), the better of two that lie on one person."""
+    """Boxes (N, 6), the better of two that lie on one person."""
     boxes = boxes[np.argsort(-boxes[:, 4], kind="stable")]
     overlap, kept = iou(boxes[:, :4], boxes[:, :4]), list[int]()
     for row in range(len(boxes)):
@@ -199,6 +210,7 @@ def _observe(
     score: float,
     label: str,
     whole: bool,
+    rows: tuple[int, ...],
     covered: bool,
     rays: Floats,
     stated: EdgeSigma | None,
@@ -211,6 +223,8 @@ def _observe(
     rel = (config.sigma_edge_rel,) * 2 if stated is None else stated.rel[2:]
     px = config.sigma_edge_px if stated is None else stated.px
     upper, lower = (factor * math.hypot(height_px * max(r, config.sigma_edge_rel), px) / camera.fy_px for r in rel)
+    if covered:
+        lower = math.hypot(lower, height_px * config.sigma_covered_rel / camera.fy_px)
     margin_px = config.cut_margin_px + 0.02 * height_px
     cut_bottom = y2 > camera.height_px - margin_px
     cut_top = y1 < config.cut_margin_px
@@ -231,4 +245,5 @@ def _observe(
         log_width=math.log(max(width_px, 1.0) / camera.fx_px),
         hidden=config.hidden_cut if cut_bottom else config.hidden_covered if covered else config.hidden,
         whole=whole,
+        rows=rows,
     )

@@ -71,9 +71,9 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     crossing: float = 0.3  # of those who move
     turns_after_s: float = 10.0  # from one way of moving to another
     stop_mps: float = 0.08  # 1-sigma of the velocity of who stands: they sway
-    sigma_tilt_rad: float = 0.012  # of the road at somebody against the ego's, beside the front end's own sigma
+    sigma_tilt_rad: float = 0.008  # of the road at somebody against the ego's, beside the front end's own sigma
     tilt_memory_s: float = 5.0  # of driving: how long that lasts
-    tilt_drift_rad: float = 0.006  # and by how much it changes within a second as people walk on
+    tilt_drift_rad: float = 0.003  # and by how much it changes within a second as people walk on
     driving_mps: float = 1.0  # as `GroundSizeConfig.driving_mps`
     sigma_roll_rad: float = 0.01  # of the front end's roll, which tilts what is aside
     kerb_m: float = -0.03  # people are on pavements too
@@ -83,7 +83,7 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     box_memory_s: float = 0.4  # for so long a box has the same error: this time counts as one box
     width_memory_s: float = 5.0  # and its width, by clothes and by what is carried: it counts once in so long
     outline_memory_s: float = 2.0  # errors that last: a box that is drawn too low or too high, by
-    sigma_outline_rel: float = 0.05  # of its height
+    sigma_outline_rel: float = 0.04  # of its height
     sure_feet: float = 0.01  # a box whose feet are hidden with less probability tells of the road
     sigma_common_rel: float = 0.03  # of the mean height of those who are there
 

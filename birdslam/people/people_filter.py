@@ -171,6 +171,7 @@ class PeopleFilter:
             return
         at = np.asarray(rows)
         z, R = self._measured(at, boxes)  # (M, 4), (M, 4, 4)
+        counts = np.minimum(1.0, self._unseen_s[at] / self.config.box_memory_s)[:, None, None]  # as so many boxes
         hidden = np.array([box.hidden for box in boxes])
         x0, P0 = self._x[at][:, :, None], self._P[at][:, :, None]  # (M, K, 1, 9)
         x = np.repeat(x0, 2, axis=2)
@@ -179,49 +180,58 @@ class PeopleFilter:
             noise = np.broadcast_to(R[:, None, None], (*x.shape[:3], 4, 4)).copy()
             hide_feet(noise[:, :, 1], np.exp(expected[:, :, 0, TALL]), self.config)
             PJt = P0 @ J.swapaxes(-1, -2)
-            S = J @ PJt + noise
+            of_one_box = J @ PJt + noise
+            S = J @ PJt + noise / counts[..., None, None]
             innovation = z[:, None, None] - expected - ((x0 - x)[..., None, :] @ J.swapaxes(-1, -2))[..., 0, :]
             information = np.linalg.inv(S)
             gain = PJt @ information
             x = x0 + (gain @ innovation[..., None])[..., 0]
         P = P0 - gain @ PJt.swapaxes(-1, -2)
         P = (P + P.swapaxes(-1, -2)) / 2.0
-        squared = (innovation[..., None, :] @ information @ innovation[..., None])[..., 0, 0]
-        log_likelihood = -0.5 * (squared + np.linalg.slogdet(S)[1])
-        log_weight = log_likelihood + np.log(np.stack([1.0 - hidden, hidden], axis=1))[:, None]
-        log_weight += np.log(np.maximum(self._weight[at], 1e-300))[:, :, None]
-        log_weight -= log_weight.max(axis=(1, 2), keepdims=True)
-        weight = np.exp(log_weight)
-        weight /= weight.sum(axis=(1, 2), keepdims=True)
-        share = weight / np.maximum(weight.sum(axis=2, keepdims=True), 1e-300)
-        self._x[at], self._P[at] = merged(x, P, share)
-        of_filters = np.maximum(weight.sum(axis=2), MIN_WEIGHT)
-        self._weight[at] = of_filters / of_filters.sum(axis=1, keepdims=True)
+        # Boxes with the same error are evidence of one: else the filter that expects least wins by being repeated
+        squared = (innovation[..., None, :] @ np.linalg.inv(of_one_box) @ innovation[..., None])[..., 0, 0]
+        evidence = -0.5 * (squared + np.linalg.slogdet(of_one_box)[1])
+        evidence += np.log(np.stack([1.0 - hidden, hidden], axis=1))[:, None]
+        most = evidence.max(axis=2, keepdims=True)
+        share = np.exp(evidence - most)
+        total = share.sum(axis=2, keepdims=True)
+        self._x[at], self._P[at] = merged(x, P, share / total)
+        log_weight = np.log(np.maximum(self._weight[at], 1e-300)) + (counts * (most + np.log(total)))[..., 0]
+        weight = np.maximum(np.exp(log_weight - log_weight.max(axis=1, keepdims=True)), MIN_WEIGHT)
+        self._weight[at] = weight / weight.sum(axis=1, keepdims=True)
         self._unseen_s[at] = 0.0
 
     def _measured(self, at: NDArray[np.intp], boxes: Sequence[PersonBox]) -> tuple[Floats, Floats]:
-        """(M, 4) of the boxes, and their covariances (M, 4, 4), more where an error is the one of the frames before."""
-        config = self.config
+        """(M, 4) of the boxes, and their covariances (M, 4, 4)."""
         z, R = measured_boxes(boxes)
-        unseen_s = self._unseen_s[at]
-        R *= np.maximum(1.0, config.box_memory_s / unseen_s)[:, None, None]
-        uses = np.array([b.whole for b in boxes]) & (unseen_s >= config.width_memory_s)
+        uses = np.array([b.whole for b in boxes]) & (self._unseen_s[at] >= self.config.width_memory_s)
         R[:, WIDTH, WIDTH] = np.where(uses, self._sizes[at, 3], UNUSED) ** 2
         return z, R
 
-    def moments(self, after_s: float = 0.0) -> Moments:
-        """Of everybody, `after_s` later, as they move."""
+    def moments(self, after_s: float = 0.0, stands: NDArray[np.bool_] | None = None) -> Moments:
+        """Of everybody, `after_s` later, as they move.
+
+        The velocity is the one of whoever moves, or none of whom `stands` (N,); its covariance is about that, with the
+        probability of the other in it.
+        """
         mean, cov = merged(self._x, self._P, self._weight)
+        standing = self._weight[:, STANDING_FILTERS].sum(axis=1)
+        moving = self._weight.copy()
+        moving[:, STANDING_FILTERS] = 0.0
+        velocity = (moving[..., None] * self._x[..., VELOCITY]).sum(axis=1) / moving.sum(axis=1)[:, None]
+        if stands is not None:
+            velocity[stands] = 0.0
+        off = mean[:, VELOCITY] - velocity
+        mean[:, VELOCITY] = velocity
+        cov[:, VELOCITY, VELOCITY] += off[:, :, None] * off[:, None, :]
         if after_s > 0.0 and len(mean):
             F = np.eye(len(STATES))
             F[X, VX] = F[Y, VY] = after_s
             mean, cov = mean @ F.T, F @ cov @ F.T
-            q = (1.0 - self._weight[:, STANDING_FILTERS].sum(axis=1)) * np.square(self._sizes[:, 1])
+            q = (1.0 - standing) * np.square(self._sizes[:, 1])
             cov[:, [X, Y], [X, Y]] += (q * after_s**3 / 3.0)[:, None]
             cov[:, [VX, VY], [VX, VY]] += (q * after_s)[:, None]
-        return Moments(
-            mean, cov, self._weight[:, STANDING_FILTERS].sum(axis=1), self._weight[:, CHILD_FILTERS].sum(axis=1)
-        )
+        return Moments(mean, cov, standing, self._weight[:, CHILD_FILTERS].sum(axis=1))
 
     def expect_tilt(self, rows: Sequence[int], tilt_prior: Floats) -> None:
         """What the next frames draw the tilts in `rows` to, (M, 2)."""

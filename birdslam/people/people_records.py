@@ -20,7 +20,8 @@ def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[Followed
     if not tracks or frame is None:
         return ()
     after_s = max(0.0, (present.t_source_ns - frame.ego.t_source_ns) * 1e-9)
-    moments = tracker.filter.moments(after_s)
+    stand = np.array([track.stands and track.hits >= KNOWN_FRAMES for track in tracks], dtype=np.bool_)
+    moments = tracker.filter.moments(after_s, stand)
     R, T = present.T_world_ego.rotation(), present.T_world_ego
     at = (moments.mean[:, :2] - [T.x_m, T.y_m]) @ R
     velocity = moments.mean[:, VX:HEIGHT] @ R
@@ -33,9 +34,8 @@ def followed_people(tracker: PeopleTracker, present: EgoFrame) -> tuple[Followed
             continue
         height_m = math.exp(float(moments.mean[k, HEIGHT]))
         sizes = tracker.config.people.sizes(track.label)
-        stands = track.stands and track.hits >= KNOWN_FRAMES
-        vx, vy = (0.0, 0.0) if stands else velocity[k].tolist()
-        moves = Moves.STANDING if stands else Moves.DRIVING if track.hits >= KNOWN_FRAMES else Moves.UNDECIDED
+        vx, vy = velocity[k].tolist()
+        moves = Moves.STANDING if stand[k] else Moves.DRIVING if track.hits >= KNOWN_FRAMES else Moves.UNDECIDED
         out.append(
             FollowedPerson(
                 person=track.person,

@@ -34,7 +34,7 @@ SIDE_MARGIN = 0.03  # of the image's width: who is predicted farther outside has
 UNKNOWN_MPS = 10.0  # an ego of unknown motion is taken to drive
 LEAVES_S = 0.3  # until who left the image is forgotten
 
-STANDS, WALKS = 0.85, 0.5  # probability of standing: hysteresis of what is reported
+STANDS, WALKS = 0.7, 0.4  # probability of standing: hysteresis of what is reported
 
 
 class PeopleTrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -25,7 +25,6 @@ class BagTopics(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     image: str = ""  # sensor_msgs/Image or CompressedImage; "": the only one that is there
     camera_info: str = ""  # sensor_msgs/CameraInfo; "": the one beside the image's topic, or the only one
     speed: str = ""  # the car's own speed: TwistStamped, TwistWithCovarianceStamped or Odometry; "": none
-    gnss: str = ""  # sensor_msgs/NavSatFix of a live drive, which comes to Earth by them; "": none
     truth: str = ""  # for `evaluate odometry`: nav_msgs/Odometry or sensor_msgs/NavSatFix; "": none
 
 

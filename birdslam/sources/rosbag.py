@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -157,6 +157,15 @@ class RosbagRecording(Recording):
             except ValueError as unfit:
                 error = str(unfit)
         return RecordedFrame(index, t_ns, image, error and f"{self._path}: {self._topic}: image {index}: {error}")
+
+    def timed(self, topic: str, *types: str) -> list[tuple[int, Any]]:
+        """The messages of another topic of these types, with their times by the images' clock. Raises DatasetError."""
+        try:
+            with Bag(self._path) as bag:
+                bag.find(topic, *types)
+                return [(self._time_ns(message), message.content) for message in bag.messages(topic)]
+        except BagError as error:
+            raise DatasetError(str(error)) from None
 
     def truth_poses(self) -> NDArray[np.float64] | None:
         """(N, 3, 4) rows of the camera at the frames, by the topic of truth; nan outside its time."""

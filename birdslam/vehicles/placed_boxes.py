@@ -58,9 +58,18 @@ class PlacedBox(msgspec.Struct, frozen=True, kw_only=True):
         return math.sqrt(max(0.0, direction @ cov @ direction))
 
 
-def place_boxes(count: int, frame_id: int, tracks: Sequence[Track], estimate: Estimate) -> tuple[PlacedBox | None, ...]:
-    """What is known of each of so many boxes of one frame; None for a box that is no vehicle on the road."""
-    reported = {vehicle.vehicle: vehicle for vehicle in estimate.vehicles}
+def place_boxes(
+    count: int,
+    frame_id: int,
+    tracks: Sequence[Track],
+    people: Sequence[tuple[int, Sequence[int]]],
+    estimate: Estimate,
+) -> tuple[PlacedBox | None, ...]:
+    """What is known of each of so many boxes of one frame; None for a box of nobody on the road.
+
+    `people` are the numbers of those who were seen in it, with the rows of their boxes: a rider has two.
+    """
+    reported = {user.vehicle: user for user in estimate.road_users}
     placed: list[PlacedBox | None] = [None] * count
     for track in tracks:
         if track.frame.frame_id == frame_id:
@@ -68,6 +77,10 @@ def place_boxes(count: int, frame_id: int, tracks: Sequence[Track], estimate: Es
             placed[track.observation.row] = (
                 _seen(track) if vehicle is None else _reported(vehicle, estimate.T_world_ego)
             )
+    for person, rows in people:
+        if person in reported:
+            for row in rows:
+                placed[row] = _reported(reported[person], estimate.T_world_ego)
     return tuple(placed)
 
 

@@ -1,37 +1,38 @@
-"""One film at other sizes, rates and compressions: whether it gives the same metres.
+"""One film at other sizes, rates and compressions, with things in the way, begun later: does it give the same metres?
 
-    python -m perf films [FILM ...] [--output DIR] [--data DIR] [--variant NAME ...] [--begin-at S ...] [--seconds S]
+    python -m perf films [FILM ...] [--part PART ...] [--seconds S] [--begin-at S ...] [--output DIR] [--data DIR]
                          [--networks] [--model ROLE=PATH ...]
+    python -m perf films FILM --run DIR     # what `birdslam run --output DIR` left of it, by seconds
 
 A film is a name of FILMS. Its camera is found as `birdslam run` finds it, once, and kept in DIR/NAME.toml, from where
-it is taken again. Each variant (film_variants.py) is driven by the odometry alone, with what the networks
-see of it. Rows: valid frames after the first 2 s, the first valid one, speed over the truth (median over valid frames,
-and the median of its deviation from that), way over that of the unchanged film. Writes films.json, films.md, films.png.
+it is taken again. Each variant of a part (film_variants.py) is driven for some seconds by the odometry alone; the
+networks look at the unchanged film. Rows: film_figures.py. Writes films.json, films.md, films.png.
 """
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.bench.ego.trajectory_errors import from_first
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.odometry.odometry import Odometry
+from birdslam.outputs.drive_files import FRAMES_FILE
 from birdslam.perception import ModelError
 from birdslam.perf.accuracy.drives import is_valid, networks_of
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import add_data, add_networks, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
-from birdslam.perf.robustness.film_variants import Timed, Variant, variants
+from birdslam.perf.robustness.film_figures import Course, TrueSpeed, course_of_run, draw, over, page, row_text, summary
+from birdslam.perf.robustness.film_variants import PARTS, Timed, Variant, variants
 from birdslam.runtime.calibration.drive import ROUGH, calibrate_drive
 from birdslam.runtime.calibration.given import Given
 from birdslam.runtime.calibration.report import write_camera_file
@@ -43,15 +44,12 @@ from birdslam.sources.recording import DatasetError, Recording
 from birdslam.trajectory import as_poses, inverse
 from birdslam.types import NS_PER_S, Frame
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
 label = "one film at other sizes, rates, compressions, and with things in the way: the same metres?"
 
 Floats = NDArray[np.float64]
-Look = Callable[[int, int, NDArray[np.uint8]], tuple[Floats, NDArray[np.bool_] | None]]
-_BEGINNING_S = 2.0  # of a film, after which it should be valid
-ALIKE = 0.03  # of the way: so near the variants of one film should be
+Seen = tuple[Floats, NDArray[np.bool_] | None]  # boxes (N, 4) and the road (H, W), by networks
+BEGINS_S = {"starts": (0.0, 5.0, 12.0)}  # of the film; of other parts its beginning alone
+SECONDS = 5.0  # of each variant
 
 
 @dataclass(frozen=True)
@@ -86,9 +84,10 @@ DEFAULT = ("town", "motorway", "00", "0005")
 def run(arguments: list[str]) -> None:
     parser = benchmark_parser("films", label, output="folder of films.json, films.md, films.png and the cameras")
     parser.add_argument("films", nargs="*", metavar="FILM", help=f"of {', '.join(FILMS)}")
-    parser.add_argument("--variant", action="append", default=[], metavar="NAME", help="this one alone; repeatable")
-    parser.add_argument("--begin-at", type=float, nargs="+", default=[0.0], metavar="S", help="of the film")
-    parser.add_argument("--seconds", type=float, default=np.inf, help="of each variant")
+    parser.add_argument("--part", action="append", choices=PARTS, help="this one alone; repeatable")
+    parser.add_argument("--begin-at", type=float, nargs="+", metavar="S", help="of the film")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="of each variant")
+    parser.add_argument("--run", type=Path, metavar="DIR", help="compare what `birdslam run` left there of the film")
     add_data(parser)
     add_networks(parser)
     options = parser.parse_args(arguments)
@@ -96,31 +95,42 @@ def run(arguments: list[str]) -> None:
     if unknown:
         raise PerfError(f"{', '.join(sorted(unknown))}: no such film; there are {', '.join(FILMS)}")
     cv2.setNumThreads(1)
-    output = options.output
     try:
-        with Ledger(None if output is None else output / "films.json", label) as ledger:
-            for name in options.films or DEFAULT:
-                film = FILMS[name]
-                camera = camera_of(name, film, options.data, output)
-                recording = open_recording(film.uri.format(data=options.data), camera)
-                true_mps = truth(film, recording, options.data)
-                found = [v for v in variants(recording.camera) if not options.variant or v.name in options.variant]
-                for begin_s in options.begin_at:
+        if options.run is not None:
+            print(text_of_run(options.run, options.films, options.data))
+            return
+        rows = measure_all(options)
+    except (DatasetError, ModelError) as error:
+        raise PerfError(str(error)) from error
+    if options.output is not None:
+        (options.output / "films.md").write_text(page(rows), encoding="utf-8")
+        draw(rows, options.output / "films.png")
+        print(f"results in {options.output}")
+
+
+def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """A row for each variant of each part of each film."""
+    output, configuration = options.output, networks_of(options)
+    path = None if output is None else output / "films.json"
+    with Ledger(path, label, seconds=options.seconds, networks=configuration is not None) as ledger:
+        for name in options.films or DEFAULT:
+            film = FILMS[name]
+            camera = camera_of(name, film, options.data, output)
+            recording = open_recording(film.uri.format(data=options.data), camera)
+            true_mps = truth(film, recording, options.data)
+            for part in options.part or PARTS:
+                for begin_s in options.begin_at or BEGINS_S.get(part, (0.0,)):
+                    span_s = begin_s, begin_s + options.seconds
+                    seen = looks(recording, span_s, configuration)
                     unchanged: dict[str, Any] | None = None
-                    for variant in found:
-                        span_s = begin_s, begin_s + options.seconds
-                        figures = measure(recording, variant, span_s, true_mps, networks_of(options))
+                    for variant in variants(recording.camera, part):
+                        figures = summary(drive(recording, variant, span_s, true_mps, seen))
                         unchanged = unchanged or figures
                         figures["way_over_unchanged"] = over(figures, unchanged)
                         begun = "" if begin_s == 0.0 else f", from {begin_s:g} s"
-                        ledger.add(f"{name}: {variant.name}{begun}", row_text(figures), **figures)
-            rows = ledger.content["rows"]
-    except (DatasetError, ModelError) as error:
-        raise PerfError(str(error)) from error
-    if output is not None:
-        (output / "films.md").write_text(table(rows), encoding="utf-8")
-        draw(rows, output / "films.png")
-        print(f"results in {output}")
+                        ledger.add(f"{name}: {variant.name}{begun}", row_text(figures), film=name, part=part, **figures)
+        rows: list[dict[str, Any]] = ledger.content["rows"]
+    return rows
 
 
 def camera_of(name: str, film: Film, data: Path, output: Path | None) -> Camera | None:
@@ -136,85 +146,83 @@ def camera_of(name: str, film: Film, data: Path, output: Path | None) -> Camera 
     return found.camera
 
 
-@dataclass
-class Course:
-    """What a variant came to: of each motion its end (s), its speed (m/s), the true one, and whether it is valid."""
+def text_of_run(folder: Path, films: list[str], data: Path) -> str:
+    """What a run of one film left in its folder, against the film's truth. Raises PerfError, DatasetError."""
+    if len(films) != 1:
+        raise PerfError("--run needs the name of its film")
+    if not (folder / FRAMES_FILE).is_file():
+        raise PerfError(f"{folder / FRAMES_FILE} is not there: `birdslam run --output DIR` writes it")
+    film = FILMS[films[0]]
+    recording = open_recording(film.uri.format(data=data)) if film.height_m is None else None
+    figures = summary(course_of_run(folder / FRAMES_FILE, truth(film, recording, data)))
+    return f"{films[0]}: {figures['valid']:.1%} of {figures['frames']} frames valid  {row_text(figures)}"
 
-    t_s: list[float] = field(default_factory=list)
-    speed_mps: list[float] = field(default_factory=list)
-    true_mps: list[float] = field(default_factory=list)
-    valid: list[bool] = field(default_factory=list)
 
-
-def measure(
+def drive(
     recording: Recording,
     variant: Variant,
     span_s: tuple[float, float],
-    true_mps: Callable[[float, float], float],
-    configuration: Configuration | None,
-) -> dict[str, Any]:
-    """One variant of a film, driven from `span_s`[0] to `span_s`[1]; `true_mps` between two times in s."""
+    true_mps: TrueSpeed,
+    looks: Callable[[int], Seen],
+) -> Course:
+    """One variant of a film, driven from `span_s`[0] to `span_s`[1], with what networks saw by each time."""
     camera = variant.camera(recording.camera)
     odometry, undistort = Odometry(camera), Undistorter(camera)
-    configuration = None if configuration is None else complete(configuration, camera, recording.rate_hz)
-    course, times_ns = Course(), []
-    with tempfile.TemporaryDirectory() as folder, _looks(configuration) as look:
+    course, times_ns = Course(), list[int]()
+    with tempfile.TemporaryDirectory() as folder:
         images = variant.images(_within(recording, span_s), Path(folder))
         for k, (t_ns, raw) in enumerate(images):
-            image = undistort(raw)
             times_ns.append(t_ns)
-            motion = odometry.estimate(odometry.track(image), k, t_ns, *look(k, t_ns, image))
+            boxes_px, road = _at_size(looks(t_ns), recording.camera, camera)
+            motion = odometry.estimate(odometry.track(undistort(raw)), k, t_ns, boxes_px, road)
             begin_ns = times_ns[k if motion is None else motion.from_frame]
             if motion is None or begin_ns == t_ns:
                 continue
-            course.t_s.append((t_ns - times_ns[0]) / NS_PER_S)
-            course.speed_mps.append(float(np.linalg.norm(motion.t_prev_curr_m)) / (t_ns - begin_ns) * NS_PER_S)
-            course.true_mps.append(true_mps(begin_ns / NS_PER_S, t_ns / NS_PER_S))
-            course.valid.append(is_valid(motion))
-    return summary(course)
+            begin_s, end_s = begin_ns / NS_PER_S, t_ns / NS_PER_S
+            mps = float(np.linalg.norm(motion.t_prev_curr_m)) / (end_s - begin_s)
+            course.add(end_s - times_ns[0] / NS_PER_S, mps, true_mps(begin_s, end_s), is_valid(motion))
+    return course
 
 
-def summary(course: Course) -> dict[str, Any]:
-    """The figures of a row."""
-    t_s, valid = np.array(course.t_s), np.array(course.valid, bool)
-    ratio = np.array(course.speed_mps) / np.maximum(np.array(course.true_mps), 0.1)
-    counted = valid & (t_s > _BEGINNING_S) & (np.array(course.true_mps) > 1.0)
-    median = float(np.median(ratio[counted])) if counted.any() else None
-    return {
-        "frames": len(t_s),
-        "valid_after_2_s": float(valid[t_s > _BEGINNING_S].mean()) if (t_s > _BEGINNING_S).any() else 0.0,
-        "first_valid_s": float(t_s[valid.argmax()]) if valid.any() else None,
-        "speed_over_truth": median,
-        "deviation": None if median is None else float(np.median(np.abs(ratio[counted] / median - 1.0))),
-        "by_second": _by_second(t_s, np.where(valid, ratio, np.nan)),
-    }
+def looks(
+    recording: Recording, span_s: tuple[float, float], configuration: Configuration | None
+) -> Callable[[int], Seen]:
+    """What the networks see of the unchanged film, by time: that of the newest image."""
+    nothing: Seen = (np.zeros((0, 4)), None)
+    if configuration is None:
+        return lambda t_ns: nothing
+    undistort, seen = Undistorter(recording.camera), dict[int, Seen]()
+    with Inference(complete(configuration, recording.camera, recording.rate_hz)) as inference:
+        for k, (t_ns, raw) in enumerate(_within(recording, span_s)):
+            found = inference.start(Frame(k, t_ns, t_ns, 0, undistort(raw))).result()
+            boxes_px = nothing[0] if found.detections is None else found.detections.boxes_px
+            seen[t_ns] = boxes_px, None if found.segmentation is None else found.segmentation.road
+    times_ns = np.array(list(seen), np.int64)
+    return lambda t_ns: seen[int(times_ns[max(int(np.searchsorted(times_ns, t_ns, side="right")) - 1, 0)])]
 
 
-def _by_second(t_s: Floats, ratio: Floats) -> list[float | None]:
-    out: list[float | None] = []
-    for second in range(int(t_s[-1]) + 1 if len(t_s) else 0):
-        here = ratio[(t_s >= second) & (t_s < second + 1)]
-        here = here[np.isfinite(here)]
-        out.append(round(float(np.median(here)), 3) if len(here) else None)
-    return out
+def _at_size(seen: Seen, given: Camera, camera: Camera) -> Seen:
+    """What was seen in images of the given camera, in those of one of another size."""
+    boxes_px, road = seen
+    width_px, height_px = camera.width_px, camera.height_px
+    if (width_px, height_px) == (given.width_px, given.height_px):
+        return seen
+    boxes_px = (boxes_px + 0.5) * np.tile([width_px / given.width_px, height_px / given.height_px], 2) - 0.5
+    if road is not None:
+        road = cv2.resize(road.astype(np.uint8), (width_px, height_px), interpolation=cv2.INTER_NEAREST) > 0
+    return boxes_px, road
 
 
-def over(figures: dict[str, Any], unchanged: dict[str, Any]) -> float | None:
-    """The way over that of the unchanged film: median over the seconds in which both are valid."""
-    both = [(a, b) for a, b in zip(figures["by_second"], unchanged["by_second"], strict=False) if a and b]
-    return float(np.median([a / b for a, b in both])) if both else None
-
-
-def truth(film: Film, recording: Recording, data: Path) -> Callable[[float, float], float]:
-    """The true speed between two times in s of the recording. Raises DatasetError."""
+def truth(film: Film, recording: Recording | None, data: Path) -> TrueSpeed:
+    """The true speed; only a film without its own truth needs none of the recording's. Raises DatasetError."""
     if film.speed_mps is not None:
         speed_mps = film.speed_mps
         return lambda begin_s, end_s: speed_mps
     if film.gps is not None:
         t_s, *_, mps = np.loadtxt(data / film.gps, delimiter=",", skiprows=1).T
         return lambda begin_s, end_s: float(np.interp(0.5 * (begin_s + end_s), t_s, mps))
-    rows = recording.truth_poses()
-    if rows is None:
+    rows = None if recording is None else recording.truth_poses()
+    if recording is None or rows is None:
         raise DatasetError(f"{film.uri}: has no truth")
     T = recording.T_cam0_cam()
     at_m = from_first(inverse(T) @ as_poses(rows) @ T)[:, :3, 3]
@@ -232,66 +240,7 @@ def _within(recording: Recording, span_s: tuple[float, float]) -> Iterator[Timed
     for frame in recording.frames():
         first_ns = frame.t_source_ns if first_ns is None else first_ns
         at_s = (frame.t_source_ns - first_ns) / NS_PER_S
-        if frame.image is not None and span_s[0] <= at_s < span_s[1]:
+        if at_s >= span_s[1]:
+            return
+        if frame.image is not None and at_s >= span_s[0]:
             yield frame.t_source_ns, frame.image
-
-
-@contextmanager
-def _looks(configuration: Configuration | None) -> Iterator[Look]:
-    """What takes an image's number, time and pixels, and gives the networks' boxes and road."""
-    if configuration is None:
-        yield lambda k, t_ns, image: (np.zeros((0, 4)), None)
-        return
-    with Inference(configuration) as inference:
-
-        def look(k: int, t_ns: int, image: NDArray[np.uint8]) -> tuple[Floats, NDArray[np.bool_] | None]:
-            found = inference.start(Frame(k, t_ns, t_ns, 0, image)).result()
-            boxes = np.zeros((0, 4)) if found.detections is None else found.detections.boxes_px
-            return boxes, None if found.segmentation is None else found.segmentation.road
-
-        yield look
-
-
-def row_text(figures: dict[str, Any]) -> str:
-    """A row for a person."""
-    return (
-        f"valid {figures['valid_after_2_s']:.0%} from {_text(figures['first_valid_s'], '.2f')} s on  speed over truth "
-        f"{_text(figures['speed_over_truth'], '.3f')} +- {_text(figures['deviation'], '.1%')}  over the unchanged "
-        f"{_text(figures['way_over_unchanged'], '.3f')}"
-    )
-
-
-def _text(figure: float | None, form: str) -> str:
-    return "-" if figure is None else format(figure, form)
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """The rows as a page."""
-    head = "| film | valid after 2 s | first valid, s | speed over truth | deviation | way over the unchanged |"
-    lines = [head, "|---|---|---|---|---|---|"]
-    lines += [
-        (
-            f"| {row['name']} | {row['valid_after_2_s']:.0%} | {_text(row['first_valid_s'], '.2f')} | "
-            f"{_text(row['speed_over_truth'], '.3f')} | {_text(row['deviation'], '.1%')} | "
-            f"{_text(row['way_over_unchanged'], '.3f')} |"
-        )
-        for row in rows
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Speed over truth by seconds, a panel for each film."""
-    films = list(dict.fromkeys(row["name"].partition(":")[0] for row in rows))
-    figure, panels = plt.subplots(len(films), 1, figsize=(10, 3.2 * len(films)), squeeze=False)
-    for name, panel in zip(films, panels[:, 0], strict=True):
-        for row in rows:
-            film, _, variant = row["name"].partition(": ")
-            if film == name:
-                ratio = [np.nan if value is None else value for value in row["by_second"]]
-                panel.plot(np.arange(len(ratio)) + 0.5, ratio, label=variant, linewidth=1)
-        panel.set(title=name, xlabel="s", ylabel="speed over truth", ylim=(0.0, 2.0))
-        panel.legend(fontsize=6, ncols=2)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,9 @@ from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import DESCRIPTOR_BYTES, FeatureExtractor, FeatureKind
 from birdslam.loops.keyframe import Keyframe
 from birdslam.loops.keyframe_builder import MOST_POINTS, SPACING_M
-from birdslam.loops.localiser import Localisation, MapState
+from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_file import decode_map, encode_map
+from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory
@@ -99,7 +101,7 @@ def recorded(ledger: Ledger, data: Path, kinds: Sequence[FeatureKind]) -> None:
             row = judged(found, truth) | {"MB_a_km": round(len(kept) / 1e3 / max(decode_map(kept).length_m, 1.0), 2)}
             ledger.add(f"{kind}: {other} in the map of {name}", row_text(row), **row)
             for street, drive_ in others.items():
-                states = [each.state for each in localised(drive_, kept, kind).localised()]
+                states = localised(drive_, kept, kind).poses
                 ledger.add(
                     f"{kind}: {street} in the map of {name}",
                     f"{len(states)} of {len(drive_[1])} frames localised: all of them would be false",
@@ -118,22 +120,33 @@ def mapped(camera: Camera, frames: Seen, kind: FeatureKind) -> PlaceMap:
     return place_map
 
 
-def localised(through: tuple[Camera, Seen], kept: bytes, kind: FeatureKind) -> MapTrajectory:
+@dataclass(frozen=True)
+class Localised:
     """A drive in a kept map, as `birdslam run --map-only` writes it."""
+
+    rows: list[Localisation]
+    frames_before: int  # the first that was localised while driving
+
+    @property
+    def poses(self) -> list[Localisation]:
+        return [row for row in self.rows if row.state is MapState.LOCALISED]
+
+
+def localised(through: tuple[Camera, Seen], kept: bytes, kind: FeatureKind) -> Localised:
     camera, frames = through
     session, trajectory = MapSession(camera, decode_map(kept), False, FeatureExtractor(kind)), MapTrajectory()
+    rows: list[Localisation] = []
     for estimate, image in frames:
-        trajectory.add(session.step(estimate, image), estimate)
-    return trajectory
+        rows += trajectory.add(session.step(estimate, image), estimate)
+    rows += trajectory.finish()
+    return Localised(rows, trajectory.frames_before)
 
 
-def judged(trajectory: MapTrajectory, truth: Sequence[SE2]) -> dict[str, Any]:
+def judged(trajectory: Localised, truth: Sequence[SE2]) -> dict[str, Any]:
     """The localised frames against where the map's own drive says that they are."""
-    found = trajectory.localised()
-    counts = trajectory.counts
-    row: dict[str, Any] = {"frames": sum(counts.values()), "localised": len(found)}
-    first = [place for place, state in enumerate(trajectory.as_found) if state is MapState.LOCALISED]
-    row["frames_to_localise"] = first[0] if first else None
+    found = trajectory.poses
+    row: dict[str, Any] = {"frames": len(trajectory.rows), "localised": len(found)}
+    row["frames_to_localise"] = trajectory.frames_before
     if found:
         error = np.array([truth[each.frame_id].between(each.T_map_ego).log() for each in found if each.T_map_ego])
         sigma = np.array([np.sqrt(np.diag(each.cov)) for each in found])

@@ -77,19 +77,30 @@ class Variant:
             yield t_ns, image
 
 
-def variants(camera: Camera) -> list[Variant]:
-    """Those of a film of this camera, the unchanged one first."""
-    every = [
-        Variant("unchanged"),
-        *(Variant(f"{size:g} of the size", size=size) for size in (0.5, 0.75, 1.5, 2.0)),
-        *(Variant(f"every {n} images", every=n) for n in (2, 3)),
-        Variant("each image twice", repeats=2),
-        *(Variant(f"H.264, crf {crf}", crf=crf) for crf in (18, 28, 35)),
-        Variant("caption", shown=_caption),
-        Variant("bonnet", shown=_bonnet),
-        Variant("flicker", shown=_flicker),
-    ]
+PARTS = ("starts", "sizes", "compression", "view")
+_SIZES, _EVERY = (1.0, 0.5, 0.75, 2.0), (1, 2, 3)
+
+
+def variants(camera: Camera, part: str) -> list[Variant]:
+    """Those of a part of PARTS for a film of this camera, the unchanged one first."""
+    every = {
+        "starts": [_other(1.0, 1), _other(0.5, 1), _other(1.0, 2), _other(1.0, 3)],
+        "sizes": [_other(size, n) for size in _SIZES for n in _EVERY],
+        "compression": [Variant("unchanged"), *(Variant(f"H.264, crf {crf}", crf=crf) for crf in (18, 23, 28, 35))],
+        "view": [
+            Variant("unchanged"),
+            Variant("each image twice", repeats=2),
+            Variant("caption", shown=_caption),
+            Variant("bonnet", shown=_bonnet),
+            Variant("flicker", shown=_flicker),
+        ],
+    }[part]
     return [variant for variant in every if variant.fits(camera)]
+
+
+def _other(size: float, every: int) -> Variant:
+    parts = [f"{size:g} of the size"] * (size != 1.0) + [f"every {every} images"] * (every != 1)
+    return Variant(", ".join(parts) or "unchanged", size=size, every=every)
 
 
 def _encoded(film: Iterator[Timed], crf: int | None, folder: Path) -> Iterator[Timed]:

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from birdslam.outputs.drive_files import ResultsError, claim_directory, write_json
-from birdslam.runtime.batch.drive import WORKING, Failure, done, failure_file
+from birdslam.runtime.batch.drive import DRIVES, WORKING, Failure, done, failure_file
 from birdslam.runtime.batch.drives import Task
 from birdslam.runtime.batch.local import Event, fitting_jobs, run_local
 from birdslam.runtime.batch.on_ray import run_ray
+from birdslam.runtime.batch.one_map import Joined, join
 from birdslam.runtime.batch.report import write_report
 from birdslam.runtime.progress import Progress
 
@@ -28,13 +29,16 @@ class BatchOutcome:
     drives: int
     failed: int
     interrupted: int  # not ended when Ctrl-C came
+    map: Joined | None = None  # of all drives, where one was asked for
 
 
-def run_batch(todo: Sequence[Task], output: Path, jobs: int | None, ray_address: str | None) -> BatchOutcome:
+def run_batch(
+    todo: Sequence[Task], output: Path, jobs: int | None, ray_address: str | None, map_file: Path | None = None
+) -> BatchOutcome:
     """Runs those drives that are not done, and writes the report of all.
 
-    `jobs`: drives at once, None: as many as fit; `ray_address`: of a Ray cluster, None: on this computer alone. Raises
-    ResultsError.
+    `jobs`: drives at once, None: as many as fit; `ray_address`: of a Ray cluster, None: on this computer alone;
+    `map_file`: the drives' maps become one there, when all have ended. Raises ResultsError, MapError.
     """
     with _exclusive(output):
         left = [task for task in todo if not done(output, task)]
@@ -45,7 +49,10 @@ def run_batch(todo: Sequence[Task], output: Path, jobs: int | None, ray_address:
         )
         failed, interrupted = _run(left, output, events)
         write_report(todo, output)
-    return BatchOutcome(len(todo), failed, interrupted)
+        joined = None
+        if map_file is not None and not interrupted:
+            joined = join([output / DRIVES / task.name for task in todo if done(output, task)], map_file)
+    return BatchOutcome(len(todo), failed, interrupted, joined)
 
 
 @contextlib.contextmanager

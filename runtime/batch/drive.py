@@ -23,12 +23,15 @@ import msgspec
 import numpy as np
 
 from birdslam.bench.ego.trajectory_errors import OdometryReport, evaluate_recordings
+from birdslam.loops.map_file import MapError
 from birdslam.outputs.drive_files import ResultsError, write_json
 from birdslam.perception import ModelError
+from birdslam.runtime.batch import one_map
 from birdslam.runtime.batch.drives import Task
 from birdslam.runtime.batch.fetch import local_copy
 from birdslam.runtime.batch.offline import Drive, pipeline
 from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.maps.drive_map import DriveMap
 from birdslam.runtime.nodes.sources import RecordedSource, SourceError, open_source
 from birdslam.runtime.process.child import end_with_parent
 from birdslam.sources.recording import DatasetError, Recording
@@ -37,7 +40,7 @@ from birdslam.types import NS_PER_S, Estimate, MapUpdate, Measurements
 DRIVES, WORKING, FAILED = "drives", ".working", "failed"
 RESULT = "result.json"
 TOP_PERCENTILE = 95.0  # of the speeds: a single wrong step is no top speed
-EXPECTED = (ConfigurationError, DatasetError, ModelError, ResultsError, SourceError, OSError)
+EXPECTED = (ConfigurationError, DatasetError, MapError, ModelError, ResultsError, SourceError, OSError)
 
 OnFrame = Callable[[int, int], object]  # called with the frames done, and of how many (0: unknown)
 
@@ -124,8 +127,13 @@ def _run(task: Task, output: Path, uri: str, on_frame: OnFrame) -> None:
     try:
         with pipeline(configuration) as drive:
             frames = min(len(recording), configuration.source.frames or len(recording))
-            motion, known = _Motion(frames, on_frame), _known(recording, frames)
+            drive_map = one_map.listener(configuration, working / task.name)
+            motion, known = _Motion(frames, on_frame, drive_map), _known(recording, frames)
             (report,) = evaluate_recordings([recording], motion.watched(drive), working, compared=known)
+        if drive_map is not None:
+            again = open_source(configuration)  # its frames once more
+            assert isinstance(again, RecordedSource)
+            drive_map.finish(recording.camera, one_map.frames(again.recording, frames), working / task.name)
         result = _result(task, working / task.name, motion, report)
         write_json(working / task.name / RESULT, result)
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -152,8 +160,8 @@ def _known(recording: Recording, frames: int) -> slice:
 class _Motion:
     """How long and how fast a drive is, by its estimates."""
 
-    def __init__(self, total: int, on_frame: OnFrame) -> None:
-        self._total, self._on_frame = total, on_frame
+    def __init__(self, total: int, on_frame: OnFrame, drive_map: DriveMap | None) -> None:
+        self._total, self._on_frame, self._map = total, on_frame, drive_map
         self.frames = 0
         self.first_ns = self.last_ns = 0
         self.speeds_mps: list[float] = []
@@ -176,6 +184,8 @@ class _Motion:
         self.first_ns = self.first_ns if self.frames else estimate.t_source_ns
         self.last_ns = estimate.t_source_ns
         self.frames += 1
+        if self._map is not None:
+            self._map.add(estimate)
         if before is not None and before.epoch == estimate.epoch and estimate.t_source_ns > before.t_source_ns:
             step = before.T_world_ego.between(estimate.T_world_ego)
             dt_s = (estimate.t_source_ns - before.t_source_ns) / NS_PER_S

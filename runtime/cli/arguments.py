@@ -68,7 +68,11 @@ def add_map(parser: argparse.ArgumentParser) -> None:
     text = "a map of places: the drive is localised in it and makes it longer, or begins it; OUTPUT/map.tum.txt"
     which.add_argument("--map", metavar="FILE", help=text)
     which.add_argument("--map-only", metavar="FILE", help="localised in this map, which stays as it is")
-    text = "GNSS fixes of the drive (CSV, NMEA, GPX): its way, and the map, on Earth; ego.geojson, ego.gpx, ego.kml"
+    which.add_argument("--no-map", action="store_true", help="whatever the configuration says: for small computers")
+    text = (
+        "GNSS fixes: a file (CSV, NMEA, GPX), topic:/NAME of a ROS bag, or a receiver /dev/TTY[@BAUD]; "
+        "the drive's way, and the map, on Earth: ego.geojson, ego.gpx, ego.kml"
+    )
     parser.add_argument("--gnss", metavar="FILE", help=text)
 
 

@@ -1,8 +1,8 @@
 """What a user can mend: each of these is one line on standard error, and exit status 2."""
 
 from birdslam.calibration.calibration import CalibrationError
-from birdslam.loops.earth import EarthError
-from birdslam.loops.gnss_file import GnssError
+from birdslam.loops.gnss.earth import EarthError
+from birdslam.loops.gnss.files import GnssError
 from birdslam.loops.map_file import MapError
 from birdslam.loops.merging import MergeError
 from birdslam.outputs.drive_files import ResultsError

@@ -26,7 +26,7 @@ def info(options: argparse.Namespace) -> int:
     size = options.map.stat().st_size
     poses = place_map.poses()
     loops = sum(link.loop for link in place_map.links)
-    placed = sum(not math.isnan(keyframe.latitude_deg) for keyframe in place_map.keyframes)
+    earth = place_map.earth
     camera = place_map.camera
     rows = [
         ("keyframes", f"{len(place_map)} of {place_map.drives} drives"),
@@ -39,7 +39,13 @@ def info(options: argparse.Namespace) -> int:
             f"{camera.width_px}x{camera.height_px}, fx {camera.fx_px:g} px, {camera.height_m:g} m over the road",
         ),
         ("camera file", camera.digest),
-        ("on Earth", f"{placed} keyframes" if placed else "no"),
+        (
+            "on Earth",
+            "no"
+            if earth is None
+            else f"{earth.latitude_deg:.6f}, {earth.longitude_deg:.6f}; {earth.fixes - earth.outliers} keyframes have "
+            f"fixes, rms {earth.rms_m:.2f} m",
+        ),
     ]
     if len(poses):
         low, high = poses.min(axis=0), poses.max(axis=0)

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
-from birdslam.bench.tracking.leave_one_out import LeftOut, left_out
+from birdslam.bench.tracking.by_class.class_tracks import IMAGE, KINDS, METRES, TracksRow, class_tracks, tracks_row
+from birdslam.bench.tracking.by_class.people import (
+    PeopleRow,
+    boxes_of_hulls,
+    has_labels,
+    judge,
+    summarise_people,
+)
+from birdslam.bench.tracking.leave_one_out import LeftOut, PlaceError, left_out
 from birdslam.bench.tracking.localisation import (
     CAMERA_OF_BOXES,
     CarError,
@@ -20,21 +28,15 @@ from birdslam.bench.tracking.localisation import (
     tilt_row,
 )
 from birdslam.bench.tracking.movers import MoversRow, movers_row
-from birdslam.bench.tracking.people import (
-    PeopleRow,
-    PeopleTracks,
-    boxes_of_hulls,
-    has_people,
-    judge,
-    summarise_people,
-)
 from birdslam.frontend import FrontEndConfig
 from birdslam.graph.pose_graph import PoseGraph
+from birdslam.perception import Detections
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.progress import Progress
 from birdslam.slam import SlamConfig
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.sources.recording import DatasetError
+from birdslam.types import Measurements
 
 
 class Sweep(NamedTuple):
@@ -76,26 +78,44 @@ def evaluate_people(
     config: FrontEndConfig,
     kind: str,
     tilt_from_images: bool = False,
-) -> tuple[list[PeopleRow], list[PeopleTracks]]:
-    """The errors of placed pedestrians or cyclists by range, and their tracks in bird's-eye view. Raises DatasetError.
+) -> tuple[list[PeopleRow], list[TracksRow]]:
+    """The errors of placed pedestrians or cyclists by range, and their tracks in bird's-eye view.
 
-    Sequences without labels of the kind are left out. No detector's boxes of cyclists were recorded: those of the
-    labels' hulls stand in.
+    Sequences without labels of the kind are left out. Raises DatasetError.
     """
+    logs = _logs_of_people(root, names, detections, config, kind, tilt_from_images)
+    return summarise_people([judge(sequence, log, kind) for sequence, log in logs])
+
+
+def evaluate_classes(
+    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, tilt_from_images: bool = False
+) -> list[TracksRow]:
+    """How good the tracks of each class are, in bird's-eye view and in the image. Raises DatasetError."""
+    rows: list[TracksRow] = []
+    for kind in KINDS:
+        tracks = [
+            class_tracks(sequence, log, kind)
+            for sequence, log in _logs_of_people(root, names, detections, config, kind, tilt_from_images)
+        ]
+        for view in (METRES, IMAGE):
+            rows += [tracks_row(of.sequence, view, [of]) for of in tracks]
+            rows.append(tracks_row("all", view, tracks))
+    return rows
+
+
+def _logs_of_people(
+    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, kind: str, tilt_from_images: bool
+) -> Iterator[tuple[TrackingSequence, list[Measurements]]]:
+    """The sequences with labels of a kind, with the front end's records of them."""
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
-    sequences = [sequence for sequence in sequences if has_people(sequence, kind)]
+    sequences = [sequence for sequence in sequences if has_labels(sequence, kind)]
     if not sequences:
         raise DatasetError(f"{root}: none of these sequences has labels of a {kind}")
-    folder, results = _folder(root, detections), []
-    with Progress("people", sum(map(len, sequences))) as progress:
+    with Progress(kind, sum(map(len, sequences))) as progress:
         progress.reach(0)
         for sequence in sequences:
-            found = read_detections(folder, sequence.name, len(sequence))
-            if kind == "cyclist" and detections == "rrc":
-                found = boxes_of_hulls(sequence, found, kind)
-            results.append(judge(sequence, measure(sequence, found, config, tilt_from_images), kind))
+            yield sequence, measure(sequence, _boxes(root, detections, sequence, kind), config, tilt_from_images)
             progress.advance(len(sequence))
-    return summarise_people(results)
 
 
 def evaluate_left_out(
@@ -105,16 +125,18 @@ def evaluate_left_out(
     config: FrontEndConfig,
     sweeps: Sequence[Sweep],
     tilt_from_images: bool = False,
+    kind: str = "car",
 ) -> list[LeftOut]:
     """How each sequence fares by the value that the others choose, for each sweep. Raises ConfigurationError."""
     sequences = [open_tracking(root, name, CAMERA_OF_BOXES) for name in names]
+    sequences = [sequence for sequence in sequences if has_labels(sequence, kind)]
     drives = 1 + sum(len(sweep.by_value) - 1 for sweep in sweeps)
     rows: list[LeftOut] = []
     with Progress("localisation", drives * sum(map(len, sequences))) as progress:
-        as_they_are = _errors(root, sequences, detections, config, progress.advance, tilt_from_images)
+        as_they_are = _errors(root, sequences, detections, config, progress.advance, kind, tilt_from_images)
         for key, as_it_is, by_value in sweeps:
             found = {
-                value: _errors(root, sequences, detections, varied, progress.advance, tilt_from_images)
+                value: _errors(root, sequences, detections, varied, progress.advance, kind, tilt_from_images)
                 for value, varied in by_value.items()
                 if value != as_it_is
             }
@@ -131,14 +153,21 @@ def _errors(
     detections: str,
     config: FrontEndConfig,
     advance: Callable[[int], None],
+    kind: str,
     tilt_from_images: bool = False,
-) -> dict[str, list[CarError]]:
-    folder, out = _folder(root, detections), {}
+) -> dict[str, Sequence[PlaceError]]:
+    out: dict[str, Sequence[PlaceError]] = {}
     for sequence in sequences:
-        found = read_detections(folder, sequence.name, len(sequence))
-        out[sequence.name] = match_cars(sequence, measure(sequence, found, config, tilt_from_images))
+        log = measure(sequence, _boxes(root, detections, sequence, kind), config, tilt_from_images)
+        out[sequence.name] = match_cars(sequence, log) if kind == "car" else judge(sequence, log, kind).errors
         advance(len(sequence))
     return out
+
+
+def _boxes(root: Path, detections: str, sequence: TrackingSequence, kind: str) -> list[Detections]:
+    """No detector's boxes of cyclists were recorded: those of the labels' hulls stand in."""
+    found = read_detections(_folder(root, detections), sequence.name, len(sequence))
+    return boxes_of_hulls(sequence, found, kind) if kind == "cyclist" and detections == "rrc" else found
 
 
 def _folder(root: Path, detections: str) -> Path:

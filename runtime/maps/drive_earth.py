@@ -1,31 +1,29 @@
-"""A drive on Earth: its estimates and a file of GNSS fixes, when the drive is over."""
+"""A drive on Earth, and its map: fixes and estimates in one graph, when the drive is over."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.earth import Earth, EarthError, place_on_earth
-from birdslam.loops.gnss_file import GnssError, read_fixes
+from birdslam.loops.drift import moved
+from birdslam.loops.gnss.earth import Earth, EarthError, GnssFix, place_on_earth
+from birdslam.loops.gnss.factors import Node, OnEarth, fixed_keyframes, tie
+from birdslam.loops.keyframe import Link, Placed
+from birdslam.loops.keyframe_builder import SPACING_M
 from birdslam.loops.place_map import PlaceMap
 from birdslam.outputs.earth_files import SUFFIXES, Way, write_ways
+from birdslam.runtime.maps.gnss_input import Fixes
+from birdslam.runtime.maps.map_drive import Poses
 from birdslam.types import Estimate
-
-Poses = list[tuple[int, SE2]]  # source time in ns, and the pose in one frame
-
-
-def read_gnss(path: Path) -> bytes:
-    """Raises GnssError where it can't be read; what is in it is judged with the recording's times."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise GnssError(f"{path}: can't be read: {error.strerror}") from None
 
 
 def poses_of(estimates: list[Estimate]) -> Poses:
@@ -36,34 +34,54 @@ def poses_of(estimates: list[Estimate]) -> Poses:
     return [(each.t_source_ns, each.T_world_ego) for each in estimates if each.epoch == longest]
 
 
-def write_earth(gnss: Path, poses: Poses, camera: Camera, output: Path, place_map: PlaceMap | None) -> dict[str, Any]:
-    """Writes ego.geojson, ego.gpx and ego.kml, and places the map's keyframes; what summary.json says.
+def write_earth(
+    fixes_from: Fixes | Sequence[GnssFix], poses: Poses, camera: Camera, output: Path, place_map: PlaceMap | None
+) -> dict[str, Any]:
+    """Writes ego.geojson, ego.gpx and ego.kml, and brings the map to Earth; what summary.json says.
 
     `poses` are in the map's frame where there is a map. Raises GnssError, EarthError, OSError.
     """
     if not poses:
         raise EarthError("the drive has no pose")
-    fixes = read_fixes(read_gnss(gnss), str(gnss), poses[0][0])
-    earth = place_on_earth(np.array([t_ns for t_ns, _ in poses], np.int64), [pose for _, pose in poses], fixes)
-    about = figures(earth, camera)
-    degrees = earth.wgs84(np.array([(pose.x_m, pose.y_m) for _, pose in poses]))
-    told = {key: value for key, value in about.items() if isinstance(value, int | float | str)}
-    way = Way("ego", degrees, [t_ns for t_ns, _ in poses], told)
-    for suffix in SUFFIXES:
-        write_ways(output / f"ego{suffix}", [way])
+    fixes = list(fixes_from(poses[0][0]) if callable(fixes_from) else fixes_from)
+    t_ns, way = np.array([t_ns for t_ns, _ in poses], np.int64), [pose for _, pose in poses]
+    earth = place_on_earth(t_ns, way, fixes)
+    nodes: Sequence[Placed]
     if place_map is not None and len(place_map):
-        put_on_earth(place_map, earth)
+        nodes, links, before = place_map.keyframes, place_map.links, place_map.fixed()
+    else:
+        nodes, links, before = *_nodes(way), {}
+    found = tie(earth, nodes, links, before | fixed_keyframes(earth, t_ns, way, fixes, nodes))
+    degrees = found.earth.wgs84(_bent(way, nodes, found))
+    about = figures(found.earth, camera)
+    told = {key: value for key, value in about.items() if isinstance(value, int | float | str)}
+    line = Way("ego", degrees, [t_ns for t_ns, _ in poses], told)
+    for suffix in SUFFIXES:
+        write_ways(output / f"ego{suffix}", [line])
+    if place_map is not None and len(place_map):
+        place_map.come_to_earth(found)
     return about
 
 
-def put_on_earth(place_map: PlaceMap, earth: Earth) -> None:
-    """Every keyframe's latitude and longitude."""
-    at = [keyframe.T_map_keyframe for keyframe in place_map.keyframes]
-    degrees = earth.wgs84(np.array([(T.x_m, T.y_m) for T in at]))
-    place_map.keyframes = [
-        replace(keyframe, latitude_deg=float(lat), longitude_deg=float(lon))
-        for keyframe, (lat, lon) in zip(place_map.keyframes, degrees, strict=True)
-    ]
+def _nodes(way: Sequence[SE2]) -> tuple[list[Node], list[Link]]:
+    """Of a drive without a map: one every few metres, joined by odometry."""
+    nodes, links = [Node(0, way[0])], []
+    for pose in way:
+        step = nodes[-1].T_map_keyframe.between(pose)
+        if math.hypot(step.x_m, step.y_m) >= SPACING_M:
+            links.append(Link(len(nodes) - 1, len(nodes), step, moved(np.zeros((3, 3)), step)))
+            nodes.append(Node(len(nodes), pose))
+    return nodes, links
+
+
+def _bent(way: Sequence[SE2], nodes: Sequence[Placed], found: OnEarth) -> NDArray[np.float64]:
+    """(N, 2) the drive's way as its nearest keyframes lie now."""
+    before = [node.T_map_keyframe for node in nodes]
+    moves = [found.poses[node.number][0] @ T.inverse() for node, T in zip(nodes, before, strict=True)]
+    tree = cKDTree(np.array([(T.x_m, T.y_m) for T in before]))
+    _, nearest = tree.query(np.array([(pose.x_m, pose.y_m) for pose in way]))
+    bent = [moves[int(row)] @ pose for row, pose in zip(nearest, way, strict=True)]
+    return np.array([(pose.x_m, pose.y_m) for pose in bent])
 
 
 def figures(earth: Earth, camera: Camera) -> dict[str, Any]:

@@ -52,6 +52,7 @@ def _g2o(place_map: PlaceMap) -> list[str]:
 
 
 def _way(place_map: PlaceMap, drive: int) -> Way:
-    own = [each for each in place_map.keyframes if each.drive == drive and not np.isnan(each.latitude_deg)]
-    degrees = np.array([(each.latitude_deg, each.longitude_deg) for each in own]).reshape(-1, 2)
+    own = [each.T_map_keyframe for each in place_map.keyframes if each.drive == drive and place_map.earth is not None]
+    xy = np.array([(T.x_m, T.y_m) for T in own]).reshape(-1, 2)
+    degrees = xy if place_map.earth is None else place_map.earth.wgs84(xy)
     return Way(f"drive {drive}", degrees, about={"drive": drive, "keyframes": len(own)})

@@ -10,29 +10,26 @@ optimizer's graph, so that it can be replayed.
 from __future__ import annotations
 
 import logging
-import os
-import signal
-import sys
 import time
 from collections import deque
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import msgspec
 import psutil
 
+from birdslam.loops.map_pose import MapPose
 from birdslam.runtime.configuration import Configuration, dump, without_passwords
 from birdslam.runtime.environment import USER_ERROR_STATUS, library_versions
 from birdslam.runtime.latency import stages
 from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest_checkpoint
 from birdslam.runtime.process import realtime
-from birdslam.runtime.process.child import begin
+from birdslam.runtime.process.beside import DISK_STATUS, Stop, run_beside
 from birdslam.runtime.process.restarts import FIRST, Assignment
 from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.recording import scene
 from birdslam.runtime.recording.recording import EXACT, About, Alive, GraphCheckpoint, Latency, RecordingWriter
-from birdslam.runtime.topology import NODES, RECORDER
+from birdslam.runtime.topology import MAP, NODES, RECORDER
 from birdslam.runtime.transport.bus import Bus, Message
 from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameError, FrameReader
@@ -45,7 +42,6 @@ QUIET_S = 0.2  # at the end: nothing more has come for so long
 END_S = 2.0  # after END_OF_SOURCE, for the rest of the map
 HEALTH_NS = 1_000_000_000
 EVENTS = 256  # of liveliness that wait
-DISK_STATUS = 3
 NICENESS = 5  # the pipeline goes first
 INDEX_MIB = 8.0, 8.0  # of objects and of larger blocks: the index of an hour, and chunks with images
 
@@ -74,7 +70,8 @@ class Recorder:
         config = configuration.recording
         self._writer, self._vitals, self._assignment = writer, vitals, assignment
         self._estimates = bus.subscriber("estimate", config.queue)
-        others = (*(topic for topic in EXACT if topic != "estimate"), *(f"health/{name}" for name in NODES))
+        health = (f"health/{name}" for name in (*NODES, MAP.name))
+        others = (*(topic for topic in EXACT if topic != "estimate"), *health, "map_pose")
         self._others = {topic: bus.subscriber(topic, config.queue) for topic in others}
         self._health = bus.publisher("health/record")
         self._events: deque[tuple[int, Alive]] = deque(maxlen=EVENTS)
@@ -170,6 +167,8 @@ class Recorder:
                 self._first_measured = record.frame_id
             self._end_measured = self._end_measured or Status.END_OF_SOURCE in record.status
             self._draw(scene.from_measurements(record, record.t_utc_ns), t_ns)
+        elif isinstance(record, MapPose):
+            self._writer.draw("/map_pose", record, t_ns)
         elif isinstance(record, MapUpdate):
             self._map_frame = record.frame_id
             self._draw(scene.from_map(record, time.time_ns()), t_ns)
@@ -255,18 +254,28 @@ def about(configuration: Configuration, models: dict[str, Any], restarts: int = 
     )
 
 
-def record(configuration: Configuration, order: RecorderAssignment, vitals: Vitals, stop: list[int]) -> str:
-    """A whole recording; why it ended early, or nothing. Raises OSError where the file can't be made."""
+def record(configuration: Configuration, order: RecorderAssignment, vitals: Vitals, stop: Stop) -> int:
+    """A whole recording; the exit status of its process."""
+    realtime.reserve(*INDEX_MIB)
     config = configuration.recording
     described = about(configuration, order.models, order.assignment.restarts)
-    writer = RecordingWriter(Path(order.file), described, configuration.camera, config.flush_ms, config.sync)
+    try:
+        writer = RecordingWriter(Path(order.file), described, configuration.camera, config.flush_ms, config.sync)
+    except OSError as error:
+        log.error("%s can't be made: %s", order.file, error.strerror)
+        return USER_ERROR_STATUS
     with Bus(configuration.vehicle, RECORDER.name, runtime_dir=configuration.runtime_dir) as bus:
         recorder = Recorder(configuration, bus, writer, vitals, order.assignment)
         vitals.beat()
         vitals.count(ready=1)
         bus.declare_alive()
         end_s = None
-        while writer.error is None and not stop and not recorder.over and (end_s is None or time.monotonic() < end_s):
+        while (
+            writer.error is None
+            and not stop.asked
+            and not recorder.over
+            and (end_s is None or time.monotonic() < end_s)
+        ):
             recorder.record_received(TURN_S)
             if recorder.ending and end_s is None:
                 end_s = time.monotonic() + END_S
@@ -274,36 +283,12 @@ def record(configuration: Configuration, order: RecorderAssignment, vitals: Vita
             pass
         vitals.count(ready=0)  # no beat any more: it waits for the disk
         writer.close(recorder.end())
-    error = writer.error
-    return f"{error.strerror}: {order.file} ends with what was written until then" if error else ""
-
-
-def main(arguments: list[str]) -> int:
-    """Entry point of the recorder's process."""
-    stop: list[int] = []
-
-    def ask(number: int, frame: FrameType | None) -> None:
-        stop.append(number)
-
-    signal.signal(signal.SIGTERM, ask)
-    _, configuration, vitals = begin(arguments)
-    os.nice(NICENESS)
-    order = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderAssignment)
-    realtime.reserve(*INDEX_MIB)
-    try:
-        reason = record(configuration, order, vitals, stop)
-    except OSError as error:
-        log.error("%s can't be made: %s", order.file, error.strerror)
-        return USER_ERROR_STATUS
-    except Exception:
-        log.exception("%s failed", RECORDER.name)
-        return 1
-    if reason:
-        log.error("the recording has ended: %s", reason)
+    if writer.error is not None:
+        what = f"{writer.error.strerror}: {order.file} ends with what was written until then"
+        log.error("the recording has ended: %s", what)
         return DISK_STATUS
-    vitals.count(ended=1)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run_beside(record, RecorderAssignment, NICENESS)

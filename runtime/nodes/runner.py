@@ -31,7 +31,7 @@ from birdslam.runtime.process import realtime
 from birdslam.runtime.process.child import begin, give_back_memory
 from birdslam.runtime.process.restarts import Assignment
 from birdslam.runtime.process.vitals import Vitals
-from birdslam.runtime.topology import NODES, RECORDER, TOPICS
+from birdslam.runtime.topology import MAP, NODES, RECORDER, TOPICS
 from birdslam.runtime.transport.bus import Bus, Publisher
 from birdslam.runtime.wire import Health
 from birdslam.sources.recording import DatasetError
@@ -40,7 +40,7 @@ from birdslam.types import Estimate, FrameRef, Measurements, Status
 log = logging.getLogger(__name__)
 
 USER_ERRORS = (ConfigurationError, DatasetError, ModelError, SourceError)
-RECORDER_PATIENCE_S = 0.2  # of a restarted node: longer than this its first records are not held back
+BESIDE_PATIENCE_S = 0.2  # of a restarted node: longer than this its first records are not held back
 DOWNSTREAM = {"capture": "perceive", "perceive": "optimize", "optimize": "supervisor"}  # who must be there to receive
 
 
@@ -87,9 +87,8 @@ def run(
         try:
             publishers = {TOPICS[topic].record: bus.publisher(topic) for topic in NODES[name].sends}
             _await_downstream(name, bus, publishers, runtime.ready_timeout_s)
-            if configuration.recording.file:
-                first_s = configuration.recording.ready_timeout_s
-                bus.wait_alive({RECORDER.name}, RECORDER_PATIENCE_S if assignment.restarts else first_s)
+            first_s = configuration.recording.ready_timeout_s
+            bus.wait_alive(_beside(configuration), BESIDE_PATIENCE_S if assignment.restarts else first_s)
             realtime.freeze_objects()
             stop.at_work = True
             vitals.beat()  # before it is ready: who is ready without a beat is stalled
@@ -98,6 +97,12 @@ def run(
             _loop(node, publishers, Meter(name, configuration, assignment), vitals, stop, configuration)
         finally:
             node.close()
+
+
+def _beside(configuration: Configuration) -> set[str]:
+    """Who is to miss no frame at the beginning of a drive."""
+    there = {RECORDER.name: bool(configuration.recording.file), MAP.name: configuration.maps_live}
+    return {name for name, is_there in there.items() if is_there}
 
 
 def _await_downstream(name: str, bus: Bus, publishers: dict[type, Publisher], timeout_s: float) -> None:

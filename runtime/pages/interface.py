@@ -37,8 +37,8 @@ do not know. A changed meaning is another version in the key.
 On the vehicle's computer, as its own user: connect to `unixsock-stream/DIR/{vehicle}/hub.sock` with multicast
 scouting off, where DIR is `runtime.runtime_dir` (of the service: `/run/birdslam`). From elsewhere, or as another
 user: through the gate, by mutual TLS ([deploy/README.md](../deploy/README.md)). Planners may read `estimate`, `map`,
-`health/*` and `alive/*`, and send every query; `frame` and `measurements` are for the nodes alone. `speed` is the one
-topic that comes from outside: the car's own computer sends it, and nobody else may ([The car's own
+`map_pose`, `health/*` and `alive/*`, and send every query; `frame` and `measurements` are for the nodes alone. `speed`
+is the one topic that comes from outside: the car's own computer sends it, and nobody else may ([The car's own
 speed](#the-cars-own-speed)). At the router of a fleet ([fleet.md](fleet.md)) `estimate`, `health/*` and `alive/*` of
 many vehicles stand under the same keys; their traces end with the stage `uplink`.
 
@@ -78,6 +78,11 @@ young enough on this computer's CLOCK_MONOTONIC (elsewhere `t_utc_ns`, with sync
 within {budget_ms:g} ms at the {percentile:g}th percentile unless the configuration's `budgets` say otherwise.
 **Valid**: the field `valid`. An estimate that is all three may be driven by. No message never means that all is well:
 past its limit a reader itself reports that its estimate is stale, as `Planner.estimates` does.
+
+`map_pose` is of another frame and another trust: the pose of `world` (REP-105's odom) in a map of places (REP-105's
+map), said some time later and at low priority, with its own state and covariance. The ego in the map is
+`T_map_odom @ T_world_ego` of any estimate of the same `epoch`; it jumps where `map_epoch` rises, estimates never do.
+Nobody waits for the map process, and without one nothing is said ([maps.md](maps.md)).
 
 `epoch` names the world frame. Where it rises, poses, map and trajectory began anew and must not be compared with
 older ones. `frame_id` never falls within a run. Frames that perceive does not answer in time are published as

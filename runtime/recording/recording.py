@@ -23,6 +23,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from birdslam.geometry.camera import Camera
+from birdslam.loops.map_pose import MapPose
 from birdslam.runtime.recording.append_only import AppendOnlyFile
 from birdslam.runtime.recording.foxglove import schema
 from birdslam.runtime.recording.scene import CHANNELS
@@ -94,6 +95,7 @@ JSON_CHANNELS: dict[str, type[msgspec.Struct]] = {
     "/latency": Latency,
     "/alive": Alive,
     "/speed": SpeedReading,
+    "/map_pose": MapPose,
     **{f"/health/{name}": Health for name in PROCESSES},
     **CHANNELS,
 }

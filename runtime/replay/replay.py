@@ -1,12 +1,11 @@
 """A recording's measurements through the back end alone, without a network or a camera.
 
 `compare` gives the recorded estimates bit for bit, or the first that differs: each estimate bears the trace of the
-message that it answers, so the order is known. Measurements without an estimate either did not reach
-the optimizer, or their estimate was lost, perhaps the first of an epoch. After a restart the optimizer began a new
-epoch, or went on from its last checkpoint with the measurements since. Where the recording lacks measurements that the
-optimizer had, nothing is compared until a new epoch begins. A file that begins in the middle of a drive has the graph
-of its first frame. `estimates` replays with
-another configuration.
+message that it answers, so the order is known. Measurements without an estimate either did not reach the optimizer, or
+their estimate was lost, perhaps the first of an epoch. After a restart the optimizer began a new epoch, or went on from
+its last checkpoint, as a rule with the measurements since: where it did not get them, or where the recording lacks
+measurements that it had, nothing is compared until a new epoch begins. A file that begins in the middle of a drive has
+the graph of its first frame. `estimates` replays with another configuration.
 """
 
 from __future__ import annotations
@@ -181,11 +180,14 @@ class Comparison:
                 self.verdict.restarts += restarts
                 return len(given) - (answered is not None)
         now = self._state
-        if unseen or (now is not None and (open_ or now.graph.epoch != estimate.epoch)):
+        behind = self._came_back and Status.GRAPH_RESTORED in estimate.status  # its checkpoint is older than that state
+        if behind:  # and it did not get what came since
+            self.verdict.restarts += self._came_back
+        if unseen or behind or (now is not None and (open_ or now.graph.epoch != estimate.epoch)):
             self._state = None
         elif now is not None:
             now.unreported = ()  # this estimate has reported it
-        if likeliest is None or unseen:
+        if likeliest is None or unseen or behind:
             self.verdict.unknown += 1
         else:
             self.verdict.difference = Difference(estimate.frame_id, differing(estimate, likeliest))

@@ -21,7 +21,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.loops.gnss_file import GNSS_FILE
+from birdslam.loops.gnss.files import GNSS_FILE
 from birdslam.ros.bag import stamp_ns
 from birdslam.ros.frames import TF_STATIC, StaticFrames
 from birdslam.ros.message_types import MessageTypes
@@ -56,7 +56,8 @@ from birdslam.sources.speed_log import KEPT_NS, KEPT_READINGS
 from birdslam.types import NS_PER_S, SpeedReading
 
 NODE = "birdslam_camera"
-# Of loops/gnss_file.py
+TOPIC = "topic:"  # before the name of one, as results.gnss
+# Of loops/gnss/files.py
 GNSS_HEAD = "time_s,latitude_deg,longitude_deg,sigma_m"
 SAME_CLOCK_NS = NS_PER_S  # a header that is within so much of this computer's UTC is of its clock
 CLOCK_FRAMES = 100  # of another clock: the least delay of so many frames tells how far off it is
@@ -100,17 +101,18 @@ class RosCamera:
     live = True
 
     def __init__(self, configuration: Configuration, must_open: bool = True) -> None:
-        source, self._topics = configuration.source, configuration.source.topics
+        source, self._topics, results = configuration.source, configuration.source.topics, configuration.results
         self.name = source.uri
         self._topic = source.uri.partition(":")[2]
         self._config = source
         try:
-            for topic in (self._topic, self._topics.camera_info, self._topics.speed, self._topics.gnss):
+            self._fixes = results.gnss.removeprefix(TOPIC) if results.gnss.startswith(TOPIC) else ""
+            for topic in (self._topic, self._topics.camera_info, self._topics.speed, self._fixes):
                 if topic:
                     check_topic(topic)
         except ValueError as error:
             raise ConfigurationError(f"{source.uri}: {error}") from None
-        self._gnss = Path(configuration.output) / GNSS_FILE if self._topics.gnss else None
+        self._gnss = Path(configuration.output) / GNSS_FILE if self._fixes else None
         self._arrived = threading.Condition()
         self._images: deque[Arrived] = deque(maxlen=RATE_FRAMES)
         self._infos: dict[str, Arrived] = {}
@@ -164,7 +166,7 @@ class RosCamera:
         if self._topics.speed:
             listens.append((self._topics.speed, self._speed_came))
         if self._gnss is not None:
-            listens.append((self._topics.gnss, self._fix_came))
+            listens.append((self._fixes, self._fix_came))
         for topic, came in listens:
             node.watch(publishers_key(domain, topic), told)
             node.subscribe(any_type_key(domain, topic), came)
@@ -216,7 +218,7 @@ class RosCamera:
             message = self._types.read(came.data, str(came.type_name))
             row = fix_row(message, self._time_ns(message, came, self._clock))
         except ValueError as error:
-            self._problem = f"{self._topics.gnss}: {error}"
+            self._problem = f"{self._fixes}: {error}"
             return
         if row is not None and self._gnss is not None and self._gnss.parent.is_dir():
             new = not self._gnss.exists()

@@ -22,8 +22,8 @@ from birdslam.outputs.drive_video import CODEC, DriveVideo, Floats, Image, check
 from birdslam.outputs.final_trajectories import FinalTracks, last_seen, write_final_ego
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.maps.drive_earth import rows as earth_rows
-from birdslam.runtime.maps.drive_map import DriveMap
-from birdslam.runtime.maps.drive_map import rows as map_rows
+from birdslam.runtime.maps.drive_map import DriveMap, check_map_choice
+from birdslam.runtime.maps.map_drive import rows as map_rows
 from birdslam.runtime.nodes.sources import Source, open_source
 from birdslam.runtime.progress import Progress
 from birdslam.runtime.recording.recorded_drive import measurements_of, recorded_drive
@@ -43,11 +43,7 @@ Records = Iterable[Measurements | Estimate | MapUpdate]
 def check_results(configuration: Configuration, source: Source) -> None:
     """Raises ConfigurationError or ResultsError where what is asked for can't be made."""
     results, recording = configuration.results, configuration.recording
-    drive_map = DriveMap.of(configuration)
-    if drive_map is not None:
-        if configuration.live and (results.map or results.map_only):
-            raise ConfigurationError("results.map: a live camera's frames are gone when the drive is over: record it")
-        drive_map.check(source.camera)
+    check_map_choice(configuration, source.camera)
     if not results.video:
         return
     output = Path(configuration.output)

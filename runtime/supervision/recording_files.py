@@ -12,7 +12,8 @@ from typing import Any
 
 from birdslam.runtime.configuration import Configuration, ConfigurationError, RecordingConfig
 from birdslam.runtime.environment import USER_ERROR_STATUS
-from birdslam.runtime.nodes.recorder import DISK_STATUS, RecorderAssignment
+from birdslam.runtime.nodes.recorder import RecorderAssignment
+from birdslam.runtime.process.beside import DISK_STATUS
 from birdslam.runtime.process.restarts import Assignment
 from birdslam.runtime.supervision.stations import Duty, Station
 from birdslam.runtime.topology import RECORDER

@@ -17,8 +17,8 @@ from typing import Any
 
 import msgspec
 
-from birdslam.loops.earth import EarthError
-from birdslam.loops.gnss_file import GnssError
+from birdslam.loops.gnss.earth import EarthError
+from birdslam.loops.gnss.files import GnssError
 from birdslam.loops.map_file import MapError
 from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
 from birdslam.outputs.plain_words import LengthsBy
@@ -36,6 +36,7 @@ from birdslam.runtime.supervision.drive_report import can_report, write_report
 from birdslam.runtime.supervision.final_results import FinalResults, check_results
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.supervision.logbook import Logbook, Results
+from birdslam.runtime.supervision.map_station import map_summary
 from birdslam.runtime.supervision.query_server import QueryServer
 from birdslam.runtime.supervision.recording_files import RecordingFiles, choose_file
 from birdslam.runtime.supervision.report import summarise, table
@@ -96,6 +97,8 @@ def _run(configuration: Configuration, lengths_by: LengthsBy | None) -> int:
                 summary["recording"] = figures
             elif figures["dropped"]:
                 live.say(f"{figures['dropped']} messages did not come to the recorder: the final results lack them")
+        if supervisor.map is not None:
+            summary |= map_summary(supervisor.map, output / "logs")
         if demo is not None and (found := demo.grade()) is not None:
             summary["truth"] = msgspec.to_builtins(found)
         try:

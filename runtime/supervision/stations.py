@@ -34,6 +34,7 @@ class Duty:
     first_message: Callable[[Assignment], msgspec.Struct] = _assignment_alone  # sent when its work begins
     final_statuses: tuple[int, ...] = ()  # exit statuses after which none is restarted; the log says why
     without: str = ""  # the run goes on without it, and this is said; "": the run fails with it
+    watchdog_s: float | None = None  # where it may show no life for longer than the others
 
     @property
     def essential(self) -> bool:
@@ -155,7 +156,7 @@ class Station:
     def stalled(self, before: Station | None) -> str:
         """Why the process at work is to be ended, or nothing; `before` is the node that sends to it."""
         runtime, process = self._config.runtime, self.process
-        limit_s, now_s = self._config.watchdog_s, time.monotonic()
+        limit_s, now_s = self.duty.watchdog_s or self._config.watchdog_s, time.monotonic()
         if process.exit_status is not None or process.begun_s is None or self._kill_s is not None:
             return ""
         self.was_ready = self.was_ready or process.ready

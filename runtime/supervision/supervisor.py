@@ -1,4 +1,4 @@
-"""Starts the three processes and the recorder of a run, watches them, and ends them.
+"""Starts the three processes of a run, its recorder and its map process, watches them, and ends them.
 
 Everything here waits by events: pidfds, signals, the logbook. On SIGINT, SIGTERM and SIGHUP capture ends the source
 there, so that the frames in flight are processed; at a second signal all processes end at once.
@@ -21,6 +21,7 @@ from birdslam.runtime.environment import INTERRUPTED_STATUS, USER_ERROR_STATUS
 from birdslam.runtime.process.notify import Notifier
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.supervision.logbook import Logbook
+from birdslam.runtime.supervision.map_station import map_station
 from birdslam.runtime.supervision.recording_files import RecordingFiles
 from birdslam.runtime.supervision.stations import Station
 
@@ -32,7 +33,7 @@ MOST_WARNINGS = 5  # at a time; the log has all of them
 
 
 class Supervisor:
-    """The nodes of one run and its recorder, from their start to their end."""
+    """The nodes of one run, and who is there beside them, from their start to their end."""
 
     def __init__(
         self,
@@ -51,6 +52,7 @@ class Supervisor:
         self._files = files
         self._frames = frames
         self.recorder: Station | None = None
+        self.map: Station | None = None
         self._notifier = Notifier()
         self._disk_said = False
         self.nodes: dict[str, Station] = {}
@@ -66,6 +68,9 @@ class Supervisor:
             if self._files is not None:
                 self.recorder = self._files.station(self._config, logs)
                 self._add(self.recorder, stack)
+            if self._config.maps_live:
+                self.map = map_station(self._config, logs)
+                self._add(self.map, stack)
             for name in START_ORDER:
                 self.nodes[name] = Station(name, self._config, logs)
                 self._add(self.nodes[name], stack)
@@ -76,7 +81,7 @@ class Supervisor:
                 self._show()
             if not self.failure and self.nodes["capture"].process.ready:
                 self._logbook.wait_over(self._config.runtime.drain_timeout_s)
-            self._end_recorder(self._config.runtime.stop_timeout_s)
+            self._end_beside(self._config.runtime.stop_timeout_s)
             self._show()
             self._notifier.once("STOPPING=1")
         if not self.failure and not self._logbook.ended and self._stopped_by is None:
@@ -88,17 +93,23 @@ class Supervisor:
 
     @property
     def _stations(self) -> tuple[Station, ...]:
-        return (*self.nodes.values(), *((self.recorder,) if self.recorder is not None else ()))
+        return (*self.nodes.values(), *self._beside)
 
-    def _end_recorder(self, timeout_s: float) -> None:
-        """Lets it write what it has received, and end its file."""
+    @property
+    def _beside(self) -> tuple[Station, ...]:
+        return tuple(station for station in (self.recorder, self.map) if station is not None)
+
+    def _end_beside(self, timeout_s: float) -> None:
+        """Lets recorder and map write what they have received, and end their files."""
         self._stop_by(timeout_s)
-        if self.recorder is None:
-            return
-        process = self.recorder.process
-        process.send(signal.SIGTERM)
-        if process.pidfd in self._selector.get_map() and select.select([process.pidfd], [], [], timeout_s)[0]:
-            self._process_ended(process.pidfd)
+        for station in self._beside:
+            station.process.send(signal.SIGTERM)
+        until_s = time.monotonic() + timeout_s
+        for station in self._beside:
+            pidfd = station.process.pidfd
+            left_s = max(0.0, until_s - time.monotonic())
+            if pidfd in self._selector.get_map() and select.select([pidfd], [], [], left_s)[0]:
+                self._process_ended(pidfd)
 
     def _signal(self, signals: socket.socket) -> None:
         for number in signals.recv(64):

@@ -1,8 +1,8 @@
 """How good tracks are: boxes matched to labels, HOTA and IDF1 in the image, ATE, RPE and motion in bird's-eye view.
 
 HOTA is Luiten et al. (IJCV 2021), IDF1 Ristani et al. (ECCVW 2016), both with TrackEval's formulas and KITTI's rules of
-what counts (`count_boxes`). The paper's ATE is the root mean square of a body's position errors in the global SE(2)
-frame, nothing aligned.
+what counts (`count_boxes`); CLEAR MOT is motmetrics'. The paper's ATE is the root mean square of a body's position
+errors in the global SE(2) frame, nothing aligned.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS
 from birdslam.sources.label_projection import Label
+from birdslam.sources.recording import DatasetError
 from birdslam.vehicles.placement.localisation import iou
 
 Floats = NDArray[np.float64]
@@ -82,14 +83,15 @@ def count_boxes(labels: Sequence[Label], tracks: Sequence[int], boxes_px: Floats
         if j in matched:
             keep.append(bool(asked[matched[j]]))
         else:
-            keep.append(box[3] - box[1] > LEAST_HEIGHT_PX and not _mostly_inside(box, regions))
+            keep.append(box[3] - box[1] > LEAST_HEIGHT_PX and not mostly_inside(box, regions))
     ids = np.array(tracks, dtype=np.int64).reshape(-1)
     names = np.array([label.track for label in vehicles], dtype=np.int64).reshape(-1)
     kept = np.array(keep, dtype=np.bool_)
     return BoxFrame(names[asked], ids[kept], overlap[asked][:, kept])
 
 
-def _mostly_inside(box: Floats, regions: Floats) -> bool:
+def mostly_inside(box: Floats, regions: Floats) -> bool:
+    """Whether more than half of a box (4,) lies in one of the regions (N, 4)."""
     span = np.clip(np.minimum(box[2:], regions[:, 2:]) - np.maximum(box[:2], regions[:, :2]), 0.0, None)
     area = max((box[2] - box[0]) * (box[3] - box[1]), 1e-9)
     return bool((span[:, 0] * span[:, 1] > 0.5 * area).any())
@@ -142,37 +144,31 @@ def hota_parts(frames: Sequence[BoxFrame]) -> Hota | None:
 
 
 @dataclass(frozen=True)
-class ClearMot:
-    """CLEAR MOT (Bernardin and Stiefelhagen 2008) at one threshold."""
+class Identities:
+    """CLEAR MOT (Bernardin and Stiefelhagen 2008) and IDF1 at one threshold."""
 
     mota: float
-    found: int
-    missed: int
-    false_alarms: int
+    idf1: float
     switches: int
 
 
-def clear_mot(frames: Sequence[BoxFrame], least: float = MATCH_IOU) -> ClearMot:
-    """TrackEval's CLEAR: who was matched in the frame before stays so where the pair still overlaps by `least`."""
-    last: dict[int, int] = {}  # label -> its last track
-    matched_before: dict[int, int] = {}
-    found = missed = false_alarms = switches = 0
+def identities(frames: Sequence[BoxFrame], least: float = MATCH_IOU) -> Identities:
+    """By motmetrics: a pair is possible where it overlaps by `least`, who was matched before stays so where it can.
+
+    Without labels MOTA and IDF1 are 0. Raises DatasetError where motmetrics is not installed.
+    """
+    try:
+        import motmetrics  # with pandas: the extra `evaluate`
+    except ImportError:
+        raise DatasetError("tracks are judged by motmetrics: pip install 'birdslam[evaluate]'") from None
+    events = motmetrics.MOTAccumulator(auto_id=True)
     for frame in frames:
-        stays = np.array(
-            [[matched_before.get(int(label)) == int(track) for track in frame.tracks] for label in frame.labels],
-            dtype=np.bool_,
-        ).reshape(frame.overlap.shape)
-        score = np.where(frame.overlap >= least - 1e-9, 1000.0 * stays + frame.overlap, 0.0)
-        rows, columns = least_cost(-score)
-        pairs = {int(frame.labels[i]): int(frame.tracks[j]) for i, j in zip(rows, columns, strict=True) if score[i, j]}
-        switches += sum(last.get(label, track) != track for label, track in pairs.items())
-        last.update(pairs)
-        matched_before = pairs
-        found += len(pairs)
-        missed += len(frame.labels) - len(pairs)
-        false_alarms += len(frame.tracks) - len(pairs)
-    mota = (found - false_alarms - switches) / max(1, found + missed)
-    return ClearMot(mota, found, missed, false_alarms, switches)
+        distance = np.where(frame.overlap >= least - 1e-9, 1.0 - frame.overlap, np.nan)
+        events.update(frame.labels.tolist(), frame.tracks.tolist(), distance)
+    asked = ["mota", "idf1", "num_switches"]
+    found = motmetrics.metrics.create().compute(events, metrics=asked, return_dataframe=False)
+    mota, idf1 = (float(found[name]) if np.isfinite(found[name]) else 0.0 for name in asked[:2])
+    return Identities(mota, idf1, int(found["num_switches"]))
 
 
 def idf1(frames: Sequence[BoxFrame]) -> float | None:

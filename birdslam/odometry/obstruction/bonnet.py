@@ -3,6 +3,9 @@
 It mirrors sky and houses, so that its inside changes from image to image, but its edge does not: the mean gradient of
 images between which the car has driven keeps a fixed edge and averages the road out. A bonnet (or a dashboard, or a
 black border) begins where such an edge, nearer to level than to vertical, crosses most columns along one curve.
+
+A bonnet stays with the car, but its edge comes and goes with what it mirrors, and is now brighter and now darker than
+the road. So it is dropped only where edges of either sign are no more frequent along it than elsewhere.
 """
 
 from __future__ import annotations
@@ -42,7 +45,7 @@ class BonnetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     edge_grey: Positive = 1.5  # per pixel, of a fixed edge in the mean: at dusk a bonnet's has 2
     changes: Share = 0.4  # of the edge's strength, its mean deviation from image to image
     on_threshold: Share = 0.5  # of the columns with such an edge, for a bonnet to be there
-    off_threshold: Share = 0.1  # ... below which it is gone
+    off_threshold: Share = 0.1  # ... more than elsewhere in the image; with fewer it is gone
     smooth_px: Positive = 8.0  # distance of an edge from its curve
 
 
@@ -59,7 +62,7 @@ class Bonnet:
         self._known: NDArray[np.float64] | None = None  # the same curve, in the rows of the detection
 
     def update(self, grey: NDArray[np.uint8], top_px: int, driven_m: float) -> bool:
-        """Takes (H, W) grey, `driven_m` after the image before, rows from `top_px` on; whether it has come or gone."""
+        """Takes (H, W) grey, `driven_m` after the image before, rows from `top_px` on; whether it has come."""
         cfg = self.config
         self._driven_m += driven_m
         if self._driven_m < cfg.step_m:
@@ -77,7 +80,7 @@ class Bonnet:
         if 2 * self._images < cfg.images:
             return False
         before, self.rows = self.rows, self._edge(top_px, *grey.shape)
-        return (before is None) != (self.rows is None)
+        return before is None and self.rows is not None
 
     @property
     def initialised(self) -> bool:
@@ -100,16 +103,22 @@ class Bonnet:
         above = round(_LOWEST * (height - top_px) / _DOWNSCALE)  # rows in which no bonnet ends
         edges = [self._level_edges(sign)[above:] for sign in (1.0, -1.0)]
         smooth = cfg.smooth_px / _DOWNSCALE
-        known = self._known if self.present else None
-        curves = [_curve(each, smooth, most, known) for each in edges]
+        curves = [_curve(each, smooth, most) for each in edges]
         (share, curve), other = max(zip(curves, reversed(edges), strict=True), key=lambda found: found[0][0])
-        if curve is None or share < (cfg.off_threshold if self.present else cfg.on_threshold):
-            return None
-        if _share(_thick(other, smooth), curve) > _LINE_SHARE * share:
-            return None  # a line, brighter or darker than both its sides: a reflection, or writing
+        if share < cfg.on_threshold or curve is None or _share(_thick(other, smooth), curve) > _LINE_SHARE * share:
+            # None, or a line, brighter or darker than both its sides: a reflection, or writing
+            curve = self._known if self._goes_on(_thick(edges[0] | edges[1], smooth)) else None
         self._known = curve
+        if curve is None:
+            return None
         fine = np.interp(np.arange(width), _DOWNSCALE * (np.arange(len(curve)) + 0.5), curve)
         return np.clip(top_px + _DOWNSCALE * (above + fine) - _MARGIN_PX, 0, height).astype(np.int64)
+
+    def _goes_on(self, thick: NDArray[np.uint8]) -> bool:
+        """Whether more of the columns have an edge along the bonnet's so far than the rest of the image has."""
+        if self._known is None:
+            return False
+        return _share(thick, self._known) - float(thick.mean()) >= self.config.off_threshold
 
     def _level_edges(self, sign: float) -> Bools:
         """Where there is a fixed edge, brighter below times `sign`."""
@@ -127,21 +136,19 @@ class Bonnet:
         return out & (beside < 0.5 * strength)
 
 
-def _curve(
-    edges: Bools, smooth: float, most: float, known: NDArray[np.float64] | None
-) -> tuple[float, NDArray[np.float64] | None]:
+def _curve(edges: Bools, smooth: float, most: float) -> tuple[float, NDArray[np.float64] | None]:
     """The share of the columns that one parabola through the edges (rows, W) crosses at an edge, and its rows (W,).
 
     By random sample consensus, seeded: a point of each third of the columns. Of curves with nearly the same share the
     highest: a caption or a reflection below the bonnet's edge is on the bonnet. `smooth` rows are near, `most` is the
-    curve's span; both in rows. `known` (W,) is the bonnet's edge so far: where shade hides a third of it, it goes on.
+    curve's span; both in rows.
     """
     columns = edges.shape[1]
     rows, at = np.nonzero(edges)
     thirds = [np.flatnonzero((at >= third * columns // 3) & (at < (third + 1) * columns // 3)) for third in range(3)]
     x, thick = np.arange(columns) / columns - 0.5, _thick(edges, smooth)
     if min(len(third) for third in thirds) < _MIN_COLUMNS // 2:
-        return (0.0, None) if known is None else (_share(thick, known), known)
+        return 0.0, None
     rng = np.random.default_rng(0)
     chosen = np.stack([third[rng.integers(0, len(third), _SAMPLES)] for third in thirds], axis=1)
     powers = np.stack([x[at[chosen]] ** 2, x[at[chosen]], np.ones(chosen.shape)], axis=-1)

@@ -222,7 +222,7 @@ class RoadScale:
             self.vanishing_point = found
 
     def _update_bonnet(self, view: RoadView, travelled_m: float) -> None:
-        """Where a bonnet turns out to have been taken for road, scale and tilt are dropped."""
+        """Where a bonnet has been taken for road until it was found, scale and tilt are dropped."""
         driven_m = travelled_m
         if not self._has_begun:  # the length is not known: optical flow tells whether the car has moved
             if view.flow_px < _MOVING_PX:
@@ -342,7 +342,7 @@ class RoadScale:
         self.fit = fit
         filter_.cov = prior_cov
         tells = filter_.information(fit)
-        self._rejected = 0.0  # in a row: one that agrees ends it, whatever it tells of the length
+        self._rejected *= 1.0 - tells  # one that agrees ends the row by as much as it tells of the length
         self._informed = tells >= _TOLD
         if self._informed:
             self._rejections, self._predicted = 0, False

@@ -46,6 +46,7 @@ class Mover:
     phase_per_m: float = 0.0
     stops: tuple[tuple[float, float], ...] = ()  # (s, until when): a red light
     plan: list[tuple[float, float, float]] = field(default_factory=list)  # (from s on, lane's d, wished speed)
+    walks: list[tuple[float, float, float]] = field(default_factory=list)  # who follows no lane: (from t_s, turn, m/s)
 
     @property
     def direction(self) -> int:
@@ -221,6 +222,8 @@ def advance(movers: list[Mover], ego: Mover, street: Street, t_s: float, dt_s: f
     everyone = [*movers, ego]
     for mover in everyone:
         if mover.lane_d_m is None:
+            while mover.walks and t_s >= mover.walks[0][0]:
+                _, mover.turn_rad, mover.speed_mps = mover.walks.pop(0)
             along, across = mover.velocity
             mover.s_m += along * dt_s
             mover.d_m += across * dt_s

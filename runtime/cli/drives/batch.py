@@ -25,6 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--address", default="auto", metavar="HOST:PORT", help=text)
     text = "every drive with each of these settings; may be repeated: every combination"
     parser.add_argument("--sweep", action="append", default=[], metavar="KEY=V1,V2", help=text)
+    text = "one map of places of all drives that share streets, made when all have ended; begun from what is there"
+    parser.add_argument("--map", metavar="FILE", help=text)
     add_config(parser)
     add_topics(parser, "speed", "truth")
     add_pipeline(parser)
@@ -41,7 +43,13 @@ def run(options: argparse.Namespace) -> int:
     todo = tasks(find_drives(options.drives), sweep(options.sweep), options.config, overrides, models, constants)
     if before := sum(done(output, task) for task in todo):
         print(f"{before} of {len(todo)} drives are done already")
-    outcome = run_batch(todo, output, options.jobs, options.address if options.engine == "ray" else None)
+    address, map_file = options.address if options.engine == "ray" else None, Path(options.map) if options.map else None
+    outcome = run_batch(todo, output, options.jobs, address, map_file)
+    if outcome.map is not None:
+        size = f"{outcome.map.keyframes} keyframes, {outcome.map.size / 1e6:.2f} MB"
+        print(f"{map_file}: {size}, {len(outcome.map.inside)} drives")
+        if outcome.map.outside:
+            print(f"not in it, for want of a street in common: {', '.join(outcome.map.outside)}")
     ended = outcome.drives - outcome.failed - outcome.interrupted
     print(f"{ended} of {outcome.drives} drives: {output / 'report.html'}")
     return INTERRUPTED_STATUS if outcome.interrupted else int(outcome.failed > 0)

@@ -6,9 +6,10 @@ import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from birdslam.bench.tracking.by_class.class_tracks import table_of_tracks
+from birdslam.bench.tracking.by_class.people import PEOPLE, PeopleRow
 from birdslam.bench.tracking.leave_one_out import LeftOut
 from birdslam.bench.tracking.localisation import LocalisationRow, TiltRow
-from birdslam.bench.tracking.people import KINDS, PeopleRow, PeopleTracks
 from birdslam.bench.tracking.tables import movers_table
 from birdslam.outputs.drive_files import claim_directory, write_json
 from birdslam.paper import PAPER
@@ -32,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "the road's pitch: with the images' error of it, as odometry on images reports it, or none"
     parser.add_argument("--tilt", choices=("images", "none"), default="images", help=text)
     text = "of whom; cyclists by boxes of the labels' hulls, with the noise of real ones"
-    parser.add_argument("--class", dest="kind", choices=("car", *KINDS), default="car", help=text)
+    parser.add_argument("--class", dest="kind", choices=("car", *PEOPLE), default="car", help=text)
     text = "how each sequence fares by a constant that the others chose of these values; may be repeated"
     parser.add_argument("--leave-one-out", action="append", default=[], metavar="KEY=V1,V2", help=text)
     add_config(parser)
@@ -49,19 +50,21 @@ def run(options: argparse.Namespace) -> int:
     claim_directory(output)
     names = sequences_of(options.root, options.sequences)
     config, tilt_from_images = configuration.slam.frontend, options.tilt == "images"
-    if options.kind != "car":
-        if sweeps or options.mode == "paper":
-            raise ConfigurationError("--class: --leave-one-out and --mode paper are of cars alone")
+    if options.kind != "car" and options.mode == "paper":
+        raise ConfigurationError("--class: --mode paper is of cars alone")
+    if sweeps:
+        left = evaluate_left_out(
+            options.root, names, options.detections, config, sweeps, tilt_from_images, options.kind
+        )
+        write_json(output / "leave_one_out.json", left)
+        print(_table_of_left_out(left))
+    elif options.kind != "car":
         people, tracks = evaluate_people(
             options.root, names, options.detections, config, options.kind, tilt_from_images
         )
         write_json(output / "report.json", {"places": people, "tracks": tracks})
         print(_table_of_people(people))
-        print(_table_of_tracks(tracks))
-    elif sweeps:
-        left = evaluate_left_out(options.root, names, options.detections, config, sweeps, tilt_from_images)
-        write_json(output / "leave_one_out.json", left)
-        print(_table_of_left_out(left))
+        print(table_of_tracks(tracks))
     else:
         used = PAPER if options.mode == "paper" else configuration.slam
         rows, tilts, movers = evaluate_localisation(options.root, names, options.detections, used, tilt_from_images)
@@ -107,16 +110,6 @@ def _table_of_people(rows: Sequence[PeopleRow]) -> str:
         )
         numbers = _in_columns(cells)
         lines.append(f"{row.sequence:11}{row.range:>9}{row.n:>7}{numbers}")
-    return "\n".join(lines)
-
-
-def _table_of_tracks(rows: Sequence[PeopleTracks]) -> str:
-    titles = "".join(f"{title:>9}" for title in ("HOTA", "DetA", "AssA", "LocA", "IDF1", "MOTA", "switches", "a min"))
-    lines = [f"{'sequence':11}{'labels':>9}{titles}  (bird's-eye view, within 2 m)"]
-    for row in rows:
-        shares = (row.hota, row.det_a, row.ass_a, row.loc_a, row.idf1, row.mota)
-        numbers = "".join(f"{share:9.3f}" for share in shares)
-        lines.append(f"{row.sequence:11}{row.labels:>9}{numbers}{row.switches:9}{row.switches_per_minute:9.1f}")
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""A place on Earth: the map's frame tied to WGS 84 by GNSS fixes, with a gate against wrong ones.
+"""Where a drive is on Earth: its frame tied to WGS 84 by GNSS fixes, with a gate against wrong ones.
 
 Fixes are joined to the drive's own way by their time. One similarity of the plane (turn, shift and scale, since metres
 are odometry's) is adjusted to all of them with Cauchy weights, together with the fixes' delay. What a wrong fix says is
@@ -8,13 +8,14 @@ out of the gate; jumps and multipath of some seconds do not turn a way that odom
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.se2 import SE2
+from birdslam.geometry.se2 import SE2, wrap
+from birdslam.loops.map_pose import EarthPose
 from birdslam.types import NS_PER_S
 
 Floats = NDArray[np.float64]
@@ -22,7 +23,9 @@ Floats = NDArray[np.float64]
 LEAST_FIXES, LEAST_WAY_M = 3, 20.0
 GATE = 3.0  # standard deviations
 DELAYS_S = np.arange(-2.0, 2.01, 0.1)
-ITERATIONS = 30
+DELAY_SIGMA_S = 0.5
+WINDOW_S, MOST_WINDOWS = 60.0, 10  # in which fixes are compared with odometry for their delay
+ITERATIONS, WINDOW_ITERATIONS = 30, 16
 DEFAULT_SIGMA_M = 5.0  # of a fix that does not say its own
 HINT_SIGMAS, HINT_REL = 3.0, 0.02  # a wrong height is told where it is that sure, and that large
 
@@ -35,6 +38,11 @@ class GnssFix(msgspec.Struct, frozen=True, kw_only=True):
     longitude_deg: float
     sigma_m: float = DEFAULT_SIGMA_M  # 1-sigma, across the ground
     speed_mps: float | None = None
+
+
+def is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:
+    """Whether there is such a place; NaN is none."""
+    return abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0
 
 
 class EarthError(ValueError):
@@ -57,6 +65,11 @@ class Earth:
     outliers: int
     rms_m: float  # of the inliers
     speed_ratio: float | None  # of the drive's speed over the fixes' own, the median; None: they have none
+    late_m: float = 0.0  # 1-sigma by which the delay, as far as it is not known, puts all places off
+
+    def with_cov(self, cov: Floats) -> Earth:
+        """`cov` (4, 4) is that of the fixes alone."""
+        return replace(self, cov=cov + np.diag([self.late_m**2, self.late_m**2, 0.0, 0.0]))
 
     def enu(self, xy_m: Floats) -> Floats:
         """(N, 2) east and north of points of the map (N, 2)."""
@@ -71,6 +84,43 @@ class Earth:
         zero = np.zeros(len(enu))
         lat, lon, _ = pymap3d.enu2geodetic(enu[:, 0], enu[:, 1], zero, self.latitude_deg, self.longitude_deg, 0.0)
         return np.column_stack([np.atleast_1d(lat), np.atleast_1d(lon)])
+
+    def xy(self, degrees: Floats) -> Floats:
+        """(N, 2) in the map of latitudes and longitudes in degrees (N, 2)."""
+        import pymap3d  # here: only who comes from Earth needs it
+
+        east, north, _ = pymap3d.geodetic2enu(
+            degrees[:, 0], degrees[:, 1], 0.0, self.latitude_deg, self.longitude_deg, 0.0
+        )
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        enu = np.column_stack([east, north]) - (self.east_m, self.north_m)
+        out: Floats = enu @ np.array([[c, -s], [s, c]]) / self.scale
+        return out
+
+    def seen_from(self, T_other_map: SE2) -> Earth:
+        """The same place in another map's frame."""
+        T = T_other_map.inverse()
+        east, north = (float(number) for number in self.enu(np.array([[T.x_m, T.y_m]]))[0])
+        return replace(self, east_m=east, north_m=north, yaw_rad=wrap(self.yaw_rad + T.yaw_rad))
+
+    def pose(self, T_map_ego: SE2, cov: Floats) -> EarthPose:
+        """An ego of the map on Earth; `cov` (3, 3), of the tangent there: its own, and that of the map around it."""
+        p = np.array([T_map_ego.x_m, T_map_ego.y_m])
+        latitude_deg, longitude_deg = (float(number) for number in self.wgs84(p[None])[0])
+        yaw_rad = wrap(self.yaw_rad + T_map_ego.yaw_rad)
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        lever = self.scale * np.array([[c, -s], [s, c]]) @ p
+        J = np.array([[1.0, 0.0, -lever[1], lever[0]], [0.0, 1.0, lever[0], lever[1]]])
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        R = self.scale * np.array([[c, -s], [s, c]])
+        place = J @ self.cov @ J.T + R @ cov[:2, :2] @ R.T
+        return EarthPose(
+            latitude_deg=latitude_deg,
+            longitude_deg=longitude_deg,
+            cov=tuple(float(number) for number in place.ravel()),
+            yaw_rad=yaw_rad,
+            yaw_sigma_rad=math.sqrt(self.cov[2, 2] + cov[2, 2]),
+        )
 
     def height_hint(self, height_m: float) -> str:
         """What the metres of the fixes say of the camera's height; "" where they say nothing against it."""
@@ -96,22 +146,14 @@ def place_on_earth(t_ns: NDArray[np.int64], poses: list[SE2], fixes: list[GnssFi
     degrees = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes])
     east, north, _ = pymap3d.geodetic2enu(degrees[:, 0], degrees[:, 1], 0.0, *origin, 0.0)
     enu, sigma = np.column_stack([east, north]), np.array([max(fix.sigma_m, 0.01) for fix in fixes])
-    best = None
-    for delay_s in DELAYS_S:
-        at = times - delay_s
-        inside = (at >= seconds[0]) & (at <= seconds[-1])
-        if inside.sum() < LEAST_FIXES:
-            continue
-        here = np.column_stack([np.interp(at[inside], seconds, column) for column in xy.T])
-        fit = _fit(here, enu[inside], sigma[inside])
-        cost = float(np.log1p(fit[2]).sum() + (inside.size - inside.sum()) * math.log1p(GATE**2))
-        # Delays are told apart by the speed's changes alone: a prior of half a second keeps those that say nothing at 0
-        cost += 0.5 * (delay_s / 0.5) ** 2
-        if best is None or cost < best[0]:
-            best = cost, float(delay_s), here, inside, fit
-    if best is None:
+    delay_s, delay_sigma_s = _delay(seconds, xy, times, enu, sigma)
+    late_m = delay_sigma_s * float(np.hypot(*np.diff(xy, axis=0).T).sum() / seconds[-1])
+    at = times - delay_s
+    inside = (at >= seconds[0]) & (at <= seconds[-1])
+    if inside.sum() < LEAST_FIXES:
         raise EarthError(f"{len(fixes)} fixes, and fewer than {LEAST_FIXES} of them within the drive's time")
-    _, delay_s, here, inside, (parameters, cov, chi2) = best
+    here = np.column_stack([np.interp(at[inside], seconds, column) for column in xy.T])
+    parameters, cov, chi2 = fit(here, enu[inside], sigma[inside])
     way_m = float(np.linalg.norm(np.ptp(here, axis=0)))
     if way_m < LEAST_WAY_M:
         raise EarthError(f"the drive goes {way_m:.0f} m between its fixes: {LEAST_WAY_M:g} m are needed for a heading")
@@ -131,10 +173,40 @@ def place_on_earth(t_ns: NDArray[np.int64], poses: list[SE2], fixes: list[GnssFi
         int((~good).sum()),
         float(np.sqrt((error_m**2).mean())),
         _speed_ratio(seconds, xy, times - delay_s, fixes),
-    )
+        late_m,
+    ).with_cov(cov)
 
 
-def _fit(xy: Floats, enu: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats]:
+def _delay(seconds: Floats, xy: Floats, times: Floats, enu: Floats, sigma: Floats) -> tuple[float, float]:
+    """By how much fixes come late, and its 1-sigma: what fits best over short windows, before odometry drifts far.
+
+    Curves and changes of speed tell delays apart; where there are none the prior keeps them at 0.
+    """
+    begin, windows = 0, []
+    for end in range(1, len(times) + 1):
+        if end == len(times) or times[end] - times[begin] > WINDOW_S:
+            if end - begin > LEAST_FIXES:
+                windows.append(slice(begin, end))
+            begin = end
+    windows = windows[:: max(1, -(-len(windows) // MOST_WINDOWS))]
+    costs = []
+    for delay_s in DELAYS_S:
+        cost = 0.5 * (delay_s / DELAY_SIGMA_S) ** 2
+        for window in windows:
+            at = times[window] - delay_s
+            inside = (at >= seconds[0]) & (at <= seconds[-1])
+            cost += float((~inside).sum()) * math.log1p(GATE**2)
+            if inside.sum() > LEAST_FIXES:
+                here = np.column_stack([np.interp(at[inside], seconds, column) for column in xy.T])
+                chi2 = fit(here, enu[window][inside], sigma[window][inside], WINDOW_ITERATIONS)[2]
+                cost += float(np.log1p(chi2).sum())
+        costs.append(cost)
+    weight = np.exp(min(costs) - np.array(costs))
+    mean_s = round(float(weight @ DELAYS_S / weight.sum()), 3)
+    return mean_s, math.sqrt(float(weight @ (DELAYS_S - mean_s) ** 2 / weight.sum()))
+
+
+def fit(xy: Floats, enu: Floats, sigma: Floats, iterations: int = ITERATIONS) -> tuple[Floats, Floats, Floats]:
     """(east, north, yaw, log scale), their covariance, and each fix's chi-square; Gauss-Newton with Cauchy weights.
 
     The start is a line through a robust pair of distant medians: Umeyama's closed form (1991) on all.
@@ -146,12 +218,12 @@ def _fit(xy: Floats, enu: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats
     shift = there.copy()
     H: Floats = np.eye(4)
     chi2: Floats = np.zeros(len(xy))
-    for iteration in range(ITERATIONS):
+    for iteration in range(iterations):
         c, s, scale = math.cos(yaw), math.sin(yaw), math.exp(log_scale)
         rotated = a @ np.array([[c, s], [-s, c]]) * scale
         error = enu - rotated - shift
         chi2 = (error**2).sum(axis=1) / sigma**2
-        weight = 1.0 / (1.0 + chi2 / (9.0 if iteration < ITERATIONS // 2 else 2.0)) / sigma**2
+        weight = 1.0 / (1.0 + chi2 / (9.0 if iteration < iterations // 2 else 2.0)) / sigma**2
         J = np.zeros((len(xy), 2, 4))
         J[:, 0, 0] = J[:, 1, 1] = 1.0
         J[:, 0, 2], J[:, 1, 2] = -rotated[:, 1], rotated[:, 0]

@@ -2,9 +2,7 @@
 
 Each matched, untruncated person's place is compared with the label's as cars' are (localisation.py): along (depth,
 ego's x) and across, with the share of errors inside the ellipses of 68.3 and 95.4 %. Speeds are compared with those of
-the labels' places over a second. Tracks are judged in bird's-eye view: similarity falls from 1 at the label's place to
-0.5 at 2 m, so that CLEAR MOT and IDF1 match within 2 m (as nuScenes does) and HOTA averages over all thresholds. Tracks
-are those in sight, as a planner takes them: a lost one goes on for a while, but not for these metrics.
+the labels' places over a second. Tracks are judged in bird's-eye view (class_tracks.py).
 """
 
 from __future__ import annotations
@@ -17,21 +15,26 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.bench.tracking.by_class.class_tracks import (
+    KINDS,
+    METRES,
+    ClassTracks,
+    TracksRow,
+    class_tracks,
+    tracks_row,
+)
 from birdslam.bench.tracking.localisation import INSIDE_1_SIGMA, INSIDE_2_SIGMA
-from birdslam.bench.tracking.metrics import BoxFrame, assign, clear_mot, hota_parts, idf1
+from birdslam.bench.tracking.metrics import assign
 from birdslam.perception import Detections
 from birdslam.sources.kitti_tracking import TrackingSequence
-from birdslam.sources.label_projection import DONT_CARE, Label, hull_px
-from birdslam.types import IN_SIGHT_NS, FollowedPerson, Measurements, Moves
+from birdslam.sources.label_projection import Label, hull_px
+from birdslam.types import FollowedPerson, Measurements, Moves
 from birdslam.vehicles.placement.localisation import iou
 
 Floats = NDArray[np.float64]
 
-KINDS = {"pedestrian": ("Pedestrian",), "cyclist": ("Cyclist",)}  # of the labels
-# Riders have no recorded boxes of their own, but some of pedestrians
-NEUTRAL = {"pedestrian": ("Person", "Person_sitting", "Cyclist"), "cyclist": ("Pedestrian", "Person", "Person_sitting")}
+PEOPLE = ("pedestrian", "cyclist")
 RANGES_M = ((5.0, 15.0), (15.0, 30.0), (30.0, 50.0))
-HALF_AT_M = 2.0  # where similarity is 0.5
 WALKING_MPS, STANDING_MPS = 0.5, 0.2  # true speeds: of who walks, and of who stands
 TRUTH_S = 0.5  # a label's speed is its places' of so long before and after
 MATCH_IOU = 0.4  # of a box with the label's, in the image
@@ -50,6 +53,7 @@ class PersonError:
     depth_m: float
     error_m: Floats
     mahalanobis2: float
+    log_det_cov: float
     true_mps: Floats  # (2,) in ego
     told_mps: Floats
     stands: bool
@@ -62,9 +66,8 @@ class PeopleResult:
     """Of one sequence."""
 
     name: str
-    frames: int
+    tracked: ClassTracks
     errors: list[PersonError] = field(default_factory=list)
-    tracked: list[BoxFrame] = field(default_factory=list)
 
 
 class PeopleRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -82,22 +85,7 @@ class PeopleRow(msgspec.Struct, frozen=True, kw_only=True):
     standing_speed_median_mps: float | None = None
 
 
-class PeopleTracks(msgspec.Struct, frozen=True, kw_only=True):
-    """A row of report.json: tracks in bird's-eye view."""
-
-    sequence: str
-    labels: int  # people times frames
-    hota: float
-    det_a: float
-    ass_a: float
-    loc_a: float
-    idf1: float
-    mota: float
-    switches: int
-    switches_per_minute: float
-
-
-def has_people(sequence: TrackingSequence, kind: str) -> bool:
+def has_labels(sequence: TrackingSequence, kind: str) -> bool:
     """Whether somebody of the kind is labelled."""
     return any(label.kind in KINDS[kind] for label in sequence.labels)
 
@@ -143,7 +131,8 @@ def boxes_of_hulls(sequence: TrackingSequence, recorded: Sequence[Detections], k
 
 def judge(sequence: TrackingSequence, measurements: Iterable[Measurements], kind: str) -> PeopleResult:
     """What the records say of the people of a kind, in every frame, against the labels."""
-    result = PeopleResult(sequence.name, len(sequence))
+    measurements = list(measurements)
+    result = PeopleResult(sequence.name, class_tracks(sequence, measurements, kind))
     places = _true_places(sequence, KINDS[kind])
     ego = sequence.ego_truth(0)
     for m in measurements:
@@ -160,8 +149,6 @@ def judge(sequence: TrackingSequence, measurements: Iterable[Measurements], kind
         for i, j in zip(*assign(overlap, MATCH_IOU), strict=True):
             if asked[i].truncated <= 0:
                 result.errors.append(_error(sequence, asked[i], seen[j], places, ego_mps))
-        in_sight = [p for p in told if p.age_ns <= IN_SIGHT_NS]
-        result.tracked.append(_tracked(sequence, here, in_sight, kind))
     return result
 
 
@@ -197,6 +184,7 @@ def _error(
         depth_m=truth.x_m,
         error_m=error,
         mahalanobis2=float(error @ np.linalg.solve(np.reshape(told.cov, (2, 2)), error)),
+        log_det_cov=float(np.linalg.slogdet(np.reshape(told.cov, (2, 2)))[1]),
         true_mps=_true_velocity(places[label.track], label.frame) @ R,
         told_mps=np.array([told.vx_mps, told.vy_mps]),
         stands=told.moves is Moves.STANDING,
@@ -205,53 +193,8 @@ def _error(
     )
 
 
-def _tracked(
-    sequence: TrackingSequence,
-    here: Sequence[Label],
-    told: Sequence[FollowedPerson],
-    kind: str,
-) -> BoxFrame:
-    """Similarities of labelled and followed people; left out is who stands where a label is that nobody asks for.
-
-    As KITTI has it: heavily occluded or truncated people are not asked for, sitting ones and DontCare regions are
-    neutral, and so are unmatched ones lower than 25 px.
-    """
-    at = np.array([[p.x_m, p.y_m] for p in told]).reshape(-1, 2)
-    neutral = [label for label in here if label.kind in (*KINDS[kind], *NEUTRAL[kind])]
-    similarity = _similarity(sequence, neutral, at)
-    rows, columns = assign(similarity, 0.5)
-    counts = np.array([n.kind in KINDS[kind] and n.occluded <= 2 and n.truncated <= 0 for n in neutral], dtype=np.bool_)
-    taken = {int(j): bool(counts[i]) for i, j in zip(rows, columns, strict=True)}
-    regions = np.array([label.box_px for label in here if label.kind == DONT_CARE]).reshape(-1, 4)
-    keep = []
-    for j, person in enumerate(told):
-        if j in taken:
-            keep += [j] if taken[j] else []
-        elif person.box_px[3] - person.box_px[1] > 25.0 and not _inside(person.box_px, regions):
-            keep.append(j)
-    ids = np.array([label.track for label, c in zip(neutral, counts, strict=True) if c], dtype=np.int64)
-    people = np.array([told[j].person for j in keep], dtype=np.int64)
-    return BoxFrame(ids, people, similarity[counts][:, keep])
-
-
-def _similarity(sequence: TrackingSequence, labels: Sequence[Label], at: Floats) -> Floats:
-    truth = [sequence.vehicle_truth(label, label.frame) for label in labels]
-    places = np.array([[t.x_m, t.y_m] for t in truth]).reshape(-1, 2)
-    away = np.linalg.norm(places[:, None] - at[None], axis=-1)
-    return np.asarray(np.maximum(0.0, 1.0 - away / (2.0 * HALF_AT_M)))
-
-
-def _inside(box: tuple[float, ...], regions: Floats) -> bool:
-    x1, y1, x2, y2 = box
-    for n1, m1, n2, m2 in regions.tolist():
-        shared = max(0.0, min(x2, n2) - max(x1, n1)) * max(0.0, min(y2, m2) - max(y1, m1))
-        if shared > 0.5 * (x2 - x1) * (y2 - y1):
-            return True
-    return False
-
-
-def summarise_people(results: Sequence[PeopleResult]) -> tuple[list[PeopleRow], list[PeopleTracks]]:
-    """A row for each sequence and range; then of those where the ego drives, where it stands, and of all."""
+def summarise_people(results: Sequence[PeopleResult]) -> tuple[list[PeopleRow], list[TracksRow]]:
+    """Rows for each sequence, of places by range and of tracks; then of where the ego drives, where it stands, all."""
     moving = [r for r in results if r.name not in STANDING_EGO]
     standing = [r for r in results if r.name in STANDING_EGO]
     groups = [(r.name, [r]) for r in results]
@@ -263,7 +206,7 @@ def summarise_people(results: Sequence[PeopleResult]) -> tuple[list[PeopleRow], 
         for name, group in groups
         for near, far in RANGES_M
     ]
-    return rows, [_tracks(name, group) for name, group in groups]
+    return rows, [tracks_row(name, METRES, [r.tracked for r in group]) for name, group in groups]
 
 
 def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
@@ -292,25 +235,3 @@ def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
 
 def _median(values: Floats) -> float | None:
     return float(np.median(values)) if len(values) else None
-
-
-def _tracks(name: str, group: Sequence[PeopleResult]) -> PeopleTracks:
-    """Of several sequences: their frames one after the other, nobody in two of them."""
-    frames, offset = [], 0
-    for result in group:
-        frames += [replace(f, labels=f.labels + offset, tracks=f.tracks + offset) for f in result.tracked]
-        offset += 1 << 32
-    parts, clear = hota_parts(frames), clear_mot(frames)
-    minutes = sum(r.frames for r in group) / 600.0
-    return PeopleTracks(
-        sequence=name,
-        labels=sum(len(f.labels) for f in frames),
-        hota=0.0 if parts is None else parts.hota,
-        det_a=0.0 if parts is None else parts.det_a,
-        ass_a=0.0 if parts is None else parts.ass_a,
-        loc_a=0.0 if parts is None else parts.loc_a,
-        idf1=idf1(frames) or 0.0,
-        mota=clear.mota,
-        switches=clear.switches,
-        switches_per_minute=clear.switches / max(minutes, 1e-9),
-    )

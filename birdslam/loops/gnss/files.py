@@ -9,16 +9,15 @@ from __future__ import annotations
 import csv
 import io
 import math
-from datetime import UTC, datetime
+from datetime import datetime
 from xml.etree import ElementTree
 
-from birdslam.loops.earth import DEFAULT_SIGMA_M, GnssFix
+from birdslam.loops.gnss.earth import DEFAULT_SIGMA_M, GnssFix, is_on_earth
+from birdslam.loops.gnss.sentences import SIGMA_PER_HDOP_M, NmeaReader, Sentence
 from birdslam.types import NS_PER_S
 
 MOST_BYTES, MOST_FIXES = 1 << 26, 1_000_000
 MOST_S = 4e9  # of a time in seconds, either way
-SIGMA_PER_HDOP_M = 4.0
-KNOT_MPS = 0.514444
 DAY_S = 86_400.0
 GNSS_FILE = "gnss.csv"  # of the fixes that came while a car drove, in the drive's folder
 COLUMNS = "time_s, latitude_deg, longitude_deg, and where known sigma_m, speed_mps"
@@ -63,11 +62,25 @@ def read_fixes(data: bytes, name: str, begin_ns: int) -> list[GnssFix]:
     return sorted(out, key=lambda fix: fix.t_source_ns)
 
 
-_Fix = tuple[float, float, float, float, float | None]
+def checked_fix(
+    name: str, t_source_ns: int, latitude_deg: float, longitude_deg: float, sigma_m: float, speed_mps: float | None
+) -> GnssFix:
+    """A fix of a stream. Raises GnssError where it is none."""
+    _checked(name, 0, t_source_ns / NS_PER_S, latitude_deg, longitude_deg, sigma_m, speed_mps)
+    return GnssFix(
+        t_source_ns=t_source_ns,
+        latitude_deg=latitude_deg,
+        longitude_deg=longitude_deg,
+        sigma_m=sigma_m,
+        speed_mps=speed_mps,
+    )
+
+
+_Fix = Sentence
 
 
 def _checked(name: str, line: int, t_s: float, lat: float, lon: float, sigma_m: float, speed: float | None) -> _Fix:
-    whole = math.isfinite(t_s) and abs(t_s) < MOST_S and abs(lat) <= 90.0 and abs(lon) <= 180.0
+    whole = math.isfinite(t_s) and abs(t_s) < MOST_S and is_on_earth(lat, lon)
     fine = math.isfinite(sigma_m) and 0.0 < sigma_m < 1e5 and (speed is None or 0.0 <= speed < 200.0)
     if not (whole and fine):
         raise GnssError(f"{name}: line {line} is no fix: {t_s:g} s, {lat:g}, {lon:g}, sigma {sigma_m:g} m")
@@ -111,59 +124,17 @@ def _csv(text: str, name: str) -> list[_Fix]:
 
 
 def _nmea(text: str, name: str) -> list[_Fix]:
-    """RMC sentences, which tell date and speed, with the dilution of the GGA of the same time."""
-    out: list[_Fix] = []
-    dilution: dict[str, float] = {}
+    """RMC sentences, which tell date and speed, with the accuracy that GST or GGA of the same time tell."""
+    reader, out = NmeaReader(), []
     for number, line in enumerate(text.splitlines(), start=1):
-        words = _sentence(line)
-        if words is None:
-            continue
         try:
-            if words[0].endswith("GGA") and len(words) > 8 and words[8]:
-                dilution = {words[1]: float(words[8])}
-            if not words[0].endswith("RMC") or len(words) < 10 or words[2] != "A":
-                continue
-            t_s = _utc(words[9], words[1])
-            latitude, longitude = _degrees(words[3], words[4]), _degrees(words[5], words[6])
-            sigma_m = SIGMA_PER_HDOP_M * dilution[words[1]] if words[1] in dilution else DEFAULT_SIGMA_M
-            speed = float(words[7]) * KNOT_MPS if words[7] else None
-            out.append(_checked(name, number, t_s, latitude, longitude, sigma_m, speed))
-        except (ValueError, OverflowError) as error:
-            if isinstance(error, GnssError):
-                raise
+            found = reader.take(line)
+        except ValueError:
             raise GnssError(f"{name}: line {number} is no NMEA fix: {line[:60]!r}") from None
-    return out
-
-
-def _sentence(line: str) -> list[str] | None:
-    """Its words, where its sum is right; receivers cut lines off."""
-    body, star, told = line.strip().partition("*")
-    if not body.startswith("$") or not star:
-        return None
-    total = 0
-    for byte in body[1:].encode("utf-8"):
-        total ^= byte
-    try:
-        return body[1:].split(",") if int(told[:2], 16) == total else None
-    except ValueError:
-        return None
-
-
-def _utc(date: str, time: str) -> float:
-    seconds = float(time[4:])
-    if not 0.0 <= seconds < 61.0:
-        raise ValueError(f"{time} is no time")
-    day = datetime(2000 + int(date[4:6]), int(date[2:4]), int(date[:2]), int(time[:2]), int(time[2:4]), tzinfo=UTC)
-    return day.timestamp() + seconds
-
-
-def _degrees(word: str, side: str) -> float:
-    """ddmm.mmmm and its hemisphere."""
-    number = float(word)
-    if not math.isfinite(number):
-        raise ValueError(f"{word} is no angle")
-    whole = math.floor(number / 100.0)
-    return (whole + (number - 100.0 * whole) / 60.0) * (-1.0 if side in ("S", "W") else 1.0)
+        if found is not None:
+            out.append(_checked(name, number, *found))
+    last = reader.finish()
+    return out if last is None else [*out, _checked(name, number, *last)]
 
 
 def _gpx(text: str, name: str) -> list[_Fix]:

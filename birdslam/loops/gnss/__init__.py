@@ -1,0 +1,1 @@
+"""A place on Earth: fixes read, and drives and maps tied to WGS 84 by them."""

@@ -1,0 +1,87 @@
+"""NMEA 0183, sentence by sentence: RMC has the fix, GST or GGA of the same time its accuracy, before it or after it."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+
+from birdslam.loops.gnss.earth import DEFAULT_SIGMA_M
+
+SIGMA_PER_HDOP_M = 4.0
+KNOT_MPS = 0.514444
+
+Sentence = tuple[float, float, float, float, float | None]  # UTC in s, latitude, longitude, sigma_m, speed_mps
+
+
+class NmeaReader:
+    """`take` each line; a fix comes once the next one begins, `finish` has the last."""
+
+    def __init__(self) -> None:
+        self._waiting: tuple[str, float, float, float, float | None] | None = None  # the time as it was told, then ...
+        self._accuracy: dict[str, float] = {}  # by the time as it was told
+
+    @property
+    def waits(self) -> str:
+        """The time, as it was told, of the fix at hand; "": there is none."""
+        return "" if self._waiting is None else self._waiting[0]
+
+    def take(self, line: str) -> Sentence | None:
+        """The fix before this line's, where this line begins another. Raises ValueError for one with a right sum and no
+        numbers; what has no right sum is passed over, since receivers cut lines off.
+        """
+        words = _words(line)
+        if words is None or len(words[0]) < 5:
+            return None
+        kind = words[0][-3:]
+        if kind == "GST" and len(words) > 7 and words[6] and words[7]:
+            self._accuracy[words[1]] = math.hypot(float(words[6]), float(words[7])) / math.sqrt(2.0)
+        elif kind == "GGA" and len(words) > 8 and words[8]:
+            self._accuracy.setdefault(words[1], SIGMA_PER_HDOP_M * float(words[8]))
+        elif kind == "RMC" and len(words) > 9 and words[2] == "A":
+            speed_mps = float(words[7]) * KNOT_MPS if words[7] else None
+            place = _degrees(words[3], words[4]), _degrees(words[5], words[6])
+            here = words[1], _utc(words[9], words[1]), *place, speed_mps
+            before, self._waiting = self.finish(), here
+            return before
+        return None
+
+    def finish(self) -> Sentence | None:
+        """The fix that waits for its accuracy."""
+        if self._waiting is None:
+            return None
+        told, utc_s, latitude_deg, longitude_deg, speed_mps = self._waiting
+        sigma_m = self._accuracy.get(told, DEFAULT_SIGMA_M)
+        self._waiting = None
+        self._accuracy = {time: sigma for time, sigma in [*self._accuracy.items()][-2:] if time != told}
+        return utc_s, latitude_deg, longitude_deg, sigma_m, speed_mps
+
+
+def _words(line: str) -> list[str] | None:
+    """Of a sentence whose sum is right."""
+    body, star, told = line.strip().partition("*")
+    if not body.startswith("$") or not star:
+        return None
+    total = 0
+    for byte in body[1:].encode("utf-8"):
+        total ^= byte
+    try:
+        return body[1:].split(",") if int(told[:2], 16) == total else None
+    except ValueError:
+        return None
+
+
+def _utc(date: str, time: str) -> float:
+    seconds = float(time[4:])
+    if not 0.0 <= seconds < 61.0:
+        raise ValueError(f"{time} is no time")
+    day = datetime(2000 + int(date[4:6]), int(date[2:4]), int(date[:2]), int(time[:2]), int(time[2:4]), tzinfo=UTC)
+    return day.timestamp() + seconds
+
+
+def _degrees(word: str, side: str) -> float:
+    """ddmm.mmmm and its hemisphere."""
+    number = float(word)
+    if not math.isfinite(number):
+        raise ValueError(f"{word} is no angle")
+    whole = math.floor(number / 100.0)
+    return (whole + (number - 100.0 * whole) / 60.0) * (-1.0 if side in ("S", "W") else 1.0)

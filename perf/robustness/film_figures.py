@@ -1,0 +1,161 @@
+"""What the ego-motion of a film came to: valid frames, the first of them, speed over the truth; table and plot."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+Floats = NDArray[np.float64]
+TrueSpeed = Callable[[float, float], float]  # m/s between two times in s of the recording
+
+BEGINNING_S = 2.0  # of a film, after which it should be valid
+ALIKE = 0.03  # of the way: so near the variants of one film should be
+_DRIVES_MPS = 1.0  # slower than that a ratio of speeds says little
+
+
+@dataclass
+class Course:
+    """What a variant came to: of each motion its end (s), its speed (m/s), the true one, and whether it is valid."""
+
+    t_s: list[float] = field(default_factory=list)
+    speed_mps: list[float] = field(default_factory=list)
+    true_mps: list[float] = field(default_factory=list)
+    valid: list[bool] = field(default_factory=list)
+
+    def add(self, t_s: float, speed_mps: float, true_mps: float, valid: bool) -> None:
+        """The next motion."""
+        self.t_s.append(t_s)
+        self.speed_mps.append(speed_mps)
+        self.true_mps.append(true_mps)
+        self.valid.append(valid)
+
+
+def course_of_run(path: Path, true_mps: TrueSpeed) -> Course:
+    """Of the frames.csv that `birdslam run` left."""
+    course = Course()
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    for before, row in itertools.pairwise(rows):
+        if row["speed_mps"]:
+            t_s, end_s = float(before["t_s"]), float(row["t_s"])
+            at_s = end_s - float(rows[0]["t_s"])
+            course.add(at_s, float(row["speed_mps"]), true_mps(t_s, end_s), row["valid"] == "1")
+    return course
+
+
+def summary(course: Course) -> dict[str, Any]:
+    """The figures of a row."""
+    t_s, valid, true_mps = np.array(course.t_s), np.array(course.valid, bool), np.array(course.true_mps)
+    ratio = np.array(course.speed_mps) / np.maximum(true_mps, 0.1)
+    late = t_s > BEGINNING_S
+    counted = valid & late & (true_mps > _DRIVES_MPS)
+    median = float(np.median(ratio[counted])) if counted.any() else None
+    return {
+        "frames": len(t_s),
+        "valid": float(valid.mean()) if len(valid) else 0.0,
+        "valid_after_2_s": float(valid[late].mean()) if late.any() else 0.0,
+        "first_valid_s": float(t_s[valid.argmax()]) if valid.any() else None,
+        "speed_over_truth": median,
+        "deviation": None if median is None else float(np.median(np.abs(ratio[counted] / median - 1.0))),
+        "by_second": _by_second(t_s, np.where(valid, ratio, np.nan)),
+    }
+
+
+def _by_second(t_s: Floats, ratio: Floats) -> list[float | None]:
+    out: list[float | None] = []
+    for second in range(int(t_s[-1]) + 1 if len(t_s) else 0):
+        here = ratio[(t_s >= second) & (t_s < second + 1)]
+        here = here[np.isfinite(here)]
+        out.append(round(float(np.median(here)), 3) if len(here) else None)
+    return out
+
+
+def over(figures: dict[str, Any], unchanged: dict[str, Any]) -> float | None:
+    """The way over that of the unchanged film: median over the seconds in which both are valid."""
+    both = [(a, b) for a, b in zip(figures["by_second"], unchanged["by_second"], strict=False) if a and b]
+    return float(np.median([a / b for a, b in both])) if both else None
+
+
+def row_text(figures: dict[str, Any]) -> str:
+    """A row for a person."""
+    return (
+        f"valid {figures['valid_after_2_s']:.0%} from {_text(figures['first_valid_s'], '.2f')} s on  speed over truth "
+        f"{_text(figures['speed_over_truth'], '.3f')} +- {_text(figures['deviation'], '.1%')}  over the unchanged "
+        f"{_text(figures['way_over_unchanged'], '.3f')}  by seconds "
+        + " ".join(_text(ratio, ".2f") for ratio in figures["by_second"])
+    )
+
+
+def _text(figure: float | None, form: str) -> str:
+    return "-" if figure is None else format(figure, form)
+
+
+def page(rows: list[dict[str, Any]]) -> str:
+    """The rows as a page, a table for each part."""
+    lines = [
+        "# One film, otherwise",
+        "",
+        "Each recording at hand at other sizes and rates, through H.264, with something in the way, and begun later",
+        "(`python -m perf films --networks`): does the same drive give the same metres? Valid frames and speed count",
+        "after the first 2 s; *over* is the speed over that of the unchanged film, the median over seconds;",
+        "*deviation* is the median deviation of the speed over the truth from its own median. `town`: the truth is GPS",
+        "at 1 Hz, in whole km/h; its lens is unknown: a constant factor is that of its focal length and height.",
+    ]
+    for part in dict.fromkeys(row["part"] for row in rows):
+        chosen = [row for row in rows if row["part"] == part]
+        lines += [
+            *("", f"## {part.capitalize()}", "", *_spread(chosen)),
+            "| film | valid after 2 s | first valid, s | speed over truth | deviation | over |",
+            "|---|---|---|---|---|---|",
+        ]
+        lines += [
+            (
+                f"| {row['name']} | {row['valid_after_2_s']:.0%} | {_text(row['first_valid_s'], '.2f')} | "
+                f"{_text(row['speed_over_truth'], '.3f')} | {_text(row['deviation'], '.1%')} | "
+                f"{_text(row['way_over_unchanged'], '.3f')} |"
+            )
+            for row in chosen
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _spread(rows: list[dict[str, Any]]) -> list[str]:
+    """For each film the least and the most of its variants, over the unchanged one."""
+    out = []
+    for film in dict.fromkeys(row["film"] for row in rows):
+        ratios = [row["way_over_unchanged"] for row in rows if row["film"] == film]
+        told = [ratio for ratio in ratios if ratio is not None]
+        if not told:
+            continue
+        inside = sum(abs(ratio - 1.0) <= ALIKE for ratio in told)
+        out.append(f"- {film}: {min(told):.3f} to {max(told):.3f}, {inside} of {len(ratios)} within {ALIKE:.0%}")
+    return [*out, ""] if out else []
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Speed over truth by seconds, a panel for each part of each film."""
+    panels = list(dict.fromkeys((row["film"], row["part"]) for row in rows))
+    figure, axes = plt.subplots(len(panels), 1, figsize=(10, 2.6 * len(panels)), squeeze=False)
+    for (film, part), panel in zip(panels, axes[:, 0], strict=True):
+        for row in rows:
+            if (row["film"], row["part"]) == (film, part):
+                ratio = [np.nan if value is None else value for value in row["by_second"]]
+                name = row["name"].partition(": ")[2]
+                panel.plot(np.arange(len(ratio)) + 0.5, ratio, marker=".", label=name, linewidth=1)
+        panel.set(title=f"{film}: {part}", xlabel="s", ylabel="speed over truth", ylim=(0.5, 1.6))
+        panel.legend(fontsize=6, ncols=3)
+        panel.grid(True, alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(path, dpi=90)
+    plt.close(figure)

@@ -1,0 +1,177 @@
+"""One drive and its map, frame by frame: `map.tum.txt` and `localisation.csv` as it goes, and the map at its end.
+
+The same for a drive that is over (drive_map.py) and for one that goes on (map_process.py).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.localiser import Localisation
+from birdslam.loops.map_pose import EarthPose, MapPose, MapState
+from birdslam.loops.place_map import MapCamera, PlaceMap
+from birdslam.loops.session import MapSession
+from birdslam.outputs.map_trajectory import MapTrajectory, TrajectoryFiles
+from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.maps.map_store import check_map, write_map
+from birdslam.types import NS_PER_S, Estimate
+
+POSE_EVERY_M = 1.0  # of way: what is kept of a drive for its place on Earth
+
+Poses = list[tuple[int, SE2]]  # source time in ns, and the pose in one frame
+
+
+@dataclass(frozen=True)
+class MapChoice:
+    """Which map, and whether the drive may write it."""
+
+    path: Path
+    extend: bool
+
+    @staticmethod
+    def of(configuration: Configuration) -> MapChoice | None:
+        """What the configuration asks for; None: no map. Raises ConfigurationError."""
+        results = configuration.results
+        if results.map and results.map_only:
+            raise ConfigurationError("results.map, results.map_only: a map is written, or only read; name one of them")
+        if results.map or results.map_only:
+            return MapChoice(Path(results.map or results.map_only).expanduser(), bool(results.map))
+        return None
+
+    def open(self, camera: Camera) -> PlaceMap:
+        """The map that the drive begins with. Raises MapError, or ConfigurationError for one of another camera."""
+        found = check_map(self.path, self.extend)
+        if found is None:
+            return PlaceMap(MapCamera.of(camera))
+        other = found.camera.differs(camera)
+        if other and self.extend:
+            raise ConfigurationError(
+                f"{self.path}: is the map of another camera: {other}; localise in it by --map-only, "
+                "or begin another map"
+            )
+        return found
+
+
+class MapDrive:
+    """`step` takes each frame, `finish` ends the drive; `save` writes the map as it is meanwhile."""
+
+    def __init__(self, choice: MapChoice, camera: Camera, output: Path) -> None:
+        """Raises MapError, ConfigurationError, OSError."""
+        self.map = choice.open(camera)
+        self.poses: Poses = []  # in the map, every metre
+        self._choice = choice
+        self._before = self._saved = len(self.map)
+        self._session = MapSession(camera, self.map, choice.extend)
+        self._trajectory, self._files = MapTrajectory(), TrajectoryFiles(output)
+        self._begin_ns: int | None = None
+        self._frame_id = -1
+        self.unwritten: OSError | None = None  # the disk is full: the drive's files end here, the map goes on
+
+    def resume(self, pose: MapPose) -> None:
+        """Goes on where the process before this one had come to."""
+        self._session.resume(pose)
+
+    def step(self, estimate: Estimate, image: NDArray[np.uint8] | None) -> Localisation:
+        """One frame, undistorted; None: it is not looked at. One that is told again, corrected, has its row already."""
+        if self._begin_ns is None:
+            self._begin_ns = estimate.t_source_ns
+        found = self._session.step(estimate, image)
+        if estimate.frame_id != self._frame_id:
+            self._write(self._trajectory.add(found, estimate))
+        self._frame_id = estimate.frame_id
+        if found.T_map_ego is not None and self._is_further(found.T_map_ego):
+            self.poses.append((found.t_source_ns, found.T_map_ego))
+        return found
+
+    def _write(self, settled: list[Localisation]) -> None:
+        if self.unwritten is None:
+            try:
+                self._files.write(settled)
+            except OSError as error:
+                self.unwritten = error
+
+    def _is_further(self, T_map_ego: SE2) -> bool:
+        if not self.poses:
+            return True
+        last = self.poses[-1][1]
+        return math.hypot(T_map_ego.x_m - last.x_m, T_map_ego.y_m - last.y_m) >= POSE_EVERY_M
+
+    @property
+    def T_map_odom(self) -> SE2 | None:
+        """Joins the two frames (REP-105); None where lost."""
+        return self._session.localiser.T_map_odom
+
+    def on_earth(self, found: Localisation) -> EarthPose | None:
+        """The ego on Earth, where the map is."""
+        return None if found.T_map_ego is None else self.map.on_earth(found.T_map_ego, found.cov)
+
+    @property
+    def unsaved(self) -> bool:
+        """Whether the map has keyframes that its file lacks."""
+        return self._choice.extend and len(self.map) > self._saved
+
+    def save(self) -> int:
+        """The map so far, whole, where it may be written; gives its size in bytes. Raises MapError."""
+        if not self._choice.extend:
+            return 0
+        size = write_map(self._choice.path, self.map)
+        self._saved = len(self.map)
+        return size
+
+    def end(self) -> None:
+        """The last keyframes, loops closed, and the files of the drive. Raises OSError."""
+        self._session.finish()
+        self._write(self._trajectory.finish())
+        if self.unwritten is None:
+            self._files.close()
+        else:
+            raise self.unwritten
+
+    def summary(self) -> dict[str, Any]:
+        """For summary.json, once ended."""
+        first_ns, begin_ns = self._trajectory.first_ns, self._begin_ns
+        return {
+            "file": str(self._choice.path),
+            **self._trajectory.counts,
+            "time_to_localise_s": None
+            if first_ns is None or begin_ns is None
+            else round((first_ns - begin_ns) / NS_PER_S, 3),
+            "keyframes": len(self.map),
+            "new_keyframes": len(self.map) - self._before,
+            "keyframes_without_place": self._session.lost_keyframes,
+        }
+
+    def write(self, summary: dict[str, Any]) -> None:
+        """The map at the end of the drive, where it may be written. Raises MapError."""
+        if not self._choice.extend:
+            return
+        if len(self.map):
+            summary["bytes"] = self.save()
+        else:
+            summary["file"] = None  # nothing that a later drive could be found by
+
+
+def rows(found: dict[str, Any]) -> list[tuple[str, str]]:
+    """The lines of a run's table that speak of the map."""
+    if "error" in found:
+        return [("map", f"NOT KEPT: {found['error']}")]
+    frames = sum(found[state.value] for state in MapState)
+    out = [("localised in the map", f"{found['localised']} of {frames} frames: map.tum.txt, localisation.csv")]
+    if found["time_to_localise_s"] is not None:
+        out.append(("  first after", f"{found['time_to_localise_s']:.1f} s"))
+    if "bytes" in found:
+        size = f"{found['keyframes']} keyframes, {found['new_keyframes']} of them new, {found['bytes'] / 1e6:.2f} MB"
+        out.append(("map", f"{found['file']}: {size}"))
+    elif found["file"] is None:
+        out.append(("map", "none: no keyframe could be made of this drive"))
+    if found["keyframes_without_place"]:
+        out.append(("  without a place", f"{found['keyframes_without_place']} keyframes: the drive never met the map"))
+    return out

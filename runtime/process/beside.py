@@ -1,0 +1,53 @@
+"""The entry of processes beside the pipeline, recorder and map: nobody waits for them, and all others go first."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable
+from types import FrameType
+from typing import TypeVar
+
+import msgspec
+
+from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.process.child import begin
+from birdslam.runtime.process.vitals import Vitals
+
+DISK_STATUS = 3  # the disk failed it
+
+_Order = TypeVar("_Order", bound=msgspec.Struct)
+
+log = logging.getLogger(__name__)
+
+
+class Stop:
+    """SIGTERM: it is to end."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        signal.signal(signal.SIGTERM, self._handle)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.asked = True
+
+
+def run_beside(work: Callable[[Configuration, _Order, Vitals, Stop], int], order: type[_Order], niceness: int) -> None:
+    """`NAME VITALS_FD PARENT_PID`, on standard input the configuration and then its order, as lines of JSON each.
+
+    Ends the process with what `work` gives; 0: all is done, and it counts as ended. 1 for a bug.
+    """
+    stop = Stop()
+    name, configuration, vitals = begin(sys.argv[1:])
+    os.nice(niceness)
+    asked = msgspec.json.decode(sys.stdin.buffer.readline(), type=order)
+    try:
+        status = work(configuration, asked, vitals, stop)
+    except Exception:
+        log.exception("%s failed", name)
+        sys.exit(1)
+    if status == 0:
+        vitals.count(ended=1)
+    sys.exit(status)

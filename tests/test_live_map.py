@@ -1,0 +1,240 @@
+"""The map process beside a drive that goes on: real processes, real zenoh; killed, stalled, refused, on a full disk."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from birdslam.loops.map_pose import InMap, MapState
+from birdslam.runtime.client import Planner
+from birdslam.runtime.maps.map_store import read_map
+from birdslam.runtime.recording.recording import Recording
+from tests.test_bus import until
+from tests.test_pipeline import F_PX, HEIGHT, LIMIT_S, UNHURRIED, WIDTH, Run, call, road_image
+
+pytestmark = pytest.mark.processes
+
+FRAMES, STEP_M = 48, 0.5
+
+
+WALL_M, WALL_HEIGHT_M = 5.0, 4.0
+
+
+def street_image(x_m: float) -> np.ndarray:
+    """The road between two walls, whose corners have depths that a map can keep."""
+    image = road_image(x_m)
+    u, v = np.meshgrid(np.arange(WIDTH, dtype=np.float32) - WIDTH / 2, np.arange(HEIGHT, dtype=np.float32) - HEIGHT / 2)
+    depth = WALL_M * F_PX / np.maximum(np.abs(u), 1.0)
+    down_m = v * depth / F_PX
+    blocks = np.random.default_rng(6).integers(0, 256, (16, 200), dtype=np.uint8)
+    blocks = cv2.resize(blocks, None, fx=16, fy=16, interpolation=cv2.INTER_NEAREST)
+    scale = np.float32(32.0)  # texels a metre: blocks of half a metre
+    along = (depth + x_m) * scale + np.where(u < 0.0, 0.0, 1500.0).astype(np.float32)
+    up = (down_m + WALL_HEIGHT_M) * scale
+    wall = cv2.remap(
+        blocks, along.astype(np.float32), up.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
+    )
+    on_wall = (down_m < 1.65) & (down_m > -WALL_HEIGHT_M) & (depth < 60.0)
+    return np.where(on_wall, wall, image).astype(np.uint8)
+
+
+def write_drive(sequence: Path, frames: int) -> Path:
+    """A small KITTI drive: straight on, half a metre a frame."""
+    (sequence / "image_0").mkdir(parents=True)
+    for number in range(frames):
+        assert cv2.imwrite(str(sequence / "image_0" / f"{number:06d}.png"), street_image(STEP_M * number))
+    row = f"{F_PX} 0 {WIDTH / 2} 0 0 {F_PX} {HEIGHT / 2} 0 0 0 1 0"
+    (sequence / "calib.txt").write_text(f"P0: {row}\n")
+    (sequence / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(frames)))
+    return sequence
+
+
+@pytest.fixture(scope="module")
+def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_drive(tmp_path_factory.mktemp("kitti") / "sequences" / "78", FRAMES)
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory, road: Path) -> bytes:
+    """The map of that road, made when a drive of it was over."""
+    place = tmp_path_factory.mktemp("kept")
+    made = call(
+        *("run", "--source", f"kitti:{road}", "--rate", "max", "--map", str(place / "road.map")),
+        *("--output", str(place / "out"), "--set", "models.shipped=false"),
+    )
+    assert made.returncode == 0, made.stderr
+    assert len(read_map(place / "road.map")) >= 4
+    return (place / "road.map").read_bytes()
+
+
+def live(place: Path, road: Path, *arguments: str) -> Run:
+    """The road again and again, ten times a second."""
+    return Run(
+        *(place, "--source", f"kitti:{road}", "--rate", "10", "--set", "source.loop=true", *UNHURRIED, *arguments)
+    )
+
+
+def in_map(planner: Planner, enough: Callable[[InMap], bool], what: str) -> InMap:
+    """The newest estimate in the map, once it is as asked."""
+    until(lambda: enough(planner.in_map()), what)
+    return planner.in_map()
+
+
+def hears(planner: Planner, frames: int) -> None:
+    """So many further estimates."""
+    until_s = time.monotonic() + LIMIT_S
+    heard = 0
+    while heard < frames:
+        assert time.monotonic() < until_s
+        heard += planner.wait(1.0) is not None
+
+
+def test_a_planner_is_told_where_it_is_in_the_map(
+    tmp_path_factory: pytest.TempPathFactory, road: Path, kept: bytes
+) -> None:
+    place = tmp_path_factory.mktemp("l")
+    path = place / "road.map"
+    path.write_bytes(kept)
+    with (
+        live(place, road, "--map-only", str(path), "--record", str(place / "l.mcap")) as run,
+        Planner(run.vehicle, run.runtime_dir) as planner,
+    ):
+        found = in_map(planner, lambda here: here.state is MapState.LOCALISED, "the drive is localised")
+        with Planner(run.vehicle, run.runtime_dir) as late:  # the last pose is there for who comes later
+            in_map(late, lambda here: here.pose is not None, "one that came late knows")
+        run.process.send_signal(signal.SIGTERM)
+        status, out, err = run.end()
+    assert status == 0, err
+    assert found.T_map_ego is not None
+    assert abs(found.T_map_ego.y_m) < 0.5
+    assert -1.0 < found.T_map_ego.x_m < STEP_M * FRAMES + 5.0
+    assert np.sqrt(found.cov[0, 0]) < 0.5
+    summary = run.summary()["map"]
+    assert summary["localised"] > 0
+    assert summary["restarts"] == 0
+    assert len((run.output / "map.tum.txt").read_text().splitlines()) == summary["localised"]
+    assert path.read_bytes() == kept
+    assert "localised in the map" in out
+    recorded = [msgspec.json.decode(m.data) for m in Recording(place / "l.mcap").messages(("/map_pose",))]
+    assert {"localised"} <= {pose["state"] for pose in recorded}
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause"),
+    [
+        (lambda run: os.kill(run.node_pid("map"), signal.SIGKILL), "was killed by SIGKILL"),
+        (lambda run: run.stall("map"), "is stalled: its loop has shown no life"),
+    ],
+    ids=["dies", "stalls"],
+)
+def test_nobody_notices_that_the_map_process_dies_or_stalls(
+    fault: Callable[[Run], None], cause: str, tmp_path_factory: pytest.TempPathFactory, road: Path
+) -> None:
+    place = tmp_path_factory.mktemp("k")
+    path = place / "road.map"
+    with (
+        live(place, road, "--map", str(path)) as run,
+        Planner(run.vehicle, run.runtime_dir) as planner,
+    ):
+        in_map(planner, lambda here: here.pose is not None and here.pose.keyframes >= 2, "there are keyframes")
+        until(path.is_file, "the map is saved meanwhile")
+        fault(run)
+        hears(planner, 10)
+        again = planner.in_map().pose
+        assert again is not None
+        in_map(
+            planner,
+            lambda here: here.pose is not None and here.pose.frame_id > again.frame_id + 3 and here.pose.keyframes > 0,
+            "its successor goes on with the map that was saved",
+        )
+        run.process.send_signal(signal.SIGTERM)
+        status, out, err = run.end()
+    assert status == 0, err
+    assert f"map {cause}" in out
+    summary = run.summary()
+    assert set(summary["restarts"].values()) == {0}
+    assert summary["map"]["restarts"] == 1
+    assert len(read_map(path)) >= 2
+
+
+def test_a_full_disk_costs_the_map_nothing_that_it_had(
+    tmp_path_factory: pytest.TempPathFactory, road: Path, kept: bytes
+) -> None:
+    place = tmp_path_factory.mktemp("f")
+    path = place / "road.map"
+    path.write_bytes(kept)
+    with (
+        live(place, road, "--map", str(path)) as run,
+        Planner(run.vehicle, run.runtime_dir) as planner,
+    ):
+        in_map(planner, lambda here: here.pose is not None, "the map process is at work")
+        limit = len(kept) - 5_000  # no file of its process may grow past it: its log may, the map may not
+        resource.prlimit(run.node_pid("map"), resource.RLIMIT_FSIZE, (limit, limit))
+        hears(planner, 30)
+        run.process.send_signal(signal.SIGTERM)
+        status, out, err = run.end()
+    assert status == 0, err
+    assert "what was there stays: File too large" in out
+    assert "File too large" in run.summary()["map"]["error"]
+    assert path.read_bytes() == kept
+    assert sorted(entry.name for entry in place.iterdir() if entry.name.startswith(".")) == []
+
+
+def test_what_no_drive_could_use_is_refused_before_it(tmp_path: Path, road: Path, kept: bytes) -> None:
+    torn, empty, whole = tmp_path / "torn.map", tmp_path / "empty.map", tmp_path / "road.map"
+    torn.write_bytes(kept[:-100])
+    empty.write_bytes(b"")
+    whole.write_bytes(kept)
+    other = road.parent / "79"
+    if not other.is_dir():
+        write_drive(other, 3)
+        (other / "calib.txt").write_text((other / "calib.txt").read_text().replace(f"{F_PX}", f"{2 * F_PX}"))
+    for name, path, source in (("torn", torn, road), ("is empty", empty, road), ("another camera", whole, other)):
+        refused = call(
+            *(
+                "run",
+                "--source",
+                f"kitti:{source}",
+                "--rate",
+                "10",
+                "--map",
+                str(path),
+                "--output",
+                str(tmp_path / "o"),
+            ),
+            *("--set", "models.shipped=false", "--set", f"runtime.runtime_dir={tmp_path / 'rt'}"),
+        )
+        assert refused.returncode == 2, refused.stderr
+        assert name in refused.stderr
+        assert len(refused.stderr.strip().splitlines()) == 1
+    assert whole.read_bytes() == kept
+
+
+def test_without_a_map_there_is_no_map_process(tmp_path: Path, road: Path, kept: bytes) -> None:
+    (tmp_path / "road.map").write_bytes(kept)
+    (tmp_path / "car.toml").write_text('[results]\nmap = "road.map"\n')
+    with Run(tmp_path, str(tmp_path / "car.toml"), "--source", f"kitti:{road}", "--rate", "20", "--no-map") as run:
+        status, _, err = run.end()
+    assert status == 0, err
+    assert not (run.output / "logs" / "map.log").exists()
+    assert "map" not in run.summary()
+
+
+def test_a_batch_of_drives_makes_one_map(tmp_path: Path, road: Path) -> None:
+    write_drive(tmp_path / "again", FRAMES)
+    done = call(
+        *("batch", str(road), str(tmp_path / "again"), "--output", str(tmp_path / "out"), "--jobs", "1"),
+        *("--map", str(tmp_path / "street.map"), "--set", "models.shipped=false"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "2 drives" in done.stdout
+    assert read_map(tmp_path / "street.map").drives == 2
