@@ -88,16 +88,16 @@ def _providers(asked: str, models: Path, threads: int, output: Path | None) -> N
     here = providers_here()
     wanted = here if asked == "all" else ("cpu", asked)
     print(f"{describe()['cpu']}; this onnxruntime has {', '.join(here)}; {threads} threads")
-    networks = {"multitask": str(SHIPPED_NETWORKS / SHIPPED_MULTITASK)}
-    networks |= {role: str(path) for role, name in OTHERS.items() if (path := models / name).is_file()}
+    files = {"multitask": SHIPPED_NETWORKS / SHIPPED_MULTITASK}
+    files |= {role: models / name for role, name in OTHERS.items() if (models / name).is_file()}
     try:
         with Ledger(output, label, providers=list(here)) as ledger:
-            for role, path in networks.items():
-                spec = ModelSpec(path=path, threads=threads)
+            for role, file in files.items():
+                spec = ModelSpec(path=str(file), threads=threads)
                 for provider, found in compared(role, spec, wanted, within_s=3.0 * len(wanted)).items():
                     figures = {"ms": found.ms, "off_rel": found.off_rel}
                     said = found.problem or f"{found.ms:7.2f} ms a run, off by {found.off_rel:.2%} (RMS)"
-                    ledger.add(f"{Path(path).name} {provider}", said, **figures)
+                    ledger.add(f"{file.name} {provider}", said, **figures)
     except ModelError as error:
         raise PerfError(str(error)) from error
 

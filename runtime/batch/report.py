@@ -97,7 +97,7 @@ def _write_drives(tasks: Sequence[Task], output: Path) -> None:
             _whole(folder / REPORT, lambda file, page=page: file.write(page))  # type: ignore[misc]
 
 
-def _whole(path: Path, write: Callable[[IO[str]], None]) -> None:
+def _whole(path: Path, write: Callable[[IO[str]], object]) -> None:
     """A file that is there whole, or as it was before."""
     partial = path.with_name(f".{path.name}.partial")
     with partial.open("w", encoding="utf-8", newline="") as file:

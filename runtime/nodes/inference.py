@@ -110,8 +110,8 @@ class Inference(Closing):
 
     @staticmethod
     def _computed_by(
-        specs: dict[Role, ModelSpec], configuration: Configuration, most_threads: int | None
-    ) -> dict[Role, ModelSpec]:
+        specs: dict[str, ModelSpec], configuration: Configuration, most_threads: int | None
+    ) -> dict[str, ModelSpec]:
         """Each network with what computes it. At rate "max" nothing is measured, so that a run repeats."""
         from birdslam.perception.session import providers_here
 
