@@ -38,7 +38,8 @@ from birdslam.types import (
 )
 from birdslam.vehicles.out_of_sequence import OpenFrame
 from birdslam.vehicles.placed_boxes import place_boxes
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65)
@@ -75,7 +76,7 @@ class Scene:
         """The next frame."""
         ego = EgoFrame(self.k, round(self.k * 1e9 / HZ), SE2(self.ego_m, 0.0, 0.0), np.zeros((3, 3)))
         dt_s = 0.0 if self.k == 0 else 1.0 / HZ
-        frame = OpenFrame(ego, dt_s, 0.0, None, 0.0, self.ego_mps * dt_s)
+        frame = OpenFrame(ego, dt_s, 0.0, None, None, self.ego_mps * dt_s)
         self.tracker.settle(frame, detections, ROAD)
         self.k += 1
         return followed_people(self.tracker, ego)
