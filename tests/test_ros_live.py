@@ -337,6 +337,11 @@ def topics(*names: str, namespace: str = "") -> list[str]:
 ODOMETRY = "/birdslam/odometry"
 
 
+def place(odometry: Any) -> float:
+    """How far ahead."""
+    return float(odometry["pose"]["pose"]["position"]["x"])
+
+
 @processes
 def test_a_listener_hears_each_message_and_again_after_the_router_was_gone(join: Any, base: Path) -> None:
     port = free_port()
@@ -350,11 +355,13 @@ def test_a_listener_hears_each_message_and_again_after_the_router_was_gone(join:
             listener = Listener(stack.enter_context(peer("hear", str(port), "4", *wanted)))
             vehicle.until_heard(listener, ODOMETRY)
             sent = [vehicle.step() for _ in range(30)]
-            until(lambda: len(listener.of("/diagnostics")) > 30, "messages are lost")
+            until(lambda: place(listener.of(ODOMETRY)[-1]) == pytest.approx(sent[-1]), "messages are lost")
             until(lambda: listener.of("/tf_static"), "who comes late has no /tf_static")
-            at = [message["pose"]["pose"]["position"]["x"] for message in listener.of(ODOMETRY)]
+            at = list(map(place, listener.of(ODOMETRY)))
             assert at[-30:] == pytest.approx(sent)
             assert at == sorted(at)
+            until(lambda: len(listener.of("/birdslam/vehicles")) > 30, "boxes are lost")
+            until(lambda: len(listener.of("/diagnostics")) > 30 and listener.of("/tf"), "the rest is lost")
             (_, box) = listener.of("/birdslam/vehicles")[-1]["detections"]
             assert (box["bbox"]["size"]["x"], box["id"]) == (4.2, "1")
             assert listener.of("/tf")[-1]["transforms"][0]["child_frame_id"] == "base_link"
