@@ -54,6 +54,7 @@ PAPER = SlamConfig(
         landmark_anchor="first_sight",  # X_p of Eq. 3 is a point of the world, and known
         correlation_length_m=0.0,  # no error but those of the edges
         zero_velocity_update=False,
+        vehicles_move_ego=True,  # all edges of Eq. 8 at once
         front_back_ambiguity=False,  # a measured yaw counts as it is
     ),
 )
