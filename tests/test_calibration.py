@@ -15,13 +15,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.calibration.calibration import CalibrationConfig, CalibrationError, Observations, by_road, calibrate
-from birdslam.calibration.height_check import VehicleHeightConfig, solve_mounting
+from birdslam.calibration.calibration import (
+    Calibration,
+    CalibrationConfig,
+    CalibrationError,
+    Observations,
+    by_road,
+    calibrate,
+)
+from birdslam.calibration.height_check import HeightCheck, VehicleHeightConfig, solve_mounting
 from birdslam.calibration.intrinsics import from_chessboard, read_intrinsics
 from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
 from birdslam.odometry.road.fit import RoadFit
+from birdslam.outputs.plain_words import DriveCounts, LengthsBy, verdict
 from birdslam.perception import Perception, Ready
+from birdslam.runtime.calibration.height import lengths_by, with_height
 from birdslam.runtime.cli.main import main
 from birdslam.sources.camera_file import camera_text, load_camera
 from birdslam.sources.recording import DatasetError
@@ -352,3 +361,47 @@ def test_a_bad_speed_file_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "speed.txt").write_text(text)
     with pytest.raises(DatasetError, match=r"speed\.txt"):
         read_speed_curve(tmp_path / "speed.txt")
+
+
+def calibrated(height_m: float, said: tuple[HeightCheck, ...], speed_mps: float = 0.0) -> Calibration:
+    camera = Camera(1280, 720, 1100.0, 1100.0, 639.5, 359.5, height_m)
+    nothing = (1e-4, 0.0, 0.0, 1e-4)
+    return Calibration(
+        camera=camera, cov=nothing, estimates=(), height_checks=said, yaw_rad=None, path_m=90.0, frames=90,
+        speed_mps=speed_mps,
+    )  # fmt: skip
+
+
+def test_a_stated_height_that_cars_contradict_is_kept_with_a_sigma_that_covers_both() -> None:
+    cars = HeightCheck(cue="vehicles", height_m=0.95, sigma_m=0.05, samples=12)
+    camera, by = with_height(calibrated(1.35, (cars,)), True, None, "video:town.mp4")
+    assert camera.height_m == 1.35
+    assert camera.scale_sigma_rel == pytest.approx(math.log(1.35 / 0.95))
+    assert "12 cars says 0.95 m" in by.contradicted_by
+    rests_on = lengths_by(camera, by, None)
+    (told,) = (said for said in verdict(counts(rests_on)) if "contradicted" in said)
+    assert "0.95 m" in told
+    agreed, by = with_height(
+        calibrated(1.35, (msgspec.structs.replace(cars, height_m=1.3),)), True, None, "video:town.mp4"
+    )
+    assert (agreed.scale_sigma_rel, by.contradicted_by) == (0.0, "")
+    assert not any("contradicted" in said for said in verdict(counts(lengths_by(agreed, by, None))))
+
+
+def counts(rests_on: LengthsBy) -> DriveCounts:
+    return DriveCounts(
+        frames=90, invalid_frames=0, invalid_by={}, statuses={}, speed_sources={}, path_m=90.0, valid_path_m=90.0,
+        scale_sigma_rel=0.3, camera_sigma_rel=0.3, lengths_by=rests_on,
+    )  # fmt: skip
+
+
+def test_a_films_sigma_has_the_time_of_its_rows_in_it() -> None:
+    """30 ms made 10.8 m/s of a rendered film with 360 rows, f 554 px, 1.35 m too long by 4.5 %: 2 sigma cover that."""
+    camera = Camera(640, 360, 554.3, 554.3, 319.5, 179.5, 1.35)
+    found = msgspec.structs.replace(calibrated(1.35, (), 10.8), camera=camera)
+    sigma_rel = with_height(found, True, None, "video:f.mp4", is_film=True)[0].scale_sigma_rel
+    assert 0.5 * 0.045 < sigma_rel < 0.045
+    assert with_height(found, True, None, "kitti:f")[0].scale_sigma_rel == 0.0
+    speed = HeightCheck(cue="speed", height_m=1.3, sigma_m=0.03, samples=9)  # has it in
+    by_speed = msgspec.structs.replace(found, height_checks=(speed,))
+    assert with_height(by_speed, False, None, "video:f.mp4", is_film=True)[0].scale_sigma_rel < 0.03

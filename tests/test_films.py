@@ -20,6 +20,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.ros.bag import BagTopics
 from birdslam.runtime.calibration.given import METADATA_SIGMA_REL, Given, focal_length_of
 from birdslam.runtime.cli.main import main
+from birdslam.sources.films.interlaced import is_undecoded, may_be_interlaced
 from birdslam.sources.films.video import VideoRecording
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, RecordedFrame
@@ -104,6 +105,31 @@ def test_other_codecs_are_read_too(name: str, codec: str, tmp_path: Path) -> Non
     assert [frame.error for frame in seen] == [None] * 10
     assert seen[4].image is not None
     assert seen[4].image[:20, :30].mean() > seen[4].image[40:].mean() + 80.0
+
+
+def test_an_interlaced_film_is_seen_or_refused(tmp_path: Path) -> None:
+    """Some OpenCV gives nothing of its pictures, without a word."""
+    path = tmp_path / "i.mp4"
+    wide = np.random.default_rng(1).integers(60, 200, (HEIGHT // 4, WIDTH // 2), np.uint8).repeat(4, 0).repeat(4, 1)
+    with av.open(str(path), "w") as container:
+        options = {"x264-params": "tff=1:interlaced=1", "crf": "8"}
+        stream = container.add_stream("libx264", rate=25, options=options)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for k in range(8):
+            image = wide[:, 8 * k : 8 * k + WIDTH].copy()
+            image[1::2] = wide[1::2, 8 * k + 4 : 8 * k + 4 + WIDTH]  # half a period later
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "gray")))
+        container.mux(stream.encode(None))
+    assert may_be_interlaced(path)
+    assert not may_be_interlaced(film(tmp_path / "p.mp4", range(0, 400, 40)))
+    if is_undecoded(path):
+        with pytest.raises(DatasetError, match=r"i.mp4: is interlaced, .* ffmpeg -i i.mp4 -vf yadif"):
+            frames(path)
+        return
+    for k, frame in enumerate(frames(path)):
+        assert frame.image is not None
+        true = wide[::2, 8 * k : 8 * k + WIDTH].astype(float)
+        assert np.corrcoef(frame.image[::2, :, 0].ravel(), true.ravel())[0, 1] > 0.9
 
 
 def test_sound_and_odd_sizes_do_no_harm(tmp_path: Path) -> None:

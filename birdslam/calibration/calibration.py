@@ -32,7 +32,7 @@ from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.vanishing_point import VanishingPoint
-from birdslam.types import Frame, Status
+from birdslam.types import NS_PER_S, Frame, Status
 from birdslam.vehicles.camera_height import BoxHeight, measure_heights
 
 Floats = NDArray[np.float64]
@@ -89,6 +89,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     yaw_rad: float | None  # of the optical axis, to the left of the direction of travel; not in the camera file
     path_m: float
     frames: int
+    speed_mps: float  # median over the frames that showed their motion
     assumed: str = ""  # why the tilt is none that the drive shows
 
 
@@ -122,6 +123,12 @@ class Observations:
     @property
     def path_m(self) -> float:
         return sum(length for _, _, length in self.steps)
+
+    @property
+    def speed_mps(self) -> float:
+        """The median; 0 without any motion."""
+        each = [length / (self.times_ns[to] - self.times_ns[of]) * NS_PER_S for of, to, length in self.steps]
+        return float(np.median(each)) if each else 0.0
 
 
 Drive = Callable[[], Iterable[tuple[Frame, Pending]]]
@@ -169,6 +176,7 @@ def calibrate(
         yaw_rad=_yaw_rad(seen),
         path_m=seen.path_m,
         frames=seen.frames,
+        speed_mps=seen.speed_mps,
     )
 
 

@@ -32,6 +32,7 @@ MEANINGS: Mapping[Status, str] = {
     Status.SEGMENTATION_CARRIED: "the road's outline is that of an earlier picture",
     Status.DEPTH_CARRIED: "the depths are those of an earlier picture",
     Status.LANES_CARRIED: "the lanes are those of an earlier picture",
+    Status.PROVIDER_MISSING: "a network runs on the processor: its accelerator is not there, or failed",
     Status.NETWORK_FAILED: "a network gave no numbers",
     Status.INPUT_STALE: "something came late",
     Status.DEGRADED_RATE: "the computer is too slow: it looks for vehicles less often",
@@ -68,6 +69,7 @@ class LengthsBy(NamedTuple):
     words: str = "the camera's height and lens, as its camera file or the recording states them"
     height_sigma_rel: float = 0.0
     focal_sigma_rel: float = 0.0
+    contradicted_by: str = ""  # what says another height than the one that was stated, and which
 
 
 AS_STATED = LengthsBy()
@@ -122,6 +124,11 @@ def _lengths(drive: DriveCounts) -> Iterable[str]:
     if by_car:
         by += f", on {_share(by_car, drive.frames)} of the frames on the car's own speed"
     yield f"Lengths are known to {drive.scale_sigma_rel:.0%} (1 sigma; twice that is all but sure). They rest on {by}."
+    if drive.lengths_by.contradicted_by:
+        yield (
+            f"The stated height (or lens) is contradicted: {drive.lengths_by.contradicted_by}. "
+            "One of them is wrong; the sigma covers both."
+        )
     if not drive.camera_sigma_rel:
         yield "In that the height counts as exact: an error of 5 % in it is an error of 5 % in all lengths."
 

@@ -14,5 +14,6 @@ Three packages, each importing only those before it:
   and how everybody moves (`flow`).
 
 Above them `labels` reads the truth off a rendered scene, `scenario` lets a world drive, `demo_world` is the shipped one
-and `roads` has hard ones. `windscreen` and `compression` change images that are done, with OpenCV and numpy alone.
+and `roads` has hard ones; `dashcam` films a scenario as a dashboard camera does. `windscreen` and `compression` change
+images that are done, with OpenCV and numpy alone.
 """

@@ -27,7 +27,7 @@ from birdslam.world.rendering.photometrics import develop, metered
 from birdslam.world.rendering.renderer import Renderer
 from birdslam.world.scenario import Moment, Scenario, moments
 from birdslam.world.truth import Floats
-from birdslam.world.windscreen import Edit
+from birdslam.world.windscreen import Edit, bonnet, caption, from_share, wiper
 
 Image = NDArray[np.uint8]
 _WIDEST_VIEW_RAD = math.radians(80.0)  # of one rendered view, across: a wider lens is put together of several
@@ -51,6 +51,7 @@ class Dashcam:
     readout_s: float = 0.0  # from the first row to the last
     exposure_s: float = 0.0  # of each row
     adapts_s: float = 0.0  # time constant of the exposure
+    light: float = 1.0  # of a day's: with less of it the picture is grainier
     glass: tuple[Edit, ...] = ()  # what is before the lens, from the farthest to the nearest, and captions
 
     @cached_property
@@ -73,6 +74,16 @@ class Dashcam:
             distortion=distortion if self.fisheye or self.k1 else (),
             fisheye=self.fisheye,
         )
+
+
+DASHCAMS: dict[str, Dashcam] = {
+    "narrow": Dashcam(fov_deg=60.0, k1=-0.3, glass=(caption,)),
+    "phone": Dashcam(fov_deg=65.0, readout_s=0.03, exposure_s=0.004),
+    "wide": Dashcam(fov_deg=100.0, k1=-0.08, readout_s=0.015, glass=(lambda index, count, image: bonnet(image),)),
+    "fisheye": Dashcam(fov_deg=140.0, fisheye=True, readout_s=0.02, glass=(caption,)),
+    "dusk": Dashcam(fov_deg=75.0, k1=-0.15, exposure_s=0.02, adapts_s=0.5, light=0.03),
+    "rain": Dashcam(fov_deg=75.0, k1=-0.15, glass=(from_share("drops_defocused", 3, 0.0), wiper(8))),
+}
 
 
 @dataclass(frozen=True)
@@ -104,7 +115,13 @@ def film(scenario: Scenario, dashcam: Dashcam, count: int, rate_hz: float, sampl
             T_before, steps = (T_now, 1.0) if before is None else (before, 2.0)
             motion = _twist(np.linalg.inv(T_before) @ T_after) * (rate_hz / steps)
             light = optics.light(renderer, now, motion)
-            lens = replace(scenario.lens, fixed=scenario.lens.fixed or exposure.metered(light, scenario.lens.whole))
+            grain = dashcam.light**-0.5
+            lens = replace(
+                scenario.lens,
+                fixed=scenario.lens.fixed or exposure.metered(light, scenario.lens.whole),
+                noise=scenario.lens.noise * grain,
+                shot=scenario.lens.shot * grain,
+            )
             image = develop(light, lens, np.random.default_rng([scenario.shake_seed, now.frame_id]))
             for edit in dashcam.glass:
                 image = edit(now.frame_id, count, image)

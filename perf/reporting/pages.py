@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from birdslam.perf.__main__ import benchmark_modules
+from birdslam.perf.cameras import lens
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import foxglove, leave_one_out, measured, results
@@ -126,6 +127,13 @@ PAGES: tuple[Derived | Page, ...] = (
         {"docs/lanes.png": ("lanes_demo_60.png", None)},
         (lanes.draw_frame_lanes,),
         SHIPPED,
+    ),
+    Page(
+        "lens",
+        ("python -m birdslam.perf lens --data {data} --output {out}",),
+        {"docs/lens.md": ("lens.md", None)},
+        (lens.run,),
+        ("tests/dashcams",),
     ),
     Page(
         "batch",

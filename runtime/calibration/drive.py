@@ -57,7 +57,8 @@ def calibrate_drive(
     topics = configuration.source.topics
     lens, height_m = lens_of(given, uri, topics)
     size = frame_size(uri, topics)
-    if lens is None and size is not None and parsed(uri)[0].camera in ("frame size", "nothing"):
+    is_film = parsed(uri)[0].camera in ("frame size", "nothing")
+    if lens is None and size is not None and is_film:
         lens = lens_of_drive(configuration, uri, given, size, stride, must_show)
     if lens is not None and size is not None:
         lens = lens.for_size(*size)
@@ -85,7 +86,7 @@ def calibrate_drive(
             if must_show:
                 raise CalibrationError(f"{uri}: {error}") from None
             found = _level(recording.camera, str(error))
-    camera, height_by = with_height(found, known_height, lens, uri)
+    camera, height_by = with_height(found, known_height, lens, uri, is_film)
     return Calibrated(camera, [*report(found, camera, height_by, uri, lens)], lengths_by(camera, height_by, lens))
 
 
@@ -101,6 +102,7 @@ def _level(camera: Camera, why: str) -> Calibration:
         yaw_rad=None,
         path_m=0.0,
         frames=0,
+        speed_mps=0.0,
         assumed=why,
     )
 

@@ -24,6 +24,10 @@ UNKNOWN_HEIGHT_M = 1.5  # where none was given: all lengths are in proportion to
 COUNTRY_SIGMA_REL = 0.08
 # Where nothing shows the height: behind a car's windscreen, 1.1 to 1.6 m; by judgement
 WINDSCREEN_M, WINDSCREEN_SIGMA_REL = 1.35, 0.2
+AGREES_SIGMA = 2.0
+# Readouts of 0 to 30 ms are usual, and no film tells its own; root mean square of an even spread
+_READOUT_SIGMA_S = 0.017
+_SHUTTER_PER_M2 = 0.066  # by rendered films of one street, with 0, 15 and 30 ms (docs/constants.md)
 
 
 def known_lengths(recording: Recording, speed_file: Path | None) -> dict[str, KnownLength]:
@@ -57,27 +61,63 @@ class HeightBy(NamedTuple):
     words: str
     check: HeightCheck | None
     sigma_rel: float  # of all lengths along the road, by this height and the focal length
+    contradicted_by: str = ""  # what says another height than the one that was stated, and which
+    shutter_rel: float = 0.0  # 1-sigma of the same lengths by rows that are read in turn
 
 
-def with_height(found: Calibration, known: bool, lens: Intrinsics | None, uri: str) -> tuple[Camera, HeightBy]:
-    """The camera with the height that was stated, else with the surest that was estimated."""
+def with_height(
+    found: Calibration, known: bool, lens: Intrinsics | None, uri: str, is_film: bool = False
+) -> tuple[Camera, HeightBy]:
+    """The camera with the height that was stated, else with the surest that was estimated.
+
+    A stated height (and focal length) that something else contradicts is kept, but its sigma covers both.
+    """
     focal_rel = focal_sigma_rel(lens)
     if known:
-        height_m, by = found.camera.height_m, HeightBy("as stated", None, focal_rel)
+        height_m, by = found.camera.height_m, _stated_height(found, focal_rel)
     else:
         height_m, by = _estimated_height(found, focal_rel)
+    held_together = by.check is not None and by.check.cue != VEHICLES  # by a known length, the shutter's share too
+    if is_film and not held_together:
+        by = by._replace(shutter_rel=shutter_rel(found.camera, height_m, found.speed_mps))
+    sigma_rel = min(math.hypot(by.sigma_rel, by.shutter_rel), 1.0)
     try:
-        return msgspec.structs.replace(found.camera, height_m=height_m, scale_sigma_rel=min(by.sigma_rel, 1.0)), by
+        return msgspec.structs.replace(found.camera, height_m=height_m, scale_sigma_rel=sigma_rel), by
     except ValueError as error:
         raise CalibrationError(f"{uri}: height {by.words}: {error}") from None
 
 
+def shutter_rel(camera: Camera, height_m: float, speed_mps: float) -> float:
+    """1-sigma of lengths along the road by rows that are read in turn, in a time that no film tells.
+
+    Near road is read later in an image than far road, and moves down meanwhile: its motion is seen over a longer time
+    than that between two images. A point of the road at depth z moves by f h V / z^2 rows a second.
+    """
+    return _SHUTTER_PER_M2 * _READOUT_SIGMA_S * speed_mps * height_m * camera.fy_px / camera.height_px
+
+
+def _sigma_rel(check: HeightCheck) -> float:
+    return math.hypot(check.sigma_m / check.height_m, COUNTRY_SIGMA_REL * (check.cue == VEHICLES))
+
+
+def _stated_height(found: Calibration, focal_rel: float) -> HeightBy:
+    """With what is farthest from it for its sigma, where that is too far."""
+
+    def away_sigma(check: HeightCheck) -> float:
+        return abs(math.log(check.height_m / found.camera.height_m)) / math.hypot(_sigma_rel(check), focal_rel)
+
+    check = max(found.height_checks, key=away_sigma, default=None)
+    if check is None or away_sigma(check) < AGREES_SIGMA:
+        return HeightBy("as stated", None, focal_rel)
+    said = f"the size of {check.samples} cars" if check.cue == VEHICLES else f"the {check.cue}"
+    contradicted = f"{said} says {check.height_m:.2f} m +- {_sigma_rel(check):.0%}"
+    between_rel = abs(math.log(check.height_m / found.camera.height_m))
+    return HeightBy("as stated", None, math.hypot(focal_rel, between_rel), contradicted)
+
+
 def _estimated_height(found: Calibration, focal_rel: float) -> tuple[float, HeightBy]:
     """By a known length, by the size of cars, or by where cameras are."""
-    sigmas = {
-        check.cue: math.hypot(check.sigma_m / check.height_m, COUNTRY_SIGMA_REL * (check.cue == VEHICLES))
-        for check in found.height_checks
-    }
+    sigmas = {check.cue: _sigma_rel(check) for check in found.height_checks}
     check = min(found.height_checks, key=lambda check: sigmas[check.cue], default=None)
     if check is None or sigmas[check.cue] > WINDSCREEN_SIGMA_REL:
         sigma_rel = math.hypot(WINDSCREEN_SIGMA_REL, focal_rel)
@@ -99,10 +139,14 @@ def focal_sigma_rel(lens: Intrinsics | None) -> float:
 
 
 def lengths_by(camera: Camera, by: HeightBy, lens: Intrinsics | None) -> LengthsBy:
+    """What the metres of a camera rest on, for people."""
     words = f"the camera's height of {camera.height_m:.2f} m ({by.words})"
     focal_rel = focal_sigma_rel(lens)
     if by.check is not None and by.check.cue != VEHICLES:  # a known length holds both together
         return LengthsBy(words, by.sigma_rel)
     if focal_rel:
         words += f" and its focal length of {camera.fx_px:.0f} px, +- {focal_rel:.0%}"
-    return LengthsBy(words, math.sqrt(max(by.sigma_rel**2 - focal_rel**2, 0.0)), focal_rel)
+    if by.shutter_rel >= 0.005:
+        words += f"; rows that the camera reads one after the other leave +- {by.shutter_rel:.0%} at this speed"
+    height_rel = math.sqrt(max(by.sigma_rel**2 - focal_rel**2, 0.0))
+    return LengthsBy(words, height_rel, focal_rel, by.contradicted_by)

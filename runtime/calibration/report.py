@@ -11,10 +11,8 @@ from birdslam.calibration.calibration import Calibration
 from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.drive_files import ResultsError
-from birdslam.runtime.calibration.height import HeightBy
+from birdslam.runtime.calibration.height import AGREES_SIGMA, HeightBy
 from birdslam.sources.camera_file import camera_text
-
-AGREES_SIGMA = 2.0
 
 
 def report(found: Calibration, camera: Camera, height_by: HeightBy, uri: str, lens: Intrinsics | None) -> Iterator[str]:
@@ -40,8 +38,12 @@ def report(found: Calibration, camera: Camera, height_by: HeightBy, uri: str, le
     if found.yaw_rad is not None:
         yield f"optical axis {np.degrees(found.yaw_rad):+.2f} deg left of the way driven (for information)"
     yield f"height {camera.height_m:.3f} m, {height_by.words}"
-    if height_by.sigma_rel:
-        yield f"all lengths +- {height_by.sigma_rel:.0%}, by height and focal length (scale_sigma_rel)"
+    if height_by.contradicted_by:
+        yield f"  CONTRADICTED: {height_by.contradicted_by}; the sigma below covers both"
+    if height_by.shutter_rel:
+        yield f"rows read in turn: +- {height_by.shutter_rel:.1%} at {found.speed_mps:.0f} m/s"
+    if camera.scale_sigma_rel:
+        yield f"all lengths +- {camera.scale_sigma_rel:.0%}, by all of these (scale_sigma_rel)"
     for check in found.height_checks:
         if check is height_by.check:
             continue

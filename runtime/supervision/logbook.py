@@ -23,7 +23,7 @@ _Record = TypeVar("_Record", Estimate, MapUpdate)
 
 
 class Results(Protocol):
-    """What birdslam.results.Recorder does while a drive goes on."""
+    """What receives the results of a drive while it goes on, as `birdslam.outputs.drive_files.Recorder` does."""
 
     def add(self, estimate: Estimate) -> None: ...
     def add_map(self, update: MapUpdate) -> None: ...

@@ -16,6 +16,7 @@ import numpy as np
 from birdslam.geometry.camera import Camera
 from birdslam.ros.bag import BagTopics
 from birdslam.sources.films.container import films_in, stated_focal_rel, why_unreadable
+from birdslam.sources.films.interlaced import is_undecoded
 from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.sources.schemes import VIDEO
 from birdslam.types import NS_PER_S
@@ -141,6 +142,11 @@ def _film(path: Path, camera: Camera) -> _Film:
         rate_hz = _measured_hz(capture)
         declared = round(declared * rate_hz)
     capture.release()
+    if is_undecoded(path):
+        raise DatasetError(
+            f"{path}: is interlaced, which this OpenCV can't decode; make it progressive first: "
+            f"ffmpeg -i {path.name} -vf yadif progressive.mp4"
+        )
     if not (math.isfinite(rate_hz) and 0.0 < rate_hz <= 1000.0):
         raise DatasetError(f"{path}: neither its container nor its frames tell a usable frame rate ({rate_hz:g})")
     if size != (camera.width_px, camera.height_px):
