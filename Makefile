@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 TRAIN_VENV := .venv-train
+SITE_VENV := .venv-site
+DIST_VENV := .venv-dist
 DATA := $(or $(BIRDSLAM_DATA),../shared/data)
 MODELS := $(or $(BIRDSLAM_MODELS),../shared/models)
 
@@ -43,6 +45,24 @@ test-slow: setup
 # What a user installs: the wheel in an empty environment, without the checkout
 wheel-test: setup
 	$(BIN)/python -m tests.installed_wheel
+
+# docs/ as a site, in out/site; a broken link fails it
+site: $(SITE_VENV)/.ready
+	NO_MKDOCS_2_WARNING=1 $(SITE_VENV)/bin/mkdocs build --strict --quiet
+
+$(SITE_VENV)/.ready: pyproject.toml
+	$(PYTHON) -m venv $(SITE_VENV)
+	$(SITE_VENV)/bin/python -m pip install --quiet --disable-pip-version-check '.[site]'
+	@touch $@
+
+# Wheel, source distribution, the list of what is in them and their digests, in out/dist: docs/release.md
+dist: $(DIST_VENV)/.ready
+	$(DIST_VENV)/bin/python .ci/dist.py out/dist
+
+$(DIST_VENV)/.ready: pyproject.toml
+	$(PYTHON) -m venv $(DIST_VENV)
+	$(DIST_VENV)/bin/python -m pip install --quiet --disable-pip-version-check build 'setuptools>=77' cyclonedx-bom
+	@touch $@
 
 # Which written pages are older than what they measure; WRITE=1 measures those anew, WRITE="NAME ..." these
 pages: setup
@@ -98,4 +118,4 @@ demo-kitti: setup
 		--model segmenter=$(MODELS)/twinlitenet_640x360.onnx --output out/00
 
 clean:
-	rm -rf $(VENV) $(TRAIN_VENV) out build *.egg-info
+	rm -rf $(VENV) $(TRAIN_VENV) $(SITE_VENV) $(DIST_VENV) out build *.egg-info

@@ -39,7 +39,8 @@ from birdslam.vehicles.out_of_sequence import OpenFrame, OutOfSequenceConfig, Ou
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import LocalisationConfig
 from birdslam.vehicles.placement.pseudolidar import FrustumNetwork
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 from birdslam.vehicles.vehicle_edges import vehicle_edges
@@ -216,7 +217,7 @@ class FrontEnd:
             dt_s=max(0.0, (t_source_ns - last_ns) * 1e-9),
             turn_rad=None if motion is None else pitch_rad - last_rad,
             image_ground=None if motion is None else motion.ground,
-            image_sigma_rad=0.0 if motion is None else motion.pitch_sigma_rad,
+            image_cov=None if motion is None else motion.tilt_cov,
             travelled_m=None if motion is None else math.hypot(step.x_m, step.y_m),
         )
 

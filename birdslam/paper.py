@@ -14,7 +14,7 @@ from birdslam.odometry.road.kalman_filter import RoadScaleConfig
 from birdslam.slam import SlamConfig
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import LocalisationConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 
 NO_GATE = 1e6  # sigmas: nothing is an outlier
 
@@ -37,6 +37,7 @@ PAPER = SlamConfig(
             sigma_pitch_blind_rad=1e-6,
             sigma_roll_rad=1e-6,
             sigma_kerb_m=1e-3,
+            sigma_common_edge_rel=0.0,
             sigma_edge_rel=0.0,
             sigma_tilt_rad=1e-6,
             sigma_crown_rad=0.0,
@@ -53,6 +54,7 @@ PAPER = SlamConfig(
         landmark_anchor="first_sight",  # X_p of Eq. 3 is a point of the world, and known
         correlation_length_m=0.0,  # no error but those of the edges
         zero_velocity_update=False,
+        vehicles_move_ego=True,  # all edges of Eq. 8 at once
         front_back_ambiguity=False,  # a measured yaw counts as it is
     ),
 )

@@ -35,6 +35,7 @@ class Status(enum.StrEnum):
     DEPTH_CARRIED = "depth_carried"  # the depth map is of an earlier frame
     LANES_CARRIED = "lanes_carried"  # lanes were due to be detected, but their last run has not ended yet
     NETWORK_FAILED = "network_failed"  # a network gave numbers that are not finite
+    PROVIDER_MISSING = "provider_missing"  # a network runs on the CPU: its accelerator is not there, or failed
     INPUT_STALE = "input_stale"  # the record that this one is made of came late
     DEGRADED_RATE = "degraded_rate"  # short of time: the networks run on fewer frames
     DEGRADED_BOXES = "degraded_boxes"  # short of time: only the detector runs, neither road nor lanes are segmented

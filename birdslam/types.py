@@ -608,7 +608,8 @@ class RoadUser(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     def __post_init__(self) -> None:
         cov, u = self.cov, self.velocity_cov
         total = sum(cov) + sum(u) + sum(self.velocity_mps) + self.length_m + self.width_m + self.standing
-        if not _is_sound(total, cov[0], cov[4], cov[8], u[0], u[3]):
+        sound = math.isfinite(total) and cov[0] >= 0.0 and cov[4] >= 0.0 and cov[8] >= 0.0
+        if not (sound and u[0] >= 0.0 and u[3] >= 0.0):
             check_finite(self, "velocity_mps", "length_m", "width_m", "standing")
             _check_cov(self, "cov", "velocity_cov")
 
@@ -616,7 +617,7 @@ class RoadUser(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 VehicleEstimate = RoadUser  # its name before people were road users
 
 
-class HiddenFan(msgspec.Struct, frozen=True, kw_only=True):
+class HiddenFan(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """Road that the camera can't see for a vehicle before it: a polygon in ego, in m, counter-clockwise.
 
     Somebody could step out of it.
@@ -627,7 +628,8 @@ class HiddenFan(msgspec.Struct, frozen=True, kw_only=True):
     y_m: tuple[float, ...]  # of its corners
 
     def __post_init__(self) -> None:
-        check_finite(self, "x_m", "y_m")
+        if not math.isfinite(sum(self.x_m) + sum(self.y_m)):
+            check_finite(self, "x_m", "y_m")
         if len(self.x_m) != len(self.y_m):
             raise ValueError(f"HiddenFan has {len(self.x_m)} x_m and {len(self.y_m)} y_m")
 

@@ -34,6 +34,7 @@ from birdslam.runtime.sections import (
     RealtimeConfig,
     RecordingConfig,
     ResultsConfig,
+    RosConfig,
     RouterConfig,
     RuntimeConfig,
     SourceConfig,
@@ -58,6 +59,7 @@ __all__ = [
     "RealtimeConfig",
     "RecordingConfig",
     "ResultsConfig",
+    "RosConfig",
     "RouterConfig",
     "RuntimeConfig",
     "SourceConfig",
@@ -99,6 +101,7 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     results: ResultsConfig = ResultsConfig()  # beside the live ones, when the drive is over
     fleet: FleetConfig = FleetConfig()  # of `birdslam uplink`, and of those who listen to many vehicles
     router: RouterConfig = RouterConfig()  # of `birdslam router` alone
+    ros: RosConfig = RosConfig()  # of `birdslam ros`, and of the source `ros:/TOPIC`
     output: str = "out"  # the folder of results
 
     @property

@@ -21,3 +21,20 @@ INTERRUPTED_STATUS = 130
 CLOSED_PIPE_STATUS = 141
 # Whose versions a run writes down
 LIBRARIES = ("birdslam", "numpy", "opencv-python-headless", "onnxruntime", "gtsam", "eclipse-zenoh")
+ONNXRUNTIMES = ("onnxruntime", "onnxruntime-openvino", "onnxruntime-gpu")  # packages of the same library
+
+
+def library_versions() -> dict[str, str]:
+    """Python's, and those of LIBRARIES."""
+    import platform
+    from importlib.metadata import PackageNotFoundError, version
+
+    out = {"python": platform.python_version()}
+    for library in LIBRARIES:
+        for package in ONNXRUNTIMES if library == "onnxruntime" else (library,):
+            try:
+                out[library] = version(package)
+                break
+            except PackageNotFoundError:
+                continue
+    return out

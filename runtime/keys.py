@@ -76,6 +76,7 @@ GROUPS = (
             "models.ROLE.every": "On one image in how many does it run? none: as its manifest says",
             "models.ROLE.threads": "On how many threads? none: as its manifest says",
             "models.ROLE.awaited": "Does an image wait for it, up to its deadline? none: as its manifest says",
+            "models.ROLE.provider": "What computes this one? As perceive.provider; none: as that says",
             "models.shipped": "Does the package's own network run where no other finds vehicles or the road?",
             "models.bodies": "Does the multi-task network look beside another detector, for the depth, length and yaw "
             "of the vehicles that this one finds?",
@@ -157,6 +158,8 @@ GROUPS = (
             "perceive.schedule.lanes.every": "On one image in how many are they made out? In place of hz",
             "perceive.looks.adaptive": "Do networks look as often as the computer can? false: as their manifests say",
             "perceive.looks.least_hz": "How often a second do they look at the least?",
+            "perceive.provider": "What computes the networks: cpu, openvino, cuda, tensorrt, or auto, what is fastest "
+            'here and gives the same? At rate "max" auto is cpu, so that a run repeats. See [networks.md](networks.md)',
             "perceive.opencv_threads": "How many threads has OpenCV?",
             "budgets.end_to_end_ms": "How old may an estimate be when the planner has it, from its image's capture on?",
             "budgets.percentile": "Of how many images in a hundred must this hold, and the limits of the parts?",
@@ -213,6 +216,17 @@ GROUPS = (
             "realtime.lock_memory": 'Does their memory stay in RAM? "auto": with a live camera',
             "realtime.NODE.priority": "Which priority has a node, under SCHED_FIFO?",
             "realtime.NODE.cpus": "On which cores may it run? none: all",
+        },
+    ),
+    Group(
+        "ROS 2, live",
+        "See [ros.md](ros.md). Of `birdslam ros`, and of a source `ros:/TOPIC`.",
+        {
+            "ros.router": "Where is the router of rmw_zenoh?",
+            "ros.domain": "Which domain? none: as the variable ROS_DOMAIN_ID says, else 0",
+            "ros.namespace": 'What stands before the names of our topics and frames, where there are several cars? "": '
+            "nothing",
+            "ros.release": "Which release of ROS 2 do the others run? Humble has no hashes of types; jazzy: any later",
         },
     ),
     Group(

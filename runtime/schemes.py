@@ -42,9 +42,20 @@ RTSP = Scheme(
     options=OF_A_CAMERA,
     refused=OF_RECORDINGS,
 )
+ROS = Scheme(
+    name="ros",
+    written=("ros:/TOPIC",),
+    what="images of ROS 2 as they come, from a topic at a router of rmw_zenoh, without ROS: [ros.md](ros.md)",
+    opener="birdslam.runtime.ros.camera:RosCamera",
+    camera="intrinsics",
+    clock="this computer's",
+    address="topic",
+    live=True,
+    options=("topics", *OF_A_CAMERA),
+    refused=OF_RECORDINGS,
+)
 
-
-OF_THE_RUNTIME = (MCAP, V4L2, RTSP)
+OF_THE_RUNTIME = (MCAP, V4L2, RTSP, ROS)
 
 
 def all_schemes() -> tuple[Scheme, ...]:

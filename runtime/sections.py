@@ -8,6 +8,7 @@ import msgspec
 
 from birdslam.perception import ModelSpec
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS, Role
+from birdslam.perception.network import Provider
 from birdslam.ros.bag import BagTopics
 
 VehicleName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")]
@@ -132,6 +133,7 @@ class PerceiveConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     deadline_periods: Positive = 0.75
     period_ms: Positive | None = None  # from one frame of the source to the next; None: by the frame rate
     opencv_threads: PositiveInt = 2  # of OpenCV in perceive
+    provider: Provider = "auto"  # what computes the networks (runtime/models/providers.py)
     schedule: ScheduleConfig = ScheduleConfig()
     looks: LooksConfig = LooksConfig()
 
@@ -252,6 +254,16 @@ class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     estimates_hz: Positive | None = None  # of the vehicle's estimates at most so many a second are sent; None: all
     # The vehicles that a listener expects: it lists them even before they have published anything
     vehicles: tuple[VehicleName, ...] = ()
+
+
+class RosConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How this computer is a node of ROS 2: of `birdslam ros`, and of the source `ros:/TOPIC`."""
+
+    router: str = "tcp/localhost:7447"  # of rmw_zenoh
+    domain: Annotated[int, msgspec.Meta(ge=0, le=232)] | None = None  # None: that of ROS_DOMAIN_ID, else 0
+    # "" or /NAME: before the names of our own topics, and of our frames, where several cars are in one domain
+    namespace: str = ""
+    release: Literal["humble", "jazzy"] = "jazzy"  # of the others; jazzy: since Iron types have hashes
 
 
 class RouterConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

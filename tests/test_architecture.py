@@ -18,7 +18,7 @@ ONLY_IN = {  # third-party library: the packages that may import it
     "numba": {"world", "world.training", "perf"},
     "ray": {"runtime.batch"},
     "rosbags": {"ros"},
-    "zenoh": {"runtime.transport", "runtime.gate", "runtime.fleet", "perf"},
+    "zenoh": {"runtime.transport", "runtime.gate", "runtime.fleet", "runtime.ros", "perf"},
 }
 MOST_MODULES = 15  # in a folder
 

@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 ALL_EDGES = WeightsConfig(leave_out=())
 EQ_6 = GraphConfig(
-    constant_velocity=False, detection_gate_sigma=1e3
+    constant_velocity=False, detection_gate_sigma=1e3, vehicles_move_ego=True
 )  # the paper's graph, and nothing counts as an outlier
 NO_CP = DriveConfig(landmarks=0, lane_points=0)
 
@@ -80,7 +80,7 @@ def test_equals_gtsam_on_the_papers_edges(drop: float) -> None:
 def test_equals_gtsam_with_the_constant_velocity_factor() -> None:
     """The yaw is known well at once: a vehicle begins at rest, where a yaw that is off does not yet turn its way."""
     world = drive(replace(NO_CP, frames=40, vehicles=3, noise=1e-3, sigma_cv_rad=0.03), seed=12)
-    config = GraphConfig(detection_gate_sigma=1e3, change_sideways_mps=2.0)
+    config = GraphConfig(detection_gate_sigma=1e3, change_sideways_mps=2.0, vehicles_move_ego=True)
     assert_gtsam_agrees(world, config, WeightsConfig(leave_out=("cp", "vv")), 2e-3)
 
 
@@ -182,7 +182,9 @@ def nees(world: Drive, config: GraphConfig, weights: WeightsConfig) -> dict[str,
 
 def assert_graph_is_honest(model: str, world: DriveConfig, seeds: int) -> None:
     config, weights = (
-        (GraphConfig(constant_velocity=False), ALL_EDGES) if model == "Eq. 6" else (GraphConfig(), WeightsConfig())
+        (GraphConfig(constant_velocity=False, vehicles_move_ego=True), ALL_EDGES)
+        if model == "Eq. 6"
+        else (GraphConfig(), WeightsConfig())
     )
     world = replace(world, traffic="road" if model == "Eq. 6" else "drawn")
     found = [nees(drive(world, seed), config, weights) for seed in range(seeds)]

@@ -28,7 +28,8 @@ from birdslam.sources.recording import DatasetError
 from birdslam.types import Estimate
 from birdslam.vehicles.placed_boxes import PlacedBox
 from birdslam.vehicles.placement.localisation import LocalisationConfig
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 
@@ -114,7 +115,7 @@ def test_boxes_of_another_tracker_keep_its_ids() -> None:
     tracker = Tracker(camera, TrackingConfig(), LocalisationConfig(), GroundSizeFilter(camera, GroundSizeConfig()))
     rows = camera.cy_px + camera.fy_px * ground.height_m / np.array([12.0, 12.0, 20.0])
     for frame in range(4):
-        tracker.ground_size.predict(0.1, None, None, 0.0, 0.0)
+        tracker.ground_size.predict(0.1, None, None, None, 0.0)
         left = np.array([300.0, 420.0, 700.0])
         heights = np.array([90.0, 90.0, 54.0])
         boxes = np.column_stack([left, rows - heights, left + 100.0, rows])

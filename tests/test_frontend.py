@@ -41,7 +41,7 @@ def motion(frame: int, T: SE2, *, d_pitch_rad: float = 0.0, since: int = 1, **ch
         "cov": np.diag([1e-4, 1e-4, 1e-6]),
         "scale_sigma_rel": 0.01,
         "ground": CAMERA.ground,
-        "pitch_sigma_rad": 0.003,
+        "tilt_cov": np.eye(2) * 0.003**2,
         "standstill": False,
         "status": (),
     }

@@ -15,13 +15,16 @@ from birdslam.vehicles.placement.localisation import (
     extent_m,
     observe_boxes,
 )
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.ground_measurements import COMMON
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.state.parallax import LearnedSize
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 CAR = DIMENSIONS["car"]
 LOCALISATION = LocalisationConfig()
 NO_OUTLIERS = np.zeros((1, 2))
+IMAGE_COV = np.diag([0.001, 0.002]) ** 2
 CONFIG = GroundSizeConfig(roof_reach_rel=1.0)  # the world here is made of cuboids
 
 
@@ -42,7 +45,7 @@ class Road:
 
     def see(self, boxes: dict[int, np.ndarray], dt_s: float = 0.1) -> tuple[dict[int, float], dict[int, float]]:
         """Nearest depths in metres and the sigmas of their logarithms."""
-        self.ground_size.predict(dt_s, 0.0, None, 0.0)
+        self.ground_size.predict(dt_s, 0.0, None, None)
         seen: list[Observation] = []
         for car, box in boxes.items():
             seen += observe_boxes(box[None], np.ones(1), ("car",), CAMERA, self.ground_size.ground, LOCALISATION)
@@ -124,7 +127,8 @@ def test_a_faster_camera_learns_no_more_of_a_size_in_the_same_time() -> None:
         road = Road()
         for _ in range(round(2.0 * hz)):
             road.see({0: road.box(20.0, 0.0, 1.5), 1: road.box(30.0, 4.0, 1.55)}, 1.0 / hz)
-        sigmas.append(math.sqrt(road.ground_size._P[2, 2]))  # private: a height's sigma alone; out comes a depth's
+        P = road.ground_size._P  # private: a height's sigma alone; out comes a depth's
+        sigmas.append(math.sqrt(P[COMMON, COMMON]))
     assert sigmas[0] == pytest.approx(sigmas[1], rel=0.1)
 
 
@@ -158,20 +162,20 @@ def test_one_wild_bottom_moves_neither_the_road_nor_the_size() -> None:
 
 def test_the_camera_s_own_pitching_carries_the_horizon_through_a_bump() -> None:
     still, told = GroundSizeFilter(CAMERA, CONFIG), GroundSizeFilter(CAMERA, CONFIG)
-    still.predict(0.1, 0.0, None, 0.0)
-    told.predict(0.1, 0.01, None, 0.0)
+    still.predict(0.1, 0.0, None, None)
+    told.predict(0.1, 0.01, None, None)
     assert told.ground.pitch_rad - still.ground.pitch_rad == pytest.approx(0.01, rel=0.05)
     for _ in range(300):
-        told.predict(0.1, 0.0, None, 0.0)
+        told.predict(0.1, 0.0, None, None)
     assert abs(told.ground.pitch_rad) < 0.001  # it lasts: then the road has turned as well
 
 
 def test_the_images_pitch_is_taken_when_it_is_new() -> None:
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     before = ground_size.sigma_pitch_rad
-    ground_size.predict(0.1, 0.0, CAMERA.ground, 0.001)  # the calibration says nothing new
+    ground_size.predict(0.1, 0.0, CAMERA.ground, IMAGE_COV)  # the calibration says nothing new
     assert ground_size.sigma_pitch_rad >= before * 0.99
-    ground_size.predict(0.1, 0.0, GroundPlane(CAMERA.height_m, 0.015), 0.001)
+    ground_size.predict(0.1, 0.0, GroundPlane(CAMERA.height_m, 0.015), IMAGE_COV)
     assert ground_size.ground.pitch_rad == pytest.approx(0.015, abs=0.002)
     assert ground_size.sigma_pitch_rad < 0.5 * before
 
@@ -249,7 +253,7 @@ def test_a_box_that_widens_is_of_a_car_that_turns_or_of_one_that_comes_nearer(sp
     for k in range(40):
         half_px = (cuboid[2] - cuboid[0]) / 2.0 * max(0.0, 0.025 * (k - 10))
         box = cuboid + np.array([-half_px, 0.0, half_px, 0.0])
-        road.ground_size.predict(0.1, 0.0, None, 0.0)
+        road.ground_size.predict(0.1, 0.0, None, None)
         seen = observe_boxes(box[None], np.ones(1), ("car",), CAMERA, road.ground_size.ground, LOCALISATION)
         if not len(road.ground_size):
             road.ground_size.begin(seen[0])

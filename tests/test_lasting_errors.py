@@ -12,7 +12,8 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, observe_boxes
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 
@@ -43,7 +44,7 @@ def test_errors_that_last_for_a_track_are_in_its_sigma_after_many_frames() -> No
         edges = rng.normal(0.0, math.hypot(CONFIG.sigma_kerb_m, CONFIG.sigma_edge_rel * CAR.height_m), len(cars))
         tilts = rng.normal(0.0, CONFIG.sigma_tilt_rad, len(cars))
         for k in range(40):
-            ground_size.predict(DT_S, 0.0, None, 0.0, STEP_M)
+            ground_size.predict(DT_S, 0.0, None, None, STEP_M)
             boxes = np.array(
                 [
                     box_of(x - STEP_M * k, y, GroundPlane(1.65, pitch_rad + tilt, 0.0), h, e)
@@ -71,7 +72,7 @@ def test_the_lower_edge_of_a_vehicle_is_never_learned_from_itself() -> None:
     ground_size = GroundSizeFilter(CAMERA, exact)
     spread = []
     for k in range(200):
-        ground_size.predict(DT_S, 0.0, None, 0.0, STEP_M)
+        ground_size.predict(DT_S, 0.0, None, None, STEP_M)
         (seen,) = observe_boxes(
             box_of(30.0, 0.0, CAMERA.ground, CAR.height_m)[None],
             np.ones(1),
@@ -97,7 +98,7 @@ def test_a_parked_car_whose_box_becomes_its_neighbours_still_stands() -> None:
     tracker = Tracker(CAMERA, TrackingConfig(), LOCALISATION, ground_size, PseudoLidarConfig())
     standing = []
     for k in range(30):
-        ground_size.predict(DT_S, 0.0, None, 0.0, 0.8)
+        ground_size.predict(DT_S, 0.0, None, None, 0.8)
         x_m = 44.0 - 0.8 * k + (0.0 if k < 12 else 4.5)  # the next one in the row
         box = box_of(x_m, 3.8, CAMERA.ground, CAR.height_m)[None]
         frame = EgoFrame(k, round(k * DT_S * 1e9), SE2(0.8 * k, 0.0, 0.0), np.diag([1e-4, 1e-4, 1e-8]))
@@ -112,7 +113,7 @@ def test_a_car_that_drives_off_is_not_taken_for_ever_new_neighbours() -> None:
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
     tracker = Tracker(CAMERA, TrackingConfig(), LOCALISATION, ground_size)
     for k in range(30):
-        ground_size.predict(DT_S, 0.0, None, 0.0, 0.8)
+        ground_size.predict(DT_S, 0.0, None, None, 0.8)
         box = box_of(20.0 + 0.4 * k, 3.8, CAMERA.ground, CAR.height_m)[None]
         frame = EgoFrame(k, round(k * DT_S * 1e9), SE2(0.8 * k, 0.0, 0.0), np.diag([1e-4, 1e-4, 1e-8]))
         tracker.follow(frame, observe_boxes(box, np.ones(1), ("car",), CAMERA, ground_size.ground, LOCALISATION))

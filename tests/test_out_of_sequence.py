@@ -20,7 +20,8 @@ from birdslam.perception.decoding.detection import EdgeSigma
 from birdslam.types import Measurements
 from birdslam.vehicles.out_of_sequence import OpenFrame, OutOfSequenceConfig, OutOfSequenceTracker
 from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, iou
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion

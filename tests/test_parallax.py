@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.state.parallax import UNKNOWN, LearnedSize, Parallax, ParallaxConfig
+from birdslam.vehicles.state.parallax import UNKNOWN, LearnedSize, Parallax
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
 from birdslam.vehicles.state.parallax_measurements import ParallaxMeasurements
 
 HEIGHT_M = 1.65  # of the camera

@@ -38,7 +38,8 @@ from birdslam.types import (
 )
 from birdslam.vehicles.out_of_sequence import OpenFrame
 from birdslam.vehicles.placed_boxes import place_boxes
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65)
@@ -75,7 +76,7 @@ class Scene:
         """The next frame."""
         ego = EgoFrame(self.k, round(self.k * 1e9 / HZ), SE2(self.ego_m, 0.0, 0.0), np.zeros((3, 3)))
         dt_s = 0.0 if self.k == 0 else 1.0 / HZ
-        frame = OpenFrame(ego, dt_s, 0.0, None, 0.0, self.ego_mps * dt_s)
+        frame = OpenFrame(ego, dt_s, 0.0, None, None, self.ego_mps * dt_s)
         self.tracker.settle(frame, detections, ROAD)
         self.k += 1
         return followed_people(self.tracker, ego)
@@ -321,8 +322,8 @@ def test_a_crowd_is_cut_to_the_nearest_sixty() -> None:
 )
 @settings(max_examples=25)
 def test_the_closest_approach_is_that_of_straight_ways(p: tuple[float, float], v: tuple[float, float]) -> None:
-    small = np.eye(2)[None] * 1e-4
-    (found,) = approaches(np.array([p]), np.array([v]), small, small)
+    small = np.full((2, 1), 1e-4)
+    (found,) = approaches(np.array([complex(*p)]), np.array([complex(*v)]), small, np.zeros((2, 1), np.complex128))
     times = np.linspace(0.0, 30.0, 30_001)
     away = np.hypot(p[0] + v[0] * times, p[1] + v[1] * times)
     assert found.distance_m == pytest.approx(away.min(), abs=0.01)

@@ -15,8 +15,9 @@ from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes
 from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
 from birdslam.vehicles.placing import Assignment, Placing, truncate_at_cut
-from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeConfig, GroundSizeFilter
-from birdslam.vehicles.state.parallax import ParallaxConfig
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeFilter
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
 from tests.test_frontend import CAMERA
 
 Floats = NDArray[np.float64]

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import shutil
 import subprocess
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.drive_files import Recorder, ResultsError
+from birdslam.outputs.earth_files import Way, write_ways
 from birdslam.outputs.report.drive_table import read_drive
 from birdslam.runtime.cli.main import main
-from birdslam.types import Estimate, MapUpdate, Status, VehicleEstimate
+from birdslam.types import Estimate, LaneLine, Lanes, LineKind, MapUpdate, Status, VehicleEstimate
 
 pytest.importorskip("plotly", reason="a report is made by plotly (pip install birdslam[report])")
 
+LINE = {"slope": 0.0, "curvature_per_m": 0.0, "curvature_rate_per_m2": 0.0, "cov": (0.001,) * 16}
 CAMERA = Camera(160, 96, 130.0, 130.0, 80.0, 48.0, 1.4)
 FRAMES, RESET = 60, 40
 EVIL = "</script><script>document.title='broken'</script>"
@@ -34,10 +38,14 @@ def results(tmp_path: Path) -> Path:
             status: tuple[Status, ...] = (Status.SCALE_INVALID,) if k < 10 else ()
             status += (Status.VIEW_OBSTRUCTED,) if k > 50 else ()
             epoch = int(k >= RESET)
+            line = LaneLine(
+                line=5, offset_m=1.8, seen_from_m=2.0, seen_to_m=20.0, to_m=25.0, kind=LineKind.SOLID, **LINE
+            )
             car = VehicleEstimate(
                 vehicle=3, T_world_vehicle=SE2(20.0 + 0.5 * (k - RESET * epoch), 3.0, 0.0), cov=(0.01,) * 9,
                 velocity_mps=(5.0, 0.0), velocity_cov=(0.01,) * 4, age_ns=0, frames=k + 1, label=f"car{EVIL}",
             )  # fmt: skip
+            walker = msgspec.structs.replace(car, vehicle=9, label="pedestrian")
             recorder.add(
                 Estimate(
                     epoch=epoch,
@@ -49,12 +57,21 @@ def results(tmp_path: Path) -> Path:
                     cov=(0.01,) * 9,
                     valid=k >= 10,
                     vehicles=(car,),
+                    people=(walker,),
+                    lanes=Lanes(lines=(line,)),
                     scale_sigma_rel=0.03,
                     status=status,
                 )
             )
             recorder.add_map(MapUpdate(epoch=epoch, frame_id=k, lanes_m=((1.0 * k, 1.8),)))
-        recorder.finish({"source": f"video:{EVIL}", "versions": {"birdslam": EVIL}})
+        stages = {f"perceive{EVIL}": {"p50": 4.0, "p99": 8.0, "max": 9.0}}
+        recorder.finish(
+            {
+                "source": f"video:{EVIL}", "versions": {"birdslam": EVIL}, "stages_ms": stages,
+                "age_ms": {"p50": 20.0, "p99": 32.0, "max": 40.0}, "earth": {"fixes": 9, "outliers": 1, "rms_m": 1.5},
+            }
+        )  # fmt: skip
+    write_ways(directory / "ego.geojson", [Way(EVIL, np.array([[49.0, 8.4], [49.001, 8.401]]))])
     (directory / "camera.toml").write_text(f"# {EVIL}\n")
     return directory
 
@@ -82,8 +99,15 @@ def test_the_drive_is_read_back_in_one_plane(results: Path) -> None:
     assert np.delete(drive.speed_mps, [0, RESET]) == pytest.approx(5.0, abs=0.01)
     assert drive.valid.tolist() == [k >= 10 for k in range(FRAMES)]
     assert drive.statuses[0] == ("scale_invalid",)
-    (track,) = drive.tracks
-    assert len(track.t_s) == FRAMES
+    assert [(track.label[:3], track.is_person, len(track.t_s)) for track in drive.tracks] == [
+        ("car", False, FRAMES),
+        ("ped", True, FRAMES),
+    ]
+    assert {kind for kind, _ in drive.lines} == {"solid"}
+    assert all(np.abs(xy_m[:, 1] - 1.8).max() < 0.01 for _, xy_m in drive.lines)
+    assert drive.earth_deg is not None
+    assert drive.earth_deg.tolist() == [[49.0, 8.4], [49.001, 8.401]]
+    assert set(drive.files) == {"ego.tum.txt", "ego.kitti.txt", "ego.geojson", "frames.csv", "map.geojson"}
     assert len(drive.lanes_m) == FRAMES
 
 
@@ -99,6 +123,12 @@ def test_the_page_is_whole_offline_and_escaped(results: Path, capsys: pytest.Cap
     assert "83 % is valid: 50 of 60 frames" in page
     assert "how long a metre is" in page
     assert own.count('"jpeg":') == FRAMES
+    for said in ("p50 4.0, p99 8.0 ms", "in all", "p50 20.0, p99 32.0 ms", "49.000000, 8.400000", "RMS 1.5 m"):
+        assert said in page
+    assert '"name":"people"' in page
+    taken = re.search(r'download="frames.csv" href="data:text/plain;base64,([^"]*)"', page)
+    assert taken is not None
+    assert base64.b64decode(taken[1]) == (results / "frames.csv").read_bytes()
 
 
 def test_what_is_no_drive_is_one_line(tmp_path: Path, results: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -42,10 +42,11 @@ def test_an_entry_is_written_as_it_is_read(scheme: Scheme) -> None:
 @EVERY
 def test_a_schemes_camera_facts_are_those_of_its_class(scheme: Scheme) -> None:
     kind = scheme.load()
-    assert issubclass(kind, LiveCamera if scheme.live else Recording)
     if scheme.live:
-        assert scheme.camera == "nothing"
+        assert kind.live
+        assert issubclass(kind, LiveCamera) == (scheme.camera == "nothing")  # of a device or a stream
     else:
+        assert issubclass(kind, Recording)
         assert (kind.own_lens.__func__ is not Recording.own_lens.__func__) == (scheme.camera == "intrinsics")
         assert kind.frame_size.__func__ is not Recording.frame_size.__func__ or scheme.camera == "calibration"
 
@@ -60,7 +61,7 @@ def test_each_table_names_classes_of_its_own_floor() -> None:
     """An opener is named in a string, which the walls of test_architecture.py do not see."""
     assert all(scheme.opener.startswith("birdslam.sources.") for scheme in schemes.RECORDED)
     runtime = {scheme.opener.rpartition(".")[0] for scheme in table.OF_THE_RUNTIME}
-    assert runtime == {"birdslam.runtime.recording", "birdslam.runtime.nodes"}
+    assert runtime == {"birdslam.runtime.recording", "birdslam.runtime.nodes", "birdslam.runtime.ros"}
 
 
 def compared_with(node: ast.AST) -> set[str]:
@@ -184,8 +185,9 @@ from birdslam.sources.recording import RecordedFrame
 class ToyCamera:
     live, rate_hz = True, 20.0
 
-    def __init__(self, config, camera, must_open):
-        self.name, self.camera, self.left = config.uri, camera, config.frames
+    def __init__(self, configuration, must_open):
+        source = configuration.source
+        self.name, self.camera, self.left = source.uri, configuration.camera, source.frames
 
     def frames(self):
         yield from (RecordedFrame(index, index, None, "dark") for index in range(self.left))

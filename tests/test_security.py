@@ -23,6 +23,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from birdslam.loops.map_pose import MapPose, MapState
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import load
 from birdslam.runtime.gate import GateError, gate_config
@@ -125,7 +126,14 @@ class Vehicle:
     def say_all(self, number: int) -> None:
         """One message of every topic."""
         update = MapUpdate(epoch=0, frame_id=number, lanes_m=((1.0, 2.0),))
-        records = {"estimate": estimate(number), "measurements": measurements(number), "map": update}
+        times = {"t_source_ns": number, "t_capture_ns": number, "t_utc_ns": number}
+        pose = MapPose(frame_id=number, **times, epoch=0, state=MapState.LOST)
+        records = {
+            "estimate": estimate(number),
+            "measurements": measurements(number),
+            "map": update,
+            "map_pose": pose,
+        }
         for topic, publisher in self.publishers.items():
             publisher.put(records.get(topic) or Health(node=TOPICS[topic].producer, t_ns=number))
 

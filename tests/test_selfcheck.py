@@ -224,7 +224,7 @@ def _motion(frame: int, camera: Camera, tilt_error_rad: float, *status: Status) 
         cov=np.eye(3) * 1e-4,
         scale_sigma_rel=0.01,
         ground=ground,
-        pitch_sigma_rad=0.003,
+        tilt_cov=np.eye(2) * 0.003**2,
         standstill=False,
         status=status,
     )

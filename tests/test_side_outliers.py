@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
-from birdslam.vehicles.state.parallax import Parallax, ParallaxConfig
+from birdslam.vehicles.state.parallax import Parallax
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
 from birdslam.vehicles.state.parallax_measurements import ParallaxMeasurements
 from birdslam.vehicles.state.side_outliers import update_with_side_outliers
 

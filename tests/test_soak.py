@@ -10,7 +10,7 @@ import psutil
 import pytest
 
 from birdslam.perf.robustness import soak
-from birdslam.perf.robustness.soak import Series, Systemd, faults, sample, table
+from birdslam.perf.robustness.soak import Series, Systemd, ages, faults, sample, table
 from tests.test_bus import until
 
 WELL: dict[str, Any] = {
@@ -47,6 +47,13 @@ def test_a_flat_drive_is_well(systemd: Systemd) -> None:
 )
 def test_what_grows_is_named(one: Series, said: str, systemd: Systemd) -> None:
     assert list(faults({"perceive": one}, WELL, systemd)) == [said]
+
+
+def test_estimates_that_come_later_and_later_are_named() -> None:
+    flat = [20.0, 22.0, 21.0, 40.0] * 100
+    assert ages(flat) == ("age at the planner, first quarter p50 21.5, p99 40.0 ms; last 21.5, 40.0 ms", [])
+    _, said = ages([20.0 + 0.05 * k for k in range(400)])
+    assert said == ["the age grew from 22.5 to 37.5 ms in the median"]
 
 
 def test_restarted_nodes_are_named(systemd: Systemd) -> None:

@@ -12,7 +12,8 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import Detections
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, extent_m, observe_boxes
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.state.parallax import LearnedSize
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
@@ -34,7 +35,7 @@ def see(
     ground_size: GroundSizeFilter, boxes: list[np.ndarray], travelled_m: float, speed_mps: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """A frame with a box of each car, each of which moves at `speed_mps`: depths in metres, sigmas of their logs."""
-    ground_size.predict(PERIOD_S, 0.0, None, 0.0, travelled_m)
+    ground_size.predict(PERIOD_S, 0.0, None, None, travelled_m)
     n, ground = len(boxes), ground_size.ground
     seen = [observe_boxes(b[None], np.ones(1), ("car",), CAMERA, ground, LOCALISATION)[0] for b in boxes]
     for new in seen[len(ground_size) :]:
@@ -61,7 +62,7 @@ def test_a_halted_car_keeps_the_road_that_it_halted_on() -> None:
     ground_size.keep_rows([])
     held = ground_size.ground, ground_size.sigma_pitch_rad
     for _ in range(600):
-        ground_size.predict(PERIOD_S, 0.0, None, 0.0, 0.0)
+        ground_size.predict(PERIOD_S, 0.0, None, None, 0.0)
     assert ground_size.ground.pitch_rad == pytest.approx(held[0].pitch_rad, abs=1e-9)
     assert ground_size.ground.roll_rad == pytest.approx(held[0].roll_rad, abs=1e-9)
     assert ground_size.sigma_pitch_rad == pytest.approx(held[1], rel=1e-6)
@@ -71,9 +72,9 @@ def test_what_is_known_of_the_road_is_forgotten_over_the_way_and_without_a_step_
     left = []
     for speed_mps in (0.0, 0.1, 1.0, 3.0, 10.0, 30.0):
         ground_size = GroundSizeFilter(CAMERA, CONFIG)
-        ground_size.predict(PERIOD_S, 0.02, None, 0.0, 0.0)
+        ground_size.predict(PERIOD_S, 0.02, None, None, 0.0)
         for _ in range(50):
-            ground_size.predict(PERIOD_S, 0.0, None, 0.0, speed_mps * PERIOD_S)
+            ground_size.predict(PERIOD_S, 0.0, None, None, speed_mps * PERIOD_S)
         left.append(ground_size.ground.pitch_rad / 0.02)
     assert left == sorted(left, reverse=True)
     assert left[0] == pytest.approx(1.0)
@@ -130,10 +131,12 @@ def test_who_begins_standing_is_as_sure_of_road_and_depths_as_it_says() -> None:
 
 def test_a_pitch_by_the_images_is_no_news_while_the_ego_stands() -> None:
     ground_size = GroundSizeFilter(CAMERA, CONFIG)
-    ground_size.predict(PERIOD_S, 0.0, GroundPlane(CAMERA.height_m, 0.01), 0.003, 1.0)
+    ground_size.predict(PERIOD_S, 0.0, GroundPlane(CAMERA.height_m, 0.01), np.eye(2) * 0.003**2, 1.0)
     before = ground_size.ground.pitch_rad, ground_size.sigma_pitch_rad
     for k in range(100):  # it trembles in its last digits
-        ground_size.predict(PERIOD_S, 0.0, GroundPlane(CAMERA.height_m, 0.01 + 1e-6 * (k % 2)), 0.003, 0.0)
+        ground_size.predict(
+            PERIOD_S, 0.0, GroundPlane(CAMERA.height_m, 0.01 + 1e-6 * (k % 2)), np.eye(2) * 0.003**2, 0.0
+        )
     assert (ground_size.ground.pitch_rad, ground_size.sigma_pitch_rad) == pytest.approx(before, rel=1e-3)
 
 

@@ -11,7 +11,8 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.vehicles.placement.depth_fusion import DepthPlace
 from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame, Track, TrackingConfig
 from birdslam.vehicles.tracking import Tracker
 
@@ -48,7 +49,7 @@ class Drive:
         px = px + self.noise_px * self.rng.standard_normal(px.shape)
         names = tuple((labels or ["car"] * len(vehicles))[i] for i in kept)
         seen = observe_boxes(px, np.full(len(px), 0.9), names, CAMERA, self.ground_size.ground, LocalisationConfig())
-        self.ground_size.predict(0.1, 0.0, None, 0.0)
+        self.ground_size.predict(0.1, 0.0, None, None)
         out = self.tracker.follow(EgoFrame(self.frame, self.frame * PERIOD_NS, T_world_ego), seen)
         self.frame += 1
         return out
@@ -151,7 +152,7 @@ def test_a_place_by_depth_counts_by_its_covariance() -> None:
             by_depth = None
             if sigma_m is not None:
                 by_depth = DepthPlace(np.array([26.0, 1.04]), np.eye(2) * sigma_m**2, 0.0, 0.1)
-            drive.ground_size.predict(0.1, 0.0, None, 0.0)
+            drive.ground_size.predict(0.1, 0.0, None, None)
             tracks = drive.tracker.follow(EgoFrame(k, k * PERIOD_NS, SE2()), seen, [by_depth])
         (track,) = tracks
         return float(track.place.centre_m[0]), float(track.place.cov[0, 0])
@@ -187,7 +188,7 @@ def test_a_vehicle_of_no_usual_size_keeps_its_id_while_its_size_is_learned() -> 
         seen = observe_boxes(
             box[None], np.full(1, 0.9), ("car",), CAMERA, drive.ground_size.ground, LocalisationConfig()
         )
-        drive.ground_size.predict(0.1, 0.0, None, 0.0)
+        drive.ground_size.predict(0.1, 0.0, None, None)
         for track in drive.tracker.follow(EgoFrame(k, k * PERIOD_NS, ego), seen):
             ids.add(track.vehicle)
             errors.append(float((ego @ track.place.centre_m)[0]) - 70.0)
@@ -269,7 +270,7 @@ def test_a_car_is_not_taken_for_what_is_seen_behind_it(label: str) -> None:
     seen = observe_boxes(
         higher[None], np.array([0.9]), (label,), CAMERA, drive.ground_size.ground, LocalisationConfig()
     )
-    drive.ground_size.predict(0.1, 0.0, None, 0.0)
+    drive.ground_size.predict(0.1, 0.0, None, None)
     shown = drive.tracker.follow(EgoFrame(drive.frame, drive.frame * PERIOD_NS, ego), seen)
     assert shown == []
     drive.frame += 1

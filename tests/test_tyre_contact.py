@@ -25,8 +25,9 @@ from birdslam.vehicles.placement.localisation import (
 from birdslam.vehicles.placement.tyre_contact import bottom_at_face
 from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
 from birdslam.vehicles.placing import Assignment, Placing
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig, GroundSizeFilter
-from birdslam.vehicles.state.parallax import ParallaxConfig
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
 from tests.test_frontend import CAMERA
 
 CONFIG = LocalisationConfig()

@@ -178,7 +178,7 @@ def _with_focal_length(windows: Sequence[_Window], fitted: LensProblem, prior: F
     return best if again is None else adjust(again, prior)
 
 
-def _sigmas(problem: LensProblem, prior: FocalPrior | None) -> Floats:
+def _sigmas(problem: LensProblem, prior: FocalPrior) -> Floats:
     """(2,) 1-sigma of k1 and of the log of the focal length.
 
     What the lens is without each part of the drive, and without each part of the image, in one step from here. Windows
@@ -196,14 +196,20 @@ def _sigmas(problem: LensProblem, prior: FocalPrior | None) -> Floats:
     return np.sqrt(np.max([own, *(_jackknife(problem, prior, parts) for parts in (blocks, ring, side))], axis=0))
 
 
-def _jackknife(problem: LensProblem, prior: FocalPrior | None, parts: Ints) -> Floats:
+def _jackknife(problem: LensProblem, prior: FocalPrior, parts: Ints) -> Floats:
     """(2,) variance by what the lens is without each part (P,) of the corners."""
     each = np.unique(parts)
     if len(each) < 2:
         return np.zeros(2)
-    without = np.array([shared_by(some_corners(problem, parts != one), prior)[0] for one in each])
+    without = np.array([_shared_without(problem, prior, parts != one) for one in each])
     out: Floats = (len(each) - 1) / len(each) * np.square(without - without.mean(axis=0)).sum(axis=0)
     return out
+
+
+def _shared_without(problem: LensProblem, prior: FocalPrior, some: NDArray[np.bool_]) -> Floats:
+    """(k1, log of the focal length) by some of the corners (P,); by what is known beforehand where few are left."""
+    left = some_corners(problem, some)
+    return shared_by(left, prior)[0] if len(left.R) else np.array([0.0, prior.log_focal])
 
 
 # --- windows ---

@@ -22,6 +22,7 @@ SIGMA_K1 = 0.3  # beforehand: dashboard cameras have -0.4 to 0
 _HUBER = 1.5  # sigmas
 _ITERATIONS = 30
 _CONVERGED = 1e-6  # relative change of the cost
+_LEAST_LEFT = 8  # corners of a window, whose poses have 30 numbers
 _HELD = 1e-6  # 1-sigma of a focal length that is held
 _NEAREST, _BEHIND_COST = 1e-3, 1e3  # a corner is no nearer; what one behind the camera costs
 
@@ -71,7 +72,9 @@ def at_focal_length(problem: LensProblem, log_focal: float) -> LensProblem:
 
 
 def some_corners(problem: LensProblem, some: NDArray[np.bool_]) -> LensProblem:
-    """The problem of some of the corners (P,) alone; windows that are left without any are left out."""
+    """The problem of some of the corners (P,) alone; windows of which few are left are left out."""
+    left = np.bincount(problem.of[some], minlength=len(problem.R))
+    some = some & (left >= _LEAST_LEFT)[problem.of]
     windows = np.unique(problem.of[some])
     return replace(
         problem,
@@ -190,6 +193,7 @@ def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _
     last = slice(poses - 3, poses)
     for k, way in enumerate(problem.t[:, -1]):
         view[k, last, last] += 1e4 * np.outer(way, way) / float(way @ way)
+    view += 1e-3 * np.eye(poses + 2)  # nothing, but where all corners of a window are outliers
     corner = (J_corner * w).transpose(0, 2, 1) @ J_corner + 1e-6 * np.eye(3)
     return cost, _System(
         of=problem.of,

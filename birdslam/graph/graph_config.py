@@ -31,6 +31,9 @@ class GraphConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_vehicles: Count = 32  # the longest out of sight go first
     detection_gate_sigma: Positive = 4.0  # Mahalanobis distance past which a detection weighs less; twice it: nothing
     detection_contradictions: Count = 5  # so many left out in a row begin the vehicle anew
+    # Whether what is seen of vehicles corrects the ego, too. False: they are placed with all of the ego's uncertainty,
+    # and leave it where odometry and landmarks put it. Their errors last (size, yaw), which no edge says
+    vehicles_move_ego: bool = False
     front_back_ambiguity: bool = True  # a CV edge may take a vehicle's front for its back; False: its yaw is believed
     # Static map
     landmark_gate_sigma: Positive = 3.0  # Mahalanobis distance past which a landmark weighs less

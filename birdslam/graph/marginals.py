@@ -95,14 +95,18 @@ def _approaches(
     told: Sequence[tuple[tuple[float, float], tuple[float, float, float, float]]],
 ) -> list[Approach]:
     """Of each vehicle to the ego, in the ego's axes: without the ego's error in world, which both have."""
-    world = window.world
-    R = world.rotation()
-    p = (np.array([(T.x_m, T.y_m) for T in poses]) - [world.x_m, world.y_m]) @ R
-    v = np.array([velocity for velocity, _ in told]) @ R - [ego_mps.real, ego_mps.imag]
-    U = R.T @ np.array([cov for _, cov in told]).reshape(-1, 2, 2) @ R
-    by_size = np.square([node.size_bias_rel for node in vehicles])[:, None, None]
-    P = window.P.take(window.layout.own)[:, 3:5, 3:5] + by_size * p[:, :, None] * p[:, None, :]
-    return approaches(p, v, P, U)
+    back, origin = cmath.rect(1.0, -window.world.yaw_rad), complex(window.world.x_m, window.world.y_m)
+    numbers: list[complex] = []
+    for pose, ((x, y), (xx, xy, _, yy)), node in zip(poses, told, vehicles, strict=True):
+        at = (complex(pose.x_m, pose.y_m) - origin) * back
+        velocity = complex(x, y) * back - ego_mps
+        turned = complex(0.5 * (xx - yy), xy) * back * back
+        by_size = node.size_bias_rel * at
+        numbers += (at, velocity, 0.5 * (xx + yy), turned, 0.5 * abs(by_size) ** 2, 0.5 * by_size * by_size)
+    p, v, u_mean, u_deviator, size_mean, size_deviator = np.array(numbers).reshape(-1, 6).T
+    xx, xy, yy = window.P.take(window.layout.places)
+    means = np.array([0.5 * (xx + yy) + size_mean.real, u_mean.real])
+    return approaches(p, v, means, np.array([0.5 * (xx - yy) + 1j * xy + size_deviator, u_deviator]))
 
 
 def _of_sizes(

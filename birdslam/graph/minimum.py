@@ -10,7 +10,7 @@ import numpy as np
 
 from birdslam.graph.costs import Floats, edge_cost, inflation, pose_cost
 from birdslam.graph.factors.factor import Linearised
-from birdslam.graph.state_layout import EGO, diagonal_blocks
+from birdslam.graph.state_layout import diagonal_blocks
 from birdslam.graph.window import Window
 
 _LEAST = 1e-8  # 0.1 mm, 0.1 mrad: edges more exact than that would cost the covariances their digits
@@ -26,11 +26,12 @@ def solver() -> tuple[Any, Any]:
     return lapack, blas
 
 
-def minimise(window: Window, terms: Sequence[Linearised], hold: bool = False) -> None:
+def minimise(window: Window, terms: Sequence[Linearised], hold: slice | None = None) -> None:
     """The minimum of Eq. 8 over the edges of the newest frame, all at once, linearised at the prediction.
 
-    Notes in each of `terms` which of its edges are outliers. `hold` keeps the ego where it is (zero-velocity update).
-    Where the numbers leave all bounds, the window is not finite afterwards.
+    Notes in each of `terms` which of its edges are outliers. The numbers `hold` of the state keep their mean and
+    covariance, and their part in all others' uncertainty: they are considered, not estimated (Schmidt 1966). Where the
+    numbers leave all bounds, the window is not finite afterwards.
     """
     if not terms:
         return
@@ -47,11 +48,11 @@ def minimise(window: Window, terms: Sequence[Linearised], hold: bool = False) ->
     W = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1).T  # P H' S^-1 H P = W'W
     whitened = blas.dtrsv(L, np.array(residual), lower=1, overwrite_x=1)
     dx = (whitened @ W).tolist()  # Eq. 8: where the sum of the window's own cost and F is least
-    held = window.ego_cov.copy() if hold else None
+    held = None if hold is None else window.P[hold, hold].copy()
     window.P -= W.T @ W
-    if held is not None:
-        dx[EGO] = 0.0, 0.0, 0.0
-        window.P[EGO, EGO] = held
+    if hold is not None:
+        dx[hold] = [0.0] * (hold.stop - hold.start)
+        window.P[hold, hold] = held
     window.shift(dx)
 
 

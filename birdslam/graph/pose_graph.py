@@ -23,13 +23,14 @@ from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, 
 from birdslam.graph.costs import Floats
 from birdslam.graph.edges import PoseEdges, pose_edges
 from birdslam.graph.factors.constant_velocity import twist_growth
-from birdslam.graph.factors.factor import Factor, GraphFrame
+from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
 from birdslam.graph.factors.standard import standard_factors
 from birdslam.graph.factors.vehicle_detection import VehicleDetections
 from birdslam.graph.graph_config import GraphConfig, check_together
 from birdslam.graph.marginals import vehicle_estimates
 from birdslam.graph.minimum import minimise, solver
 from birdslam.graph.pending_map import PendingMap
+from birdslam.graph.state_layout import EGO
 from birdslam.graph.vehicles import SHORTEST_S, VehicleNodes, cv_edge
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
@@ -238,14 +239,19 @@ class PoseGraph:
 
     def _minimise(self, frame: GraphFrame, window: Window) -> None:
         """Eq. 8 over this frame's edges."""
-        names, terms = [], []
+        hold = EGO if frame.zero_velocity else None
+        terms: dict[str, Linearised] = {}
+        alone: list[Linearised] = []  # what leaves the ego where it is
+        joint: list[Linearised] = []
         for factor in self._linearising:
             term = factor.linearise(frame, window)
             if term is not None and math.isfinite(sum(term.residual)):
-                names.append(factor.name)
-                terms.append(term)
-        minimise(window, terms, frame.zero_velocity)
-        self.outliers = {name: term.outliers for name, term in zip(names, terms, strict=True)}
+                terms[factor.name] = term
+                leaves_ego = factor.of_vehicles and not self.config.vehicles_move_ego
+                (alone if leaves_ego else joint).append(term)
+        minimise(window, alone, window.layout.ego_poses)
+        minimise(window, joint, hold)
+        self.outliers = {name: term.outliers for name, term in terms.items()}
 
     def _update_vehicles(self, frame: GraphFrame, window: Window) -> None:
         """Forgets who is long out of sight, and begins who is new or was an outlier too often."""

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from birdslam.graph.costs import Floats
@@ -44,6 +46,14 @@ class StateLayout:
         own[:, 3:] = of_vehicles
         # (M, 9, 9) of the numbers of P in a row: the ego's and each vehicle's own part
         self.own = own[:, :, None] * self.size + own[:, None, :]
+        # (3, M) of them: xx, xy and yy of each vehicle's place
+        self.places = np.array([self.own[:, 3, 3], self.own[:, 3, 4], self.own[:, 4, 4]])
+
+    @staticmethod
+    @functools.lru_cache(maxsize=64)
+    def of(nodes: int, vehicles: int) -> StateLayout:
+        """The layout, which nobody may change: vehicles come and go, a few in each number."""
+        return StateLayout(nodes, vehicles)
 
     @staticmethod
     def node(k: int) -> slice:

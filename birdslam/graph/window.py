@@ -57,7 +57,7 @@ class Window:
         self.heading = [1.0 + 0j] * nodes
         self.velocity: list[complex] = []  # in the vehicle's own frame, m/s
         self.turn_radps: list[float] = []
-        self.layout = StateLayout(nodes, 0)
+        self.layout = StateLayout.of(nodes, 0)
         self.P = np.zeros((self.layout.size, self.layout.size))
 
     def state(self) -> WindowState:
@@ -69,7 +69,7 @@ class Window:
     def from_state(state: WindowState) -> Window:
         """The window that had this state. Raises ValueError where its arrays do not belong together."""
         nodes, M = len(state.node_frames), len(state.velocity)
-        layout = StateLayout(nodes, M)
+        layout = StateLayout.of(nodes, M)
         sizes = len(state.at), len(state.heading), len(state.turn_radps), state.P.shape
         if sizes != (nodes + M, nodes + M, M, (layout.size, layout.size)) or not 0 <= state.next_node < nodes:
             raise ValueError(f"a window of {nodes} nodes and {M} vehicles with arrays of {sizes}")
@@ -260,7 +260,7 @@ class Window:
 
     def select(self, rows: Sequence[int]) -> None:
         """Keeps the vehicles `rows` in that order; -1 makes room for a new one, to be placed next."""
-        n, before, self.layout = self.nodes, self.layout, StateLayout(self.nodes, len(rows))
+        n, before, self.layout = self.nodes, self.layout, StateLayout.of(self.nodes, len(rows))
         kept, old = [k for k, row in enumerate(rows) if row >= 0], [row for row in rows if row >= 0]
         egos = np.arange(before.ego_poses.stop)
         source = np.concatenate([egos, before.of_vehicles[old].ravel()])

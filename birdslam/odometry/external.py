@@ -125,7 +125,7 @@ class ExternalOdometry:
             cov=cov,
             scale_sigma_rel=self.config.sigma_scale_rel,
             ground=self.camera.ground,
-            pitch_sigma_rad=self.config.sigma_pitch_rad,
+            tilt_cov=np.eye(2) * self.config.sigma_pitch_rad**2,
             standstill=False,
             status=status,
         )

@@ -53,8 +53,8 @@ class MetricScale(Protocol):
         """1-sigma of the scale as a fraction."""
 
     @property
-    def pitch_sigma_rad(self) -> float:
-        """1-sigma of the ground's pitch."""
+    def tilt_cov(self) -> NDArray[np.float64]:
+        """(2, 2) of the ground's pitch and roll."""
 
     @property
     def unknown(self) -> bool:

@@ -51,7 +51,8 @@ class Motion(msgspec.Struct, frozen=True):
 
     R_prev_curr (3, 3) and t_prev_curr_m (3,) in camera axes (x right, y down, z forward), p_prev = R p_curr + t.
     T_prev_curr is the same on the road plane (REP-103) and `cov` (3, 3) the covariance of its tangent (x_m, y_m,
-    yaw_rad), with the scale's uncertainty in it. `ground` is the present camera over the road.
+    yaw_rad), with the scale's uncertainty in it. `ground` is the present camera over the road,
+    `tilt_cov` (2, 2) the covariance of its pitch and roll.
     """
 
     from_frame: int
@@ -62,10 +63,15 @@ class Motion(msgspec.Struct, frozen=True):
     cov: Floats
     scale_sigma_rel: float
     ground: GroundPlane
-    pitch_sigma_rad: float
+    tilt_cov: Floats
     standstill: bool
     status: tuple[Status, ...]
     speed_sources: tuple[SpeedSource, ...] = ()
+
+    @property
+    def pitch_sigma_rad(self) -> float:
+        """1-sigma of the ground's pitch."""
+        return math.sqrt(float(self.tilt_cov[0, 0]))
 
 
 def planar(step: Pose, ground: GroundPlane) -> SE2:

@@ -94,7 +94,7 @@ class MotionRecords:
             cov=cov,
             scale_sigma_rel=scale.sigma_rel if car_sigma_rel is None else car_sigma_rel,
             ground=scale.ground,
-            pitch_sigma_rad=scale.pitch_sigma_rad,
+            tilt_cov=scale.tilt_cov,
             standstill=Status.STANDSTILL in status,
             status=(*status, *scale.car_status()),
             speed_sources=sources,

@@ -32,6 +32,7 @@ MEANINGS: Mapping[Status, str] = {
     Status.SEGMENTATION_CARRIED: "the road's outline is that of an earlier picture",
     Status.DEPTH_CARRIED: "the depths are those of an earlier picture",
     Status.LANES_CARRIED: "the lanes are those of an earlier picture",
+    Status.PROVIDER_MISSING: "a network runs on the processor: its accelerator is not there, or failed",
     Status.NETWORK_FAILED: "a network gave no numbers",
     Status.INPUT_STALE: "something came late",
     Status.DEGRADED_RATE: "the computer is too slow: it looks for vehicles less often",

@@ -83,9 +83,9 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     box_memory_s: float = 0.4  # for so long a box has the same error: this time counts as one box
     width_memory_s: float = 5.0  # and its width, by clothes and by what is carried: it counts once in so long
     outline_memory_s: float = 2.0  # errors that last: a box that is drawn too low or too high, by
-    sigma_outline_rel: float = 0.04  # of its height
+    sigma_outline_rel: float = 0.06  # of its height
     sure_feet: float = 0.01  # a box whose feet are hidden with less probability tells of the road
-    sigma_common_rel: float = 0.03  # of the mean height of those who are there
+    sigma_common_rel: float = 0.055  # of the mean height of those who are there
 
     def sizes(self, label: str) -> Sizes:
         """Of a kind."""

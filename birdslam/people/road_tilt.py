@@ -37,7 +37,9 @@ def tilts_of(boxes: Sequence[PersonBox], sigma_pitch_rad: float, height_m: float
     for _ in range(2):  # a child, or feet that something hides, tells another tilt (Cauchy)
         mean = float((weight * tilt).sum()) / (float(weight.sum()) + sigma_pitch_rad**-2)
         weight = information / (1.0 + information * np.square(tilt - mean) / 4.0)
-    total = weight.sum() - weight + sigma_pitch_rad**-2  # of all others, and of the front end
-    mean_tilt = ((weight * tilt).sum() - weight * tilt) / total
-    by_heights = config.sigma_common_rel * ((weight * slope).sum() - weight * slope) / total
-    return np.stack([mean_tilt, 1.0 / total + np.square(by_heights)], axis=1)
+    others = np.maximum(weight.sum() - weight, UNUSED**-2)
+    by_boxes = ((weight * tilt).sum() - weight * tilt) / others
+    by_heights = config.sigma_common_rel * ((weight * slope).sum() - weight * slope) / others
+    spread = 1.0 / others + np.square(by_heights)  # all are tall together: many know no better than that
+    share = sigma_pitch_rad**2 / (sigma_pitch_rad**2 + spread)  # against the front end's
+    return np.stack([share * by_boxes, share * spread], axis=1)

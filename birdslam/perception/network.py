@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Protocol, cast, get_args
+from typing import Annotated, Any, Literal, Protocol, cast, get_args
 
 import msgspec
 import numpy as np
@@ -43,6 +42,8 @@ from birdslam.perception.onnx_files.unread_outputs import without_outputs
 from birdslam.perception.verge import without_verge
 from birdslam.perception.views import Preparation, View, make_views
 
+Provider = Literal["auto", "cpu", "openvino", "cuda", "tensorrt"]
+
 
 class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A network as the configuration names it; None stands for what the manifest states (see `manifest.Schedule`)."""
@@ -52,6 +53,7 @@ class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     every: Count | None = None  # it runs on one frame in so many
     threads: Annotated[int, msgspec.Meta(ge=1, le=64)] | None = None  # of the network
     awaited: bool | None = None  # whether a frame waits for it, up to its deadline
+    provider: Provider | None = None  # what it is computed by; None: as perceive.provider says
 
 
 class Decoder(Protocol):
@@ -118,10 +120,13 @@ class Network:
         schedule: Schedule,
         unread: Collection[str] = (),
         apart: Collection[str] = (),
+        provider: str = "cpu",
     ) -> None:
         """`unread` are outputs that are not to be computed, `apart` those that `run_without` leaves out too.
 
-        Raises Misfit where manifest and network contradict each other, an onnxruntime error where it can't run."""
+        A `provider` that is not there, or fails later, gives way to the CPU: `fell_back` then says why. Raises Misfit
+        where manifest and network contradict each other, an onnxruntime error where it can't run.
+        """
         self.name = name
         self.role: Role = manifest.role
         self.path = path
@@ -132,19 +137,51 @@ class Network:
         make_decoder, self._finding, outputs_of = DECODINGS[type(table)]
         self._outputs = tuple(output for output in outputs_of(table) if output not in unread)
         self._preparation = Preparation(manifest.input)
-        from birdslam.perception.session import open_session  # here: only who runs networks holds onnxruntime's 18 MB
+        # here: only who runs networks holds onnxruntime's 18 MB
+        from birdslam.perception.session import SESSION_ERRORS, ProviderMissing, open_session
+
+        self.fell_back = ""  # why it runs on the CPU although something else was asked for
 
         def bound(left_out: Collection[str]) -> _Bound:
             outputs = tuple(output for output in self._outputs if output not in left_out)
             part = without_outputs(content, {*unread, *left_out}) if unread or left_out else content
-            session = open_session(part, manifest.input, outputs, schedule.threads)
+            session = open_session(part, manifest.input, outputs, schedule.threads, self.provider)
             return _Bound(session, manifest.input.name, self._preparation.tensor, outputs)
 
-        self._whole = bound(())
-        self._part = bound(apart) if apart else self._whole
+        def bind() -> None:
+            self._whole = bound(())
+            self._part = bound(apart) if apart else self._whole
+
+        self.provider, self._bind = provider, bind
+        try:
+            bind()
+        except ProviderMissing as error:
+            self._fall_back(error)
+        except SESSION_ERRORS as error:
+            if provider == "cpu":
+                raise
+            self._fall_back(error)
         shapes = {output: tensor.shape for output, tensor in self._whole.tensors.items()}
         self.decoder = make_decoder(table, manifest.input, shapes)
         self._views: dict[tuple[int, int], tuple[View, ...]] = {}
+
+    def _fall_back(self, error: Exception) -> None:
+        self.fell_back = f"{self.provider}: {' '.join(str(error).split())}"
+        self.provider = "cpu"
+        self._bind()
+
+    def _computed(self, apart: bool = False) -> _Bound | None:
+        """After a run on the input; None where it gave no numbers. What fails on an accelerator is run on the CPU."""
+        from birdslam.perception.session import SESSION_ERRORS
+
+        try:
+            bound = self._part if apart else self._whole
+            return bound if bound.infer() else None
+        except SESSION_ERRORS as error:
+            if self.provider == "cpu":
+                raise
+            self._fall_back(error)
+            return self._computed(apart)
 
     def views(self, image: NDArray[np.uint8]) -> tuple[View, ...]:
         """The views in which an image is run, each a run of its own. Raises ValueError where it is no image."""
@@ -165,7 +202,7 @@ class Network:
 
     def infer(self) -> bool:
         """Runs the network on its input; False where an output holds a number that is not finite."""
-        return self._whole.infer()
+        return self._computed() is not None
 
     def read(self, view: View) -> Any:
         """The outputs of the last run decoded, for `merge`."""
@@ -173,17 +210,18 @@ class Network:
 
     def run(self, image: NDArray[np.uint8]) -> Findings | None:
         """The findings in a grey (H, W) or BGR (H, W, 3) image of any size; None where the network gave no numbers."""
-        return self._run(self._whole, image)
+        return self._run(image)
 
     def run_without(self, image: NDArray[np.uint8]) -> Findings | None:
         """As `run`, and the same to a bit, without the outputs that stand `apart` and what only they need."""
-        return self._run(self._part, image)
+        return self._run(image, apart=True)
 
-    def _run(self, bound: _Bound, image: NDArray[np.uint8]) -> Findings | None:
+    def _run(self, image: NDArray[np.uint8], apart: bool = False) -> Findings | None:
         views, parts = self.views(image), []
         for view in views:
             self.prepare(image, view)
-            if not bound.infer():
+            bound = self._computed(apart)
+            if bound is None:
                 return None
             parts.append(self.decoder.read(bound.tensors, view))
         merged = self.decoder.merge(parts, views)
@@ -206,6 +244,8 @@ class Network:
 
     def describe(self) -> dict[str, Any]:
         """What ran, for a summary: plain values."""
+        from birdslam.perception.session import onnxruntime_version
+
         return {
             "name": self.name,
             "role": self.role,
@@ -217,7 +257,8 @@ class Network:
             "every": self.schedule.every,
             "threads": self.schedule.threads,
             "awaited": self.schedule.awaited,
-            "onnxruntime": version("onnxruntime"),
+            "provider": self.provider,
+            "onnxruntime": onnxruntime_version(),
         }
 
 
@@ -232,7 +273,8 @@ def load_network(
 
     Where the `spec` does not say how many threads it has, these are its manifest's, but no more than `most_threads`.
     Of a multi-task network the outputs `unread` are not computed, which "depth" alone may be, and `run_without` leaves
-    out `apart` too, which "segmentation" alone may be. A `name` that is a role's must be the manifest's. Raises
+    out `apart` too, which "segmentation" alone may be. A provider "auto" is the CPU here: what is fastest is
+    measured by runtime/models/providers.py. A `name` that is a role's must be the manifest's. Raises
     ModelError naming the file, the key, what the manifest says and what the network has.
     """
     path = Path(spec.path)
@@ -253,7 +295,8 @@ def load_network(
 
     try:
         outputs = (unread, apart) if manifest.role == "multitask" else ((), ())
-        return Network(name, path, manifest, sha256, content, schedule, *outputs)
+        provider = "cpu" if spec.provider in (None, "auto") else str(spec.provider)
+        return Network(name, path, manifest, sha256, content, schedule, *outputs, provider)
     except ManifestMismatch as error:
         raise ModelError(f"{path}: {error} (manifest {origin})") from error
     except SESSION_ERRORS as error:

@@ -11,7 +11,6 @@ import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +165,8 @@ class PointNet:
 
     def describe(self) -> dict[str, Any]:
         """What ran, for a summary: plain values."""
+        from birdslam.perception.session import onnxruntime_version
+
         return {
             "name": self.name,
             "role": self.role,
@@ -175,7 +176,7 @@ class PointNet:
             "points": self.manifest.points.count,
             "every": self.schedule.every,
             "threads": self.schedule.threads,
-            "onnxruntime": version("onnxruntime"),
+            "onnxruntime": onnxruntime_version(),
         }
 
 

@@ -92,6 +92,8 @@ class Head(Protocol):
     def role(self) -> Role: ...
     @property
     def schedule(self) -> Schedule: ...
+    @property
+    def fell_back(self) -> str: ...
     def run(self, image: NDArray[np.uint8]) -> Findings | None: ...
 
 
@@ -256,7 +258,7 @@ class Networks:
 
     def _take_results(self, frame_id: int) -> list[Status]:
         """The results that are there replace the older ones; returns the status of what failed or is carried."""
-        status = []
+        status = [Status.PROVIDER_MISSING] if any(slot.head.fell_back for slot in self._slots) else []
         for slot in self._slots:
             if slot.running is not None and slot.running.done():
                 findings = slot.running.result()  # a head's exception is a bug and surfaces here

@@ -11,7 +11,13 @@ from birdslam.perception.onnx_files.subnormal import without_tiny_weights
 SESSION_ERRORS = tuple(
     error for error in vars(ort_errors).values() if isinstance(error, type) and issubclass(error, Exception)
 )
-PROVIDERS = ["CPUExecutionProvider"]
+CPU = "CPUExecutionProvider"
+EXECUTION_PROVIDERS = {  # of the configuration -> of onnxruntime; the packages that bring them: docs/networks.md
+    "cpu": CPU,
+    "openvino": "OpenVINOExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+}
 _FLOAT32 = "tensor(float)"
 
 
@@ -29,16 +35,42 @@ def session_options(threads: int) -> ort.SessionOptions:
     return options
 
 
+def onnxruntime_version() -> str:
+    """Of the package that is there: onnxruntime, or one with more providers."""
+    return str(ort.__version__)
+
+
+class ProviderMissing(Exception):
+    """The provider is not in this onnxruntime, or does not begin on this computer; says which."""
+
+
+def providers_here() -> tuple[str, ...]:
+    """Of EXECUTION_PROVIDERS those that this onnxruntime was built with, "cpu" first."""
+    built = set(ort.get_available_providers())
+    return tuple(name for name, theirs in EXECUTION_PROVIDERS.items() if theirs in built)
+
+
+def _options_of(provider: str, threads: int) -> dict[str, str]:
+    if provider != "openvino":
+        return {}
+    return {"device_type": "CPU", "num_of_threads": str(threads), "precision": "FP32"}
+
+
 def plain_session(content: bytes, threads: int) -> ort.InferenceSession:
     """Of a network as it is, compared with no manifest."""
-    return ort.InferenceSession(content, session_options(threads), providers=PROVIDERS)
+    return ort.InferenceSession(content, session_options(threads), providers=[CPU])
 
 
-def open_session(content: bytes, input: Input, outputs: tuple[str, ...], threads: int) -> ort.InferenceSession:
-    """A session with the input's shape fixed, after its inputs and outputs were compared with the manifest."""
+def open_session(
+    content: bytes, input: Input, outputs: tuple[str, ...], threads: int, provider: str = "cpu"
+) -> ort.InferenceSession:
+    """A session with the input's shape fixed, after its inputs and outputs were compared with the manifest.
+
+    Raises ProviderMissing where the provider can't be had, and ManifestMismatch.
+    """
     probe_options = session_options(1)
     probe_options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    probe = ort.InferenceSession(content, probe_options, providers=PROVIDERS)
+    probe = ort.InferenceSession(content, probe_options, providers=[CPU])
     has_inputs = [i.name for i in probe.get_inputs()]
     if has_inputs != [input.name]:
         raise ManifestMismatch("input.name", repr(input.name), f"the inputs {has_inputs}")
@@ -63,4 +95,16 @@ def open_session(content: bytes, input: Input, outputs: tuple[str, ...], threads
             raise ManifestMismatch(
                 "output", f"{output} as {_FLOAT32} (all that manifests can say)", has_outputs[output]
             )
-    return ort.InferenceSession(without_tiny_weights(content), options, providers=PROVIDERS)
+    whole = without_tiny_weights(content)
+    if provider == "cpu":
+        return ort.InferenceSession(whole, options, providers=[CPU])
+    if provider not in providers_here():
+        raise ProviderMissing(f"this onnxruntime has no {provider}, but {', '.join(providers_here())}")
+    wanted = EXECUTION_PROVIDERS[provider]
+    try:
+        session = ort.InferenceSession(whole, options, providers=[(wanted, _options_of(provider, threads)), CPU])
+    except SESSION_ERRORS as error:
+        raise ProviderMissing(f"{provider} does not begin: {error}") from error
+    if session.get_providers()[0] != wanted:  # onnxruntime goes to the CPU by itself
+        raise ProviderMissing(f"{provider} does not begin on this computer")
+    return session

@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 import shutil
-from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-import numpy as np
-
 from birdslam.ros.bag import NEEDS_EXTRA, BagError
+from birdslam.ros.message_types import MessageTypes
+from birdslam.ros.messages import LATCHED
 
 Storage = Literal["mcap", "sqlite3"]
-
-# vision_msgs 4, since Humble; rosbags knows the packages of ROS itself alone
-VISION_MSGS = {
-    "ObjectHypothesis": "string class_id\nfloat64 score",
-    "ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
-    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
-    "Detection3D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-    "vision_msgs/BoundingBox3D bbox\nstring id",
-    "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
-}
 
 
 class BagWriter:
@@ -40,7 +29,8 @@ class BagWriter:
             raise BagError(f"{directory}: is there already")
         self.directory = directory
         self._partial = directory.with_name(f".{directory.name}.partial")
-        self._store = _types()
+        self._types = MessageTypes()
+        self.make = self._types.make
         self._connections: dict[str, Any] = {}
         try:
             if self._partial.exists():  # of an export that was killed
@@ -65,50 +55,22 @@ class BagWriter:
         finally:
             shutil.rmtree(self._partial, ignore_errors=True)
 
-    def make(self, name: str, /, **fields: Any) -> Any:
-        """A message of its full name; fields that are not given are zero."""
-        for field, kind in self._store.fielddefs[name][1]:
-            if field not in fields:
-                fields[field] = self._zero(kind)
-        return self._store.types[name](**fields)
-
-    def _zero(self, kind: Any) -> Any:
-        node, value = int(kind[0]), kind[1]
-        if node == 1:  # a number, a truth value or a string
-            return "" if value[0] == "string" else 0
-        if node == 2:  # a message
-            return self.make(value)
-        element, count = value
-        if int(element[0]) == 1 and element[1][0] != "string":
-            return np.zeros(count, dtype=np.uint8 if element[1][0] in ("byte", "octet") else element[1][0])
-        return [self._zero(element) for _ in range(count)]
-
     def write(self, topic: str, message: Any, t_ns: int) -> None:
         """A message that the bag received at `t_ns`."""
         kind = message.__msgtype__
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
-                topic, kind, typestore=self._store, offered_qos_profiles=_qos(topic)
+                topic, kind, typestore=self._types.store, offered_qos_profiles=_qos(topic)
             )
         try:
-            self._writer.write(self._connections[topic], max(t_ns, 0), self._store.serialize_cdr(message, kind))
+            self._writer.write(self._connections[topic], max(t_ns, 0), self._types.cdr(message))
         except OSError as error:
             raise BagError(f"{self.directory}: can't be written: {error.strerror}") from None
 
 
-@cache
-def _types() -> Any:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    for name, fields in VISION_MSGS.items():
-        store.register(get_types_from_msg(fields, f"vision_msgs/msg/{name}"))
-    return store
-
-
 def _qos(topic: str) -> list[Any]:
     """What comes once must wait for those who come later: transient local; the rest by default."""
-    if topic not in ("/tf_static", "/birdslam/path"):
+    if topic not in LATCHED:
         return []
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,22 @@ ON_THE_ROAD = ("base_footprint", "base_link")
 
 
 class StaticFrames:
-    """The static transforms between a bag's frames."""
+    """The static transforms between the frames of a bag, or of messages of /tf_static."""
 
     def __init__(self, bag: Bag) -> None:
+        self._add(message.content for message in bag.messages(TF_STATIC))
+
+    @classmethod
+    def of(cls, messages: Iterable[Any]) -> StaticFrames:
+        """Of tf2_msgs/TFMessage."""
+        found = cls.__new__(cls)
+        found._add(messages)
+        return found
+
+    def _add(self, messages: Iterable[Any]) -> None:
         self._from_parent: dict[str, tuple[str, Transform]] = {}
-        for message in bag.messages(TF_STATIC):
-            for one in message.content.transforms:
+        for message in messages:
+            for one in message.transforms:
                 child, parent = one.child_frame_id.lstrip("/"), one.header.frame_id.lstrip("/")
                 self._from_parent[child] = parent, _matrix(one.transform)
 

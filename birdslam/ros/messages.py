@@ -1,4 +1,4 @@
-"""Our records as ROS messages, made by rosbags in an export or by rclpy in a node; docs/ros.md lists the topics.
+"""Our records as ROS messages, for a bag or for a live ROS 2; docs/ros.md lists the topics.
 
 Axes are REP-103's as everywhere in types.py. REP-105: `odom` is our world, continued where a new epoch begins (at the
 pose where the last one ended: the motion between is unknown); `base_link` is ego, the camera's foot on the road. Our
@@ -8,9 +8,10 @@ the child's. What is not estimated has the variance UNKNOWN.
 
 from __future__ import annotations
 
+import enum
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,16 +20,48 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import Transform, ego_pose, mount_pose
-from birdslam.types import NS_PER_S, Attitude, EgoEdge, Estimate, MapUpdate, RoadUser
+from birdslam.types import NS_PER_S, Attitude, EgoEdge, Estimate, Lanes, LineColour, LineKind, MapUpdate, RoadUser
 
 Floats = NDArray[np.float64]
 Sent = tuple[str, Any]  # topic, message
+
+ODOMETRY, DETECTIONS, MARKERS = (
+    "nav_msgs/msg/Odometry",
+    "vision_msgs/msg/Detection3DArray",
+    "visualization_msgs/msg/MarkerArray",
+)
+TOPICS = {  # topic -> type of its messages
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/birdslam/odometry": ODOMETRY,
+    "/birdslam/path": "nav_msgs/msg/Path",
+    "/birdslam/vehicles": DETECTIONS,
+    "/birdslam/vehicles/odometry": ODOMETRY,
+    "/birdslam/people": DETECTIONS,
+    "/birdslam/people/odometry": ODOMETRY,
+    "/birdslam/lanes": MARKERS,
+    "/birdslam/lane_lines": MARKERS,
+    "/birdslam/ego_lane": "nav_msgs/msg/Path",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+}
+LATCHED = ("/tf_static", "/birdslam/path")  # what comes once must wait for those who come later
 
 ODOM, BASE, CAMERA = "odom", "base_link", "camera_optical_frame"
 UNKNOWN = 1e6  # variance of what is not estimated
 VEHICLE_HEIGHT_M = 1.5  # of boxes of a height that is not known
 LANE_WIDTH_M = 0.15  # drawn
+CURVE_STEP_M = 2.0  # between two points of a line or a lane
+COLOURS = {LineColour.YELLOW: (1.0, 0.8, 0.0)}  # others are white
+EDGE_COLOUR = (0.5, 0.5, 0.5)
 PLANE = (0, 1, 5)  # x, y and yaw among ROS' six: x, y, z, about x, about y, about z
+
+
+class Level(enum.IntEnum):
+    """Of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
 
 
 class Make(Protocol):
@@ -38,10 +71,13 @@ class Make(Protocol):
 
 
 class RosMessages:
-    """Of one drive, in order: it remembers where the last epoch ended and, with `keep_path`, all poses."""
+    """Of one drive, in order: it remembers where the last epoch ended and, with `keep_path`, all poses.
 
-    def __init__(self, make: Make, camera: Camera, name: str, keep_path: bool = False) -> None:
-        self._make, self._camera, self._name = make, camera, name
+    `frames` stands before the names of all frames ("red/"), so that several cars are in one tree.
+    """
+
+    def __init__(self, make: Make, camera: Camera, name: str, keep_path: bool = False, frames: str = "") -> None:
+        self._make, self._camera, self._name, self._frames = make, camera, name, frames
         self._T_odom_world = SE2()
         self._last: tuple[Estimate, SE2] | None = None  # and T_odom_ego
         self._keep_path = keep_path
@@ -73,6 +109,8 @@ class RosMessages:
         yield "/birdslam/people", self._detections(estimate, estimate.people, t_ns)
         for person in estimate.people:
             yield "/birdslam/people/odometry", self._vehicle(person, estimate.attitude.z_m, t_ns, "person")
+        if estimate.lanes is not None:
+            yield from self._lanes(estimate.lanes, t_ns)
         yield "/diagnostics", self._diagnostics(estimate, t_ns)
 
     def of_map(self, update: MapUpdate, t_ns: int) -> Iterator[Sent]:
@@ -85,7 +123,33 @@ class RosMessages:
         for lane, (x_m, y_m) in zip(ids, (self._T_odom_world @ np.array(update.lanes_m)).tolist(), strict=True):
             lanes.setdefault(lane, []).append(self._make("geometry_msgs/msg/Point", x=x_m, y=y_m, z=z_m))
         markers = [self._marker(lane, points, t_ns) for lane, points in sorted(lanes.items())]
-        yield "/birdslam/lanes", self._make("visualization_msgs/msg/MarkerArray", markers=markers)
+        yield "/birdslam/lanes", self._make(MARKERS, markers=markers)
+
+    def _lanes(self, lanes: Lanes, t_ns: int) -> Iterator[Sent]:
+        """The lines of one frame, which replace those of the frame before, and the middle of the ego's lane."""
+        markers = [self._make("visualization_msgs/msg/Marker", header=self._header(BASE, t_ns), action=3)]  # DELETEALL
+        for line in lanes.lines:
+            points = self._curve(line.y_m, line.seen_from_m, line.to_m)
+            colour = EDGE_COLOUR if line.kind is LineKind.EDGE else COLOURS.get(line.colour, (1.0, 1.0, 1.0))
+            marker = self._marker_of(BASE, line.kind.value, line.line, points, t_ns)
+            marker.type = marker.LINE_STRIP
+            marker.color = self._colour(*colour, line.existence)
+            markers.append(marker)
+        yield "/birdslam/lane_lines", self._make(MARKERS, markers=markers)
+        if lanes.ego is not None:
+            header = self._header(BASE, t_ns)
+            poses = [
+                self._make("geometry_msgs/msg/PoseStamped", header=header, pose=self._at(point))
+                for point in self._curve(lanes.ego.centre_m, 0.0, lanes.ego.to_m)
+            ]
+            yield "/birdslam/ego_lane", self._make("nav_msgs/msg/Path", header=header, poses=poses)
+
+    def _curve(self, y_m: Callable[[float], float], from_m: float, to_m: float) -> list[Any]:
+        steps = max(2, round(abs(to_m - from_m) / CURVE_STEP_M) + 1)
+        return [
+            self._make("geometry_msgs/msg/Point", x=x_m, y=y_m(x_m), z=0.0)
+            for x_m in np.linspace(from_m, to_m, steps).tolist()
+        ]
 
     def path(self) -> Iterator[Sent]:
         """The whole path, when the drive is over; nothing without `keep_path`."""
@@ -132,7 +196,7 @@ class RosMessages:
                     id=str(vehicle.vehicle),
                 )
             )  # fmt: skip
-        return self._make("vision_msgs/msg/Detection3DArray", header=header, detections=detections)
+        return self._make(DETECTIONS, header=header, detections=detections)
 
     def _diagnostics(self, estimate: Estimate, t_ns: int) -> Any:
         statuses = ", ".join(status.value for status in estimate.status)
@@ -145,25 +209,40 @@ class RosMessages:
             "vehicles": len(estimate.vehicles),
             "people": len(estimate.people),
         }
+        level = Level.ERROR if not estimate.valid else Level.WARN if estimate.status else Level.OK
+        return self.diagnostic("estimate", level, statuses or "ok", values, t_ns)[1]
+
+    def diagnostic(self, what: str, level: Level, text: str, values: Mapping[str, object], t_ns: int) -> Sent:
+        """The state of a part of the system."""
         status = self._make(
             "diagnostic_msgs/msg/DiagnosticStatus",
-            name="birdslam: estimate",
-            message=statuses or "ok",
+            name=f"birdslam: {what}",
+            message=text,
             hardware_id=self._name,
+            level=int(level),
             values=[self._make("diagnostic_msgs/msg/KeyValue", key=key, value=str(v)) for key, v in values.items()],
         )
-        kind = type(status)
-        status.level = kind.ERROR if not estimate.valid else kind.WARN if estimate.status else kind.OK
-        return self._make("diagnostic_msgs/msg/DiagnosticArray", header=self._header("", t_ns), status=[status])
+        header = self._header("", t_ns)
+        return "/diagnostics", self._make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status])
 
     def _marker(self, lane: int, points: list[Any], t_ns: int) -> Any:
         space = "lane" if lane < 0 else f"lane {lane}"
         self._markers[space] += 1  # each stays, so that the map grows
+        return self._marker_of(ODOM, space, self._markers[space], points, t_ns)
+
+    def _marker_of(self, frame: str, space: str, number: int, points: list[Any], t_ns: int) -> Any:
         return self._make(
-            "visualization_msgs/msg/Marker", header=self._header(ODOM, t_ns), ns=space, id=self._markers[space],
-            type=8, action=0, pose=self._pose(np.eye(4)), scale=self._vector(LANE_WIDTH_M, LANE_WIDTH_M, 0.0),
-            color=self._make("std_msgs/msg/ColorRGBA", r=1.0, g=1.0, b=1.0, a=1.0), points=points,
+            "visualization_msgs/msg/Marker", header=self._header(frame, t_ns), ns=space, id=number, type=8, action=0,
+            pose=self._pose(np.eye(4)), scale=self._vector(LANE_WIDTH_M, LANE_WIDTH_M, 0.0),
+            color=self._colour(1.0, 1.0, 1.0, 1.0), points=points,
         )  # fmt: skip
+
+    def _colour(self, red: float, green: float, blue: float, alpha: float) -> Any:
+        return self._make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha)
+
+    def _at(self, point: Any) -> Any:
+        turn = self._make("geometry_msgs/msg/Quaternion", w=1.0)
+        return self._make("geometry_msgs/msg/Pose", position=point, orientation=turn)
 
     def _odometry(
         self, child: str, pose: Transform, cov: Floats, twist: tuple[float, ...], twist_cov: Floats, t_ns: int
@@ -173,9 +252,9 @@ class RosMessages:
             "geometry_msgs/msg/Twist", linear=self._vector(vx, vy, 0.0), angular=self._vector(0.0, 0.0, yaw_rate)
         )
         return self._make(
-            "nav_msgs/msg/Odometry",
+            ODOMETRY,
             header=self._header(ODOM, t_ns),
-            child_frame_id=child,
+            child_frame_id=self._frames + child,
             pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(pose), covariance=_six(cov)),
             twist=self._make("geometry_msgs/msg/TwistWithCovariance", twist=moving, covariance=_six(twist_cov)),
         )
@@ -187,12 +266,14 @@ class RosMessages:
             "geometry_msgs/msg/Transform", translation=self._vector(at.x, at.y, at.z), rotation=pose.orientation
         )
         header = self._header(parent, t_ns)
-        return self._make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=moved)
+        return self._make(
+            "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=self._frames + child, transform=moved
+        )
 
     def _header(self, frame: str, t_ns: int) -> Any:
         sec, nanosec = divmod(max(t_ns, 0), NS_PER_S)
         stamp = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame and self._frames + frame)
 
     def _pose(self, T: Transform) -> Any:
         from scipy.spatial.transform import Rotation  # here, as in trajectory.py
@@ -246,12 +327,3 @@ def _six(cov: Floats) -> Floats:
 def t_of(estimate: Estimate, live: bool) -> int:
     """The time of a message: UTC of a live camera, else the recording's own clock, as in the bag that it came from."""
     return estimate.t_utc_ns if live and estimate.t_utc_ns else estimate.t_source_ns
-
-
-def rclpy_message(name: str, /, **fields: Any) -> Any:
-    """Makes messages in a ROS 2 installation; see docs/examples/ros2_node.py."""
-    from importlib import import_module
-
-    package, _, kind = name.split("/")
-    message: Callable[..., Any] = getattr(import_module(f"{package}.msg"), kind)
-    return message(**fields)

@@ -12,12 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.types import SpeedReading
+from birdslam.types import NS_PER_S, SpeedReading
 
 Floats = NDArray[np.float64]
+FIX_SIGMA_M = 5.0  # of a fix without a covariance: a receiver without corrections, under open sky
 
 IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
 CAMERA_INFO = "sensor_msgs/CameraInfo"
+FIX = "sensor_msgs/NavSatFix"
 SPEEDS = ("geometry_msgs/TwistStamped", "geometry_msgs/TwistWithCovarianceStamped", "nav_msgs/Odometry")
 
 # ROS encoding -> bytes a pixel, and what OpenCV does to it
@@ -129,6 +131,14 @@ def speed(message: Any, t_ns: int, sigma_mps: float, yaw_rate_sigma_radps: float
         yaw_rate_radps=yaw_rate,
         yaw_rate_sigma_radps=0.0 if yaw_rate is None else _sigma(cov, 35, yaw_rate_sigma_radps),
     )
+
+
+def fix_row(message: Any, t_ns: int) -> str | None:
+    """A sensor_msgs/NavSatFix as a line of loops/gnss_file.py (time, degrees, sigma); None where there is no fix."""
+    if message.status.status < 0 or not (math.isfinite(message.latitude) and math.isfinite(message.longitude)):
+        return None
+    sigma_m = _sigma(message.position_covariance, 0, FIX_SIGMA_M)
+    return f"{t_ns / NS_PER_S:.9f},{message.latitude:.9f},{message.longitude:.9f},{sigma_m:.3f}"
 
 
 def yaw_rate(message: Any) -> float:

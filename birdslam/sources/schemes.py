@@ -24,10 +24,10 @@ class Scheme:
     name: str
     written: tuple[str, ...]  # as a user writes it; a name without a colon needs no address
     what: str
-    opener: str  # module:class; called with (path, camera=, stride=), or as runtime/nodes/cameras.py says if `live`
+    opener: str  # module:class; called with (path, camera=, stride=); if `live` with (configuration, must_open)
     camera: Literal["calibration", "intrinsics", "frame size", "nothing"]  # intrinsics: the height may be missing
     clock: Literal["recorded times", "frame rate", "this computer's"]
-    address: Literal["path", "device", "network"] = "path"
+    address: Literal["path", "device", "network", "topic"] = "path"
     live: bool = False
     options: tuple[str, ...] = OF_A_RECORDING  # keys of [source] that it takes; uri, rate and frames hold for all
     refused: tuple[str, ...] = ()  # keys that are an error beside it; others that it does not take are ignored

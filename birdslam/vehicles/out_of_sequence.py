@@ -38,7 +38,7 @@ class OpenFrame:
     dt_s: float
     turn_rad: float | None
     image_ground: GroundPlane | None
-    image_sigma_rad: float
+    image_cov: NDArray[np.float64] | None
     travelled_m: float | None = None
 
 
@@ -123,4 +123,4 @@ class OutOfSequenceTracker:
 
 
 def _predict(ground_size: GroundSizeFilter, frame: OpenFrame) -> None:
-    ground_size.predict(frame.dt_s, frame.turn_rad, frame.image_ground, frame.image_sigma_rad, frame.travelled_m)
+    ground_size.predict(frame.dt_s, frame.turn_rad, frame.image_ground, frame.image_cov, frame.travelled_m)

@@ -39,7 +39,8 @@ from birdslam.vehicles.placement.uncertain_yaw import (
     weigh_yaws,
 )
 from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeFilter
-from birdslam.vehicles.state.parallax import LearnedSize, Parallax, ParallaxConfig
+from birdslam.vehicles.state.parallax import LearnedSize, Parallax
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
 from birdslam.vehicles.state.parallax_measurements import measure_boxes
 from birdslam.vehicles.state.yaw_by_outline import YawByOutline
 from birdslam.vehicles.track import Track

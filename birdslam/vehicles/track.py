@@ -16,7 +16,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.types import MotionEdge
 from birdslam.vehicles.placement.localisation import Observation, Place
 from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig
-from birdslam.vehicles.state.parallax import ParallaxConfig
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
 
 
 class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

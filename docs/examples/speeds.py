@@ -14,7 +14,7 @@ from birdslam.sources.detection_file import read_detection_file
 video, camera_file, boxes_file, output = sys.argv[1:]
 recording = open_recording(f"video:{video}", load_camera(Path(camera_file)))
 slam, boxes = BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz), read_detection_file(Path(boxes_file))
-draw_box, draw_label = sv.BoxAnnotator(), sv.LabelAnnotator()
+draw_box, draw_label = (kind(color_lookup=sv.ColorLookup.INDEX) for kind in (sv.BoxAnnotator, sv.LabelAnnotator))
 size = sv.VideoInfo(recording.camera.width_px, recording.camera.height_px, recording.rate_hz)
 with sv.VideoSink(output, size) as sink:
     for frame in recording.undistorted_frames():

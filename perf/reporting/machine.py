@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 import platform
 import subprocess
@@ -12,7 +11,7 @@ from typing import Any
 
 import psutil
 
-from birdslam.runtime.environment import LIBRARIES
+from birdslam.runtime.environment import library_versions
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 _STEAL = 7  # of /proc/stat's columns: user nice system idle iowait irq softirq steal guest guest_nice
@@ -32,7 +31,7 @@ def describe() -> dict[str, Any]:
         "load_before": round(os.getloadavg()[0], 2),
         "commit": _git("rev-parse", "--short=12", "HEAD"),
         "uncommitted_files": len(_git("status", "--porcelain").splitlines()),
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
+        "versions": library_versions(),
     }
 
 
@@ -46,10 +45,6 @@ def _git(*arguments: str) -> str:
     except (OSError, subprocess.CalledProcessError):
         return ""  # an installed copy without its history
     return done.stdout.strip()
-
-
-def _version(name: str) -> str:
-    return importlib.metadata.version(name)
 
 
 class Steal:

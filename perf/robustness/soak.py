@@ -1,10 +1,11 @@
 """A long drive at the full rate: memory, descriptors, watchdogs and drops of every process, from the first minute on.
 
-    python -m perf soak [--minutes 30] [--rate 33] [--source demo] [--record] [--models DIR]
+    python -m perf soak [--minutes 30] [--rate 33] [--source demo] [--record] [--models DIR] [...]
 
-Without `--source` the software camera of the fault suite drives down its street. The soak stands in systemd's place,
-and notices where the supervisor misses its watchdog. Ends with status 1, and says why, where after the first minute a
-process grew by more than 1 % or held more descriptors, where a process was restarted, or a watchdog was missed.
+Further options are those of `birdslam run`. Without `--source` the software camera of the fault suite drives down its
+street. The soak stands in systemd's place, and notices where the supervisor misses its watchdog. Ends with status 1,
+and says why, where after the first minute a process grew by more than 1 % or held more descriptors, where a process was
+restarted, a watchdog was missed, or estimates came later to the planner at the end than at the beginning.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import tempfile
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ label = "memory, descriptors, watchdogs and drops of every process over a long d
 WARM_S, SAMPLE_S, SAID_S = 60.0, 5.0, 30.0
 SPAN = 6  # samples at either end whose medians are compared: what a process holds swings by its garbage
 GROWTH = 0.01
+AGE_GROWTH = 0.1  # of the age's median, first quarter to last
 WATCHDOG_S = 5.0  # of the supervisor, as in deploy/birdslam.service
 
 
@@ -122,6 +124,16 @@ def faults(series: Mapping[str, Series], summary: dict[str, Any], systemd: Syste
         yield f"the supervisor missed its watchdog {systemd.missed} times"
 
 
+def ages(found_ms: Sequence[float]) -> tuple[str, list[str]]:
+    """Of estimates after the first minute: p50 and p99 in the first and the last quarter, and what is not well."""
+    quarter = max(1, len(found_ms) // 4)
+    p50, p99 = np.percentile(found_ms[:quarter], (50, 99))
+    end_p50, end_p99 = np.percentile(found_ms[-quarter:], (50, 99))
+    said = f"age at the planner, first quarter p50 {p50:.1f}, p99 {p99:.1f} ms; last {end_p50:.1f}, {end_p99:.1f} ms"
+    grew = end_p50 > (1.0 + AGE_GROWTH) * p50
+    return said, [f"the age grew from {p50:.1f} to {end_p50:.1f} ms in the median"] if grew else []
+
+
 def restarts(summary: dict[str, Any]) -> dict[str, int]:
     """Of each node, and of the recorder where there is one: dead, or ended by its watchdog."""
     recorder = {"record": summary["recording"]["restarts"]} if "recording" in summary else {}
@@ -144,14 +156,21 @@ def table(series: Mapping[str, Series], summary: dict[str, Any], systemd: System
     return "\n".join(lines)
 
 
-def drive(vehicle: Vehicle, minutes: float) -> dict[str, Series]:
-    """Samples until the time is over. Raises RuntimeError where the run ends before."""
+def drive(vehicle: Vehicle, minutes: float) -> tuple[dict[str, Series], list[float]]:
+    """Samples until the time is over, and the ages of estimates in ms; both after the first minute.
+
+    Raises RuntimeError where the run ends before.
+    """
     begun_s = time.monotonic()
     until_s = begun_s + max(60.0 * minutes, WARM_S + 2 * SAMPLE_S)
     due_s, said_s, frames = begun_s + WARM_S, begun_s, 0
     series: dict[str, Series] = defaultdict(Series)
+    ages_ms: list[float] = []
     while (now_s := time.monotonic()) < until_s:
-        frames += vehicle.planner.wait(1.0) is not None
+        estimate = vehicle.planner.wait(1.0)
+        frames += estimate is not None
+        if estimate is not None and now_s >= begun_s + WARM_S:
+            ages_ms.append((time.monotonic_ns() - estimate.t_capture_ns) / 1e6)
         if vehicle.process.poll() is not None:
             raise RuntimeError(f"the run has ended by itself: {(vehicle.place / 'run.log').read_text()[-1000:]}")
         if now_s >= due_s:
@@ -161,7 +180,7 @@ def drive(vehicle: Vehicle, minutes: float) -> dict[str, Series]:
             said_s += SAID_S
             held = ", ".join(f"{name} {one.mib[-1]:.1f} ({one.growth:+.2%})" for name, one in series.items())
             print(f"{(now_s - begun_s) / 60.0:5.1f} min  {frames} estimates  {held or 'warming up'}", flush=True)
-    return dict(series)
+    return dict(series), ages_ms
 
 
 def run(arguments: list[str]) -> int:
@@ -172,15 +191,15 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--source", default="", metavar="URI", help="goes round and round; left out: a software camera")
     parser.add_argument("--record", action="store_true", help="with a recorder beside it")
     parser.add_argument("--models", type=Path, help="folder of networks")
-    options = parser.parse_args(arguments)
+    options, more = parser.parse_known_args(arguments)
     ends_with_its_vehicle()
     with tempfile.TemporaryDirectory(prefix="soak") as folder, Systemd(Path(folder)) as systemd:
         place = Path(folder)
         recorded = record_options(place) if options.record else []
         os.environ.update(systemd.environment)
-        extra = [*model_options(options.models), *recorded]
+        extra = [*model_options(options.models), *recorded, *more]
         with Vehicle(place, *extra, rate_hz=options.rate, source=options.source) as vehicle:
-            series = drive(vehicle, options.minutes)
+            series, ages_ms = drive(vehicle, options.minutes)
             status = vehicle.stop()
             summary = json.loads((vehicle.output / "summary.json").read_text())
     print(table(series, summary, systemd))
@@ -188,7 +207,9 @@ def run(arguments: list[str]) -> int:
         f"frames {summary['frames_in']}, rate {summary['rate_hz']} Hz, age {summary['age_ms']} ms, {summary['budget']}"
     )
     print(f"longest silence of the supervisor's watchdog: {systemd.longest_s:.1f} s of {WATCHDOG_S:g}")
-    found = [*faults(series, summary, systemd), *([f"the run ended with status {status}"] if status else [])]
+    said, late = ages(ages_ms)
+    print(said)
+    found = [*faults(series, summary, systemd), *late, *([f"the run ended with status {status}"] if status else [])]
     for line in found:
         print(f"NOT WELL: {line}")
     return int(bool(found))

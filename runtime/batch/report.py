@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import html
+import importlib.util
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -17,12 +18,15 @@ from typing import IO, Any
 import msgspec
 import numpy as np
 
-from birdslam.outputs.drive_files import ResultsError
+from birdslam.outputs.drive_files import FRAMES_FILE, ResultsError
+from birdslam.outputs.report.drive_table import read_drive
+from birdslam.outputs.report.page import REPORT, plotly_script, report_page
 from birdslam.runtime.batch.drive import DRIVES, RESULT, DriveResult, Failure, failure_file
 from birdslam.runtime.batch.drives import Task
 
 MOST_BARS = 40  # of a plot; more drives are drawn as a histogram
 MOST_STATUSES = 12
+PLOTLY = "plotly.js"  # beside the report: the pages of all drives read it
 MOST_IN_A_CELL = 4  # statuses of one drive
 COLUMNS = (
     "drive", "source", "settings", "error", "frames", "duration_s", "path_m", "mean_speed_mps", "top_speed_mps",
@@ -37,10 +41,11 @@ PLOTS = (
     ("ate_m", "ATE (m), where truth is there"),
 )
 STYLE = (
-    "body{font:15px sans-serif;margin:2em;color:#222}table{border-collapse:collapse;margin:1em 0}"
-    "td,th{padding:.25em .7em;border-bottom:1px solid #ddd;text-align:right}"
+    ":root{color-scheme:light dark}body{font:15px sans-serif;margin:2em}table{"
+    "border-collapse:collapse;margin:1em 0}"
+    "td,th{padding:.25em .7em;border-bottom:1px solid #8888;text-align:right}"
     "td:first-child,th:first-child{text-align:left}"
-    ".failed{color:#b00;text-align:left}img{max-width:100%}"
+    ".failed{color:#d1342f;text-align:left}img{max-width:100%;background:#fff}a{color:inherit}"
 )
 
 Outcome = DriveResult | Failure
@@ -74,12 +79,25 @@ def write_report(tasks: Sequence[Task], output: Path) -> None:
         _whole(output / "report.csv", lambda file: _write_csv(file, tasks, output))
         names, numbers, statuses = _numbers(tasks, output)
         _plot(names, numbers, statuses, output / "report.png")
+        _write_drives(tasks, output)
         _whole(output / "report.html", lambda file: _write_page(file, tasks, output))
     except OSError as error:
         raise ResultsError(f"report in {output}: {error.strerror}") from None
 
 
-def _whole(path: Path, write: Callable[[IO[str]], None]) -> None:
+def _write_drives(tasks: Sequence[Task], output: Path) -> None:
+    """A page of each drive, where plotly is installed; they share its text, which lies beside them."""
+    if importlib.util.find_spec("plotly") is None:
+        return
+    _whole(output / PLOTLY, lambda file: file.write(plotly_script()))
+    for outcome in outcomes(tasks, output):
+        folder = output / DRIVES / outcome.drive
+        if (folder / FRAMES_FILE).is_file() and not (folder / REPORT).is_file():
+            page = report_page(read_drive(folder), plotly=f"../../{PLOTLY}")
+            _whole(folder / REPORT, lambda file, page=page: file.write(page))  # type: ignore[misc]
+
+
+def _whole(path: Path, write: Callable[[IO[str]], object]) -> None:
     """A file that is there whole, or as it was before."""
     partial = path.with_name(f".{path.name}.partial")
     with partial.open("w", encoding="utf-8", newline="") as file:
@@ -148,7 +166,8 @@ def _plot(names: list[str], numbers: np.ndarray, statuses: Counter[str], path: P
 
 
 def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
-    file.write(f'<!doctype html><meta charset="utf-8"><title>BirdSLAM: drives</title><style>{STYLE}</style>\n')
+    head = '<!doctype html><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    file.write(f"{head}<title>BirdSLAM: drives</title><style>{STYLE}</style>\n")
     file.write('<h1>Drives</h1>\n<p><img src="report.png" alt="plots"></p>\n')
     if any(task.settings for task in tasks):
         _write_sweep(file, tasks, output)
@@ -178,7 +197,8 @@ def _write_page(file: IO[str], tasks: Sequence[Task], output: Path) -> None:
         cells = [found[column] for column in (*columns, "ate_m", "ate_pct", "scale_error")]
         most = sorted(outcome.statuses.items(), key=lambda one: -one[1])[:MOST_IN_A_CELL]
         cells.append(", ".join(f"{name} {count}" for name, count in most))
-        link = f'<a href="{DRIVES}/{name}/bev.png">{name}</a>'
+        page = REPORT if (output / DRIVES / outcome.drive / REPORT).is_file() else "bev.png"
+        link = f'<a href="{DRIVES}/{name}/{page}">{name}</a>'
         file.write(f"<tr><td>{link}</td>" + "".join(f"<td>{_text(cell)}</td>" for cell in cells) + "</tr>\n")
     file.write("</table>\n")
 

@@ -53,6 +53,8 @@ COMMANDS = (
             "vehicle.fleet", "run_uplink", "add_uplink_arguments"),
     Command("router", "the router of a fleet (table [router]): each vehicle writes its own keys alone, listeners read",
             "vehicle.fleet", "run_router", "add_router_arguments"),
+    Command("ros", "say as a node of ROS 2 what a vehicle's BirdSLAM says, at a router of rmw_zenoh, without ROS",
+            "vehicle.ros"),
     Command("doctor", "check this machine: cores, permissions, memory, camera, models, clock", "vehicle.doctor"),
     Command("deploy",
             "write what installs the service on a vehicle computer: DIR/deploy/install.sh, units, configuration",

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import msgspec
+
 from birdslam.perception import ModelError, load_network
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.look_rate import threads_of_a_network
@@ -222,13 +224,23 @@ def _models(configuration: Configuration) -> Iterator[Finding]:
     specs = configuration.models.in_use()
     if not specs:
         yield Finding("models", "warning", "none", "without --model none the shipped network runs; now odometry only")
+    from birdslam.perception.session import providers_here
+
+    here = ", ".join(providers_here())
     for role, spec in specs.items():
+        asked = spec.provider or configuration.perceive.provider
         try:
-            described = load_network(role, spec).describe()
+            network = load_network(role, msgspec.structs.replace(spec, provider=asked))
+            described = network.describe()
         except ModelError as error:
             yield Finding(role, "error", str(error), "give the network that its manifest describes")
         else:
-            yield Finding(role, "ok", f"{described['file']}, sha256 {described['sha256'][:12]}")
+            found = f"{described['file']}, sha256 {described['sha256'][:12]}, by {asked} of {here}"
+            if network.fell_back:
+                advice = 'install the package that brings it (docs/networks.md), or perceive.provider = "auto"'
+                yield Finding(role, "warning", f"{found}: {network.fell_back}", advice)
+            else:
+                yield Finding(role, "ok", found)
 
 
 def _source(configuration: Configuration) -> Iterator[Finding]:

@@ -1,7 +1,8 @@
-"""Where fixes of a drive come from: a file, a topic of the drive's own ROS bag, or a receiver on a serial line.
+"""Where fixes of a drive come from: a file, a topic of ROS, or a receiver on a serial line.
 
-`FILE` (CSV, NMEA, GPX; see birdslam/loops/gnss/files.py), `topic:/NAME` (sensor_msgs/NavSatFix), `/dev/TTY[@BAUD]`
-(NMEA 0183). A serial line's fixes bear the time at which they came in; that this is late is found out with the rest.
+`FILE` (CSV, NMEA, GPX; see birdslam/loops/gnss/files.py), `topic:/NAME` (sensor_msgs/NavSatFix) of the drive's own bag,
+or of a live ROS 2 those that came while the car drove, `/dev/TTY[@BAUD]` (NMEA 0183). A serial line's fixes bear the
+time at which they came in; that this is late is found out with the rest.
 """
 
 from __future__ import annotations
@@ -18,11 +19,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from birdslam.loops.gnss.earth import DEFAULT_SIGMA_M, GnssFix
-from birdslam.loops.gnss.files import MOST_BYTES, MOST_FIXES, GnssError, checked_fix, read_fixes
+from birdslam.loops.gnss.files import GNSS_FILE, MOST_BYTES, MOST_FIXES, GnssError, checked_fix, read_fixes
 from birdslam.loops.gnss.sentences import NmeaReader, Sentence
 from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.schemes import ROS, all_schemes
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.rosbag import RosbagRecording
+from birdslam.sources.schemes import scheme_of
 
 TOPIC, BAG, NAV_SAT_FIX = "topic:", "rosbag", "sensor_msgs/NavSatFix"
 BAUD = 9600  # as NMEA 0183 receivers come
@@ -47,6 +50,8 @@ def recorded_fixes(configuration: Configuration) -> Fixes | None:
     name = configuration.results.gnss
     if not name or is_serial(name):
         return None
+    if name.startswith(TOPIC) and scheme_of(configuration.source.uri, all_schemes()) is ROS:
+        return lambda begin_ns: _that_came(Path(configuration.output) / GNSS_FILE, begin_ns)
     if name.startswith(TOPIC):
         found = _of_bag(configuration, name.removeprefix(TOPIC))
         return lambda begin_ns: found
@@ -58,6 +63,13 @@ def recorded_fixes(configuration: Configuration) -> Fixes | None:
         raise GnssError(f"{path}: can't be read: {error.strerror}") from None
     read_fixes(data, str(path), 0)  # what is wrong with it is said before the drive
     return lambda begin_ns: read_fixes(data, str(path), begin_ns)
+
+
+def _that_came(path: Path, begin_ns: int) -> list[GnssFix]:
+    """What the source wrote while the car drove (runtime/ros/camera.py)."""
+    if not path.is_file():
+        raise GnssError(f"{path}: no fix came")
+    return read_fixes(path.read_bytes(), str(path), begin_ns)
 
 
 def _of_bag(configuration: Configuration, topic: str) -> list[GnssFix]:

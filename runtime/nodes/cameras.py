@@ -12,8 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from birdslam.geometry.camera import Camera
-from birdslam.runtime.configuration import SourceConfig
+from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.nodes.sources import SourceError
 from birdslam.sources.recording import RecordedFrame
 
@@ -25,10 +24,12 @@ class LiveCamera(ABC):
 
     live = True
 
-    def __init__(self, config: SourceConfig, camera: Camera, must_open: bool = True) -> None:
+    def __init__(self, configuration: Configuration, must_open: bool = True) -> None:
         """Raises SourceError where it does not open; without `must_open` that is a camera that is gone for now."""
+        assert configuration.camera is not None  # `open_source` has refused it
+        config = configuration.source
         self.name = self._uri = config.uri
-        self.camera = camera
+        self.camera = configuration.camera
         self.rate_hz = config.rate if isinstance(config.rate, float) else LIVE_RATE_HZ
         self._config = config
         self._closing = threading.Event()

@@ -16,12 +16,13 @@ from typing import Any
 from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.mapping.lane_mapper import LaneHead
-from birdslam.perception import Detections, Networks, Perception, Ready, load_network
+from birdslam.perception import Detections, ModelSpec, Networks, Perception, Ready, load_network
 from birdslam.perception.completion import GridCompletion, shipped_completion
 from birdslam.perception.manifest import Role
 from birdslam.perception.pointnet import PointNet, load_pointnet
 from birdslam.perception.schedule import ROLES
 from birdslam.runtime.configuration import Configuration, PerceiveConfig
+from birdslam.runtime.models.providers import chosen
 from birdslam.runtime.nodes.degradation import Mode
 from birdslam.runtime.nodes.look_rate import Cost, LookRate, measure, threads_of_a_network
 from birdslam.runtime.process import realtime
@@ -69,7 +70,11 @@ class Inference(Closing):
             specs.pop("detector", None)
         whole = boxes is not None or chosen or bool({"detector", "segmenter"} & specs.keys())
         apart = APART if self._adapts and not whole else ()
+        specs = self._computed_by(specs, configuration, most_threads)
         heads = [load_network(role, spec, most_threads, unread, apart) for role, spec in specs.items()]
+        for head in heads:
+            if head.fell_back:
+                log.warning("%s runs on the CPU: %s", head.role, head.fell_back)
         self._specs = specs
         self._lanes_every = schedule.lanes.every or 1
         self.frustum_network: PointNet | None = None if pointnet is None else load_pointnet(pointnet)
@@ -102,6 +107,16 @@ class Inference(Closing):
             boxes_alone=self._boxes_alone,
             detections=boxes,
         )
+
+    @staticmethod
+    def _computed_by(
+        specs: dict[str, ModelSpec], configuration: Configuration, most_threads: int | None
+    ) -> dict[str, ModelSpec]:
+        """Each network with what computes it. At rate "max" nothing is measured, so that a run repeats."""
+        from birdslam.perception.session import providers_here
+
+        asked, here = configuration.perceive.provider, ("cpu",) if configuration.lossless else providers_here()
+        return {role: chosen(role, spec, asked, here, most_threads) for role, spec in specs.items()}
 
     def _submit(self, run: Run, *arguments: Any) -> Future[Any]:
         if run not in self._awaited and self._deadline_ns is not None:

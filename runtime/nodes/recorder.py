@@ -9,9 +9,7 @@ optimizer's graph, so that it can be replayed.
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
-import platform
 import time
 from collections import deque
 from pathlib import Path
@@ -22,7 +20,7 @@ import psutil
 
 from birdslam.loops.map_pose import MapPose
 from birdslam.runtime.configuration import Configuration, dump, without_passwords
-from birdslam.runtime.environment import LIBRARIES, USER_ERROR_STATUS
+from birdslam.runtime.environment import USER_ERROR_STATUS, library_versions
 from birdslam.runtime.latency import stages
 from birdslam.runtime.nodes.checkpoints import checkpoint_path, newest_checkpoint
 from birdslam.runtime.process import realtime
@@ -245,7 +243,7 @@ def _latency(estimate: Estimate, message: Message) -> Latency:
 
 def about(configuration: Configuration, models: dict[str, Any], restarts: int = 0) -> About:
     """Of a recording that begins now."""
-    versions = {"python": platform.python_version(), **{name: importlib.metadata.version(name) for name in LIBRARIES}}
+    versions = library_versions()
     utc_offset_ns = time.time_ns() - time.monotonic_ns()
     return About(
         configuration=dump(without_passwords(configuration)),

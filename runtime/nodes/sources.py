@@ -106,14 +106,14 @@ def parsed(uri: str) -> tuple[Scheme, str]:
 
 def _open_camera(scheme: Scheme, configuration: Configuration, must_open: bool) -> Source:
     source = configuration.source
-    if configuration.camera is None:
+    if configuration.camera is None and scheme.camera == "nothing":
         raise ConfigurationError(f"{source.uri}: a live camera needs a camera file (--camera FILE)")
     for key, reason in REFUSALS.items():
         if key in scheme.refused and getattr(source, key):
             raise ConfigurationError(f"{source.uri}: {reason}")
     if source.rate == "max":
         raise ConfigurationError(f'{source.uri}: rate "max" is for recordings; a live camera has its own')
-    camera: Source = scheme.load()(source, configuration.camera, must_open)
+    camera: Source = scheme.load()(configuration, must_open)
     return camera
 
 

@@ -14,8 +14,6 @@ from birdslam.runtime.recording.recorded_drive import recorded_drive
 from birdslam.runtime.recording.recording import Recording, RecordingError
 from birdslam.types import Estimate, MapUpdate
 
-REPORT = "report.html"
-
 
 def can_report() -> bool:
     """Whether the extra `report` is installed."""

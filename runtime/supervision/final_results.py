@@ -96,7 +96,10 @@ class FinalResults:
                 if self._asked_video:
                     raise
                 summary["video"] = None
-        if self.map is not None:
+        if self.map is not None and self._config.live:  # its frames are gone, and it may be gone itself
+            assert self._config.camera is not None
+            summary |= self.map.finish(self._config.camera, iter(()), Path(self._config.output))
+        elif self.map is not None:
             source = open_source(self._config)
             summary |= self.map.finish(source.camera, source_frames(source), Path(self._config.output))
         return summary

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from birdslam.runtime.configuration import Configuration, dump
-from birdslam.runtime.environment import LIBRARIES
+from birdslam.runtime.environment import library_versions
 from birdslam.runtime.supervision.demo_report import rows as truth_rows
 from birdslam.runtime.supervision.final_results import rows as final_rows
 from birdslam.runtime.supervision.logbook import Logbook
@@ -52,7 +50,7 @@ def summarise(
         "budget": _budget(configuration, logbook),
         "models": models,
         "configuration": dump(configuration),
-        "versions": {"python": platform.python_version(), **{n: importlib.metadata.version(n) for n in LIBRARIES}},
+        "versions": library_versions(),
     }
 
 

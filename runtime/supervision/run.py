@@ -22,6 +22,7 @@ from birdslam.loops.gnss.files import GnssError
 from birdslam.loops.map_file import MapError
 from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
 from birdslam.outputs.plain_words import LengthsBy
+from birdslam.outputs.report.page import REPORT
 from birdslam.perception import ModelError, load_network
 from birdslam.perception.pointnet import load_pointnet
 from birdslam.runtime.configuration import Configuration, ConfigurationError, ModelsConfig, complete
@@ -31,7 +32,7 @@ from birdslam.runtime.process import realtime
 from birdslam.runtime.process.child import give_back_memory
 from birdslam.runtime.recording.recording import RecordingError
 from birdslam.runtime.supervision.demo_report import DemoReport
-from birdslam.runtime.supervision.drive_report import REPORT, can_report, write_report
+from birdslam.runtime.supervision.drive_report import can_report, write_report
 from birdslam.runtime.supervision.final_results import FinalResults, check_results
 from birdslam.runtime.supervision.live import LiveLine
 from birdslam.runtime.supervision.logbook import Logbook, Results

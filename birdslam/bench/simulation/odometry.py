@@ -55,7 +55,10 @@ class OdometryNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     side_per_turn: float = 1.1  # a turn that is missed may be taken for a sidestep
     log_scale: Drift = Drift(0.0193, 0.0114, 5.7)
     ground_rad: Drift = Drift(0.0011, 0.0034, 6.0)  # pitch of the road as estimated from the images
-    landmarks: NotNegative = 26.0  # road tracks in sight of a frame
+    roll_rad: Drift = Drift(0.0022, 0.0097, 42.6)  # and its roll (`python -m perf tilt`)
+    # Road tracks in sight of a frame that become CP edges: half of the 26 that the odometry follows by itself, since
+    # the networks' road and boxes take the others from the whole front end (`python -m perf edges`)
+    landmarks: NotNegative = 13.0
     landmark_frames: Annotated[float, msgspec.Meta(ge=1.0)] = 5.6  # for how long one is followed
     landmark_px: NotNegative = 0.39
 
@@ -167,7 +170,7 @@ class SimulatedOdometry:
             cov=np.diag([*np.square(sigma_m), sigma_rad**2]),
             scale_sigma_rel=noise.log_scale.slow,  # the white part averages out
             ground=self.camera.ground,
-            pitch_sigma_rad=config.sigma_pitch_rad,
+            tilt_cov=np.eye(2) * config.sigma_pitch_rad**2,
             standstill=standstill,
             status=(Status.STANDSTILL,) if standstill else (),
         )

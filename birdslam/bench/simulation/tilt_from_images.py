@@ -1,7 +1,7 @@
-"""Odometry without images that reports the road's pitch as images would: with their errors of it.
+"""Odometry without images that reports the road's tilt as images would: with their errors of it.
 
-`SimulatedOdometry` reports the calibrated plane; what drives has one from the images, and errs by `ground_rad` of
-`OdometryNoise`.
+`SimulatedOdometry` reports the calibrated plane; what drives has one from the images, and errs by `ground_rad` and
+`roll_rad` of `OdometryNoise`.
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ Floats = NDArray[np.float64]
 
 
 class TiltFromImages:
-    """An EgoMotion: a simulated one, that reports the road's pitch as the images would, while it drives.
+    """An EgoMotion: a simulated one, that reports the road's pitch and roll as the images would, while it drives.
 
-    `grounds` are the true ones, by frame; where one is None, none is reported anew. Of the roll images say nothing: it
-    is the calibrated one.
+    `grounds` are the true ones, by frame; where one is None, none is reported anew.
     """
 
     def __init__(
@@ -35,7 +34,8 @@ class TiltFromImages:
         rng: np.random.Generator,
     ) -> None:
         self._odometry, self._grounds = odometry, grounds
-        self._error, self._sigma_rad = Walk(noise.ground_rad, 1, rng), noise.ground_rad.sigma
+        self._pitch, self._roll = Walk(noise.ground_rad, 1, rng), Walk(noise.roll_rad, 1, rng)
+        self._cov = np.diag([noise.ground_rad.sigma**2, noise.roll_rad.sigma**2])
         self._reported = odometry.camera.ground
 
     @property
@@ -55,11 +55,11 @@ class TiltFromImages:
         road_mask: NDArray[np.bool_] | None = None,
         speeds: Sequence[SpeedReading] = (),
     ) -> Motion | None:
-        """The simulated motion, with the road's pitch."""
+        """The simulated motion, with the road's tilt."""
         motion = self._odometry.estimate(tracks, frame_id, t_source_ns, vehicle_boxes_px, road_mask, speeds)
         if motion is None:
             return None
-        (error_rad,), at = self._error.draw(), self._grounds[frame_id]
+        (pitch_rad,), (roll_rad,), at = self._pitch.draw(), self._roll.draw(), self._grounds[frame_id]
         if at is not None and not motion.standstill:
-            self._reported = GroundPlane(at.height_m, at.pitch_rad + float(error_rad), self._odometry.camera.roll_rad)
-        return msgspec.structs.replace(motion, ground=self._reported, pitch_sigma_rad=self._sigma_rad)
+            self._reported = GroundPlane(at.height_m, at.pitch_rad + float(pitch_rad), at.roll_rad + float(roll_rad))
+        return msgspec.structs.replace(motion, ground=self._reported, tilt_cov=self._cov)

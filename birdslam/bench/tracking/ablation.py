@@ -65,6 +65,7 @@ def idea_variants() -> dict[str, Method]:
         "landmarks where the last key frame saw them": ("landmark_anchor",),
         "standstill held": ("zero_velocity_update",),
         "a front that may be a back": ("front_back_ambiguity",),
+        "vehicles leave the ego where it is": ("vehicles_move_ego",),
     }
     out: dict[str, Method] = {"nothing (the paper)": PAPER}
     for name, fields in alone.items():

@@ -14,7 +14,7 @@ import numpy as np
 
 from birdslam.geometry.camera import GroundPlane
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS, TrackingSequence
-from birdslam.vehicles.state.ground_size_filter import GroundSizeConfig
+from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 
 HALF_SPAN = 3  # frames before and after, whose labels count too: a camera pitches within half a second
 NEAREST_M, FARTHEST_M = 5.0, 60.0  # of labels that are used

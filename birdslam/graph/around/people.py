@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -21,7 +22,9 @@ MOST = 60  # the nearest; a message and a frame's time have their limits
 YAW_UNKNOWN = math.pi**2 / 3.0  # the variance of a direction of which nothing is known
 CHANGE_MPS = 0.8  # 1-sigma by which a velocity changes within a second, as in `people_config.Sizes`
 TURNS_MPS = 0.5  # who moves slower has no yaw
+AS_COMPLEX = np.array([1.0, 1.0j])
 FARTHEST_M, FASTEST_MPS = 1e4, 1e3  # somebody beyond is no person, but numbers that no front end made
+_LIMITS = np.repeat([FARTHEST_M, FASTEST_MPS, FARTHEST_M**2, FASTEST_MPS**2], [2, 2, 4, 4])
 
 
 def people_estimates(
@@ -31,21 +34,26 @@ def people_estimates(
 
     `world` is T_world_ego when they were told of, `ego_cov` (3, 3) of its tangent; `ego_mps` is the ego's velocity.
     """
-    people = [f for f in people if _is_person(f)]
     if not people:
         return ()
-    if len(people) > MOST:
-        people = sorted(people, key=lambda p: (math.hypot(p.x_m, p.y_m), p.person))[:MOST]
-        people.sort(key=lambda p: p.person)
-    p = np.array([(f.x_m, f.y_m) for f in people])
-    v = np.array([(f.vx_mps, f.vy_mps) for f in people])
-    P = np.array([f.cov for f in people]).reshape(-1, 2, 2)
-    U = np.array([f.velocity_cov for f in people]).reshape(-1, 2, 2)
+    flat = chain.from_iterable((f.x_m, f.y_m, f.vx_mps, f.vy_mps, *f.cov, *f.velocity_cov) for f in people)
+    table = np.fromiter(flat, np.float64, 12 * len(people)).reshape(-1, 12)
+    sane = (np.abs(table) < _LIMITS).all(axis=1)
+    if len(people) > MOST or not sane.all():
+        away_m = np.hypot(table[:, 0], table[:, 1])
+        nearest = sorted(np.flatnonzero(sane).tolist(), key=lambda k: (away_m[k], people[k].person))[:MOST]
+        kept = sorted(nearest, key=lambda k: people[k].person)
+        people, table = [people[k] for k in kept], table[kept]
+    p, v = table[:, :2], table[:, 2:4]
+    P, U = table[:, 4:8].reshape(-1, 2, 2), table[:, 8:].reshape(-1, 2, 2)
     if since_s > 0.0:
         p = p + v * since_s
         P = P + U * since_s**2 + np.eye(2) * (CHANGE_MPS**2 * since_s**3 / 3.0)
         U = U + np.eye(2) * (CHANGE_MPS**2 * since_s)
-    near = approaches(p - [way.x_m, way.y_m], v - [ego_mps.real, ego_mps.imag], P, U)
+    both = np.array([P, U])
+    means = 0.5 * (both[..., 0, 0] + both[..., 1, 1])
+    deviators = 0.5 * (both[..., 0, 0] - both[..., 1, 1]) + 1j * both[..., 0, 1]
+    near = approaches(p @ AS_COMPLEX - complex(way.x_m, way.y_m), v @ AS_COMPLEX - ego_mps, means, deviators)
     # The ego's error moves everybody: by its place, and by its yaw the more the farther they are
     J = np.zeros((len(p), 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = 1.0
@@ -89,8 +97,3 @@ def people_estimates(
             people, in_world, velocity, own, velocity_cov, yaws, yaw_var, near, strict=True
         )
     )
-
-
-def _is_person(f: FollowedPerson) -> bool:
-    near = max(abs(f.x_m), abs(f.y_m)) < FARTHEST_M and max(abs(f.vx_mps), abs(f.vy_mps)) < FASTEST_MPS
-    return near and max(map(abs, f.cov)) < FARTHEST_M**2 and max(map(abs, f.velocity_cov)) < FASTEST_MPS**2

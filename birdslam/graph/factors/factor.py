@@ -64,6 +64,7 @@ class Factor:
 
     name: str  # unique in the graph: "CV"
     equation: str  # of the paper, or what it is
+    of_vehicles: ClassVar[bool] = False  # its edges say where vehicles are; see `GraphConfig.vehicles_move_ego`
     state_type: ClassVar[type | None] = None  # of `state`, for msgspec; None: it keeps nothing from frame to frame
 
     def begin(self) -> None:

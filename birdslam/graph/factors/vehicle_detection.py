@@ -15,6 +15,7 @@ class VehicleDetections(Factor):
 
     name = "CV"
     equation = "Eqs. 2 and 6"
+    of_vehicles = True
 
     def __init__(self, config: GraphConfig) -> None:
         self._gate = config.detection_gate_sigma**2

@@ -37,6 +37,7 @@ class MeasuredTwist(Factor):
 
     name = "VV"
     equation = "Eqs. 2 and 6"
+    of_vehicles = True
 
     def linearise(self, frame: GraphFrame, window: Window) -> Linearised | None:
         """Each edge measures the three numbers of its vehicle's twist."""

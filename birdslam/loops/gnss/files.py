@@ -19,6 +19,7 @@ from birdslam.types import NS_PER_S
 MOST_BYTES, MOST_FIXES = 1 << 26, 1_000_000
 MOST_S = 4e9  # of a time in seconds, either way
 DAY_S = 86_400.0
+GNSS_FILE = "gnss.csv"  # of the fixes that came while a car drove, in the drive's folder
 COLUMNS = "time_s, latitude_deg, longitude_deg, and where known sigma_m, speed_mps"
 
 

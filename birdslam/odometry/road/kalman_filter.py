@@ -126,11 +126,10 @@ class RoadFilter:
         return out
 
     @property
-    def chord(self) -> tuple[Floats, float]:
-        """(pitch, roll) against the plane through the foot and the road chord_m ahead, and 1-sigma of the pitch."""
-        half_m = 0.5 * self.config.chord_m
-        H = np.array([1.0, half_m])
-        return self.tilt + np.array([self.x[3] * half_m, 0.0]), float(np.sqrt(H @ self.cov[1:4:2, 1:4:2] @ H))
+    def chord(self) -> tuple[Floats, Floats]:
+        """(pitch, roll) against the plane through the foot and the road chord_m ahead, and their covariance (2, 2)."""
+        H = np.array([[1.0, 0.0, 0.5 * self.config.chord_m], [0.0, 1.0, 0.0]])
+        return H @ self.x[1:ROAD], H @ self.cov[1:ROAD, 1:ROAD] @ H.T
 
     @property
     def prediction(self) -> tuple[Floats, Floats]:

@@ -50,9 +50,9 @@ class MovingMedianScale:
         return self.camera.ground
 
     @property
-    def pitch_sigma_rad(self) -> float:
-        """The body pitches about the calibrated plane, which is not measured here."""
-        return float(np.hypot(self.config.sigma_mount_rad, self.config.sigma_bounce_rad))
+    def tilt_cov(self) -> NDArray[np.float64]:
+        """The body pitches and rolls about the calibrated plane, which is not measured here."""
+        return np.eye(2) * (self.config.sigma_mount_rad**2 + self.config.sigma_bounce_rad**2)
 
     @property
     def sigma_rel(self) -> float:

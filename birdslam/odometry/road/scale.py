@@ -89,8 +89,8 @@ class RoadScale:
         return self.sigma_rel > self.config.invalid_sigma_rel
 
     @property
-    def pitch_sigma_rad(self) -> float:
-        """1-sigma of the ground's pitch."""
+    def tilt_cov(self) -> NDArray[np.float64]:
+        """(2, 2) of the ground's pitch and roll."""
         return self._filter.chord[1]
 
     def restart(self, grey: NDArray[np.uint8], pose: Pose, sigma_rel: float) -> None:

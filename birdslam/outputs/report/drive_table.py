@@ -16,18 +16,35 @@ from birdslam.geometry.se2 import SE2
 from birdslam.outputs.drive_files import FRAME_COLUMNS, FRAMES_FILE, ResultsError
 
 Floats = NDArray[np.float64]
+PEOPLE = frozenset({"pedestrian", "person", "cyclist", "rider", "bicycle"})
+FILES = {  # what the page hands out, where it is there
+    "ego.tum.txt": "the ego's way, TUM lines",
+    "ego.kitti.txt": "the ego's way, KITTI rows",
+    "ego.final.tum.txt": "smoothed, TUM lines",
+    "map.tum.txt": "the way in the map, TUM lines",
+    "ego.gpx": "the way on Earth, GPX",
+    "ego.geojson": "the way on Earth, GeoJSON",
+    "frames.csv": "a line a frame",
+    "map.geojson": "the road's lines",
+}
+MOST_FILE_BYTES = 1_500_000  # of one that the page holds
 MOST_TRACKS, FEWEST_ROWS = 150, 5  # a track of fewer frames is mostly a false alarm
 MOST_MAP_POINTS = 6000
 
 
 @dataclass(frozen=True)
 class TrackTable:
-    """One vehicle: its number and class, times (N,) in s and places (N, 2) in the plane."""
+    """One road user: its number and class, times (N,) in s and places (N, 2) in the plane."""
 
     name: str
     label: str
     t_s: Floats
     xy_m: Floats
+
+    @property
+    def is_person(self) -> bool:
+        """Whether it is a pedestrian or a cyclist."""
+        return self.label in PEOPLE
 
 
 @dataclass(frozen=True)
@@ -48,6 +65,9 @@ class DriveTable:
     statuses: list[tuple[str, ...]]
     tracks: list[TrackTable]
     lanes_m: Floats  # (M, 2)
+    lines: list[tuple[str, Floats]]  # kind of each of the road's lines, and its vertices (K, 2)
+    earth_deg: Floats | None  # (K, 2) latitude and longitude along the way; None: no GNSS was there
+    files: dict[str, str]  # text of those of FILES that are there
     landmarks_m: Floats
     summary: dict[str, Any]
     camera: str  # the text of camera.toml; "": there is none
@@ -78,6 +98,9 @@ def read_drive(directory: Path) -> DriveTable:
             statuses=[tuple(row["status"].split()) for row in rows],
             tracks=_longest(_tracks(directory / "tracks", to_plane, numbers[0, 1])),
             lanes_m=lanes,
+            lines=_lines(directory / "map.geojson", to_plane),
+            earth_deg=_earth(directory / "ego.geojson"),
+            files=_files(directory),
             landmarks_m=landmarks,
             summary=summary,
             camera=camera.read_text(encoding="utf-8") if camera.is_file() else "",
@@ -111,6 +134,33 @@ def _map_points(path: Path, kind: str, to_plane: dict[int, SE2]) -> Floats:
     points = [to_plane[epoch] @ np.array(xy) for epoch, xy in of_epoch.items()]
     every = max(1, -(-sum(map(len, points)) // MOST_MAP_POINTS))
     return np.vstack([np.zeros((0, 2)), *points])[::every]
+
+
+def _lines(path: Path, to_plane: dict[int, SE2]) -> list[tuple[str, Floats]]:
+    if not path.is_file():
+        return []
+    out = []
+    for feature in json.loads(path.read_text(encoding="utf-8"))["features"]:
+        about, points = feature["properties"], np.array(feature["geometry"]["coordinates"], np.float64)
+        if about["epoch"] in to_plane and points.ndim == 2 and points.shape[1] == 2:
+            out.append((str(about["kind"]), to_plane[about["epoch"]] @ points))
+    return out
+
+
+def _earth(path: Path) -> Floats | None:
+    if not path.is_file():
+        return None
+    (way,) = json.loads(path.read_text(encoding="utf-8"))["features"]
+    return np.array(way["geometry"]["coordinates"], np.float64)[:, ::-1]
+
+
+def _files(directory: Path) -> dict[str, str]:
+    there = {name: directory / name for name in FILES}
+    return {
+        name: path.read_text(encoding="utf-8")
+        for name, path in there.items()
+        if path.is_file() and path.stat().st_size <= MOST_FILE_BYTES
+    }
 
 
 def _tracks(directory: Path, to_plane: dict[int, SE2], begin_s: float) -> Iterator[TrackTable]:

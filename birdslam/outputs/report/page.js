@@ -27,7 +27,7 @@ const moment = (t) => [{ type: "line", x0: t, x1: t, yref: "paper", y0: 0, y1: 1
 function draw() {
   const time = { title: { text: "time (s)" }, range: [0, last] };
   Plotly.react("map", [...data.map, here], layout({
-    title: "from above", legend: { orientation: "h", y: -0.26 },
+    title: "from above", legend: { orientation: "h", y: -0.2 },
     xaxis: { title: { text: "right of the start (m)" } },
     yaxis: { title: { text: "ahead of the start (m)" }, scaleanchor: "x", scaleratio: 1 } }), config);
   Plotly.react("speed", data.speeds, layout({
@@ -55,7 +55,7 @@ function move() {
 slider.max = String(data.t.length - 1);
 slider.addEventListener("input", move);
 dark.addEventListener("change", draw);
-document.getElementById("statuses").style.height = `${130 + 26 * Math.max(1, data.statuses.length)}px`;
+document.getElementById("statuses").style.height = `${160 + 26 * Math.max(1, data.statuses.length)}px`;
 draw();
 move();
 for (const name of ["map", "speed"]) {

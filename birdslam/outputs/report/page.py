@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.outputs.plain_words import MEANINGS, meaning
-from birdslam.outputs.report.drive_table import DriveTable, TrackTable
+from birdslam.outputs.report.drive_table import FILES, DriveTable, TrackTable
 from birdslam.types import INVALIDATING, Status
 
+REPORT = "report.html"  # beside the results
 STYLE, SCRIPT = (Path(__file__).parent / name for name in ("page.css", "page.js"))
 PICTURES, PICTURE_WIDTH_PX, JPEG_QUALITY = 150, 900, 68  # of the video, some 6 MB
 SMOOTHED_S = 0.5  # over which the speed that is drawn is a mean
@@ -28,15 +29,27 @@ MOST_POINTS = 4000  # of a line
 # A frame is of the first of these that it fits; colour in light and in dark
 KINDS = (("not valid", "#d1342f"), ("stands", "#8b95a5"), ("valid, with remarks", "#e0a100"), ("valid", "#1f9d6b"))
 
+TRACK_COLOURS = {"vehicles": "#5b7fd6", "people": "#c455b8"}
+
 Trace = dict[str, Any]
 
 
-def report_page(drive: DriveTable, video: Path | None = None) -> str:
-    """The whole page. `video` is that of `--video`, of which pictures are taken. Raises ResultsError without plotly."""
+def plotly_script() -> str:
+    """plotly's own text. Raises ResultsError where it is not installed."""
     try:
         from plotly.offline import get_plotlyjs
     except ImportError:
         raise ResultsError("a report needs the extra `report`: pip install 'birdslam[report]'") from None
+    return str(get_plotlyjs())
+
+
+def report_page(drive: DriveTable, video: Path | None = None, plotly: str = "") -> str:
+    """The whole page. `video` is that of `--video`, of which pictures are taken.
+
+    `plotly` is the address of its text where many pages share one file; "": it is in the page. Raises ResultsError
+    where plotly is not installed.
+    """
+    script = f'<script src="{html.escape(plotly)}"></script>' if plotly else f"<script>{plotly_script()}</script>"
     pictures = _pictures(video) if video is not None and video.is_file() else []
     shown = _thinned(len(drive.t_s))
     data = {
@@ -65,8 +78,13 @@ def report_page(drive: DriveTable, video: Path | None = None) -> str:
             '<output id="words"></output></section>',
             '<section id="speed" class="plot low"></section><section id="statuses" class="plot low"></section>',
             f"<section><h2>What the statuses mean</h2><table>{_status_rows(drive)}</table></section>",
+            f"<section><h2>How long it took, capture to planner</h2><table>{_latency_rows(drive)}</table></section>"
+            if drive.summary.get("stages_ms")
+            else "",
+            f"<section><h2>On Earth</h2>{_earth_words(drive)}</section>" if drive.earth_deg is not None else "",
+            f'<section><h2>To take away</h2><p class="files">{_downloads(drive)}</p></section>',
             f"<section><h2>Camera and versions</h2>{_details(drive)}</section>",
-            f"<script>{get_plotlyjs()}</script>",
+            script,
             f'<script type="application/json" id="data">{_json(data)}</script>',
             f"<script>{SCRIPT.read_text(encoding='utf-8')}</script></body></html>",
         )
@@ -79,9 +97,11 @@ def report_page(drive: DriveTable, video: Path | None = None) -> str:
 def _map_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
     traces = [
         _points("road landmarks", drive.landmarks_m, "#8b95a5", 2),
-        _points("lanes", drive.lanes_m, "#b48a00", 3),
-        *(_track(track, first=track is drive.tracks[0]) for track in drive.tracks),
+        _points("lanes", drive.lanes_m, "#b48a00", 3) if not drive.lines else _lines(drive),
     ]
+    for kind, people in (("vehicles", False), ("people", True)):
+        own = [track for track in drive.tracks if track.is_person is people]
+        traces += [_track(track, kind, first=track is own[0]) for track in own]
     kinds = np.array([_kind(drive, k) for k in shown])
     for number, (name, colour) in enumerate(KINDS):
         here = shown[kinds == number]
@@ -108,19 +128,33 @@ def _points(name: str, xy_m: NDArray[np.float64], colour: str, size: int) -> Tra
     }
 
 
-def _track(track: TrackTable, first: bool) -> Trace:
+def _lines(drive: DriveTable) -> Trace:
+    """All of the road's lines as one trace, with gaps between them."""
+    x: list[float | None] = []
+    y: list[float | None] = []
+    for _, xy_m in drive.lines:
+        x += [*_rounded(-xy_m[:, 1]), None]
+        y += [*_rounded(xy_m[:, 0]), None]
+    line = {"color": "#b48a00", "width": 2}
+    return {
+        "name": "lines", "type": "scatter", "mode": "lines", "x": x, "y": y, "line": line, "hoverinfo": "skip",
+        "connectgaps": False,
+    }  # fmt: skip
+
+
+def _track(track: TrackTable, kind: str, first: bool) -> Trace:
     rows = _thinned(len(track.t_s), 200)
     label = html.escape(f"{track.label} {track.name}")
     return {
-        "name": "vehicles",
-        "legendgroup": "vehicles",
+        "name": kind,
+        "legendgroup": kind,
         "showlegend": first,
         "type": "scatter",
         "mode": "lines+markers",
         "x": _rounded(-track.xy_m[rows, 1]),
         "y": _rounded(track.xy_m[rows, 0]),
-        "line": {"width": 1.5, "color": "#5b7fd6"},
-        "marker": {"size": 3, "color": "#5b7fd6"},
+        "line": {"width": 1.5, "color": TRACK_COLOURS[kind]},
+        "marker": {"size": 3, "color": TRACK_COLOURS[kind]},
         "text": [f"{label}, {t:.1f} s" for t in track.t_s[rows]],
         "hoverinfo": "text",
     }
@@ -241,6 +275,37 @@ def _status_rows(drive: DriveTable) -> str:
         words = html.escape(MEANINGS[Status(name)])
         rows.append(f"<tr><td>{html.escape(name)}</td><td>{frames}</td><td>{effect}</td><td>{words}</td></tr>")
     return "".join(rows) or "<tr><td>none: all is well</td></tr>"
+
+
+def _latency_rows(drive: DriveTable) -> str:
+    """A row a stage with its bar: p50 dark, to p99 light, by the longest p99."""
+    stages, age = drive.summary["stages_ms"], drive.summary.get("age_ms") or {}
+    rows = {str(name): one for name, one in stages.items() if isinstance(one, dict)} | {"in all": age}
+    most = max((float(one.get("p99", 0.0)) for one in rows.values()), default=0.0) or 1.0
+    out = []
+    for name, one in rows.items():
+        p50, p99 = float(one.get("p50", 0.0)), float(one.get("p99", 0.0))
+        bar = f'<i style="width:{p99 / most:.1%}"><b style="width:{p50 / (p99 or 1.0):.1%}"></b></i>'
+        words = f"p50 {p50:.1f}, p99 {p99:.1f} ms"
+        out.append(f'<tr><td>{html.escape(name)}</td><td>{words}</td><td class="bar">{bar}</td></tr>')
+    return "".join(out)
+
+
+def _earth_words(drive: DriveTable) -> str:
+    assert drive.earth_deg is not None
+    (lat, lon), (to_lat, to_lon) = drive.earth_deg[0], drive.earth_deg[-1]
+    about = drive.summary.get("earth", {})
+    told = about if isinstance(about, dict) else {}
+    fit = f"; {told['fixes']} fixes, {told['outliers']} left out, RMS {told['rms_m']} m" if "rms_m" in told else ""
+    return f"<p>from {lat:.6f}, {lon:.6f} to {to_lat:.6f}, {to_lon:.6f} (WGS 84){html.escape(fit)}</p>"
+
+
+def _downloads(drive: DriveTable) -> str:
+    out = []
+    for name, text in drive.files.items():
+        data = base64.b64encode(text.encode()).decode("ascii")
+        out.append(f'<a download="{name}" href="data:text/plain;base64,{data}">{name}</a> {FILES[name]}')
+    return "<br>".join(out)
 
 
 def _details(drive: DriveTable) -> str:

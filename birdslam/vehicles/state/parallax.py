@@ -12,13 +12,25 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.se2 import SE2
+from birdslam.vehicles.state.motion_modes import (
+    FILTERS,
+    MODES,
+    MOVING,
+    STANDING,
+    STATIONARY,
+    UNUSUAL,
+    WITHOUT_GROUND,
+    birth_velocity_cov,
+    birth_weights,
+    mix,
+    process_noise,
+)
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
 from birdslam.vehicles.state.parallax_measurements import (
     BY_HEIGHT,
     BY_WIDTH,
@@ -42,56 +54,10 @@ from birdslam.vehicles.state.side_outliers import update_with_side_outliers
 
 Floats = NDArray[np.float64]
 
-# UNUSUAL stands too, and is of no usual size; STARTED stood when first seen, and has such a one's size and place
-MODES = STANDING, UNUSUAL, STARTED, CREEPING, DRIVING, CROSSING = range(6)
-STATIONARY, MOVING = [STANDING, UNUSUAL], [STARTED, CREEPING, DRIVING, CROSSING]
-WITHOUT_GROUND = [6, 7]  # STATIONARY again, without the cue GROUND
-FILTERS = len(MODES) + len(WITHOUT_GROUND)
 UNKNOWN = 1e6  # variance of a size that motion does not measure, and of what is not used
 DEPTH_UNKNOWN = 1.0  # 1-sigma at birth, as a fraction
 MAX_SIDE_OUTLIER = 0.45  # prior probability of one side
 MIN_WEIGHT = 1e-9  # of a filter: one that was ruled out may come back
-
-
-class ParallaxConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How vehicles move and stop, and how long the errors of a detector last; docs/constants.md has the data."""
-
-    standing: float = 0.3  # of the vehicles, when first seen; those that drive are the rest
-    unusual: float = 0.03  # that stand and are of no usual size
-    creeping: float = 0.3  # of the vehicles, when first seen: slowly, along their heading
-    crossing: float = 0.05  # of the vehicles, when first seen: they drive in any direction
-    sigma_unusual_rel: float = 0.3  # of their height
-    sigma_creep_mps: float = 2.0  # 1-sigma of a creeping vehicle's velocity
-    sigma_drive_mps: float = 10.0  # 1-sigma of a driving vehicle's velocity
-    road_half_width_m: float = 10.0  # what moves farther aside than that may do so in any direction
-    sigma_across_rel: float = 0.1  # of it across the vehicle's heading, as a fraction
-    sigma_across_mps: float = 0.3  # and beside it
-    stands_for_s: float = 60.0  # on average, until it starts to creep
-    creeps_for_s: float = 10.0  # until it stops, or drives
-    drives_for_s: float = 20.0  # until it creeps
-    change_mps: float = 2.0  # 1-sigma by which the velocity of a vehicle that moves changes within a second
-    change_across_mps: float = 0.5  # the same across its heading
-    outline_drift_rel: float = 0.03  # of the outline's width, in a second: the yaw is not known as well
-    box_memory_s: float = 0.5  # for so long a box has the same error: this time counts as one box
-    view_memory_s: float = 1.5  # the same of the face that its edges lie at
-    sigma_scale_rel: float = 0.02  # of the odometry's metres
-    sigma_tilt_rad: float = 0.004  # of the road at a vehicle against the ego's
-    tilt_memory_s: float = 5.0  # how long that lasts
-    sigma_kerb_m: float = 0.06  # how far the road under a vehicle in the ego's lane lies off the ego's plane
-    sigma_crown_rad: float = 0.007  # and the more the farther it stands to the side
-    sigma_bank_per_m: float = 0.001  # and more, by the square of that: what stands far aside is on another road
-    sigma_face_m: float = 1.0  # edges of a box lie not all at its nearest face, and on others as it turns
-    path_half_width_m: float = 1.75  # of the ego's path, half a lane: there growth is the closing gap's, of any size
-    # Of the left sides of boxes, and of the right: hidden, or a neighbour's (side_outliers.py)
-    side_outlier: Annotated[float, msgspec.Meta(ge=0.0, le=0.3)] = 0.03
-    side_outlier_memory_s: Annotated[float, msgspec.Meta(gt=0.0)] = 0.15  # how long one lasts
-    sigma_side_outlier_rel: float = 0.3  # of the box's width
-    gate_sigma: float = 3.0  # past it of all filters a measurement is an outlier: its noise is raised
-    another: float = 0.02  # of the boxes: they are of another vehicle than the track's
-    leap_sigma: float = 2.5  # what stands and is seen farther off than that may be another vehicle
-    sigma_another_rel: float = 0.15  # how far off it stands along the line of sight: a row of parked vehicles
-    sigma_another_m: float = 1.0  # and across it
-    sigma_another_size_rel: float = 0.1  # how much its size differs
 
 
 @dataclass(frozen=True)
@@ -121,10 +87,8 @@ class Parallax:
 
     def __init__(self, config: ParallaxConfig) -> None:
         self.config = config
-        driving = 1.0 - config.standing - config.unusual - config.creeping - config.crossing
-        birth = [config.standing, config.unusual, 0.0, config.creeping, driving, config.crossing]
         self._another_var = config.sigma_another_size_rel**2
-        self._prior_weight = np.maximum(birth, MIN_WEIGHT)
+        self._prior_weight = np.maximum(birth_weights(config), MIN_WEIGHT)
         self._x = np.zeros((0, FILTERS, len(STATES)))
         self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
         self._weight = np.zeros((0, len(MODES)))
@@ -162,11 +126,8 @@ class Parallax:
         P[..., :2, :2] = np.eye(2) * (DEPTH_UNKNOWN * float(centre_m[0])) ** 2
         heading_rad = np.array([T_world_ego.yaw_rad + yaw_rad])
         on_road = abs(float(centre_m[1])) < config.road_half_width_m
-        for moving, along_mps in ((CREEPING, config.sigma_creep_mps), (DRIVING, config.sigma_drive_mps)):
-            on_road_mps = math.hypot(config.sigma_across_mps, config.sigma_across_rel * along_mps)
-            across_mps = on_road_mps if on_road else along_mps
-            P[:, moving, VX:HEIGHT, VX:HEIGHT] = _rotated(np.square([along_mps, across_mps]), heading_rad)
-        P[:, CROSSING, [VX, VY], [VX, VY]] = config.sigma_drive_mps**2
+        for moving, cov in birth_velocity_cov(config, heading_rad, on_road).items():
+            P[:, moving, VX:HEIGHT, VX:HEIGHT] = cov
         P[..., [HEIGHT, WIDTH], [HEIGHT, WIDTH]] = np.square(sigmas)
         P[:, [UNUSUAL, WITHOUT_GROUND[1]], HEIGHT, HEIGHT] = config.sigma_unusual_rel**2
         P[..., TILT, TILT] = config.sigma_tilt_rad**2
@@ -187,8 +148,8 @@ class Parallax:
         self._side_outlier *= math.exp(-dt_s / self.config.side_outlier_memory_s)
         if not len(self._x) or dt_s <= 0.0:
             return
-        self._mix(dt_s)
         config = self.config
+        self._weight, self._x, self._P = mix(config, dt_s, self._weight, self._x, self._P)
         keep = math.exp(-dt_s / config.tilt_memory_s)
         self._x[..., TILT] *= keep
         self._P[..., TILT, :] *= keep
@@ -198,23 +159,13 @@ class Parallax:
         F[X, VX] = F[Y, VY] = dt_s
         self._x[:, MOVING] = self._x[:, MOVING] @ F.T
         self._P[:, MOVING] = F @ self._P[:, MOVING] @ F.T
-        self._P[:, MOVING, : VY + 1, : VY + 1] += self._process_noise(dt_s)
+        self._P[:, MOVING, : VY + 1, : VY + 1] += process_noise(config, dt_s, self._yaw_rad, self._on_road)
         if ego_cov is not None:  # an error of the ego's step moves the vehicle against it
             at = self._x[..., :2] - [T_world_ego.x_m, T_world_ego.y_m]
             J = np.zeros((*at.shape[:2], 2, 3))
             J[..., :2, :2] = T_world_ego.rotation()
             J[..., 0, 2], J[..., 1, 2] = -at[..., 1], at[..., 0]
             self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
-
-    def _process_noise(self, dt_s: float) -> Floats:
-        """(N, len(MOVING), 4, 4) of x, y, vx, vy: along and across the heading, or the same in any direction."""
-        config = self.config
-        along_across = _rotated(np.square([config.change_mps, config.change_across_mps]), self._yaw_rad)
-        of_velocity = np.stack([along_across] * len(MOVING), axis=1)
-        of_velocity[~self._on_road] = of_velocity[:, MOVING.index(CROSSING)] = np.eye(2) * config.change_mps**2
-        in_time = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
-        out: Floats = in_time[:, None, :, None] * of_velocity[:, :, None, :, None, :]  # the Kronecker product
-        return out.reshape(*of_velocity.shape[:2], 4, 4)
 
     def learn_sizes(
         self, rows: Sequence[int], boxes: ParallaxMeasurements, T_world_ego: SE2, height_m: float
@@ -326,43 +277,6 @@ class Parallax:
         for name in ("_x", "_P", "_weight", "_prior", "_unseen_s", "_yaw_rad", "_on_road", "_side_outlier"):
             setattr(self, name, getattr(self, name)[rows])
 
-    def _mix(self, dt_s: float) -> None:
-        """The filters' states and weights mixed by how often vehicles change their mode within `dt_s`."""
-        config = self.config
-        starts, changes, slows = (
-            1.0 - math.exp(-dt_s / time_s) for time_s in (config.stands_for_s, config.creeps_for_s, config.drives_for_s)
-        )
-        share = np.eye(len(MODES))  # (from, to)
-        share[STATIONARY, STATIONARY], share[STATIONARY, STARTED] = 1.0 - starts, starts
-        for slow in (STARTED, CREEPING):
-            share[slow, slow], share[slow, STANDING] = 1.0 - changes / 2.0, changes / 2.0
-        share[CREEPING, CREEPING], share[CREEPING, DRIVING] = 1.0 - changes, changes / 2.0
-        for fast in (DRIVING, CROSSING):
-            share[fast, fast], share[fast, CREEPING] = 1.0 - slows, slows
-        joint = self._weight[:, :, None] * share
-        self._weight = joint.sum(axis=1)
-        share = joint / self._weight[:, None]
-        modes, without_ground = list(MODES), WITHOUT_GROUND + MOVING
-        x, P = self._x.copy(), self._P.copy()
-        self._x[:, modes], self._P[:, modes] = self._mixed(share, x[:, modes], P[:, modes])
-        self._x[:, WITHOUT_GROUND], self._P[:, WITHOUT_GROUND] = self._mixed(
-            share[..., STATIONARY], x[:, without_ground], P[:, without_ground]
-        )
-
-    def _mixed(self, share: Floats, x: Floats, P: Floats) -> tuple[Floats, Floats]:
-        """The moments of filters (N, 6) mixed by `share` (N, 6, K); of the six and of the K the first two stand."""
-        P[:, STATIONARY, [[VX], [VY]], [[VX], [VY]]] = self.config.sigma_creep_mps**2  # when it starts
-        to = share.swapaxes(1, 2)  # (N, to, from)
-        mean = to @ x
-        gap = x[:, None] - mean[:, :, None]  # (N, to, from, 8)
-        cov = (to @ P.reshape(*P.shape[:2], -1)).reshape(*mean.shape, P.shape[-1])
-        cov += (to[..., None] * gap).swapaxes(-1, -2) @ gap
-        speed = slice(VX, VY + 1)
-        mean[:, STATIONARY, speed] = 0.0
-        cov[:, STATIONARY, speed] = 0.0
-        cov[:, STATIONARY, :, speed] = 0.0
-        return mean, cov
-
     def _size_measurements(
         self, rows: Sequence[int], lasting: Floats, in_path: NDArray[np.bool_], side_outlier: Floats
     ) -> LearnedSize:
@@ -399,12 +313,4 @@ def _squared_mahalanobis(gap: Floats, S: Floats) -> Floats:
 def _log_likelihood(innovation: Floats, S: Floats) -> Floats:
     """(...), less a constant."""
     out: Floats = -0.5 * (_squared_mahalanobis(innovation, S) + np.log(np.linalg.det(S)))
-    return out
-
-
-def _rotated(variances: Floats, yaw_rad: Floats) -> Floats:
-    """(N, 2, 2) in world of `variances` (2,) along and across headings (N,)."""
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-    R = np.stack([c, -s, s, c], axis=-1).reshape(-1, 2, 2)
-    out: Floats = R * variances @ R.swapaxes(-1, -2)
     return out

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from birdslam.runtime.supervision.drive_report import REPORT, write_report
+from birdslam.outputs.report.page import REPORT
+from birdslam.runtime.supervision.drive_report import write_report
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,0 +1,101 @@
+"""How vehicles move: the modes of `parallax.Parallax`, and how its filters are mixed as vehicles change them.
+
+The interacting multiple model (Blom and Bar-Shalom 1988): before each prediction the filters of all modes are mixed by
+how probably a vehicle came from one mode to the other, and each mode then moves with a noise of its own.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.vehicles.state.parallax_config import ParallaxConfig
+from birdslam.vehicles.state.parallax_measurements import VX, VY
+
+Floats = NDArray[np.float64]
+
+# UNUSUAL stands too, and is of no usual size; STARTED stood when first seen, and has such a one's size and place
+MODES = STANDING, UNUSUAL, STARTED, CREEPING, DRIVING, CROSSING = range(6)
+STATIONARY, MOVING = [STANDING, UNUSUAL], [STARTED, CREEPING, DRIVING, CROSSING]
+WITHOUT_GROUND = [6, 7]  # STATIONARY again, without the cue GROUND
+FILTERS = len(MODES) + len(WITHOUT_GROUND)
+
+
+def birth_weights(config: ParallaxConfig) -> Floats:
+    """(MODES,): how probably a vehicle that is seen for the first time is in each mode."""
+    driving = 1.0 - config.standing - config.unusual - config.creeping - config.crossing
+    return np.array([config.standing, config.unusual, 0.0, config.creeping, driving, config.crossing])
+
+
+def birth_velocity_cov(config: ParallaxConfig, heading_rad: Floats, on_road: bool) -> dict[int, Floats]:
+    """(2, 2) of the velocity in world of one that is new, by mode; the others stand."""
+    out = {CROSSING: np.eye(2) * config.sigma_drive_mps**2}
+    for moving, along_mps in ((CREEPING, config.sigma_creep_mps), (DRIVING, config.sigma_drive_mps)):
+        on_road_mps = math.hypot(config.sigma_across_mps, config.sigma_across_rel * along_mps)
+        across_mps = on_road_mps if on_road else along_mps
+        out[moving] = rotated(np.square([along_mps, across_mps]), heading_rad)[0]
+    return out
+
+
+def transitions(config: ParallaxConfig, dt_s: float) -> Floats:
+    """(MODES, MODES), from and to: how often vehicles change their mode within `dt_s`."""
+    starts, changes, slows = (
+        1.0 - math.exp(-dt_s / time_s) for time_s in (config.stands_for_s, config.creeps_for_s, config.drives_for_s)
+    )
+    share = np.eye(len(MODES))
+    share[STATIONARY, STATIONARY], share[STATIONARY, STARTED] = 1.0 - starts, starts
+    for slow in (STARTED, CREEPING):
+        share[slow, slow], share[slow, STANDING] = 1.0 - changes / 2.0, changes / 2.0
+    share[CREEPING, CREEPING], share[CREEPING, DRIVING] = 1.0 - changes, changes / 2.0
+    for fast in (DRIVING, CROSSING):
+        share[fast, fast], share[fast, CREEPING] = 1.0 - slows, slows
+    return share
+
+
+def mix(config: ParallaxConfig, dt_s: float, weight: Floats, x: Floats, P: Floats) -> tuple[Floats, Floats, Floats]:
+    """Weights (N, MODES), states (N, FILTERS, 8) and covariances after the changes of mode within `dt_s`."""
+    joint = weight[:, :, None] * transitions(config, dt_s)
+    after = joint.sum(axis=1)
+    share = joint / after[:, None]
+    modes, without_ground = list(MODES), WITHOUT_GROUND + MOVING
+    mixed_x, mixed_P = x.copy(), P.copy()
+    mixed_x[:, modes], mixed_P[:, modes] = _mixed(config, share, x[:, modes], P[:, modes])
+    mixed_x[:, WITHOUT_GROUND], mixed_P[:, WITHOUT_GROUND] = _mixed(
+        config, share[..., STATIONARY], x[:, without_ground], P[:, without_ground]
+    )
+    return after, mixed_x, mixed_P
+
+
+def _mixed(config: ParallaxConfig, share: Floats, x: Floats, P: Floats) -> tuple[Floats, Floats]:
+    """The moments of filters (N, 6) mixed by `share` (N, 6, K); of the six and of the K the first two stand."""
+    P[:, STATIONARY, [[VX], [VY]], [[VX], [VY]]] = config.sigma_creep_mps**2  # when it starts
+    to = share.swapaxes(1, 2)  # (N, to, from)
+    mean = to @ x
+    gap = x[:, None] - mean[:, :, None]  # (N, to, from, 8)
+    cov = (to @ P.reshape(*P.shape[:2], -1)).reshape(*mean.shape, P.shape[-1])
+    cov += (to[..., None] * gap).swapaxes(-1, -2) @ gap
+    speed = slice(VX, VY + 1)
+    mean[:, STATIONARY, speed] = 0.0
+    cov[:, STATIONARY, speed] = 0.0
+    cov[:, STATIONARY, :, speed] = 0.0
+    return mean, cov
+
+
+def process_noise(config: ParallaxConfig, dt_s: float, yaw_rad: Floats, on_road: NDArray[np.bool_]) -> Floats:
+    """(N, len(MOVING), 4, 4) of x, y, vx, vy: along and across the heading, or the same in any direction."""
+    along_across = rotated(np.square([config.change_mps, config.change_across_mps]), yaw_rad)
+    of_velocity = np.stack([along_across] * len(MOVING), axis=1)
+    of_velocity[~on_road] = of_velocity[:, MOVING.index(CROSSING)] = np.eye(2) * config.change_mps**2
+    in_time = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
+    out: Floats = in_time[:, None, :, None] * of_velocity[:, :, None, :, None, :]  # the Kronecker product
+    return out.reshape(*of_velocity.shape[:2], 4, 4)
+
+
+def rotated(variances: Floats, yaw_rad: Floats) -> Floats:
+    """(N, 2, 2) in world of `variances` (2,) along and across headings (N,)."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    R = np.stack([c, -s, s, c], axis=-1).reshape(-1, 2, 2)
+    out: Floats = R * variances @ R.swapaxes(-1, -2)
+    return out

@@ -1,0 +1,1 @@
+"""What the edges of the graph are worth, on images and on simulated drives."""

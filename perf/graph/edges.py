@@ -1,0 +1,327 @@
+"""What each edge of the graph is worth: the ego's and vehicles' errors with each left out, alone, halved and doubled.
+
+    python -m perf edges --logs DIR [--model ROLE=PATH ...] [--clips 0005,0002] [--seeds 3] [--output FILE]
+
+Logs of images are recorded once, by the whole front end with its lane head, and kept in DIR as MessagePack; those of
+simulated drives are made anew. ATE is in m, nothing aligned; NEES is over its degrees of freedom: the ego's of its pose
+in the world, a vehicle's of its place in the ego's frame. Statistics of real and simulated edges stand side by side
+(bench/simulation/edge_statistics.py). Vehicles are those that KITTI labels, in five frames or more.
+Of 00 and 06 the first frames are left out, whose true poses are interpolated.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from birdslam.bench.baselines.trajectories import LiveTrajectories, Trajectories
+from birdslam.bench.simulation.edge_statistics import EdgeStatistics, edge_statistics
+from birdslam.bench.simulation.odometry import SimulatedOdometry, SimulationConfig
+from birdslam.bench.tracking.benchmark import LEAST_FRAMES, Live, Truth, make_log, ours
+from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
+from birdslam.bench.tracking.metrics import path_errors
+from birdslam.geometry.se2 import SE2
+from birdslam.graph.pose_graph import PoseGraph
+from birdslam.paper import NO_GATE
+from birdslam.perception import Pending, Perception, Ready
+from birdslam.perf.reporting.arguments import add_data, benchmark_parser
+from birdslam.runtime.batch.offline import pipeline
+from birdslam.runtime.cli.arguments import add_config, add_settings
+from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.nodes.sources import open_recorded, recording_uri
+from birdslam.runtime.options import configuration_of
+from birdslam.slam import SlamConfig
+from birdslam.sources.kitti_tracking import open_tracking, read_detections
+from birdslam.sources.opening import open_recording
+from birdslam.trajectory import as_poses, inverse, mount_pose, split_pose
+from birdslam.types import LandmarkKind, Measurements
+from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig
+
+label = "what each edge of the graph is worth, on images and on simulated drives"
+
+TRACKING = "kitti_tracking/training"
+CLIPS = {  # folder, and how many frames are left out at its beginning
+    "0005": (f"{TRACKING}/image_03/0005", 0),
+    "0002": (f"{TRACKING}/image_02/0002", 0),
+    "raw": ("kitti_raw_clip", 1),
+    "00": ("kitti_odometry/sequences/00", 13),
+    "06": ("kitti_odometry/sequences/06", 11),
+}
+SIMULATED = ("0002", "0003", "0005", "0018")  # sequences whose true poses and boxes simulated drives take
+EGO_DIMENSIONS, PLACE = 3, 2
+Change = Callable[[Measurements], Measurements]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The default but for a change of the graph, or of each record."""
+
+    live: Live
+    change: Change = lambda m: m
+
+
+def variants() -> dict[str, Variant]:
+    """All that are compared; the first is the default."""
+    base = ours(SlamConfig())
+
+    def graph(**fields: object) -> Variant:
+        return Variant(replace(base, graph=msgspec.structs.replace(base.graph, **fields)))
+
+    def out(*edges: str) -> Variant:
+        return Variant(replace(base, weights=msgspec.structs.replace(base.weights, leave_out=("vv", *edges))))
+
+    moved = graph(vehicles_move_ego=True)
+    gates = {"detection_gate_sigma": NO_GATE, "landmark_gate_sigma": NO_GATE}
+    bare = {"landmark_common_m": 0.0, "correlation_length_m": 0.0, "front_back_ambiguity": False}
+    found = {
+        "default": Variant(base),
+        "vehicles move the ego": moved,
+        "without CC": out("cc"),
+        "without CP: CC alone": out("cp"),
+        "without lanes: CC and points": out("lanes"),
+        "CC and lanes": replace(Variant(base), change=_without_points),
+        "CC and vehicles": replace(moved, live=replace(moved.live, weights=out("cp").live.weights)),
+        "VV beside constant velocity": Variant(
+            replace(base, weights=msgspec.structs.replace(base.weights, leave_out=()))
+        ),
+        "VV alone, as in Eq. 6": Variant(
+            replace(
+                base,
+                graph=msgspec.structs.replace(base.graph, constant_velocity=False),
+                weights=msgspec.structs.replace(base.weights, leave_out=()),
+            )
+        ),
+        "without gates": graph(**gates),
+        "gates alone": graph(**bare),
+    }
+    for name, field in (("CC", "cc"), ("CP", "cp"), ("CV", "cv")):
+        for word, factor in (("halved", 2.0), ("doubled", 0.5)):
+            found[f"{name} {word}"] = Variant(base, _reweighed(field, factor))
+    return found
+
+
+def _without_points(m: Measurements) -> Measurements:
+    return msgspec.structs.replace(m, cp=tuple(e for e in m.cp if e.kind is LandmarkKind.LANE_STATION))
+
+
+def _reweighed(field: str, factor: float) -> Change:
+    """Multiplies the covariances of one type of edge, which divides its information."""
+
+    def change(m: Measurements) -> Measurements:
+        edges = getattr(m, field)
+        if not edges:
+            return m
+        wider = [
+            msgspec.structs.replace(e, cov=tuple(factor * c for c in e.cov))
+            for e in (edges if isinstance(edges, tuple) else (edges,))
+        ]
+        return msgspec.structs.replace(m, **{field: tuple(wider) if isinstance(edges, tuple) else wider[0]})
+
+    return change
+
+
+# --- logs and truth ---
+
+
+@dataclass(frozen=True)
+class Case:
+    """A log with the ego's true poses in the world of its first frame and, of tracking sequences, labels."""
+
+    name: str
+    log: list[Measurements]
+    ego: dict[int, SE2]
+    truth: Truth | None
+
+
+def recorded(name: str, data: Path, logs: Path, configuration: Configuration) -> Case:
+    """A clip's log of its images: the one in `logs`, or recorded anew and put there."""
+    folder, left_out = CLIPS[name]
+    path = logs / f"{name}.log"
+    if not path.exists():
+        source = configuration.source
+        with pipeline(configuration) as drive:
+            recording = open_recorded(
+                recording_uri(str(data / folder)), configuration.camera, source.stride, source.topics
+            )
+            log = [record for record in drive(recording) if isinstance(record, Measurements)]
+        logs.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(msgspec.msgpack.encode(log, enc_hook=_plain))
+    log = msgspec.msgpack.decode(path.read_bytes(), type=list[Measurements])[left_out:]
+    if folder.startswith(TRACKING):
+        truth = Truth.of(open_tracking(data / TRACKING, name), log)
+        return Case(name, log, truth.ego, truth)
+    recording = open_recording(f"kitti:{data / folder}")
+    poses = recording.truth_poses()
+    assert poses is not None, name
+    T_cam0_cam, mount = recording.T_cam0_cam(), mount_pose(recording.camera.ground)
+    camera = inverse(T_cam0_cam) @ as_poses(poses) @ T_cam0_cam
+    first = inverse(camera[log[0].frame_id])
+    ego = {m.frame_id: split_pose(mount @ first @ camera[m.frame_id] @ inverse(mount))[0] for m in log}
+    return Case(name, log, ego, None)
+
+
+def _plain(value: object) -> object:
+    """A number of numpy as Python's own."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"no number: {value!r}")
+
+
+def simulated(name: str, data: Path, seed: int) -> Case:
+    """A drive by true poses with simulated odometry and the boxes at hand."""
+    sequence = open_tracking(data / TRACKING, name, CAMERA_OF_BOXES)
+    found = read_detections(data / TRACKING / "det_02_rrc", name, len(sequence))
+    rng = np.random.default_rng([seed, *name.encode()])
+    odometry = SimulatedOdometry(sequence.camera, sequence.camera_poses, SimulationConfig(), rng)
+
+    def given(frame: int, image: NDArray[np.uint8]) -> Pending:
+        return Ready(Perception(found[frame], None, {"detector": 0}, ()))
+
+    frames = range(min(150, len(sequence)))
+    log = make_log(sequence, frames, odometry, given, None, SlamConfig().frontend)
+    truth = Truth.of(sequence, log)
+    return Case(f"{name}, seed {seed}", log, truth.ego, truth)
+
+
+# --- grades ---
+
+
+def grade(variant: Variant, case: Case) -> dict[str, float]:
+    """ATE of ego and cars (mean, live and final; each car's as "live 31") and NEES of both."""
+    graph, live = PoseGraph(variant.live.graph, variant.live.weights), LiveTrajectories()
+    smoother = RtsSmoother(SmootherConfig())
+    of_ego, of_cars = [], []
+    for record in case.log:
+        m = variant.change(record)
+        estimate = graph.optimise(m)
+        live.add(estimate)
+        smoother.add(m, estimate)
+        error = estimate.T_world_ego.between(case.ego[m.frame_id]).log()
+        if estimate.epoch == 0 and m is not case.log[0]:
+            of_ego.append(_nees(np.asarray(error), np.reshape(estimate.cov, (3, 3))))
+        if case.truth is not None:
+            of_cars += _nees_of_cars(graph, m, case.truth)
+    ego = path_errors(case.ego, live.result.ego)
+    assert ego is not None
+    out = {"ego": ego.ate_m, "NEES of the ego": float(np.mean(of_ego)) / EGO_DIMENSIONS}
+    if case.truth is None:
+        return out
+    final = Trajectories(ego=live.result.ego)
+    for (epoch, vehicle), way in smoother.smooth().items():
+        for frame, pose in way.items():
+            final.put_vehicle(vehicle, frame, live.T_first_world[epoch] @ pose)
+    for what, result in (("live", live.result), ("final", final)):
+        errors = case.truth.errors(result)
+        cars = {k: e.ate_m for k, e in errors.items() if k != "ego" and e is not None and e.frames >= LEAST_FRAMES}
+        out |= {f"{what} {car}": ate_m for car, ate_m in cars.items()}
+        out[f"cars, {what}"] = float(np.mean([*cars.values()])) if cars else math.nan
+    out["NEES of cars"] = float(np.mean(of_cars)) / PLACE if of_cars else math.nan
+    return out
+
+
+def _nees_of_cars(graph: PoseGraph, m: Measurements, truth: Truth) -> list[float]:
+    told, out = graph.vehicles_in_ego(), []
+    for car, vehicle in truth.matches[m.frame_id].items():
+        goal = truth.vehicles[car].get(m.frame_id)
+        if vehicle in told and goal is not None:
+            T_ego_vehicle, cov = told[vehicle]
+            there = truth.ego[m.frame_id].between(goal)
+            error = np.array([T_ego_vehicle.x_m - there.x_m, T_ego_vehicle.y_m - there.y_m])
+            out.append(_nees(error, cov[:2, :2]))
+    return out
+
+
+def _nees(error: NDArray[np.float64], cov: NDArray[np.float64]) -> float:
+    return float(error @ np.linalg.solve(cov + 1e-9 * np.eye(len(cov)), error))
+
+
+# --- the table ---
+
+
+def left_out(grades: Mapping[str, Mapping[str, Mapping[str, float]]], what: str) -> list[str]:
+    """For each case: the variant that is best on all others by the mean logarithm, and what it is worth on this one."""
+    names = [case for case, by in next(iter(grades.values())).items() if math.isfinite(by.get(what, math.nan))]
+    lines = []
+    for case in names:
+        others = [each for each in names if each != case]
+        score = {v: float(np.mean([math.log(by[each][what]) for each in others])) for v, by in grades.items()}
+        best = min(score, key=lambda v: score[v])
+        lines.append(f"{case}: {best}, {grades[best][case][what]:.2f} (default {grades['default'][case][what]:.2f})")
+    return lines
+
+
+def table(grades: Mapping[str, Mapping[str, Mapping[str, float]]], drawn: Mapping[str, Sequence[str]]) -> str:
+    """A row for each variant; `drawn` are the cases whose mean and spread over draws are one column."""
+    cases = [*next(iter(grades.values()))]
+    single = [case for case in cases if case not in {each for names in drawn.values() for each in names}]
+    columns: list[tuple[str, list[str], str]] = [(f"{case} {what}", [case], what) for case in single for what in WHAT]
+    columns += [(f"{name} {what}", [*names], what) for name, names in drawn.items() for what in WHAT]
+    columns = [c for c in columns if any(c[2] in grades["default"][case] for case in c[1])]
+    lines = ["| edges | " + " | ".join(title for title, _, _ in columns) + " |", "| --- " * (len(columns) + 1) + "|"]
+    for variant, by in grades.items():
+        cells = []
+        for _, names, what in columns:
+            values = np.array([by[case][what] for case in names])
+            cells.append(f"{values.mean():.2f}" + (f" ± {values.std():.2f}" if len(values) > 1 else ""))
+        lines.append(f"| {variant} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def statistics_table(cases: Sequence[Case]) -> str:
+    """A row for each log: what its CC and CP edges are worth."""
+    fields = EdgeStatistics.__struct_fields__
+    lines = ["| log | " + " | ".join(name.replace("_", " ") for name in fields) + " |"]
+    lines.append("| --- " * (len(fields) + 1) + "|")
+    for case in cases:
+        found = edge_statistics(case.log, case.ego)
+        cells = ["-" if found is None else f"{getattr(found, name):.3g}" for name in fields]
+        lines.append(f"| {case.name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+WHAT = ("ego", "cars, live", "cars, final", "NEES of the ego", "NEES of cars")
+
+
+def run(arguments: list[str]) -> None:
+    parser = benchmark_parser("edges", label)
+    add_data(parser)
+    add_config(parser)
+    parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH", help="that looks at the images")
+    add_settings(parser)
+    parser.add_argument("--logs", type=Path, required=True, help="where recorded logs are kept")
+    parser.add_argument("--clips", default=",".join(CLIPS), help="with images, a list; none where empty")
+    parser.add_argument("--seeds", type=int, default=3, help="of each simulated drive")
+    options = parser.parse_args(arguments)
+    configuration = configuration_of(options)
+    cases = [recorded(clip, options.data, options.logs, configuration) for clip in options.clips.split(",") if clip]
+    drives = [simulated(name, options.data, seed) for name in SIMULATED for seed in range(options.seeds)]
+    for case in cases:
+        kinds = [edge.kind for m in case.log for edge in m.cp]
+        lanes = sum(kind is LandmarkKind.LANE_STATION for kind in kinds)
+        print(
+            f"{case.name}: {len(case.log)} frames, {len(kinds) - lanes} sights of points, {lanes} of lanes", flush=True
+        )
+    print(statistics_table([*cases, *drives]), flush=True)
+    grades: dict[str, dict[str, dict[str, float]]] = {}
+    for name, variant in variants().items():
+        grades[name] = {case.name: grade(variant, case) for case in [*cases, *drives]}
+        of = grades[name]
+        print(f"{name:30} " + "  ".join(f"{case.name} {of[case.name]['ego']:.2f}" for case in cases), flush=True)
+    drawn = {f"simulated {name}": [d.name for d in drives if d.name.startswith(name)] for name in SIMULATED if drives}
+    print(table(grades, drawn))
+    for what in ("ego", "cars, live"):
+        print(f"\nBest on the others, {what}, left one out:", *left_out(grades, what), sep="\n  ")
+    if options.output is not None:
+        _write(options.output, grades)
+
+
+def _write(path: Path, grades: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(grades, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,40 @@
+"""`birdslam ros`: a vehicle's estimates for ROS 2, beside its run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from birdslam.runtime.cli.arguments import add_settings
+from birdslam.runtime.configuration import ConfigurationError
+from birdslam.runtime.options import configuration_of
+from birdslam.runtime.ros import publisher
+from birdslam.runtime.supervision.run import check_runtime_dir
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which vehicle, and which part of ROS."""
+    parser.add_argument("config", nargs="?", type=Path, metavar="CONFIG.toml", help="of the vehicle")
+    parser.add_argument("--vehicle", metavar="NAME", help="its name on the bus")
+    parser.add_argument("--runtime-dir", metavar="DIR", help="as runtime.runtime_dir of the run")
+    add_ros(parser)
+    parser.add_argument("--rate", dest="rate_hz", type=float, metavar="HZ", help="at most so many estimates a second")
+    add_settings(parser)
+    parser.set_defaults(model=[])
+
+
+def add_ros(parser: argparse.ArgumentParser) -> None:
+    """Where ROS is."""
+    parser.add_argument("--router", metavar="tcp/HOST:PORT", help="of rmw_zenoh; default: tcp/localhost:7447")
+    parser.add_argument("--domain", type=int, metavar="N", help="default: ROS_DOMAIN_ID, else 0")
+    parser.add_argument("--namespace", metavar="/NAME", help="before our topics and frames")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Until it is asked to end."""
+    if options.rate_hz is not None and not options.rate_hz > 0.0:
+        raise ConfigurationError(f"--rate {options.rate_hz:g}: needs a positive number")
+    configuration = configuration_of(options)
+    check_runtime_dir(configuration.vehicle, configuration.runtime_dir)
+    publisher.run(configuration, options.rate_hz)
+    return 0

@@ -1,0 +1,203 @@
+"""`birdslam ros`: what a vehicle's BirdSLAM says, as messages of ROS 2, live; docs/ros.md lists them.
+
+A process of its own, and of its vehicle's bus a planner like any other: it can slow nothing down, and nothing comes in
+through it. It waits for the vehicle and for the router, and lives through restarts of both.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import zenoh
+
+from birdslam.geometry.camera import Camera
+from birdslam.ros.messages import LATCHED, TOPICS, Level, RosMessages, Sent, t_of
+from birdslam.ros.rmw_zenoh import LATCHED_QOS, Qos
+from birdslam.runtime.configuration import Configuration
+from birdslam.runtime.process import signals
+from birdslam.runtime.process.notify import Notifier
+from birdslam.runtime.ros.session import NoRouter, RosNode, RosPublisher
+from birdslam.runtime.topology import PROCESSES
+from birdslam.runtime.transport.bus import Bus, BusError
+from birdslam.runtime.transport.closing import Closing
+from birdslam.runtime.wire import Health
+from birdslam.types import EgoEdge, Estimate, MapUpdate, Measurements
+
+NODE = "birdslam"
+_DEPTH = 64  # estimates that wait while a computer is busy: two seconds of them
+_SILENT_S = 1.0  # without an estimate for so long, the diagnostics say so, and again each time
+_LOOK_S = 0.1
+_REPORT_S = 60.0  # between two lines that say that there is no router
+_KEPT_MOTIONS = 64
+
+
+class RosBridge(Closing):
+    """A vehicle's bus and a node of ROS 2. A context manager; raises as Bus and RosNode do."""
+
+    def __init__(self, vehicle: str, node: RosNode, runtime_dir: Path | None = None, rate_hz: float | None = None):
+        self._vehicle, self._node = vehicle, node
+        self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
+        self._due_ns = 0
+        namespace = node.node.namespace
+        own, self._frames = ("", "") if namespace == "/" else (namespace, f"{namespace.strip('/')}/")
+        self._publishers: dict[str, RosPublisher] = {}
+        for topic, type_name in TOPICS.items():
+            full = own + topic if topic.startswith("/birdslam/") else topic  # the others are ROS' own, absolute
+            qos = LATCHED_QOS if topic in LATCHED else Qos()
+            self._publishers[topic] = node.publisher(full, type_name, qos)
+        self._bus = Bus(vehicle, "ros", runtime_dir=runtime_dir)
+        self._estimates = self._bus.subscriber("estimate", _DEPTH)
+        self._measurements = self._bus.subscriber("measurements", _DEPTH)
+        self._maps = self._bus.subscriber("map")
+        self._healths = {name: self._bus.subscriber(f"health/{name}") for name in PROCESSES}
+        self._messages: RosMessages | None = None
+        self._motions: dict[int, EgoEdge] = {}  # by the frame that each leads to
+        self._last_frame, self._told_ns = -1, 0
+        self._heard_s = time.monotonic()
+
+    @property
+    def connected(self) -> bool:
+        """Whether the router is there now."""
+        return self._node.connected
+
+    @property
+    def alive(self) -> frozenset[str]:
+        """The vehicle's nodes that are alive."""
+        return self._bus.alive & set(PROCESSES)
+
+    def step(self, timeout_s: float) -> None:
+        """Says what comes within that time: one estimate, with all that came beside it."""
+        message = self._estimates.recv(timeout_s)
+        while (measured := self._measurements.recv(0.0)) is not None:
+            record: Measurements = measured.record
+            if record.cc is not None:
+                self._motions[record.cc.to_frame] = record.cc
+        while len(self._motions) > _KEPT_MOTIONS:
+            del self._motions[next(iter(self._motions))]
+        if message is not None:
+            self._heard_s = time.monotonic()
+            self._say_estimate(message.record)
+        elif time.monotonic() - self._heard_s > _SILENT_S:
+            self._heard_s = time.monotonic()
+            self._say_silence()
+        self._say_map()
+        self._say_healths()
+
+    def _say_estimate(self, estimate: Estimate) -> None:
+        if estimate.t_capture_ns <= self._told_ns:  # what was predicted is put right: tf has one pose a time
+            return
+        if self._messages is None or estimate.frame_id <= self._last_frame:  # another drive
+            self._messages = self._begin(estimate)
+        if self._messages is None:
+            return
+        self._last_frame, self._told_ns = estimate.frame_id, estimate.t_capture_ns
+        now_ns = time.monotonic_ns()
+        if now_ns < self._due_ns:
+            return
+        self._due_ns = max(self._due_ns + self._period_ns, now_ns)  # the rate in the mean, and no burst after a pause
+        motion = self._motions.pop(estimate.frame_id, None)
+        for sent in self._messages.of_estimate(estimate, t_of(estimate, live=True), motion):
+            self._send(sent)
+
+    def _begin(self, estimate: Estimate) -> RosMessages | None:
+        """Asks the vehicle for its camera; None where it does not say it (yet)."""
+        try:
+            answer = self._bus.query("configuration")
+        except BusError as error:
+            print(f"birdslam: ros: no camera of vehicle {self._vehicle!r}: {error}", file=sys.stderr, flush=True)
+            return None
+        if not answer or not answer[0].get("camera"):
+            return None
+        camera = msgspec.convert(answer[0]["camera"], Camera)
+        messages = RosMessages(self._node.types.make, camera, self._vehicle, frames=self._frames)
+        self._send(messages.fixed(t_of(estimate, live=True)))
+        self._motions.clear()
+        return messages
+
+    def _say_map(self) -> None:
+        while (message := self._maps.recv(0.0)) is not None:
+            update: MapUpdate = message.record
+            if self._messages is not None:
+                for sent in self._messages.of_map(update, time.time_ns()):
+                    self._send(sent)
+
+    def _say_healths(self) -> None:
+        for subscriber in self._healths.values():
+            while (message := subscriber.recv(0.0)) is not None:
+                health: Health = message.record
+                if self._messages is not None:
+                    self._send(self._messages.diagnostic(health.node, *_judged(health), time.time_ns()))
+
+    def _say_silence(self) -> None:
+        missing = sorted({"capture", "perceive", "optimize"} - self.alive)
+        text = f"no estimate; not alive: {', '.join(missing)}" if missing else "no estimate"
+        if self._messages is not None:
+            self._send(self._messages.diagnostic("estimate", Level.ERROR, text, {}, time.time_ns()))
+
+    def _send(self, sent: Sent) -> None:
+        topic, message = sent
+        try:
+            self._publishers[topic].publish(message)
+        except zenoh.ZError as error:  # this message alone
+            print(f"birdslam: ros: {topic}: {error}", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Leaves both."""
+        self._bus.close()
+        self._node.close()
+
+
+def _judged(health: Health) -> tuple[Level, str, dict[str, Any]]:
+    values = {
+        "rate_hz": f"{health.rate_hz:.1f}",
+        "dropped": health.dropped,
+        "step_p99_ms": f"{health.step.p99_ms:.1f}",
+        "age_p99_ms": f"{health.age.p99_ms:.1f}",
+        "overruns": health.overruns,
+        "restarts": health.restarts,
+        "mode": health.mode,
+        "rss_mib": health.rss_bytes >> 20,
+    }
+    statuses = ", ".join(status.value for status in health.status)
+    return Level.WARN if health.status else Level.OK, statuses or "ok", values
+
+
+def run(configuration: Configuration, rate_hz: float | None = None) -> None:
+    """Until SIGTERM or SIGINT. Raises ConfigurationError, BagError without rosbags, and as Bus does."""
+    vehicle = configuration.vehicle
+    signals.block()
+    zenoh.init_log_from_env_or("error")
+    notifier = Notifier()
+    notifier.once("READY=1")  # the vehicle waits for no network
+    node = _wait_for_router(configuration, notifier)
+    if node is None:
+        return
+    reached: bool | None = None
+    with RosBridge(vehicle, node, configuration.runtime_dir, rate_hz) as bridge:
+        while not signals.asked_to_end(0.0):
+            bridge.step(_LOOK_S)
+            if (now := bridge.connected) != reached:
+                reached = now
+                state = "is connected to" if now else "has lost"
+                print(f"the ROS node of vehicle {vehicle!r} {state} {configuration.ros.router}", flush=True)
+            notifier.alive(f"router {'reached' if reached else 'GONE'}, {len(bridge.alive)} nodes alive")
+        notifier.once("STOPPING=1")
+
+
+def _wait_for_router(configuration: Configuration, notifier: Notifier) -> RosNode | None:
+    """The node, as soon as the router is there; None where a signal came first."""
+    reported_s = -_REPORT_S
+    while True:
+        try:
+            return RosNode(configuration.ros, NODE)
+        except NoRouter as error:
+            if time.monotonic() - reported_s >= _REPORT_S:
+                reported_s = time.monotonic()
+                print(f"birdslam: ros: {error}", file=sys.stderr, flush=True)
+        notifier.alive(f"looks for {configuration.ros.router}")
+        if signals.asked_to_end(_LOOK_S):
+            return None

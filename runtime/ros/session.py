@@ -1,0 +1,191 @@
+"""A node of ROS 2 on a zenoh session of its own, at the router of rmw_zenoh.
+
+It is a client of the router and listens on nothing. Where ZENOH_SESSION_CONFIG_URI names a file, as for every node of
+rmw_zenoh, that file has the session's certificates and access rules.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+import zenoh.ext
+
+from birdslam.ros.message_types import MessageTypes
+from birdslam.ros.rmw_zenoh import (
+    MOST_DOMAIN,
+    NO_HASH,
+    Node,
+    Qos,
+    attachment,
+    check_namespace,
+    check_topic,
+    gid,
+    topic_key,
+)
+from birdslam.runtime.configuration import ConfigurationError, RosConfig
+from birdslam.runtime.transport.closing import Closing
+from birdslam.runtime.transport.session import close_session, open_session
+
+SESSION_FILE = "ZENOH_SESSION_CONFIG_URI"
+DOMAIN = "ROS_DOMAIN_ID"
+ROUTER_S = 2.0  # one attempt to reach it
+_MOST_BYTES = 1 << 26  # of a message: an image of 5000x4000 px in colour; zenoh would put together 1 GiB
+_RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
+_HEARTBEAT_S = 0.5  # of what is latched, after a message: as rmw_zenoh
+_CDR = zenoh.Encoding("application/cdr")
+
+
+def domain_of(config: RosConfig) -> int:
+    """The domain, as for any node of ROS from its variable where the configuration says none."""
+    if config.domain is not None:
+        return config.domain
+    text = os.environ.get(DOMAIN, "0")
+    if not text.isdecimal() or int(text) > MOST_DOMAIN:
+        raise ConfigurationError(f"{DOMAIN}={text!r}: needs a number from 0 to {MOST_DOMAIN}")
+    return int(text)
+
+
+class NoRouter(RuntimeError):
+    """The router is not there."""
+
+
+def session_config(router: str, timeout_s: float) -> zenoh.Config:
+    """Of zenoh: it waits so long for the router, and looks for ever for one that was there once.
+
+    Raises ConfigurationError where the file of the session can't be one.
+    """
+    file = os.environ.get(SESSION_FILE)
+    try:
+        config = zenoh.Config.from_file(file) if file else zenoh.Config()
+        settings: dict[str, Any] = {
+            "mode": "client",
+            "connect/endpoints": [router],
+            "connect/timeout_ms": round(1e3 * timeout_s),
+            "connect/exit_on_failure": True,
+            "connect/retry": _RETRY,
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+            "transport/link/rx/max_message_size": _MOST_BYTES,
+            "transport/shared_memory/enabled": False,
+            "adminspace/enabled": False,
+            "timestamping/enabled": True,  # what is kept for those that come late needs it
+        }
+        for name, value in settings.items():
+            config.insert_json5(name, json.dumps(value))
+    except zenoh.ZError as error:
+        where = f"{SESSION_FILE}={file}" if file else f"ros.router {router!r}"
+        raise ConfigurationError(f"{where}: {error}") from error
+    return config
+
+
+class RosPublisher:
+    """Of one topic. `publish` never waits: what the network does not take is dropped, as rmw_zenoh does it."""
+
+    def __init__(self, session: zenoh.Session, key: str, token: str, qos: Qos, read: Callable[[Any], bytes]) -> None:
+        self._cdr, self._gid, self._numbers = read, gid(token), itertools.count(1)
+        reliability = zenoh.Reliability.RELIABLE if qos.reliable else zenoh.Reliability.BEST_EFFORT
+        self._publisher: Any
+        if qos.transient_local:
+            self._publisher = zenoh.ext.declare_advanced_publisher(
+                session,
+                key,
+                encoding=_CDR,
+                congestion_control=zenoh.CongestionControl.DROP,
+                reliability=reliability,
+                cache=zenoh.ext.CacheConfig(qos.depth),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
+                publisher_detection=True,
+            )
+        else:
+            self._publisher = session.declare_publisher(
+                key, encoding=_CDR, congestion_control=zenoh.CongestionControl.DROP, reliability=reliability
+            )
+        self._token = session.liveliness().declare_token(token)
+
+    def publish(self, message: Any) -> None:
+        """One message."""
+        said = attachment(next(self._numbers), time.time_ns(), self._gid)
+        self._publisher.put(self._cdr(message), attachment=said)
+
+
+class RosNode(Closing):
+    """A node with its publishers and subscriptions. A context manager.
+
+    Raises ConfigurationError for a name or a file that can't be, NoRouter where none is there within the time.
+    """
+
+    def __init__(self, config: RosConfig, name: str, timeout_s: float = ROUTER_S) -> None:
+        self.types = MessageTypes()
+        self.domain = domain_of(config)
+        try:
+            namespace = check_namespace(config.namespace)
+            check_topic(f"/{name}")
+        except ValueError as error:
+            raise ConfigurationError(f"ros.namespace: {error}") from None
+        self._hashed = config.release != "humble"
+        self._numbers = itertools.count(1)
+        self._lock = threading.Lock()  # of the tokens: subscriptions come from zenoh's threads
+        settings = session_config(config.router, timeout_s)
+        try:
+            self.session = open_session(settings)
+        except zenoh.ZError as error:
+            raise NoRouter(
+                f"ros.router {config.router}: the router is not there: no connection within {timeout_s:g} s"
+            ) from error
+        self.node = Node(self.domain, str(self.session.info.zid()), namespace, name)
+        self._tokens = [self.session.liveliness().declare_token(self.node.token())]
+        self._subscribers: list[Any] = []
+
+    @property
+    def connected(self) -> bool:
+        """Whether the router is there now."""
+        return bool(self.session.info.routers_zid())
+
+    def type_hash(self, type_name: str) -> str:
+        """Of the release that the others run."""
+        return self.types.type_hash(type_name) if self._hashed else NO_HASH
+
+    def publisher(self, topic: str, type_name: str, qos: Qos) -> RosPublisher:
+        """Of a full topic name."""
+        hashed = self.type_hash(type_name)
+        token = self.node.publisher_token(next(self._numbers), topic, type_name, hashed, qos)
+        key = topic_key(self.domain, topic, type_name, hashed)
+        return RosPublisher(self.session, key, token, qos, self.types.cdr)
+
+    def subscribe(self, key: str, receive: Callable[[zenoh.Sample], object], late: bool = False) -> None:
+        """Calls `receive` of each message, on zenoh's thread; with `late` also of what came before (/tf_static)."""
+        callback = zenoh.handlers.Callback(receive, indirect=False)
+        if late:
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            self._subscribers.append(
+                zenoh.ext.declare_advanced_subscriber(self.session, key, callback, history=history)
+            )
+        else:
+            self._subscribers.append(self.session.declare_subscriber(key, callback))
+
+    def watch(self, key: str, told: Callable[[str], object]) -> None:
+        """Calls `told` of each token of somebody who is there or comes, on zenoh's thread."""
+
+        def changed(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                told(str(sample.key_expr))
+
+        callback = zenoh.handlers.Callback(changed, indirect=False)
+        self._subscribers.append(self.session.liveliness().declare_subscriber(key, callback, history=True))
+
+    def say_listening(self, topic: str, type_name: str, type_hash: str, qos: Qos) -> None:
+        """Tells the publishers of a topic that somebody listens: some send only then."""
+        with self._lock:
+            token = self.node.subscription_token(next(self._numbers), topic, type_name, type_hash, qos)
+            self._tokens.append(self.session.liveliness().declare_token(token))
+
+    def close(self) -> None:
+        """Leaves; a second call does nothing."""
+        close_session(self.session)

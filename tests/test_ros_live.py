@@ -1,0 +1,507 @@
+"""ROS 2 live: names and bytes beside those of an independent implementation, and messages both ways through a router.
+
+The counterpart is the package zenoh-ros2-sdk, in a process of its own. A real rmw_zenoh was not at hand.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from birdslam.geometry.camera import Camera
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.gnss.files import GNSS_FILE, GnssError, read_fixes
+from birdslam.perf.latency.ros import estimate, peer
+from birdslam.perf.processes import free_port
+from birdslam.ros.bag import BagTopics
+from birdslam.ros.message_types import MessageTypes
+from birdslam.ros.messages import TOPICS, RosMessages
+from birdslam.ros.rmw_zenoh import (
+    LATCHED_QOS,
+    NO_HASH,
+    SENSOR_QOS,
+    Node,
+    Qos,
+    attachment,
+    check_namespace,
+    publication_of,
+    topic_key,
+    type_of_key,
+)
+from birdslam.ros.sensor import FIX_SIGMA_M
+from birdslam.runtime.cli.main import main
+from birdslam.runtime.configuration import Configuration, ConfigurationError, ResultsConfig, RosConfig, SourceConfig
+from birdslam.runtime.maps.drive_map import DriveMap
+from birdslam.runtime.nodes.sources import SourceError, open_source
+from birdslam.runtime.ros.camera import CLOCK_FRAMES, GNSS_HEAD, SenderClock
+from birdslam.runtime.ros.publisher import RosBridge
+from birdslam.runtime.ros.session import NoRouter, RosNode
+from birdslam.runtime.supervision.query_server import QueryServer
+from birdslam.sources.opening import open_recording
+from birdslam.types import Estimate, Lane, LaneLine, Lanes, LineColour, LineKind
+from tests.test_bus import until
+
+sdk = pytest.importorskip("zenoh_ros2_sdk")
+processes = pytest.mark.processes
+ROOT = Path(__file__).resolve().parent.parent
+CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5, pitch_rad=0.05, roll_rad=-0.02)
+LIMIT_S = 60.0
+# Published: in the documentation of ROS 2 (Jazzy), `ros2 topic info --verbose`
+KNOWN_HASHES = {
+    "std_msgs/msg/String": "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+    "sensor_msgs/msg/Image": "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47",
+}
+
+
+# --- names and bytes ---
+
+
+@pytest.mark.parametrize("namespace", ["/", "/red", "/fleet/red"])
+@pytest.mark.parametrize("qos", [Qos(), LATCHED_QOS, SENSOR_QOS])
+def test_names_are_those_of_the_other_implementation(namespace: str, qos: Qos) -> None:
+    from zenoh_ros2_sdk import keyexpr
+    from zenoh_ros2_sdk.entity import EndpointEntity, EntityKind, NodeEntity
+    from zenoh_ros2_sdk.qos import QosDurability, QosProfile, QosReliability
+    from zenoh_ros2_sdk.utils import ros2_to_dds_type
+
+    theirs = QosProfile(
+        reliability=QosReliability.RELIABLE if qos.reliable else QosReliability.BEST_EFFORT,
+        durability=QosDurability.TRANSIENT_LOCAL if qos.transient_local else QosDurability.VOLATILE,
+        history_depth=qos.depth,
+    )
+    node, hashed = Node(3, "a1b2", namespace, "birdslam"), KNOWN_HASHES["sensor_msgs/msg/Image"]
+    other = NodeEntity(domain_id=3, session_id="a1b2", node_id=0, node_name="birdslam", namespace=namespace)
+    assert node.token() == keyexpr.node_liveliness_keyexpr(other)
+    dds = ros2_to_dds_type("sensor_msgs/msg/Image")
+    for kind, token in (
+        (EntityKind.PUBLISHER, node.publisher_token(7, "/front/image", "sensor_msgs/msg/Image", hashed, qos)),
+        (EntityKind.SUBSCRIPTION, node.subscription_token(7, "/front/image", "sensor_msgs/msg/Image", hashed, qos)),
+    ):
+        end = EndpointEntity(other, 7, kind, "/front/image", dds, hashed, theirs.encode())
+        assert token == keyexpr.endpoint_liveliness_keyexpr(end)
+    assert topic_key(3, "/front/image", "sensor_msgs/msg/Image", hashed) == keyexpr.topic_keyexpr(
+        3, "/front/image", dds, hashed
+    )
+    found = publication_of(node.publisher_token(7, "/front/image", "sensor_msgs/msg/Image", hashed, qos))
+    assert found == ("/front/image", "sensor_msgs/msg/Image", hashed)
+
+
+def test_an_attachment_is_that_of_zenohs_serializer_and_of_the_other_implementation() -> None:
+    from zenoh.ext import Int64, z_serialize
+    from zenoh_ros2_sdk.attachment import Attachment
+
+    said, gid = attachment(5, 1_700_000_000_000_000_001, bytes(range(16))), bytes(range(16))
+    assert said == bytes(z_serialize((Int64(5), Int64(1_700_000_000_000_000_001), gid)))
+    assert Attachment.from_bytes(said) == Attachment(5, 1_700_000_000_000_000_001, gid)
+
+
+@pytest.mark.parametrize("name", sorted({*TOPICS.values(), *KNOWN_HASHES}))
+def test_hashes_are_those_of_the_other_implementation(name: str, tmp_path: Path) -> None:
+    from zenoh_ros2_sdk.message_registry import MessageRegistry
+    from zenoh_ros2_sdk.utils import get_type_hash, load_dependencies_recursive
+
+    from birdslam.perf.latency.ros_peer import write_definitions
+
+    write_definitions(tmp_path)
+    text = (tmp_path / f"{name}.msg").read_text()
+    others = load_dependencies_recursive(name, text, MessageRegistry(str(tmp_path)))
+    hashed = MessageTypes().type_hash(name)
+    assert hashed == get_type_hash(name, msg_definition=text, dependencies=others)
+    assert hashed == KNOWN_HASHES.get(name, hashed)
+
+
+class Cdr:
+    """Reads little-endian CDR (XCDR1) by itself: a value lies at a multiple of its size, after four bytes of head."""
+
+    def __init__(self, data: bytes) -> None:
+        assert data[:4] == b"\0\1\0\0"
+        self._data, self._at = data[4:], 0
+
+    def number(self, kind: str) -> Any:
+        size = struct.calcsize(kind)
+        self._at += -self._at % size
+        (value,) = struct.unpack_from(f"<{kind}", self._data, self._at)
+        self._at += size
+        return value
+
+    def numbers(self, kind: str, count: int) -> list[Any]:
+        return [self.number(kind) for _ in range(count)]
+
+    def string(self) -> str:
+        size = self.number("I")
+        text = self._data[self._at : self._at + size]
+        self._at += size
+        assert text[-1:] == b"\0"
+        return text[:-1].decode()
+
+    def header(self) -> tuple[int, str]:
+        sec, nanosec = self.number("i"), self.number("I")
+        return sec * 10**9 + nanosec, self.string()
+
+    @property
+    def rest(self) -> bytes:
+        return self._data[self._at :]
+
+
+def messages(lanes: Lanes | None = None, frames: str = "") -> dict[str, tuple[Any, bytes]]:
+    types, told = MessageTypes(), estimate(3, vehicles=2)
+    told = Estimate(**{f: getattr(told, f) for f in told.__struct_fields__} | {"lanes": lanes})
+    ros = RosMessages(types.make, CAMERA, "car", frames=frames)
+    sent = [ros.fixed(told.t_utc_ns), *ros.of_estimate(told, told.t_utc_ns)]
+    return {topic: (message, types.cdr(message)) for topic, message in sent}
+
+
+def test_the_bytes_of_a_pose_field_by_field() -> None:
+    message, data = messages()["/birdslam/odometry"]
+    read = Cdr(data)
+    t_ns, frame = read.header()
+    stamp = message.header.stamp
+    assert (t_ns, frame, read.string()) == (stamp.sec * 10**9 + stamp.nanosec, "odom", "base_link")
+    assert read.numbers("d", 7) == pytest.approx([0.3, 0, 0, 0, 0, 0, 1])
+    cov = np.reshape(read.numbers("d", 36), (6, 6))
+    assert [cov[i, i] for i in range(6)] == pytest.approx([0.01, 0.01, 1e6, 1e6, 1e6, 1e-4])
+    assert read.numbers("d", 6) == [0.0] * 6
+    assert np.diag(np.reshape(read.numbers("d", 36), (6, 6))).tolist() == [1e6] * 6
+    assert not read.rest.strip(b"\0")
+
+
+def test_the_bytes_of_vehicles_field_by_field() -> None:
+    _, data = messages(frames="red/")["/birdslam/vehicles"]
+    read = Cdr(data)
+    assert read.header()[1] == "red/odom"
+    assert read.number("I") == 2
+    for number in range(2):
+        assert read.header()[1] == "red/odom"
+        assert read.number("I") == 1  # hypotheses
+        assert (read.string(), read.number("d")) == ("car", 1.0)
+        assert read.numbers("d", 2) == pytest.approx([10.0 + number, 3.0])
+        read.numbers("d", 5)
+        read.numbers("d", 36)
+        read.numbers("d", 7)  # of the box
+        assert read.numbers("d", 3) == pytest.approx([4.2, 1.8, 1.5])
+        assert read.string() == str(number)
+    assert not read.rest.strip(b"\0")
+
+
+def test_the_bytes_of_transforms_field_by_field() -> None:
+    for topic, parent, child in (("/tf", "odom", "base_link"), ("/tf_static", "base_link", "camera_optical_frame")):
+        message, data = messages()[topic]
+        read = Cdr(data)
+        assert read.number("I") == 1
+        assert (read.header()[1], read.string()) == (parent, child)
+        at, turn = message.transforms[0].transform.translation, message.transforms[0].transform.rotation
+        assert read.numbers("d", 7) == [at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w]
+        assert not read.rest.strip(b"\0")
+
+
+def test_lines_and_the_ego_lane() -> None:
+    cov = tuple(0.01 * np.eye(4).ravel())
+    curve = {"slope": 0.0, "curvature_per_m": 0.002, "curvature_rate_per_m2": 0.0, "cov": cov, "to_m": 20.0}
+    line = LaneLine(
+        line=4, offset_m=1.8, seen_from_m=0.0, seen_to_m=15.0, kind=LineKind.DASHED, colour=LineColour.YELLOW, **curve
+    )
+    lane = Lane(offset_m=0.1, width_m=3.5, width_slope=0.0, width_sigma_m=0.1, **curve)
+    found = messages(Lanes(lines=(line,), lanes=(lane,), ego_index=0))
+    cleared, drawn = found["/birdslam/lane_lines"][0].markers
+    assert (cleared.action, drawn.action) == (drawn.DELETEALL, drawn.ADD)
+    assert (drawn.type, drawn.ns, drawn.id, drawn.header.frame_id) == (drawn.LINE_STRIP, "dashed", 4, "base_link")
+    assert (drawn.color.r, drawn.color.b) == (1.0, 0.0)
+    assert [p.y for p in drawn.points] == pytest.approx([line.y_m(p.x) for p in drawn.points])
+    assert (drawn.points[0].x, drawn.points[-1].x) == (0.0, 20.0)
+    path, _ = found["/birdslam/ego_lane"]
+    assert path.poses[-1].pose.position.y == pytest.approx(lane.centre_m(20.0))
+
+
+@given(st.text("abz09_/*$#?% .é-", max_size=30))
+def test_a_name_reaches_no_key_but_its_own(name: str) -> None:
+    """Whatever somebody calls a topic or a namespace: it is refused, or the key is one plain key."""
+    for checked in (lambda: topic_key(0, name, "std_msgs/msg/String", NO_HASH), lambda: check_namespace(name)):
+        try:
+            found = checked()
+        except ValueError:
+            continue
+        assert not set(found) & set("*$#?% .é-")
+        if found != "/":
+            zenoh.KeyExpr(found.strip("/"))
+
+
+@given(st.text("@ros2_lv/%MP*:_aA0", max_size=60), st.binary(max_size=80))
+def test_what_others_send_is_read_or_refused(token: str, data: bytes) -> None:
+    assert publication_of(token) is None or token.count("/") == 12
+    type_of_key(token)
+    types = MessageTypes()
+    for name in ("sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"):
+        with suppress(ValueError):
+            types.read(b"\0\1\0\0" + data, name)
+
+
+def test_times_of_the_same_clock_are_exact_and_those_of_another_keep_their_intervals() -> None:
+    clock, offset = SenderClock(), 10**18
+    for arrived, delay in ((10**9, 3_000_000), (2 * 10**9, 40_000_000)):
+        assert clock.monotonic_ns(arrived + offset - delay, arrived, arrived + offset) == arrived - delay
+    assert clock.monotonic_ns(offset + 5, 3, offset + 3) == 3  # not from the future
+    other, period = SenderClock(), 30_000_000
+    delays = [4_000_000, 9_000_000, 1_000_000, 7_000_000, 2_000_000] * 40
+    times = [other.monotonic_ns(k * period, 10**9 + k * period + d, offset) for k, d in enumerate(delays)]
+    assert np.diff(times[3:]).tolist() == [period] * (len(delays) - 4)
+    late = [other.monotonic_ns(k * period, 2 * 10**9 + k * period, offset) for k in range(500, 500 + CLOCK_FRAMES + 1)]
+    assert late[-1] == 2 * 10**9 + (500 + CLOCK_FRAMES) * period  # the sender's clock was set: after some frames
+
+
+def test_what_can_not_be_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    for arguments, said in (
+        (["ros", "--namespace", "/a b"], "ros.namespace: '/a b' is no topic of ROS"),
+        (["ros", "--router", "nowhere"], "ros.router"),
+        (["ros", "--domain", "400"], "ros.domain"),
+        (["ros", "--rate", "0"], "--rate 0: needs a positive number"),
+        (["run", "--source", "ros:front/image", "--output", str(tmp_path)], "is no topic of ROS"),
+        (["run", "--source", "ros:/a", "--rate", "max", "--output", str(tmp_path)], 'rate "max" is for recordings'),
+    ):
+        assert main(arguments) == 2
+        assert said in capsys.readouterr().err
+    monkeypatch.setenv("ROS_DOMAIN_ID", "many")
+    with pytest.raises(ConfigurationError, match="ROS_DOMAIN_ID='many'"):
+        RosNode(RosConfig(), "birdslam")
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    monkeypatch.setenv("ZENOH_SESSION_CONFIG_URI", str(tmp_path / "none.json5"))
+    with pytest.raises(ConfigurationError, match=r"ZENOH_SESSION_CONFIG_URI=.*none\.json5"):
+        RosNode(RosConfig(), "birdslam")
+
+
+# --- through a router ---
+
+
+class Listener:
+    """What a process of the other implementation hears: (topic, message) as they come."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.heard: list[tuple[str, Any]] = []
+        self._thread = threading.Thread(target=self._read, args=(process.stdout,), daemon=True)
+        self._thread.start()
+
+    def _read(self, lines: Any) -> None:
+        for line in lines:
+            said = json.loads(line)
+            self.heard.append((said["topic"], said["message"]))
+
+    def of(self, topic: str) -> list[Any]:
+        return [message for name, message in tuple(self.heard) if name == topic]
+
+
+class Vehicle:
+    """A vehicle's bus with its node of ROS beside it; a step sends an estimate, and is it passed on."""
+
+    def __init__(self, join: Any, base: Path, port: int, **config: Any) -> None:
+        hub = join("supervisor", hub=True)
+        QueryServer(Configuration(camera=CAMERA), hub)
+        self._out, self._frame = hub.publisher("estimate"), 0
+        self.bridge = RosBridge("car", RosNode(RosConfig(router=f"tcp/127.0.0.1:{port}", **config), "birdslam"), base)
+        assert self._out.wait_matched(LIMIT_S)
+
+    def step(self) -> float:
+        """Where the ego was."""
+        told = estimate(self._frame, vehicles=2)
+        self._frame += 1
+        self._out.put(told)
+        self.bridge.step(LIMIT_S)
+        return told.T_world_ego.x_m
+
+    def until_heard(self, listener: Listener, topic: str, before: int = 0) -> None:
+        def heard() -> bool:
+            self.step()
+            return len(listener.of(topic)) > before
+
+        until(heard, f"{topic} is not heard")
+
+
+def topics(*names: str, namespace: str = "") -> list[str]:
+    return [f"{namespace * name.startswith('/birdslam')}{name}={TOPICS[name]}" for name in names]
+
+
+ODOMETRY = "/birdslam/odometry"
+
+
+def place(odometry: Any) -> float:
+    """How far ahead."""
+    return float(odometry["pose"]["pose"]["position"]["x"])
+
+
+@processes
+def test_a_listener_hears_each_message_and_again_after_the_router_was_gone(join: Any, base: Path) -> None:
+    port = free_port()
+    with ExitStack() as stack:
+        with pytest.raises(NoRouter, match=f"ros.router tcp/127.0.0.1:{port}: the router is not there"):
+            RosNode(RosConfig(router=f"tcp/127.0.0.1:{port}"), "birdslam", timeout_s=0.2)
+        with peer("router", str(port)):
+            vehicle = Vehicle(join, base, port, domain=4)
+            stack.enter_context(vehicle.bridge)
+            wanted = topics(ODOMETRY, "/tf", "/tf_static", "/birdslam/vehicles", "/diagnostics")
+            listener = Listener(stack.enter_context(peer("hear", str(port), "4", *wanted)))
+            vehicle.until_heard(listener, ODOMETRY)
+            sent = [vehicle.step() for _ in range(30)]
+            until(lambda: place(listener.of(ODOMETRY)[-1]) == pytest.approx(sent[-1]), "messages are lost")
+            until(lambda: listener.of("/tf_static"), "who comes late has no /tf_static")
+            at = list(map(place, listener.of(ODOMETRY)))
+            assert at[-30:] == pytest.approx(sent)
+            assert at == sorted(at)
+            until(lambda: len(listener.of("/birdslam/vehicles")) > 30, "boxes are lost")
+            until(lambda: len(listener.of("/diagnostics")) > 30 and listener.of("/tf"), "the rest is lost")
+            (_, box) = listener.of("/birdslam/vehicles")[-1]["detections"]
+            assert (box["bbox"]["size"]["x"], box["id"]) == (4.2, "1")
+            assert listener.of("/tf")[-1]["transforms"][0]["child_frame_id"] == "base_link"
+            assert listener.of("/diagnostics")[-1]["status"][0]["message"] == "ok"
+            with zenoh.open(client(port)) as other:
+                said = [str(reply.ok.key_expr) for reply in other.liveliness().get("@ros2_lv/4/**") if reply.ok]
+            found = {one.topic for token in said if (one := publication_of(token)) is not None}
+            assert found == set(TOPICS)
+        until(lambda: not vehicle.bridge.connected, "the router's end is not noticed")
+        vehicle.step()  # goes nowhere, and waits for nothing
+        with peer("router", str(port)):
+            vehicle.until_heard(listener, ODOMETRY, before=len(listener.of(ODOMETRY)))
+
+
+@processes
+def test_in_a_namespace_topics_and_frames_are_the_vehicles_own(join: Any, base: Path) -> None:
+    port = free_port()
+    with ExitStack() as stack:
+        stack.enter_context(peer("router", str(port)))
+        vehicle = Vehicle(join, base, port, domain=0, namespace="red")
+        stack.enter_context(vehicle.bridge)
+        wanted = topics(ODOMETRY, "/tf", namespace="/red")
+        listener = Listener(stack.enter_context(peer("hear", str(port), "0", *wanted)))
+        vehicle.until_heard(listener, f"/red{ODOMETRY}")
+        until(lambda: listener.of("/tf"), "/tf is not heard")
+        message = listener.of(f"/red{ODOMETRY}")[-1]
+        assert (message["header"]["frame_id"], message["child_frame_id"]) == ("red/odom", "red/base_link")
+
+
+def client(port: int) -> zenoh.Config:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return config
+
+
+@contextmanager
+def car(port: int, uri: str, rate_hz: float, frames: int) -> Iterator[subprocess.Popen[str]]:
+    """A car that publishes a recording's images, ready to begin."""
+    command = [sys.executable, "-m", "tests.ros_peer", str(port), "0", uri, str(rate_hz), str(frames)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().strip() == "ready"
+            yield process
+        finally:
+            process.kill()
+
+
+def configuration(port: int, output: Path, **source: Any) -> Configuration:
+    topics = BagTopics(speed="/wheels")
+    return Configuration(
+        source=SourceConfig(uri="ros:/front/image", topics=topics, camera_timeout_s=LIMIT_S, **source),
+        ros=RosConfig(router=f"tcp/127.0.0.1:{port}", domain=0),
+        output=str(output),
+        results=ResultsConfig(gnss="topic:/fix"),
+    )
+
+
+@processes
+def test_images_of_a_topic_are_a_source_with_their_camera_speed_and_fixes(tmp_path: Path) -> None:
+    port, recording = free_port(), open_recording("demo")
+    with peer("router", str(port)), car(port, "demo", 20.0, 10_000):
+        source = open_source(configuration(port, tmp_path, frames=40))
+        frames = list(source.frames())
+    assert source.live
+    given, own = source.camera, recording.camera
+    assert (given.width_px, given.fx_px) == (own.width_px, own.fx_px)
+    assert given.ground.height_m == pytest.approx(own.ground.height_m)
+    assert given.ground.pitch_rad == pytest.approx(own.ground.pitch_rad, abs=1e-9)
+    images = [frame for frame in frames if frame.image is not None]
+    assert len(images) >= 30
+    first = next(k for k, one in enumerate(recording.frames()) if np.array_equal(one.image, images[0].image))
+    true = list(islice(recording.frames(), first, first + len(frames) + 40))
+    place = 0
+    for frame in images:  # in their order, each as it was sent, whatever was dropped between
+        place = next(k for k in range(place, len(true)) if np.array_equal(true[k].image, frame.image)) + 1
+    times = [frame.t_source_ns for frame in frames]
+    assert times == sorted(set(times))
+    assert {reading.speed_mps for reading in images[-1].speeds} == {5.0}
+    assert all(reading.t_ns <= time.monotonic_ns() for reading in images[-1].speeds)
+    fixes = read_fixes((tmp_path / GNSS_FILE).read_bytes(), "fixes", 0)
+    assert [fix.sigma_m for fix in fixes] == [FIX_SIGMA_M] * len(fixes)
+    assert 49.0 < fixes[-1].latitude_deg < 49.1
+    assert times[0] - 10**10 < fixes[0].t_source_ns < times[-1]
+
+
+def test_a_live_drive_comes_to_earth_by_the_fixes_that_came(tmp_path: Path) -> None:
+    live = msgspec.structs.replace(configuration(1, tmp_path), camera=CAMERA)
+    drive = DriveMap.of(live)
+    assert drive is not None
+    for k in range(60):
+        told = estimate(k, vehicles=0)
+        drive.add(msgspec.structs.replace(told, t_source_ns=k * 10**8, T_world_ego=SE2(float(k), 0.0, 0.0)))
+    with pytest.raises(GnssError, match=r"gnss\.csv: no fix came"):
+        drive.finish(CAMERA, iter(()), tmp_path)
+    east = 1.0 / 73_055.0  # degrees of longitude in a metre, at 49 degrees
+    rows = [f"{0.1 * k:.9f},49.0,{8.4 + east * k:.9f},1.000" for k in range(60)]
+    (tmp_path / GNSS_FILE).write_text("\n".join((GNSS_HEAD, *rows)) + "\n")
+    earth = drive.finish(CAMERA, iter(()), tmp_path)["earth"]
+    assert earth["fixes"] > 10
+    assert earth["outliers"] == 0
+    assert earth["x_axis_from_east_rad"] == pytest.approx(0.0, abs=0.01)
+    assert (tmp_path / "ego.gpx").is_file()
+
+
+@processes
+def test_a_source_without_images_says_why(tmp_path: Path) -> None:
+    port = free_port()
+    asked = configuration(port, tmp_path)
+    short = msgspec.structs.replace(asked, source=msgspec.structs.replace(asked.source, camera_timeout_s=0.5))
+    with pytest.raises(SourceError, match="the router is not there"):
+        open_source(short)
+    with peer("router", str(port)):
+        with pytest.raises(SourceError, match="nobody publishes /front/image in domain 0"):
+            open_source(short)
+        with car(port, "demo", 20.0, 10_000):
+            other = msgspec.structs.replace(asked.source, uri="ros:/front/camera_info")
+            with pytest.raises(SourceError, match="/front/camera_info is sensor_msgs/CameraInfo; expected"):
+                open_source(msgspec.structs.replace(asked, source=other))
+            given = msgspec.structs.replace(asked, camera=CAMERA)
+            with pytest.raises(SourceError, match="the camera is for 64x32"):
+                open_source(given)
+
+
+@processes
+def test_while_the_router_is_gone_frames_say_so_and_then_images_come_again(tmp_path: Path) -> None:
+    port = free_port()
+    with ExitStack() as stack:
+        router = stack.enter_context(ExitStack())
+        router.enter_context(peer("router", str(port)))
+        stack.enter_context(car(port, "demo", 20.0, 100_000))
+        source = open_source(configuration(port, tmp_path))
+        frames = source.frames()
+        stack.callback(source.close)
+        assert next(frames).image is not None
+        router.close()
+        said = next(frame.error for frame in frames if frame.image is None)
+        assert "no image for" in str(said)
+        until(lambda: "the router is not there" in str(next(frames).error), "it does not say that the router is gone")
+        stack.enter_context(peer("router", str(port)))
+        until(lambda: next(frames).image is not None, "no image comes again")
