@@ -1,10 +1,10 @@
-"""Rendered dashcams hold for ever: lens, rows read in turn, dusk, wipers, drops, each with its camera file unknown.
+"""Rendered dashcams hold for ever: lens, rows read in turn, wipers, drops, bonnet, each with its camera file unknown.
 
 The films in tests/dashcams are rendered by
 
-    python -m perf lens --render tests/dashcams
+    python -m perf lens narrow phone rain wide --render tests/dashcams
 
-(extra `train`, and PyAV): the shipped drive's street at 10 Hz, 6 s through its first bend, by each of
+(extra `train`, and PyAV): the shipped drive's street at 10 Hz, 6 s through its first bend, by four of
 `world.dashcam.DASHCAMS`, H.264.
 """
 
@@ -27,7 +27,7 @@ from birdslam.sources.opening import open_recording
 from birdslam.types import Status
 
 FILMS = Path(__file__).parent / "dashcams"
-NAMES = ("narrow", "rain")
+NAMES = ("narrow", "phone", "rain", "wide")
 NO_BOXES = np.zeros((0, 4))
 PRIOR_SIGMA = 0.15
 
@@ -86,7 +86,7 @@ def ways(name: str) -> tuple[float, float, float, list[bool]]:
     return (way_m / true_m if true_m else math.nan), sigma_rel, speed_mps, valid
 
 
-@pytest.mark.parametrize("name", ["rain"])
+@pytest.mark.parametrize("name", ["phone", "rain"])
 def test_a_known_lens_gives_a_way_within_its_sigma(name: str) -> None:
     ratio, sigma_rel, _, valid = ways(name)
     assert np.mean(valid) > 0.8
@@ -94,7 +94,7 @@ def test_a_known_lens_gives_a_way_within_its_sigma(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["narrow"])
+@pytest.mark.parametrize("name", ["narrow", "wide"])
 def test_the_others_ways_are_within_their_sigma(name: str) -> None:
     ratio, sigma_rel, _, valid = ways(name)
     assert not any(valid) or abs(math.log(ratio)) < 2.0 * sigma_rel
