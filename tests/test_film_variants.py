@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from birdslam.geometry.camera import Camera
+from birdslam.perf.robustness.film_figures import Course, course_of_run, over, summary
 from birdslam.perf.robustness.film_variants import PARTS, Timed, Variant, variants
 
 CAMERA = Camera(640, 360, 500.0, 500.0, 318.0, 181.0, height_m=1.4)
@@ -74,3 +75,29 @@ def test_what_is_in_the_way_is_seen(tmp_path: Path) -> None:
                 for (_, shown), (_, raw) in zip(variant.images(iter(film()), tmp_path), film(), strict=True)
             ]
             assert max(changed) > 10.0, variant.name
+
+
+def test_a_truth_whose_every_third_step_is_too_long_makes_no_rate_another_one() -> None:
+    """As KITTI's: the ways of a second are compared, not its frames."""
+    courses = []
+    for every in (1, 2):
+        course = Course()
+        for k in range(every, 61, every):
+            true = sum(1.2 if step % 3 == 0 else 0.9 for step in range(k - every, k))
+            course.add(0.1 * k, 0.1 * every, 10.0, 10.0 * true / every, valid=k > 5)
+        courses.append(summary(course))
+    ratio = over(courses[1], courses[0])
+    assert ratio is not None
+    assert abs(ratio - 1.0) < 0.015
+    assert abs(courses[0]["speed_over_truth"] - courses[1]["speed_over_truth"]) > 0.03  # of frames it would be
+    assert courses[0]["first_valid_s"] == pytest.approx(0.6)
+
+
+def test_a_run_is_read_from_what_it_left(tmp_path: Path) -> None:
+    rows = [f"{k},{0.1 * k:.3f},{'' if k == 0 else 5.0},{int(k > 2)}" for k in range(41)]
+    (tmp_path / "frames.csv").write_text("\n".join(["frame,t_s,speed_mps,valid", *rows]))
+    figures = summary(course_of_run(tmp_path / "frames.csv", lambda begin_s, end_s: 4.0))
+    assert figures["frames"] == 40
+    assert figures["valid_after_2_s"] == 1.0
+    assert figures["speed_over_truth"] == pytest.approx(1.25)
+    assert figures["by_second"][1] == pytest.approx(1.25)

@@ -98,6 +98,23 @@ def test_frames_that_were_coasted_over_and_measurements_that_came_too_late(tmp_p
     assert verdict.equal == len(tape.estimates)
 
 
+def test_a_frame_that_was_written_after_the_estimate_that_predicts_it(tmp_path: Path) -> None:
+    """As by a recorder that had to wait for a core."""
+    tape, frames = Tape(tmp_path), measured(20)
+    for measurements in frames[:10]:
+        tape.step(measurements)
+    late = FrameRef(**stamps(frames[10]))
+    tape.coast(late)
+    tape.writer.add("frame", late, tape.tick())
+    tape.take(tape.send(frames[10]))
+    for measurements in frames[11:]:
+        tape.step(measurements)
+    tape.end(frames[-1])
+    verdict = verdict_of(tape)
+    assert verdict.same, verdict.difference
+    assert (verdict.unknown, verdict.coasted, verdict.equal) == (0, 1, len(tape.estimates))
+
+
 @pytest.mark.parametrize("with_checkpoint", [True, False])
 def test_restarts_of_the_optimizer(tmp_path: Path, with_checkpoint: bool) -> None:
     tape, frames = Tape(tmp_path), measured(40)

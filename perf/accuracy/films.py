@@ -31,7 +31,17 @@ from birdslam.perf.accuracy.drives import is_valid, networks_of
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import add_data, add_networks, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
-from birdslam.perf.robustness.film_figures import Course, TrueSpeed, course_of_run, draw, over, page, row_text, summary
+from birdslam.perf.robustness.film_figures import (
+    BEGINNING_S,
+    Course,
+    TrueSpeed,
+    course_of_run,
+    draw,
+    over,
+    page,
+    row_text,
+    summary,
+)
 from birdslam.perf.robustness.film_variants import PARTS, Timed, Variant, variants
 from birdslam.runtime.calibration.drive import ROUGH, calibrate_drive
 from birdslam.runtime.calibration.given import Given
@@ -124,7 +134,10 @@ def measure_all(options: argparse.Namespace) -> list[dict[str, Any]]:
                     seen = looks(recording, span_s, configuration)
                     unchanged: dict[str, Any] | None = None
                     for variant in variants(recording.camera, part):
-                        figures = summary(drive(recording, variant, span_s, true_mps, seen))
+                        course = drive(recording, variant, span_s, true_mps, seen)
+                        if not course.t_s or course.t_s[-1] <= BEGINNING_S:
+                            continue  # the film is over before its speed counts
+                        figures = summary(course)
                         unchanged = unchanged or figures
                         figures["way_over_unchanged"] = over(figures, unchanged)
                         begun = "" if begin_s == 0.0 else f", from {begin_s:g} s"
@@ -180,7 +193,8 @@ def drive(
                 continue
             begin_s, end_s = begin_ns / NS_PER_S, t_ns / NS_PER_S
             mps = float(np.linalg.norm(motion.t_prev_curr_m)) / (end_s - begin_s)
-            course.add(end_s - times_ns[0] / NS_PER_S, mps, true_mps(begin_s, end_s), is_valid(motion))
+            at_s = end_s - times_ns[0] / NS_PER_S
+            course.add(at_s, end_s - begin_s, mps, true_mps(begin_s, end_s), is_valid(motion))
     return course
 
 

@@ -26,16 +26,18 @@ _DRIVES_MPS = 1.0  # slower than that a ratio of speeds says little
 
 @dataclass
 class Course:
-    """What a variant came to: of each motion its end (s), its speed (m/s), the true one, and whether it is valid."""
+    """What a variant came to: each motion's end and duration (s), speed (m/s), the true one, whether it is valid."""
 
     t_s: list[float] = field(default_factory=list)
+    lasts_s: list[float] = field(default_factory=list)
     speed_mps: list[float] = field(default_factory=list)
     true_mps: list[float] = field(default_factory=list)
     valid: list[bool] = field(default_factory=list)
 
-    def add(self, t_s: float, speed_mps: float, true_mps: float, valid: bool) -> None:
+    def add(self, t_s: float, lasts_s: float, speed_mps: float, true_mps: float, valid: bool) -> None:
         """The next motion."""
         self.t_s.append(t_s)
+        self.lasts_s.append(lasts_s)
         self.speed_mps.append(speed_mps)
         self.true_mps.append(true_mps)
         self.valid.append(valid)
@@ -50,7 +52,7 @@ def course_of_run(path: Path, true_mps: TrueSpeed) -> Course:
         if row["speed_mps"]:
             t_s, end_s = float(before["t_s"]), float(row["t_s"])
             at_s = end_s - float(rows[0]["t_s"])
-            course.add(at_s, float(row["speed_mps"]), true_mps(t_s, end_s), row["valid"] == "1")
+            course.add(at_s, end_s - t_s, float(row["speed_mps"]), true_mps(t_s, end_s), row["valid"] == "1")
     return course
 
 
@@ -68,16 +70,23 @@ def summary(course: Course) -> dict[str, Any]:
         "first_valid_s": float(t_s[valid.argmax()]) if valid.any() else None,
         "speed_over_truth": median,
         "deviation": None if median is None else float(np.median(np.abs(ratio[counted] / median - 1.0))),
-        "by_second": _by_second(t_s, np.where(valid, ratio, np.nan)),
+        "by_second": _by_second(course),
     }
 
 
-def _by_second(t_s: Floats, ratio: Floats) -> list[float | None]:
+def _by_second(course: Course) -> list[float | None]:
+    """The way over the true one of the valid motions of each second.
+
+    Of ways and not of frames: KITTI's every third true step may be a tenth too long, so that a median over frames is
+    another one at another rate.
+    """
+    t_s, lasts_s, valid = np.array(course.t_s), np.array(course.lasts_s), np.array(course.valid, bool)
+    way_m, true_m = np.array(course.speed_mps) * lasts_s, np.array(course.true_mps) * lasts_s
     out: list[float | None] = []
     for second in range(int(t_s[-1]) + 1 if len(t_s) else 0):
-        here = ratio[(t_s >= second) & (t_s < second + 1)]
-        here = here[np.isfinite(here)]
-        out.append(round(float(np.median(here)), 3) if len(here) else None)
+        here = valid & (t_s >= second) & (t_s < second + 1)
+        true = float(true_m[here].sum())
+        out.append(round(float(way_m[here].sum()) / true, 3) if true > 0.1 else None)
     return out
 
 

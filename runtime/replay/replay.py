@@ -31,7 +31,7 @@ from birdslam.runtime.wire import Trace, WireError, decode, encode
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
 
 BackEnd = tuple[GraphConfig, WeightsConfig]
-PATIENCE = 64  # estimates that wait for measurements which were written after them
+PATIENCE = 64  # estimates that wait for measurements, or a frame, which were written after them
 KEPT_FRAMES = 256  # references of frames, for those that the optimizer coasted over
 COMPARED = (
     *("v1/frame", "v1/measurements", "v1/measurements/trace", "v1/estimate", "v1/estimate/trace"),
@@ -130,16 +130,17 @@ class Comparison:
             self.verdict.open_end += 1
 
     def _answer(self, patience: int) -> None:
-        """Replays the estimates whose measurements are there; more than `patience` of them do not wait for theirs."""
+        """Replays the estimates whose measurements or frame are there; more than `patience` do not wait for theirs."""
         while self._estimates and self.verdict.difference is None:
             message = self._estimates[0]
             cause = message.trace.stages[:-1]
             by_measurements = bool(cause) and cause[-1].node == "perceive"
             place = next((i for i, m in enumerate(self._measurements) if m.trace.stages == cause), None)
-            if by_measurements and place is None and len(self._estimates) <= patience:
+            estimate = _record(message.data, Estimate)
+            missing = place is None if by_measurements else estimate.frame_id not in self._frames
+            if missing and len(self._estimates) <= patience:
                 return
             self._estimates.popleft()
-            estimate = _record(message.data, Estimate)
             self.verdict.epochs += estimate.epoch != self._epoch
             self._epoch = estimate.epoch
             number = message.trace.number
