@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import Transform, ego_pose, mount_pose
-from birdslam.types import NS_PER_S, Attitude, EgoEdge, Estimate, Lanes, LineColour, LineKind, MapUpdate, RoadUser
+from birdslam.types import NS_PER_S, EgoEdge, Estimate, Lanes, LineColour, LineKind, MapUpdate, RoadUser
 
 Floats = NDArray[np.float64]
 Sent = tuple[str, Any]  # topic, message
@@ -102,7 +102,7 @@ class RosMessages:
         yield "/tf", self._make("tf2_msgs/msg/TFMessage", transforms=[self._transform(ODOM, BASE, pose, t_ns)])
         cov = _rotated(np.reshape(estimate.cov, (3, 3)), T_odom_ego.yaw_rad)
         twist, twist_cov = _twist(estimate, before, T_odom_ego, motion)
-        yield "/birdslam/odometry", self._odometry(BASE, pose, cov, twist, twist_cov, t_ns)
+        yield "/birdslam/odometry", self._odometry(BASE, self._pose(pose), cov, twist, twist_cov, t_ns)
         yield "/birdslam/vehicles", self._detections(estimate, estimate.vehicles, t_ns)
         for vehicle in estimate.vehicles:
             yield "/birdslam/vehicles/odometry", self._vehicle(vehicle, estimate.attitude.z_m, t_ns)
@@ -163,7 +163,7 @@ class RosMessages:
 
     def _vehicle(self, vehicle: RoadUser, z_m: float, t_ns: int, kind: str = "vehicle") -> Any:
         T_odom_vehicle = self._T_odom_world @ vehicle.T_world_vehicle
-        pose = ego_pose(T_odom_vehicle, Attitude(z_m=z_m))
+        pose = self._level(T_odom_vehicle, z_m)
         cov = _rotated(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
         c, s = math.cos(vehicle.T_world_vehicle.yaw_rad), math.sin(vehicle.T_world_vehicle.yaw_rad)
         R_vehicle_world = np.array([[c, s], [-s, c]])
@@ -178,8 +178,8 @@ class RosMessages:
             height_m = vehicle.height_m or VEHICLE_HEIGHT_M
             T_odom_vehicle = self._T_odom_world @ vehicle.T_world_vehicle
             z_m = estimate.attitude.z_m
-            foot = self._pose(ego_pose(T_odom_vehicle, Attitude(z_m=z_m)))
-            middle = self._pose(ego_pose(T_odom_vehicle, Attitude(z_m=z_m + height_m / 2.0)))
+            foot = self._level(T_odom_vehicle, z_m)
+            middle = self._level(T_odom_vehicle, z_m + height_m / 2.0)
             cov = _rotated(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
             hypothesis = self._make(
                 "vision_msgs/msg/ObjectHypothesisWithPose",
@@ -245,7 +245,7 @@ class RosMessages:
         return self._make("geometry_msgs/msg/Pose", position=point, orientation=turn)
 
     def _odometry(
-        self, child: str, pose: Transform, cov: Floats, twist: tuple[float, ...], twist_cov: Floats, t_ns: int
+        self, child: str, pose: Any, cov: Floats, twist: tuple[float, ...], twist_cov: Floats, t_ns: int
     ) -> Any:
         vx, vy, yaw_rate = twist
         moving = self._make(
@@ -255,7 +255,7 @@ class RosMessages:
             ODOMETRY,
             header=self._header(ODOM, t_ns),
             child_frame_id=self._frames + child,
-            pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(pose), covariance=_six(cov)),
+            pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=_six(cov)),
             twist=self._make("geometry_msgs/msg/TwistWithCovariance", twist=moving, covariance=_six(twist_cov)),
         )
 
@@ -284,6 +284,16 @@ class RosMessages:
             "geometry_msgs/msg/Pose",
             position=self._make("geometry_msgs/msg/Point", x=at_x, y=at_y, z=at_z),
             orientation=self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        )
+
+    def _level(self, T: SE2, z_m: float) -> Any:
+        """Of a body on the road, without pitch and roll."""
+        return self._make(
+            "geometry_msgs/msg/Pose",
+            position=self._make("geometry_msgs/msg/Point", x=T.x_m, y=T.y_m, z=z_m),
+            orientation=self._make(
+                "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(T.yaw_rad / 2.0), w=math.cos(T.yaw_rad / 2.0)
+            ),
         )
 
     def _vector(self, x: float, y: float, z: float) -> Any:
