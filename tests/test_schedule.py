@@ -84,10 +84,11 @@ class Head:
         self.schedule = Schedule(**said)
         self.go, self.done = threading.Event(), threading.Event()
         self.frames: list[int] = []
+        self.fell_back = ""
 
     def run(self, image: np.ndarray) -> Findings:
         self.frames.append(int(image[0, 0]))
-        self.go.wait()
+        self.go.wait(60.0)
         self.done.set()
         if self.role == "detector":
             return Findings(detections=Detections(np.zeros((0, 4)), np.zeros(0), ()))
