@@ -76,6 +76,8 @@ def test_without_bodies_the_detections_stay(others: Detections | None) -> None:
 
 
 class Head:
+    fell_back = ""  # its provider is the CPU
+
     def __init__(self, role: Any, found: Detections, every: int = 1) -> None:
         self.name, self.role, self.schedule = role, role, Schedule(every=every)
         self.found, self.ran = found, 0

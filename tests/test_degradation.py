@@ -76,6 +76,8 @@ def test_one_step_at_a_time_and_never_sooner_than_a_window(ages_ms: list[float])
 class Head:
     """A network that counts its runs."""
 
+    fell_back = ""  # its provider is the CPU
+
     def __init__(self, role: str) -> None:
         self.name = self.role = role
         self.schedule = Schedule()

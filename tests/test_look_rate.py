@@ -117,6 +117,7 @@ def test_every_network_is_measured_on_an_image_of_the_camera() -> None:
 
 
 class Head:
+    fell_back = ""  # its provider is the CPU
     name = role = "detector"
     schedule = Schedule(every=2)
 

@@ -389,6 +389,8 @@ def test_every_augmentation_gives_an_image() -> None:
 class Head:
     """A network that answers at once."""
 
+    fell_back = ""  # its provider is the CPU
+
     def __init__(self, role: Any, findings: Findings, every: int = 1) -> None:
         self.name, self.role, self.findings = role, role, findings
         self.schedule = Schedule(every=every)

@@ -370,6 +370,7 @@ class FakeHead:
     name: str = "detector"
     role: Any = "detector"
     schedule: Schedule = field(default_factory=Schedule)
+    fell_back: str = ""
 
     def run(self, image: NDArray[np.uint8]) -> Findings | None:
         raise AssertionError("the fake executor answers for it")
