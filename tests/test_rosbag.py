@@ -20,7 +20,7 @@ from birdslam.geometry.camera import AXES_EGO_CAM, Camera, GroundPlane, Undistor
 from birdslam.geometry.se2 import SE2
 from birdslam.ros.bag import BagTopics
 from birdslam.ros.sensor import lens, pixels
-from birdslam.runtime.calibration import given
+from birdslam.runtime.calibration.given import Given, lens_of
 from birdslam.runtime.configuration import load
 from birdslam.runtime.nodes.sources import open_source
 from birdslam.sources.opening import open_recording
@@ -326,14 +326,14 @@ def test_frames_without_truth_are_named_and_left_out(tmp_path: Path) -> None:
 
 
 def test_calibrate_takes_the_lens_of_the_bag_and_the_height_where_it_is_known(tmp_path: Path) -> None:
-    none = given.Given()
-    found, height_m = given.lens_of(none, bag(tmp_path / "drive"), BagTopics())
+    none = Given()
+    found, height_m = lens_of(none, bag(tmp_path / "drive"), BagTopics())
     assert found is not None
     assert (found.fx_px, found.width_px, found.source, height_m) == (50.0, WIDTH, CAMERA_INFO, pytest.approx(1.4))
     without = ros.write_bag(tmp_path / "without", [message for message in drive() if message[0] != "/tf_static"])
-    assert given.lens_of(none, f"rosbag:{without}", BagTopics())[1] is None
-    stated = given.Given(height_m=1.2)
-    assert given.lens_of(stated, f"rosbag:{without}", BagTopics())[1] == 1.2
+    assert lens_of(none, f"rosbag:{without}", BagTopics())[1] is None
+    stated = Given(height_m=1.2)
+    assert lens_of(stated, f"rosbag:{without}", BagTopics())[1] == 1.2
 
 
 def test_the_truth_of_a_satellites_fixes(tmp_path: Path) -> None:
