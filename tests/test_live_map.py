@@ -162,7 +162,7 @@ def test_nobody_notices_that_the_map_process_dies_or_stalls(
     assert f"map {cause}" in out
     summary = run.summary()
     assert set(summary["restarts"].values()) == {0}
-    assert summary["map"]["restarts"] == 1
+    assert summary["map"]["restarts"] == 1, out + err
     assert len(read_map(path)) >= 4
 
 
