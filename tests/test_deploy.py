@@ -143,8 +143,6 @@ LOOP = """
 [source]
 uri = "kitti:/srv/drive"
 loop = true
-[runtime]
-stop_timeout_s = 8.0
 [recording]
 file = "/var/lib/birdslam/recordings"
 [fleet]
