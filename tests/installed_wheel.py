@@ -18,7 +18,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES = 30
 LIMIT_S = 600.0
-NOT_PACKED = {".pyc", ".nbi", ".nbc"}  # and what numba keeps beside them
+NOT_PACKED = {".md", ".png", ".pyc", ".nbi", ".nbc"}  # pages and pictures of perf/, caches
 
 
 def call(*command: str | Path, cwd: Path, env: dict[str, str] | None = None) -> str:
