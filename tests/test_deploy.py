@@ -88,7 +88,7 @@ def wheel(folder: Path) -> Path:
         for folder_of in ("birdslam", "runtime", "deploy", "configs"):
             name = "birdslam" if folder_of == "birdslam" else f"birdslam/{folder_of}"
             for file in sorted((ROOT / folder_of).rglob("*")):
-                if file.suffix in {".py", ".toml", ".onnx"} or file.parent == DEPLOY:
+                if file.suffix in {".py", ".toml", ".onnx", ".css", ".js"} or file.parent == DEPLOY:
                     archive.write(file, Path(name) / file.relative_to(ROOT / folder_of))
         archive.writestr("packages.pth", "/srv/packages\n")
         archive.writestr(f"{info}/METADATA", "Metadata-Version: 2.1\nName: birdslam\nVersion: 0.1.0\n")
