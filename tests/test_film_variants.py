@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from birdslam.geometry.camera import Camera
-from birdslam.perf.robustness.film_figures import Course, course_of_run, over, summary
+from birdslam.perf.robustness.film_figures import Course, course_of_run, over, row_text, summary
 from birdslam.perf.robustness.film_variants import PARTS, Timed, Variant, variants
 
 CAMERA = Camera(640, 360, 500.0, 500.0, 318.0, 181.0, height_m=1.4)
@@ -101,3 +101,4 @@ def test_a_run_is_read_from_what_it_left(tmp_path: Path) -> None:
     assert figures["valid_after_2_s"] == 1.0
     assert figures["speed_over_truth"] == pytest.approx(1.25)
     assert figures["by_second"][1] == pytest.approx(1.25)
+    assert "over the unchanged -" in row_text(figures)  # it is the only film

@@ -101,7 +101,7 @@ def row_text(figures: dict[str, Any]) -> str:
     return (
         f"valid {figures['valid_after_2_s']:.0%} from {_text(figures['first_valid_s'], '.2f')} s on  speed over truth "
         f"{_text(figures['speed_over_truth'], '.3f')} +- {_text(figures['deviation'], '.1%')}  over the unchanged "
-        f"{_text(figures['way_over_unchanged'], '.3f')}  by seconds "
+        f"{_text(figures.get('way_over_unchanged'), '.3f')}  by seconds "
         + " ".join(_text(ratio, ".2f") for ratio in figures["by_second"])
     )
 
