@@ -8,11 +8,11 @@ import gtsam
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from birdslam.bench.baselines.batch_se2 import Solution, ego_key, solve, vehicle_key
 from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
@@ -22,8 +22,6 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import RoadFilter, RoadScaleConfig
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
-
-Floats = NDArray[np.float64]
 
 ALL_EDGES = WeightsConfig(leave_out=())
 EQ_6 = GraphConfig(

@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.corners.keyframes import KeyframeConfig, KeyframeWindow
 from birdslam.odometry.corners.resection import resect
 from birdslam.odometry.corners.sliding_window import match_ids
 from birdslam.odometry.median import quantile
 from birdslam.odometry.road.kalman_filter import RoadScaleConfig
-
-Floats = NDArray[np.float64]
 
 FOCAL_PX, HALF_XY = 370.0, (0.86, 0.26)  # of the shipped drive's camera; half the image in normalised coordinates
 STEP_M = 0.45

@@ -14,7 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from birdslam.geometry.arrays import Floats
+
 Complexes = NDArray[np.complex128]
 Rows = NDArray[np.int64]
 Triple = tuple[float, float, float]

@@ -12,10 +12,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.approach import approaches
-from birdslam.graph.costs import Floats, Triple
+from birdslam.graph.costs import Triple
 from birdslam.graph.standing import judge, reported_velocity
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import Window

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis, moved, slope_basis
 from birdslam.lanes.paint import LinePoints
 from birdslam.lanes.road_view import tilted
 
-Floats = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
 # Prior of a road's shape in an image without a past: heading, curvature, its rate, beside what the search has found

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis, moved
@@ -22,8 +23,6 @@ from birdslam.lanes.parallel_search import Peak, find_lines, find_shape
 from birdslam.lanes.road_view import RoadView, road_view
 from birdslam.perception import Segmentation
 from birdslam.types import LaneLine, LineColour, LineKind
-
-Floats = NDArray[np.float64]
 
 PAINT, LEFT_EDGE, RIGHT_EDGE = 0, 1, 2  # classes of lines: each is seen by points of its own
 MOVED_M = 0.8  # travelled between two updates: an image from the same place has the same errors

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import Segmentation
 from birdslam.types import Lane, LaneLine
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 FROM_M, STEP_M = 1.0, 0.5  # of the points of an outline
 _FAR_PX = 20_000.0  # OpenCV draws no farther

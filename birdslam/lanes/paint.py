@@ -13,10 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.lanes.road_view import LATTICE_M, RoadView, tilted
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 SIDE_M = 0.28  # from a line's middle to the asphalt beside it; lines are up to 0.3 m wide
 APART_M = 0.3  # between two ridges

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.keyframe import Floats, Link, Placed
+from birdslam.loops.keyframe import Link, Placed
 
 DCS_PHI = 5.0  # chi-square at which a loop begins to count less
 ORIGIN_SIGMA = 1e-3, 1e-3, 1e-4  # the map's frame is that of its first keyframe

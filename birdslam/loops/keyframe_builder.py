@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import Features
-from birdslam.loops.keyframe import Floats
 from birdslam.loops.triangulation import Points, View, triangulate
 from birdslam.trajectory import ego_pose, mount_pose
 from birdslam.types import Attitude

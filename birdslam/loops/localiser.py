@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import LOOP_YAW_RAD, ODOMETRY_SCALE_REL, drift_after, is_exact, moved
 from birdslam.loops.features import Features
-from birdslam.loops.keyframe import Floats
 from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import PlaceMap
 from birdslam.loops.verification import Fix, locate

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.loops.features import DESCRIPTOR_BYTES, hamming
-from birdslam.loops.keyframe import Floats
 
 MOST_WORDS, LEAST_WORDS = 1024, 16
 DESCRIPTORS_PER_WORD = 8

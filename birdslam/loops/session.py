@@ -11,12 +11,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops, held
 from birdslam.loops.drift import moved
 from birdslam.loops.features import FeatureExtractor
-from birdslam.loops.keyframe import Floats, Keyframe, Link
+from birdslam.loops.keyframe import Keyframe, Link
 from birdslam.loops.keyframe_builder import LOOK_M, LOOK_NS, KeyframeBuilder, Look, NewKeyframe
 from birdslam.loops.localiser import Localisation, Localiser, shared
 from birdslam.loops.map_pose import MapPose, MapState

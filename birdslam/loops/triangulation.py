@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.loops.features import Features, hamming, match
 from birdslam.trajectory import Transform, inverse
-
-Floats = NDArray[np.float64]
 
 MATCH_BITS = 60  # neighbouring frames look alike
 MATCH_RATIO = 0.85

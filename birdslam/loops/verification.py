@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import Features, hamming, match
@@ -22,8 +23,6 @@ from birdslam.loops.keyframe import Keyframe
 from birdslam.loops.triangulation import cross, rotation
 from birdslam.trajectory import Transform, ego_pose, inverse, mount_pose, split_pose
 from birdslam.types import Attitude
-
-Floats = NDArray[np.float64]
 
 MATCH_BITS, MATCH_RATIO = 72, 0.85  # where nothing is known of the pose
 GUIDED_BITS, GUIDED_RATIO = 80, 0.9  # where the pose says where to look

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.types import LandmarkEdge, LandmarkKind
 
-Floats = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
 _CELLS = 1 << 20  # stations of one lane along one axis, before their ids repeat: 4000 km

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 
-Floats = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
 NO_LANE = -1  # of a point that lies on no known lane

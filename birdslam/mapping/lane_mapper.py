@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.ego_lane import EgoLane
@@ -28,7 +29,6 @@ from birdslam.mapping.lanes import AmodalLanes, Completion, LanesConfig, LaneVie
 from birdslam.perception import Segmentation
 from birdslam.types import LandmarkEdge, LanePoint, Lanes, Status
 
-Floats = NDArray[np.float64]
 Ids = NDArray[np.int64]
 Submit = Callable[..., Future[Any]]  # (function, *arguments), as of an executor
 

@@ -20,15 +20,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.lane_ids import LaneCloud, LaneIds
 from birdslam.perception import Segmentation
 
-Floats = NDArray[np.float64]
 Points = NDArray[np.float32]  # (N, 1, 2), as OpenCV takes them: x and y
 Grids = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 ROAD, BOUNDARY = 0, 1  # the channels of a pair of grids
 

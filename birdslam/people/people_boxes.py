@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import Detections
 from birdslam.perception.decoding.detection import EdgeSigma
 from birdslam.vehicles.placement.localisation import iou
-
-Floats = NDArray[np.float64]
 
 PEDESTRIAN, CYCLIST = "pedestrian", "cyclist"  # labels of records
 PERSON, BICYCLE, MOTORCYCLE = "person", "bicycle", "motorcycle"  # labels of detectors, which may say "cyclist" too

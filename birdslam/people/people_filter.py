@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.people.box_model import MIN_SLOPE, TALL, UNUSED, WIDTH, expected_boxes, hide_feet, measured_boxes
 from birdslam.people.people_boxes import PersonBox
@@ -33,7 +34,6 @@ from birdslam.people.people_state import (
     VELOCITY,
     VX,
     VY,
-    Floats,
     Moments,
     X,
     Y,

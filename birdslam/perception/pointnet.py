@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.manifest import ManifestMismatch, ModelError, Schedule
@@ -27,8 +28,6 @@ from birdslam.perception.network import (
     refuse_weights_elsewhere,
 )
 from birdslam.perception.pointnet_manifest import Bins, Body, PointNetManifest, Points
-
-Floats = NDArray[np.float64]
 
 CORE = 0.5  # of a box's width and height, about its middle: where its vehicle is
 REACH_M = 8.0  # from the depth of the core: points farther off are of another body or the background

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
-Floats32 = NDArray[np.float32]
+from birdslam.geometry.arrays import Floats32, Image
 
 BLOCK_PX, DCT_PX = 16, 8
 DEADZONE = 1.0 / 6.0  # what is added before a level is rounded down, as H.264's reference encoder does in P images

@@ -20,16 +20,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Image
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_exp, rotation_log
 from birdslam.types import NS_PER_S
 from birdslam.world.rendering.photometrics import develop, metered
 from birdslam.world.rendering.renderer import Renderer
 from birdslam.world.scenario import Moment, Scenario, moments
-from birdslam.world.truth import Floats
 from birdslam.world.windscreen import Edit, bonnet, caption, from_share, wiper
 
-Image = NDArray[np.uint8]
 _WIDEST_VIEW_RAD = math.radians(80.0)  # of one rendered view, across: a wider lens is put together of several
 _MARGIN_RAD = math.radians(4.0)  # of a view beyond its sector: rows see farther while the car turns
 _SKY_M = 1e4

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-
-Floats = NDArray[np.float64]
 
 # Of each pixel. `lane` is painted lane and road boundaries; other paint (zebras, arrows, stop lines) is `road`;
 # `pavement` is what is paved beside the road, kerbs too; grass is `vegetation`; cyclists with their cycles are `person`

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
+from birdslam.geometry.arrays import Image
+
 Edit = Callable[[int, int, Image], Image]  # an image's index, how many there are, the image -> what is seen of it
 
 KINDS = ("nothing", "drops", "rain", "drops_defocused", "dirt", "reflection")

@@ -19,13 +19,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.signal import savgol_filter
 
 from birdslam.bench.ego.consistency import Consistency
 from birdslam.bench.ego.trajectory_errors import ate_m, from_first, path_length_m
 from birdslam.frontend import FrontEnd, FrontEndConfig
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
@@ -45,7 +45,6 @@ from birdslam.sources.shipped_drive import DemoRecording
 from birdslam.trajectory import as_poses, ego_pose, inverse, mount_pose
 from birdslam.types import NS_PER_S, Estimate, Frame, SpeedReading, Status
 
-Floats = NDArray[np.float64]
 Readings = list[SpeedReading]
 Coming = list[tuple[int, SpeedReading]]  # with the time of each one's coming, in its order
 Fault = Callable[[Readings, float], Coming]  # of the readings, and the middle of the drive in s

@@ -12,10 +12,10 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from birdslam.bench.ego.trajectory_errors import from_first
+from birdslam.geometry.arrays import Bools, Floats, Image
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
@@ -29,9 +29,6 @@ from birdslam.status import INVALIDATING
 from birdslam.trajectory import as_poses, inverse
 from birdslam.types import Frame, Status
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Image = NDArray[np.uint8]
 Edit = Callable[[int, int, Image], Image]
 
 SEQUENCES = (

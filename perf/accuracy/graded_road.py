@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
-
-Floats = NDArray[np.float64]
 
 TEXEL_M, SIDE, LEVELS = 0.02, 1024, 6
 LOOK_M, SAMPLES = 160.0, 4000

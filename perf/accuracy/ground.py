@@ -20,11 +20,11 @@ import cv2
 import matplotlib
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.ego.trajectory_errors import path_length_m
 from birdslam.frontend import FrontEnd, FrontEndConfig, Pending
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats, Image
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import rotation_exp
 from birdslam.odometry.road.kalman_filter import RoadScaleConfig
@@ -42,9 +42,6 @@ from birdslam.types import Frame, Measurements
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 label = "the ground on a grade, after a pitch step, with a wrong height: plotted"
 

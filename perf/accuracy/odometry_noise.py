@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from birdslam.bench.ego.trajectory_errors import from_first
 from birdslam.bench.simulation.odometry import OdometryNoise, fit_drift
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.perf.reporting.arguments import add_data
@@ -25,7 +26,6 @@ from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import Recording
 from birdslam.trajectory import Transform, as_poses, inverse
 
-Floats = NDArray[np.float64]
 CLIPS = {"kitti_odometry/sequences/00": 13, "kitti_odometry/sequences/06": 11, "kitti_raw_clip": 1}  # frames left out
 LEAST_STEP_M = 0.05  # a shorter step has no direction to speak of
 ROAD_AHEAD_M = 12.0  # the tilt that counts is that against the road so far ahead

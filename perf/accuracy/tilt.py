@@ -19,11 +19,11 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.simulation.odometry import fit_drift
 from birdslam.bench.tracking.labelled_road import LEAST_VEHICLES, labelled_grounds
 from birdslam.frontend import FrontEnd, FrontEndConfig
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
@@ -38,8 +38,6 @@ from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.trajectory import inverse
 from birdslam.types import Frame
-
-Floats = NDArray[np.float64]
 
 label = "pitch and roll of the road ahead on real drives, in mrad: as filed, by images, as placed"
 

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.path import Path as Outline
-from numpy.typing import NDArray
 
 from birdslam.bench.tracking.by_class.class_tracks import HALF_AT_M
 from birdslam.bench.tracking.localisation import INSIDE_1_SIGMA, INSIDE_2_SIGMA
 from birdslam.bench.tracking.metrics import BoxFrame, assign, hota_parts, identities
+from birdslam.geometry.arrays import Floats
 from birdslam.perception.external import external_detections
 from birdslam.perception.schedule import Networks
 from birdslam.perf.errors import PerfError
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 label = "rendered people: a child that steps out, a crowd, standing people before a driving ego"
 
-Floats = NDArray[np.float64]
 SECONDS = {"child": 3.6, "crowd": 5.0, "standing": 4.0}
 NEAR_M = 2.0  # of the true place
 SEEN_SHARE = 0.3  # of a body; who is hidden more is not asked for

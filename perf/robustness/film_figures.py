@@ -11,12 +11,10 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from numpy.typing import NDArray
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-Floats = NDArray[np.float64]
 TrueSpeed = Callable[[float, float], float]  # m/s between two times in s of the recording
 
 BEGINNING_S = 2.0  # of a film, after which it should be valid

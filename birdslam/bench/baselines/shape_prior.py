@@ -14,14 +14,12 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.baselines.trajectories import Method, Trajectories
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.types import Measurements, VehicleEdge
-
-Floats = NDArray[np.float64]
 
 # Keypoints as fractions of length, width and height about the middle of the footprint: the body's corners under and
 # over the bumpers, and the roof's

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.bench.ego import truth_quality
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
@@ -20,8 +21,6 @@ from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
 from birdslam.types import INVALIDATING, EgoEdge, Estimate, Measurements, Status
-
-Floats = NDArray[np.float64]
 
 DIMENSIONS = 3
 MEDIAN = 2.366  # of the chi-square of three degrees of freedom: what a consistent error's squared distance is as often

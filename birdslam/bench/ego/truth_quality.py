@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 # Changes of a step's rotation below it, so many in a row, are no car's: KITTI 00 and 06 have 0.000005 rad over their
 # first 13 and 11 images and 0.0001 to 0.005 after them, as all other sequences and the built-in world do throughout

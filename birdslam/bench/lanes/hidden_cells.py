@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Bools
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.lanes import (
@@ -33,7 +34,6 @@ from birdslam.mapping.lanes import (
 )
 from birdslam.perception import Segmentation
 
-Bools = NDArray[np.bool_]
 Grids = NDArray[np.float32]
 
 LATER_LOOKS = 75  # whose points are the truth: at 0.4 m from one to the next the ego has passed by then

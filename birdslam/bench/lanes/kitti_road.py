@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Bools
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.lanes.line_tracker import still_lines
 from birdslam.lanes.outline import lane_mask, line_px, visible
@@ -22,8 +23,6 @@ from birdslam.lanes.topology import LaneRow, lane_row
 from birdslam.perception import Segmentation
 from birdslam.sources.recording import DatasetError
 from birdslam.types import Bound, LaneLine
-
-Bools = NDArray[np.bool_]
 
 # KITTI's camera 2 of 2011_09_26, rectified
 FOCAL_PX, CENTRE_PX, HEIGHT_M = 721.5377, (609.5593, 172.854), 1.65

@@ -12,9 +12,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools
 from birdslam.sources.recording import DatasetError
-
-Bools = NDArray[np.bool_]
 
 MARKING, OWN_CAR = (0, 0, 255), (255, 0, 204)  # BGR
 REACH_PX = 5  # from a pixel of the one to one of the other

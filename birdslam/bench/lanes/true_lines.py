@@ -7,12 +7,9 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.sources.shipped_drive import TrueLine
 from birdslam.types import Bound, Lane, LaneLine, Lanes, LineKind
-
-Floats = NDArray[np.float64]
 
 RANGES_M = (5.0, 10.0, 20.0, 30.0)
 MATCH_AT_M, MATCH_M = 10.0, 1.0  # a found line is the true one that is nearest here, within so much

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.se2 import SE2
@@ -27,7 +28,6 @@ from birdslam.odometry.motion import Motion, planar
 from birdslam.trajectory import Transform, inverse
 from birdslam.types import LandmarkEdge, SpeedReading, Status
 
-Floats = NDArray[np.float64]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 
 

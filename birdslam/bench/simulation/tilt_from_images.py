@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.bench.simulation.odometry import OdometryNoise, SimulatedOdometry, Walk
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.odometry.motion import Motion
 from birdslam.types import SpeedReading
-
-Floats = NDArray[np.float64]
 
 
 class TiltFromImages:

@@ -11,18 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.ego.trajectory_errors import rms
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS
 from birdslam.sources.label_projection import Label
 from birdslam.sources.recording import DatasetError
 from birdslam.vehicles.placement.localisation import iou
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MATCH_IOU = 0.5
 HOTA_IOU = np.arange(0.05, 0.99, 0.05)

@@ -12,17 +12,15 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.ego.motion_consistency import STRETCH_M, MotionConsistency, Motions
 from birdslam.bench.tracking.benchmark import Live, Truth
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.trajectory import inverse
 from birdslam.types import Measurements
-
-Floats = NDArray[np.float64]
 
 PLACE = 2  # degrees of freedom
 SIMULATED = ("simulate", "truth")  # odometries that err from the true poses themselves

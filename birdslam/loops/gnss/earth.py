@@ -14,11 +14,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.loops.map_pose import EarthPose
 from birdslam.types import NS_PER_S
-
-Floats = NDArray[np.float64]
 
 LEAST_FIXES, LEAST_WAY_M = 3, 20.0
 GATE = 3.0  # standard deviations

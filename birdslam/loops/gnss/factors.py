@@ -17,10 +17,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import PlaceFactor, close_loops, inliers
 from birdslam.loops.gnss.earth import LEAST_FIXES, Earth, EarthError, GnssFix, fit
-from birdslam.loops.keyframe import Fixed, Floats, Link, Placed
+from birdslam.loops.keyframe import Fixed, Link, Placed
 from birdslam.types import NS_PER_S
 
 REACH_M = 6.0  # from a fix to its keyframe, along the way

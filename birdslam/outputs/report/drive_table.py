@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.drive_files import FRAME_COLUMNS, FRAMES_FILE, ResultsError
 
-Floats = NDArray[np.float64]
 PEOPLE = frozenset({"pedestrian", "person", "cyclist", "rider", "bicycle"})
 FILES = {  # what the page hands out, where it is there
     "ego.tum.txt": "the ego's way, TUM lines",

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.perception.decoding.detection import (
     MOST_CANDIDATES,
     Candidates,
@@ -17,9 +18,6 @@ from birdslam.perception.decoding.detection import (
 )
 from birdslam.perception.manifest import BoxList, Input, ManifestMismatch, Scoring, Ssd
 from birdslam.perception.views import View
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 LARGEST_LOG = 20.0  # of a size over its prior's, and of a logit: past it numbers have gone wild
 

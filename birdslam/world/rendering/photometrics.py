@@ -10,10 +10,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.world.rendering.light import SKY_SLOTS
 from birdslam.world.rendering.textures import GRAIN, noise_bank
-
-Floats32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

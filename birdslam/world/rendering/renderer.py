@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.geometry.camera import Camera
 from birdslam.world.rendering import ground
 from birdslam.world.rendering import materials as m
@@ -21,9 +22,6 @@ from birdslam.world.rendering.shapes import bodies, scenery, trucks
 from birdslam.world.rendering.shapes.solids import new_buffer
 from birdslam.world.rendering.textures import foliage_masks, noise_bank, pictures
 from birdslam.world.street.street import ASPHALT, CEMENT, COBBLES, Street
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 _CAPACITY = 150_000  # triangles of a frame
 _FINE_CELLS, _FINE_PER_M = 448, 16.0

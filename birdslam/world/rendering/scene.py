@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
+from birdslam.geometry.arrays import Floats, Floats32
 
 
 @dataclass(frozen=True)

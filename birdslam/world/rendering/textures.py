@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats32 = NDArray[np.float32]
+from birdslam.geometry.arrays import Floats32
 
 SIZE_PX = 256
 LEVELS = 7

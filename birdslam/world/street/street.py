@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.world.street.course import STEP_M, Course
-
-Floats = NDArray[np.float64]
 
 # Surfaces of a band of the cross-section
 (ASPHALT, CEMENT, SLABS, GRASS, SOIL, COBBLES, KERB, CYCLE, PARKING, RAILS) = range(10)

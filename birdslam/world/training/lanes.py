@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.lanes import AmodalLanes, LanesConfig, points_of
 from birdslam.perception import Segmentation
 from birdslam.world.truth import CLASSES, WorldFrame
-
-Floats = NDArray[np.float64]
 
 
 class LaneSamplesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -17,13 +17,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.perception.decoding.depth import DepthMap
 from birdslam.perception.pointnet import frustum_of
 from birdslam.perception.pointnet_manifest import Body, Points
 from birdslam.world.truth import WorldFrame, WorldObject
-
-Floats = NDArray[np.float64]
 
 POINTS = Points(name="points", count=512, features=("x", "y", "z", "u", "v", "log_depth"), scale=0.5)
 BODY = Body(output="body")

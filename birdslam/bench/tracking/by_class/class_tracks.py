@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.bench.tracking.metrics import LEAST_HEIGHT_PX, BoxFrame, assign, hota_parts, identities, mostly_inside
+from birdslam.geometry.arrays import Floats
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import DONT_CARE, Label
 from birdslam.types import IN_SIGHT_NS, Measurements
 from birdslam.vehicles.placement.localisation import iou
-
-Floats = NDArray[np.float64]
 
 KINDS = {"car": ("Car",), "pedestrian": ("Pedestrian",), "cyclist": ("Cyclist",)}  # of the labels
 NEUTRAL = {

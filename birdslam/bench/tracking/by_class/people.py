@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.tracking.by_class.class_tracks import (
     KINDS,
@@ -25,13 +24,12 @@ from birdslam.bench.tracking.by_class.class_tracks import (
 )
 from birdslam.bench.tracking.localisation import INSIDE_1_SIGMA, INSIDE_2_SIGMA
 from birdslam.bench.tracking.metrics import assign
+from birdslam.geometry.arrays import Floats
 from birdslam.perception import Detections
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import Label, hull_px
 from birdslam.types import FollowedPerson, Measurements, Moves
 from birdslam.vehicles.placement.localisation import iou
-
-Floats = NDArray[np.float64]
 
 PEOPLE = ("pedestrian", "cyclist")
 RANGES_M = ((5.0, 15.0), (15.0, 30.0), (30.0, 50.0))
