@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Image
 from birdslam.runtime.transport.closing import Closing
 from birdslam.types import FrameRef
 
@@ -28,6 +27,8 @@ _WORD_BYTES = 8
 _MAX_SIDE_PX = 16_384
 _MAX_SLOTS = 64
 _MIX = 0x9E3779B97F4A7C15  # odd, so that it spreads each number of a slot's head over the whole checksum
+
+Image = NDArray[np.uint8]
 
 
 class FrameError(ValueError):
