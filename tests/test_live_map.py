@@ -6,7 +6,8 @@ import os
 import resource
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -83,6 +84,16 @@ def live(place: Path, road: Path, *arguments: str) -> Run:
     )
 
 
+@contextmanager
+def mapping(place: Path, road: Path, kept: bytes) -> Iterator[tuple[Run, Planner, Path]]:
+    """The road again, with a copy of the map that was kept: the run, a planner beside it, the copy."""
+    path = place / "road.map"
+    path.write_bytes(kept)
+    with live(place, road, "--map", str(path)) as run, Planner(run.vehicle, run.runtime_dir) as planner:
+        in_map(planner, lambda here: here.pose is not None, "the map process is at work")
+        yield run, planner, path
+
+
 def in_map(planner: Planner, enough: Callable[[InMap], bool], what: str) -> InMap:
     """The newest estimate in the map, once it is as asked."""
     until(lambda: enough(planner.in_map()), what)
@@ -139,14 +150,7 @@ def test_a_planner_is_told_where_it_is_in_the_map(
 def test_nobody_notices_that_the_map_process_dies_or_stalls(
     fault: Callable[[Run], None], cause: str, tmp_path_factory: pytest.TempPathFactory, road: Path, kept: bytes
 ) -> None:
-    place = tmp_path_factory.mktemp("k")
-    path = place / "road.map"
-    path.write_bytes(kept)
-    with (
-        live(place, road, "--map", str(path)) as run,
-        Planner(run.vehicle, run.runtime_dir) as planner,
-    ):
-        in_map(planner, lambda here: here.pose is not None, "the map process is at work")
+    with mapping(tmp_path_factory.mktemp("k"), road, kept) as (run, planner, path):
         fault(run)
         hears(planner, 10)
         again = planner.in_map().pose
@@ -170,13 +174,7 @@ def test_a_full_disk_costs_the_map_nothing_that_it_had(
     tmp_path_factory: pytest.TempPathFactory, road: Path, kept: bytes
 ) -> None:
     place = tmp_path_factory.mktemp("f")
-    path = place / "road.map"
-    path.write_bytes(kept)
-    with (
-        live(place, road, "--map", str(path)) as run,
-        Planner(run.vehicle, run.runtime_dir) as planner,
-    ):
-        in_map(planner, lambda here: here.pose is not None, "the map process is at work")
+    with mapping(place, road, kept) as (run, planner, path):
         limit = len(kept) - 5_000  # no file of its process may grow past it: its log may, the map may not
         resource.prlimit(run.node_pid("map"), resource.RLIMIT_FSIZE, (limit, limit))
         hears(planner, 30)
@@ -200,17 +198,8 @@ def test_what_no_drive_could_use_is_refused_before_it(tmp_path: Path, road: Path
         (other / "calib.txt").write_text((other / "calib.txt").read_text().replace(f"{F_PX}", f"{2 * F_PX}"))
     for name, path, source in (("torn", torn, road), ("is empty", empty, road), ("another camera", whole, other)):
         refused = call(
-            *(
-                "run",
-                "--source",
-                f"kitti:{source}",
-                "--rate",
-                "10",
-                "--map",
-                str(path),
-                "--output",
-                str(tmp_path / "o"),
-            ),
+            *("run", "--source", f"kitti:{source}", "--rate", "10", "--map", str(path)),
+            *("--output", str(tmp_path / "o")),
             *("--set", "models.shipped=false", "--set", f"runtime.runtime_dir={tmp_path / 'rt'}"),
         )
         assert refused.returncode == 2, refused.stderr
