@@ -75,8 +75,7 @@ def test_the_batch_finds_the_scale_by_itself(world: Drive) -> None:
         else msgspec.structs.replace(
             m,
             cc=msgspec.structs.replace(
-                m.cc,
-                T_from_to=SE2(m.cc.T_from_to.x_m * factor, m.cc.T_from_to.y_m * factor, m.cc.T_from_to.yaw_rad),
+                m.cc, T_from_to=SE2(m.cc.T_from_to.x_m * factor, m.cc.T_from_to.y_m * factor, m.cc.T_from_to.yaw_rad)
             ),
         )
         for m in world.measurements

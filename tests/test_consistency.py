@@ -83,8 +83,7 @@ def test_equals_gtsam_with_the_constant_velocity_factor() -> None:
 
 
 @pytest.mark.parametrize(
-    "sigma_cv_rad",
-    [pytest.param(0.05, marks=pytest.mark.slow), 0.1, pytest.param(0.2, marks=pytest.mark.slow)],
+    "sigma_cv_rad", [pytest.param(0.05, marks=pytest.mark.slow), 0.1, pytest.param(0.2, marks=pytest.mark.slow)]
 )
 def test_full_noise_costs_no_more_than_five_percent_of_the_batch(sigma_cv_rad: float) -> None:
     """One linearisation and the marginalisation of all but the newest poses, against the batch of all edges so far."""

@@ -164,12 +164,7 @@ def read(tensors: dict[str, NDArray[np.float32]], width_px: int = WIDTH, height_
     return decoder().read(tensors, view)
 
 
-poses = st.builds(
-    SE2,
-    st.floats(9.0, 35.0),
-    st.floats(-4.0, 4.0),
-    st.floats(-math.pi, math.pi),
-)
+poses = st.builds(SE2, st.floats(9.0, 35.0), st.floats(-4.0, 4.0), st.floats(-math.pi, math.pi))
 sizes_m = st.tuples(st.floats(3.0, 12.0), st.floats(1.5, 2.6), st.floats(1.3, 3.5))
 
 

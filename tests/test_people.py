@@ -317,8 +317,7 @@ def test_a_crowd_is_cut_to_the_nearest_sixty() -> None:
 
 
 @given(
-    p=st.tuples(st.floats(3.0, 40.0), st.floats(-8.0, 8.0)),
-    v=st.tuples(st.floats(-15.0, -1.0), st.floats(-2.0, 2.0)),
+    p=st.tuples(st.floats(3.0, 40.0), st.floats(-8.0, 8.0)), v=st.tuples(st.floats(-15.0, -1.0), st.floats(-2.0, 2.0))
 )
 @settings(max_examples=25)
 def test_the_closest_approach_is_that_of_straight_ways(p: tuple[float, float], v: tuple[float, float]) -> None:

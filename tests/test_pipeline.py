@@ -396,10 +396,7 @@ def test_a_service_is_stopped_in_order(drive: Path, place: Path) -> None:
 
 
 def test_a_stalled_node_and_then_a_killed_supervisor(drive: Path, place: Path) -> None:
-    arguments = (
-        *("--source", f"kitti:{drive}", "--set", "source.loop=true"),
-        *("--set", "runtime.restart=never"),
-    )
+    arguments = (*("--source", f"kitti:{drive}", "--set", "source.loop=true"), *("--set", "runtime.restart=never"))
     with Run(place, *arguments) as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             assert planner.wait(LIMIT_S) is not None

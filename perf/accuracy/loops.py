@@ -51,11 +51,7 @@ label = "places found again, poses in a kept map, loops closed; a map's size and
 
 PARTS = "recorded", "loop", "alike", "gnss", "size"
 BASE_M = 0.537  # between the cameras of the two passes
-OTHERS = (
-    "kitti_odometry/sequences/00",
-    "kitti_odometry/sequences/06",
-    "kitti_tracking/training/image_03/0005",
-)
+OTHERS = ("kitti_odometry/sequences/00", "kitti_odometry/sequences/06", "kitti_tracking/training/image_03/0005")
 LENGTHS_KM = 1, 10, 100
 LOOK_UPS = 20
 ORIGIN, FIX_M = (51.05, -114.05), 2.5

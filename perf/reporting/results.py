@@ -28,7 +28,6 @@ label = "docs/results.md and the README's table, from the reports of the evaluat
 
 KEPT = ROOT / "docs" / "results"
 TEXT = KEPT / "page.md"  # the page without its figures
-PAGE = ROOT / "docs" / "results.md"
 README = ROOT / "README.md"
 REAL = "--model detector={models}/yolox_nano_416.onnx --model segmenter={models}/twinlitenet_640x360.onnx"
 SEQUENCES = "{data}/kitti_odometry/sequences"
@@ -191,10 +190,7 @@ def run(arguments: list[str]) -> None:
 def texts() -> dict[str, str]:
     """What is to stand in the page and in the README. Raises PerfError."""
     found, when = kept(), measured.load()
-    return {
-        "docs/results.md": page(found, when),
-        "README.md": readme(README.read_text(encoding="utf-8"), found, when),
-    }
+    return {"docs/results.md": page(found, when), "README.md": readme(README.read_text(encoding="utf-8"), found, when)}
 
 
 def readme(text: str, found: Mapping[str, Kept], when: Mapping[str, measured.Measured]) -> str:
