@@ -122,9 +122,7 @@ def test_a_planner_is_told_where_it_is_in_the_map(
         found = in_map(planner, lambda here: here.state is MapState.LOCALISED, "the drive is localised")
         with Planner(run.vehicle, run.runtime_dir) as late:  # the last pose is there for who comes later
             in_map(late, lambda here: here.pose is not None, "one that came late knows")
-        run.process.send_signal(signal.SIGTERM)
-        status, out, err = run.end()
-    assert status == 0, err
+        out = run.stop()
     assert found.T_map_ego is not None
     assert abs(found.T_map_ego.y_m) < 0.5
     assert -1.0 < found.T_map_ego.x_m < STEP_M * FRAMES + 5.0
@@ -160,13 +158,11 @@ def test_nobody_notices_that_the_map_process_dies_or_stalls(
             lambda here: here.pose is not None and here.pose.frame_id > again.frame_id + 3 and here.pose.keyframes >= 4,
             "its successor goes on with the map that was kept",
         )
-        run.process.send_signal(signal.SIGTERM)
-        status, out, err = run.end()
-    assert status == 0, err
+        out = run.stop()
     assert f"map {cause}" in out
     summary = run.summary()
     assert set(summary["restarts"].values()) == {0}
-    assert summary["map"]["restarts"] == 1, out + err
+    assert summary["map"]["restarts"] == 1, out
     assert len(read_map(path)) >= 4
 
 
@@ -178,9 +174,7 @@ def test_a_full_disk_costs_the_map_nothing_that_it_had(
         limit = len(kept) - 5_000  # no file of its process may grow past it: its log may, the map may not
         resource.prlimit(run.node_pid("map"), resource.RLIMIT_FSIZE, (limit, limit))
         hears(planner, 30)
-        run.process.send_signal(signal.SIGTERM)
-        status, out, err = run.end()
-    assert status == 0, err
+        out = run.stop()
     assert "what was there stays: File too large" in out
     assert "File too large" in run.summary()["map"]["error"]
     assert path.read_bytes() == kept

@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry import bev
-from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.approach import approaches
 from birdslam.graph.around.hidden_road import hidden_fans
@@ -41,8 +40,8 @@ from birdslam.vehicles.placed_boxes import place_boxes
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame
+from tests.recordings import KITTI as CAMERA
 
-CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65)
 ROAD = GroundSizeFilter(CAMERA, GroundSizeConfig())
 Box = tuple[float, float, float, float]
 HZ = 10.0

@@ -376,9 +376,7 @@ def test_a_recorder_that_dies_or_stalls_is_restarted_with_a_new_file(
         drive_on(planner, 20)  # it goes on meanwhile
         until(lambda: files[1].is_file() and files[1].stat().st_size > 0, "its successor writes")
         drive_on(planner, 40)
-        run.process.send_signal(signal.SIGTERM)
-        status, out, err = run.end()
-    assert status == 0, err
+        out = run.stop()
     assert f"record {cause}; it is restarted" in out
     assert set(run.summary()["restarts"].values()) == {0}
     summary = run.summary()["recording"]
@@ -415,9 +413,7 @@ def test_a_recorder_that_keeps_dying_is_not_restarted_and_the_drive_continues(
             drive_on(planner, 15)
             os.kill(run.node_pid("record"), signal.SIGKILL)
         drive_on(planner, 40)
-        run.process.send_signal(signal.SIGTERM)
-        status, out, err = run.end()
-    assert status == 0, err
+        out = run.stop()
     assert "nothing is recorded any more, the run goes on" in out
     assert run.summary()["recording"]["restarts"] == 1
 
@@ -439,9 +435,7 @@ def test_a_full_disk_ends_the_recording_and_the_drive_continues(
         limit = file.stat().st_size + 20_000  # no file of its process may grow past it: the write fails
         resource.prlimit(run.node_pid("record"), resource.RLIMIT_FSIZE, (limit, limit))
         drive_on(planner, 60)
-        run.process.send_signal(signal.SIGTERM)
-        status, out, err = run.end()
-    assert status == 0, err
+        out = run.stop()
     assert "the recording has ended: File too large" in out
     assert "CUT OFF" in out
     summary = run.summary()
