@@ -235,10 +235,10 @@ def _smoothed(drive: DriveTable) -> NDArray[np.float64]:
 
 def _frame_words(drive: DriveTable, k: int) -> str:
     speed = drive.speed_mps[k]
-    told = "" if np.isnan(speed) else f", {speed:.1f} m/s (+- {drive.scale_sigma_rel[k]:.0%})"
+    speed_text = "" if np.isnan(speed) else f", {speed:.1f} m/s (+- {drive.scale_sigma_rel[k]:.0%})"
     said = "; ".join(meaning(name) for name in drive.statuses[k])
     state = "valid" if drive.valid[k] else "NOT VALID"
-    return html.escape(f"{drive.t_s[k]:.1f} s, frame {drive.frame[k]}{told}: {state}{'; ' if said else ''}{said}")
+    return html.escape(f"{drive.t_s[k]:.1f} s, frame {drive.frame[k]}{speed_text}: {state}{'; ' if said else ''}{said}")
 
 
 def _facts(drive: DriveTable) -> str:
@@ -271,7 +271,7 @@ def _status_rows(drive: DriveTable) -> str:
     for name in _names(drive):
         count = sum(name in statuses for statuses in drive.statuses)
         frames = f"{count} frame{'s' * (count != 1)}"
-        effect = "not valid" if _invalidates(name) else "told only"
+        effect = "not valid" if _invalidates(name) else "reported only"
         words = html.escape(MEANINGS[Status(name)])
         rows.append(f"<tr><td>{html.escape(name)}</td><td>{frames}</td><td>{effect}</td><td>{words}</td></tr>")
     return "".join(rows) or "<tr><td>none: all is well</td></tr>"
@@ -294,9 +294,13 @@ def _latency_rows(drive: DriveTable) -> str:
 def _earth_words(drive: DriveTable) -> str:
     assert drive.earth_deg is not None
     (lat, lon), (to_lat, to_lon) = drive.earth_deg[0], drive.earth_deg[-1]
-    about = drive.summary.get("earth", {})
-    told = about if isinstance(about, dict) else {}
-    fit = f"; {told['fixes']} fixes, {told['outliers']} left out, RMS {told['rms_m']} m" if "rms_m" in told else ""
+    said = drive.summary.get("earth", {})
+    fit_of = said if isinstance(said, dict) else {}
+    fit = (
+        f"; {fit_of['fixes']} fixes, {fit_of['outliers']} left out, RMS {fit_of['rms_m']} m"
+        if "rms_m" in fit_of
+        else ""
+    )
     return f"<p>from {lat:.6f}, {lon:.6f} to {to_lat:.6f}, {to_lon:.6f} (WGS 84){html.escape(fit)}</p>"
 
 
