@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import html
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +71,7 @@ def report_page(drive: DriveTable, video: Path | None = None, plotly: str = "") 
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<style>{STYLE.read_text(encoding='utf-8')}</style></head><body>",
             f"<header><h1>{name}</h1><p>{_facts(drive)}</p></header>",
-            f'<section class="verdict"><h2>How far to believe it</h2><ul>{_items(_verdict(drive))}</ul></section>',
+            f'<section class="verdict"><h2>How far to believe it</h2><ul>{_verdict(drive)}</ul></section>',
             f'<main><section id="map" class="plot"></section>{film}</main>',
             '<section class="slider"><input id="at" type="range" min="0" step="1" value="0" aria-label="moment">'
             '<output id="words"></output></section>',
@@ -106,13 +105,8 @@ def _map_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
     for number, (name, colour) in enumerate(KINDS):
         here = shown[kinds == number]
         if len(here):
-            traces.append(
-                {
-                    **_points(f"own way: {name}", drive.xy_m[here], colour, 6),
-                    "text": [_frame_words(drive, k) for k in here],
-                    "hoverinfo": "text",
-                }
-            )
+            words = {"text": [_frame_words(drive, k) for k in here], "hoverinfo": "text"}
+            traces.append(_points(f"own way: {name}", drive.xy_m[here], colour, 6) | words)
     return [trace for trace in traces if len(trace["x"])]
 
 
@@ -242,18 +236,15 @@ def _frame_words(drive: DriveTable, k: int) -> str:
 
 
 def _facts(drive: DriveTable) -> str:
-    seen = drive.summary
-    source = html.escape(str(seen.get("source", "")))
-    return f"{source}<br>{len(drive.t_s)} frames, {drive.t_s[-1]:.1f} s, {float(seen.get('path_m', 0.0)):.0f} m"
+    source = html.escape(str(drive.summary.get("source", "")))
+    return (
+        f"{source}<br>{len(drive.t_s)} frames, {drive.t_s[-1]:.1f} s, {float(drive.summary.get('path_m', 0.0)):.0f} m"
+    )
 
 
-def _verdict(drive: DriveTable) -> list[str]:
-    said = drive.summary.get("verdict", [])
-    return [str(line) for line in said] if isinstance(said, list) else []
-
-
-def _items(lines: Sequence[str]) -> str:
-    return "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+def _verdict(drive: DriveTable) -> str:
+    lines = drive.summary.get("verdict")
+    return "".join(f"<li>{html.escape(str(line))}</li>" for line in (lines if isinstance(lines, list) else ()))
 
 
 def _names(drive: DriveTable) -> list[str]:
