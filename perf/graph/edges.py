@@ -28,6 +28,7 @@ from birdslam.bench.simulation.odometry import SimulatedOdometry, SimulationConf
 from birdslam.bench.tracking.benchmark import LEAST_FRAMES, Live, Truth, make_log, ours
 from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
 from birdslam.bench.tracking.metrics import path_errors
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.paper import NO_GATE
@@ -239,7 +240,7 @@ def _nees_of_cars(graph: PoseGraph, m: Measurements, truth: Truth) -> list[float
     return out
 
 
-def _nees(error: NDArray[np.float64], cov: NDArray[np.float64]) -> float:
+def _nees(error: Floats, cov: Floats) -> float:
     return float(error @ np.linalg.solve(cov + 1e-9 * np.eye(len(cov)), error))
 
 
