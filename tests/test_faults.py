@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from birdslam.perf.robustness.faults import markdown, measure, survived
-from birdslam.perf.robustness.faulty_vehicle import WITHOUT_SPARES, Vehicle, model_options, record_options
+from birdslam.perf.robustness.faulty_vehicle import Vehicle, model_options, record_options
 from birdslam.perf.robustness.injection import FAULTS
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.presence import ring_path
@@ -37,16 +37,20 @@ def models_dir_if_any() -> Path | None:
     return folder if folder.is_dir() else None
 
 
-def test_faults_in_short(place: Path) -> None:
-    with Vehicle(place, *PATIENT) as vehicle:
+def test_faults_in_short_and_a_node_that_keeps_dying_ends_the_run_with_its_name(place: Path) -> None:
+    with Vehicle(place, *PATIENT, "--set", "runtime.restarts_max=1") as vehicle:
         for fault in FAULTS:
             if f"{fault.name} {fault.node}" not in SHORT:
                 continue
             vehicle.settle(0.5)
             row = measure(vehicle, fault)
             assert survived(row, BUSY_MACHINE), row
-        vehicle.settle(0.5)
-        assert vehicle.stop() == 0
+        vehicle.settle(0.3)
+        vehicle.node("perceive").send_signal(signal.SIGKILL)
+        assert vehicle.process.wait(120.0) == 1
+        last = (place / "run.log").read_text().splitlines()[-1]
+        assert last.startswith("birdslam: perceive was killed by SIGKILL")
+        assert "2 times in 60 s: it is not restarted" in last
     assert left_behind(vehicle) == []
 
 
@@ -109,14 +113,3 @@ def test_nothing_leaks_over_a_hundred_restarts(place: Path) -> None:
         assert epochs == sorted(epochs)
         assert vehicle.stop() == 0
     assert left_behind(vehicle) == []
-
-
-def test_a_node_that_keeps_dying_ends_the_run_with_its_name(place: Path) -> None:
-    with Vehicle(place, *PATIENT, *WITHOUT_SPARES, "--set", "runtime.restarts_max=1") as vehicle:
-        vehicle.node("optimize").send_signal(signal.SIGKILL)
-        vehicle.settle(0.3)
-        vehicle.node("optimize").send_signal(signal.SIGKILL)
-        assert vehicle.process.wait(120.0) == 1
-        last = (place / "run.log").read_text().splitlines()[-1]
-        assert last.startswith("birdslam: optimize was killed by SIGKILL")
-        assert "2 times in 60 s: it is not restarted" in last

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import json
-import multiprocessing
 import os
 import select
 import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,9 @@ import numpy as np
 import pytest
 
 from birdslam.runtime.batch.offline import pipeline
+from birdslam.runtime.cli.main import main
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import load
-from birdslam.runtime.environment import ENVIRONMENT
 from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.recording.recording import Recording
 from birdslam.runtime.replay.replay import compare
@@ -42,16 +41,22 @@ WITH_NETWORKS = ("--set", "models.shipped=true")  # of most runs it is not their
 UNHURRIED = ("--set", "budgets.end_to_end_ms=60000", "--set", "degradation.enabled=false")
 
 
+@functools.cache
+def _texture() -> np.ndarray:
+    texture = cv2.GaussianBlur(np.random.default_rng(5).integers(0, 256, (2048, 2048), dtype=np.uint8), (0, 0), 2.0)
+    return cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload, no-any-return]
+
+
 def road_image(x_m: float) -> np.ndarray:
     """A textured road under an empty sky, seen from `x_m` along the road; level camera."""
     u, v = np.meshgrid(np.arange(WIDTH, dtype=np.float32), np.arange(HEIGHT, dtype=np.float32))
     below = np.maximum(v - HEIGHT / 2, 0.5)
     depth = F_PX * HEIGHT_M / below
     side = (u - WIDTH / 2) * depth / F_PX
-    texture = cv2.GaussianBlur(np.random.default_rng(5).integers(0, 256, (2048, 2048), dtype=np.uint8), (0, 0), 2.0)
-    texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
     scale = np.float32(24.0)  # texels a metre
-    road = cv2.remap(texture, side * scale + 1024, (depth + x_m) * scale, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    road = cv2.remap(
+        _texture(), side * scale + 1024, (depth + x_m) * scale, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
+    )
     return np.where(v > HEIGHT / 2 + 4, road, 200).astype(np.uint8)
 
 
@@ -176,8 +181,8 @@ def wait_gone(pids: list[int]) -> None:
 
 
 def evaluate(sequence: Path, output: Path, *arguments: str) -> bytes:
-    done = call("evaluate", "odometry", str(sequence), "--output", str(output), *arguments)
-    assert done.returncode == 0, done.stderr
+    """What one process computes: this one, whose libraries have the nodes' environment (conftest.py)."""
+    assert main(["evaluate", "odometry", str(sequence), "--output", str(output), *arguments]) == 0
     return (output / sequence.name / "ego.kitti.txt").read_bytes()
 
 
@@ -200,15 +205,7 @@ def untimed(record: Any) -> bytes:
 
 
 def records_of_one_process(sequence: Path, overrides: dict[str, Any]) -> Records:
-    """What `evaluate` computes, in a process that computes in the same environment as the nodes."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in ENVIRONMENT.items():
-            patch.setenv(name, value)
-        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-            return pool.submit(_pipeline_records, sequence, overrides).result()
-
-
-def _pipeline_records(sequence: Path, overrides: dict[str, Any]) -> Records:
+    """What `evaluate` computes."""
     records: Records = {topic: [] for topic in TOPICS}
     topic_of = {kind: topic for topic, kind in TOPICS.items()}
     recording = open_recording(f"kitti:{sequence}", stride=overrides.get("source.stride", 1))
@@ -311,7 +308,7 @@ def test_a_torn_image_costs_one_frame_and_a_status(drive: Path, place: Path) -> 
 
 
 def test_a_slow_reader_costs_dropped_frames_that_are_counted(drive: Path, place: Path) -> None:
-    count = 2_000  # over some seconds, so that perceive sees several, and the gaps between them
+    count = 1_000  # over a second or more, so that perceive sees several, and the gaps between them
     run = run_all(place, drive, "--rate", "1000", "--set", "source.loop=true", "--set", f"source.frames={count}")
     summary = run.summary()
     assert summary["frames_in"] == count
@@ -322,6 +319,7 @@ def test_a_slow_reader_costs_dropped_frames_that_are_counted(drive: Path, place:
 
 
 def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None:
+    begun_ns = time.monotonic_ns()
     with Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true") as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             first, second = planner.wait(LIMIT_S), planner.wait(LIMIT_S)
@@ -352,6 +350,7 @@ def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None
             assert last is not None
             assert len(epochs) == 2
             assert [first.epoch, *epochs, last.epoch] == sorted([first.epoch, *epochs, last.epoch])
+            assert last.t_capture_ns - begun_ns >= 100_000_000 * last.frame_id  # a recording keeps its own time
 
             nodes = [run.node_pid(name) for name in ("capture", "perceive", "optimize")]
             run.process.send_signal(signal.SIGINT)
@@ -367,35 +366,14 @@ def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None
         assert run.left_behind() == []
         summary = run.summary()
         assert summary["ended"] == "SIGINT"
+        assert set(summary["stages_ms"]) == {
+            *("capture", "capture -> perceive", "perceive queue", "perceive"),
+            *("perceive -> optimize", "optimize queue", "optimize", "optimize -> planner"),
+        }
         assert len((run.output / "ego.kitti.txt").read_text().splitlines()) == summary["frames_in"]
 
 
-def test_without_restarts_a_killed_node_ends_the_run_with_its_name(drive: Path, place: Path) -> None:
-    with Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true", "--set", "runtime.restart=never") as run:
-        with Planner(run.vehicle, run.runtime_dir) as planner:
-            assert planner.wait(LIMIT_S) is not None
-        os.kill(run.node_pid("perceive"), signal.SIGKILL)
-        status, _, err = run.end()
-        assert status == 1
-        assert err.startswith("birdslam: perceive was killed by SIGKILL")
-        assert err.count("\n") == 1
-        assert run.summary()["frames_processed"] > 0
-
-
-def test_a_service_is_stopped_in_order(drive: Path, place: Path) -> None:
-    with Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true") as run:
-        with Planner(run.vehicle, run.runtime_dir) as planner:
-            assert planner.wait(LIMIT_S) is not None
-        run.process.send_signal(signal.SIGTERM)
-        status, _, err = run.end()
-        assert (status, err) == (0, "")
-        summary = run.summary()
-        assert summary["ended"] == "SIGTERM"
-        assert summary["frames_processed"] + summary["frames_dropped"] == summary["frames_in"]
-        assert run.left_behind() == []
-
-
-def test_a_stalled_node_and_then_a_killed_supervisor(drive: Path, place: Path) -> None:
+def test_a_killed_supervisor_and_then_a_stalled_node(drive: Path, place: Path) -> None:
     arguments = (
         *("--source", f"kitti:{drive}", "--set", "source.loop=true"),
         *("--set", "runtime.restart=never"),
@@ -403,20 +381,19 @@ def test_a_stalled_node_and_then_a_killed_supervisor(drive: Path, place: Path) -
     with Run(place, *arguments) as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             assert planner.wait(LIMIT_S) is not None
+        nodes = [run.node_pid(name) for name in ("capture", "perceive", "optimize")]
+        run.kill()
+        wait_gone(nodes)
+    with Run(place, *arguments) as run:  # over what the killed one left behind
+        with Planner(run.vehicle, run.runtime_dir) as planner:
+            assert planner.wait(LIMIT_S) is not None
         run.stall("optimize")
         status, _, err = run.end()
         assert status == 1
         assert err.startswith(f"birdslam: optimize is stalled: its loop has shown no life for {1e3 * LIMIT_S:g} ms")
-
-    with Run(place, *arguments) as run:  # over what the killed node left behind
-        with Planner(run.vehicle, run.runtime_dir) as planner:
-            assert planner.wait(LIMIT_S) is not None
-        nodes = [run.node_pid(name) for name in ("capture", "perceive", "optimize")]
-        run.kill()
-        wait_gone(nodes)
-    again = run_all(place, drive, "--rate", "max")
-    assert again.summary()["frames_processed"] == FRAMES
-    assert again.left_behind() == []
+        assert err.count("\n") == 1
+        assert run.summary()["frames_processed"] > 0
+        assert run.left_behind() == []
 
 
 @pytest.mark.parametrize(
@@ -455,20 +432,6 @@ def test_a_manifest_that_does_not_fit_its_network(drive: Path, models_dir: Path,
     assert str(path) in err
     assert "input.width_px" in err
     assert err.count("\n") == 1
-
-
-def test_a_recording_keeps_its_own_time(drive: Path, place: Path) -> None:
-    """Its last frame leaves when its time stamp says, and each stage of the way is measured."""
-    begun_s = time.monotonic()
-    run = run_all(place, drive, *UNHURRIED)
-    assert time.monotonic() - begun_s >= 0.1 * (FRAMES - 1)
-    summary = run.summary()
-    assert summary["frames_processed"] + summary["frames_dropped"] == summary["frames_in"] == FRAMES
-    parts = summary["stages_ms"]
-    assert set(parts) == {
-        *("capture", "capture -> perceive", "perceive queue", "perceive"),
-        *("perceive -> optimize", "optimize queue", "optimize", "optimize -> planner"),
-    }
 
 
 def test_a_killed_capture_goes_on_in_its_recording(drive: Path, place: Path) -> None:
