@@ -233,7 +233,7 @@ def test_three_processes_give_the_bytes_of_one(drive: Path, place: Path) -> None
         )
     (sequence / "calib.txt").write_text((drive / "calib.txt").read_text())
     (sequence / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(len(shown))))
-    speed.write_text("".join(f"{0.02 * n:.2f} {'nan' if n == 30 else 8.0}\n" for n in range(40)))
+    speed.write_text("".join(f"{0.02 * n:.2f} {'nan' if n == 30 else 8.0}\n" for n in range(120)))
 
     run = Run(
         *(place, "--source", f"kitti:{sequence}", "--rate", "max", "--speed", str(speed)),
