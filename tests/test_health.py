@@ -16,7 +16,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import (
@@ -46,8 +45,8 @@ from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.wire import Health, Spread, Stage, Trace, decode, encode
 from birdslam.types import Estimate, MapUpdate, Status
+from tests.recordings import SMALL as CAMERA
 
-CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
 MS = 1_000_000
 
 

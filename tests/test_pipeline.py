@@ -101,6 +101,13 @@ class Run:
         out, err = self.process.communicate(timeout=LIMIT_S)
         return self.process.returncode, out, err
 
+    def stop(self) -> str:
+        """Asks it to end, which it does without an error; what it printed."""
+        self.process.send_signal(signal.SIGTERM)
+        status, out, err = self.end()
+        assert status == 0, err
+        return out
+
     def summary(self) -> dict:
         return json.loads((self.output / "summary.json").read_text())
 

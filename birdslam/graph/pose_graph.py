@@ -59,11 +59,7 @@ class PoseGraph:
     """Bounded in time and memory; deterministic; raises nothing for what a record may say."""
 
     def __init__(
-        self,
-        config: GraphConfig,
-        weights: WeightsConfig,
-        epoch: int = 0,
-        factors: Sequence[Factor] | None = None,
+        self, config: GraphConfig, weights: WeightsConfig, epoch: int = 0, factors: Sequence[Factor] | None = None
     ) -> None:
         """`factors`, which then belong to this graph, are `standard_factors(config, weights)` by default.
 

@@ -378,10 +378,7 @@ def _joined(*parts: LinePoints) -> LinePoints:
 
 
 def still_lines(
-    camera: Camera,
-    image: NDArray[np.uint8],
-    segmentation: Segmentation,
-    boxes_px: Floats,
+    camera: Camera, image: NDArray[np.uint8], segmentation: Segmentation, boxes_px: Floats
 ) -> tuple[tuple[LaneLine, ...], GroundPlane]:
     """The lines of a single image, and the ground under its camera with the pitch that makes them parallel."""
     tracker = LineTracker(camera, certain_m=LEAST_PAINT_M)  # there will be no other

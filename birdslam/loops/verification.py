@@ -27,7 +27,6 @@ from birdslam.types import Attitude
 
 MATCH_BITS, MATCH_RATIO = 72, 0.85  # where nothing is known of the pose
 GUIDED_BITS, GUIDED_RATIO = 80, 0.9  # where the pose says where to look
-LEAST_PLACES = 6  # cells of the image, of GRID_PX, that the inliers must lie in
 GRID_CELLS = 8, 4  # across and down the image
 RANSAC_PX, RANSAC_LOOKS = 4.0, 400
 GATE = 3.0  # standard deviations of a coordinate

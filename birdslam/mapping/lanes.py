@@ -280,10 +280,7 @@ def _along_and_aside_m(pieces: Floats, points: Floats) -> tuple[Floats, Floats]:
     direction = pieces[:, 1] - pieces[:, 0]
     direction = direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-9)[:, None]
     gap = points[:, None, :] - pieces.mean(axis=1)[None]
-    return (
-        (gap * direction).sum(axis=2),
-        gap[..., 0] * direction[:, 1] - gap[..., 1] * direction[:, 0],
-    )
+    return ((gap * direction).sum(axis=2), gap[..., 0] * direction[:, 1] - gap[..., 1] * direction[:, 0])
 
 
 def _lengths_m(pieces: Floats) -> Floats:

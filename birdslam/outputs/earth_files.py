@@ -72,10 +72,7 @@ def _time(t_ns: int) -> str:
 
 
 def _kml(ways: Sequence[Way]) -> str:
-    out = [
-        '<?xml version="1.0" encoding="UTF-8"?>',
-        '<kml xmlns="http://www.opengis.net/kml/2.2"><Document>',
-    ]
+    out = ['<?xml version="1.0" encoding="UTF-8"?>', '<kml xmlns="http://www.opengis.net/kml/2.2"><Document>']
     for way in ways:
         data = "".join(
             f"<Data name={quoteattr(key)}><value>{escape(str(value))}</value></Data>"

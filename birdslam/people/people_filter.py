@@ -74,12 +74,7 @@ class PeopleFilter:
         self._tilt_prior, self._moves = self._tilt_prior[rows], self._moves[rows]
 
     def predict(
-        self,
-        dt_s: float,
-        T_world_ego: SE2,
-        ego_cov: Floats | None,
-        ground_shift_rad: float,
-        ego_mps: float,
+        self, dt_s: float, T_world_ego: SE2, ego_cov: Floats | None, ground_shift_rad: float, ego_mps: float
     ) -> None:
         """To the next frame: people move, and the ground's estimate moved by `ground_shift_rad` beside its own motion.
 

@@ -56,10 +56,7 @@ class Boxes3d:
             return self
         factor = camera.fx_px / (self.canonical_focal_rel * camera.width_px)
         return replace(
-            self,
-            depth_m=self.depth_m * factor,
-            sigma_depth_m=self.sigma_depth_m * factor,
-            canonical_focal_rel=0.0,
+            self, depth_m=self.depth_m * factor, sigma_depth_m=self.sigma_depth_m * factor, canonical_focal_rel=0.0
         )
 
     def centres_cam_m(self, camera: Camera) -> NDArray[np.float64]:

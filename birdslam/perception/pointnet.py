@@ -23,10 +23,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.manifest import ManifestMismatch, ModelError, Schedule
 from birdslam.perception.manifest_file import find_as
-from birdslam.perception.network import (
-    ModelSpec,
-    refuse_weights_elsewhere,
-)
+from birdslam.perception.network import ModelSpec, refuse_weights_elsewhere
 from birdslam.perception.pointnet_manifest import Bins, Body, PointNetManifest, Points
 
 CORE = 0.5  # of a box's width and height, about its middle: where its vehicle is

@@ -32,6 +32,7 @@ from birdslam.world.windscreen import Edit, bonnet, caption, from_share, wiper
 _WIDEST_VIEW_RAD = math.radians(80.0)  # of one rendered view, across: a wider lens is put together of several
 _MARGIN_RAD = math.radians(4.0)  # of a view beyond its sector: rows see farther while the car turns
 _SKY_M = 1e4
+SAMPLES = 2  # rays of a pixel, each way
 _BLUR_STEPS = 4  # views within an exposure
 
 
@@ -95,14 +96,14 @@ class FilmFrame:
     camera: Camera  # with this frame's own height, pitch and roll over the road
 
 
-def film(scenario: Scenario, dashcam: Dashcam, count: int, rate_hz: float, samples: int = 2) -> Iterator[FilmFrame]:
+def film(scenario: Scenario, dashcam: Dashcam, count: int, rate_hz: float) -> Iterator[FilmFrame]:
     """`count` images of a drive, at `rate_hz`. Raises ValueError at night, whose light is of a lens without distortion.
 
     Other cars stand still while an image is read, the camera moves.
     """
     if scenario.night is not None:
         raise ValueError("a night is lit through a lens without distortion alone")
-    renderer, optics = Renderer(scenario.street, scenario.sky, samples), _Optics(dashcam)
+    renderer, optics = Renderer(scenario.street, scenario.sky, SAMPLES), _Optics(dashcam)
     exposure = _Exposure(dashcam.adapts_s, rate_hz)
     before: Floats | None = None
     now: Moment | None = None

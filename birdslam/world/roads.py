@@ -18,18 +18,7 @@ from birdslam.world.rendering.night import Night, even_sky
 from birdslam.world.rendering.photometrics import Lens
 from birdslam.world.scenario import Scenario
 from birdslam.world.street.course import STEP_M, Course
-from birdslam.world.street.street import (
-    ASPHALT,
-    BAND,
-    CROSSING,
-    GRASS,
-    HATCHED,
-    LINE,
-    LINE_KINDS,
-    MARK,
-    Lane,
-    Street,
-)
+from birdslam.world.street.street import ASPHALT, BAND, CROSSING, GRASS, HATCHED, LINE, LINE_KINDS, MARK, Lane, Street
 from birdslam.world.traffic.fleet import draw_shape, draw_truck
 from birdslam.world.traffic.flow import Mover
 from birdslam.world.traffic.placement import Standing, background, tree

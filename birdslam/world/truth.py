@@ -17,18 +17,7 @@ from birdslam.geometry.se2 import SE2
 
 # Of each pixel. `lane` is painted lane and road boundaries; other paint (zebras, arrows, stop lines) is `road`;
 # `pavement` is what is paved beside the road, kerbs too; grass is `vegetation`; cyclists with their cycles are `person`
-CLASSES = (
-    "sky",
-    "road",
-    "lane",
-    "pavement",
-    "building",
-    "vegetation",
-    "pole_sign",
-    "vehicle",
-    "person",
-    "other",
-)
+CLASSES = ("sky", "road", "lane", "pavement", "building", "vegetation", "pole_sign", "vehicle", "person", "other")
 LABELS = ("car", "van", "truck", "bus", "cyclist", "pedestrian")
 
 

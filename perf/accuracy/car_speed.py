@@ -31,9 +31,8 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
-from birdslam.perception import ModelError, Perception
+from birdslam.perception import Perception
 from birdslam.perf.accuracy.drives import SPEED_FLOOR_M, SPEED_LIMIT, networks_of, uri_of
-from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import add_data, add_networks, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.configuration import Configuration
@@ -96,16 +95,13 @@ def run(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
     path = None if options.output is None else options.output / "car_speed.json"
-    try:
-        configuration = networks_of(options)
-        with Ledger(path, label, rate_hz=RATE_HZ, noise_rel=NOISE_REL, factor=FACTOR, delay_s=DELAY_S) as ledger:
-            for sequence in options.sequences or SEQUENCES:
-                drive = read(sequence, options, configuration)
-                for name, readings, dark in variants(drive, options.seeds, not options.no_faults):
-                    figures = measure(drive, readings, dark)
-                    ledger.add(f"{drive.name} {name}", row_text(figures), **figures)
-    except (DatasetError, ModelError) as error:
-        raise PerfError(str(error)) from error
+    configuration = networks_of(options)
+    with Ledger(path, label, rate_hz=RATE_HZ, noise_rel=NOISE_REL, factor=FACTOR, delay_s=DELAY_S) as ledger:
+        for sequence in options.sequences or SEQUENCES:
+            drive = read(sequence, options, configuration)
+            for name, readings, dark in variants(drive, options.seeds, not options.no_faults):
+                figures = measure(drive, readings, dark)
+                ledger.add(f"{drive.name} {name}", row_text(figures), **figures)
 
 
 def variants(drive: Drive, seeds: int, faults: bool) -> list[tuple[str, Coming, bool]]:

@@ -76,9 +76,12 @@ def add_drive_options(parser: argparse.ArgumentParser) -> None:
 
 def networks_of(options: argparse.Namespace) -> Configuration | None:
     """The configuration whose networks are to run; None: none are."""
-    if not options.networks and not options.model:
-        return None
-    configuration = load(None, {f"models.{m.partition('=')[0]}.path": m.partition("=")[2] for m in options.model})
+    return with_networks(options.model) if options.networks or options.model else None
+
+
+def with_networks(models: Sequence[str]) -> Configuration:
+    """The default configuration with these networks (ROLE=PATH), each frame awaiting them."""
+    configuration = load(None, {f"models.{m.partition('=')[0]}.path": m.partition("=")[2] for m in models})
     return msgspec.structs.replace(configuration, source=SourceConfig(rate="max"))
 
 

@@ -7,8 +7,6 @@ KITTI's true poses are interpolated over the first frames of a sequence (13 of 0
 
 from __future__ import annotations
 
-import argparse
-
 import cv2
 import msgspec
 import numpy as np
@@ -21,7 +19,7 @@ from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
-from birdslam.perf.reporting.arguments import add_data
+from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import Recording
 from birdslam.trajectory import Transform, as_poses, inverse
@@ -39,7 +37,7 @@ label = "the simulated odometry's noise, fitted to the real clips"
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf odometry_noise", description=__doc__)
+    parser = benchmark_parser("odometry_noise", label, output="")
     add_data(parser)
     data = parser.parse_args(arguments).data
     noise = fit([(open_recording(f"kitti:{data / clip}"), left_out) for clip, left_out in CLIPS.items()])

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.perception import Detections, Findings, ModelError, ModelSpec, Network, load_network
+from birdslam.perception import Detections, Findings, ModelSpec, Network, load_network
 from birdslam.perception.decoding.multitask import MultiTaskDecoder
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS
 from birdslam.perception.session import providers_here
@@ -32,7 +32,6 @@ from birdslam.perf.reporting.figures import Ledger
 from birdslam.perf.reporting.machine import describe
 from birdslam.runtime.models.providers import compared
 from birdslam.sources.opening import open_recording
-from birdslam.sources.recording import DatasetError
 from birdslam.world.training.grading import LONG, Grades, box_ious, extents, overlap
 
 label = "the shipped network: held-out worlds, and real frames beside LiDAR and two other networks"
@@ -64,23 +63,20 @@ def run(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if options.provider:
         return _providers(options.provider, options.models, options.threads, options.output)
-    try:
-        network = load_network("multitask", ModelSpec(path=str(options.network), threads=options.threads))
-        with Ledger(options.output, label, network=network.describe()) as ledger:
-            if importlib.util.find_spec("numba") is None:
-                print("held-out worlds: left out, numba is not installed (extra [train])")
-            else:
-                for width_px, height_px in SIZES:
-                    figures = simulated(network, options.frames, width_px, height_px)
-                    ledger.add(f"worlds {width_px}x{height_px}", _summary(figures), **figures)
-            if options.data.is_dir():
-                for name, folder in RECORDINGS.items():
-                    figures = real(network, options.data / folder, options.models)
-                    ledger.add(f"real {name}", _summary(figures), **figures)
-            else:
-                print(f"real frames: left out, {options.data} is not there (set BIRDSLAM_DATA)")
-    except (ModelError, DatasetError) as error:
-        raise PerfError(str(error)) from error
+    network = load_network("multitask", ModelSpec(path=str(options.network), threads=options.threads))
+    with Ledger(options.output, label, network=network.describe()) as ledger:
+        if importlib.util.find_spec("numba") is None:
+            print("held-out worlds: left out, numba is not installed (extra [train])")
+        else:
+            for width_px, height_px in SIZES:
+                figures = simulated(network, options.frames, width_px, height_px)
+                ledger.add(f"worlds {width_px}x{height_px}", _summary(figures), **figures)
+        if options.data.is_dir():
+            for name, folder in RECORDINGS.items():
+                figures = real(network, options.data / folder, options.models)
+                ledger.add(f"real {name}", _summary(figures), **figures)
+        else:
+            print(f"real frames: left out, {options.data} is not there (set BIRDSLAM_DATA)")
 
 
 def _providers(asked: str, models: Path, threads: int, output: Path | None) -> None:
@@ -90,16 +86,13 @@ def _providers(asked: str, models: Path, threads: int, output: Path | None) -> N
     print(f"{describe()['cpu']}; this onnxruntime has {', '.join(here)}; {threads} threads")
     files = {"multitask": SHIPPED_NETWORKS / SHIPPED_MULTITASK}
     files |= {role: models / name for role, name in OTHERS.items() if (models / name).is_file()}
-    try:
-        with Ledger(output, label, providers=list(here)) as ledger:
-            for role, file in files.items():
-                spec = ModelSpec(path=str(file), threads=threads)
-                for provider, found in compared(role, spec, wanted, within_s=3.0 * len(wanted)).items():
-                    figures = {"ms": found.ms, "off_rel": found.off_rel}
-                    said = found.problem or f"{found.ms:7.2f} ms a run, off by {found.off_rel:.2%} (RMS)"
-                    ledger.add(f"{file.name} {provider}", said, **figures)
-    except ModelError as error:
-        raise PerfError(str(error)) from error
+    with Ledger(output, label, providers=list(here)) as ledger:
+        for role, file in files.items():
+            spec = ModelSpec(path=str(file), threads=threads)
+            for provider, found in compared(role, spec, wanted, within_s=3.0 * len(wanted)).items():
+                figures = {"ms": found.ms, "off_rel": found.off_rel}
+                said = found.problem or f"{found.ms:7.2f} ms a run, off by {found.off_rel:.2%} (RMS)"
+                ledger.add(f"{file.name} {provider}", said, **figures)
 
 
 def simulated(network: Network, frames: int, width_px: int, height_px: int) -> dict[str, float]:

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from birdslam.bench.tracking.metrics import assign
 from birdslam.people.people_boxes import PeopleBoxesConfig, people_boxes
-from birdslam.perception import ModelError, ModelSpec, load_network
-from birdslam.perf.errors import PerfError
+from birdslam.perception import ModelSpec, load_network
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.kitti import find_images, read_image
@@ -63,14 +62,11 @@ def run(arguments: list[str]) -> None:
     add_data(parser)
     options = parser.parse_args(arguments)
     root = options.data / "kitti_tracking" / "training"
-    try:
-        sequences = [open_tracking(root, name) for name in SEQUENCES]
-        with Ledger(options.output, label, every=options.every) as ledger:
-            for path in options.network:
-                row = measure(path, sequences, options.every)
-                ledger.add(Path(path).stem, "  ".join(f"{name} {value}" for name, value in row.items()), **row)
-    except (ModelError, DatasetError) as error:
-        raise PerfError(str(error)) from None
+    sequences = [open_tracking(root, name) for name in SEQUENCES]
+    with Ledger(options.output, label, every=options.every) as ledger:
+        for path in options.network:
+            row = measure(path, sequences, options.every)
+            ledger.add(Path(path).stem, "  ".join(f"{name} {value}" for name, value in row.items()), **row)
 
 
 def measure(path: str, sequences: Sequence[TrackingSequence], every: int) -> dict[str, object]:

@@ -247,18 +247,7 @@ def _inference(benchmarks: Benchmarks) -> Iterator[str]:
 def _optimizer(benchmarks: Benchmarks) -> Iterator[str]:
     rows = benchmarks.get("optimizer", {}).get("rows", [])
     if rows:
-        titles = (
-            "who",
-            "vehicles",
-            "frames",
-            "p50 us",
-            "p99",
-            "p99.9",
-            "max",
-            "first 1000",
-            "last 1000",
-            "MB more",
-        )
+        titles = ("who", "vehicles", "frames", "p50 us", "p99", "p99.9", "max", "first 1000", "last 1000", "MB more")
         names = ("frames", "p50_us", "p99_us", "p999_us", "max_us", "first_thousand_p50_us", "last_thousand_p50_us")
         picked = (*names, "rss_growth_mb")
         yield from table(titles, ([row["contender"], row["vehicles"], *(row[name] for name in picked)] for row in rows))

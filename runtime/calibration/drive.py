@@ -76,11 +76,7 @@ def calibrate_drive(
 
         try:
             found = calibrate(
-                drive,
-                recording.camera,
-                configuration.slam.frontend,
-                config,
-                known_lengths(recording, given.speed),
+                drive, recording.camera, configuration.slam.frontend, config, known_lengths(recording, given.speed)
             )
         except CalibrationError as error:
             if must_show:

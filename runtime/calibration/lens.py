@@ -24,12 +24,7 @@ _LENS_S = 120.0  # of a film, from which its lens is found
 
 
 def lens_of_drive(
-    configuration: Configuration,
-    uri: str,
-    given: Given,
-    size_px: tuple[int, int],
-    stride: int,
-    must_show: bool = True,
+    configuration: Configuration, uri: str, given: Given, size_px: tuple[int, int], stride: int, must_show: bool = True
 ) -> Intrinsics:
     """The lens of a film that says nothing of its camera, by what its images show.
 

@@ -105,9 +105,9 @@ def from_estimate(estimate: Estimate, t_ns: int) -> Iterator[Drawn]:
     yield "/scene", SceneUpdate(deletions=(gone,), entities=tuple(entities))
 
 
-def curve_points(curve: LaneLine | Lane, from_m: float = 0.0) -> NDArray[np.float64]:
+def curve_points(curve: LaneLine | Lane) -> NDArray[np.float64]:
     """(N, 2) in ego: a line, or a lane's centre line, as far as it is known."""
-    x = np.arange(from_m, max(curve.to_m, from_m) + LINE_STEP_M, LINE_STEP_M)
+    x = np.arange(0.0, max(curve.to_m, 0.0) + LINE_STEP_M, LINE_STEP_M)
     a, h, c, d = curve.offset_m, curve.slope, curve.curvature_per_m, curve.curvature_rate_per_m2
     return np.column_stack([x, a + x * (h + x * (c / 2.0 + x * d / 6.0))])
 

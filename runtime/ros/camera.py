@@ -34,18 +34,7 @@ from birdslam.ros.rmw_zenoh import (
     publishers_key,
     type_of_key,
 )
-from birdslam.ros.sensor import (
-    CAMERA_INFO,
-    FIX,
-    IMAGES,
-    SPEEDS,
-    Lens,
-    fix_row,
-    is_rectified,
-    lens,
-    pixels,
-    speed,
-)
+from birdslam.ros.sensor import CAMERA_INFO, FIX, IMAGES, SPEEDS, Lens, fix_row, is_rectified, lens, pixels, speed
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.sources import SourceError
 from birdslam.runtime.ros.session import ROUTER_S, NoRouter, RosNode

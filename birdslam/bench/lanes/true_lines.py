@@ -14,7 +14,6 @@ from birdslam.types import Bound, Lane, LaneLine, Lanes, LineKind
 RANGES_M = (5.0, 10.0, 20.0, 30.0)
 MATCH_AT_M, MATCH_M = 10.0, 1.0  # a found line is the true one that is nearest here, within so much
 SIDE_M = 6.0  # true lines of the ego's lane and its neighbours: these are to be found
-TWIN_M = 0.6  # true lines nearer to each other are one bound
 RIGHT_M = 0.5  # of a lane's bounds, for it to be the ego's
 KERB = "kerb"
 

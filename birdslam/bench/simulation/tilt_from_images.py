@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from birdslam.bench.simulation.odometry import OdometryNoise, SimulatedOdometry, Walk
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
+from birdslam.odometry.external import WithoutImages
 from birdslam.odometry.motion import Motion
 from birdslam.types import SpeedReading
 
 
-class TiltFromImages:
+class TiltFromImages(WithoutImages):
     """An EgoMotion: a simulated one, that reports the road's pitch and roll as the images would, while it drives.
 
     `grounds` are the true ones, by frame; where one is None, none is reported anew.
@@ -36,14 +37,6 @@ class TiltFromImages:
         self._pitch, self._roll = Walk(noise.ground_rad, 1, rng), Walk(noise.roll_rad, 1, rng)
         self._cov = np.diag([noise.ground_rad.sigma**2, noise.roll_rad.sigma**2])
         self._reported = odometry.camera.ground
-
-    @property
-    def road_tracks(self) -> tuple[NDArray[np.int64], Floats]:
-        """Empty, as the simulated one's."""
-        return self._odometry.road_tracks
-
-    def track(self, image: NDArray[np.uint8]) -> None:
-        """Does nothing: no image is needed."""
 
     def estimate(
         self,

@@ -18,15 +18,7 @@ from birdslam.bench.baselines import batch_se3, cubeslam, nair, namdev
 from birdslam.bench.baselines.shape_prior import Initialised
 from birdslam.bench.baselines.trajectories import LiveTrajectories, Method, Trajectories
 from birdslam.bench.simulation.odometry import SimulatedOdometry
-from birdslam.bench.tracking.metrics import (
-    BoxFrame,
-    PathErrors,
-    count_boxes,
-    hota,
-    idf1,
-    match_vehicles,
-    path_errors,
-)
+from birdslam.bench.tracking.metrics import BoxFrame, PathErrors, count_boxes, hota, idf1, match_vehicles, path_errors
 from birdslam.frontend import EgoMotion, FrontEnd, FrontEndConfig, Pending
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2

@@ -87,10 +87,7 @@ def tie(earth: Earth, keyframes: Sequence[Placed], links: Sequence[Link], fixed:
         nodes = [Node(each.number, T_earth_map @ each.T_map_keyframe) for each in keyframes]
         factors = [
             PlaceFactor(
-                number,
-                (float(x), float(y)),
-                fixed[number].sigma_m / earth.scale,
-                fixed[number].weighed_m / earth.scale,
+                number, (float(x), float(y)), fixed[number].sigma_m / earth.scale, fixed[number].weighed_m / earth.scale
             )
             for number, (x, y) in zip(numbers, flat.xy(degrees), strict=True)
         ]

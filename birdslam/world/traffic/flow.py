@@ -13,14 +13,7 @@ import numpy as np
 
 from birdslam.world.rendering import materials as m
 from birdslam.world.street.street import Street
-from birdslam.world.traffic.fleet import (
-    Body,
-    draw_cyclist,
-    draw_pedestrian,
-    draw_shape,
-    draw_truck,
-    draw_vehicle,
-)
+from birdslam.world.traffic.fleet import Body, draw_cyclist, draw_pedestrian, draw_shape, draw_truck, draw_vehicle
 from birdslam.world.traffic.parking import Lot, Row, kerb_rows
 
 ACCELERATION_MPS2, BRAKING_MPS2, GAP_S, GAP_M = 1.5, 2.2, 1.3, 2.2

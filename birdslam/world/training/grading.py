@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from birdslam.perception import Detections, Findings
 from birdslam.world.truth import CLASSES, WorldFrame, WorldObject
 
-_ROAD, _LANE, _SKY = (CLASSES.index(name) for name in ("road", "lane", "sky"))
+_ROAD, _LANE = (CLASSES.index(name) for name in ("road", "lane"))
 _VEHICLES = ("car", "van", "truck", "bus")
 CLEAR = 0.9  # of a body is seen where its whole outline is
 LONG = 2.0  # width over height of the box of a vehicle that is seen from the side

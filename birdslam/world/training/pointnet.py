@@ -28,7 +28,6 @@ POINTS = Points(name="points", count=512, features=("x", "y", "z", "u", "v", "lo
 BODY = Body(output="body")
 VEHICLES = ("car", "van", "truck", "bus")
 INPUT, OUTPUT = POINTS.name, BODY.output
-TARGETS = 8  # centre (3), log of the size (3), yaw (1), how much it counts (1)
 FAR_M = 300.0  # the sky's depth
 _CONCENTRATION_MAX = 200.0
 

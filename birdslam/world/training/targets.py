@@ -75,9 +75,7 @@ def encode(frame: WorldFrame, window: Window, width_px: int, height_px: int, con
     half = (width_px // 2, height_px // 2)
     shrinks = window.x1_px - window.x0_px > width_px
     image = cv2.resize(
-        frame.image[rows, columns],
-        (width_px, height_px),
-        interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR,
+        frame.image[rows, columns], (width_px, height_px), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     ).astype(np.uint8, copy=False)
     classes, depth_m = frame.classes[rows, columns], frame.depth_m[rows, columns]
     lane = (classes == _LANE).astype(np.float32)
@@ -108,12 +106,7 @@ def _objects(
 
 
 def _row(
-    frame: WorldFrame,
-    body: WorldObject,
-    window: Window,
-    size: tuple[int, int],
-    zoom: float,
-    config: TargetsConfig,
+    frame: WorldFrame, body: WorldObject, window: Window, size: tuple[int, int], zoom: float, config: TargetsConfig
 ) -> dict[str, float] | None:
     """One object as a row; None where nothing of it can be seen."""
     scale = np.array(size) / [window.x1_px - window.x0_px, window.y1_px - window.y0_px]
