@@ -20,7 +20,7 @@ from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.perf.reporting.arguments import add_data, add_networks
-from birdslam.runtime.configuration import Configuration, SourceConfig, load
+from birdslam.runtime.configuration import Configuration, load
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, Recording
@@ -81,8 +81,7 @@ def networks_of(options: argparse.Namespace) -> Configuration | None:
 
 def with_networks(models: Sequence[str]) -> Configuration:
     """The default configuration with these networks (ROLE=PATH), each frame awaiting them."""
-    configuration = load(None, {f"models.{m.partition('=')[0]}.path": m.partition("=")[2] for m in models})
-    return msgspec.structs.replace(configuration, source=SourceConfig(rate="max"))
+    return load(None, {f"models.{m.partition('=')[0]}.path": m.partition("=")[2] for m in models}).as_lossless()
 
 
 def uri_of(sequence: str, data: Path) -> str:

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
-
 from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
 from birdslam.calibration.lens import FIELD_OF_VIEW_DEG, STATED_SIGMA_REL, focal_by_field_of_view
 from birdslam.ros.bag import BagTopics
-from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.nodes.sources import parsed
 from birdslam.sources.camera_file import load_camera
 from birdslam.sources.recording import DatasetError, Recording
@@ -79,11 +77,6 @@ def focal_length_of(given: Given, uri: str, width_px: int) -> FocalLength:
     fov_deg, sigma_rel = FIELD_OF_VIEW_DEG[given.kind]
     focal_px = focal_by_field_of_view(width_px, fov_deg)
     return FocalLength(focal_px, sigma_rel, f"that of a {given.kind}, {fov_deg:g} deg across")
-
-
-def lossless(configuration: Configuration) -> Configuration:
-    """Every frame of the source, however long it takes."""
-    return msgspec.structs.replace(configuration, source=msgspec.structs.replace(configuration.source, rate="max"))
 
 
 def class_and_path(uri: str) -> tuple[type[Recording], Path]:

@@ -13,7 +13,7 @@ from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.calibration.lens import followed_corners, self_calibrate
 from birdslam.calibration.lens_adjustment import IMAGES
 from birdslam.geometry.camera import Camera
-from birdslam.runtime.calibration.given import Given, focal_length_of, lossless
+from birdslam.runtime.calibration.given import Given, focal_length_of
 from birdslam.runtime.calibration.height import UNKNOWN_HEIGHT_M
 from birdslam.runtime.configuration import Configuration, complete
 from birdslam.runtime.nodes.inference import Inference
@@ -36,7 +36,7 @@ def lens_of_drive(
     middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
     camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
     recording = open_recorded(uri, camera, stride, configuration.source.topics)
-    configuration = lossless(configuration)
+    configuration = configuration.as_lossless()
     frames = max(1, round(_LENS_S * recording.rate_hz))
     with Inference(complete(configuration, camera, recording.rate_hz)) as inference:
 

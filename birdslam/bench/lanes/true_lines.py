@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from birdslam.bench.figures import median
 from birdslam.sources.shipped_drive import TrueLine
 from birdslam.types import Bound, Lane, LaneLine, Lanes, LineKind
 
@@ -123,12 +124,12 @@ class LineScores:
             drive=drive,
             frames=self.frames,
             ranges=tuple(_range_score(x, self.errors[x]) for x in RANGES_M),
-            heading_error_median_deg=float(np.degrees(np.median(np.abs(self.headings)))) if self.headings else None,
+            heading_error_median_deg=median(np.degrees(np.abs(self.headings))),
             recall=self.found / self.seen if self.seen else None,
             false_lines_per_km=len(self.false_ids) / driven_m * 1e3 if driven_m > 0.0 else None,
             ego_lane_share=self.with_lane / max(self.frames, 1),
             ego_lane_wrong=self.wrong / max(self.frames, 1),
-            width_error_rel=float(np.median(self.widths)) if self.widths else None,
+            width_error_rel=median(self.widths),
             jitter_m=float(np.std(self.changes)) if self.changes else None,
             found_after_s=self.first_right_s,
         )

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from birdslam.bench.figures import median
 from birdslam.bench.tracking.localisation import MEASURED_KIND, RANGES_M
 from birdslam.bench.tracking.metrics import LEAST_HEIGHT_PX, least_cost
 from birdslam.sources.kitti import KITTI_RATE_HZ
@@ -183,7 +184,7 @@ def motion_row(sequence: str, seen: Sequence[Sight]) -> MotionRow:
     return MotionRow(
         sequence=sequence,
         asked=len(pairs),
-        velocity_error_median_mps=float(np.median(errors)) if errors else None,
+        velocity_error_median_mps=median(errors),
         standing=len(standing),
         false_movers=sum(speed > REPORTED_DRIVING_MPS for speed, _ in standing),
         false_movers_sure=sum(speed - 2.0 * sigma > REPORTED_DRIVING_MPS for speed, sigma in standing),

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from birdslam.bench.ego.trajectory_errors import compare, from_first
+from birdslam.bench.figures import median
 from birdslam.bench.tracking.metrics import least_cost, path_errors
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
@@ -115,9 +116,9 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
         ego_ate_pct=ego.ate_pct,
         ego_scale_error=ego.scale_error,
         vehicles=len(ates),
-        vehicle_ate_m=float(np.median(ates)) if ates else None,
-        vehicle_centre_m=float(np.median(distance)) if errors else None,
-        vehicle_centre_rel=float(np.median(distance / reach)) if errors else None,
+        vehicle_ate_m=median(ates),
+        vehicle_centre_m=median(distance),
+        vehicle_centre_rel=median(distance / reach),
         found=found / asked if asked else None,
         reported=reported / asked if asked else None,
     )

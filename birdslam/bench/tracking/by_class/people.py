@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import msgspec
 import numpy as np
 
+from birdslam.bench.figures import median
 from birdslam.bench.tracking.by_class.class_tracks import (
     KINDS,
     METRES,
@@ -226,10 +227,6 @@ def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
         lateral_error_median_m=float(np.median(np.abs(across))),
         inside_1_sigma=float(np.mean(spread <= INSIDE_1_SIGMA)),
         inside_2_sigma=float(np.mean(spread <= INSIDE_2_SIGMA)),
-        walking_speed_error_median_mps=_median(np.linalg.norm(told - true, axis=1)[walking]),
-        standing_speed_median_mps=_median(np.linalg.norm(told, axis=1)[standing]),
+        walking_speed_error_median_mps=median(np.linalg.norm(told - true, axis=1)[walking]),
+        standing_speed_median_mps=median(np.linalg.norm(told, axis=1)[standing]),
     )
-
-
-def _median(values: Floats) -> float | None:
-    return float(np.median(values)) if len(values) else None
