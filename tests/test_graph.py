@@ -600,7 +600,7 @@ def test_the_benchmark_measures_what_it_says(tmp_path: Path, capsys: pytest.Capt
         perf_main(["optimizer", *f"--vehicles 0,2 --frames 150 --contenders ours --output {tmp_path}/F.json".split()])
         == 0
     )
-    rows = json.loads((tmp_path / "F.json").read_text())
+    rows = json.loads((tmp_path / "F.json").read_text())["rows"]
     assert [(row["contender"], row["vehicles"], row["frames"], row["exceptions"]) for row in rows] == [
         ("ours", 0, 150, 0),
         ("ours", 2, 150, 0),

@@ -21,7 +21,8 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.ego_lane import EgoLane
-from birdslam.lanes.line_tracker import LineTracker, TrackedLines
+from birdslam.lanes.line_tracker import LineTracker
+from birdslam.lanes.tracked_lines import TrackedLines
 from birdslam.mapping.landmark_edges import StaticMapConfig
 from birdslam.mapping.lane_edges import LaneEdgesConfig, Station, lane_stations
 from birdslam.mapping.lane_ids import NO_LANE, cell_keys

@@ -247,11 +247,11 @@ class PeopleFilter:
         noise = np.stack([R, R])
         hide_feet(noise[1], np.exp(z[:, TALL]) / (1.0 - self.config.hidden_share), self.config)
         hidden = np.array([b.hidden for b in boxes])
-        squared, told = np.full((n, len(boxes)), np.inf), np.full((n, len(boxes)), np.inf)
+        squared, costs = np.full((n, len(boxes)), np.inf), np.full((n, len(boxes)), np.inf)
         for k, prior in enumerate((1.0 - hidden, hidden)):
             gap = z[None, :, :WIDTH] - mean[:, None, k]
             whole = S[:, None, k] + noise[k][None, :, :WIDTH, :WIDTH]
             d2 = (gap[..., None, :] @ np.linalg.inv(whole) @ gap[..., None])[..., 0, 0]
             cost = d2 + np.linalg.slogdet(whole)[1] - 2.0 * np.log(prior)[None]
-            squared, told = np.where(cost < told, d2, squared), np.minimum(told, cost)
-        return squared, told
+            squared, costs = np.where(cost < costs, d2, squared), np.minimum(costs, cost)
+        return squared, costs

@@ -123,8 +123,8 @@ class PeopleTracker:
         """(row, box): the assignment of least total cost, the negative log-likelihood within the gate."""
         if not boxes or not self.tracks:
             return []
-        squared, told = self.filter.distances(boxes, T_world_ego, height_m)
-        cost = np.where(squared <= self.config.gate, told, NEVER)
+        squared, costs = self.filter.distances(boxes, T_world_ego, height_m)
+        cost = np.where(squared <= self.config.gate, costs, NEVER)
         births = np.where(np.eye(len(boxes)), NEW, NEVER)  # a row of somebody new for each box
         rows, columns = self._assign(np.vstack([cost, births]))
         known = len(self.tracks)

@@ -73,12 +73,14 @@ def run(arguments: list[str]) -> None:
     with Ledger(options.output, label) as ledger, Inference(with_networks(options.model)) as inference:
         for name, truth_of in drives:
             recording = open_recording(f"kitti:{options.data / name}")
-            told = follow(recording, inference.networks.start)
+            sources = follow(recording, inference.networks.start)
             truth = truth_of(recording)
-            for who, tilts in told.items():
+            for source, tilts in sources.items():
                 row = _row(tilts, truth)
-                ledger.add(f"{Path(name).name} {who}", ", ".join(f"{k} {v}" for k, v in row.items()), **row)
-            by_images.append([t.tilt_rad - u.tilt_rad for t, u in zip(told["images"], truth, strict=False) if t and u])
+                ledger.add(f"{Path(name).name} {source}", ", ".join(f"{k} {v}" for k, v in row.items()), **row)
+            by_images.append(
+                [t.tilt_rad - u.tilt_rad for t, u in zip(sources["images"], truth, strict=False) if t and u]
+            )
         for axis, angle in enumerate(("pitch", "roll")):
             errors = [np.array(of)[:, axis] for of in by_images if of]
             drift = fit_drift(errors, [np.ones(len(e)) for e in errors])

@@ -228,11 +228,11 @@ def grade(variant: Variant, case: Case) -> dict[str, float]:
 
 
 def _nees_of_cars(graph: PoseGraph, m: Measurements, truth: Truth) -> list[float]:
-    told, out = graph.vehicles_in_ego(), []
+    estimated, out = graph.vehicles_in_ego(), []
     for car, vehicle in truth.matches[m.frame_id].items():
         goal = truth.vehicles[car].get(m.frame_id)
-        if vehicle in told and goal is not None:
-            T_ego_vehicle, cov = told[vehicle]
+        if vehicle in estimated and goal is not None:
+            T_ego_vehicle, cov = estimated[vehicle]
             there = truth.ego[m.frame_id].between(goal)
             error = np.array([T_ego_vehicle.x_m - there.x_m, T_ego_vehicle.y_m - there.y_m])
             out.append(_nees(error, cov[:2, :2]))

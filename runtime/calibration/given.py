@@ -80,7 +80,7 @@ def focal_length_of(given: Given, uri: str, width_px: int) -> FocalLength:
 
 
 def class_and_path(uri: str) -> tuple[type[Recording], Path]:
-    """Of a source's URI: what reads it, and where it lies."""
+    """The class that reads a source's URI, and the path in it."""
     scheme, address = parsed(uri)
     return scheme.load(), Path(address).expanduser()
 

@@ -54,8 +54,8 @@ def write_earth(
     found = tie(earth, nodes, links, before | fixed_keyframes(earth, t_ns, way, fixes, nodes))
     degrees = found.earth.wgs84(_bent(way, nodes, found))
     about = figures(found.earth, camera)
-    told = {key: value for key, value in about.items() if isinstance(value, int | float | str)}
-    line = Way("ego", degrees, [t_ns for t_ns, _ in poses], told)
+    properties = {key: value for key, value in about.items() if isinstance(value, int | float | str)}
+    line = Way("ego", degrees, [t_ns for t_ns, _ in poses], properties)
     for suffix in SUFFIXES:
         write_ways(output / f"ego{suffix}", [line])
     if place_map is not None and len(place_map):

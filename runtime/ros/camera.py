@@ -136,7 +136,7 @@ class RosCamera:
         domain = node.domain
         said: set[Publication] = set()
 
-        def told(token: str) -> None:
+        def publisher_came(token: str) -> None:
             found = publication_of(token)
             if found is None or found in said:
                 return
@@ -157,7 +157,7 @@ class RosCamera:
         if self._gnss is not None:
             listens.append((self._fixes, self._fix_came))
         for topic, came in listens:
-            node.watch(publishers_key(domain, topic), told)
+            node.watch(publishers_key(domain, topic), publisher_came)
             node.subscribe(any_type_key(domain, topic), came)
 
     def _info_topics(self) -> list[str]:

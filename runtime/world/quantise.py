@@ -75,7 +75,7 @@ def quantise(network: Path, frames: int) -> tuple[bytes, str]:
 
 
 def last_convolutions(model: onnx.ModelProto) -> list[str]:
-    """Names of the convolutions behind which no other stands, and of what lies between them and the outputs."""
+    """Names of the last convolutions before the outputs, and of the nodes between them and the outputs."""
     maker = {output: node for node in model.graph.node for output in node.output}
     names, waiting = [], list(OUTPUTS)
     while waiting:

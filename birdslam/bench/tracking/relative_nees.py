@@ -44,11 +44,11 @@ def nees_rows(sequence: TrackingSequence, log: Sequence[Measurements], live: Liv
     """The rows of one log; vehicles as `live` has them."""
     truth, motions = Truth.of(sequence, log), Motions(sequence.camera.ground)
     graph = PoseGraph(live.graph, live.weights)
-    told = []
+    estimated = []
     for m in log:
         motions.add(m)
         graph.optimise(m)
-        told.append(graph.vehicles_in_ego())
+        estimated.append(graph.vehicles_in_ego())
     first = log[0].frame_id
     poses = sequence.camera_poses[first : first + len(log)]
     camera = inverse(poses[0]) @ poses
@@ -58,9 +58,9 @@ def nees_rows(sequence: TrackingSequence, log: Sequence[Measurements], live: Liv
     per_stretch: dict[int, list[float]] = defaultdict(list)
     for k, m in enumerate(log):
         for label, vehicle in truth.matches[m.frame_id].items():
-            if vehicle not in told[k] or m.frame_id not in truth.vehicles[label]:
+            if vehicle not in estimated[k] or m.frame_id not in truth.vehicles[label]:
                 continue
-            (T_ego_vehicle, cov), goal = told[k][vehicle], truth.vehicles[label][m.frame_id]
+            (T_ego_vehicle, cov), goal = estimated[k][vehicle], truth.vehicles[label][m.frame_id]
             per_frame[label].append(_nees(T_ego_vehicle, cov[:2, :2], truth.ego[m.frame_id].between(goal)))
             if k in stretches:
                 begin, T_begin_ego, cov_ego = stretches[k]
@@ -126,6 +126,6 @@ def _ego_rows(sequence: str, odometry: str, per: str, found: MotionConsistency) 
     return [ego, scale]
 
 
-def _nees(told: SE2, cov: Floats, goal: SE2) -> float:
-    error = np.array([told.x_m - goal.x_m, told.y_m - goal.y_m])
+def _nees(estimated: SE2, cov: Floats, goal: SE2) -> float:
+    error = np.array([estimated.x_m - goal.x_m, estimated.y_m - goal.y_m])
     return float(error @ np.linalg.solve(cov, error))

@@ -135,7 +135,9 @@ def render_report(setting: Setting, published: Published, outcomes: Sequence[Out
         )
     movers = [outcome.movers for outcome in outcomes if outcome.movers is not None]
     if movers:
-        parts.append(f"## Standing tracks that are told to drive\n\n{ABOUT_MOVERS}\n\n{tables.movers_table(movers)}")
+        parts.append(
+            f"## Standing tracks that are reported to drive\n\n{ABOUT_MOVERS}\n\n{tables.movers_table(movers)}"
+        )
     ranges = [row for outcome in outcomes for row in outcome.ranges]
     if ranges:
         parts.append(

@@ -273,7 +273,7 @@ def ranges_table(rows: Sequence[RangeRow]) -> str:
 
 
 def motion_table(rows: Sequence[MotionRow]) -> str:
-    """Of the found cars: their velocities, and how many standing and driving ones were told as the other."""
+    """Of the found cars: their velocities, and how many standing and driving ones were reported as the other."""
     head = ["Seq", "sights", "velocity error m/s", "standing", "false movers", "sure of it"]
     head += ["driving", "missed movers", "sure of it"]
     lines = [
@@ -290,8 +290,17 @@ def motion_table(rows: Sequence[MotionRow]) -> str:
 
 
 def movers_table(rows: Sequence[MoversRow]) -> str:
-    """Tracks of standing vehicles that are told to drive, and of driving ones that are told so, and in all."""
-    head = ["Seq", "odometry", "standing", "told to drive", "driving", "told", "soon", "where (ahead, left in m: m/s)"]
+    """Tracks of standing vehicles that are reported to drive, and of driving ones that are, and in all."""
+    head = [
+        "Seq",
+        "odometry",
+        "standing",
+        "reported to drive",
+        "driving",
+        "reported",
+        "soon",
+        "where (ahead, left in m: m/s)",
+    ]
     lines = [
         [
             row.sequence,
