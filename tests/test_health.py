@@ -22,6 +22,7 @@ from birdslam.runtime.configuration import (
     BudgetsConfig,
     Configuration,
     ConfigurationError,
+    ModelsConfig,
     NodeScheduling,
     PerceiveConfig,
     RealtimeConfig,
@@ -282,7 +283,13 @@ def refused(*arguments: object) -> None:
 
 def test_the_doctor_finds_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rt = RuntimeConfig(runtime_dir=str(tmp_path / "rt"))
-    healthy = Configuration(vehicle="doc", runtime=rt, output=str(tmp_path), source=SourceConfig(uri="demo"))
+    healthy = Configuration(
+        vehicle="doc",
+        runtime=rt,
+        output=str(tmp_path),
+        source=SourceConfig(uri="demo"),
+        models=ModelsConfig(shipped=False),
+    )
 
     def with_realtime(**settings: object) -> Configuration:
         return msgspec.structs.replace(healthy, realtime=RealtimeConfig(**settings))  # type: ignore[arg-type]

@@ -52,9 +52,9 @@ def unit_of_length(seed: int, way_m: float, sigma_px: float) -> Floats:
 
 
 def test_the_unit_of_length_walks_no_faster_than_the_road_filter_is_told() -> None:
-    """Over 60 m of 8 streets: the root mean square of what it walked, in which a drift to one side would show too."""
+    """Over 60 m of 4 streets: the root mean square of what it walked, in which a drift to one side would show too."""
     way_m, walked = 60.0, []
-    for seed in range(8):
+    for seed in range(4):
         unit = np.log(unit_of_length(seed, way_m, 0.35))
         walked.append(unit[-8:].mean() - unit[:8].mean())
     assert np.sqrt(np.mean(np.square(walked))) < RoadScaleConfig().scale_walk_rel_per_sqrt_m * np.sqrt(way_m)

@@ -13,6 +13,7 @@ import numpy as np
 
 from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
+from birdslam.geometry.pose import rotation_exp, rotation_log
 from birdslam.loops.features import Features, hamming, match
 from birdslam.trajectory import Transform, inverse
 
@@ -142,12 +143,13 @@ def _refined(T: Transform, prior: Transform, rays: Floats, rho: Floats, xy: Floa
         J = (Jp[:, :2] - predicted[:, :, None] * Jp[:, 2:3]) / z[:, None, None]
         error = xy - predicted
         weight = 1.0 / (1.0 + ((error / sigma[:, None]) ** 2).sum(axis=1) / 4.0) / sigma**2
-        H = np.einsum("nai,n,naj->ij", J, weight, J) + prior_information
-        deviation = np.concatenate([T[:3, 3] - prior[:3, 3], _rotation_vector(T[:3, :3] @ prior[:3, :3].T)])
-        g = np.einsum("nai,n,na->i", J, weight, error) - prior_information @ deviation
+        weighed = (J * weight[:, None, None]).reshape(-1, 6)
+        H = weighed.T @ J.reshape(-1, 6) + prior_information
+        deviation = np.concatenate([T[:3, 3] - prior[:3, 3], rotation_log(T[:3, :3] @ prior[:3, :3].T)])
+        g = weighed.T @ error.ravel() - prior_information @ deviation
         step = np.linalg.solve(H, g)
         T = T.copy()
-        T[:3, :3] = rotation(step[3:]) @ T[:3, :3]
+        T[:3, :3] = rotation_exp(step[3:]) @ T[:3, :3]
         T[:3, 3] += step[:3]
     return T
 
@@ -157,19 +159,4 @@ def cross(v: Floats) -> Floats:
     out = np.zeros((len(v), 3, 3))
     out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
     out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
-    return out
-
-
-def rotation(w: Floats) -> Floats:
-    """(3, 3) of a rotation vector in rad."""
-    from scipy.spatial.transform import Rotation  # here: few processes need it
-
-    out: Floats = Rotation.from_rotvec(w).as_matrix()
-    return out
-
-
-def _rotation_vector(R: Floats) -> Floats:
-    from scipy.spatial.transform import Rotation  # here: few processes need it
-
-    out: Floats = Rotation.from_matrix(R).as_rotvec()
     return out

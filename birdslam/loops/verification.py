@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
+from birdslam.geometry.pose import rotation_exp
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import Features, hamming, match
 from birdslam.loops.keyframe import Keyframe
-from birdslam.loops.triangulation import cross, rotation
+from birdslam.loops.triangulation import cross
 from birdslam.trajectory import Transform, ego_pose, inverse, mount_pose, split_pose
 from birdslam.types import Attitude
 
@@ -126,7 +127,7 @@ def _ransac(camera: Camera, features: Features, local: LocalMap, pairs: Ints) ->
     if not found or inliers is None or len(inliers) < 8:
         return None, pairs
     T_cam_keyframe = np.eye(4)
-    T_cam_keyframe[:3, :3] = rotation(rotated.ravel().astype(np.float64))
+    T_cam_keyframe[:3, :3] = rotation_exp(rotated.ravel().astype(np.float64))
     T_cam_keyframe[:3, 3] = moved.ravel()
     if not np.isfinite(T_cam_keyframe).all():
         return None, pairs
@@ -176,11 +177,12 @@ def _adjust(
         blur = (depth[:, :2] - predicted * depth[:, 2:3]) / z[:, None]
         W = np.linalg.inv(noise[:, None, None] * np.eye(2) + blur[:, :, None] * blur[:, None, :])
         error = xy - predicted
-        chi2 = np.einsum("na,nab,nb->n", error, W, error)
+        chi2 = (error * (W @ error[:, :, None])[:, :, 0]).sum(axis=1)
         good = (chi2 < GATE**2) & (p[:, 2] > 0.5)
         weight = (p[:, 2] > 0.5) / (1.0 + chi2 / 4.0)
-        H = np.einsum("nai,n,nab,nbj->ij", J, weight, W, J)
-        g = np.einsum("nai,n,nab,nb->i", J, weight, W, error)
+        weighed = (weight[:, None, None] * (W @ J)).reshape(-1, 6)
+        H = weighed.T @ J.reshape(-1, 6)
+        g = weighed.T @ error.ravel()
         state = split_pose(pose)[1]
         g -= prior * np.array([0.0, 0.0, pose[2, 3], state.roll_rad, state.pitch_rad, 0.0])
         H += np.diag(prior)
@@ -189,7 +191,7 @@ def _adjust(
         step = np.linalg.solve(H, g)
         pose = pose.copy()
         pose[:3, 3] += pose[:3, :3] @ np.clip(step[:3], -2.0, 2.0)
-        pose[:3, :3] = pose[:3, :3] @ rotation(step[3:])
+        pose[:3, :3] = pose[:3, :3] @ rotation_exp(step[3:])
         if float(np.abs(step).max()) < 1e-5:
             break
     if not good.any() or abs(pose[2, 3]) > 1.5 or math.hypot(*pose[:2, 3]) > 60.0:
