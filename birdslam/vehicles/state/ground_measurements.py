@@ -17,10 +17,10 @@ from birdslam.geometry import bev
 
 Floats = NDArray[np.float64]
 
-# States of all vehicles: tilt of the camera over the road, its mean over the drive, lasting errors of the images' tilt,
-# what the sizes and what the lower edges have in common
-PITCH, ROLL, MEAN_PITCH, MEAN_ROLL, IMAGE_PITCH, IMAGE_ROLL, SIZE, LOWER = range(8)
-COMMON, OWN = 8, 4  # and of each vehicle:
+# States of all vehicles: tilt of the camera over the road, lasting errors of the images' tilt, what the sizes and what
+# the lower edges have in common
+PITCH, ROLL, IMAGE_PITCH, IMAGE_ROLL, SIZE, LOWER = range(6)
+COMMON, OWN = 6, 4  # and of each vehicle:
 HEIGHT, OUTLINE, EDGE, TILT = range(OWN)
 Cue = Literal["bottom", "top", "width"]
 CUES: tuple[Cue, ...] = ("bottom", "top", "width")  # measurements of each box, in this order

@@ -4,8 +4,6 @@ data chose.
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +16,7 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     sigma_pitch_rad: float = 0.010  # of the camera over real roads against its calibration, all together
     sigma_roll_rad: float = 0.02  # the same
-    # Of these variances the share that lasts for a drive: the mount, the load, the camera file
-    mean_tilt_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.7
-    pitch_memory_s: float = 5.0  # of driving: how long the pitch's deviation from the drive's mean lasts
+    pitch_memory_s: float = 5.0  # of driving: how long the pitch's deviation from the calibration lasts
     roll_memory_s: float = 20.0  # of driving: how long the roll's deviation lasts
     sigma_pitch_step_rad: float = 0.0008  # a frame of driving: the road's change of grade, and the odometry's error
     sigma_pitch_blind_rad: float = 0.003  # a frame without odometry
@@ -59,11 +55,6 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return np.square([self.sigma_image_pitch_rad, self.sigma_image_roll_rad])
 
     @property
-    def mean_tilt_var(self) -> NDArray[np.float64]:
-        """(2,) of the drive's means of pitch and roll."""
-        return np.square([self.sigma_pitch_rad, self.sigma_roll_rad]) * self.mean_tilt_share
-
-    @property
     def tilt_var(self) -> NDArray[np.float64]:
-        """(2,) of pitch and roll about those means."""
-        return np.square([self.sigma_pitch_rad, self.sigma_roll_rad]) * (1.0 - self.mean_tilt_share)
+        """(2,) of pitch and roll about the calibration."""
+        return np.square([self.sigma_pitch_rad, self.sigma_roll_rad])

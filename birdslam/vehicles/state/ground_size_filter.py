@@ -1,16 +1,15 @@
 """The road's tilt and the vehicles' sizes, each from the other, by the boxes of the vehicles alone.
 
-    x = [pitch, roll, their means, errors of the images' tilt, common size and edge,
+    x = [pitch, roll, errors of the images' tilt, common size and edge,
          and of every vehicle: log h, log w, edge, tilt]      and, for one frame only, of every box: log z
 
 One Kalman filter holds them all; ground_measurements.py has the measurements.
 
-What is wrong for as long as a drive lasts is a state of the drive: the mean of the tilt, by how much its vehicles are
-taller than their classes (size_prior.py), how low their boxes end, and by how much the tilt that images see before the
-ego is off where vehicles are. What is wrong with one vehicle for as long as it is in sight is a state of the
-vehicle, so that its many frames don't average it away: `edge` is by how much its box ends lower than the ego's plane at
-its face (m: the kerb, and where the detector draws its edge), `tilt` by how much the road at it is tilted against the
-ego's (rad).
+What is wrong for as long as a drive lasts is a state of the drive: by how much its vehicles are taller than their
+classes (size_prior.py), how low their boxes end, and by how much the tilt that images see before the ego is off where
+vehicles are. What is wrong with one vehicle for as long as it is in sight is a state of the vehicle, so that its many
+frames don't average it away: `edge` is by how much its box ends lower than the ego's plane at its face (m: the kerb,
+and where the detector draws its edge), `tilt` by how much the road at it is tilted against the ego's (rad).
 """
 
 from __future__ import annotations
@@ -33,8 +32,6 @@ from birdslam.vehicles.state.ground_measurements import (
     IMAGE_PITCH,
     IMAGE_ROLL,
     LOWER,
-    MEAN_PITCH,
-    MEAN_ROLL,
     OUTLINE,
     OWN,
     PITCH,
@@ -53,7 +50,7 @@ Floats = NDArray[np.float64]
 ITERATIONS = 2
 DEPTH_UNKNOWN = 2.0  # 1-sigma of log z before a frame is seen
 UNUSED = 1e3  # 1-sigma of a cue that is not used
-_TILTS, _MEANS, _IMAGES = slice(PITCH, ROLL + 1), slice(MEAN_PITCH, MEAN_ROLL + 1), slice(IMAGE_PITCH, IMAGE_ROLL + 1)
+_TILTS, _IMAGES = slice(PITCH, ROLL + 1), slice(IMAGE_PITCH, IMAGE_ROLL + 1)
 _MIN_DT_S = 1e-3
 _MIN_SHARE = 1e-6  # of a second, that counts as driving
 
@@ -72,9 +69,9 @@ class Depths:
 class GroundSizeFilter:
     """predict() once a frame, then estimate_depths() of its boxes.
 
-    State: pitch and roll (rad) of the camera over the road, their means over the drive and the lasting errors of the
-    images' of them; the log of a factor on all heights, and where all boxes end as a share of the height; of each
-    vehicle the log of its height in metres, the log of its outline's width as a factor, its edge (m) and tilt (rad).
+    State: pitch and roll (rad) of the camera over the road, and the lasting errors of the images' of them; the log of a
+    factor on all heights, and where all boxes end as a share of the height; of each vehicle the log of its height in
+    metres, the log of its outline's width as a factor, its edge (m) and tilt (rad).
     Measurements: of each box the slopes of bottom and top and the log of its width (see the module); pitch and roll
     (rad) by the images. `placing.Placing` reads depths and heights; `ground` is read by `localisation.observe_boxes`,
     by association, and by the front end's lanes and landmarks.
@@ -86,11 +83,9 @@ class GroundSizeFilter:
         self._unseen_s = np.zeros(0)  # of each vehicle
         self._driven_s = np.zeros(0)  # and how much of that counts as driving of the ego
         self._sigma_tilt = np.zeros(0)
-        mean = config.mean_tilt_var
-        self._x = np.array([camera.pitch_rad, camera.roll_rad] * 2 + [0.0] * 4)
+        self._x = np.array([camera.pitch_rad, camera.roll_rad, *np.zeros(COMMON - 2)])
         common = np.square([config.sigma_common_rel, config.sigma_common_edge_rel])
-        self._P = np.diag([*mean + config.tilt_var, *mean, *config.image_var, *common])
-        self._P[[PITCH, ROLL, MEAN_PITCH, MEAN_ROLL], [MEAN_PITCH, MEAN_ROLL, PITCH, ROLL]] = np.tile(mean, 2)
+        self._P = np.diag([*config.tilt_var, *config.image_var, *common])
         self._sizes = SizePrior(config.sigma_common_rel, config.size_dof)
         self._image_ground = camera.ground
 
@@ -176,10 +171,8 @@ class GroundSizeFilter:
         scale = np.ones(len(self._x))
         scale[_TILTS], scale[_IMAGES], scale[COMMON + TILT :: OWN] = keep, keep_image, keep_tilt
         self._x *= scale
-        self._x[_TILTS] += (1.0 - keep) * self._x[_MEANS]
+        self._x[_TILTS] += (1.0 - keep) * [self.camera.pitch_rad, self.camera.roll_rad]
         self._P *= np.outer(scale, scale)
-        self._P[_TILTS] += (1.0 - keep)[:, None] * self._P[_MEANS]
-        self._P[:, _TILTS] += (1.0 - keep) * self._P[:, _MEANS]
         noise = np.zeros(len(self._x))
         noise[_TILTS] = (1.0 - keep**2) * config.tilt_var
         noise[_IMAGES] = (1.0 - keep_image**2) * config.image_var
