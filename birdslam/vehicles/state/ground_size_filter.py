@@ -1,6 +1,6 @@
 """The road's tilt and the vehicles' sizes, each from the other, by the boxes of the vehicles alone.
 
-    x = [pitch, roll, errors of the images' tilt, common size and edge,
+    x = [pitch, roll, crown, errors of the images' tilt, common size and edge,
          and of every vehicle: log h, log w, edge, tilt]      and, for one frame only, of every box: log z
 
 One Kalman filter holds them all; ground_measurements.py has the measurements.
@@ -26,6 +26,7 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.vehicles.placement.localisation import Observation
 from birdslam.vehicles.state.ground_measurements import (
     COMMON,
+    CROWN,
     CUES,
     EDGE,
     HEIGHT,
@@ -50,7 +51,7 @@ Floats = NDArray[np.float64]
 ITERATIONS = 2
 DEPTH_UNKNOWN = 2.0  # 1-sigma of log z before a frame is seen
 UNUSED = 1e3  # 1-sigma of a cue that is not used
-_TILTS, _IMAGES = slice(PITCH, ROLL + 1), slice(IMAGE_PITCH, IMAGE_ROLL + 1)
+_TILTS, _ROAD, _IMAGES = slice(PITCH, ROLL + 1), slice(PITCH, CROWN + 1), slice(IMAGE_PITCH, IMAGE_ROLL + 1)
 _MIN_DT_S = 1e-3
 _MIN_SHARE = 1e-6  # of a second, that counts as driving
 
@@ -69,9 +70,9 @@ class Depths:
 class GroundSizeFilter:
     """predict() once a frame, then estimate_depths() of its boxes.
 
-    State: pitch and roll (rad) of the camera over the road, and the lasting errors of the images' of them; the log of a
-    factor on all heights, and where all boxes end as a share of the height; of each vehicle the log of its height in
-    metres, the log of its outline's width as a factor, its edge (m) and tilt (rad).
+    State: pitch and roll (rad) of the camera over the road, by how much its sides fall off (rad), and lasting errors of
+    the images' tilt; the log of a factor on all heights, and where all boxes end as a share of the height; of each
+    vehicle the log of its height in metres, the log of its outline's width as a factor, its edge (m) and tilt (rad).
     Measurements: of each box the slopes of bottom and top and the log of its width (see the module); pitch and roll
     (rad) by the images. `placing.Placing` reads depths and heights; `ground` is read by `localisation.observe_boxes`,
     by association, and by the front end's lanes and landmarks.
@@ -85,7 +86,7 @@ class GroundSizeFilter:
         self._sigma_tilt = np.zeros(0)
         self._x = np.array([camera.pitch_rad, camera.roll_rad, *np.zeros(COMMON - 2)])
         common = np.square([config.sigma_common_rel, config.sigma_common_edge_rel])
-        self._P = np.diag([*config.tilt_var, *config.image_var, *common])
+        self._P = np.diag([*config.road_var, *config.image_var, *common])
         self._sizes = SizePrior(config.sigma_common_rel, config.size_dof)
         self._image_ground = camera.ground
 
@@ -165,16 +166,16 @@ class GroundSizeFilter:
         self._unseen_s = self._unseen_s + dt_s
         self._driven_s = self._driven_s + share * dt_s
         self._x[PITCH] += turn_rad or 0.0
-        keep = np.exp(-share * dt_s / np.array([config.pitch_memory_s, config.roll_memory_s]))
+        keep = np.exp(-share * dt_s / config.road_memory_s)
         keep_image = np.exp(-share * dt_s / np.array([config.image_pitch_memory_s, config.image_roll_memory_s]))
         keep_tilt = math.exp(-share * dt_s / config.tilt_memory_s)
         scale = np.ones(len(self._x))
-        scale[_TILTS], scale[_IMAGES], scale[COMMON + TILT :: OWN] = keep, keep_image, keep_tilt
+        scale[_ROAD], scale[_IMAGES], scale[COMMON + TILT :: OWN] = keep, keep_image, keep_tilt
         self._x *= scale
-        self._x[_TILTS] += (1.0 - keep) * [self.camera.pitch_rad, self.camera.roll_rad]
+        self._x[_ROAD] += (1.0 - keep) * [self.camera.pitch_rad, self.camera.roll_rad, 0.0]
         self._P *= np.outer(scale, scale)
         noise = np.zeros(len(self._x))
-        noise[_TILTS] = (1.0 - keep**2) * config.tilt_var
+        noise[_ROAD] = (1.0 - keep**2) * config.road_var
         noise[_IMAGES] = (1.0 - keep_image**2) * config.image_var
         noise[COMMON + TILT :: OWN] = (1.0 - keep_tilt**2) * np.square(self._sigma_tilt)
         step = config.sigma_pitch_blind_rad if turn_rad is None else config.sigma_pitch_step_rad
