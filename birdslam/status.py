@@ -1,11 +1,20 @@
-"""Statuses: expected trouble, as records report it."""
+"""The words of records that a newer sender may add to; statuses: expected trouble, as records report it."""
 
 from __future__ import annotations
 
 import enum
+from typing import Self
 
 
-class Status(enum.StrEnum):
+class Word(enum.StrEnum):
+    """A word of records; one that only a newer sender knows is read as the member that `NEWER` is another name of."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> Self | None:
+        return cls["NEWER"] if isinstance(value, str) else None
+
+
+class Status(Word):
     """Expected trouble, carried in the record; `INVALIDATING` says which make an estimate invalid."""
 
     END_OF_SOURCE = "end_of_source"  # the source has no further frame; the last record of a run
@@ -53,9 +62,7 @@ class Status(enum.StrEnum):
     )
     UNKNOWN = "unknown"  # a newer sender's status that this reader does not know
 
-    @classmethod
-    def _missing_(cls, value: object) -> Status | None:
-        return cls.UNKNOWN if isinstance(value, str) else None
+    NEWER = UNKNOWN
 
 
 INVALIDATING = frozenset(

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.se2 import SE2
 from birdslam.status import INVALIDATING as INVALIDATING
 from birdslam.status import Status as Status
+from birdslam.status import Word
 
 Cov3 = Annotated[tuple[float, ...], msgspec.Meta(min_length=9, max_length=9)]
 Cov2 = Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)]
@@ -78,7 +79,7 @@ def check_points(record: msgspec.Struct, *points_m: tuple[float, float]) -> None
             raise ValueError(f"{type(record).__name__} needs finite points, got ({x_m}, {y_m})")
 
 
-class SpeedSource(enum.StrEnum):
+class SpeedSource(Word):
     """Where the metres of a frame's motion come from."""
 
     ROAD = "road"  # the road's image, under a camera of known height
@@ -86,21 +87,17 @@ class SpeedSource(enum.StrEnum):
     CARRIED = "carried"  # the scale of an earlier frame
     UNKNOWN = "unknown"  # a newer sender's source that this reader does not know
 
-    @classmethod
-    def _missing_(cls, value: object) -> SpeedSource | None:
-        return cls.UNKNOWN if isinstance(value, str) else None
+    NEWER = UNKNOWN
 
 
-class Moves(enum.StrEnum):
+class Moves(Word):
     """Whether a vehicle stands or drives, decided with hysteresis."""
 
     UNDECIDED = "undecided"  # too little was seen of it
     STANDING = "standing"  # its velocity is reported as zero
     DRIVING = "driving"
 
-    @classmethod
-    def _missing_(cls, value: object) -> Moves | None:
-        return cls.UNDECIDED if isinstance(value, str) else None
+    NEWER = UNDECIDED
 
 
 class SpeedReading(msgspec.Struct, frozen=True, kw_only=True):
@@ -257,7 +254,7 @@ class LanePoint(msgspec.Struct, frozen=True, array_like=True, gc=False):
             check_finite(self, "x_m", "y_m")
 
 
-class LineKind(enum.StrEnum):
+class LineKind(Word):
     """What a line on the road is."""
 
     UNKNOWN = "unknown"
@@ -266,21 +263,17 @@ class LineKind(enum.StrEnum):
     DOUBLE = "double"  # two lines of paint side by side
     EDGE = "edge"  # where the road ends, with or without a kerb
 
-    @classmethod
-    def _missing_(cls, value: object) -> LineKind | None:
-        return cls.UNKNOWN if isinstance(value, str) else None
+    NEWER = UNKNOWN
 
 
-class LineColour(enum.StrEnum):
+class LineColour(Word):
     """The colour of a painted line, where it is sure."""
 
     UNKNOWN = "unknown"
     WHITE = "white"
     YELLOW = "yellow"
 
-    @classmethod
-    def _missing_(cls, value: object) -> LineColour | None:
-        return cls.UNKNOWN if isinstance(value, str) else None
+    NEWER = UNKNOWN
 
 
 Cov4 = Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)]
@@ -324,16 +317,14 @@ class LaneLine(msgspec.Struct, frozen=True, kw_only=True, gc=False):
             _check_cov(self, "cov")
 
 
-class Bound(enum.StrEnum):
+class Bound(Word):
     """What a lane's left or right is known by."""
 
     PAINT = "paint"
     EDGE = "edge"  # the road's edge
     WIDTH = "width"  # neither is seen: the other side's line, and the width of lanes
 
-    @classmethod
-    def _missing_(cls, value: object) -> Bound | None:
-        return cls.WIDTH if isinstance(value, str) else None
+    NEWER = WIDTH
 
 
 class Lane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
@@ -380,16 +371,14 @@ class Lane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
         _check_cov(self, "cov")
 
 
-class LaneChange(enum.StrEnum):
+class LaneChange(Word):
     """The ego's change of lanes: told once, in the frame in which the middle of the ego has crossed the line."""
 
     NONE = "none"
     LEFT = "left"
     RIGHT = "right"
 
-    @classmethod
-    def _missing_(cls, value: object) -> LaneChange | None:
-        return cls.NONE if isinstance(value, str) else None
+    NEWER = NONE
 
 
 class VehicleLane(msgspec.Struct, frozen=True, kw_only=True, gc=False):

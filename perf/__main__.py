@@ -24,6 +24,7 @@ def benchmark_modules() -> dict[str, str]:
 def main(arguments: list[str]) -> int:
     os.environ.update(ENVIRONMENT)  # before numpy is loaded: computes as the nodes do
     from birdslam.perf.errors import PerfError  # and what loads numpy only now
+    from birdslam.runtime.cli.errors import USER_ERRORS
 
     names = benchmark_modules()
     wanted = arguments[:1] if arguments and arguments[0] in names else names  # one that is named needs no other
@@ -32,7 +33,7 @@ def main(arguments: list[str]) -> int:
     if arguments and arguments[0] in benchmarks:
         try:
             status: int | None = benchmarks[arguments[0]].run(arguments[1:])
-        except PerfError as error:
+        except (PerfError, *USER_ERRORS) as error:
             print(f"perf {arguments[0]}: {error}", file=sys.stderr)
             return USER_ERROR_STATUS
         except KeyboardInterrupt:

@@ -109,6 +109,10 @@ class Configuration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         """Every frame is processed, as fast as it can be."""
         return self.source.rate == "max"
 
+    def as_lossless(self) -> Configuration:
+        """The same, but for `lossless`."""
+        return msgspec.structs.replace(self, source=msgspec.structs.replace(self.source, rate="max"))
+
     @property
     def restarts(self) -> bool:
         """Whether a node that died is begun anew."""

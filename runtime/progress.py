@@ -101,9 +101,9 @@ class Progress:
             self._visible = False
 
 
-def with_progress(items: Iterable[_Item], what: str, total: int | None, unit: str = "frames") -> Iterator[_Item]:
-    """The items, with progress."""
-    with Progress(what, total, unit) as progress:
+def with_progress(items: Iterable[_Item], what: str, total: int | None) -> Iterator[_Item]:
+    """The items, with progress in frames."""
+    with Progress(what, total, "frames") as progress:
         for item in items:
             yield item
             progress.advance()

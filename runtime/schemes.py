@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from birdslam.sources import schemes as recorded
 from birdslam.sources.schemes import Scheme
 
@@ -18,41 +20,33 @@ MCAP = Scheme(
     is_at=lambda path: path.suffix.lower() == ".mcap" and not path.is_dir(),  # one of ROS has been recognised before
     recognised="any other .mcap file",
 )
-V4L2 = Scheme(
+_live = partial(Scheme, clock="this computer's", live=True, refused=OF_RECORDINGS)
+V4L2 = _live(
     name="v4l2",
     written=("v4l2:/dev/videoN",),
     what="a camera of this computer",
     opener="birdslam.runtime.nodes.cameras:DeviceCamera",
     camera="nothing",
-    clock="this computer's",
     address="device",
-    live=True,
     options=OF_A_CAMERA,
-    refused=OF_RECORDINGS,
 )
-RTSP = Scheme(
+RTSP = _live(
     name="rtsp",
     written=("rtsp://HOST/PATH",),
     what="a camera of the network",
     opener="birdslam.runtime.nodes.cameras:NetworkCamera",
     camera="nothing",
-    clock="this computer's",
     address="network",
-    live=True,
     options=OF_A_CAMERA,
-    refused=OF_RECORDINGS,
 )
-ROS = Scheme(
+ROS = _live(
     name="ros",
     written=("ros:/TOPIC",),
     what="images of ROS 2 as they come, from a topic at a router of rmw_zenoh, without ROS: [ros.md](ros.md)",
     opener="birdslam.runtime.ros.camera:RosCamera",
     camera="intrinsics",
-    clock="this computer's",
     address="topic",
-    live=True,
     options=("topics", *OF_A_CAMERA),
-    refused=OF_RECORDINGS,
 )
 
 OF_THE_RUNTIME = (MCAP, V4L2, RTSP, ROS)

@@ -6,15 +6,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from birdslam.bench.simulation.drive import DriveConfig, drive
 from birdslam.bench.tracking import ablation
 from birdslam.bench.tracking.benchmark import PAPER, Live, ours
+from birdslam.geometry.arrays import Floats
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.slam import SlamConfig
-
-Floats = NDArray[np.float64]
 
 WORLD = drive(DriveConfig(frames=25, rate_hz=10.0, vehicles=2, landmarks=12, noise=0.0, traffic="convoy"), seed=2)
 of_both_graphs = pytest.mark.parametrize("base", [PAPER, ours(SlamConfig())], ids=["paper", "birdslam"])

@@ -13,12 +13,11 @@ from birdslam.bench.baselines import batch_se3, cubeslam, nair, namdev
 from birdslam.bench.baselines.posegraph3 import solve_batch
 from birdslam.bench.baselines.trajectories import LiveTrajectories, Trajectories, dead_reckoned
 from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
-from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.perf.latency import incremental
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
+from tests.recordings import KITTI as CAMERA
 
-CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65)
 QUIET = DriveConfig(frames=40, rate_hz=10.0, vehicles=3, landmarks=8, lane_points=0, noise=0.0)
 HEIGHT_M = 1.5
 UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -75,8 +74,7 @@ def test_the_batch_finds_the_scale_by_itself(world: Drive) -> None:
         else msgspec.structs.replace(
             m,
             cc=msgspec.structs.replace(
-                m.cc,
-                T_from_to=SE2(m.cc.T_from_to.x_m * factor, m.cc.T_from_to.y_m * factor, m.cc.T_from_to.yaw_rad),
+                m.cc, T_from_to=SE2(m.cc.T_from_to.x_m * factor, m.cc.T_from_to.y_m * factor, m.cc.T_from_to.yaw_rad)
             ),
         )
         for m in world.measurements

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,11 @@ import pytest
 from birdslam.geometry.camera import Camera
 from birdslam.perception import Boxes3d, Detections, Findings, Networks
 from birdslam.perception.decoding.detection import with_bodies
-from birdslam.perception.manifest import Schedule
+from birdslam.perception.shipped import run_at_once
 from birdslam.vehicles.placement.depth_fusion import PseudoLidarConfig
 from birdslam.vehicles.placement.localisation import LocalisationConfig, observe_boxes
 from birdslam.vehicles.placement.pseudolidar import bodies_by_detector
+from tests.heads import Head
 
 CAMERA = Camera(1242, 375, 720.0, 720.0, 620.0, 180.0, height_m=1.65)
 IMAGE = np.zeros((2, 2), np.uint8)
@@ -75,36 +75,22 @@ def test_without_bodies_the_detections_stay(others: Detections | None) -> None:
     assert len(with_bodies(boxes(), embodied(boxes(LEFT), [9.0]))) == 0
 
 
-class Head:
-    fell_back = ""  # its provider is the CPU
-
-    def __init__(self, role: Any, found: Detections, every: int = 1) -> None:
-        self.name, self.role, self.schedule = role, role, Schedule(every=every)
-        self.found, self.ran = found, 0
-
-    def run(self, image: np.ndarray[Any, Any]) -> Findings:
-        self.ran += 1
-        return Findings(detections=self.found)
-
-
-def at_once(run: Any, image: Any) -> Future[Any]:
-    future: Future[Any] = Future()
-    future.set_result(run(image))
-    return future
+def head(role: Any, found: Detections, every: int = 1) -> Head:
+    return Head(role, Findings(detections=found), every=every)
 
 
 def test_bodies_are_of_the_same_image() -> None:
-    heads = [Head("detector", boxes(LEFT)), Head("segmenter", boxes()), Head("depth", boxes())]
-    shipped = Head("multitask", embodied(boxes(LEFT), [25.0]), every=2)
-    networks = Networks([*heads, shipped], at_once, bodies=True)
+    heads = [head("detector", boxes(LEFT)), head("segmenter", boxes()), head("depth", boxes())]
+    shipped = head("multitask", embodied(boxes(LEFT), [25.0]), every=2)
+    networks = Networks([*heads, shipped], run_at_once, bodies=True)
     first, second = (networks.start(frame, IMAGE).result().detections for frame in (0, 1))
     assert first is not None
     assert first.boxes3d is not None
     assert second is not None
     assert second.boxes3d is None  # the multi-task network did not look
-    assert shipped.ran == 1
-    unasked = Head("multitask", embodied(boxes(LEFT), [25.0]))
-    plain = Networks([*heads, unasked], at_once).start(0, IMAGE).result().detections
+    assert shipped.runs == 1
+    unasked = head("multitask", embodied(boxes(LEFT), [25.0]))
+    plain = Networks([*heads, unasked], run_at_once).start(0, IMAGE).result().detections
     assert plain is not None
     assert plain.boxes3d is None
-    assert unasked.ran == 0
+    assert unasked.runs == 0

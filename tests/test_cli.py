@@ -23,6 +23,13 @@ def configuration(*arguments: str):  # type: ignore[no-untyped-def]
     return configuration_of(parse(arguments))
 
 
+def test_no_map_takes_away_the_map_of_the_configuration_file(tmp_path: Path) -> None:
+    (tmp_path / "car.toml").write_text('[results]\nmap = "road.map"\n')
+    arguments = ["run", str(tmp_path / "car.toml"), "--source", "v4l2:/dev/video0"]
+    assert configuration(*arguments).maps_live
+    assert not configuration(*arguments, "--no-map").maps_live
+
+
 def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         main(["--version"])

@@ -8,12 +8,11 @@ import gtsam
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from birdslam.bench.baselines.batch_se2 import Solution, ego_key, solve, vehicle_key
 from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
-from birdslam.geometry.camera import Camera
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
@@ -22,8 +21,7 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import RoadFilter, RoadScaleConfig
 from birdslam.types import EgoEdge, Estimate, Measurements, VehicleEdge
-
-Floats = NDArray[np.float64]
+from tests.recordings import KITTI as CAMERA
 
 ALL_EDGES = WeightsConfig(leave_out=())
 EQ_6 = GraphConfig(
@@ -85,8 +83,7 @@ def test_equals_gtsam_with_the_constant_velocity_factor() -> None:
 
 
 @pytest.mark.parametrize(
-    "sigma_cv_rad",
-    [pytest.param(0.05, marks=pytest.mark.slow), 0.1, pytest.param(0.2, marks=pytest.mark.slow)],
+    "sigma_cv_rad", [pytest.param(0.05, marks=pytest.mark.slow), 0.1, pytest.param(0.2, marks=pytest.mark.slow)]
 )
 def test_full_noise_costs_no_more_than_five_percent_of_the_batch(sigma_cv_rad: float) -> None:
     """One linearisation and the marginalisation of all but the newest poses, against the batch of all edges so far."""
@@ -219,9 +216,6 @@ def test_covariances_of_the_live_graph_are_honest_over_longer_drives(
         frames=frames, vehicles=2, landmarks=8, lane_points=0, outliers=outliers, sigma_cv_rad=sigma_cv_rad
     )
     assert_graph_is_honest("constant velocity", world, seeds=300)
-
-
-CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65)
 
 
 def scale_nees(seed: int, outliers: float, comparisons: int) -> float:

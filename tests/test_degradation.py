@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from birdslam.frontend import FrontEnd
 from birdslam.geometry.camera import Camera
-from birdslam.perception import Detections, Findings, ModelSpec, Segmentation
-from birdslam.perception.manifest import Schedule
+from birdslam.perception import ModelSpec
 from birdslam.runtime.configuration import (
     Configuration,
     DegradationConfig,
@@ -33,6 +32,7 @@ from birdslam.runtime.transport.presence import ring_path
 from birdslam.runtime.transport.ring import FrameRing
 from birdslam.runtime.wire import Trace
 from birdslam.types import INVALIDATING, Frame, FrameRef, Measurements, Status
+from tests.heads import Head
 
 CONFIG = DegradationConfig(window_frames=4, late_share=0.5, calm_frames=6, calm_share=0.5)
 BOTH = ("detector", "segmenter")
@@ -71,23 +71,6 @@ def test_one_step_at_a_time_and_never_sooner_than_a_window(ages_ms: list[float])
             assert abs(order.index(degradation.mode) - before) == 1
             assert number - last >= CONFIG.window_frames
             last = number
-
-
-class Head:
-    """A network that counts its runs."""
-
-    fell_back = ""  # its provider is the CPU
-
-    def __init__(self, role: str) -> None:
-        self.name = self.role = role
-        self.schedule = Schedule()
-        self.runs = 0
-
-    def run(self, image: np.ndarray) -> Findings:
-        self.runs += 1
-        if self.role == "detector":
-            return Findings(detections=Detections(np.zeros((0, 4)), np.zeros(0), ()))
-        return Findings(segmentation=Segmentation(image > 0, image > 0))
 
 
 @pytest.mark.parametrize(

@@ -329,7 +329,7 @@ class Derived(Base):
 
     # A heading
     third: dict[str, int] = msgspec.field(
-        default_factory=dict,  # over several lines
+        default_factory=dict  # over several lines
     )
     fourth: str = "#"
     first: int = 3  # again
@@ -337,8 +337,4 @@ class Derived(Base):
 
 def test_comments_of_fields() -> None:
     assert comments(Base) == {"first": "of the base", "second": "Told above, in two lines"}
-    assert comments(Derived) == {
-        "first": "again",
-        "second": "Told above, in two lines",
-        "third": "over several lines",
-    }
+    assert comments(Derived) == {"first": "again", "second": "Told above, in two lines", "third": "over several lines"}

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from birdslam.bench.simulation.drive import DriveConfig, drive
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.checkpoint import CheckpointError
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
@@ -22,8 +22,6 @@ from birdslam.graph.state_layout import StateLayout
 from birdslam.graph.weights import WeightsConfig
 from birdslam.graph.window import Window
 from birdslam.types import Estimate
-
-Floats = NDArray[np.float64]
 
 SETTINGS = GraphConfig(), WeightsConfig()
 LOG = drive(DriveConfig(frames=60, vehicles=3, landmarks=8), 3).measurements

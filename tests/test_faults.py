@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,10 +11,11 @@ import psutil
 import pytest
 
 from birdslam.perf.robustness.faults import markdown, measure, survived
-from birdslam.perf.robustness.faulty_vehicle import WITHOUT_SPARES, Vehicle, model_options, record_options
+from birdslam.perf.robustness.faulty_vehicle import Vehicle, model_options, record_options
 from birdslam.perf.robustness.injection import FAULTS
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.presence import ring_path
+from tests.test_pipeline import left_behind
 
 pytestmark = pytest.mark.processes
 
@@ -37,6 +37,7 @@ def models_dir_if_any() -> Path | None:
     return folder if folder.is_dir() else None
 
 
+@pytest.mark.slow  # each node's death is in test_pipeline.py, test_recording.py and test_live_map.py
 def test_faults_in_short(place: Path) -> None:
     with Vehicle(place, *PATIENT) as vehicle:
         for fault in FAULTS:
@@ -47,13 +48,7 @@ def test_faults_in_short(place: Path) -> None:
             assert survived(row, BUSY_MACHINE), row
         vehicle.settle(0.5)
         assert vehicle.stop() == 0
-    assert left_behind(vehicle) == []
-
-
-def left_behind(vehicle: Vehicle) -> list[Path]:
-    """Sockets and rings that still exist."""
-    ring = ring_path(vehicle.vehicle, vehicle.runtime_dir)
-    return [*(vehicle.runtime_dir / vehicle.vehicle).glob("*.sock*"), *ring.parent.glob(f"{ring.name}*")]
+    assert left_behind(vehicle.vehicle, vehicle.runtime_dir) == []
 
 
 @pytest.mark.slow
@@ -108,15 +103,4 @@ def test_nothing_leaks_over_a_hundred_restarts(place: Path) -> None:
         assert {what: n for what, n in after.items() if n > before[what]} == {}
         assert epochs == sorted(epochs)
         assert vehicle.stop() == 0
-    assert left_behind(vehicle) == []
-
-
-def test_a_node_that_keeps_dying_ends_the_run_with_its_name(place: Path) -> None:
-    with Vehicle(place, *PATIENT, *WITHOUT_SPARES, "--set", "runtime.restarts_max=1") as vehicle:
-        vehicle.node("optimize").send_signal(signal.SIGKILL)
-        vehicle.settle(0.3)
-        vehicle.node("optimize").send_signal(signal.SIGKILL)
-        assert vehicle.process.wait(120.0) == 1
-        last = (place / "run.log").read_text().splitlines()[-1]
-        assert last.startswith("birdslam: optimize was killed by SIGKILL")
-        assert "2 times in 60 s: it is not restarted" in last
+    assert left_behind(vehicle.vehicle, vehicle.runtime_dir) == []

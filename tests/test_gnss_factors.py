@@ -120,7 +120,7 @@ def test_a_place_on_earth_is_within_its_covariance() -> None:
     """Over many drives, at their end, where it is worst."""
     inside = []
     for seed in range(12):
-        true, nodes, links = way(800.0, seed)
+        true, nodes, links = way(400.0, seed)
         found = tied(true, nodes, links, fixes_of(true, 1.5, seed=seed))
         T, cov = found.poses[nodes[-1].number]
         here = found.earth.pose(T, cov)

@@ -16,10 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from birdslam.bench.baselines.posegraph3 import BatchConfig
 from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.factors.landmark_points import LandmarkPoints, sum_of_points
@@ -31,8 +31,6 @@ from birdslam.perf.__main__ import main as perf_main
 from birdslam.perf.latency import incremental, optimizer
 from birdslam.perf.latency.optimizer import CONTENDERS
 from birdslam.types import EgoEdge, Estimate, LanePoint, Measurements, Status
-
-Floats = NDArray[np.float64]
 
 ALL_EDGES = WeightsConfig(leave_out=())
 EQ_6 = GraphConfig(
@@ -602,7 +600,7 @@ def test_the_benchmark_measures_what_it_says(tmp_path: Path, capsys: pytest.Capt
         perf_main(["optimizer", *f"--vehicles 0,2 --frames 150 --contenders ours --output {tmp_path}/F.json".split()])
         == 0
     )
-    rows = json.loads((tmp_path / "F.json").read_text())
+    rows = json.loads((tmp_path / "F.json").read_text())["rows"]
     assert [(row["contender"], row["vehicles"], row["frames"], row["exceptions"]) for row in rows] == [
         ("ours", 0, 150, 0),
         ("ours", 2, 150, 0),

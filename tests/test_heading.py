@@ -6,15 +6,14 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from birdslam.bench.tracking.localisation import INSIDE_2_SIGMA
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.vehicles.placement.localisation import DIMENSIONS, LocalisationConfig, Observation, observe_boxes, place
 from birdslam.vehicles.placement.uncertain_yaw import HeadingConfig, YawPrior, initial_yaw_rad, marginalise_yaw
 
-Floats = NDArray[np.float64]
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 CAR = DIMENSIONS["car"]
 CONFIG, LOCALISATION = HeadingConfig(), LocalisationConfig()

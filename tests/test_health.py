@@ -16,13 +16,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import (
     BudgetsConfig,
     Configuration,
     ConfigurationError,
+    ModelsConfig,
     NodeScheduling,
     PerceiveConfig,
     RealtimeConfig,
@@ -45,8 +45,8 @@ from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Bus
 from birdslam.runtime.wire import Health, Spread, Stage, Trace, decode, encode
 from birdslam.types import Estimate, MapUpdate, Status
+from tests.recordings import SMALL as CAMERA
 
-CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
 MS = 1_000_000
 
 
@@ -283,7 +283,13 @@ def refused(*arguments: object) -> None:
 
 def test_the_doctor_finds_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rt = RuntimeConfig(runtime_dir=str(tmp_path / "rt"))
-    healthy = Configuration(vehicle="doc", runtime=rt, output=str(tmp_path), source=SourceConfig(uri="demo"))
+    healthy = Configuration(
+        vehicle="doc",
+        runtime=rt,
+        output=str(tmp_path),
+        source=SourceConfig(uri="demo"),
+        models=ModelsConfig(shipped=False),
+    )
 
     def with_realtime(**settings: object) -> Configuration:
         return msgspec.structs.replace(healthy, realtime=RealtimeConfig(**settings))  # type: ignore[arg-type]

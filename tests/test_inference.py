@@ -10,33 +10,26 @@ from contextlib import AbstractContextManager, contextmanager
 import numpy as np
 import pytest
 
-from birdslam.perception import Detections, Findings, ModelSpec, Segmentation
-from birdslam.perception.manifest import Schedule
+from birdslam.perception import Findings, ModelSpec
 from birdslam.runtime.configuration import Configuration, ModelsConfig, PerceiveConfig, SourceConfig
 from birdslam.runtime.nodes import inference
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.types import Frame, Status
+from tests.heads import Head
 
 IMAGE = np.zeros((4, 4), dtype=np.uint8)
 
 
-class Head:
-    """A network that answers when it is let."""
-
-    fell_back = ""  # its provider is the CPU
+class Gated(Head):
+    """Answers when it is let."""
 
     def __init__(self, role: str, awaited: bool = True) -> None:
-        self.name = self.role = role
-        self.schedule = Schedule(awaited=awaited)
+        super().__init__(role, awaited=awaited)
         self.go = threading.Semaphore(0)
-        self.runs = 0
 
     def run(self, image: np.ndarray) -> Findings:
         self.go.acquire(timeout=60.0)
-        self.runs += 1
-        if self.role == "detector":
-            return Findings(detections=Detections(np.zeros((0, 4)), np.zeros(0), ()))
-        return Findings(segmentation=Segmentation(image > 0, image > 0))
+        return super().run(image)
 
 
 def frame(frame_id: int) -> Frame:
@@ -49,7 +42,7 @@ Made = Callable[..., AbstractContextManager[Inference]]
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> Made:
     @contextmanager
-    def make(detector: Head, segmenter: Head, deadline_ms: float, rate: object = None) -> Iterator[Inference]:
+    def make(detector: Gated, segmenter: Gated, deadline_ms: float, rate: object = None) -> Iterator[Inference]:
         heads = {"detector": detector, "segmenter": segmenter}
         monkeypatch.setattr(inference, "load_network", lambda role, spec, *others: heads[role])
         spec = ModelSpec("none.onnx")
@@ -69,7 +62,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Made:
 
 
 def test_a_frame_waits_until_its_deadline_and_no_longer(made: Made) -> None:
-    detector, segmenter = Head("detector"), Head("segmenter")
+    detector, segmenter = Gated("detector"), Gated("segmenter")
     with made(detector, segmenter, deadline_ms=50.0) as networks:
         segmenter.go.release()
         seen = frame(0)
@@ -84,7 +77,7 @@ def test_a_frame_waits_until_its_deadline_and_no_longer(made: Made) -> None:
 
 
 def test_a_frame_continues_once_its_awaited_networks_have_answered(made: Made) -> None:
-    detector, segmenter = Head("detector"), Head("segmenter", awaited=False)
+    detector, segmenter = Gated("detector"), Gated("segmenter", awaited=False)
     with made(detector, segmenter, deadline_ms=60_000.0) as networks:
         detector.go.release()
         perception = networks.start(frame(0)).result()
@@ -99,7 +92,7 @@ def test_a_frame_waits_no_longer_than_what_comes_after_leaves_of_its_budget(
     monkeypatch.setattr(inference.time, "monotonic_ns", lambda: clock_ns[0])
     monkeypatch.setattr(inference, "wait", lambda awaited, timeout: waited_s.append(timeout))
     waited_s: list[float] = []
-    detector, segmenter = Head("detector"), Head("segmenter")
+    detector, segmenter = Gated("detector"), Gated("segmenter")
     with made(detector, segmenter, deadline_ms=100.0) as networks:
         for frame_id in range(2):  # the front end takes 1 s after the first: that is past any budget
             networks.start(Frame(frame_id, 0, clock_ns[0], 0, IMAGE)).result()
@@ -111,7 +104,7 @@ def test_a_frame_waits_no_longer_than_what_comes_after_leaves_of_its_budget(
 
 
 def test_rate_max_awaits_all(made: Made) -> None:
-    detector, segmenter = Head("detector"), Head("segmenter", awaited=False)
+    detector, segmenter = Gated("detector"), Gated("segmenter", awaited=False)
     with made(detector, segmenter, deadline_ms=0.001, rate="max") as networks:
         pending = networks.start(frame(0))
         threading.Timer(0.05, segmenter.go.release).start()
@@ -122,7 +115,7 @@ def test_rate_max_awaits_all(made: Made) -> None:
 
 
 def test_what_runs_aside_begins_when_its_frame_is_over(made: Made) -> None:
-    detector, segmenter = Head("detector"), Head("segmenter")
+    detector, segmenter = Gated("detector"), Gated("segmenter")
     with made(detector, segmenter, 1.0) as networks:
         aside = networks.aside
         assert aside is not None
@@ -139,6 +132,6 @@ def test_what_runs_aside_begins_when_its_frame_is_over(made: Made) -> None:
 
 
 def test_at_rate_max_nothing_runs_aside(made: Made) -> None:
-    detector, segmenter = Head("detector"), Head("segmenter")
+    detector, segmenter = Gated("detector"), Gated("segmenter")
     with made(detector, segmenter, 1.0, rate="max") as networks:
         assert networks.aside is None

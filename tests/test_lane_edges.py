@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
@@ -22,7 +22,6 @@ CONFIG = LaneEdgesConfig()
 CAMERA = Camera(
     width_px=1242, height_px=375, fx_px=720.0, fy_px=720.0, cx_px=610.0, cy_px=173.0, height_m=1.65, pitch_rad=0.01
 )
-Floats = NDArray[np.float64]
 
 
 def line(yaw_rad: float, aside_m: float, start_m: float = 5.0, end_m: float = 15.0) -> Floats:

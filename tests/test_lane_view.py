@@ -69,7 +69,9 @@ def test_a_network_that_fails_completes_nothing() -> None:
     np.testing.assert_array_equal(view.completed, view.seen)
 
 
-@pytest.mark.parametrize("shape", [(90, 300), (90, 300, 3)], ids=["grey", "colour"])
+@pytest.mark.parametrize(
+    "shape", [(90, 300, 3), pytest.param((90, 300), marks=pytest.mark.slow)], ids=["colour", "grey"]
+)
 def test_the_picture_has_image_cells_and_lanes(tmp_path: Path, shape: tuple[int, ...]) -> None:
     path = tmp_path / "lanes.png"
     draw_lanes("a road", np.full(shape, 90, np.uint8), lane_view(seen_of_a_road(), SE2(9.75)), CONFIG, path)

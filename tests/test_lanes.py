@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.lane_ids import LaneCloud
@@ -16,7 +17,6 @@ from birdslam.mapping.lanes import (
     ROAD,
     AmodalLanes,
     Completion,
-    Floats,
     Grids,
     LanesConfig,
     cell_centres_m,

@@ -6,7 +6,8 @@ import os
 import resource
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -15,11 +16,18 @@ import numpy as np
 import pytest
 
 from birdslam.loops.map_pose import InMap, MapState
+from birdslam.runtime.batch.offline import pipeline
+from birdslam.runtime.cli.main import main
 from birdslam.runtime.client import Planner
+from birdslam.runtime.configuration import load
+from birdslam.runtime.maps.drive_map import DriveMap
+from birdslam.runtime.maps.map_drive import MapChoice
 from birdslam.runtime.maps.map_store import read_map
 from birdslam.runtime.recording.recording import Recording
+from birdslam.sources.opening import open_recording
+from birdslam.types import Estimate
 from tests.test_bus import until
-from tests.test_pipeline import F_PX, HEIGHT, LIMIT_S, UNHURRIED, WIDTH, Run, call, road_image
+from tests.test_pipeline import F_PX, HEIGHT, LIMIT_S, UNHURRIED, WIDTH, Run, road_image
 
 pytestmark = pytest.mark.processes
 
@@ -67,11 +75,13 @@ def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def kept(tmp_path_factory: pytest.TempPathFactory, road: Path) -> bytes:
     """The map of that road, made when a drive of it was over."""
     place = tmp_path_factory.mktemp("kept")
-    made = call(
-        *("run", "--source", f"kitti:{road}", "--rate", "max", "--map", str(place / "road.map")),
-        *("--output", str(place / "out"), "--set", "models.shipped=false"),
-    )
-    assert made.returncode == 0, made.stderr
+    recording = open_recording(f"kitti:{road}")
+    making = DriveMap(MapChoice(place / "road.map", extend=True), None)
+    with pipeline(load(None, {"models.shipped": False})) as drive:
+        for record in drive(recording):
+            if isinstance(record, Estimate):
+                making.add(record)
+    making.finish(recording.camera, ((n, 0, street_image(STEP_M * n)) for n in range(FRAMES)), place)
     assert len(read_map(place / "road.map")) >= 4
     return (place / "road.map").read_bytes()
 
@@ -81,6 +91,16 @@ def live(place: Path, road: Path, *arguments: str) -> Run:
     return Run(
         *(place, "--source", f"kitti:{road}", "--rate", "10", "--set", "source.loop=true", *UNHURRIED, *arguments)
     )
+
+
+@contextmanager
+def mapping(place: Path, road: Path, kept: bytes) -> Iterator[tuple[Run, Planner, Path]]:
+    """The road again, with a copy of the map that was kept: the run, a planner beside it, the copy."""
+    path = place / "road.map"
+    path.write_bytes(kept)
+    with live(place, road, "--map", str(path)) as run, Planner(run.vehicle, run.runtime_dir) as planner:
+        in_map(planner, lambda here: here.pose is not None, "the map process is at work")
+        yield run, planner, path
 
 
 def in_map(planner: Planner, enough: Callable[[InMap], bool], what: str) -> InMap:
@@ -111,13 +131,13 @@ def test_a_planner_is_told_where_it_is_in_the_map(
         found = in_map(planner, lambda here: here.state is MapState.LOCALISED, "the drive is localised")
         with Planner(run.vehicle, run.runtime_dir) as late:  # the last pose is there for who comes later
             in_map(late, lambda here: here.pose is not None, "one that came late knows")
-        run.process.send_signal(signal.SIGTERM)
-        status, out, err = run.end()
-    assert status == 0, err
+        out = run.stop()
     assert found.T_map_ego is not None
     assert abs(found.T_map_ego.y_m) < 0.5
     assert -1.0 < found.T_map_ego.x_m < STEP_M * FRAMES + 5.0
     assert np.sqrt(found.cov[0, 0]) < 0.5
+    assert run.summary()["ended"] == "SIGTERM"
+    assert run.left_behind() == []
     summary = run.summary()["map"]
     assert summary["localised"] > 0
     assert summary["restarts"] == 0
@@ -128,113 +148,69 @@ def test_a_planner_is_told_where_it_is_in_the_map(
     assert {"localised"} <= {pose["state"] for pose in recorded}
 
 
-@pytest.mark.parametrize(
-    ("fault", "cause"),
-    [
-        (lambda run: os.kill(run.node_pid("map"), signal.SIGKILL), "was killed by SIGKILL"),
-        (lambda run: run.stall("map"), "is stalled: its loop has shown no life"),
-    ],
-    ids=["dies", "stalls"],
-)
-def test_nobody_notices_that_the_map_process_dies_or_stalls(
-    fault: Callable[[Run], None], cause: str, tmp_path_factory: pytest.TempPathFactory, road: Path, kept: bytes
-) -> None:
-    place = tmp_path_factory.mktemp("k")
-    path = place / "road.map"
-    path.write_bytes(kept)
-    with (
-        live(place, road, "--map", str(path)) as run,
-        Planner(run.vehicle, run.runtime_dir) as planner,
-    ):
-        in_map(planner, lambda here: here.pose is not None, "the map process is at work")
-        fault(run)
-        hears(planner, 10)
-        again = planner.in_map().pose
-        assert again is not None
-        in_map(
-            planner,
-            lambda here: here.pose is not None and here.pose.frame_id > again.frame_id + 3 and here.pose.keyframes >= 4,
-            "its successor goes on with the map that was kept",
-        )
-        run.process.send_signal(signal.SIGTERM)
-        status, out, err = run.end()
-    assert status == 0, err
-    assert f"map {cause}" in out
-    summary = run.summary()
-    assert set(summary["restarts"].values()) == {0}
-    assert summary["map"]["restarts"] == 1, out + err
-    assert len(read_map(path)) >= 4
-
-
-def test_a_full_disk_costs_the_map_nothing_that_it_had(
+def test_nobody_notices_that_the_map_process_dies_stalls_and_has_a_full_disk(
     tmp_path_factory: pytest.TempPathFactory, road: Path, kept: bytes
 ) -> None:
-    place = tmp_path_factory.mktemp("f")
-    path = place / "road.map"
-    path.write_bytes(kept)
-    with (
-        live(place, road, "--map", str(path)) as run,
-        Planner(run.vehicle, run.runtime_dir) as planner,
-    ):
-        in_map(planner, lambda here: here.pose is not None, "the map process is at work")
-        limit = len(kept) - 5_000  # no file of its process may grow past it: its log may, the map may not
+    place = tmp_path_factory.mktemp("k")
+    with mapping(place, road, kept) as (run, planner, path):
+        for fault in (lambda: os.kill(run.node_pid("map"), signal.SIGKILL), lambda: run.stall("map")):
+            fault()
+            hears(planner, 10)
+            before = planner.in_map().pose
+            assert before is not None
+            after = before.frame_id + 3
+            in_map(
+                planner,
+                lambda here, after=after: (  # type: ignore[misc]
+                    here.pose is not None and here.pose.frame_id > after and here.pose.keyframes >= 4
+                ),
+                "its successor goes on with the map that was kept",
+            )
+        limit = path.stat().st_size - 5_000  # no file of its process may grow past it: its log may, the map may not
         resource.prlimit(run.node_pid("map"), resource.RLIMIT_FSIZE, (limit, limit))
-        hears(planner, 30)
-        run.process.send_signal(signal.SIGTERM)
-        status, out, err = run.end()
-    assert status == 0, err
+        whole, saved = path.read_bytes(), len(read_map(path))
+        in_map(planner, lambda here: here.pose is not None and here.pose.keyframes > saved, "the map has grown")
+        out = run.stop()
+    assert "map was killed by SIGKILL" in out
+    assert "map is stalled: its loop has shown no life" in out
+    summary = run.summary()
+    assert set(summary["restarts"].values()) == {0}
+    assert summary["map"]["restarts"] == 2, out
     assert "what was there stays: File too large" in out
-    assert "File too large" in run.summary()["map"]["error"]
-    assert path.read_bytes() == kept
+    assert "File too large" in summary["map"]["error"]
+    assert path.read_bytes() == whole
+    assert len(read_map(path)) >= 4
     assert sorted(entry.name for entry in place.iterdir() if entry.name.startswith(".")) == []
 
 
-def test_what_no_drive_could_use_is_refused_before_it(tmp_path: Path, road: Path, kept: bytes) -> None:
+def test_what_no_drive_could_use_is_refused_before_it(
+    tmp_path: Path, road: Path, kept: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
     torn, empty, whole = tmp_path / "torn.map", tmp_path / "empty.map", tmp_path / "road.map"
     torn.write_bytes(kept[:-100])
     empty.write_bytes(b"")
     whole.write_bytes(kept)
-    other = road.parent / "79"
-    if not other.is_dir():
-        write_drive(other, 3)
-        (other / "calib.txt").write_text((other / "calib.txt").read_text().replace(f"{F_PX}", f"{2 * F_PX}"))
+    other = write_drive(tmp_path / "79", 3)
+    (other / "calib.txt").write_text((other / "calib.txt").read_text().replace(f"{F_PX}", f"{2 * F_PX}"))
     for name, path, source in (("torn", torn, road), ("is empty", empty, road), ("another camera", whole, other)):
-        refused = call(
-            *(
-                "run",
-                "--source",
-                f"kitti:{source}",
-                "--rate",
-                "10",
-                "--map",
-                str(path),
-                "--output",
-                str(tmp_path / "o"),
-            ),
-            *("--set", "models.shipped=false", "--set", f"runtime.runtime_dir={tmp_path / 'rt'}"),
+        refused = main(
+            [
+                *("run", "--source", f"kitti:{source}", "--rate", "10", "--map", str(path)),
+                *("--output", str(tmp_path / "o"), "--set", f"runtime.runtime_dir={tmp_path / 'rt'}"),
+                *("--set", "models.shipped=false"),
+            ]
         )
-        assert refused.returncode == 2, refused.stderr
-        assert name in refused.stderr
-        assert len(refused.stderr.strip().splitlines()) == 1
+        said = capsys.readouterr().err
+        assert refused == 2, said
+        assert name in said
+        assert len(said.strip().splitlines()) == 1
     assert whole.read_bytes() == kept
 
 
-def test_without_a_map_there_is_no_map_process(tmp_path: Path, road: Path, kept: bytes) -> None:
-    (tmp_path / "road.map").write_bytes(kept)
-    (tmp_path / "car.toml").write_text('[results]\nmap = "road.map"\n')
-    with Run(tmp_path, str(tmp_path / "car.toml"), "--source", f"kitti:{road}", "--rate", "20", "--no-map") as run:
-        status, _, err = run.end()
-    assert status == 0, err
-    assert not (run.output / "logs" / "map.log").exists()
-    assert "map" not in run.summary()
-
-
-def test_a_batch_of_drives_makes_one_map(tmp_path: Path, road: Path) -> None:
-    write_drive(tmp_path / "again", FRAMES)
-    done = call(
-        *("batch", str(road), str(tmp_path / "again"), "--output", str(tmp_path / "out"), "--jobs", "1"),
-        *("--map", str(tmp_path / "street.map"), "--set", "models.shipped=false"),
-    )
-    assert done.returncode == 0, done.stderr
-    assert "2 drives" in done.stdout
+@pytest.mark.slow  # test_maps.py joins maps, test_batch.py drives
+def test_a_batch_of_drives_makes_one_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drives = [str(write_drive(tmp_path / name, FRAMES // 2)) for name in ("once", "again")]
+    batch = ("batch", *drives, "--output", str(tmp_path / "out"), "--jobs", "2", "--map", str(tmp_path / "street.map"))
+    assert main([*batch, "--set", "models.shipped=false"]) == 0
+    assert "2 drives" in capsys.readouterr().out
     assert read_map(tmp_path / "street.map").drives == 2

@@ -12,13 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from birdslam.geometry.camera import Camera
-from birdslam.perception import Findings
-from birdslam.perception.manifest import Schedule
 from birdslam.perception.schedule import Networks
 from birdslam.perception.shipped import run_at_once
 from birdslam.runtime.configuration import LooksConfig
 from birdslam.runtime.nodes.look_rate import Cost, LookRate, load, measure, threads_of_a_network
 from birdslam.runtime.process import realtime
+from tests.heads import Head
 
 PERIOD_MS = 30.0
 SLOW = {"multitask": Cost(ms=22.0, threads=1, every=1)}
@@ -116,21 +115,8 @@ def test_every_network_is_measured_on_an_image_of_the_camera() -> None:
     assert min(took_ms.values()) >= 0.0
 
 
-class Head:
-    fell_back = ""  # its provider is the CPU
-    name = role = "detector"
-    schedule = Schedule(every=2)
-
-    def __init__(self) -> None:
-        self.frames: list[int] = []
-
-    def run(self, image: np.ndarray) -> Findings:
-        self.frames.append(int(image[0, 0]))
-        return Findings()
-
-
 def test_networks_that_are_spared_run_on_fewer_frames() -> None:
-    head = Head()
+    head = Head("detector", every=2)
     networks = Networks([head], run_at_once)
     for frame_id in range(24):
         networks.slowdown = 1 if frame_id < 12 else 3

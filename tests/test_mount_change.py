@@ -9,10 +9,10 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.odometry.road.mount_change import MountChangeConfig, MountChangeDetector
 
-Floats = NDArray[np.float64]
 STEP_M = 0.8
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65, pitch_rad=0.01, tilt_sigma_rad=0.004)
 

@@ -1,4 +1,4 @@
-"""Standing tracks that are told to drive, and the road by labels, on made-up sequences."""
+"""Standing tracks that are reported to drive, and the road by labels, on made-up sequences."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def sequence_of(ego_mps: float = 0.0) -> TrackingSequence:
 
 
 def told(sequence: TrackingSequence, drives: dict[int, range]) -> MoversRow:
-    """Car k is vehicle 10 + k, and is told to drive in these frames."""
+    """Car k is vehicle 10 + k, and is reported to drive in these frames."""
     log, estimates = [], []
     for frame in range(FRAMES):
         here, times = sequence.labels_of(frame), {"t_source_ns": 0, "t_capture_ns": 0, "t_utc_ns": 0}
@@ -70,7 +70,7 @@ def told(sequence: TrackingSequence, drives: dict[int, range]) -> MoversRow:
     return movers_row(sequence, log, estimates, "truth")
 
 
-def test_a_parked_car_that_is_told_to_drive_is_counted_once_with_its_place() -> None:
+def test_a_parked_car_that_is_reported_to_drive_is_counted_once_with_its_place() -> None:
     row = told(sequence_of(), {0: range(12, 15), 2: range(0, FRAMES)})
     assert (row.standing, row.driving, row.told, row.soon) == (2, 1, 1, 1)
     (false,) = row.false

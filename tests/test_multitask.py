@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,8 +26,9 @@ from birdslam.perception.decoding.multitask import (
     MultiTaskDecoder,
     body_slices,
 )
-from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, ManifestMismatch, MultiTask, Schedule, Stretch
+from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, ManifestMismatch, MultiTask, Stretch
 from birdslam.perception.onnx_files.unread_outputs import without_outputs
+from birdslam.perception.shipped import run_at_once
 from birdslam.perception.views import make_views
 from birdslam.types import Status
 from birdslam.world.training.augmentation import AugmentationConfig
@@ -38,6 +38,7 @@ from birdslam.world.training.targets import COLUMN, Example, TargetsConfig, Wind
 from birdslam.world.training.validation import validate
 from birdslam.world.truth import CLASSES as SURFACES
 from birdslam.world.truth import WorldFrame, WorldObject
+from tests.heads import Head
 
 WIDTH, HEIGHT, CELL = 320, 96, 4
 BODY = body_slices()
@@ -164,12 +165,7 @@ def read(tensors: dict[str, NDArray[np.float32]], width_px: int = WIDTH, height_
     return decoder().read(tensors, view)
 
 
-poses = st.builds(
-    SE2,
-    st.floats(9.0, 35.0),
-    st.floats(-4.0, 4.0),
-    st.floats(-math.pi, math.pi),
-)
+poses = st.builds(SE2, st.floats(9.0, 35.0), st.floats(-4.0, 4.0), st.floats(-math.pi, math.pi))
 sizes_m = st.tuples(st.floats(3.0, 12.0), st.floats(1.5, 2.6), st.floats(1.3, 3.5))
 
 
@@ -386,25 +382,6 @@ def test_every_augmentation_gives_an_image() -> None:
     assert np.isfinite(batch.log_depth).all()
 
 
-class Head:
-    """A network that answers at once."""
-
-    fell_back = ""  # its provider is the CPU
-
-    def __init__(self, role: Any, findings: Findings, every: int = 1) -> None:
-        self.name, self.role, self.findings = role, role, findings
-        self.schedule = Schedule(every=every)
-
-    def run(self, image: NDArray[np.uint8]) -> Findings:
-        return self.findings
-
-
-def submit(run: Any, *arguments: Any) -> Future[Any]:
-    future: Future[Any] = Future()
-    future.set_result(run(*arguments))
-    return future
-
-
 def findings(label: str) -> Findings:
     mask = np.zeros((2, 2), dtype=bool)
     return Findings(Detections(np.zeros((1, 4)), np.ones(1), (label,)), Segmentation(mask, mask))
@@ -412,7 +389,7 @@ def findings(label: str) -> Findings:
 
 def test_one_network_fills_three_roles_and_leaves_those_that_others_have() -> None:
     image = np.zeros((2, 2), dtype=np.uint8)
-    alone = Networks([Head("multitask", findings("car"), every=2)], submit)
+    alone = Networks([Head("multitask", findings("car"), every=2)], run_at_once)
     first, second = (alone.start(frame, image).result() for frame in (0, 1))
     assert first.ages == {"detector": 0, "segmenter": 0, "depth": 0}
     assert first.status == ()
@@ -420,7 +397,7 @@ def test_one_network_fills_three_roles_and_leaves_those_that_others_have() -> No
     carried = {Status.DETECTIONS_CARRIED, Status.SEGMENTATION_CARRIED, Status.DEPTH_CARRIED}
     assert set(second.status) == carried
     own = Head("detector", Findings(detections=findings("bus").detections))
-    beside = Networks([own, Head("multitask", findings("car"), every=2)], submit)
+    beside = Networks([own, Head("multitask", findings("car"), every=2)], run_at_once)
     first, second = (beside.start(frame, image).result() for frame in (0, 1))
     assert first.detections is not None
     assert first.detections.labels == ("bus",)
@@ -432,7 +409,7 @@ def test_one_network_fills_three_roles_and_leaves_those_that_others_have() -> No
 def test_a_network_whose_roles_are_all_taken_does_not_run() -> None:
     heads = [Head(role, Findings()) for role in ("detector", "segmenter", "depth")]
     shipped = Head("multitask", findings("car"))
-    perception = Networks([*heads, shipped], submit).start(0, np.zeros((2, 2), dtype=np.uint8)).result()
+    perception = Networks([*heads, shipped], run_at_once).start(0, np.zeros((2, 2), dtype=np.uint8)).result()
     assert perception.detections is None
     assert perception.ages == {"detector": 0, "segmenter": 0, "depth": 0}
 

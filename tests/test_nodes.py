@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.runtime.configuration import Configuration, RuntimeConfig, SourceConfig
 from birdslam.runtime.nodes import capture
@@ -27,8 +26,7 @@ from birdslam.runtime.transport.ring import FrameReader
 from birdslam.runtime.wire import Trace
 from birdslam.sources.recording import RecordedFrame
 from birdslam.types import Estimate, FrameRef, MapUpdate, Measurements, Status
-
-CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
+from tests.recordings import SMALL as CAMERA
 
 
 class Inbox:

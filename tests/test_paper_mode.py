@@ -6,11 +6,11 @@ import gtsam
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from birdslam.bench.baselines.batch_se2 import ego_key, solve, vehicle_key
 from birdslam.bench.simulation.drive import Drive, DriveConfig, drive
 from birdslam.bench.tracking.benchmark import PAPER
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.edges import CvEdge
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
@@ -22,8 +22,6 @@ from birdslam.graph.weights import WeightsConfig
 from birdslam.graph.window import Window
 from birdslam.slam import SlamConfig
 from birdslam.types import Estimate, LandmarkEdge, Measurements, Status
-
-Floats = NDArray[np.float64]
 
 # Sec. 3.3.2 of the paper
 LAMBDA_CP, LAMBDA_CV = 10_000.0, (10.0, 1_000.0)

@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from birdslam.geometry import bev
-from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.approach import approaches
 from birdslam.graph.around.hidden_road import hidden_fans
@@ -41,8 +40,8 @@ from birdslam.vehicles.placed_boxes import place_boxes
 from birdslam.vehicles.state.ground_size_config import GroundSizeConfig
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.track import EgoFrame
+from tests.recordings import KITTI as CAMERA
 
-CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, height_m=1.65)
 ROAD = GroundSizeFilter(CAMERA, GroundSizeConfig())
 Box = tuple[float, float, float, float]
 HZ = 10.0
@@ -317,8 +316,7 @@ def test_a_crowd_is_cut_to_the_nearest_sixty() -> None:
 
 
 @given(
-    p=st.tuples(st.floats(3.0, 40.0), st.floats(-8.0, 8.0)),
-    v=st.tuples(st.floats(-15.0, -1.0), st.floats(-2.0, 2.0)),
+    p=st.tuples(st.floats(3.0, 40.0), st.floats(-8.0, 8.0)), v=st.tuples(st.floats(-15.0, -1.0), st.floats(-2.0, 2.0))
 )
 @settings(max_examples=25)
 def test_the_closest_approach_is_that_of_straight_ways(p: tuple[float, float], v: tuple[float, float]) -> None:

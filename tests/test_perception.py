@@ -17,16 +17,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from birdslam.perception import (
-    Detections,
-    Findings,
-    ModelSpec,
-    Networks,
-    Perception,
-    Ready,
-    Segmentation,
-    load_network,
-)
+from birdslam.perception import Detections, Findings, ModelSpec, Networks, Perception, Ready, Segmentation, load_network
 from birdslam.perception.decoding.detection import MOST_CANDIDATES, YoloxDecoder, intersections, suppress
 from birdslam.perception.manifest import SHIPPED_NETWORKS, FitPad, Input, Schedule, Stretch, Tiles, Yolox
 from birdslam.perception.views import Preparation, View, make_views

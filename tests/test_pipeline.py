@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import json
-import multiprocessing
 import os
 import select
 import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,9 @@ import numpy as np
 import pytest
 
 from birdslam.runtime.batch.offline import pipeline
+from birdslam.runtime.cli.main import main
 from birdslam.runtime.client import Planner
 from birdslam.runtime.configuration import load
-from birdslam.runtime.environment import ENVIRONMENT
 from birdslam.runtime.process.vitals import Vitals
 from birdslam.runtime.recording.recording import Recording
 from birdslam.runtime.replay.replay import compare
@@ -36,10 +35,17 @@ from birdslam.types import INVALIDATING, Estimate, FrameRef, MapUpdate, Measurem
 pytestmark = pytest.mark.processes
 
 FRAMES, WIDTH, HEIGHT, F_PX, HEIGHT_M = 12, 480, 160, 260.0, 1.65
+TORN = 5  # image of a drive
 LIMIT_S = 240.0
 WITH_NETWORKS = ("--set", "models.shipped=true")  # of most runs it is not their figures that are looked at
 # Nothing is left out or coasted over for want of time
 UNHURRIED = ("--set", "budgets.end_to_end_ms=60000", "--set", "degradation.enabled=false")
+
+
+@functools.cache
+def _texture() -> np.ndarray:
+    texture = cv2.GaussianBlur(np.random.default_rng(5).integers(0, 256, (2048, 2048), dtype=np.uint8), (0, 0), 2.0)
+    return cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload, no-any-return]
 
 
 def road_image(x_m: float) -> np.ndarray:
@@ -48,10 +54,10 @@ def road_image(x_m: float) -> np.ndarray:
     below = np.maximum(v - HEIGHT / 2, 0.5)
     depth = F_PX * HEIGHT_M / below
     side = (u - WIDTH / 2) * depth / F_PX
-    texture = cv2.GaussianBlur(np.random.default_rng(5).integers(0, 256, (2048, 2048), dtype=np.uint8), (0, 0), 2.0)
-    texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
     scale = np.float32(24.0)  # texels a metre
-    road = cv2.remap(texture, side * scale + 1024, (depth + x_m) * scale, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    road = cv2.remap(
+        _texture(), side * scale + 1024, (depth + x_m) * scale, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
+    )
     return np.where(v > HEIGHT / 2 + 4, road, 200).astype(np.uint8)
 
 
@@ -68,19 +74,6 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     poses = sequence.parent.parent / "poses" / "77.txt"
     poses.parent.mkdir()
     poses.write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {0.8 * i}\n" for i in range(FRAMES)))
-    return sequence
-
-
-def torn(drive: Path, folder: Path, number: int) -> Path:
-    """The same drive with one image cut off."""
-    sequence = folder / "sequences" / "torn"
-    (sequence / "image_0").mkdir(parents=True)
-    for path in sorted((drive / "image_0").iterdir()):
-        data = path.read_bytes()
-        whole = int(path.stem) != number
-        (sequence / "image_0" / path.name).write_bytes(data if whole else data[: len(data) // 3])
-    for name in ("calib.txt", "times.txt"):
-        (sequence / name).write_text((drive / name).read_text())
     return sequence
 
 
@@ -108,6 +101,13 @@ class Run:
         out, err = self.process.communicate(timeout=LIMIT_S)
         return self.process.returncode, out, err
 
+    def stop(self) -> str:
+        """Asks it to end, which it does without an error; what it printed."""
+        self.process.send_signal(signal.SIGTERM)
+        status, out, err = self.end()
+        assert status == 0, err
+        return out
+
     def summary(self) -> dict:
         return json.loads((self.output / "summary.json").read_text())
 
@@ -132,9 +132,7 @@ class Run:
         vitals.close()
 
     def left_behind(self) -> list[Path]:
-        """Sockets and rings that still exist."""
-        ring = ring_path(self.vehicle, self.runtime_dir)
-        return [*(self.runtime_dir / self.vehicle).glob("*.sock*"), *ring.parent.glob(f"{ring.name}*")]
+        return left_behind(self.vehicle, self.runtime_dir)
 
     def __enter__(self) -> Run:
         return self
@@ -146,6 +144,12 @@ class Run:
         if self.process.poll() is None:
             self.process.kill()
         self.process.communicate(timeout=LIMIT_S)
+
+
+def left_behind(vehicle: str, runtime_dir: Path) -> list[Path]:
+    """Sockets and rings that still exist."""
+    ring = ring_path(vehicle, runtime_dir)
+    return [*(runtime_dir / vehicle).glob("*.sock*"), *ring.parent.glob(f"{ring.name}*")]
 
 
 def command(*arguments: str) -> list[str]:
@@ -176,8 +180,8 @@ def wait_gone(pids: list[int]) -> None:
 
 
 def evaluate(sequence: Path, output: Path, *arguments: str) -> bytes:
-    done = call("evaluate", "odometry", str(sequence), "--output", str(output), *arguments)
-    assert done.returncode == 0, done.stderr
+    """What one process computes: this one, whose libraries have the nodes' environment (conftest.py)."""
+    assert main(["evaluate", "odometry", str(sequence), "--output", str(output), *arguments]) == 0
     return (output / sequence.name / "ego.kitti.txt").read_bytes()
 
 
@@ -199,19 +203,11 @@ def untimed(record: Any) -> bytes:
     return encode(record)
 
 
-def records_of_one_process(sequence: Path, overrides: dict[str, Any]) -> Records:
-    """What `evaluate` computes, in a process that computes in the same environment as the nodes."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in ENVIRONMENT.items():
-            patch.setenv(name, value)
-        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-            return pool.submit(_pipeline_records, sequence, overrides).result()
-
-
-def _pipeline_records(sequence: Path, overrides: dict[str, Any]) -> Records:
+def records_of_one_process(sequence: Path, overrides: dict[str, Any], speeds: Path | None = None) -> Records:
+    """What `evaluate` computes."""
     records: Records = {topic: [] for topic in TOPICS}
     topic_of = {kind: topic for topic, kind in TOPICS.items()}
-    recording = open_recording(f"kitti:{sequence}", stride=overrides.get("source.stride", 1))
+    recording = open_recording(f"kitti:{sequence}", stride=overrides.get("source.stride", 1), speeds=speeds)
     with pipeline(load(None, overrides)) as measure:
         for record in measure(recording):
             records[topic_of[type(record)]].append(untimed(record))
@@ -230,47 +226,58 @@ def records_of_three(file: Path) -> Records:
     }
 
 
-def test_evaluation_drive_and_replay_agree_on_motions_that_no_car_makes(drive: Path, place: Path) -> None:
-    """The drive backwards after itself: an implausible motion, and a new world once the odometry is steady again."""
-    sequence = place / "sequences" / "back"
+def test_three_processes_give_the_bytes_of_one(drive: Path, place: Path) -> None:
+    """The drive backwards after itself: an implausible motion, and a new world once the odometry is steady again; one
+    image of it is torn, and a sensor of the car's speed fails.
+    """
+    sequence, speed, file = place / "sequences" / "back", place / "speed.csv", place / "back.mcap"
     (sequence / "image_0").mkdir(parents=True)
     shown = [*range(FRAMES), *range(FRAMES - 2, -1, -1)]
-    for number, path in enumerate(drive / "image_0" / f"{k:06d}.png" for k in shown):
-        (sequence / "image_0" / f"{number:06d}.png").write_bytes(path.read_bytes())
+    for number, image in enumerate(drive / "image_0" / f"{k:06d}.png" for k in shown):
+        data = image.read_bytes()
+        (sequence / "image_0" / image.with_stem(f"{number:06d}").name).write_bytes(
+            data[: len(data) // 3] if number == TORN else data
+        )
     (sequence / "calib.txt").write_text((drive / "calib.txt").read_text())
     (sequence / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(len(shown))))
-    run_all(place, sequence, "--rate", "max", "--model", "none", "--record", str(place / "back.mcap"))
-    live = records_of_three(place / "back.mcap")
-    assert live == records_of_one_process(sequence, {"models.shipped": False})
+    speed.write_text("".join(f"{0.02 * n:.2f} {'nan' if n == 30 else 8.0}\n" for n in range(120)))
+
+    run = Run(
+        *(place, "--source", f"kitti:{sequence}", "--rate", "max", "--speed", str(speed)),
+        *("--record", str(file), *WITH_NETWORKS),
+    )
+    status, out, err = run.end()
+    assert (status, err) == (0, "")
+    assert f"{TORN:06d}.png" in out
+    assert "networks began on" in out
+
+    live = records_of_three(file)
+    assert live == records_of_one_process(sequence, {}, speed)
+    verdict = compare(Recording(file))
+    assert verdict.same, verdict.difference
+    assert verdict.equal == len(shown) + 1  # the end too
     estimates = [decode(data, Estimate) for data in live["v1/estimate"]]
     assert any(Status.MOTION_IMPLAUSIBLE in estimate.status for estimate in estimates)
     assert estimates[-1].epoch > estimates[FRAMES - 1].epoch
-    verdict = compare(Recording(place / "back.mcap"))
-    assert verdict.same, verdict.difference
-    assert verdict.equal == len(shown) + 1  # the end too
-
-
-def test_three_processes_give_the_bytes_of_one(drive: Path, place: Path) -> None:
-    """With what the car says of its speed, a sensor's failure among it."""
-    speed, file = place / "speed.csv", place / "three.mcap"
-    speed.write_text("".join(f"{0.02 * n:.2f} {'nan' if n == 30 else 8.0}\n" for n in range(60)))
-    offline = evaluate(drive, place / "a", "--speed", str(speed))
-    run = run_all(place, drive, "--rate", "max", "--speed", str(speed), "--record", str(file), *WITH_NETWORKS)
-    assert (run.output / "ego.kitti.txt").read_bytes() == offline
     refs = [decode(message.data, FrameRef) for message in Recording(file).messages(("v1/frame",))]
     log = read_speeds(speed)
-    for ref in refs[:FRAMES]:
+    for ref in refs[: len(shown)]:
         wanted = msgspec.structs.replace(ref, speeds=log.until(ref.t_source_ns))
-        assert encode(ref) == encode(wanted)
+        assert encode(ref) == encode(wanted)  # bytes, since a reading that is no number equals nothing
         assert wanted.speeds
-    assert compare(Recording(file)).same
-    assert len(offline.splitlines()) == FRAMES
+
     summary = run.summary()
-    assert (summary["frames_in"], summary["frames_processed"], summary["frames_dropped"]) == (FRAMES, FRAMES, 0)
+    assert (summary["frames_in"], summary["frames_processed"], summary["frames_dropped"]) == (len(shown), len(shown), 0)
+    assert summary["statuses"]["frame_unreadable"] == 1
+    assert summary["statuses"].get("not_initialised", 0) <= 6
     assert summary["ended"] == "end of source"
     assert set(summary["age_ms"]) == {"p50", "p99", "max"}
     assert summary["configuration"]["camera"]["width_px"] == WIDTH
     assert run.left_behind() == []
+
+
+def test_an_evaluation_tells_the_path_of_the_drive(drive: Path, place: Path) -> None:
+    assert len(evaluate(drive, place / "a", "--model", "none").splitlines()) == FRAMES
     report = json.loads((place / "a" / "report.json").read_text())
     assert [(row["sequence"], row["frames"]) for row in report] == [("77", FRAMES)]
     assert report[0]["path_m"] == pytest.approx(0.8 * (FRAMES - 1))
@@ -295,23 +302,8 @@ def test_real_frames_and_networks_too(data_dir: Path, models_dir: Path, place: P
     assert (run.output / "bev.png").stat().st_size > 1000
 
 
-def test_a_torn_image_costs_one_frame_and_a_status(drive: Path, place: Path) -> None:
-    sequence = torn(drive, place, number=5)
-    run = Run(place, "--source", f"kitti:{sequence}", "--rate", "max")
-    status, out, err = run.end()
-    assert (status, err) == (0, "")
-    assert "000005.png" in out
-    assert "networks began on" in out
-    summary = run.summary()
-    assert summary["frames_in"] == FRAMES
-    assert summary["statuses"]["frame_unreadable"] == 1
-    assert summary["frames_processed"] + summary["frames_dropped"] == FRAMES
-    assert "not_initialised" not in summary["statuses"] or summary["statuses"]["not_initialised"] <= 3
-    assert evaluate(sequence, place / "a", "--model", "none") == (run.output / "ego.kitti.txt").read_bytes()
-
-
 def test_a_slow_reader_costs_dropped_frames_that_are_counted(drive: Path, place: Path) -> None:
-    count = 2_000  # over some seconds, so that perceive sees several, and the gaps between them
+    count = 500  # over half a second or more, so that perceive sees several, and the gaps between them
     run = run_all(place, drive, "--rate", "1000", "--set", "source.loop=true", "--set", f"source.frames={count}")
     summary = run.summary()
     assert summary["frames_in"] == count
@@ -321,7 +313,8 @@ def test_a_slow_reader_costs_dropped_frames_that_are_counted(drive: Path, place:
     assert summary["statuses"]["frames_dropped"] > 0
 
 
-def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None:
+def test_planner_second_instance_and_interrupt(drive: Path, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    begun_ns = time.monotonic_ns()
     with Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true") as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             first, second = planner.wait(LIMIT_S), planner.wait(LIMIT_S)
@@ -333,13 +326,11 @@ def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None
             assert reading.on_time
             assert reading.estimate is not None
 
-            rival = call(
-                *("run", "--source", f"kitti:{drive}", "--vehicle", run.vehicle, "--output", str(place / "rival")),
-                *("--set", f"runtime.runtime_dir={run.runtime_dir}"),
-            )
-            assert rival.returncode == 2
-            assert rival.stderr.startswith(f"birdslam: vehicle '{run.vehicle}' already runs")
-            assert rival.stderr.count("\n") == 1
+            rival = ("run", "--source", f"kitti:{drive}", "--vehicle", run.vehicle, "--output", str(place / "rival"))
+            assert main([*rival, "--set", f"runtime.runtime_dir={run.runtime_dir}"]) == 2
+            said = capsys.readouterr().err
+            assert said.startswith(f"birdslam: vehicle '{run.vehicle}' already runs")
+            assert said.count("\n") == 1
             assert not (place / "rival").exists()
 
             heard = call(
@@ -352,6 +343,7 @@ def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None
             assert last is not None
             assert len(epochs) == 2
             assert [first.epoch, *epochs, last.epoch] == sorted([first.epoch, *epochs, last.epoch])
+            assert last.t_capture_ns - begun_ns >= 100_000_000 * last.frame_id  # a recording keeps its own time
 
             nodes = [run.node_pid(name) for name in ("capture", "perceive", "optimize")]
             run.process.send_signal(signal.SIGINT)
@@ -367,56 +359,24 @@ def test_planner_second_instance_and_interrupt(drive: Path, place: Path) -> None
         assert run.left_behind() == []
         summary = run.summary()
         assert summary["ended"] == "SIGINT"
+        assert set(summary["stages_ms"]) == {
+            *("capture", "capture -> perceive", "perceive queue", "perceive"),
+            *("perceive -> optimize", "optimize queue", "optimize", "optimize -> planner"),
+        }
         assert len((run.output / "ego.kitti.txt").read_text().splitlines()) == summary["frames_in"]
 
 
-def test_without_restarts_a_killed_node_ends_the_run_with_its_name(drive: Path, place: Path) -> None:
+def test_without_restarts_a_stalled_node_ends_the_run_with_its_name(drive: Path, place: Path) -> None:
     with Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true", "--set", "runtime.restart=never") as run:
-        with Planner(run.vehicle, run.runtime_dir) as planner:
-            assert planner.wait(LIMIT_S) is not None
-        os.kill(run.node_pid("perceive"), signal.SIGKILL)
-        status, _, err = run.end()
-        assert status == 1
-        assert err.startswith("birdslam: perceive was killed by SIGKILL")
-        assert err.count("\n") == 1
-        assert run.summary()["frames_processed"] > 0
-
-
-def test_a_service_is_stopped_in_order(drive: Path, place: Path) -> None:
-    with Run(place, "--source", f"kitti:{drive}", "--set", "source.loop=true") as run:
-        with Planner(run.vehicle, run.runtime_dir) as planner:
-            assert planner.wait(LIMIT_S) is not None
-        run.process.send_signal(signal.SIGTERM)
-        status, _, err = run.end()
-        assert (status, err) == (0, "")
-        summary = run.summary()
-        assert summary["ended"] == "SIGTERM"
-        assert summary["frames_processed"] + summary["frames_dropped"] == summary["frames_in"]
-        assert run.left_behind() == []
-
-
-def test_a_stalled_node_and_then_a_killed_supervisor(drive: Path, place: Path) -> None:
-    arguments = (
-        *("--source", f"kitti:{drive}", "--set", "source.loop=true"),
-        *("--set", "runtime.restart=never"),
-    )
-    with Run(place, *arguments) as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             assert planner.wait(LIMIT_S) is not None
         run.stall("optimize")
         status, _, err = run.end()
         assert status == 1
         assert err.startswith(f"birdslam: optimize is stalled: its loop has shown no life for {1e3 * LIMIT_S:g} ms")
-
-    with Run(place, *arguments) as run:  # over what the killed node left behind
-        with Planner(run.vehicle, run.runtime_dir) as planner:
-            assert planner.wait(LIMIT_S) is not None
-        nodes = [run.node_pid(name) for name in ("capture", "perceive", "optimize")]
-        run.kill()
-        wait_gone(nodes)
-    again = run_all(place, drive, "--rate", "max")
-    assert again.summary()["frames_processed"] == FRAMES
-    assert again.left_behind() == []
+        assert err.count("\n") == 1
+        assert run.summary()["frames_processed"] > 0
+        assert run.left_behind() == []
 
 
 @pytest.mark.parametrize(
@@ -428,52 +388,47 @@ def test_a_stalled_node_and_then_a_killed_supervisor(drive: Path, place: Path) -
     ],
 )
 def test_what_a_user_has_to_mend_is_named_before_anything_starts(
-    drive: Path, place: Path, arguments: list[str], said: str
+    drive: Path, place: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (place / "file").touch()
     (place / "camera.toml").write_text("width_px = 480\nheight_px = 161\nfx_px = -1.0\n")
-    run = Run(place, "--source", f"kitti:{drive}", *(text.format(place=place) for text in arguments))
-    status, out, err = run.end()
+    status, out, err = refused(drive, place, capsys, *(text.format(place=place) for text in arguments))
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
     assert said in err
-    assert run.left_behind() == []
 
 
-def test_a_manifest_that_does_not_fit_its_network(drive: Path, models_dir: Path, place: Path) -> None:
+def refused(drive: Path, place: Path, capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    """Exit status and what was said of a run that can't begin, and left nothing behind."""
+    status = main(
+        [
+            *("run", "--vehicle", "test", "--source", f"kitti:{drive}", "--output", str(place / "out")),
+            *("--set", f"runtime.runtime_dir={place / 'rt'}", "--set", "models.shipped=false", *arguments),
+        ]
+    )
+    assert left_behind("test", place / "rt") == []
+    return status, *capsys.readouterr()
+
+
+def test_a_manifest_that_does_not_fit_its_network(
+    drive: Path, models_dir: Path, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     manifest = place / "wrong.toml"
     shipped = Path(__file__).parent.parent / "birdslam" / "perception" / "manifests" / "twinlitenet_640x360.toml"
     manifest.write_text(shipped.read_text().replace("640", "320"))
     path = models_dir / "twinlitenet_640x360.onnx"
-    run = Run(
-        place,
-        *("--source", f"kitti:{drive}", "--model", f"segmenter={path}"),
-        *("--set", f"models.segmenter.manifest={manifest}"),
-    )
-    status, out, err = run.end()
+    chosen = ("--model", f"segmenter={path}", "--set", f"models.segmenter.manifest={manifest}")
+    status, out, err = refused(drive, place, capsys, *chosen)
     assert (status, out) == (2, "")
     assert str(path) in err
     assert "input.width_px" in err
     assert err.count("\n") == 1
 
 
-def test_a_recording_keeps_its_own_time(drive: Path, place: Path) -> None:
-    """Its last frame leaves when its time stamp says, and each stage of the way is measured."""
-    begun_s = time.monotonic()
-    run = run_all(place, drive, *UNHURRIED)
-    assert time.monotonic() - begun_s >= 0.1 * (FRAMES - 1)
-    summary = run.summary()
-    assert summary["frames_processed"] + summary["frames_dropped"] == summary["frames_in"] == FRAMES
-    parts = summary["stages_ms"]
-    assert set(parts) == {
-        *("capture", "capture -> perceive", "perceive queue", "perceive"),
-        *("perceive -> optimize", "optimize queue", "optimize", "optimize -> planner"),
-    }
-
-
-def test_a_killed_capture_goes_on_in_its_recording(drive: Path, place: Path) -> None:
+def test_a_killed_capture_goes_on_in_its_recording_until_it_dies_too_often(drive: Path, place: Path) -> None:
     with Run(
-        place, "--source", f"kitti:{drive}", "--set", "source.loop=true", *UNHURRIED, "--set", "runtime.spares=true"
+        *(place, "--source", f"kitti:{drive}", "--set", "source.loop=true", *UNHURRIED),
+        *("--set", "runtime.spares=true", "--set", "runtime.restarts_max=1"),
     ) as run:
         with Planner(run.vehicle, run.runtime_dir) as planner:
             before = planner.wait(LIMIT_S)
@@ -487,10 +442,13 @@ def test_a_killed_capture_goes_on_in_its_recording(drive: Path, place: Path) -> 
             frames, time_ns = after.frame_id - before.frame_id, after.t_source_ns - before.t_source_ns
             assert frames >= 2  # the number left out tells perceive of the gap
             assert time_ns == pytest.approx(frames * 100_000_000, abs=1000)
-        run.process.send_signal(signal.SIGTERM)
+        os.kill(run.node_pid("capture"), signal.SIGKILL)
         status, out, err = run.end()
-        assert (status, err) == (0, "")
+        assert status == 1
         assert "capture was killed by SIGKILL" in out
+        assert err.startswith("birdslam: capture was killed by SIGKILL")
+        assert err.endswith("2 times in 60 s: it is not restarted\n")
+        assert err.count("\n") == 1
         assert run.summary()["restarts"] == {"optimize": 0, "perceive": 0, "capture": 1}
         assert run.left_behind() == []
 

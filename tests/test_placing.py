@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from birdslam.geometry import bev
@@ -20,7 +19,6 @@ from birdslam.vehicles.state.ground_size_filter import Depths, GroundSizeFilter
 from birdslam.vehicles.state.parallax_config import ParallaxConfig
 from tests.test_frontend import CAMERA
 
-Floats = NDArray[np.float64]
 CAR = DIMENSIONS["car"]
 CONFIG = LocalisationConfig()
 

@@ -290,13 +290,7 @@ def test_the_papers_rule_asks_the_depth() -> None:
     assert fuse(by_box(), by_depth(), PseudoLidarConfig(rule="off")).centre_m.tolist() == [20.0, 1.0]
 
 
-@given(
-    st.floats(5.0, 50.0),
-    st.floats(5.0, 50.0),
-    st.floats(1e-3, 100.0),
-    st.floats(1e-3, 100.0),
-    st.floats(-0.9, 0.9),
-)
+@given(st.floats(5.0, 50.0), st.floats(5.0, 50.0), st.floats(1e-3, 100.0), st.floats(1e-3, 100.0), st.floats(-0.9, 0.9))
 def test_the_combined_covariance_is_one(a_m: float, b_m: float, a_var: float, b_var: float, rho: float) -> None:
     cov = np.array([[a_var, rho * math.sqrt(a_var * 0.1)], [rho * math.sqrt(a_var * 0.1), 0.1]])
     both = fuse(Place(a_m, np.array([a_m, 0.0]), cov), by_depth(b_m, b_var), CONFIG)

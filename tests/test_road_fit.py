@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.odometry.road.fit import MOTION, ROAD, Gradients, fit_without_prior, shared_gradient
-
-Floats = NDArray[np.float64]
 
 N = 1200
 STATES = ROAD + MOTION + 2

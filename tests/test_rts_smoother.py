@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from birdslam.bench.ego.trajectory_errors import rms
 from birdslam.frontend import FrontEnd, FrontEndConfig
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
@@ -22,7 +22,6 @@ from birdslam.vehicles.placement.localisation import DIMENSIONS
 from birdslam.vehicles.rts_smoother import RtsSmoother, SmootherConfig, VehicleMeasurement, smooth_vehicle
 from tests.test_frontend import CAMERA, ScriptedOdometry, frame, motion
 
-Floats = NDArray[np.float64]
 CAR = DIMENSIONS["car"]
 CONFIG = SmootherConfig()
 FRAMES = 40

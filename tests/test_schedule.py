@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from birdslam.geometry.camera import Camera
-from birdslam.perception import Detections, Findings, ModelSpec, Networks, Perception, Segmentation
-from birdslam.perception.manifest import Schedule
+from birdslam.perception import Findings, ModelSpec, Networks, Perception
 from birdslam.runtime.configuration import (
     Configuration,
     ConfigurationError,
@@ -26,6 +25,7 @@ from birdslam.runtime.nodes import inference
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.sections import NetworkTurn, ScheduleConfig, Turn
 from birdslam.types import Frame, Status
+from tests.heads import Head
 
 CAMERA = Camera(640, 192, 370.0, 370.0, 320.0, 88.0, 1.6)
 IMAGE = np.zeros((4, 4), dtype=np.uint8)
@@ -75,28 +75,22 @@ def test_what_cannot_be_is_refused_by_name(tmp_path: Path, text: str, reason: st
         of_toml(tmp_path, f"[perceive.schedule]\n{text}\n")
 
 
-class Head:
-    """A network that answers when it is let."""
+class Gated(Head):
+    """Answers when it is let."""
 
     def __init__(self, role: str, spec: ModelSpec) -> None:
-        self.name = self.role = role
         said = {key: getattr(spec, key) for key in ("every", "awaited") if getattr(spec, key) is not None}
-        self.schedule = Schedule(**said)
+        super().__init__(role, **said)
         self.go, self.done = threading.Event(), threading.Event()
-        self.frames: list[int] = []
-        self.fell_back = ""
 
-    def run(self, image: np.ndarray) -> Findings:
-        self.frames.append(int(image[0, 0]))
+    def answer(self, image: np.ndarray) -> Findings:
         self.go.wait(60.0)
         self.done.set()
-        if self.role == "detector":
-            return Findings(detections=Detections(np.zeros((0, 4)), np.zeros(0), ()))
-        return Findings(segmentation=Segmentation(image > 0, image > 0))
+        return super().answer(image)
 
 
 def test_of_frames_before_the_one_that_is_looked_at_no_more_detections_come() -> None:
-    head = Head("detector", ModelSpec("none.onnx", every=2, awaited=False))
+    head = Gated("detector", ModelSpec("none.onnx", every=2, awaited=False))
     with ThreadPoolExecutor(1) as threads:
         networks = Networks([head], threads.submit, patience_s=0.0)
         networks.start(4, IMAGE)
@@ -109,10 +103,10 @@ def test_of_frames_before_the_one_that_is_looked_at_no_more_detections_come() ->
 
 
 def test_each_head_runs_on_its_frames_and_a_late_one_is_skipped_and_said_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    heads: dict[str, Head] = {}
+    heads: dict[str, Gated] = {}
 
     def loaded(role: str, spec: ModelSpec, *others: object) -> Head:
-        heads[role] = Head(role, spec)
+        heads[role] = Gated(role, spec)
         return heads[role]
 
     monkeypatch.setattr(inference, "load_network", loaded)

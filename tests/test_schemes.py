@@ -81,7 +81,7 @@ def test_only_the_table_compares_scheme_names() -> None:
         f"{path.relative_to(ROOT)}: {ast.unparse(node)}"
         for folder in ("birdslam", "runtime")
         for path in sorted((ROOT / folder).rglob("*.py"))
-        if any(name in (text := path.read_text()) for name in names)
+        if any(f'"{name}"' in (text := path.read_text()) for name in names)
         for node in ast.walk(ast.parse(text))
         if compared_with(node) & names
     ]

@@ -128,12 +128,7 @@ class Vehicle:
         update = MapUpdate(epoch=0, frame_id=number, lanes_m=((1.0, 2.0),))
         times = {"t_source_ns": number, "t_capture_ns": number, "t_utc_ns": number}
         pose = MapPose(frame_id=number, **times, epoch=0, state=MapState.LOST)
-        records = {
-            "estimate": estimate(number),
-            "measurements": measurements(number),
-            "map": update,
-            "map_pose": pose,
-        }
+        records = {"estimate": estimate(number), "measurements": measurements(number), "map": update, "map_pose": pose}
         for topic, publisher in self.publishers.items():
             publisher.put(records.get(topic) or Health(node=TOPICS[topic].producer, t_ns=number))
 
@@ -243,10 +238,7 @@ def answers(session: zenoh.Session, topic: str, limit_s: float = 2.0) -> int:
 
 @needs_openssl
 def test_a_planner_asks_what_it_may_and_no_more(vehicle: Vehicle, certificates: Path) -> None:
-    with (
-        outside(certificates, vehicle.port) as session,
-        outside(certificates, vehicle.port, "stranger") as stranger,
-    ):
+    with outside(certificates, vehicle.port) as session, outside(certificates, vehicle.port, "stranger") as stranger:
         hear(vehicle, session, keys(READABLE))  # each node has said something, which it keeps
         for topic in ASKABLE:
             until(lambda topic=topic: answers(session, topic) == 1, f"an answer about {topic}")  # type: ignore[misc]
@@ -463,9 +455,7 @@ def test_the_example_of_a_planner_elsewhere(vehicle: Vehicle, certificates: Path
     text = re.sub(r'"(ca|planner)\.(pem|key)"', lambda m: json.dumps(str(certificates / m[0].strip('"'))), text)
     (tmp_path / "planner.json5").write_text(text)
     listen = subprocess.Popen(
-        [sys.executable, str(DEPLOY / "listen.py"), str(tmp_path / "planner.json5")],
-        stdout=subprocess.PIPE,
-        text=True,
+        [sys.executable, str(DEPLOY / "listen.py"), str(tmp_path / "planner.json5")], stdout=subprocess.PIPE, text=True
     )
     try:
         assert listen.stdout is not None

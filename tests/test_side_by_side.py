@@ -49,9 +49,10 @@ def begin(place: Path, name: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.processes
-def test_two_films_run_beside_each_other_and_beside_a_live_car(place: Path) -> None:
+@pytest.mark.parametrize("films", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_films_run_beside_each_other_and_beside_a_live_car(place: Path, films: int) -> None:
     with VehicleLock("car"):  # the live one, whom planners find by this name
-        runs = {name: begin(place, name) for name in ("a", "b")}
+        runs = {name: begin(place, name) for name in ("a", "b")[:films]}
         told = {name: run.communicate(timeout=LIMIT_S) for name, run in runs.items()}
         for name, (out, err) in told.items():
             assert (runs[name].returncode, err) == (0, "")

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.vehicles.state.parallax import Parallax
 from birdslam.vehicles.state.parallax_config import ParallaxConfig
 from birdslam.vehicles.state.parallax_measurements import ParallaxMeasurements
 from birdslam.vehicles.state.side_outliers import update_with_side_outliers
-
-Floats = NDArray[np.float64]
 
 N, FILTERS, STATES, CUES = 2, 3, 5, 4
 CAR_HEIGHT_M, CAR_WIDTH_M, CAMERA_M = 1.5, 1.6, 1.65

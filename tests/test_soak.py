@@ -58,10 +58,7 @@ def test_estimates_that_come_later_and_later_are_named() -> None:
 
 def test_restarted_nodes_are_named(systemd: Systemd) -> None:
     restarted = {**WELL, "restarts": {"capture": 2, "perceive": 0}, "recording": {"restarts": 1, "dropped": 0}}
-    assert list(faults({}, restarted, systemd)) == [
-        "capture was restarted 2 times",
-        "record was restarted 1 times",
-    ]
+    assert list(faults({}, restarted, systemd)) == ["capture was restarted 2 times", "record was restarted 1 times"]
 
 
 def test_a_supervisor_that_is_silent_for_too_long_misses_its_watchdog(

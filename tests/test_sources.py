@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.geometry.camera import Camera, Undistorter
+from birdslam.geometry.camera import Undistorter
 from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
 from birdslam.runtime.nodes.sources import (
     EndOfSource,
@@ -25,32 +25,16 @@ from birdslam.runtime.nodes.sources import (
     open_source,
     to_frame,
 )
-from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
+from birdslam.sources.recording import DatasetError, RecordedFrame
 from birdslam.types import Status
+from tests.recordings import PERIOD_NS, Frames
+from tests.recordings import SMALL as CAMERA
 
-CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
-PERIOD_NS = 100_000_000
+TORN = frozenset({2})
 
 
 def image(value: int = 0) -> np.ndarray:
     return np.full((32, 64), value, dtype=np.uint8)
-
-
-class Drive(Recording):
-    """Frames without a disk; number 2 is torn."""
-
-    name, camera, rate_hz = "drive", CAMERA, 10.0
-
-    def __init__(self, count: int) -> None:
-        self._count = count
-
-    def __len__(self) -> int:
-        return self._count
-
-    def frames(self) -> Generator[RecordedFrame]:
-        for index in range(self._count):
-            torn = index == 2
-            yield RecordedFrame(index, index * PERIOD_NS, None if torn else image(index), "torn" if torn else None)
 
 
 class Live:
@@ -103,7 +87,7 @@ def test_rate_max_is_always_due() -> None:
 
 
 def test_a_recording_is_read_whole_whatever_the_reader_does() -> None:
-    reader = ReadAhead(RecordedSource(Drive(9), SourceConfig()), capacity=2)
+    reader = ReadAhead(RecordedSource(Frames(9, TORN), SourceConfig()), capacity=2)
     seen = []
     for _ in range(9):
         item = reader.next(timeout_s=60.0)
@@ -146,22 +130,22 @@ def test_what_a_source_raises_reaches_the_reader() -> None:
 
 
 def test_closing_ends_a_reader_that_waits() -> None:
-    reader = ReadAhead(RecordedSource(Drive(100), SourceConfig()), capacity=1)
+    reader = ReadAhead(RecordedSource(Frames(100, TORN), SourceConfig()), capacity=1)
     wait_for(lambda: reader.read == 2)
     reader.close(timeout_s=60.0)
     assert not any(thread.name == "read-ahead" and thread.is_alive() for thread in threading.enumerate())
 
 
 def test_a_loop_goes_on_in_time_and_ends_after_so_many_frames() -> None:
-    source = RecordedSource(Drive(4), SourceConfig(loop=True, frames=10))
+    source = RecordedSource(Frames(4, TORN), SourceConfig(loop=True, frames=10))
     times = [frame.t_source_ns for frame in source.frames()]
     assert times == [PERIOD_NS * i for i in range(10)]
-    assert len(list(RecordedSource(Drive(4), SourceConfig(frames=3)).frames())) == 3
-    assert list(RecordedSource(Drive(0), SourceConfig(loop=True)).frames()) == []
+    assert len(list(RecordedSource(Frames(4, TORN), SourceConfig(frames=3)).frames())) == 3
+    assert list(RecordedSource(Frames(0, TORN), SourceConfig(loop=True)).frames()) == []
 
 
 def test_offline_frames_keep_the_unreadable_one() -> None:
-    frames = list(offline_frames(RecordedSource(Drive(4), SourceConfig())))
+    frames = list(offline_frames(RecordedSource(Frames(4, TORN), SourceConfig())))
     assert [frame.frame_id for frame in frames] == [0, 1, 2, 3]
     assert [frame.image is None for frame in frames] == [False, False, True, False]
     assert frames[2].status == (Status.FRAME_UNREADABLE,)
@@ -271,7 +255,7 @@ def test_a_resumed_recording_goes_on_where_it_was(start: int, loop: bool, frames
         frames = 40
 
     def source() -> RecordedSource:
-        return RecordedSource(Counted(9), SourceConfig(loop=loop, frames=frames))
+        return RecordedSource(Frames(9, TORN), SourceConfig(loop=loop, frames=frames))
 
     whole = list(source().frames())
     resumed = source()
@@ -279,8 +263,3 @@ def test_a_resumed_recording_goes_on_where_it_was(start: int, loop: bool, frames
     rest = list(resumed.frames())
     assert [frame.t_source_ns for frame in rest] == [frame.t_source_ns for frame in whole[start:]]
     assert [frame.index for frame in rest] == [frame.index for frame in whole[start:]]
-
-
-class Counted(Drive):
-    def frames(self, start: int = 0) -> Generator[RecordedFrame]:
-        yield from list(super().frames())[start:]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -13,13 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.geometry.camera import Camera
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
 from birdslam.runtime.nodes.sources import RecordedSource, offline_frames, open_source
 from birdslam.runtime.options import speeds_of
 from birdslam.sources.opening import open_recording
-from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
+from birdslam.sources.recording import DatasetError
 from birdslam.sources.speed_file import (
     SIGMA_MPS,
     YAW_RATE_SIGMA_RADPS,
@@ -30,25 +28,8 @@ from birdslam.sources.speed_file import (
 )
 from birdslam.sources.speed_log import KEPT_NS, KEPT_READINGS, SpeedLog
 from birdslam.types import SpeedReading
-
-CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
-PERIOD_NS = 100_000_000
-
-
-class Drive(Recording):
-    """Frames at 10 Hz, without a disk."""
-
-    name, camera, rate_hz = "drive", CAMERA, 10.0
-
-    def __init__(self, count: int) -> None:
-        self._count = count
-
-    def __len__(self) -> int:
-        return self._count
-
-    def frames(self, start: int = 0) -> Iterator[RecordedFrame]:
-        for index in range(start, self._count):
-            yield RecordedFrame(index, index * PERIOD_NS, np.zeros((32, 64), dtype=np.uint8))
+from tests.recordings import PERIOD_NS, Frames
+from tests.recordings import SMALL as CAMERA
 
 
 def reading(t_ns: int, speed_mps: float = 5.0) -> SpeedReading:
@@ -122,7 +103,7 @@ def test_a_frame_carries_at_most_the_newest_readings() -> None:
 
 def test_the_same_frames_bear_the_same_readings_offline_and_in_a_loop(tmp_path: Path) -> None:
     path = file(tmp_path, "".join(f"{0.02 * number} {number}\n" for number in range(40)))
-    recording = with_speeds(Drive(5), path)
+    recording = with_speeds(Frames(5), path)
     borne = [frame.speeds for frame in recording.undistorted_frames()]
     assert [one[-1].t_ns for one in borne] == [number * PERIOD_NS for number in range(5)]
     assert [frame.speeds for frame in offline_frames(RecordedSource(recording, SourceConfig()))] == borne
@@ -130,13 +111,13 @@ def test_the_same_frames_bear_the_same_readings_offline_and_in_a_loop(tmp_path: 
     assert [frame.speeds for frame in looped[:5]] == borne
     again = [msgspec.structs.replace(one, t_ns=one.t_ns - 5 * PERIOD_NS) for one in looped[8].speeds]
     assert tuple(again) == borne[3]
-    assert [frame.speeds for frame in Drive(2).undistorted_frames()] == [(), ()]
+    assert [frame.speeds for frame in Frames(2).undistorted_frames()] == [(), ()]
 
 
 def test_a_file_of_another_clock_is_named(tmp_path: Path) -> None:
     for text in ("1700000000 3\n1700000001 3\n", "-9 3\n-8 3\n"):
         with pytest.raises(DatasetError, match=r"speed\.csv: its times .* lie outside the recording's, 0 to 0\.5 s"):
-            with_speeds(Drive(5), file(tmp_path, text))
+            with_speeds(Frames(5), file(tmp_path, text))
 
 
 def test_a_speed_file_is_asked_for_by_the_configuration(tmp_path: Path) -> None:

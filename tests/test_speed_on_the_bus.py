@@ -19,7 +19,6 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
@@ -42,9 +41,9 @@ from birdslam.sources.recording import RecordedFrame
 from birdslam.sources.speed_log import KEPT_READINGS, added
 from birdslam.types import EgoEdge, FrameRef, Measurements, SpeedReading, SpeedSource, Status
 from tests.foreign_sender import foreign_session, matched
+from tests.recordings import SMALL as CAMERA
 from tests.test_bus import until
 
-CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5)
 MS = 1_000_000
 LIMIT_S = 60.0
 

@@ -80,11 +80,7 @@ _TIMES = {
 _ATTITUDE = Attitude(z_m=-0.12, pitch_rad=0.011, roll_rad=-0.004)
 _GROUND = Ground(height_m=1.65, pitch_rad=0.009, roll_rad=0.002)
 _READING = SpeedReading(
-    t_ns=33_290_000_000,
-    speed_mps=11.25,
-    sigma_mps=0.0625,
-    yaw_rate_radps=-0.125,
-    yaw_rate_sigma_radps=0.015625,
+    t_ns=33_290_000_000, speed_mps=11.25, sigma_mps=0.0625, yaw_rate_radps=-0.125, yaw_rate_sigma_radps=0.015625
 )
 _KNOWN = {
     "label_probability": 0.75,
@@ -152,11 +148,7 @@ EXAMPLES: tuple[msgspec.Struct, ...] = (
         inliers=57,
         keyframes=412,
         earth=EarthPose(
-            latitude_deg=51.04933,
-            longitude_deg=-114.05395,
-            cov=_COV2,
-            yaw_rad=0.5,
-            yaw_sigma_rad=0.0078125,
+            latitude_deg=51.04933, longitude_deg=-114.05395, cov=_COV2, yaw_rad=0.5, yaw_sigma_rad=0.0078125
         ),
     ),
     _READING,

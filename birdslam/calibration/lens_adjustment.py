@@ -185,10 +185,9 @@ def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _
     by_image[..., poses:] = J_lens
     J_view, J_corner, r = (x.reshape(P, 2 * IMAGES, -1) for x in (by_image, J_corner, r))
     w = np.repeat(weight, 2, axis=1)[..., None]
-    by_view = (J_view * w).transpose(0, 2, 1) @ J_view
-    begin = np.flatnonzero(np.diff(problem.of, prepend=-1))  # corners of one window stand together
-    view = np.add.reduceat(by_view, begin, axis=0)
-    gradient = np.add.reduceat(np.einsum("pni,pn->pi", J_view * w, r[..., 0]), begin, axis=0)
+    weighed = J_view * w
+    view = _summed_by_window(problem.of, weighed, J_view)
+    gradient = _summed_by_window(problem.of, weighed, r)[..., 0]
     # A window's unit of length is its own: the way to its last image is held where it is
     last = slice(poses - 3, poses)
     for k, way in enumerate(problem.t[:, -1]):
@@ -198,13 +197,20 @@ def _linearise(problem: LensProblem, prior: FocalPrior | None) -> tuple[float, _
     return cost, _System(
         of=problem.of,
         corner=corner,
-        corner_by_view=(J_corner * w).transpose(0, 2, 1) @ J_view,
+        corner_by_view=J_corner.transpose(0, 2, 1) @ weighed,
         view=view,
         corner_gradient=np.einsum("pni,pn->pi", J_corner * w, r[..., 0]),
         view_gradient=gradient,
         prior=np.diag(known[1]),
         prior_gradient=known[1] * away,
     )
+
+
+def _summed_by_window(of: Ints, a: Floats, b: Floats) -> Floats:
+    """The sum of a_p' b_p over the corners p of each window: (W, V, N) of (P, M, V) and (P, M, N)."""
+    ends = np.flatnonzero(np.diff(of)) + 1  # corners of one window stand together
+    parts = zip(np.split(a, ends), np.split(b, ends), strict=True)
+    return np.stack([x.reshape(-1, x.shape[-1]).T @ y.reshape(-1, y.shape[-1]) for x, y in parts])
 
 
 def _reduced(system: _System, damping: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
@@ -215,11 +221,9 @@ def _reduced(system: _System, damping: float) -> tuple[Floats, Floats, Floats, F
     """
     inverse = np.asarray(np.linalg.inv(system.corner * (1.0 + damping * np.eye(3))), np.float64)
     part = inverse @ system.corner_by_view
-    begin = np.flatnonzero(np.diff(system.of, prepend=-1))
     view = system.view * (1.0 + damping * np.eye(system.view.shape[-1]))
-    view = view - np.add.reduceat(system.corner_by_view.transpose(0, 2, 1) @ part, begin, axis=0)
-    taken = np.einsum("pij,pi->pj", part, system.corner_gradient)
-    gradient = system.view_gradient - np.add.reduceat(taken, begin, axis=0)
+    view = view - _summed_by_window(system.of, system.corner_by_view, part)
+    gradient = system.view_gradient - _summed_by_window(system.of, part, system.corner_gradient[..., None])[..., 0]
     poses, lens = slice(None, -2), slice(-2, None)
     solved = np.linalg.solve(view[:, poses, poses], np.concatenate([view[:, poses, lens], gradient[:, poses, None]], 2))
     by_lens, alone = solved[..., :2], solved[..., 2]

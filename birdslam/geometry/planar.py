@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from birdslam.geometry.arrays import Floats
 
 _TAU = 2.0 * np.pi
 _SMALL_RAD = 0.05  # below it the series are exact to the last digit

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from birdslam.geometry.arrays import Floats
 
 
 def rotation_exp(w: Floats) -> Floats:

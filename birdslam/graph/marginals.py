@@ -12,10 +12,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.approach import approaches
-from birdslam.graph.costs import Floats, Triple
+from birdslam.graph.costs import Triple
 from birdslam.graph.standing import judge, reported_velocity
 from birdslam.graph.vehicles import VehicleNode
 from birdslam.graph.window import Window
@@ -53,17 +54,17 @@ def vehicle_estimates(
     ahead_s = [max((t_ns - v.node_ns) * 1e-9, 0.0) for v in vehicles]
     poses, velocities, covs = marginals_in_world(window, ahead_s, changes)
     covs += _of_sizes(window.world, ego_mps, vehicles, poses, velocities)
-    told: list[tuple[tuple[float, float], tuple[float, float, float, float]]] = []
+    motions: list[tuple[tuple[float, float], tuple[float, float, float, float]]] = []
     for v, velocity, cov in zip(vehicles, velocities, covs.tolist(), strict=True):
         velocity_cov = cov[3][3], cov[3][4], cov[4][3], cov[4][4]
         if birth_det is not None:
             judge(v, velocity, velocity_cov, birth_det, t_ns)
             velocity, velocity_cov = reported_velocity(v, velocity, velocity_cov)
-        told.append((velocity, velocity_cov))
-    near = _approaches(window, ego_mps, vehicles, poses, told)
+        motions.append((velocity, velocity_cov))
+    near = _approaches(window, ego_mps, vehicles, poses, motions)
     out = []
     for v, pose, (velocity, velocity_cov), cov, approach in zip(
-        vehicles, poses, told, covs.tolist(), near, strict=True
+        vehicles, poses, motions, covs.tolist(), near, strict=True
     ):
         reported = VehicleEstimate(
             vehicle=v.vehicle,
@@ -92,12 +93,12 @@ def _approaches(
     ego_mps: complex,
     vehicles: Sequence[VehicleNode],
     poses: Sequence[SE2],
-    told: Sequence[tuple[tuple[float, float], tuple[float, float, float, float]]],
+    motions: Sequence[tuple[tuple[float, float], tuple[float, float, float, float]]],
 ) -> list[Approach]:
     """Of each vehicle to the ego, in the ego's axes: without the ego's error in world, which both have."""
     back, origin = cmath.rect(1.0, -window.world.yaw_rad), complex(window.world.x_m, window.world.y_m)
     numbers: list[complex] = []
-    for pose, ((x, y), (xx, xy, _, yy)), node in zip(poses, told, vehicles, strict=True):
+    for pose, ((x, y), (xx, xy, _, yy)), node in zip(poses, motions, vehicles, strict=True):
         at = (complex(pose.x_m, pose.y_m) - origin) * back
         velocity = complex(x, y) * back - ego_mps
         turned = complex(0.5 * (xx - yy), xy) * back * back

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from birdslam.graph.costs import Floats, edge_cost, inflation, pose_cost
+from birdslam.geometry.arrays import Floats
+from birdslam.graph.costs import edge_cost, inflation, pose_cost
 from birdslam.graph.factors.factor import Linearised
 from birdslam.graph.state_layout import diagonal_blocks
 from birdslam.graph.window import Window

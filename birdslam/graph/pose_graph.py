@@ -15,12 +15,12 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.hidden_road import hidden_fans
 from birdslam.graph.around.people import people_estimates
 from birdslam.graph.camera_scale import with_camera_scale
 from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, packed, plain, unpack, unpacked
-from birdslam.graph.costs import Floats
 from birdslam.graph.edges import PoseEdges, pose_edges
 from birdslam.graph.factors.constant_velocity import twist_growth
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
@@ -59,11 +59,7 @@ class PoseGraph:
     """Bounded in time and memory; deterministic; raises nothing for what a record may say."""
 
     def __init__(
-        self,
-        config: GraphConfig,
-        weights: WeightsConfig,
-        epoch: int = 0,
-        factors: Sequence[Factor] | None = None,
+        self, config: GraphConfig, weights: WeightsConfig, epoch: int = 0, factors: Sequence[Factor] | None = None
     ) -> None:
         """`factors`, which then belong to this graph, are `standard_factors(config, weights)` by default.
 

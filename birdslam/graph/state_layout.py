@@ -9,7 +9,7 @@ import functools
 
 import numpy as np
 
-from birdslam.graph.costs import Floats
+from birdslam.geometry.arrays import Floats
 
 EGO = slice(0, 3)
 

@@ -16,9 +16,10 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.constant_twist import advance
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.costs import Complexes, Cov, Floats, Rows
+from birdslam.graph.costs import Complexes, Cov, Rows
 from birdslam.graph.state_layout import EGO, StateLayout, diagonal
 
 KEY_NODE = 0  # the ego node that landmarks are tied to; it is renewed once in every round of the nodes

@@ -9,11 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-
-Floats = NDArray[np.float64]
 
 
 def basis(x_m: Floats) -> Floats:

@@ -6,67 +6,38 @@ says where each is, and only what lies on no known line can be a new one.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.lanes.curves import basis, moved
-from birdslam.lanes.line_filter import FARTHEST_M, STEEPEST, LineFilter, Support
+from birdslam.lanes.curves import basis
+from birdslam.lanes.line_filter import LineFilter, Support
 from birdslam.lanes.paint import LinePoints, edge_points, paint_points
 from birdslam.lanes.parallel_search import Peak, find_lines, find_shape
 from birdslam.lanes.road_view import RoadView, road_view
+from birdslam.lanes.tracked_lines import LEFT_EDGE, PAINT, RIGHT_EDGE, Track, TrackedLines, existence_of
 from birdslam.perception import Segmentation
-from birdslam.types import LaneLine, LineColour, LineKind
+from birdslam.types import LaneLine
 
-Floats = NDArray[np.float64]
-
-PAINT, LEFT_EDGE, RIGHT_EDGE = 0, 1, 2  # classes of lines: each is seen by points of its own
 MOVED_M = 0.8  # travelled between two updates: an image from the same place has the same errors
 STANDING_UPDATES = 4  # of a car that has not moved yet
 LEAST_PAINT_M, LEAST_EDGE_M = 2.4, 8.0  # evidence of a new line
-EVIDENCE_M = 6.0  # metres of paint that make a line three to two
 CERTAIN_M = 5.0  # ... that needs no second image
 APART_M = 0.45  # from a known line
 EDGE_WEIGHT = 0.3  # of an edge's points in the search: side roads and kerbstones bend a mask's border
 MOST_LINES = 9
 CONFIRMED, MOST_SCORE = 3.0, 8.0
 SAME_M = 0.3  # two lines nearer than this along all of 5 to 20 m are one
-TO_M = 60.0  # to which a line is predicted at the most
 FORGOTTEN_M = -2.0  # a line that ended so far behind the ego is dropped
 NEAR_M, FAR_M = 5.0, 25.0  # where a line that is there has to be seen
 PAST_EDGE_M, MOST_ROAD_PAST = 0.8, 0.35  # so far past an edge there is no road along so much of it
-WORST_SIGMA_M = 0.6  # to which range a line is predicted
-SIGMA_HEIGHT_REL = 0.02  # of the camera's height, as of landmarks (mapping.StaticMapConfig)
-SIGMA_OFFSET_M = 0.025  # of the paint's middle
-SOLID, DASHED = 0.8, 0.6  # share of a line that is painted
-LEAST_PAINTED = 0.2  # of a dashed line; less of it is an arrow, or a scrap
 LEAST_EXISTENCE, LOOKS_OF_A_SCRAP = 0.4, 4.0  # what has less after so many images is dropped
-YELLOW = 25.0  # excess of yellow over the road's
 PROFILE_M = 4.0, 22.0  # where paint and gaps are resolved
-
-
-_AHEAD_M = np.arange(5.0, TO_M + 1.0, 5.0)
-_AHEAD = basis(_AHEAD_M)
-
-
-class _Track(msgspec.Struct):
-    """What is known of a line beside its curve."""
-
-    kind: int  # class of its points
-    line: int = -1  # its id, once it is sure
-    score: float = 0.0
-    evidence_m: float = 0.0
-    seen_from_m: float = 0.0  # in the filter's ego frame
-    seen_to_m: float = 0.0
-    painted: float = 0.0  # share, a running mean
-    looks: float = 0.0  # weight of that mean
-    yellow: float = 0.0
-    coloured: float = 0.0
 
 
 class LineTracker:
@@ -82,7 +53,7 @@ class LineTracker:
     def clear(self) -> None:
         """All lines are dropped; ids go on counting."""
         self._filter = LineFilter()
-        self._tracks: list[_Track] = []
+        self._tracks: list[Track] = []
         self._T_world_filter: SE2 | None = None
         self._standing = 0
         self.tilt_rad = 0.0  # of the last image against its pitch
@@ -179,10 +150,10 @@ class LineTracker:
             shape.curvature_per_m,
             np.array([kind != PAINT for kind, _ in found], dtype=bool),
         )
-        self._tracks = [_Track(kind, score=1.0) for kind, _ in found]
+        self._tracks = [Track(kind, score=1.0) for kind, _ in found]
         return shape.tilt_rad
 
-    def _with_edges(self, view: RoadView, paint: LinePoints) -> tuple[LinePoints, NDArray[np.int64]]:
+    def _with_edges(self, view: RoadView, paint: LinePoints) -> tuple[LinePoints, Ints]:
         """All points of the image, and the class of each; edges are looked for from the way ahead."""
         shape = self._filter.curves[self._reference()].copy()
         shape[0] = 0.0
@@ -240,7 +211,7 @@ class LineTracker:
             elif track.kind != PAINT:
                 track.looks += 1.0
 
-    def _add_lines(self, points: LinePoints, of: NDArray[np.int64], seen: list[Support], height_m: float) -> None:
+    def _add_lines(self, points: LinePoints, of: Ints, seen: list[Support], height_m: float) -> None:
         """Lines of points that lie on none that is known."""
         free = np.ones(len(points), bool)
         for support in seen:
@@ -260,7 +231,7 @@ class LineTracker:
                 if any(taken) or len(self._tracks) >= MOST_LINES:
                     continue
                 self._filter.add(peak.offset_m, peak.heading, like, kind != PAINT)
-                self._tracks.append(_Track(kind, score=1.0))
+                self._tracks.append(Track(kind, score=1.0))
 
     def _drop_lines(self) -> None:
         """Lines that are no more seen, have ended behind the ego, or lie on another."""
@@ -269,7 +240,7 @@ class LineTracker:
         ys = self._filter.curves @ basis(x).T
         for k in sorted(range(len(self._tracks)), key=lambda k: -self._tracks[k].score):
             track = self._tracks[k]
-            if track.looks >= LOOKS_OF_A_SCRAP and _existence(track) < LEAST_EXISTENCE:
+            if track.looks >= LOOKS_OF_A_SCRAP and existence_of(track) < LEAST_EXISTENCE:
                 continue
             if track.score <= 0.0 or (track.looks and track.seen_to_m < FORGOTTEN_M):
                 continue
@@ -297,92 +268,13 @@ class LineTracker:
         )
 
 
-@dataclass(frozen=True)
-class TrackedLines:
-    """The lines after an update: tracks, curves (n, 4) and covariances (4, 4) in the ego at `T_world_seen`."""
-
-    T_world_seen: SE2
-    tracks: tuple[_Track, ...]
-    curves: Floats
-    covs: tuple[Floats, ...]
-    tilt_rad: float  # of their image against its pitch
-    height_m: float  # of its camera
-    sigma_roll_rad: float  # of its ground
-
-    def at(self, T_world_ego: SE2) -> tuple[LaneLine, ...]:
-        """The lines in the ego's frame at `T_world_ego`, moved by the ego's motion, from left to right."""
-        step, out = self.T_world_seen.between(T_world_ego), []
-        for track, seen, seen_cov in zip(self.tracks, self.curves, self.covs, strict=True):
-            curve, J = moved(seen, step)
-            cov = J @ seen_cov @ J.T + _systematic(curve, self.height_m, self.sigma_roll_rad)
-            sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", _AHEAD, cov, _AHEAD), 0.0))
-            known = _AHEAD_M[sigma < WORST_SIGMA_M]
-            if not len(known) or not np.isfinite(cov).all() or abs(curve[0]) > FARTHEST_M or abs(curve[1]) > STEEPEST:
-                continue
-            line = LaneLine(
-                line=track.line,
-                offset_m=float(curve[0]),
-                slope=float(curve[1]),
-                curvature_per_m=float(curve[2]),
-                curvature_rate_per_m2=float(curve[3]),
-                cov=tuple(cov.ravel().tolist()),
-                seen_from_m=track.seen_from_m - step.x_m,
-                seen_to_m=track.seen_to_m - step.x_m,
-                to_m=float(known[-1]),
-                kind=_kind(track),
-                colour=_colour(track),
-                existence=_existence(track),
-            )
-            out.append(line)
-        return tuple(sorted(out, key=lambda line: -line.y_m(8.0)))
-
-
-def _systematic(curve: Floats, height_m: float, sigma_roll_rad: float) -> Floats:
-    """(4, 4) what no number of images lessens: errors of the camera's height, which scales a curve, and of its roll.
-
-    A roll moves a point of the road at y sideways by the height and y^2 over it (Eq. 1): outer lines most.
-    """
-    a, h, c, d = curve.tolist()
-    by_height = np.array([a, 0.0, -c, -2.0 * d])
-    by_roll = np.array([a * a, 2.0 * a * h, 2.0 * (h * h + a * c), 6.0 * h * c + 2.0 * a * d]) / height_m
-    by_roll[0] += height_m
-    out: Floats = SIGMA_HEIGHT_REL**2 * np.outer(by_height, by_height) + sigma_roll_rad**2 * np.outer(by_roll, by_roll)
-    out[0, 0] += SIGMA_OFFSET_M**2
-    return out
-
-
-def _existence(track: _Track) -> float:
-    """The probability that it is a line: by its paint, and by how little of the road in view has none."""
-    existence = 1.0 - math.exp(-track.evidence_m / EVIDENCE_M)
-    if track.kind != PAINT or not track.looks:
-        return existence
-    return existence * min(1.0, track.painted / LEAST_PAINTED)
-
-
-def _kind(track: _Track) -> LineKind:
-    if track.kind != PAINT:
-        return LineKind.EDGE
-    if track.looks < 1.0:
-        return LineKind.UNKNOWN
-    return LineKind.SOLID if track.painted > SOLID else LineKind.DASHED if track.painted < DASHED else LineKind.UNKNOWN
-
-
-def _colour(track: _Track) -> LineColour:
-    if track.kind != PAINT or not track.coloured:
-        return LineColour.UNKNOWN
-    return LineColour.YELLOW if track.yellow > YELLOW else LineColour.WHITE
-
-
 def _joined(*parts: LinePoints) -> LinePoints:
     names = ("x_m", "y_m", "sigma_m", "weight", "masked", "yellow")
     return LinePoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def still_lines(
-    camera: Camera,
-    image: NDArray[np.uint8],
-    segmentation: Segmentation,
-    boxes_px: Floats,
+    camera: Camera, image: NDArray[np.uint8], segmentation: Segmentation, boxes_px: Floats
 ) -> tuple[tuple[LaneLine, ...], GroundPlane]:
     """The lines of a single image, and the ground under its camera with the pitch that makes them parallel."""
     tracker = LineTracker(camera, certain_m=LEAST_PAINT_M)  # there will be no other

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import Segmentation
 from birdslam.types import Lane, LaneLine
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 FROM_M, STEP_M = 1.0, 0.5  # of the points of an outline
 _FAR_PX = 20_000.0  # OpenCV draws no farther
 _CLOSE_PX = 9  # gaps of a mask that are closed: its border to paint, and noise
 
 
-def line_px(camera: Camera, ground: GroundPlane, line: LaneLine, to_m: float | None = None) -> Floats:
-    """(N, 2) pixels of a line from the nearest road in the image to where it is known, or to `to_m`."""
-    x_m = np.arange(FROM_M, line.to_m if to_m is None else to_m, STEP_M)
+def line_px(camera: Camera, ground: GroundPlane, line: LaneLine) -> Floats:
+    """(N, 2) pixels of a line from the nearest road in the image to where it is known."""
+    x_m = np.arange(FROM_M, line.to_m, STEP_M)
     return _px(camera, ground, x_m, np.array([line.y_m(x) for x in x_m.tolist()]))
 
 

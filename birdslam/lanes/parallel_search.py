@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from birdslam.lanes.curves import Floats
+from birdslam.geometry.arrays import Floats
 from birdslam.lanes.paint import LinePoints
 from birdslam.lanes.road_view import HALF_WIDTH_M, tilted
 

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.lanes.curves import basis
 from birdslam.types import Bound, Lane, LaneLine, LineKind
-
-Floats = NDArray[np.float64]
 
 AT_M = 8.0  # where lanes are judged: in view of most cameras, and near enough to be sure
 LEAST_LANE_M, WIDEST_LANE_M = 2.3, 4.2

@@ -70,10 +70,10 @@ class Traffic:
         """The lanes with the probability that their traffic is oncoming, where something showed it."""
         if lanes.ego_index is None:
             return lanes
-        told = tuple(self._told(lanes, k) for k in range(len(lanes.lanes)))
-        return lanes if told == lanes.lanes else msgspec.structs.replace(lanes, lanes=told)
+        directed = tuple(self._directed(lanes, k) for k in range(len(lanes.lanes)))
+        return lanes if directed == lanes.lanes else msgspec.structs.replace(lanes, lanes=directed)
 
-    def _told(self, lanes: Lanes, k: int) -> Lane:
+    def _directed(self, lanes: Lanes, k: int) -> Lane:
         """Lane `k` by the lines between it and the ego's: the innermost that is known decides."""
         ego, lane = lanes.ego_index, lanes.lanes[k]
         if ego is None or k == ego:

@@ -6,12 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.types import FollowedPerson
-
-Floats = NDArray[np.float64]
 
 SLOW_MPS = 1.0  # below it a road user may stand, and a time gap is no number
 DRIVES_MPS = 3.0  # slower vehicles park, turn or cross

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-
-Floats = NDArray[np.float64]
 
 LOST_SIGMA_M, LOST_SIGMA_RAD = 0.5, math.radians(1.5)  # a pose less exact than that is none
 # Odometry between fixes, 1-sigma: along and across as a share of the way, yaw by the root of it

@@ -8,11 +8,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import Transform, ego_pose
 from birdslam.types import Attitude
-
-Floats = NDArray[np.float64]
 
 
 class Placed(Protocol):

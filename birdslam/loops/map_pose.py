@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.drift import Floats, is_exact, moved
+from birdslam.loops.drift import is_exact, moved
 from birdslam.types import Cov2, Cov3, Estimate
 
 

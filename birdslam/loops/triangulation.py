@@ -10,13 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
+from birdslam.geometry.pose import rotation_exp, rotation_log
 from birdslam.loops.features import Features, hamming, match
 from birdslam.trajectory import Transform, inverse
-
-Floats = NDArray[np.float64]
 
 MATCH_BITS = 60  # neighbouring frames look alike
 MATCH_RATIO = 0.85
@@ -41,10 +40,10 @@ class View:
 class Points:
     """Of a keyframe, in its camera's axes; `feature` is the row of each in the keyframe's features."""
 
-    feature: NDArray[np.int64]
+    feature: Ints
     p_cam_m: Floats  # (N, 3)
     sigma_depth_rel: Floats  # (N,)
-    frames: NDArray[np.int64]  # (N,) that saw it
+    frames: Ints  # (N,) that saw it
 
 
 def triangulate(camera: Camera, keyframe: View, others: Sequence[View]) -> Points:
@@ -81,7 +80,7 @@ def triangulate(camera: Camera, keyframe: View, others: Sequence[View]) -> Point
     return Points(kept, rays[kept] / rho[kept, None], np.maximum(sigma_rel[kept], 0.01), frames[kept])
 
 
-def _observations(own: Features, others: Sequence[View]) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, Floats]:
+def _observations(own: Features, others: Sequence[View]) -> tuple[Ints, Ints, Floats, Floats]:
     """(O,) the keyframe's feature, (O,) the frame, (O, 2) the pixel there and (O,) its sigma."""
     rows, views, px, sigma = [], [], [], []
     for number, view in enumerate(others):
@@ -101,23 +100,14 @@ def _projected(rays: Floats, rho: Floats, T: Transform) -> tuple[Floats, Floats]
     return p, np.maximum(p[:, 2], 1e-3)
 
 
-def _residuals(
-    rays: Floats, rho: Floats, poses: Transform, rows: NDArray[np.int64], views: NDArray[np.int64], xy: Floats
-) -> Floats:
+def _residuals(rays: Floats, rho: Floats, poses: Transform, rows: Ints, views: Ints, xy: Floats) -> Floats:
     p, z = _projected(rays[rows], rho[rows], poses[views])
     out: Floats = xy - p[:, :2] / z[:, None]
     return out
 
 
 def _depths(
-    rays: Floats,
-    rho: Floats,
-    poses: Transform,
-    rows: NDArray[np.int64],
-    views: NDArray[np.int64],
-    xy: Floats,
-    sigma: Floats,
-    good: NDArray[np.bool_],
+    rays: Floats, rho: Floats, poses: Transform, rows: Ints, views: Ints, xy: Floats, sigma: Floats, good: Bools
 ) -> tuple[Floats, Floats]:
     """Inverse depths by Gauss-Newton with Cauchy weights, and their information."""
     T = poses[views]
@@ -153,12 +143,13 @@ def _refined(T: Transform, prior: Transform, rays: Floats, rho: Floats, xy: Floa
         J = (Jp[:, :2] - predicted[:, :, None] * Jp[:, 2:3]) / z[:, None, None]
         error = xy - predicted
         weight = 1.0 / (1.0 + ((error / sigma[:, None]) ** 2).sum(axis=1) / 4.0) / sigma**2
-        H = np.einsum("nai,n,naj->ij", J, weight, J) + prior_information
-        deviation = np.concatenate([T[:3, 3] - prior[:3, 3], _rotation_vector(T[:3, :3] @ prior[:3, :3].T)])
-        g = np.einsum("nai,n,na->i", J, weight, error) - prior_information @ deviation
+        weighed = (J * weight[:, None, None]).reshape(-1, 6)
+        H = weighed.T @ J.reshape(-1, 6) + prior_information
+        deviation = np.concatenate([T[:3, 3] - prior[:3, 3], rotation_log(T[:3, :3] @ prior[:3, :3].T)])
+        g = weighed.T @ error.ravel() - prior_information @ deviation
         step = np.linalg.solve(H, g)
         T = T.copy()
-        T[:3, :3] = rotation(step[3:]) @ T[:3, :3]
+        T[:3, :3] = rotation_exp(step[3:]) @ T[:3, :3]
         T[:3, 3] += step[:3]
     return T
 
@@ -168,19 +159,4 @@ def cross(v: Floats) -> Floats:
     out = np.zeros((len(v), 3, 3))
     out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
     out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
-    return out
-
-
-def rotation(w: Floats) -> Floats:
-    """(3, 3) of a rotation vector in rad."""
-    from scipy.spatial.transform import Rotation  # here: few processes need it
-
-    out: Floats = Rotation.from_rotvec(w).as_matrix()
-    return out
-
-
-def _rotation_vector(R: Floats) -> Floats:
-    from scipy.spatial.transform import Rotation  # here: few processes need it
-
-    out: Floats = Rotation.from_matrix(R).as_rotvec()
     return out

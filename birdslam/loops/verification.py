@@ -15,19 +15,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
+from birdslam.geometry.pose import rotation_exp
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import Features, hamming, match
 from birdslam.loops.keyframe import Keyframe
-from birdslam.loops.triangulation import cross, rotation
+from birdslam.loops.triangulation import cross
 from birdslam.trajectory import Transform, ego_pose, inverse, mount_pose, split_pose
 from birdslam.types import Attitude
 
-Floats = NDArray[np.float64]
-
 MATCH_BITS, MATCH_RATIO = 72, 0.85  # where nothing is known of the pose
 GUIDED_BITS, GUIDED_RATIO = 80, 0.9  # where the pose says where to look
-LEAST_PLACES = 6  # cells of the image, of GRID_PX, that the inliers must lie in
 GRID_CELLS = 8, 4  # across and down the image
 RANSAC_PX, RANSAC_LOOKS = 4.0, 400
 GATE = 3.0  # standard deviations of a coordinate
@@ -112,9 +111,7 @@ def _camera_pose(camera: Camera, T_keyframe_ego: Transform) -> Transform:
     return inverse(T_keyframe_ego @ mount_pose(camera.ground))
 
 
-def _ransac(
-    camera: Camera, features: Features, local: LocalMap, pairs: NDArray[np.int64]
-) -> tuple[Transform | None, NDArray[np.int64]]:
+def _ransac(camera: Camera, features: Features, local: LocalMap, pairs: Ints) -> tuple[Transform | None, Ints]:
     if len(pairs) < 8:
         return None, pairs
     found, rotated, moved, inliers = cv2.solvePnPRansac(
@@ -130,7 +127,7 @@ def _ransac(
     if not found or inliers is None or len(inliers) < 8:
         return None, pairs
     T_cam_keyframe = np.eye(4)
-    T_cam_keyframe[:3, :3] = rotation(rotated.ravel().astype(np.float64))
+    T_cam_keyframe[:3, :3] = rotation_exp(rotated.ravel().astype(np.float64))
     T_cam_keyframe[:3, 3] = moved.ravel()
     if not np.isfinite(T_cam_keyframe).all():
         return None, pairs
@@ -141,9 +138,7 @@ def _ransac(
     return pose, pairs[inliers.ravel()]
 
 
-def _guided(
-    camera: Camera, features: Features, local: LocalMap, pose: Transform, radius_px: float
-) -> NDArray[np.int64]:
+def _guided(camera: Camera, features: Features, local: LocalMap, pose: Transform, radius_px: float) -> Ints:
     """Matches within `radius_px` of where the pose puts each point."""
     T = _camera_pose(camera, pose)
     p = local.points_m @ T[:3, :3].T + T[:3, 3]
@@ -156,8 +151,8 @@ def _guided(
 
 
 def _adjust(
-    camera: Camera, features: Features, local: LocalMap, pairs: NDArray[np.int64], pose: Transform
-) -> tuple[Transform, Floats, NDArray[np.bool_]] | None:
+    camera: Camera, features: Features, local: LocalMap, pairs: Ints, pose: Transform
+) -> tuple[Transform, Floats, Bools] | None:
     """Gauss-Newton with Cauchy weights: T_keyframe_ego (4, 4), the covariance of (x, y, yaw), and the inliers."""
     if len(pairs) < 8:
         return None
@@ -167,7 +162,7 @@ def _adjust(
     xy = camera.to_xy(features.px[pairs[:, 1]])
     noise = (features.sigma_px[pairs[:, 1]] ** 2 + OTHER_VIEW_PX**2) / camera.fx_px**2
     prior = np.array([0.0, 0.0, SIGMA_Z_M**-2, SIGMA_TILT_RAD**-2, SIGMA_TILT_RAD**-2, 0.0])
-    good: NDArray[np.bool_] = np.ones(len(pairs), bool)
+    good: Bools = np.ones(len(pairs), bool)
     H: Floats = np.eye(6)
     for _ in range(ITERATIONS):
         p_ego = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -182,11 +177,12 @@ def _adjust(
         blur = (depth[:, :2] - predicted * depth[:, 2:3]) / z[:, None]
         W = np.linalg.inv(noise[:, None, None] * np.eye(2) + blur[:, :, None] * blur[:, None, :])
         error = xy - predicted
-        chi2 = np.einsum("na,nab,nb->n", error, W, error)
+        chi2 = (error * (W @ error[:, :, None])[:, :, 0]).sum(axis=1)
         good = (chi2 < GATE**2) & (p[:, 2] > 0.5)
         weight = (p[:, 2] > 0.5) / (1.0 + chi2 / 4.0)
-        H = np.einsum("nai,n,nab,nbj->ij", J, weight, W, J)
-        g = np.einsum("nai,n,nab,nb->i", J, weight, W, error)
+        weighed = (weight[:, None, None] * (W @ J)).reshape(-1, 6)
+        H = weighed.T @ J.reshape(-1, 6)
+        g = weighed.T @ error.ravel()
         state = split_pose(pose)[1]
         g -= prior * np.array([0.0, 0.0, pose[2, 3], state.roll_rad, state.pitch_rad, 0.0])
         H += np.diag(prior)
@@ -195,7 +191,7 @@ def _adjust(
         step = np.linalg.solve(H, g)
         pose = pose.copy()
         pose[:3, 3] += pose[:3, :3] @ np.clip(step[:3], -2.0, 2.0)
-        pose[:3, :3] = pose[:3, :3] @ rotation(step[3:])
+        pose[:3, :3] = pose[:3, :3] @ rotation_exp(step[3:])
         if float(np.abs(step).max()) < 1e-5:
             break
     if not good.any() or abs(pose[2, 3]) > 1.5 or math.hypot(*pose[:2, 3]) > 60.0:

@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.ego_lane import EgoLane
-from birdslam.lanes.line_tracker import LineTracker, TrackedLines
+from birdslam.lanes.line_tracker import LineTracker
+from birdslam.lanes.tracked_lines import TrackedLines
 from birdslam.mapping.landmark_edges import StaticMapConfig
 from birdslam.mapping.lane_edges import LaneEdgesConfig, Station, lane_stations
 from birdslam.mapping.lane_ids import NO_LANE, cell_keys
@@ -28,8 +30,7 @@ from birdslam.mapping.lanes import AmodalLanes, Completion, LanesConfig, LaneVie
 from birdslam.perception import Segmentation
 from birdslam.types import LandmarkEdge, LanePoint, Lanes, Status
 
-Floats = NDArray[np.float64]
-Ids = NDArray[np.int64]
+Ids = Ints
 Submit = Callable[..., Future[Any]]  # (function, *arguments), as of an executor
 
 REMEMBERED_FRAMES = 64  # whose poses are kept for late segmentations

@@ -43,7 +43,19 @@ class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_pitch_rad: Positive = 0.006  # of the road against the calibrated plane
 
 
-class ExternalOdometry:
+class WithoutImages:
+    """What is the same of every EgoMotion that sees no image."""
+
+    @property
+    def road_tracks(self) -> tuple[NDArray[np.int64], Floats]:
+        """Empty: no corners are tracked."""
+        return np.zeros(0, np.int64), np.zeros((0, 2))
+
+    def track(self, image: NDArray[np.uint8]) -> None:
+        """Does nothing: no image is needed."""
+
+
+class ExternalOdometry(WithoutImages):
     """An EgoMotion of the front end. `trajectory` is of the camera, or with `config.ego` of the ego."""
 
     def __init__(self, camera: Camera, trajectory: TimedPoses, config: ExternalConfig) -> None:
@@ -54,14 +66,6 @@ class ExternalOdometry:
         self._coasting = MotionConfig()
         self._last: tuple[int, int, Pose] | None = None  # frame, time and pose of the last that had one
         self._velocity: tuple[SE2, float] | None = None  # the last motion, and its duration in s
-
-    @property
-    def road_tracks(self) -> tuple[NDArray[np.int64], Floats]:
-        """Empty: no corners are tracked."""
-        return np.zeros(0, np.int64), np.zeros((0, 2))
-
-    def track(self, image: NDArray[np.uint8]) -> None:
-        """Does nothing: no image is needed."""
 
     def estimate(
         self,

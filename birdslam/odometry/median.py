@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from birdslam.geometry.pose import Floats
+from birdslam.geometry.arrays import Floats
 
 
 def upper_median(values: Floats) -> float:

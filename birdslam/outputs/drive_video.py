@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats, Image
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.outline import lane_px, line_px
@@ -36,9 +37,6 @@ from birdslam.outputs.bev_picture import (
 )
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.types import Estimate, Lanes, LineKind, MapUpdate, RoadUser
-
-Image = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
 MOST_SCALE, MOST_WIDTH_PX = 1.5, 1280  # of the camera's image, enlarged or reduced
 STRIP_PX, PANEL_PX = 96, 368  # height of the strip of text below the image, width of the bird's-eye view

@@ -12,12 +12,10 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.types import NS_PER_S, Estimate, LaneLine
-
-Floats = NDArray[np.float64]
 
 NODE_AT_M = 6.0  # ahead of the ego
 NODE_EVERY_M = 2.0

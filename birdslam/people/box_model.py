@@ -19,10 +19,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.people.people_boxes import PersonBox
 from birdslam.people.people_config import PeopleConfig
-from birdslam.people.people_state import FOOT, HEAD, HEIGHT, KERB, STATES, TILT, Floats
+from birdslam.people.people_state import FOOT, HEAD, HEIGHT, KERB, STATES, TILT
 
 BEARING, BOTTOM, TALL, WIDTH = range(4)
 UNUSED = 1e3  # 1-sigma of what is not measured

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.people.box_model import MIN_SLOPE, TALL, UNUSED, WIDTH, expected_boxes, hide_feet, measured_boxes
 from birdslam.people.people_boxes import PersonBox
@@ -33,7 +34,6 @@ from birdslam.people.people_state import (
     VELOCITY,
     VX,
     VY,
-    Floats,
     Moments,
     X,
     Y,
@@ -74,12 +74,7 @@ class PeopleFilter:
         self._tilt_prior, self._moves = self._tilt_prior[rows], self._moves[rows]
 
     def predict(
-        self,
-        dt_s: float,
-        T_world_ego: SE2,
-        ego_cov: Floats | None,
-        ground_shift_rad: float,
-        ego_mps: float,
+        self, dt_s: float, T_world_ego: SE2, ego_cov: Floats | None, ground_shift_rad: float, ego_mps: float
     ) -> None:
         """To the next frame: people move, and the ground's estimate moved by `ground_shift_rad` beside its own motion.
 
@@ -208,7 +203,7 @@ class PeopleFilter:
         R[:, WIDTH, WIDTH] = np.where(uses, self._sizes[at, 3], UNUSED) ** 2
         return z, R
 
-    def moments(self, after_s: float = 0.0, stands: NDArray[np.bool_] | None = None) -> Moments:
+    def moments(self, after_s: float = 0.0, stands: Bools | None = None) -> Moments:
         """Of everybody, `after_s` later, as they move.
 
         The velocity is the one of whoever moves, or none of whom `stands` (N,); its covariance is about that, with the
@@ -252,11 +247,11 @@ class PeopleFilter:
         noise = np.stack([R, R])
         hide_feet(noise[1], np.exp(z[:, TALL]) / (1.0 - self.config.hidden_share), self.config)
         hidden = np.array([b.hidden for b in boxes])
-        squared, told = np.full((n, len(boxes)), np.inf), np.full((n, len(boxes)), np.inf)
+        squared, costs = np.full((n, len(boxes)), np.inf), np.full((n, len(boxes)), np.inf)
         for k, prior in enumerate((1.0 - hidden, hidden)):
             gap = z[None, :, :WIDTH] - mean[:, None, k]
             whole = S[:, None, k] + noise[k][None, :, :WIDTH, :WIDTH]
             d2 = (gap[..., None, :] @ np.linalg.inv(whole) @ gap[..., None])[..., 0, 0]
             cost = d2 + np.linalg.slogdet(whole)[1] - 2.0 * np.log(prior)[None]
-            squared, told = np.where(cost < told, d2, squared), np.minimum(told, cost)
-        return squared, told
+            squared, costs = np.where(cost < costs, d2, squared), np.minimum(costs, cost)
+        return squared, costs

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.people.people_config import PeopleConfig, Sizes
 from birdslam.people.people_state import (
     FILTERS,
@@ -19,7 +20,6 @@ from birdslam.people.people_state import (
     VELOCITY,
     VX,
     VY,
-    Floats,
     X,
     Y,
     merged,

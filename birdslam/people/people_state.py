@@ -11,10 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
+from birdslam.geometry.arrays import Floats
 
 STATES = X, Y, VX, VY, HEIGHT, TILT, KERB, FOOT, HEAD = range(9)
 VELOCITY = slice(2, 4)

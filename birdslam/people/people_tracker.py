@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.people.people_boxes import BICYCLE, CYCLIST, PEDESTRIAN, PeopleBoxesConfig, PersonBox, people_boxes
@@ -25,8 +25,6 @@ from birdslam.types import FIRST_PERSON
 from birdslam.vehicles.out_of_sequence import OpenFrame
 from birdslam.vehicles.placement.localisation import iou
 from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
-
-Floats = NDArray[np.float64]
 
 NEVER = 1e9  # the cost of what can't be
 NEW = 2.0  # -2 log of the density of new people in bearing, slope and log height: about one in the image
@@ -125,8 +123,8 @@ class PeopleTracker:
         """(row, box): the assignment of least total cost, the negative log-likelihood within the gate."""
         if not boxes or not self.tracks:
             return []
-        squared, told = self.filter.distances(boxes, T_world_ego, height_m)
-        cost = np.where(squared <= self.config.gate, told, NEVER)
+        squared, costs = self.filter.distances(boxes, T_world_ego, height_m)
+        cost = np.where(squared <= self.config.gate, costs, NEVER)
         births = np.where(np.eye(len(boxes)), NEW, NEVER)  # a row of somebody new for each box
         rows, columns = self._assign(np.vstack([cost, births]))
         known = len(self.tracks)

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats
 from birdslam.people.box_model import MIN_SLOPE, NEAREST_M, UNUSED
 from birdslam.people.people_boxes import PersonBox
 from birdslam.people.people_config import PeopleConfig
-from birdslam.people.people_state import Floats
 
 
 def tilts_of(boxes: Sequence[PersonBox], sigma_pitch_rad: float, height_m: float, config: PeopleConfig) -> Floats:

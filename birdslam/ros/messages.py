@@ -15,14 +15,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import Transform, ego_pose, mount_pose
 from birdslam.types import NS_PER_S, EgoEdge, Estimate, Lanes, LineColour, LineKind, MapUpdate, RoadUser
 
-Floats = NDArray[np.float64]
 Sent = tuple[str, Any]  # topic, message
 
 ODOMETRY, DETECTIONS, MARKERS = (

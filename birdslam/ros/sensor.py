@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from birdslam.types import NS_PER_S, SpeedReading
 
-Floats = NDArray[np.float64]
 FIX_SIGMA_M = 5.0  # of a fix without a covariance: a receiver without corrections, under open sky
 
 IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.perception import Detections
@@ -25,8 +25,6 @@ from birdslam.sources.kitti import KITTI_HEIGHT_M, find_images, read_image, read
 from birdslam.sources.label_projection import Label, project_labels
 from birdslam.sources.recording import DatasetError
 from birdslam.trajectory import Transform, as_poses, inverse, read_kitti
-
-Floats = NDArray[np.float64]
 
 COLOUR_CAMERAS = (2, 3)  # left, right
 IMAGE_SIZE_PX = (1242, 375)  # of those where there is no image to ask

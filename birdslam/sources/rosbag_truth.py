@@ -9,14 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.ros.frames import StaticFrames
 from birdslam.trajectory import Transform, inverse, mount_pose
-
-Floats = NDArray[np.float64]
 
 COURSE_M = 5.0  # the course is taken between two fixes so far apart: GNSS is some 1 m off; chosen on no data
 WGS84_A_M, WGS84_E2 = 6378137.0, 6.69437999014e-3  # semi-major axis, first eccentricity squared

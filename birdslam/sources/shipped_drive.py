@@ -15,15 +15,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.camera_file import load_camera
 from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.types import NS_PER_S, Ground
-
-Floats = NDArray[np.float64]
 
 DIRECTORY = Path(__file__).parent / "drives" / "shipped"
 NAME = "demo"

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
-Floats32 = NDArray[np.float32]
+from birdslam.geometry.arrays import Floats32, Image
 
 BLOCK_PX, DCT_PX = 16, 8
+GROUP = 12  # images, of which the first is coded alone
 DEADZONE = 1.0 / 6.0  # what is added before a level is rounded down, as H.264's reference encoder does in P images
 STILL_BONUS = 1.0  # grey levels a pixel: a block that stands still costs no bits
 
@@ -21,12 +21,11 @@ STILL_BONUS = 1.0  # grey levels a pixel: a block that stands still costs no bit
 class VideoEncoder:
     """`code` gives back each image of a video as a player shows it; one after the other, all of one size.
 
-    `step` is the quantiser's, in grey levels of the orthonormal DCT (H.264's QP 28 is 16, QP 34 is 32); every
-    `group`-th image is coded alone.
+    `step` is the quantiser's, in grey levels of the orthonormal DCT (H.264's QP 28 is 16, QP 34 is 32).
     """
 
-    def __init__(self, step: float = 24.0, group: int = 12) -> None:
-        self._step, self._group = step, group
+    def __init__(self, step: float = 24.0) -> None:
+        self._step = step
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
         self._shown: list[Floats32] = []  # the planes of the image before
         self._count = 0
@@ -37,7 +36,7 @@ class VideoEncoder:
         unit = 2 * BLOCK_PX
         padded = cv2.copyMakeBorder(image, 0, -height % unit, 0, -width % unit, cv2.BORDER_REPLICATE)
         planes = _planes(np.asarray(padded, np.uint8))
-        alone = self._count % self._group == 0
+        alone = self._count % GROUP == 0
         moves = np.zeros((*padded.shape[:2], 2), np.float32) if alone else self._moves(planes[0])
         for k, plane in enumerate(planes):
             guess = np.full_like(plane, 128.0) if alone else _moved(self._shown[k], moves)

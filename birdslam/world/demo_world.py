@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.world.rendering.light import SKY_SLOTS
 from birdslam.world.rendering.photometrics import Lens
@@ -21,7 +22,6 @@ from birdslam.world.traffic.fleet import draw_cyclist, draw_pedestrian, draw_sha
 from birdslam.world.traffic.flow import Mover, populate, settle
 from birdslam.world.traffic.placement import furnish
 from birdslam.world.traffic.poses import place
-from birdslam.world.truth import Floats
 
 RATE_HZ = 33.0
 FRAMES = 1000

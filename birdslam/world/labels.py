@@ -7,13 +7,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.world.rendering import materials as m
 from birdslam.world.rendering.scene import Bodies, Rendered
 from birdslam.world.street.street import CROSSING, LINE_KINDS, Street
 from birdslam.world.traffic.flow import Mover
-from birdslam.world.truth import Floats, WorldFrame, WorldLane, WorldObject
+from birdslam.world.truth import WorldFrame, WorldLane, WorldObject
 
 LANE_AHEAD_M, LANE_BEHIND_M, LANE_STEP_M = 80.0, 12.0, 1.0
 _SIDE_ROAD_M = 60.0

@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.world.demo_world import demo_lens, demo_sky
 from birdslam.world.rendering import materials as m
@@ -21,7 +22,7 @@ from birdslam.world.traffic.fleet import draw_cyclist, draw_pedestrian, draw_sha
 from birdslam.world.traffic.flow import Mover
 from birdslam.world.traffic.placement import furnish
 from birdslam.world.traffic.poses import place
-from birdslam.world.truth import Floats, WorldFrame
+from birdslam.world.truth import WorldFrame
 
 CAMERA = Camera(960, 288, 556.8, 556.8, 479.5, 135.0, height_m=1.55, pitch_rad=0.01)  # the shipped drive's, larger
 EGO_M = 30.0  # where along the street the ego begins

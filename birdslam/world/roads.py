@@ -11,29 +11,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.world.rendering import materials as m
 from birdslam.world.rendering.night import Night, even_sky
 from birdslam.world.rendering.photometrics import Lens
 from birdslam.world.scenario import Scenario
 from birdslam.world.street.course import STEP_M, Course
-from birdslam.world.street.street import (
-    ASPHALT,
-    BAND,
-    CROSSING,
-    GRASS,
-    HATCHED,
-    LINE,
-    LINE_KINDS,
-    MARK,
-    Lane,
-    Street,
-)
+from birdslam.world.street.street import ASPHALT, BAND, CROSSING, GRASS, HATCHED, LINE, LINE_KINDS, MARK, Lane, Street
 from birdslam.world.traffic.fleet import draw_shape, draw_truck
 from birdslam.world.traffic.flow import Mover
 from birdslam.world.traffic.placement import Standing, background, tree
 from birdslam.world.traffic.poses import place
-from birdslam.world.truth import Floats
 
 # The field of view of KITTI's cameras, at a size that renders in a sixth of a second
 CAMERA = Camera(640, 192, 371.2, 371.2, 319.5, 90.0, height_m=1.65, pitch_rad=0.008)

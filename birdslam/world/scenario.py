@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.types import NS_PER_S
 from birdslam.world.labels import frame_of
@@ -24,7 +25,7 @@ from birdslam.world.traffic.fleet import draw_shape
 from birdslam.world.traffic.flow import Mover, advance, populate, settle
 from birdslam.world.traffic.placement import furnish
 from birdslam.world.traffic.poses import ego_pose, moving, place
-from birdslam.world.truth import Floats, WorldFrame
+from birdslam.world.truth import WorldFrame
 
 STREET_M = 1500.0  # of a drawn drive
 SIGHT_M = 190.0  # what stands farther away is left out

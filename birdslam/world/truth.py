@@ -11,25 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 
-Floats = NDArray[np.float64]
-
 # Of each pixel. `lane` is painted lane and road boundaries; other paint (zebras, arrows, stop lines) is `road`;
 # `pavement` is what is paved beside the road, kerbs too; grass is `vegetation`; cyclists with their cycles are `person`
-CLASSES = (
-    "sky",
-    "road",
-    "lane",
-    "pavement",
-    "building",
-    "vegetation",
-    "pole_sign",
-    "vehicle",
-    "person",
-    "other",
-)
+CLASSES = ("sky", "road", "lane", "pavement", "building", "vegetation", "pole_sign", "vehicle", "person", "other")
 LABELS = ("car", "van", "truck", "bus", "cyclist", "pedestrian")
 
 
@@ -67,7 +55,7 @@ class WorldFrame:
     """One rendered image and all that is true of it."""
 
     image: NDArray[np.uint8]  # (H, W, 3) BGR
-    depth_m: NDArray[np.float32]  # (H, W) along the optical axis, inf is sky
+    depth_m: Floats32  # (H, W) along the optical axis, inf is sky
     classes: NDArray[np.uint8]  # (H, W) indices of CLASSES
     instances: NDArray[np.uint16]  # (H, W) object_id + 1, 0 is none
     objects: tuple[WorldObject, ...]

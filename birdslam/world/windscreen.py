@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
+from birdslam.geometry.arrays import Image
+
 Edit = Callable[[int, int, Image], Image]  # an image's index, how many there are, the image -> what is seen of it
 
 KINDS = ("nothing", "drops", "rain", "drops_defocused", "dirt", "reflection")
@@ -20,6 +20,7 @@ KINDS = ("nothing", "drops", "rain", "drops_defocused", "dirt", "reflection")
 _DEFOCUSED_DROPS, _DEFOCUSED_RADIUS_REL, _DEFOCUS_REL = 45, (0.012, 0.04), 0.006
 _DEFOCUSED_COVER, _BEND, _DEFOCUSED_LIGHT_GREY = (0.4, 0.95), (-0.5, 0.5), (-25.0, 35.0)
 BONNET_SHARE = 0.14  # of the image's height, in its middle
+LACQUER_GREY, MIRRORED = 40.0, 0.35  # of a bonnet: its own brightness, and the share of what is over it
 
 
 class Overlay:
@@ -118,7 +119,7 @@ def from_middle(kind: str, seed: int) -> Edit:
     return from_share(kind, seed, 0.5)
 
 
-def bonnet(image: Image, lacquer: float = 40.0, mirrored: float = 0.35) -> Image:
+def bonnet(image: Image) -> Image:
     """A car's own bonnet along the lower edge: lacquer of one brightness that mirrors, blurred, what is over it."""
     height, width = image.shape[:2]
     mask = np.zeros((height, width), np.float32)
@@ -126,7 +127,7 @@ def bonnet(image: Image, lacquer: float = 40.0, mirrored: float = 0.35) -> Image
     centre, axes = (width // 2, height + round(high)), (round(0.62 * width), round(2.0 * high))
     cv2.ellipse(mask, centre, axes, 0.0, 0.0, 360.0, 1.0, -1, cv2.LINE_AA)
     upside_down = cv2.GaussianBlur(image[::-1], (0, 0), sigmaX=4.0, sigmaY=10.0).astype(np.float32)
-    shown = lacquer + mirrored * np.roll(upside_down, round(0.5 * height), axis=0)
+    shown = LACQUER_GREY + MIRRORED * np.roll(upside_down, round(0.5 * height), axis=0)
     cover = mask if image.ndim == 2 else mask[..., None]
     return np.clip((1.0 - cover) * image + cover * shown, 0.0, 255.0).astype(np.uint8)
 

@@ -23,7 +23,7 @@ import numpy as np
 from birdslam.bench.ego.trajectory_errors import OdometryReport, compare, from_first, in_camera0
 from birdslam.bench.tracking.benchmark import EGO as EGO_BODY
 from birdslam.perf.errors import PerfError
-from birdslam.perf.latency.live import Ask, add_run_options, drive, setting_options
+from birdslam.perf.latency.live import add_run_options, drive, once, setting_options
 from birdslam.perf.latency.system import age_of
 from birdslam.perf.processes import run_birdslam
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
@@ -75,7 +75,7 @@ def _source(ledger: Ledger, options: argparse.Namespace, source: str) -> None:
     )
     rates = sorted({round(recording.rate_hz), *options.rates})
     for rate, load in [(rate, 0) for rate in rates] + ([(rates[-1], options.load)] if options.load else []):
-        with busy_cores(load), drive(_ask(options, source, recording, rate)) as result:
+        with busy_cores(load), drive(once(options, source, recording, rate)) as result:
             row = graded(recording, result.place / "out", result.summary)
             ages_ms = [age_of(message) for message in result.messages]
             row |= {"epochs": len({m.record.epoch for m in result.messages}), "age_ms": spread(ages_ms)}
@@ -87,18 +87,6 @@ def _source(ledger: Ledger, options: argparse.Namespace, source: str) -> None:
 
 def _missing(ledger: Ledger, name: str, reason: str) -> None:
     ledger.add(name, f"missing: {reason}", missing=reason)
-
-
-def _ask(options: argparse.Namespace, source: str, recording: Recording, rate: float) -> Ask:
-    return Ask(
-        source=source,
-        rate=rate,
-        seconds=len(recording) / rate,
-        models=tuple(options.model),
-        settings=tuple(options.set),
-        config=options.config,
-        loop=False,
-    )
 
 
 def _offline(options: argparse.Namespace, source: str, recording: Recording) -> Row:

@@ -12,15 +12,15 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from birdslam.bench.ego.trajectory_errors import from_first
+from birdslam.geometry.arrays import Bools, Floats, Image
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.perf.reporting.arguments import add_data, add_networks
-from birdslam.runtime.configuration import Configuration, SourceConfig, load
+from birdslam.runtime.configuration import Configuration, load
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, Recording
@@ -29,9 +29,6 @@ from birdslam.status import INVALIDATING
 from birdslam.trajectory import as_poses, inverse
 from birdslam.types import Frame, Status
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Image = NDArray[np.uint8]
 Edit = Callable[[int, int, Image], Image]
 
 SEQUENCES = (
@@ -79,10 +76,12 @@ def add_drive_options(parser: argparse.ArgumentParser) -> None:
 
 def networks_of(options: argparse.Namespace) -> Configuration | None:
     """The configuration whose networks are to run; None: none are."""
-    if not options.networks and not options.model:
-        return None
-    configuration = load(None, {f"models.{m.partition('=')[0]}.path": m.partition("=")[2] for m in options.model})
-    return msgspec.structs.replace(configuration, source=SourceConfig(rate="max"))
+    return with_networks(options.model) if options.networks or options.model else None
+
+
+def with_networks(models: Sequence[str]) -> Configuration:
+    """The default configuration with these networks (ROLE=PATH), each frame awaiting them."""
+    return load(None, {f"models.{m.partition('=')[0]}.path": m.partition("=")[2] for m in models}).as_lossless()
 
 
 def uri_of(sequence: str, data: Path) -> str:

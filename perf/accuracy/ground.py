@@ -9,7 +9,6 @@ degrees: KITTI 00 with each image from frame 40 on turned by K R K^-1, so that t
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -20,31 +19,29 @@ import cv2
 import matplotlib
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.ego.trajectory_errors import path_length_m
 from birdslam.frontend import FrontEnd, FrontEndConfig, Pending
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats, Image
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import rotation_exp
 from birdslam.odometry.road.kalman_filter import RoadScaleConfig
 from birdslam.outputs.drive_files import claim_directory
 from birdslam.perception import Perception, Ready
+from birdslam.perf.accuracy.drives import with_networks
 from birdslam.perf.accuracy.graded_road import GradedRoad, Stand
-from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
-from birdslam.runtime.configuration import Configuration, SourceConfig, load
+from birdslam.perf.reporting.figures import Ledger
+from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.sources.opening import open_recording
-from birdslam.sources.recording import DatasetError, Recording
+from birdslam.sources.recording import Recording
 from birdslam.trajectory import as_poses
 from birdslam.types import Frame, Measurements
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 label = "the ground on a grade, after a pitch step, with a wrong height: plotted"
 
@@ -86,34 +83,19 @@ def run(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     claim_directory(options.output)
     cv2.setNumThreads(2)
-    rows: dict[str, Any] = {}
-    figure, axes = plt.subplots(3, 2, figsize=(13, 11))
-    print(f"a grade of {GRADE:.0%} up and down, simulated ...", flush=True)
-    rows["grade"] = _grade(axes[0])
-    _keep(options.output, rows)
-    print(f"grade: {rows['grade']}")
-    configuration = load(None, {f"models.{m.partition('=')[0]}.path": m.partition("=")[2] for m in options.model})
-    configuration = msgspec.structs.replace(configuration, source=SourceConfig(rate="max"))
-    try:
+    figure, (grade, step, height) = plt.subplots(3, 2, figsize=(13, 11))
+    with Ledger(options.output / "ground.json", label) as ledger:
+        row = _grade(grade)
+        ledger.add(f"grade of {GRADE:.0%}, simulated", str(row), **row)
+        configuration = with_networks(options.model)
         recording = open_recording(f"kitti:{options.data / 'kitti_odometry' / 'sequences' / '00'}")
-    except DatasetError as error:
-        raise PerfError(str(error)) from None
-    print(f"a pitch step of {STEP_DEG} degrees in KITTI 00 ...", flush=True)
-    rows["pitch_step"] = _pitch_step(recording, configuration, axes[1])
-    _keep(options.output, rows)
-    print(f"pitch_step: {rows['pitch_step']}")
-    print("a wrong height in KITTI 00 ...", flush=True)
-    rows["height"] = _height(recording, configuration, axes[2])
-    _keep(options.output, rows)
-    print(f"height: {rows['height']}")
+        for name, measure, axes in (("pitch step", _pitch_step, step), ("wrong height", _height, height)):
+            for case, row in measure(recording, configuration, axes).items():
+                ledger.add(f"{name}, KITTI 00, {case}", str(row), **row)
     figure.tight_layout()
     figure.savefig(options.output / "ground.png", dpi=80)
     plt.close(figure)
     print(f"results in {options.output}")
-
-
-def _keep(output: Path, rows: dict[str, Any]) -> None:
-    (output / "ground.json").write_text(json.dumps(rows, indent=2) + "\n")
 
 
 def _drive(camera: Camera, frames: Iterable[Frame], start: Callable[[Frame], Pending]) -> Drive:

@@ -7,23 +7,23 @@ the extra [train].
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32, Ints
 from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig
 from birdslam.perception.completion import SHIPPED, GridCompletion
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import benchmark_parser
+from birdslam.perf.reporting.figures import Ledger
 
 label = "amodal lanes in bird's-eye view, with and without their completion"
 
 
-def overlap(grids: NDArray[np.float32], truth: NDArray[np.float32], config: LanesConfig) -> NDArray[np.int64]:
+def overlap(grids: Floats32, truth: Floats32, config: LanesConfig) -> Ints:
     """(2, 2): intersection and union, in cells, of road and boundary."""
     out = np.zeros((2, 2), dtype=np.int64)
     for channel in (ROAD, BOUNDARY):
@@ -50,26 +50,18 @@ def measure(drives: int, path: Path = SHIPPED) -> dict[str, Any]:
             frames += 1
             cells["raw"] += overlap(gathered, truth, config)
             cells["completed"] += overlap(complete(gathered), truth, config)
-    return {
-        "drives": drives,
-        "frames": frames,
-        **{
-            f"{name}_{what}_iou": float(counts[channel, 0] / max(counts[channel, 1], 1))
-            for name, counts in cells.items()
-            for channel, what in ((ROAD, "road"), (BOUNDARY, "lane"))
-        },
+    return {"frames": frames} | {
+        f"{name}_{what}_iou": float(counts[channel, 0] / max(counts[channel, 1], 1))
+        for name, counts in cells.items()
+        for channel, what in ((ROAD, "road"), (BOUNDARY, "lane"))
     }
 
 
-def run(arguments: list[str]) -> int:
-    """`python -m perf lanes`."""
+def run(arguments: list[str]) -> None:
     parser = benchmark_parser("lanes", label)
     parser.add_argument("--drives", type=int, default=24, help="worlds to drive through")
     parser.add_argument("--model", type=Path, default=SHIPPED)
-    args = parser.parse_args(arguments)
-    report = measure(args.drives, args.model)
-    for key, value in report.items():
-        print(f"{key:24} {value:.3f}" if isinstance(value, float) else f"{key:24} {value}")
-    if args.output:
-        args.output.write_text(json.dumps(report, indent=2) + "\n")
-    return 0
+    options = parser.parse_args(arguments)
+    with Ledger(options.output, label, drives=options.drives) as ledger:
+        report = measure(options.drives, options.model)
+        ledger.add("lanes", "  ".join(f"{key} {value:.3f}" for key, value in report.items()), **report)

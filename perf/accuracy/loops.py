@@ -39,25 +39,19 @@ from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
 from birdslam.outputs.map_trajectory import MapTrajectory
-from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.batch.offline import pipeline
 from birdslam.runtime.configuration import load
 from birdslam.runtime.maps.drive_earth import write_earth
 from birdslam.runtime.nodes.sources import open_recorded
-from birdslam.sources.recording import DatasetError
 from birdslam.types import NS_PER_S, Attitude, Estimate
 
 label = "places found again, poses in a kept map, loops closed; a map's size and look-up time"
 
 PARTS = "recorded", "loop", "alike", "gnss", "size"
 BASE_M = 0.537  # between the cameras of the two passes
-OTHERS = (
-    "kitti_odometry/sequences/00",
-    "kitti_odometry/sequences/06",
-    "kitti_tracking/training/image_03/0005",
-)
+OTHERS = ("kitti_odometry/sequences/00", "kitti_odometry/sequences/06", "kitti_tracking/training/image_03/0005")
 LENGTHS_KM = 1, 10, 100
 LOOK_UPS = 20
 ORIGIN, FIX_M = (51.05, -114.05), 2.5
@@ -76,10 +70,7 @@ def run(arguments: list[str]) -> None:
     cv2.setNumThreads(1)
     with Ledger(options.output, label, features=[str(kind) for kind in options.features], way_m=options.way) as ledger:
         if "recorded" in options.part:
-            try:
-                recorded(ledger, options.data, [FeatureKind(kind) for kind in options.features])
-            except DatasetError as error:
-                raise PerfError(str(error)) from error
+            recorded(ledger, options.data, [FeatureKind(kind) for kind in options.features])
         if "loop" in options.part:
             loop(ledger, options.way)
         if "alike" in options.part:

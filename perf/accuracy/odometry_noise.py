@@ -7,25 +7,22 @@ KITTI's true poses are interpolated over the first frames of a sequence (13 of 0
 
 from __future__ import annotations
 
-import argparse
-
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from birdslam.bench.ego.trajectory_errors import from_first
 from birdslam.bench.simulation.odometry import OdometryNoise, fit_drift
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
-from birdslam.perf.reporting.arguments import add_data
+from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import Recording
 from birdslam.trajectory import Transform, as_poses, inverse
 
-Floats = NDArray[np.float64]
 CLIPS = {"kitti_odometry/sequences/00": 13, "kitti_odometry/sequences/06": 11, "kitti_raw_clip": 1}  # frames left out
 LEAST_STEP_M = 0.05  # a shorter step has no direction to speak of
 ROAD_AHEAD_M = 12.0  # the tilt that counts is that against the road so far ahead
@@ -39,7 +36,7 @@ label = "the simulated odometry's noise, fitted to the real clips"
 
 
 def run(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perf odometry_noise", description=__doc__)
+    parser = benchmark_parser("odometry_noise", label, output="")
     add_data(parser)
     data = parser.parse_args(arguments).data
     noise = fit([(open_recording(f"kitti:{data / clip}"), left_out) for clip, left_out in CLIPS.items()])
@@ -82,7 +79,7 @@ def fit(clips: list[tuple[Recording, int]]) -> OdometryNoise:
     )
 
 
-def measure(recording: Recording, left_out: int) -> tuple[Floats, list[tuple[NDArray[np.int64], Floats]], float]:
+def measure(recording: Recording, left_out: int) -> tuple[Floats, list[tuple[Ints, Floats]], float]:
     """The errors (N, len(COLUMNS)), the road tracks of each frame, and how far they scatter (px)."""
     odometry = Odometry(recording.camera)
     T_cam0_cam = recording.T_cam0_cam()
@@ -127,11 +124,7 @@ def _pitch_rad(poses: Transform, recording: Recording) -> float:
 
 
 def _gaps_px(
-    recording: Recording,
-    step: Transform,
-    motion: Motion,
-    before: tuple[NDArray[np.int64], Floats],
-    after: tuple[NDArray[np.int64], Floats],
+    recording: Recording, step: Transform, motion: Motion, before: tuple[Ints, Floats], after: tuple[Ints, Floats]
 ) -> Floats:
     """Where road tracks are against where their last sight, laid on the road and moved as the camera did, puts them."""
     _, a, b = np.intersect1d(before[0], after[0], return_indices=True)

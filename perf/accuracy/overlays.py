@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 from birdslam.bench.ego import truth_quality
+from birdslam.geometry.arrays import Image
 from birdslam.odometry.odometry import Odometry
 from birdslam.odometry.plausibility import PlausibilityConfig
 from birdslam.perception import ModelError
@@ -31,7 +32,6 @@ from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.recording import DatasetError
 from birdslam.types import NS_PER_S, Status
 from birdslam.world import windscreen
-from birdslam.world.windscreen import Image
 
 label = "drops, dirt and a reflection over recorded drives"
 

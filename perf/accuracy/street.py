@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Ints
+
 WIDTH_PX, HEIGHT_PX, F_PX, HEIGHT_M = 480, 160, 260.0, 1.65
 LOOP_FRAMES, TEXELS, TEXELS_PER_M = 128, 2048, 24.0
 FRAME_M = TEXELS / LOOP_FRAMES / TEXELS_PER_M  # driven from one frame to the next
@@ -20,8 +22,6 @@ FRONT_AT_M, FRONT_HIGH_M = 7.0, 6.0  # the house fronts: to either side of the c
 SKY = 200
 GRAIN_TEXELS = (1, 3, 9, 27)  # asphalt and plaster have grain of every size
 MEAN, CONTRAST = 128.0, 40.0
-
-Floats = NDArray[np.float64]
 
 
 class Texture:
@@ -62,7 +62,7 @@ class Texture:
         return rows
 
 
-def _place(at: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
+def _place(at: Floats) -> tuple[Floats, Ints, Floats]:
     """Turns of the texture, the texel in it, and the share of that one."""
     turns, at = np.divmod(at, TEXELS)
     i = np.minimum(at.astype(np.int64), TEXELS - 1)  # a turn less a rounding error is a turn

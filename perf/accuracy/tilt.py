@@ -19,18 +19,17 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.simulation.odometry import fit_drift
 from birdslam.bench.tracking.labelled_road import LEAST_VEHICLES, labelled_grounds
 from birdslam.frontend import FrontEnd, FrontEndConfig
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
-from birdslam.perf.errors import PerfError
+from birdslam.perf.accuracy.drives import with_networks
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
-from birdslam.runtime.configuration import SourceConfig, load
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.sources.kitti import KittiRecording
 from birdslam.sources.kitti_tracking import open_tracking
@@ -38,8 +37,6 @@ from birdslam.sources.opening import open_recording
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.trajectory import inverse
 from birdslam.types import Frame
-
-Floats = NDArray[np.float64]
 
 label = "pitch and roll of the road ahead on real drives, in mrad: as filed, by images, as placed"
 
@@ -66,8 +63,6 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--model", action="append", default=[], metavar="ROLE=PATH")
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
-    networks = load(None, {f"models.{m.partition('=')[0]}.path": m.partition("=")[2] for m in options.model})
-    networks = msgspec.structs.replace(networks, source=SourceConfig(rate="max"))
     tracking = options.data / "kitti_tracking" / "training"
     drives: list[tuple[str, Callable[[Recording], list[Tilt | None]]]] = [
         ("kitti_tracking/training/image_03/0005", lambda _: by_labels(tracking, "0005")),
@@ -75,24 +70,21 @@ def run(arguments: list[str]) -> None:
         ("kitti_raw_clip", lambda recording: by_lidar(recording, options.data / "kitti_raw_clip" / "lidar_cam0")),
     ]
     by_images: list[list[Floats]] = []
-    try:
-        with Ledger(options.output, label) as ledger, Inference(networks) as inference:
-            for name, truth_of in drives:
-                recording = open_recording(f"kitti:{options.data / name}")
-                told = follow(recording, inference.networks.start)
-                truth = truth_of(recording)
-                for who, tilts in told.items():
-                    row = _row(tilts, truth)
-                    ledger.add(f"{Path(name).name} {who}", ", ".join(f"{k} {v}" for k, v in row.items()), **row)
-                by_images.append(
-                    [t.tilt_rad - u.tilt_rad for t, u in zip(told["images"], truth, strict=False) if t and u]
-                )
-            for axis, angle in enumerate(("pitch", "roll")):
-                errors = [np.array(of)[:, axis] for of in by_images if of]
-                drift = fit_drift(errors, [np.ones(len(e)) for e in errors])
-                ledger.add(f"images' {angle}", f"{drift}", **msgspec.structs.asdict(drift))
-    except DatasetError as error:
-        raise PerfError(str(error)) from error
+    with Ledger(options.output, label) as ledger, Inference(with_networks(options.model)) as inference:
+        for name, truth_of in drives:
+            recording = open_recording(f"kitti:{options.data / name}")
+            sources = follow(recording, inference.networks.start)
+            truth = truth_of(recording)
+            for source, tilts in sources.items():
+                row = _row(tilts, truth)
+                ledger.add(f"{Path(name).name} {source}", ", ".join(f"{k} {v}" for k, v in row.items()), **row)
+            by_images.append(
+                [t.tilt_rad - u.tilt_rad for t, u in zip(sources["images"], truth, strict=False) if t and u]
+            )
+        for axis, angle in enumerate(("pitch", "roll")):
+            errors = [np.array(of)[:, axis] for of in by_images if of]
+            drift = fit_drift(errors, [np.ones(len(e)) for e in errors])
+            ledger.add(f"images' {angle}", f"{drift}", **msgspec.structs.asdict(drift))
 
 
 class _Watched(Odometry):

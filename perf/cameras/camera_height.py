@@ -23,7 +23,6 @@ from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.sources.kitti import KITTI_HEIGHT_M
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
-from birdslam.sources.recording import DatasetError
 from birdslam.vehicles.camera_height import measure_heights
 
 label = "the camera's height by the size of cars, on KITTI's tracking sequences"
@@ -43,38 +42,35 @@ def run(arguments: list[str]) -> None:
     if not names:
         raise PerfError(f"{root}: has no recorded boxes (det_02_rrc/Car)")
     errors, sigmas = [], []
-    try:
-        with Ledger(options.output, label, height_m=KITTI_HEIGHT_M, begin_m=BEGIN_M) as ledger:
-            for name in names:
-                sequence = open_tracking(root, name, CAMERA_OF_BOXES)
-                pitch_rad = _pitch_rad(sequence)
-                if pitch_rad is None:
-                    continue
-                camera = msgspec.structs.replace(sequence.camera, height_m=BEGIN_M, pitch_rad=pitch_rad)
-                detections = read_detections(root / "det_02_rrc", name, len(sequence))
-                config = FrontEndConfig()
-                boxes = [
-                    box
-                    for record in measure(sequence, detections, config)
-                    for box in measure_heights(record.cv, camera, config.localisation)
-                ]
-                cov = np.diag([SIGMA_PITCH_RAD**2, SIGMA_ROLL_RAD**2])
-                for found in checks_by_vehicles(boxes, camera, cov, VehicleHeightConfig()):
-                    error, sigma = math.log(found.height_m / KITTI_HEIGHT_M), found.sigma_m / found.height_m
-                    errors.append(error)
-                    sigmas.append(sigma)
-                    row = {"height_m": round(found.height_m, 3), "sigma_rel": round(sigma, 4), "error": round(error, 4)}
-                    text = f"{found.height_m:.2f} m, {error:+.1%}, own sigma {sigma:.1%}, {found.samples} vehicles"
-                    ledger.add(name, text, **row, vehicles=found.samples)
-            e, s = np.array(errors), np.array(sigmas)
-            kept = np.arange(len(e)) != int(np.abs(e / s).argmax())
-            rms, chi2, chi2_without = (
-                float(v) for v in (np.sqrt(np.mean(e**2)), np.mean((e / s) ** 2), np.mean((e / s)[kept] ** 2))
-            )
-            text = f"{len(e)} sequences: {rms:.1%} RMS, chi2 {chi2:.2f}, without the worst {chi2_without:.2f}"
-            ledger.add("all", text, rms=round(rms, 4), chi2=round(chi2, 3), chi2_without_worst=round(chi2_without, 3))
-    except DatasetError as error:
-        raise PerfError(str(error)) from error
+    with Ledger(options.output, label, height_m=KITTI_HEIGHT_M, begin_m=BEGIN_M) as ledger:
+        for name in names:
+            sequence = open_tracking(root, name, CAMERA_OF_BOXES)
+            pitch_rad = _pitch_rad(sequence)
+            if pitch_rad is None:
+                continue
+            camera = msgspec.structs.replace(sequence.camera, height_m=BEGIN_M, pitch_rad=pitch_rad)
+            detections = read_detections(root / "det_02_rrc", name, len(sequence))
+            config = FrontEndConfig()
+            boxes = [
+                box
+                for record in measure(sequence, detections, config)
+                for box in measure_heights(record.cv, camera, config.localisation)
+            ]
+            cov = np.diag([SIGMA_PITCH_RAD**2, SIGMA_ROLL_RAD**2])
+            for found in checks_by_vehicles(boxes, camera, cov, VehicleHeightConfig()):
+                error, sigma = math.log(found.height_m / KITTI_HEIGHT_M), found.sigma_m / found.height_m
+                errors.append(error)
+                sigmas.append(sigma)
+                row = {"height_m": round(found.height_m, 3), "sigma_rel": round(sigma, 4), "error": round(error, 4)}
+                text = f"{found.height_m:.2f} m, {error:+.1%}, own sigma {sigma:.1%}, {found.samples} vehicles"
+                ledger.add(name, text, **row, vehicles=found.samples)
+        e, s = np.array(errors), np.array(sigmas)
+        kept = np.arange(len(e)) != int(np.abs(e / s).argmax())
+        rms, chi2, chi2_without = (
+            float(v) for v in (np.sqrt(np.mean(e**2)), np.mean((e / s) ** 2), np.mean((e / s)[kept] ** 2))
+        )
+        text = f"{len(e)} sequences: {rms:.1%} RMS, chi2 {chi2:.2f}, without the worst {chi2_without:.2f}"
+        ledger.add("all", text, rms=round(rms, 4), chi2=round(chi2, 3), chi2_without_worst=round(chi2_without, 3))
 
 
 def _pitch_rad(sequence: TrackingSequence) -> float | None:

@@ -28,6 +28,7 @@ from birdslam.bench.simulation.odometry import SimulatedOdometry, SimulationConf
 from birdslam.bench.tracking.benchmark import LEAST_FRAMES, Live, Truth, make_log, ours
 from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
 from birdslam.bench.tracking.metrics import path_errors
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.paper import NO_GATE
@@ -228,18 +229,18 @@ def grade(variant: Variant, case: Case) -> dict[str, float]:
 
 
 def _nees_of_cars(graph: PoseGraph, m: Measurements, truth: Truth) -> list[float]:
-    told, out = graph.vehicles_in_ego(), []
+    estimated, out = graph.vehicles_in_ego(), []
     for car, vehicle in truth.matches[m.frame_id].items():
         goal = truth.vehicles[car].get(m.frame_id)
-        if vehicle in told and goal is not None:
-            T_ego_vehicle, cov = told[vehicle]
+        if vehicle in estimated and goal is not None:
+            T_ego_vehicle, cov = estimated[vehicle]
             there = truth.ego[m.frame_id].between(goal)
             error = np.array([T_ego_vehicle.x_m - there.x_m, T_ego_vehicle.y_m - there.y_m])
             out.append(_nees(error, cov[:2, :2]))
     return out
 
 
-def _nees(error: NDArray[np.float64], cov: NDArray[np.float64]) -> float:
+def _nees(error: Floats, cov: Floats) -> float:
     return float(error @ np.linalg.solve(cov + 1e-9 * np.eye(len(cov)), error))
 
 

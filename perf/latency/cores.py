@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from birdslam.perf.accuracy.accuracy import graded
-from birdslam.perf.latency.live import Ask, add_run_options, drive
+from birdslam.perf.latency.live import add_run_options, drive, once
 from birdslam.perf.latency.system import figures
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
 from birdslam.perf.reporting.figures import Ledger
@@ -75,16 +75,7 @@ def on_first(cores: int) -> Iterator[None]:
 def measure(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     """One run's figures, and whether it went to its end."""
     recording = open_recording(options.source)
-    ask = Ask(
-        source=options.source,
-        rate=options.rate,
-        seconds=len(recording) / options.rate,
-        models=tuple(options.model),
-        settings=tuple(options.set),
-        config=options.config,
-        loop=False,
-    )
-    with drive(ask) as result:
+    with drive(once(options, options.source, recording, options.rate)) as result:
         graded_row: dict[str, Any] = {}
         if recording.truth_poses() is not None:
             graded_row = graded(recording, result.place / "out", result.summary)

@@ -76,10 +76,7 @@ def run(arguments: list[str]) -> None:
 def time_rows(log: Sequence[Measurements]) -> list[dict[str, Any]]:
     """Every method's time for the whole log and for the newest pose, and how many times the live graph's that is."""
     live = {"incremental": ours(SlamConfig()), "incremental, paper mode": PAPER}
-    batches = {
-        "batch SE(3), metric odometry": nair.CONFIG,
-        "batch SE(3), unscaled odometry, lanes": batch_se3.CONFIG,
-    }
+    batches = {"batch SE(3), metric odometry": nair.CONFIG, "batch SE(3), unscaled odometry, lanes": batch_se3.CONFIG}
     took: dict[str, tuple[float, float]] = {}
     for name, method in live.items():
         whole = [_updates_s(PoseGraph(method.graph, method.weights), log) for _ in range(REPEATS)]

@@ -22,18 +22,18 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.perception import ModelError, ModelSpec, Network, load_network
+from birdslam.perception import ModelSpec, Network, load_network
 from birdslam.perception.completion import GridCompletion
 from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perf.errors import PerfError
 from birdslam.perf.latency.live import add_run_options
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
 from birdslam.perf.reporting.figures import Ledger, curve, noise, spread, spread_text
-from birdslam.runtime.configuration import Configuration, ConfigurationError, complete, load, parse_setting
+from birdslam.runtime.configuration import Configuration, complete, load, parse_setting
 from birdslam.runtime.fields import parted
 from birdslam.runtime.nodes.inference import Inference
 from birdslam.runtime.nodes.nodes import front_end
-from birdslam.runtime.nodes.sources import SourceError, offline_frames, open_source
+from birdslam.runtime.nodes.sources import offline_frames, open_source
 from birdslam.types import Frame
 
 label = "every network, and the whole perceive step, by threads"
@@ -52,28 +52,25 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="of each row")
     options = parser.parse_args(arguments)
     models = [tuple(text.partition("=")[::2]) for text in options.model]
-    try:
-        configuration, frames = _frames(options, models)
-        alone_too = [*models, *_shipped(configuration)]
-        with Ledger(options.output, label, source=options.source, rate=options.rate, models=alone_too) as ledger:
-            for (role, path), threads in itertools.product(alone_too, options.threads):
-                network = load_network(role, ModelSpec(path=path, threads=threads))
-                row = _row(alone(network, frames, options.seconds))
-                ledger.add(
-                    f"{role} {network.path.name} {threads} threads",
-                    _summary(row),
-                    network=network.describe(),
-                    size_bytes=network.path.stat().st_size,
-                    **row,
-                )
-            if configuration.models.completion:
-                row = _row(_completion(configuration, options.seconds))
-                ledger.add("completion lanes.onnx 1 threads", _summary(row), **row)
-            for threads in options.threads:
-                row = _row(perceive(_with_threads(configuration, threads), frames, options))
-                ledger.add(f"perceive step {threads} threads", _summary(row), threads=threads, **row)
-    except (ModelError, ConfigurationError, SourceError) as error:
-        raise PerfError(str(error)) from error
+    configuration, frames = _frames(options, models)
+    alone_too = [*models, *_shipped(configuration)]
+    with Ledger(options.output, label, source=options.source, rate=options.rate, models=alone_too) as ledger:
+        for (role, path), threads in itertools.product(alone_too, options.threads):
+            network = load_network(role, ModelSpec(path=path, threads=threads))
+            row = _row(alone(network, frames, options.seconds))
+            ledger.add(
+                f"{role} {network.path.name} {threads} threads",
+                _summary(row),
+                network=network.describe(),
+                size_bytes=network.path.stat().st_size,
+                **row,
+            )
+        if configuration.models.completion:
+            row = _row(_completion(configuration, options.seconds))
+            ledger.add("completion lanes.onnx 1 threads", _summary(row), **row)
+        for threads in options.threads:
+            row = _row(perceive(_with_threads(configuration, threads), frames, options))
+            ledger.add(f"perceive step {threads} threads", _summary(row), threads=threads, **row)
 
 
 def _shipped(configuration: Configuration) -> list[tuple[str, str]]:

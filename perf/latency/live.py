@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import json
 import os
@@ -25,6 +26,7 @@ from birdslam.runtime.client import Planner
 from birdslam.runtime.fields import is_key
 from birdslam.runtime.topology import NODES
 from birdslam.runtime.transport.bus import Message
+from birdslam.sources.recording import Recording
 from birdslam.types import Status
 
 START_S, END_S = 90.0, 120.0  # the shipped drive is graded and filmed at its end
@@ -60,6 +62,15 @@ class Ask(msgspec.Struct, frozen=True, kw_only=True):
             *(part for model in self.models for part in ("--model", model)),
             *setting_options(settings),
         ]
+
+
+def once(options: argparse.Namespace, source: str, recording: Recording, rate: float) -> Ask:
+    """A recording once at a rate, with the models and settings of a command line (`add_run_options`)."""
+    models, settings = tuple(options.model), tuple(options.set)
+    seconds = len(recording) / rate
+    return Ask(
+        source=source, rate=rate, seconds=seconds, models=models, settings=settings, config=options.config, loop=False
+    )
 
 
 @dataclass

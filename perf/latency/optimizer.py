@@ -31,7 +31,7 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perf.reporting.arguments import benchmark_parser
-from birdslam.perf.reporting.figures import curve, noise, spread, write_json
+from birdslam.perf.reporting.figures import Ledger, curve, noise, spread
 from birdslam.perf.reporting.machine import Steal
 from birdslam.types import FIRST_PERSON, FollowedPerson, Measurements
 
@@ -50,7 +50,7 @@ _LAG_FRAMES = GraphConfig().ego_nodes
 
 
 def run(arguments: list[str]) -> None:
-    parser = benchmark_parser("optimizer", label, output="JSON, a list of objects")
+    parser = benchmark_parser("optimizer", label)
     parser.add_argument("--vehicles", default="0,1,3,6,10,15", help="in sight, a list")
     parser.add_argument("--people", type=int, default=0, help="followed beside the vehicles, of `ours` and `ours_live`")
     parser.add_argument("--frames", type=int, default=10_000)
@@ -58,8 +58,7 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--limit-s", type=float, default=60.0, help="time for each contender's frames")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
-    rows: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory() as folder:
+    with Ledger(options.output, label, seed=options.seed) as ledger, tempfile.TemporaryDirectory() as folder:
         for vehicles in (int(n) for n in options.vehicles.split(",")):
             log = Path(folder) / f"{vehicles}.log"
             config = DriveConfig(frames=options.frames, vehicles=vehicles, traffic="convoy")
@@ -67,10 +66,7 @@ def run(arguments: list[str]) -> None:
             for contender in options.contenders.split(","):
                 row = measure(contender, vehicles, log, options.limit_s)
                 name = f"{contender} {vehicles} vehicles" + (f" {options.people} people" if options.people else "")
-                rows.append({"name": name, **row})
-                print(f"{rows[-1]['name']:44} {summary(row)}", flush=True)
-                if options.output is not None:
-                    write_json(options.output, rows)  # after each: Ctrl-C keeps what was measured
+                ledger.add(name, summary(row), **row)
 
 
 def write_log(log: Path, config: DriveConfig, seed: int, people: int = 0) -> None:
@@ -103,15 +99,8 @@ def summary(row: dict[str, Any]) -> str:
 def measure(contender: str, vehicles: int, log: Path, limit_s: float) -> dict[str, Any]:
     """One contender in a process of its own."""
     one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    command = [
-        sys.executable,
-        "-m",
-        "birdslam.perf.latency.optimizer",
-        contender,
-        str(vehicles),
-        str(log),
-        str(limit_s),
-    ]
+    program = [sys.executable, "-m", "birdslam.perf.latency.optimizer"]
+    command = [*program, contender, str(vehicles), str(log), str(limit_s)]
     done = subprocess.run(command, env=os.environ | one_thread, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{contender} with {vehicles} vehicles: {done.stderr}")

@@ -6,7 +6,6 @@ of the independent package zenoh-ros2-sdk, each a process of its own.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
 import subprocess
@@ -24,6 +23,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.perf.errors import PerfError
 from birdslam.perf.processes import birdslam_command, free_port
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.supervision.query_server import QueryServer
 from birdslam.runtime.transport.bus import Bus, Publisher
@@ -108,7 +108,7 @@ class Heard:
 
 def run(arguments: list[str]) -> int:
     """Prints how many were sent and heard, topic by topic; 1 where one was lost."""
-    parser = argparse.ArgumentParser(prog="python -m perf ros", description=__doc__)
+    parser = benchmark_parser("ros", label, output="")
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--rate", type=float, default=33.0)
     parser.add_argument("--vehicles", type=int, default=10)

@@ -69,13 +69,13 @@ def hear(port: int, domain: int, topics: list[str]) -> None:
         for text in topics:
             topic, _, kind = text.partition("=")
 
-            def told(message: Any, topic: str = topic) -> None:
+            def came(message: Any, topic: str = topic) -> None:
                 line = {"topic": topic, "came_ns": time.time_ns(), "message": plain(message)}
                 with whole_lines:  # each topic has a thread of its own
                     print(json.dumps(line), flush=True)
 
             qos = QosProfile(durability=QosDurability.TRANSIENT_LOCAL) if topic == "/tf_static" else None
-            subscribers.append(ROS2Subscriber(topic, kind, told, domain_id=domain, router_port=port, qos=qos))
+            subscribers.append(ROS2Subscriber(topic, kind, came, domain_id=domain, router_port=port, qos=qos))
         print("ready", flush=True)
         sys.stdin.read()
         for subscriber in subscribers:

@@ -21,8 +21,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera
-from birdslam.perception import Detections, Findings, ModelError, ModelSpec, Network, load_network
+from birdslam.perception import Detections, Findings, ModelSpec, Network, load_network
 from birdslam.perception.decoding.multitask import MultiTaskDecoder
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS
 from birdslam.perception.session import providers_here
@@ -32,7 +33,6 @@ from birdslam.perf.reporting.figures import Ledger
 from birdslam.perf.reporting.machine import describe
 from birdslam.runtime.models.providers import compared
 from birdslam.sources.opening import open_recording
-from birdslam.sources.recording import DatasetError
 from birdslam.world.training.grading import LONG, Grades, box_ious, extents, overlap
 
 label = "the shipped network: held-out worlds, and real frames beside LiDAR and two other networks"
@@ -64,23 +64,20 @@ def run(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if options.provider:
         return _providers(options.provider, options.models, options.threads, options.output)
-    try:
-        network = load_network("multitask", ModelSpec(path=str(options.network), threads=options.threads))
-        with Ledger(options.output, label, network=network.describe()) as ledger:
-            if importlib.util.find_spec("numba") is None:
-                print("held-out worlds: left out, numba is not installed (extra [train])")
-            else:
-                for width_px, height_px in SIZES:
-                    figures = simulated(network, options.frames, width_px, height_px)
-                    ledger.add(f"worlds {width_px}x{height_px}", _summary(figures), **figures)
-            if options.data.is_dir():
-                for name, folder in RECORDINGS.items():
-                    figures = real(network, options.data / folder, options.models)
-                    ledger.add(f"real {name}", _summary(figures), **figures)
-            else:
-                print(f"real frames: left out, {options.data} is not there (set BIRDSLAM_DATA)")
-    except (ModelError, DatasetError) as error:
-        raise PerfError(str(error)) from error
+    network = load_network("multitask", ModelSpec(path=str(options.network), threads=options.threads))
+    with Ledger(options.output, label, network=network.describe()) as ledger:
+        if importlib.util.find_spec("numba") is None:
+            print("held-out worlds: left out, numba is not installed (extra [train])")
+        else:
+            for width_px, height_px in SIZES:
+                figures = simulated(network, options.frames, width_px, height_px)
+                ledger.add(f"worlds {width_px}x{height_px}", _summary(figures), **figures)
+        if options.data.is_dir():
+            for name, folder in RECORDINGS.items():
+                figures = real(network, options.data / folder, options.models)
+                ledger.add(f"real {name}", _summary(figures), **figures)
+        else:
+            print(f"real frames: left out, {options.data} is not there (set BIRDSLAM_DATA)")
 
 
 def _providers(asked: str, models: Path, threads: int, output: Path | None) -> None:
@@ -90,16 +87,13 @@ def _providers(asked: str, models: Path, threads: int, output: Path | None) -> N
     print(f"{describe()['cpu']}; this onnxruntime has {', '.join(here)}; {threads} threads")
     files = {"multitask": SHIPPED_NETWORKS / SHIPPED_MULTITASK}
     files |= {role: models / name for role, name in OTHERS.items() if (models / name).is_file()}
-    try:
-        with Ledger(output, label, providers=list(here)) as ledger:
-            for role, file in files.items():
-                spec = ModelSpec(path=str(file), threads=threads)
-                for provider, found in compared(role, spec, wanted, within_s=3.0 * len(wanted)).items():
-                    figures = {"ms": found.ms, "off_rel": found.off_rel}
-                    said = found.problem or f"{found.ms:7.2f} ms a run, off by {found.off_rel:.2%} (RMS)"
-                    ledger.add(f"{file.name} {provider}", said, **figures)
-    except ModelError as error:
-        raise PerfError(str(error)) from error
+    with Ledger(output, label, providers=list(here)) as ledger:
+        for role, file in files.items():
+            spec = ModelSpec(path=str(file), threads=threads)
+            for provider, found in compared(role, spec, wanted, within_s=3.0 * len(wanted)).items():
+                figures = {"ms": found.ms, "off_rel": found.off_rel}
+                said = found.problem or f"{found.ms:7.2f} ms a run, off by {found.off_rel:.2%} (RMS)"
+                ledger.add(f"{file.name} {provider}", said, **figures)
 
 
 def simulated(network: Network, frames: int, width_px: int, height_px: int) -> dict[str, float]:
@@ -124,8 +118,8 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
     T_cam_cam0 = np.linalg.inv(recording.T_cam0_cam())
     road, lane, shares = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64), []
     agreed = np.zeros(4, dtype=np.int64)  # theirs found, theirs, ours confirmed, ours
-    sizes: list[NDArray[np.float64]] = []  # of ours over theirs, see `extents`
-    depths: list[NDArray[np.float64]] = []  # (N, 3): said, LiDAR's, on the road
+    sizes: list[Floats] = []  # of ours over theirs, see `extents`
+    depths: list[Floats] = []  # (N, 3): said, LiDAR's, on the road
     for number, image in _images(recording.frames()):
         found = _findings(network, image)
         lidar = folder / "lidar_cam0" / f"{number:06d}.npy"
@@ -186,7 +180,7 @@ def _images(frames: Iterator[Any]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
             yield number, cast(NDArray[np.uint8], frame.image)
 
 
-def _beside_lidar(found: Findings, points_m: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+def _beside_lidar(found: Findings, points_m: Floats, camera: Camera) -> Floats:
     """(N, 3) said depth, LiDAR depth, 1 on the predicted road, of the returns in the image."""
     assert found.depth is not None
     assert found.segmentation is not None
@@ -200,7 +194,7 @@ def _beside_lidar(found: Findings, points_m: NDArray[np.float64], camera: Camera
     return np.column_stack([said_m[inside], points_m[inside, 2], on_road])
 
 
-def _depth_figures(depths: NDArray[np.float64]) -> dict[str, float]:
+def _depth_figures(depths: Floats) -> dict[str, float]:
     said_m, lidar_m, on_road = depths.T
     road = on_road > 0.0
     scale = float(np.median(lidar_m / said_m))
@@ -213,7 +207,7 @@ def _depth_figures(depths: NDArray[np.float64]) -> dict[str, float]:
     }
 
 
-def _agreement(ours: Detections, theirs: Detections) -> NDArray[np.int64]:
+def _agreement(ours: Detections, theirs: Detections) -> Ints:
     """(4,) theirs found among ours, theirs, ours confirmed by theirs, ours: vehicles over the bars."""
     ours, theirs = ours.only(VEHICLES), theirs.only(VEHICLES)
     shared = box_ious(theirs.boxes_px[theirs.scores > MIN_SCORE], ours.boxes_px)
@@ -233,7 +227,7 @@ def _agreement(ours: Detections, theirs: Detections) -> NDArray[np.int64]:
     )
 
 
-def _sizes(ours: Detections, theirs: Detections, width_px: int) -> list[NDArray[np.float64]]:
+def _sizes(ours: Detections, theirs: Detections, width_px: int) -> list[Floats]:
     """Of each vehicle that both see whole, over the bars: our box over theirs."""
     ours, theirs = ours.only(VEHICLES), theirs.only(VEHICLES)
     out = []

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.path import Path as Outline
-from numpy.typing import NDArray
 
 from birdslam.bench.tracking.by_class.class_tracks import HALF_AT_M
 from birdslam.bench.tracking.localisation import INSIDE_1_SIGMA, INSIDE_2_SIGMA
 from birdslam.bench.tracking.metrics import BoxFrame, assign, hota_parts, identities
+from birdslam.geometry.arrays import Floats
 from birdslam.perception.external import external_detections
 from birdslam.perception.schedule import Networks
 from birdslam.perf.errors import PerfError
@@ -36,12 +36,11 @@ if TYPE_CHECKING:
 
 label = "rendered people: a child that steps out, a crowd, standing people before a driving ego"
 
-Floats = NDArray[np.float64]
 SECONDS = {"child": 3.6, "crowd": 5.0, "standing": 4.0}
 NEAR_M = 2.0  # of the true place
 SEEN_SHARE = 0.3  # of a body; who is hidden more is not asked for
 WALKING_MPS, STANDING_MPS = 0.5, 0.1
-SETTLED_S = 1.0  # of a track; what is told before it is counted apart
+SETTLED_S = 1.0  # of a track; what is reported before it is counted apart
 
 
 def run(arguments: list[str]) -> None:
@@ -169,7 +168,7 @@ def of_child(steps: list[Step], rate_hz: float) -> dict[str, Any]:
 
 
 def mahalanobis2(estimate: Estimate, user: RoadUser, error_m: Floats) -> float:
-    """The square of an error in the ego's axes over the covariance that is told."""
+    """The square of an error in the ego's axes over the covariance that is reported."""
     own = user.T_world_vehicle.rotation().T @ estimate.T_world_ego.rotation() @ error_m
     return float(own @ np.linalg.solve(np.reshape(user.cov, (3, 3))[:2, :2], own))
 
@@ -181,9 +180,10 @@ def of_many(steps: list[Step], rate_hz: float) -> dict[str, Any]:
         bodies = [b for b in step.truth.objects if b.label in PEOPLE and b.visible >= SEEN_SHARE]
         users = [user for user in step.estimate.people if user.in_sight]
         true = [true_place(step.truth, body) for body in bodies]
-        told = [place_of(step.estimate, user) for user in users]
+        estimated = [place_of(step.estimate, user) for user in users]
         away = np.linalg.norm(
-            np.reshape([at for at, _ in true], (-1, 1, 2)) - np.reshape([at for at, _ in told], (1, -1, 2)), axis=-1
+            np.reshape([at for at, _ in true], (-1, 1, 2)) - np.reshape([at for at, _ in estimated], (1, -1, 2)),
+            axis=-1,
         )
         likeness = np.maximum(0.0, 1.0 - away / (2.0 * HALF_AT_M))
         frames.append(
@@ -191,17 +191,17 @@ def of_many(steps: list[Step], rate_hz: float) -> dict[str, Any]:
                      likeness)
         )  # fmt: skip
         for i, j in zip(*assign(likeness), strict=True):
-            (at, velocity), (told_at, told_mps) = true[i], told[j]
+            (at, velocity), (estimated_at, estimated_mps) = true[i], estimated[j]
             if not 5.0 <= at[0] < 30.0 or users[j].frames < SETTLED_S * rate_hz:
                 continue
-            error = told_at - at
+            error = estimated_at - at
             depth.append(abs(float(error[0])) / float(at[0]))
             inside.append(mahalanobis2(step.estimate, users[j], error))
             speed = float(np.linalg.norm(velocity))
             if speed > WALKING_MPS:
-                walking.append(float(np.linalg.norm(told_mps - velocity)))
+                walking.append(float(np.linalg.norm(estimated_mps - velocity)))
             elif speed < STANDING_MPS:
-                standing.append(float(np.linalg.norm(told_mps)))
+                standing.append(float(np.linalg.norm(estimated_mps)))
     parts, kept = hota_parts(frames), identities(frames)
     sure = np.array(inside)
     return {

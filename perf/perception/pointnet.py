@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.perception import DepthMap, ModelError, ModelSpec, Network, load_network
+from birdslam.perception import DepthMap, ModelSpec, Network, load_network
 from birdslam.perception.decoding.detection import EdgeSigma
 from birdslam.perception.manifest import SHIPPED_NETWORKS
 from birdslam.perception.pointnet import PointNet, load_pointnet
@@ -98,14 +98,11 @@ def run(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if any(importlib.util.find_spec(name) is None for name in ("numba", "torch")):
         raise PerfError("held-out worlds need the extra [train]: numba, torch")
-    try:
-        pointnet = load_pointnet(ModelSpec(str(options.network), threads=1))
-        if options.depth == "network":
-            samples = _seen_by(load_network("multitask", ModelSpec(str(options.multitask))), options.frames)
-        else:
-            samples = _noisy(options.frames)
-    except ModelError as error:
-        raise PerfError(str(error)) from error
+    pointnet = load_pointnet(ModelSpec(str(options.network), threads=1))
+    if options.depth == "network":
+        samples = _seen_by(load_network("multitask", ModelSpec(str(options.multitask))), options.frames)
+    else:
+        samples = _noisy(options.frames)
     with Ledger(options.output, label, network=pointnet.describe(), depth=options.depth) as ledger:
         for (method, near_m, far_m), errors in measured(samples, pointnet).items():
             if errors.centre_m:
@@ -178,7 +175,7 @@ def by_bottom(seen: Observation, ground: GroundPlane, config: LocalisationConfig
 
 def _observed(
     frame: WorldFrame,
-    boxes_px: NDArray[np.float64],
+    boxes_px: Floats,
     labels: Sequence[str],
     truth: Sequence[WorldObject],
     edge_sigma: EdgeSigma | None = None,

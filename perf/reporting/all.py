@@ -137,8 +137,7 @@ def _write(folder: Path, head: dict[str, Any], outcome: dict[str, str]) -> None:
     for name in outcome:
         file = folder / f"{name}.json"
         if file.is_file():
-            content = json.loads(file.read_text(encoding="utf-8"))
-            benchmarks[name] = {"rows": content} if isinstance(content, list) else content
+            benchmarks[name] = json.loads(file.read_text(encoding="utf-8"))
     content = {**head, "outcome": outcome, "benchmarks": benchmarks}
     write_json(folder / "report.json", content)
     report.write(folder, content)

@@ -26,9 +26,9 @@ _DEFINES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 
 @dataclass(frozen=True)
 class Definition:
-    """A statement of a module: its normal form, and the full names that it uses."""
+    """A statement of a module: what of it is digested, and the full names that it uses."""
 
-    form: str
+    said: str
     uses: frozenset[str]
 
 
@@ -52,12 +52,13 @@ class Code:
                 parts = path.relative_to(folder).with_suffix("").parts
                 self._files[".".join((name, *parts)).removesuffix(".__init__")] = path
         self._modules: dict[str, Module] = {}
+        self._places: dict[str, tuple[str, str]] = {}
 
     def digest(self, roots: Iterable[str], more: Iterable[str] = ()) -> str:
         """Of all that these functions, classes or modules (full names) reach, and of `more`. Raises PerfError for a
         name that is not there."""
-        forms = {form for definition in self._reached(roots) for form in _said(definition, self._files)}
-        return _short((*sorted(forms), *more))
+        said = {definition.said for definition in self._reached(roots) if definition.said}
+        return _short((*sorted(said), *more))
 
     def _reached(self, roots: Iterable[str]) -> Iterator[Definition]:
         todo = list(roots)
@@ -94,6 +95,11 @@ class Code:
 
     def _split(self, full: str) -> tuple[str, str]:
         """The module and the name in it, "" for all of it; ("", "") for code that is not ours."""
+        if full not in self._places:
+            self._places[full] = self._place(full)
+        return self._places[full]
+
+    def _place(self, full: str) -> tuple[str, str]:
         parts = full.split(".")
         for end in range(len(parts), 0, -1):
             if (module := ".".join(parts[:end])) in self._files:
@@ -106,14 +112,6 @@ class Code:
         return self._modules[name]
 
 
-def _said(definition: Definition, ours: Mapping[str, Path]) -> Iterator[str]:
-    """What of a definition is digested: itself, and the names of other libraries that it uses."""
-    if definition.form:
-        tops = {name.partition(".")[0] for name in ours}
-        others = sorted(name for name in definition.uses if name.partition(".")[0] not in tops)
-        yield f"{definition.form} {' '.join(others)}"
-
-
 def _read(name: str, tree: ast.Module, known: Mapping[str, Path]) -> Module:
     module = Module()
     statements = [node for node in tree.body if not _is_text(node) and not _is_main_guard(node)]
@@ -122,11 +120,13 @@ def _read(name: str, tree: ast.Module, known: Mapping[str, Path]) -> Module:
         if not isinstance(node, _DEFINES):  # also of `try` and `if TYPE_CHECKING`
             module.imports |= _imports(node)
     own = {each: f"{name}.{each}" for _, names in bound for each in names if each not in module.imports}
+    outside, tops = own | module.imports, {each.partition(".")[0] for each in known}
     for node, names in bound:
         if isinstance(node, (ast.Import, ast.ImportFrom)):
             continue
-        uses = frozenset(_uses(node, own | module.imports | _imports(node), known))
-        definition = Definition(_form(node), uses)
+        uses = frozenset(_uses(node, outside | _imports(node), known))
+        others = sorted(each for each in uses if each.partition(".")[0] not in tops)  # of other libraries
+        definition = Definition(f"{_form(node)} {' '.join(others)}", uses)
         for each in names - module.imports.keys():
             module.definitions.setdefault(each, []).append(definition)
         if not names:

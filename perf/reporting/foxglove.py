@@ -22,9 +22,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from birdslam.geometry.arrays import Floats
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.runtime.recording.recording import JSON_CHANNELS, Recording, RecordingError
@@ -32,7 +32,6 @@ from birdslam.trajectory import inverse
 
 label = "the layout for Foxglove, drawn of a recording"
 
-Floats = NDArray[np.float64]
 LAYOUT = Path("docs/examples/foxglove-layout.json")
 SIZE_IN = 14.0, 7.9
 GAP = 0.004, 0.032  # between panels, of the width; and of the height, where their titles stand

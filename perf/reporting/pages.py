@@ -11,7 +11,6 @@ go on.
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import os
 import re
@@ -29,6 +28,7 @@ from birdslam.perf.cameras import lens
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import foxglove, leave_one_out, measured, results
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.code_digest import Code, files_digest
 from birdslam.perf.reporting.machine import ROOT, describe
 from birdslam.perf.reporting.measured import Measured
@@ -174,7 +174,7 @@ PAGES: tuple[Derived | Page, ...] = (
 
 def run(arguments: list[str]) -> int:
     """Lists the pages, after writing what is asked for; 1 where that failed. Raises PerfError without a checkout."""
-    parser = argparse.ArgumentParser(prog="python -m perf pages", description=__doc__)
+    parser = benchmark_parser("pages", label, output="")
     names = [page.name for page in PAGES]
     parser.add_argument("--write", nargs="*", metavar="NAME", choices=names, help="what is old, or these")
     parser.add_argument("--only-quick", action="store_true", help=f"what takes less than {QUICK_S:.0f} s")

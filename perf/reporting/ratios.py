@@ -28,8 +28,6 @@ REFERENCE = Path(__file__).parent.parent / "reference.toml"
 FRAMES, LIMIT_S = 300, 10.0
 RATE_HZ, TRANSPORT_S = 200, 0.6
 
-Round = dict[str, float]
-
 
 class Bound(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the ratio was when it was written down, and what it must not exceed."""
@@ -109,9 +107,6 @@ def _back_end() -> Iterator[tuple[str, float]]:
     over_frames_us = ours["over_frames_us"]
     third = len(over_frames_us) // 3
     first_us, last_us = np.median(over_frames_us[third : 2 * third]), np.median(over_frames_us[2 * third :])
-    yield (
-        "pose graph over gtsam's fixed lag, 15 vehicles",
-        ours["p50_us"] / peer["p50_us"],
-    )
+    yield ("pose graph over gtsam's fixed lag, 15 vehicles", ours["p50_us"] / peer["p50_us"])
     yield "pose graph, 15 vehicles over 3", ours["p50_us"] / took["ours", 3]["p50_us"]
     yield "pose graph, last frames over middle ones", float(last_us / first_us)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from birdslam.perf.reporting.machine import ROOT
 from birdslam.runtime.latency import key_of
 
 FEW = 1000
+Row = Mapping[str, Any]
 Benchmarks = Mapping[str, Mapping[str, Any]]
 
 
@@ -109,14 +110,8 @@ def _system(benchmarks: Benchmarks) -> Iterator[str]:
         titles,
         (
             [
-                name,
-                run["rate_hz"],
-                f"{run['dropped']} of {run['frames']}",
-                run["cpu_cores"],
-                run["rss_mb"],
-                run.get("pss_mb"),
-                *_percentiles(run["age_ms"]),
-                run["steal_during_percent"],
+                *(name, run["rate_hz"], f"{run['dropped']} of {run['frames']}", run["cpu_cores"], run["rss_mb"]),
+                *(run.get("pss_mb"), *_percentiles(run["age_ms"]), run["steal_during_percent"]),
             ]
             for name, run in runs.items()
         ),
@@ -147,29 +142,14 @@ def _cores(benchmarks: Benchmarks) -> Iterator[str]:
     rows = benchmarks.get("cores", {}).get("rows", [])
     if rows:
         yield "The source once, on the first so many cores by affinity:\n"
-        titles = (
-            "on",
-            "rate Hz",
-            "dropped",
-            "predicted",
-            "age p50",
-            "p99",
-            "cores",
-            "MB",
-            "MB shared once",
-            "seen in the frame",
-            "reported",
-            "ego ATE m",
-        )
+        titles = ["on", "rate Hz", "dropped", "predicted", "age p50", "p99", "cores", "MB", "MB shared once"]
+        titles += ["seen in the frame", "reported", "ego ATE m"]
         there = [row for row in rows if "missing" not in row]
         yield from table(
             titles,
             (
                 [
-                    row["name"],
-                    row["rate_hz"],
-                    f"{row['dropped']} of {row['frames']}",
-                    row.get("predicted"),
+                    *(row["name"], row["rate_hz"], f"{row['dropped']} of {row['frames']}", row.get("predicted")),
                     *_percentiles(row["age_ms"], ("p50", "p99")),
                     *(row.get(name) for name in ("cpu_cores", "rss_mb", "pss_mb", "found", "reported", "ate_m")),
                 ]
@@ -180,39 +160,14 @@ def _cores(benchmarks: Benchmarks) -> Iterator[str]:
         yield from ["", *missing] if missing else []
 
 
-def _vehicles(benchmarks: Benchmarks) -> Iterator[str]:
-    rows = benchmarks.get("vehicles", {}).get("rows", [])
-    if rows:
-        yield "The optimize process on the real bus, at the rate, with so many vehicles in sight:\n"
-        titles = ("vehicles", "step p50", "p99", "p99.9", "max", "cores", "MB", "dropped", "steal %")
-        yield from table(
-            titles,
-            (
-                [
-                    row["vehicles"],
-                    *_percentiles(row["step_ms"]),
-                    row["cpu_cores"],
-                    row["rss_mb"],
-                    f"{row['dropped']} of {row['frames']}",
-                    row["steal_percent"],
-                ]
-                for row in rows
-            ),
-        )
-
-
 def _accuracy(benchmarks: Benchmarks) -> Iterator[str]:
     rows = [row for name in ("accuracy", "accuracy-data") for row in benchmarks.get(name, {}).get("rows", [])]
     if rows:
         titles = {
             **{"frames": "frames", "dropped": "dropped", "ate_m": "ego ATE m", "ate_se3_m": "aligned"},
             **{"scale_error": "scale error", "rpe_t_m": "RPE m", "rpe_r_deg": "RPE deg"},
-            **{
-                "vehicle_ate_m": "vehicles' ATE m",
-                "vehicle_centre_rel": "place, of the range",
-                "found": "seen in the frame",
-                "reported": "reported",
-            },
+            **{"vehicle_ate_m": "vehicles' ATE m", "vehicle_centre_rel": "place, of the range"},
+            **{"found": "seen in the frame", "reported": "reported"},
         }
         there = [row for row in rows if "missing" not in row]
         ages = (_percentiles(row.get("age_ms", {}), ("p50", "p99")) for row in there)
@@ -226,91 +181,69 @@ def _accuracy(benchmarks: Benchmarks) -> Iterator[str]:
         )
 
 
-def _inference(benchmarks: Benchmarks) -> Iterator[str]:
-    rows = benchmarks.get("inference", {}).get("rows", [])
-    if rows:
-        titles = ("what", "p50", "p99", "max", "prepare p50", "network p50", "read p50")
-        parts = ("prepare", "network", "read")
-        yield from table(
-            titles,
-            (
-                [
-                    row["name"],
-                    *_percentiles(row["total_ms"], ("p50", "p99", "max")),
-                    *(row["parts_ms"].get(part, {}).get("p50") for part in parts),
-                ]
-                for row in rows
-            ),
-        )
-
-
 def _optimizer(benchmarks: Benchmarks) -> Iterator[str]:
-    rows = benchmarks.get("optimizer", {}).get("rows", [])
-    if rows:
-        titles = (
-            "who",
-            "vehicles",
-            "frames",
-            "p50 us",
-            "p99",
-            "p99.9",
-            "max",
-            "first 1000",
-            "last 1000",
-            "MB more",
-        )
-        names = ("frames", "p50_us", "p99_us", "p999_us", "max_us", "first_thousand_p50_us", "last_thousand_p50_us")
-        picked = (*names, "rss_growth_mb")
-        yield from table(titles, ([row["contender"], row["vehicles"], *(row[name] for name in picked)] for row in rows))
-    batch = benchmarks.get("incremental", {}).get("rows", [])
-    if batch:
-        yield "\nA whole sequence, batch over incremental (the paper's own ratio is 1.9 s / 0.016 s = 119):\n"
-        yield from table(
-            ("who", "frames", "seconds", "ratio", "iterations"),
-            (
-                [
-                    row["method"],
-                    row.get("frames", ""),
-                    row["seconds"],
-                    "not converged" if row["ratio"] is None else row["ratio"],
-                    row.get("iterations") or "",
-                ]
-                for row in batch
-            ),
-        )
+    titles = ("who", "vehicles", "frames", "p50 us", "p99", "p99.9", "max", "first 1000", "last 1000", "MB more")
+    names = ("frames", "p50_us", "p99_us", "p999_us", "max_us", "first_thousand_p50_us", "last_thousand_p50_us")
+    picked = ("contender", "vehicles", *names, "rss_growth_mb")
+    yield from _table_of("optimizer", titles, lambda row: [row[name] for name in picked])(benchmarks)
+    yield from _table_of(
+        "incremental",
+        ("who", "frames", "seconds", "ratio", "iterations"),
+        lambda row: [
+            *(row["method"], row.get("frames", ""), row["seconds"]),
+            *("not converged" if row["ratio"] is None else row["ratio"], row.get("iterations") or ""),
+        ],
+        "\nA whole sequence, batch over incremental (the paper's own ratio is 1.9 s / 0.016 s = 119):\n",
+    )(benchmarks)
 
 
-def _transport(benchmarks: Benchmarks) -> Iterator[str]:
-    rows = benchmarks.get("transport", {}).get("rows", [])
-    if rows:
-        titles = ("case", "p50", "p99", "p99.9", "max", "cpu % send", "cpu % receive", "dropped", "steal %")
-        yield from table(
-            titles,
-            (
-                [
-                    row["name"],
-                    *_percentiles(row["latency_ms"]),
-                    *row["cpu_percent"].values(),
-                    f"{row['dropped']} of {row['sent']}",
-                    row["steal_percent"],
-                ]
-                for row in rows
-            ),
-        )
+def _table_of(
+    benchmark: str, titles: Sequence[str], cells: Callable[[Row], Iterable[object]], before: str = ""
+) -> Callable[[Benchmarks], Iterator[str]]:
+    """A section that is one table, a row for each of a benchmark's; nothing where it has none."""
+
+    def section(benchmarks: Benchmarks) -> Iterator[str]:
+        rows = benchmarks.get(benchmark, {}).get("rows", [])
+        if rows:
+            yield from [before] if before else []
+            yield from table(titles, map(cells, rows))
+
+    return section
 
 
-def _ratios(benchmarks: Benchmarks) -> Iterator[str]:
-    rows = benchmarks.get("ratios", {}).get("rows", [])
-    if rows:
-        titles = ("ours over the peer", "median", "rounds", "reference", "bound")
-        yield from table(
-            titles,
-            (
-                [row["name"], row["median"], " ".join(_cell(v) for v in row["rounds"]), row["measured"], row["bound"]]
-                for row in rows
-            ),
-        )
-
+_vehicles = _table_of(
+    "vehicles",
+    ("vehicles", "step p50", "p99", "p99.9", "max", "cores", "MB", "dropped", "steal %"),
+    lambda row: [
+        *(row["vehicles"], *_percentiles(row["step_ms"]), row["cpu_cores"], row["rss_mb"]),
+        *(f"{row['dropped']} of {row['frames']}", row["steal_percent"]),
+    ],
+    "The optimize process on the real bus, at the rate, with so many vehicles in sight:\n",
+)
+_inference = _table_of(
+    "inference",
+    ("what", "p50", "p99", "max", "prepare p50", "network p50", "read p50"),
+    lambda row: [
+        *(row["name"], *_percentiles(row["total_ms"], ("p50", "p99", "max"))),
+        *(row["parts_ms"].get(part, {}).get("p50") for part in ("prepare", "network", "read")),
+    ],
+)
+_transport = _table_of(
+    "transport",
+    ("case", "p50", "p99", "p99.9", "max", "cpu % send", "cpu % receive", "dropped", "steal %"),
+    lambda row: [
+        *(row["name"], *_percentiles(row["latency_ms"]), *row["cpu_percent"].values()),
+        *(f"{row['dropped']} of {row['sent']}", row["steal_percent"]),
+    ],
+)
+_ratios = _table_of(
+    "ratios",
+    ("ours over the peer", "median", "rounds", "reference", "bound"),
+    lambda row: [
+        *(row["name"], row["median"], " ".join(_cell(value) for value in row["rounds"])),
+        *(row["measured"], row["bound"]),
+    ],
+)
 
 SECTIONS = (
     ("The whole system", _system),

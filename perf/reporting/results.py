@@ -8,7 +8,6 @@ The page's words are in docs/results/page.md.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +20,7 @@ from birdslam.bench.tracking.benchmark import EGO, Row, mean_ate_m
 from birdslam.bench.tracking.tables import METHOD_TITLES, read_published
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting import measured
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.machine import ROOT
 from birdslam.runtime.pages.tables import table
 
@@ -28,7 +28,6 @@ label = "docs/results.md and the README's table, from the reports of the evaluat
 
 KEPT = ROOT / "docs" / "results"
 TEXT = KEPT / "page.md"  # the page without its figures
-PAGE = ROOT / "docs" / "results.md"
 README = ROOT / "README.md"
 REAL = "--model detector={models}/yolox_nano_416.onnx --model segmenter={models}/twinlitenet_640x360.onnx"
 SEQUENCES = "{data}/kitti_odometry/sequences"
@@ -182,7 +181,7 @@ README_PARTS = {  # evaluation, or page, -> the rows of the summary that are of 
 
 def run(arguments: list[str]) -> None:
     """Writes the page and the README's table. Raises PerfError."""
-    argparse.ArgumentParser(prog="python -m perf results", description=__doc__).parse_args(arguments)
+    benchmark_parser("results", label, output="").parse_args(arguments)
     for file, text in texts().items():
         (ROOT / file).write_text(text, encoding="utf-8")
         print(file)
@@ -191,10 +190,7 @@ def run(arguments: list[str]) -> None:
 def texts() -> dict[str, str]:
     """What is to stand in the page and in the README. Raises PerfError."""
     found, when = kept(), measured.load()
-    return {
-        "docs/results.md": page(found, when),
-        "README.md": readme(README.read_text(encoding="utf-8"), found, when),
-    }
+    return {"docs/results.md": page(found, when), "README.md": readme(README.read_text(encoding="utf-8"), found, when)}
 
 
 def readme(text: str, found: Mapping[str, Kept], when: Mapping[str, measured.Measured]) -> str:

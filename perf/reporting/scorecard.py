@@ -93,14 +93,11 @@ def keep(new: Card, folder: Path = RESULTS) -> Path:
 
 def last(version: str, folder: Path = RESULTS) -> Card:
     """The card of the newest version kept, up to `version`. Raises PerfError where there is none."""
-    paths = sorted((path for path in folder.glob("*.json") if _number(path.stem) <= _number(version)), key=_by_version)
+    kept = (path for path in folder.glob("*.json") if _number(path.stem) <= _number(version))
+    paths = sorted(kept, key=lambda path: _number(path.stem))
     if not paths:
         raise PerfError(f"{folder}: keeps no results of version {version} or before")
     return msgspec.convert(json.loads(paths[-1].read_text(encoding="utf-8")), Card)
-
-
-def _by_version(path: Path) -> tuple[int, ...]:
-    return _number(path.stem)
 
 
 def _number(version: str) -> tuple[int, ...]:

@@ -9,13 +9,13 @@ anything was marked valid that was not: by its own status, or by where the car r
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from birdslam.perf.accuracy.street import FRAME_M
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.machine import describe
 from birdslam.perf.robustness.faulty_vehicle import (
     PATIENCE_S,
@@ -128,7 +128,7 @@ def markdown(rows: list[Row]) -> str:
 
 def run(arguments: list[str]) -> int:
     """0 where every fault was survived, within its promise, and nothing wrong was marked valid."""
-    parser = argparse.ArgumentParser(prog="python -m perf faults", description=__doc__)
+    parser = benchmark_parser("faults", label, output="")
     parser.add_argument("names", nargs="*", metavar="NAME", help="only faults whose name contains one of these")
     parser.add_argument("--models", type=Path, help="folder of networks, for perceive to carry their weight")
     parser.add_argument("--markdown", type=Path, help="the page goes there, table and head")

@@ -79,11 +79,7 @@ class Vehicle:
 
     def start(self) -> None:
         """Starts the system; again, where it was killed."""
-        settings = {
-            "runtime.runtime_dir": self.runtime_dir,
-            "runtime.restarts_max": 1000,
-            "runtime.watchdog_ms": 1000,
-        }
+        settings = {"runtime.runtime_dir": self.runtime_dir, "runtime.restarts_max": 1000, "runtime.watchdog_ms": 1000}
         with (self.place / "run.log").open("ab") as log:
             self.process = subprocess.Popen(
                 [

@@ -11,12 +11,10 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from numpy.typing import NDArray
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-Floats = NDArray[np.float64]
 TrueSpeed = Callable[[float, float], float]  # m/s between two times in s of the recording
 
 BEGINNING_S = 2.0  # of a film, after which it should be valid
@@ -144,11 +142,11 @@ def _spread(rows: list[dict[str, Any]]) -> list[str]:
     out = []
     for film in dict.fromkeys(row["film"] for row in rows):
         ratios = [row["way_over_unchanged"] for row in rows if row["film"] == film]
-        told = [ratio for ratio in ratios if ratio is not None]
-        if not told:
+        known = [ratio for ratio in ratios if ratio is not None]
+        if not known:
             continue
-        inside = sum(abs(ratio - 1.0) <= ALIKE for ratio in told)
-        out.append(f"- {film}: {min(told):.3f} to {max(told):.3f}, {inside} of {len(ratios)} within {ALIKE:.0%}")
+        inside = sum(abs(ratio - 1.0) <= ALIKE for ratio in known)
+        out.append(f"- {film}: {min(known):.3f} to {max(known):.3f}, {inside} of {len(ratios)} within {ALIKE:.0%}")
     return [*out, ""] if out else []
 
 

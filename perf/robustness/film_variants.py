@@ -11,11 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Image
 from birdslam.geometry.camera import Camera
 
-Image = NDArray[np.uint8]
 Timed = tuple[int, Image]  # t_source_ns, the raw image
 Shown = Callable[[int, Image], Image]  # of an image's index and the image
 

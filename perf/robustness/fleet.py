@@ -190,9 +190,7 @@ def runs(place: Place, names: list[str], source: str) -> Iterator[None]:
             )
             for command in ("run", "uplink"):
                 process = subprocess.Popen(
-                    birdslam_command(command, str(file)),
-                    stdout=subprocess.DEVNULL,
-                    start_new_session=True,
+                    birdslam_command(command, str(file)), stdout=subprocess.DEVNULL, start_new_session=True
                 )
                 stack.callback(process.wait)
                 stack.callback(process.send_signal, signal.SIGTERM)

@@ -101,9 +101,7 @@ def full_disk(node: str) -> Injection:
 def _beside(program: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
     """Another process, from when it says that it is at work until the end of the fault."""
     process = subprocess.Popen(
-        [sys.executable, "-c", program, *arguments],
-        stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        [sys.executable, "-c", program, *arguments], stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)}
     )
     assert process.stdout is not None
     try:

@@ -10,7 +10,6 @@ restarted, a watchdog was missed, or estimates came later to the planner at the 
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import os
@@ -27,6 +26,7 @@ from typing import Any
 import numpy as np
 import psutil
 
+from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.robustness.faulty_vehicle import Vehicle, ends_with_its_vehicle, model_options, record_options
 from birdslam.runtime.transport.closing import Closing
 
@@ -185,7 +185,7 @@ def drive(vehicle: Vehicle, minutes: float) -> tuple[dict[str, Series], list[flo
 
 def run(arguments: list[str]) -> int:
     """Gives the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m perf soak", description=__doc__)
+    parser = benchmark_parser("soak", label, output="")
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--rate", type=float, default=33.0, metavar="HZ")
     parser.add_argument("--source", default="", metavar="URI", help="goes round and round; left out: a software camera")

@@ -99,7 +99,7 @@ def done(output: Path, task: Task) -> bool:
 
 
 def failure_file(output: Path, name: str) -> Path:
-    """Where is written why a drive failed."""
+    """The file that says why a drive failed."""
     return output / FAILED / f"{name}.json"
 
 
@@ -168,7 +168,7 @@ class _Motion:
         self._before: Estimate | None = None
 
     def watched(self, drive: Drive) -> Drive:
-        """The drive, looked at on its way."""
+        """The same drive; its estimates are counted as they pass."""
 
         def watched(recording: Recording) -> Iterator[Measurements | Estimate | MapUpdate]:
             for record in drive(recording):

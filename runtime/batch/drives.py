@@ -95,13 +95,13 @@ def _listed(path: Path) -> Iterator[Found]:
 
 
 def _uri(path: Path) -> str | None:
-    """Of the source that lies at a path; None where there is none."""
+    """The URI of the source at a path; None where there is none."""
     scheme = scheme_at(path, all_schemes())
     return None if scheme is None else f"{scheme.name}:{path}"
 
 
 def _uri_of_url(url: str) -> str:
-    """By its name alone. Raises ConfigurationError where that does not say it."""
+    """The URI of the source at a URL, by the file's name alone. Raises ConfigurationError where that is not enough."""
     scheme = by_suffix(Path(url), all_schemes())
     if scheme is None:
         raise ConfigurationError(f"{url}: say what it is, as in {ROSBAG.name}:{url} or {MCAP.name}:{url}")
@@ -109,7 +109,7 @@ def _uri_of_url(url: str) -> str:
 
 
 def sweep(texts: Sequence[str]) -> list[dict[str, Any]]:
-    """Every combination of KEY=V1,V2. Raises ConfigurationError."""
+    """Every combination of the values of KEY=V1,V2 settings. Raises ConfigurationError."""
     axes = []
     for text in texts:
         key, equals, values = text.partition("=")
@@ -158,7 +158,7 @@ def tasks(
 
 
 def _anchor(tree: dict[str, Any]) -> None:
-    """Paths that count from the folder where the command was given; a worker may stand elsewhere."""
+    """Makes paths absolute, by the folder in which the command was given: a worker may run in another one."""
     if tree["source"]["speed"]:
         tree["source"]["speed"] = str(Path(tree["source"]["speed"]).expanduser().absolute())
     for spec in tree["models"].values():
@@ -168,7 +168,7 @@ def _anchor(tree: dict[str, Any]) -> None:
 
 
 def _names(drives: Sequence[Found]) -> list[str]:
-    """By their files and folders; where two would be alike, with a part of the hash of where they lie."""
+    """A name for each drive, that of its file or folder; of equal names each gets a part of its URI's hash."""
     plain = [Path(drive.uri.partition(":")[2] or drive.uri).stem for drive in drives]
     counts = Counter(plain)
     return [

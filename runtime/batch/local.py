@@ -28,7 +28,7 @@ DETAILS_BYTES = 4000  # of what a process wrote that are kept
 
 @dataclass(frozen=True)
 class Event:
-    """Of a drive: how far it is, or its end; `failure` is None where it went well."""
+    """How far a drive has come, or its end; `failure` is None where it has its results."""
 
     task: Task
     share: float  # of its frames that are done

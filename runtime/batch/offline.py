@@ -6,7 +6,6 @@ import contextlib
 from collections.abc import Callable, Iterator
 
 import cv2
-import msgspec
 
 from birdslam.runtime.configuration import Configuration, complete
 from birdslam.runtime.nodes.ego_motion import external_odometry
@@ -22,9 +21,7 @@ Drive = Callable[[Recording], Iterator[Measurements | Estimate | MapUpdate]]
 @contextlib.contextmanager
 def pipeline(configuration: Configuration) -> Iterator[Drive]:
     """A function that drives a recording: each frame's Measurements, its Estimate, and what the map gained."""
-    configuration = msgspec.structs.replace(
-        configuration, source=msgspec.structs.replace(configuration.source, rate="max")
-    )
+    configuration = configuration.as_lossless()
     cv2.setNumThreads(configuration.perceive.opencv_threads)
     with contextlib.ExitStack() as stack:
 

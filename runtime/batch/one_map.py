@@ -28,14 +28,14 @@ class Joined:
 
 
 def listener(configuration: Configuration, folder: Path) -> DriveMap | None:
-    """Hears a drive's estimates and makes its map at its end; None: no map is asked for."""
+    """Takes a drive's estimates and makes its map when it has ended; None where no map is asked for."""
     if not configuration.results.map:
         return None
     return DriveMap(MapChoice(folder / DRIVE_MAP, extend=True), None)
 
 
 def frames(recording: Recording, count: int) -> Frames:
-    """The first so many, from the beginning again."""
+    """The first `count` frames, read from the beginning again."""
     for frame in recording.undistorted_frames():
         if frame.frame_id >= count:
             return

@@ -98,7 +98,7 @@ def _write_drives(tasks: Sequence[Task], output: Path) -> None:
 
 
 def _whole(path: Path, write: Callable[[IO[str]], object]) -> None:
-    """A file that is there whole, or as it was before."""
+    """Writes a file whole; whatever goes wrong, the old one stays."""
     partial = path.with_name(f".{path.name}.partial")
     with partial.open("w", encoding="utf-8", newline="") as file:
         write(file)

@@ -15,7 +15,7 @@ from birdslam.frontend import Pending
 from birdslam.geometry.camera import Camera
 from birdslam.outputs.plain_words import LengthsBy
 from birdslam.ros.bag import BagTopics
-from birdslam.runtime.calibration.given import Given, frame_size, lens_of, lossless
+from birdslam.runtime.calibration.given import Given, frame_size, lens_of
 from birdslam.runtime.calibration.height import UNKNOWN_HEIGHT_M, known_lengths, lengths_by, with_height
 from birdslam.runtime.calibration.lens import lens_of_drive
 from birdslam.runtime.calibration.report import report
@@ -65,7 +65,7 @@ def calibrate_drive(
     recording = _open(uri, lens, height_m, stride, topics)
     known_height = height_m is not None or lens is None  # a recording with a calibration of its own says the height
     cv2.setNumThreads(configuration.perceive.opencv_threads)
-    configuration = lossless(configuration)
+    configuration = configuration.as_lossless()
     with Inference(configuration) as inference:
 
         def drive() -> Iterator[tuple[Frame, Pending]]:
@@ -76,11 +76,7 @@ def calibrate_drive(
 
         try:
             found = calibrate(
-                drive,
-                recording.camera,
-                configuration.slam.frontend,
-                config,
-                known_lengths(recording, given.speed),
+                drive, recording.camera, configuration.slam.frontend, config, known_lengths(recording, given.speed)
             )
         except CalibrationError as error:
             if must_show:

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
-
 from birdslam.calibration.intrinsics import Intrinsics, from_chessboard, read_intrinsics
 from birdslam.calibration.lens import FIELD_OF_VIEW_DEG, STATED_SIGMA_REL, focal_by_field_of_view
 from birdslam.ros.bag import BagTopics
-from birdslam.runtime.configuration import Configuration, ConfigurationError
+from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.nodes.sources import parsed
 from birdslam.sources.camera_file import load_camera
 from birdslam.sources.recording import DatasetError, Recording
@@ -81,13 +79,8 @@ def focal_length_of(given: Given, uri: str, width_px: int) -> FocalLength:
     return FocalLength(focal_px, sigma_rel, f"that of a {given.kind}, {fov_deg:g} deg across")
 
 
-def lossless(configuration: Configuration) -> Configuration:
-    """Every frame of the source, however long it takes."""
-    return msgspec.structs.replace(configuration, source=msgspec.structs.replace(configuration.source, rate="max"))
-
-
 def class_and_path(uri: str) -> tuple[type[Recording], Path]:
-    """Of a source's URI: what reads it, and where it lies."""
+    """The class that reads a source's URI, and the path in it."""
     scheme, address = parsed(uri)
     return scheme.load(), Path(address).expanduser()
 

@@ -88,7 +88,7 @@ def with_height(
 
 
 def shutter_rel(camera: Camera, height_m: float, speed_mps: float) -> float:
-    """1-sigma of lengths along the road by rows that are read in turn, in a time that no film tells.
+    """1-sigma of lengths along the road, as a fraction, by a rolling shutter whose readout time no film states.
 
     Near road is read later in an image than far road, and moves down meanwhile: its motion is seen over a longer time
     than that between two images. A point of the road at depth z moves by f h V / z^2 rows a second.
@@ -101,7 +101,7 @@ def _sigma_rel(check: HeightCheck) -> float:
 
 
 def _stated_height(found: Calibration, focal_rel: float) -> HeightBy:
-    """With what is farthest from it for its sigma, where that is too far."""
+    """The height as stated; where an estimate contradicts it, the largest difference is its sigma."""
 
     def away_sigma(check: HeightCheck) -> float:
         return abs(math.log(check.height_m / found.camera.height_m)) / math.hypot(_sigma_rel(check), focal_rel)
@@ -116,7 +116,7 @@ def _stated_height(found: Calibration, focal_rel: float) -> HeightBy:
 
 
 def _estimated_height(found: Calibration, focal_rel: float) -> tuple[float, HeightBy]:
-    """By a known length, by the size of cars, or by where cameras are."""
+    """By a known length, by the size of cars, or by where most cameras are mounted."""
     sigmas = {check.cue: _sigma_rel(check) for check in found.height_checks}
     check = min(found.height_checks, key=lambda check: sigmas[check.cue], default=None)
     if check is None or sigmas[check.cue] > WINDSCREEN_SIGMA_REL:

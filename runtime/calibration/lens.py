@@ -12,8 +12,9 @@ from birdslam.calibration.calibration import CalibrationError
 from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.calibration.lens import followed_corners, self_calibrate
 from birdslam.calibration.lens_adjustment import IMAGES
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
-from birdslam.runtime.calibration.given import Given, focal_length_of, lossless
+from birdslam.runtime.calibration.given import Given, focal_length_of
 from birdslam.runtime.calibration.height import UNKNOWN_HEIGHT_M
 from birdslam.runtime.configuration import Configuration, complete
 from birdslam.runtime.nodes.inference import Inference
@@ -24,12 +25,7 @@ _LENS_S = 120.0  # of a film, from which its lens is found
 
 
 def lens_of_drive(
-    configuration: Configuration,
-    uri: str,
-    given: Given,
-    size_px: tuple[int, int],
-    stride: int,
-    must_show: bool = True,
+    configuration: Configuration, uri: str, given: Given, size_px: tuple[int, int], stride: int, must_show: bool = True
 ) -> Intrinsics:
     """The lens of a film that says nothing of its camera, by what its images show.
 
@@ -41,11 +37,11 @@ def lens_of_drive(
     middle = 0.5 * (width_px - 1.0), 0.5 * (height_px - 1.0)
     camera = Camera(width_px, height_px, focal_px, focal_px, *middle, height_m=given.height_m or UNKNOWN_HEIGHT_M)
     recording = open_recorded(uri, camera, stride, configuration.source.topics)
-    configuration = lossless(configuration)
+    configuration = configuration.as_lossless()
     frames = max(1, round(_LENS_S * recording.rate_hz))
     with Inference(complete(configuration, camera, recording.rate_hz)) as inference:
 
-        def images() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float64]]]:
+        def images() -> Iterator[tuple[NDArray[np.uint8], Floats]]:
             seen = islice(offline_frames(RecordedSource(recording, configuration.source)), frames)
             for frame in with_progress(seen, "lens", min(frames, len(recording)) or None):
                 if frame.image is not None:

@@ -19,7 +19,7 @@ from birdslam.sources.schemes import written
 
 @dataclass(frozen=True)
 class Command:
-    """What the user types, what the help says, and the functions that add its arguments and that are it."""
+    """A command: its words, its help, the function that adds its arguments, and the function that runs it."""
 
     words: str
     help: str

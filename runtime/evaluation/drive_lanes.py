@@ -31,8 +31,7 @@ def evaluate_drive(configuration: Configuration, drive: str) -> DriveReport:
 
     Raises ConfigurationError, DatasetError, ModelError, ResultsError.
     """
-    lossless = msgspec.structs.replace(configuration.source, rate="max")
-    configuration = msgspec.structs.replace(configuration, source=lossless)
+    configuration = configuration.as_lossless()
     recording = open_recorded(recording_uri(drive), configuration.camera, configuration.source.stride)
     if not isinstance(recording, DemoRecording) or not recording.has_lines:
         raise DatasetError(f"{drive}: has no true lines: `python -m perf roads --keep DIR` renders drives that have")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,8 +25,7 @@ def evaluate_hidden(configuration: Configuration, drive: str) -> HiddenReport:
 
     Raises ConfigurationError, DatasetError, ModelError, ResultsError.
     """
-    lossless = msgspec.structs.replace(configuration.source, rate="max")
-    configuration = msgspec.structs.replace(configuration, source=lossless)
+    configuration = configuration.as_lossless()
     recording = open_recorded(recording_uri(drive), configuration.camera, configuration.source.stride)
     output = Path(configuration.output)
     claim_directory(output)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
-
 from birdslam.outputs.drive_files import claim_directory
 from birdslam.outputs.lane_picture import draw_lanes
 from birdslam.runtime.configuration import Configuration, ConfigurationError, complete
@@ -20,8 +18,7 @@ def draw_frame_lanes(configuration: Configuration, drive: str, frame_id: int | N
 
     `drive`: a KITTI directory or a source's URI. Raises ConfigurationError, DatasetError, ResultsError.
     """
-    lossless = msgspec.structs.replace(configuration.source, rate="max")
-    configuration = msgspec.structs.replace(configuration, source=lossless)
+    configuration = configuration.as_lossless()
     recording = open_recorded(recording_uri(drive), configuration.camera, configuration.source.stride)
     frames = len(recording)
     asked = frame_id if frame_id is not None else max(frames - 1, 0)

@@ -9,13 +9,7 @@ from typing import NamedTuple
 import msgspec
 
 from birdslam.bench.tracking.by_class.class_tracks import IMAGE, KINDS, METRES, TracksRow, class_tracks, tracks_row
-from birdslam.bench.tracking.by_class.people import (
-    PeopleRow,
-    boxes_of_hulls,
-    has_labels,
-    judge,
-    summarise_people,
-)
+from birdslam.bench.tracking.by_class.people import PeopleRow, boxes_of_hulls, has_labels, judge, summarise_people
 from birdslam.bench.tracking.leave_one_out import LeftOut, PlaceError, left_out
 from birdslam.bench.tracking.localisation import (
     CAMERA_OF_BOXES,
@@ -72,12 +66,7 @@ def evaluate_localisation(
 
 
 def evaluate_people(
-    root: Path,
-    names: Sequence[str],
-    detections: str,
-    config: FrontEndConfig,
-    kind: str,
-    tilt_from_images: bool = False,
+    root: Path, names: Sequence[str], detections: str, config: FrontEndConfig, kind: str, tilt_from_images: bool = False
 ) -> tuple[list[PeopleRow], list[TracksRow]]:
     """The errors of placed pedestrians or cyclists by range, and their tracks in bird's-eye view.
 

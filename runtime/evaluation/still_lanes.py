@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import msgspec
 import numpy as np
 
 from birdslam.bench.lanes.kitti_road import (
@@ -37,8 +36,7 @@ def evaluate_paint(configuration: Configuration, folder: Path) -> PaintReport:
     pairs = find_images(folder)
     output = Path(configuration.output)
     claim_directory(output)
-    lossless = msgspec.structs.replace(configuration.source, rate="max")
-    configuration = msgspec.structs.replace(configuration, source=lossless)
+    configuration = configuration.as_lossless()
     scores = []
     with Inference(configuration) as inference, Progress(folder.name, len(pairs)) as progress:
         for image_path, mask_path in pairs:
@@ -65,8 +63,7 @@ def evaluate_stills(configuration: Configuration, folder: Path, height_m: float 
     pairs = find_pairs(folder)
     output = Path(configuration.output)
     claim_directory(output)
-    lossless = msgspec.structs.replace(configuration.source, rate="max")
-    configuration = msgspec.structs.replace(configuration, source=lossless)
+    configuration = configuration.as_lossless()
     if configuration.camera is not None and configuration.camera.distortion:
         raise ConfigurationError("--camera: the masks are of undistorted images: a camera without distortion is needed")
     scores = []

@@ -260,9 +260,7 @@ def _log_maker(
     def make(seed: int, config: FrontEndConfig) -> list[Measurements]:
         perceive: Callable[[int, NDArray[np.uint8]], Pending] = given
         if network:
-            lossless = msgspec.structs.replace(job.configuration.source, rate="max")
-            configuration = msgspec.structs.replace(job.configuration, source=lossless)
-            perceive = stack.enter_context(Inference(configuration)).networks.start
+            perceive = stack.enter_context(Inference(job.configuration.as_lossless())).networks.start
         odometry = _odometry(job, sequence, frames, np.random.default_rng([seed, *sequence.name.encode()]))
 
         def counted(frame: int, image: NDArray[np.uint8]) -> Pending:

@@ -85,13 +85,7 @@ def access_control(vehicles: tuple[str, ...], listeners: tuple[str, ...]) -> dic
         ]
         subjects.append(_subject("listeners", list(listeners)))
         policies.append(_policy("listeners", [rule["id"] for rule in rules[-4:]]))
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    }
+    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}
 
 
 def _rule(name: str, flow: str, messages: list[str], keys: Any) -> dict[str, Any]:

@@ -22,7 +22,8 @@ import zenoh
 from birdslam.runtime.configuration import Configuration, ConfigurationError, FleetConfig
 from birdslam.runtime.fleet.link import check, open_link
 from birdslam.runtime.process import signals
-from birdslam.runtime.process.notify import LOOK_S, Notifier
+from birdslam.runtime.process.notify import LOOK_S
+from birdslam.runtime.process.sender import send
 from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, key_of
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, Publisher, Subscriber
 from birdslam.runtime.transport.closing import Closing
@@ -34,7 +35,6 @@ FORWARDED = ("estimate", *(f"health/{node}" for node in PROCESSES))
 _NODE = "uplink"
 _MOST_STAGES = 7  # of a trace that comes in, so that one more fits
 _TRY_S = 2.0  # one attempt to reach the router
-_REPORT_S = 60.0  # between two lines that say that there is none
 
 
 class Uplink(Closing):
@@ -42,6 +42,8 @@ class Uplink(Closing):
 
     A context manager. Raises as Bus does.
     """
+
+    pause_s = LOOK_S
 
     def __init__(
         self, vehicle: str, config: FleetConfig, session: zenoh.Session, runtime_dir: Path | None = None
@@ -65,6 +67,11 @@ class Uplink(Closing):
         for thread in self._threads:
             thread.start()
         self._bus.on_alive(self._alive_changed)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the router is there now."""
+        return bool(self._session.info.routers_zid())
 
     @property
     def alive(self) -> frozenset[str]:
@@ -118,6 +125,9 @@ class Uplink(Closing):
 
         return ask
 
+    def step(self) -> None:
+        """Its threads send."""
+
     def close(self) -> None:
         """Forwards nothing more; the vehicle's nodes are then not alive for the fleet."""
         self._bus.close()  # wakes those that forward
@@ -142,34 +152,7 @@ def run(configuration: Configuration) -> None:
     check("fleet", config, "router")
     signals.block()
     zenoh.init_log_from_env_or("error")
-    notifier = Notifier()
-    notifier.once("READY=1")  # the vehicle waits for no network
-    session = _wait_for_router(config, notifier)
-    if session is None:
-        return
-    reached: bool | None = None
-    with Uplink(vehicle, config, session, configuration.runtime_dir) as uplink:
-        while True:
-            if (now := bool(session.info.routers_zid())) != reached:
-                reached = now
-                state = f"is connected to {config.router}" if now else f"has lost {config.router} and looks for it"
-                print(f"the uplink of vehicle {vehicle!r} {state}", flush=True)
-            notifier.alive(f"router {'reached' if reached else 'GONE'}, {len(uplink.alive)} nodes alive")
-            if signals.asked_to_end(notifier.period_s or LOOK_S):
-                break
-        notifier.once("STOPPING=1")
-
-
-def _wait_for_router(config: FleetConfig, notifier: Notifier) -> zenoh.Session | None:
-    """The session, as soon as it can be had; None where a signal came first."""
-    reported_s = -_REPORT_S
-    while True:
-        try:
-            return open_link(config, _TRY_S)
-        except BusError as error:
-            if time.monotonic() - reported_s >= _REPORT_S:
-                reported_s = time.monotonic()
-                print(f"birdslam: uplink: {error}", file=sys.stderr, flush=True)
-        notifier.alive(f"looks for {config.router}")
-        if signals.asked_to_end(LOOK_S):  # a refusal may come at once
-            return None
+    send(
+        *(_NODE, f"the uplink of vehicle {vehicle!r}", config.router, lambda: open_link(config, _TRY_S), BusError),
+        lambda session: Uplink(vehicle, config, session, configuration.runtime_dir),
+    )

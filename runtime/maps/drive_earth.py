@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import moved
@@ -54,8 +54,8 @@ def write_earth(
     found = tie(earth, nodes, links, before | fixed_keyframes(earth, t_ns, way, fixes, nodes))
     degrees = found.earth.wgs84(_bent(way, nodes, found))
     about = figures(found.earth, camera)
-    told = {key: value for key, value in about.items() if isinstance(value, int | float | str)}
-    line = Way("ego", degrees, [t_ns for t_ns, _ in poses], told)
+    properties = {key: value for key, value in about.items() if isinstance(value, int | float | str)}
+    line = Way("ego", degrees, [t_ns for t_ns, _ in poses], properties)
     for suffix in SUFFIXES:
         write_ways(output / f"ego{suffix}", [line])
     if place_map is not None and len(place_map):
@@ -74,7 +74,7 @@ def _nodes(way: Sequence[SE2]) -> tuple[list[Node], list[Link]]:
     return nodes, links
 
 
-def _bent(way: Sequence[SE2], nodes: Sequence[Placed], found: OnEarth) -> NDArray[np.float64]:
+def _bent(way: Sequence[SE2], nodes: Sequence[Placed], found: OnEarth) -> Floats:
     """(N, 2) the drive's way as its nearest keyframes lie now."""
     before = [node.T_map_keyframe for node in nodes]
     moves = [found.poses[node.number][0] @ T.inverse() for node, T in zip(nodes, before, strict=True)]

@@ -37,11 +37,7 @@ class CaptureNode:
     mode: str = Mode.FULL
 
     def __init__(
-        self,
-        configuration: Configuration,
-        bus: Bus,
-        wait: Callable[[float], object],
-        assignment: Assignment = FIRST,
+        self, configuration: Configuration, bus: Bus, wait: Callable[[float], object], assignment: Assignment = FIRST
     ) -> None:
         self.ended = False
         self._config = configuration

@@ -141,10 +141,7 @@ class Inference(Closing):
         took_ms = measure(runs, camera, measured_s)
         costs: dict[str, Cost] = {
             h.role: Cost(
-                took_ms[h.role],
-                h.schedule.threads,
-                h.schedule.every,
-                took_ms.get(BOXES) if h.role in ROLES else None,
+                took_ms[h.role], h.schedule.threads, h.schedule.every, took_ms.get(BOXES) if h.role in ROLES else None
             )
             for h in heads
         }

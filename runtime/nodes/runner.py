@@ -146,9 +146,7 @@ def _loop(
                 trace = message.trace.after(name, taken_ns, now_ns, arrived_ns)
                 if _is_frame(record):
                     vitals.count(
-                        next_frame=record.frame_id + 1,
-                        t_source_ns=record.t_source_ns,
-                        t_capture_ns=record.t_capture_ns,
+                        next_frame=record.frame_id + 1, t_source_ns=record.t_source_ns, t_capture_ns=record.t_capture_ns
                     )
                     if Status.PERCEPTION_LATE not in record.status:
                         meter.frame(record.t_capture_ns, trace)

@@ -6,14 +6,16 @@ import contextlib
 import os
 from pathlib import Path
 
+CGROUPS = Path("/sys/fs/cgroup")
 
-def usable_cores(root: Path = Path("/sys/fs/cgroup")) -> float:
-    """By its affinity and by the quota of its control groups, whose tree is at `root`."""
-    return min(float(len(os.sched_getaffinity(0))), quota(root))
+
+def usable_cores() -> float:
+    """By its affinity and by the quota of its control groups."""
+    return min(float(len(os.sched_getaffinity(0))), quota(CGROUPS))
 
 
 def quota(root: Path) -> float:
-    """Cores that the control groups of this process leave it; infinite where they set no limit."""
+    """Cores that this process' control groups, in the tree at `root`, leave it; infinite where they set no limit."""
     group = Path("/proc/self/cgroup").read_text().strip().rpartition("::")[2].lstrip("/")
     limits = [float("inf")]
     for place in (root / group, *(root / group).parents):

@@ -34,18 +34,7 @@ from birdslam.ros.rmw_zenoh import (
     publishers_key,
     type_of_key,
 )
-from birdslam.ros.sensor import (
-    CAMERA_INFO,
-    FIX,
-    IMAGES,
-    SPEEDS,
-    Lens,
-    fix_row,
-    is_rectified,
-    lens,
-    pixels,
-    speed,
-)
+from birdslam.ros.sensor import CAMERA_INFO, FIX, IMAGES, SPEEDS, Lens, fix_row, is_rectified, lens, pixels, speed
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.nodes.sources import SourceError
 from birdslam.runtime.ros.session import ROUTER_S, NoRouter, RosNode
@@ -147,7 +136,7 @@ class RosCamera:
         domain = node.domain
         said: set[Publication] = set()
 
-        def told(token: str) -> None:
+        def publisher_came(token: str) -> None:
             found = publication_of(token)
             if found is None or found in said:
                 return
@@ -168,7 +157,7 @@ class RosCamera:
         if self._gnss is not None:
             listens.append((self._fixes, self._fix_came))
         for topic, came in listens:
-            node.watch(publishers_key(domain, topic), told)
+            node.watch(publishers_key(domain, topic), publisher_came)
             node.subscribe(any_type_key(domain, topic), came)
 
     def _info_topics(self) -> list[str]:

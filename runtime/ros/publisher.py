@@ -19,7 +19,7 @@ from birdslam.ros.messages import LATCHED, TOPICS, Level, RosMessages, Sent, t_o
 from birdslam.ros.rmw_zenoh import LATCHED_QOS, Qos
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.process import signals
-from birdslam.runtime.process.notify import Notifier
+from birdslam.runtime.process.sender import send
 from birdslam.runtime.ros.session import NoRouter, RosNode, RosPublisher
 from birdslam.runtime.topology import PROCESSES
 from birdslam.runtime.transport.bus import Bus, BusError
@@ -30,13 +30,14 @@ from birdslam.types import EgoEdge, Estimate, MapUpdate, Measurements
 NODE = "birdslam"
 _DEPTH = 64  # estimates that wait while a computer is busy: two seconds of them
 _SILENT_S = 1.0  # without an estimate for so long, the diagnostics say so, and again each time
-_LOOK_S = 0.1
-_REPORT_S = 60.0  # between two lines that say that there is no router
+_WAIT_S = 0.1  # for an estimate, in a step
 _KEPT_MOTIONS = 64
 
 
 class RosBridge(Closing):
     """A vehicle's bus and a node of ROS 2. A context manager; raises as Bus and RosNode do."""
+
+    pause_s = 0.0  # a step waits itself
 
     def __init__(self, vehicle: str, node: RosNode, runtime_dir: Path | None = None, rate_hz: float | None = None):
         self._vehicle, self._node = vehicle, node
@@ -69,7 +70,7 @@ class RosBridge(Closing):
         """The vehicle's nodes that are alive."""
         return self._bus.alive & set(PROCESSES)
 
-    def step(self, timeout_s: float) -> None:
+    def step(self, timeout_s: float = _WAIT_S) -> None:
         """Says what comes within that time: one estimate, with all that came beside it."""
         message = self._estimates.recv(timeout_s)
         while (measured := self._measurements.recv(0.0)) is not None:
@@ -168,36 +169,10 @@ def _judged(health: Health) -> tuple[Level, str, dict[str, Any]]:
 
 def run(configuration: Configuration, rate_hz: float | None = None) -> None:
     """Until SIGTERM or SIGINT. Raises ConfigurationError, BagError without rosbags, and as Bus does."""
-    vehicle = configuration.vehicle
+    vehicle, config = configuration.vehicle, configuration.ros
     signals.block()
     zenoh.init_log_from_env_or("error")
-    notifier = Notifier()
-    notifier.once("READY=1")  # the vehicle waits for no network
-    node = _wait_for_router(configuration, notifier)
-    if node is None:
-        return
-    reached: bool | None = None
-    with RosBridge(vehicle, node, configuration.runtime_dir, rate_hz) as bridge:
-        while not signals.asked_to_end(0.0):
-            bridge.step(_LOOK_S)
-            if (now := bridge.connected) != reached:
-                reached = now
-                state = "is connected to" if now else "has lost"
-                print(f"the ROS node of vehicle {vehicle!r} {state} {configuration.ros.router}", flush=True)
-            notifier.alive(f"router {'reached' if reached else 'GONE'}, {len(bridge.alive)} nodes alive")
-        notifier.once("STOPPING=1")
-
-
-def _wait_for_router(configuration: Configuration, notifier: Notifier) -> RosNode | None:
-    """The node, as soon as the router is there; None where a signal came first."""
-    reported_s = -_REPORT_S
-    while True:
-        try:
-            return RosNode(configuration.ros, NODE)
-        except NoRouter as error:
-            if time.monotonic() - reported_s >= _REPORT_S:
-                reported_s = time.monotonic()
-                print(f"birdslam: ros: {error}", file=sys.stderr, flush=True)
-        notifier.alive(f"looks for {configuration.ros.router}")
-        if signals.asked_to_end(_LOOK_S):
-            return None
+    send(
+        *("ros", f"the ROS node of vehicle {vehicle!r}", config.router, lambda: RosNode(config, NODE), NoRouter),
+        lambda node: RosBridge(vehicle, node, configuration.runtime_dir, rate_hz),
+    )

@@ -170,12 +170,12 @@ class RosNode(Closing):
         else:
             self._subscribers.append(self.session.declare_subscriber(key, callback))
 
-    def watch(self, key: str, told: Callable[[str], object]) -> None:
-        """Calls `told` of each token of somebody who is there or comes, on zenoh's thread."""
+    def watch(self, key: str, came: Callable[[str], object]) -> None:
+        """Calls `came` of each token of somebody who is there or comes, on zenoh's thread."""
 
         def changed(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
-                told(str(sample.key_expr))
+                came(str(sample.key_expr))
 
         callback = zenoh.handlers.Callback(changed, indirect=False)
         self._subscribers.append(self.session.liveliness().declare_subscriber(key, callback, history=True))

@@ -10,7 +10,8 @@ from typing import Any
 import msgspec
 
 from birdslam.bench.tracking.shipped_drive import VEHICLES, DemoGrade, grade
-from birdslam.outputs.drive_video import Floats, outline
+from birdslam.geometry.arrays import Floats
+from birdslam.outputs.drive_video import outline
 from birdslam.runtime.configuration import Configuration
 from birdslam.sources.opening import open_recording
 from birdslam.sources.schemes import DEMO, scheme_of

@@ -16,9 +16,10 @@ from typing import Any
 
 import msgspec
 
+from birdslam.geometry.arrays import Floats, Image
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.outputs.drive_files import ResultsError, claim_directory
-from birdslam.outputs.drive_video import CODEC, DriveVideo, Floats, Image, check_video
+from birdslam.outputs.drive_video import CODEC, DriveVideo, check_video
 from birdslam.outputs.final_trajectories import FinalTracks, last_seen, write_final_ego
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.maps.drive_earth import rows as earth_rows

@@ -16,11 +16,7 @@ from birdslam.runtime.topology import NODES
 
 
 def summarise(
-    configuration: Configuration,
-    stations: Mapping[str, Station],
-    logbook: Logbook,
-    models: dict[str, Any],
-    ended: str,
+    configuration: Configuration, stations: Mapping[str, Station], logbook: Logbook, models: dict[str, Any], ended: str
 ) -> dict[str, Any]:
     """What summary.json says of the run, beside the recorder's counts."""
     sent = {name: stations[name].total("frames") for name in NODES}

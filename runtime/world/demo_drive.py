@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.progress import with_progress
 from birdslam.sources.recording import DatasetError
-from birdslam.sources.shipped_drive import COLUMNS, LABELS, LINE_COLUMNS, LINE_KINDS, Floats, write_drive
+from birdslam.sources.shipped_drive import COLUMNS, LABELS, LINE_COLUMNS, LINE_KINDS, write_drive
 
 if TYPE_CHECKING:
     from birdslam.world.truth import WorldFrame

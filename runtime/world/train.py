@@ -88,7 +88,7 @@ def _render(seed: int, width_px: int, height_px: int) -> WorldFrame:
 
 
 def _share(parameters: Sequence[torch.nn.Parameter]) -> None:
-    """The mean of all processes' gradients, in each."""
+    """Replaces each gradient by its mean over all processes."""
     gradients = [p.grad for p in parameters if p.grad is not None]
     flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
     distributed.all_reduce(flat)

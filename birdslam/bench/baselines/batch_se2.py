@@ -13,17 +13,15 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.baselines.trajectories import Trajectories, dead_reckoned
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.planar import between, compose, log
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.types import LandmarkEdge, LandmarkKind, Measurements, VehicleEdge
-
-Floats = NDArray[np.float64]
 
 label = "Batch SE(2), same edges"
 

@@ -13,16 +13,14 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.baselines.posegraph3 import BatchConfig, optimise_batch
 from birdslam.bench.baselines.trajectories import Trajectories
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.weights import WeightsConfig
 from birdslam.types import Measurements, VehicleEdge
-
-Floats = NDArray[np.float64]
 
 label = "CubeSLAM"
 

@@ -14,14 +14,12 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.baselines.trajectories import Trajectories, dead_reckoned
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.types import Measurements, VehicleEdge
-
-Floats = NDArray[np.float64]
 
 label = "Namdev et al."
 

@@ -13,16 +13,14 @@ from dataclasses import dataclass
 import gtsam
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.baselines.batch_se2 import landmark_key
 from birdslam.bench.baselines.trajectories import Trajectories
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.trajectory import ego_pose, inverse, split_pose
 from birdslam.types import Attitude, LandmarkEdge, LandmarkKind, Measurements
-
-Floats = NDArray[np.float64]
 
 
 class BatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -14,14 +14,12 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.baselines.trajectories import Method, Trajectories
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.types import Measurements, VehicleEdge
-
-Floats = NDArray[np.float64]
 
 # Keypoints as fractions of length, width and height about the middle of the footprint: the body's corners under and
 # over the bumpers, and the roof's
@@ -58,12 +56,12 @@ class Initialised:
         return self.method.run(fitted(log, camera), camera)
 
 
-def fitted(log: Sequence[Measurements], camera: Camera, config: ShapePriorConfig | None = None) -> list[Measurements]:
+def fitted(log: Sequence[Measurements], camera: Camera) -> list[Measurements]:
     """The log with each CV edge's pose, sizes and covariance by the wireframe; one without a fit is kept as it is."""
     edges = [edge for m in log for edge in m.cv]
     if not edges:
         return list(log)
-    found = iter(_fit(edges, camera, config or ShapePriorConfig()))
+    found = iter(_fit(edges, camera, ShapePriorConfig()))
     return [msgspec.structs.replace(m, cv=tuple(next(found) for _ in m.cv)) for m in log]
 
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.ego import truth_quality
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
@@ -20,8 +20,6 @@ from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
 from birdslam.types import INVALIDATING, EgoEdge, Estimate, Measurements, Status
-
-Floats = NDArray[np.float64]
 
 DIMENSIONS = 3
 MEDIAN = 2.366  # of the chi-square of three degrees of freedom: what a consistent error's squared distance is as often
@@ -135,11 +133,7 @@ class Motions:
         return end
 
     def _judge(
-        self,
-        motions: list[tuple[int, int, SE2, Floats]],
-        truth: Transform,
-        interpolated: NDArray[np.bool_],
-        noise: Floats,
+        self, motions: list[tuple[int, int, SE2, Floats]], truth: Transform, interpolated: Bools, noise: Floats
     ) -> MotionConsistency:
         if not motions:
             return MotionConsistency(n=0)

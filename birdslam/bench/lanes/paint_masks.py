@@ -12,9 +12,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.bench.figures import mean
+from birdslam.geometry.arrays import Bools
 from birdslam.sources.recording import DatasetError
-
-Bools = NDArray[np.bool_]
 
 MARKING, OWN_CAR = (0, 0, 255), (255, 0, 204)  # BGR
 REACH_PX = 5  # from a pixel of the one to one of the other
@@ -82,9 +82,9 @@ def report_of(network: str, scores: list[PaintScore]) -> PaintReport:
     return PaintReport(
         network=network,
         images=len(scores),
-        precision=_mean([s.precision for s in scores if s.true_px]),
-        recall=_mean([s.recall for s in scores]),
-        recall_by_night=_mean([s.recall for s in scores if s.night]),
+        precision=mean([s.precision for s in scores if s.true_px]),
+        recall=mean([s.recall for s in scores]),
+        recall_by_night=mean([s.recall for s in scores if s.night]),
         by_image=tuple(scores),
     )
 
@@ -97,8 +97,3 @@ def _share_near(some: Bools, others: Bools) -> float | None:
         return 0.0
     distance_px = cv2.distanceTransform((~others).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return float(np.mean(np.asarray(distance_px)[some] <= REACH_PX))
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None

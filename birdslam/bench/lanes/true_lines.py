@@ -7,17 +7,14 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.bench.figures import median
 from birdslam.sources.shipped_drive import TrueLine
 from birdslam.types import Bound, Lane, LaneLine, Lanes, LineKind
-
-Floats = NDArray[np.float64]
 
 RANGES_M = (5.0, 10.0, 20.0, 30.0)
 MATCH_AT_M, MATCH_M = 10.0, 1.0  # a found line is the true one that is nearest here, within so much
 SIDE_M = 6.0  # true lines of the ego's lane and its neighbours: these are to be found
-TWIN_M = 0.6  # true lines nearer to each other are one bound
 RIGHT_M = 0.5  # of a lane's bounds, for it to be the ego's
 KERB = "kerb"
 
@@ -127,12 +124,12 @@ class LineScores:
             drive=drive,
             frames=self.frames,
             ranges=tuple(_range_score(x, self.errors[x]) for x in RANGES_M),
-            heading_error_median_deg=float(np.degrees(np.median(np.abs(self.headings)))) if self.headings else None,
+            heading_error_median_deg=median(np.degrees(np.abs(self.headings))),
             recall=self.found / self.seen if self.seen else None,
             false_lines_per_km=len(self.false_ids) / driven_m * 1e3 if driven_m > 0.0 else None,
             ego_lane_share=self.with_lane / max(self.frames, 1),
             ego_lane_wrong=self.wrong / max(self.frames, 1),
-            width_error_rel=float(np.median(self.widths)) if self.widths else None,
+            width_error_rel=median(self.widths),
             jitter_m=float(np.std(self.changes)) if self.changes else None,
             found_after_s=self.first_right_s,
         )

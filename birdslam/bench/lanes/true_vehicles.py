@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
+from birdslam.bench.figures import mean, median
 from birdslam.bench.lanes.true_lines import KERB, ego_bounds, y_at
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.shipped_drive import TrueBody, TrueLine
@@ -81,11 +82,11 @@ class VehicleScores:
         """What was collected."""
         return VehiclesReport(
             vehicles=len(self._right),
-            right=float(np.mean(self._right)) if self._right else None,
-            log_loss=float(np.mean(self._losses)) if self._losses else None,
+            right=mean(self._right),
+            log_loss=mean(self._losses),
             leaders=len(self._leaders),
-            leader_right=float(np.mean(self._leaders)) if self._leaders else None,
-            gap_error_median_m=float(np.median(self._gaps)) if self._gaps else None,
+            leader_right=mean(self._leaders),
+            gap_error_median_m=median(self._gaps),
             gap_error_p95_m=float(np.quantile(self._gaps, 0.95)) if self._gaps else None,
         )
 

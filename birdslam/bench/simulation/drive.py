@@ -12,13 +12,12 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.planar import between, compose, exp
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.types import EgoEdge, LandmarkEdge, LanePoint, Measurements, MotionEdge, Status, VehicleEdge
 
-Floats = NDArray[np.float64]
 Count = Annotated[int, msgspec.Meta(ge=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 

@@ -12,12 +12,10 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.types import LandmarkEdge, Measurements
-
-Floats = NDArray[np.float64]
 
 SPAN = 4  # frames: as far as the graph ties a key frame to the one before
 LEAST_M = 1.0  # a shorter way's length says nothing of the scale

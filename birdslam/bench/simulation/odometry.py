@@ -15,20 +15,21 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
+from birdslam.odometry.external import WithoutImages
 from birdslam.odometry.motion import Motion, planar
 from birdslam.trajectory import Transform, inverse
 from birdslam.types import LandmarkEdge, SpeedReading, Status
 
-Floats = NDArray[np.float64]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+LAGS = 8  # frames over which `fit_drift` looks at what errors have in common
 
 
 class Drift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -95,10 +96,11 @@ class Walk:
         return out
 
 
-class SimulatedOdometry:
+class SimulatedOdometry(WithoutImages):
     """An EgoMotion of the front end from `poses` (N, 4, 4): `T_first_i` of the camera; frame ids are their rows.
 
-    `true_poses`, where `poses` are already someone's odometry, say where the camera was when it saw the landmarks.
+    `landmarks` gives the CP edges. `true_poses`, where `poses` are already someone's odometry, say where the camera was
+    when it saw the landmarks.
     """
 
     def __init__(
@@ -123,21 +125,13 @@ class SimulatedOdometry:
         self._next_landmark = 0
         self._last_frame: int | None = None
 
-    @property
-    def road_tracks(self) -> tuple[NDArray[np.int64], Floats]:
-        """Empty: no corners are followed without images. `landmarks` gives the CP edges instead."""
-        return np.zeros(0, np.int64), np.zeros((0, 2))
-
-    def track(self, image: NDArray[np.uint8]) -> None:
-        """Does nothing: no image is needed."""
-
     def estimate(
         self,
         tracks: None,
         frame_id: int,
         t_source_ns: int,
         vehicle_boxes_px: Floats,
-        road_mask: NDArray[np.bool_] | None = None,
+        road_mask: Bools | None = None,
         speeds: Sequence[SpeedReading] = (),
     ) -> Motion | None:
         """The motion since the last frame; None for the first one. The car's own speed is not simulated."""
@@ -216,7 +210,7 @@ def _on_road(camera: Camera, poses: Transform) -> list[SE2]:
     return out
 
 
-def fit_drift(errors: list[Floats], weights: list[Floats], lags: int = 8) -> Drift:
+def fit_drift(errors: list[Floats], weights: list[Floats]) -> Drift:
     """The Drift of measured errors, one series (N,) for each clip, each with the weights (N,) of its errors.
 
     The slow part is what errors of frames close by have in common (mean of the products over lags 1-3, about zero, so
@@ -231,10 +225,8 @@ def fit_drift(errors: list[Floats], weights: list[Floats], lags: int = 8) -> Dri
         total = sum(float(w.sum()) for _, w in pairs)
         return sum(float((e * w).sum()) for e, w in pairs) / max(total, 1e-12)
 
-    variance, shared = product(0), [product(lag) for lag in range(1, lags + 1)]
+    variance, shared = product(0), [product(lag) for lag in range(1, LAGS + 1)]
     slow = min(max(float(np.mean(shared[:3])), 0.0), variance)
     late = max(float(np.mean(shared[-3:])), 0.05 * slow)
     decay = math.log(max(slow / late, 1.05)) if slow > 0.0 else 1.0
-    return Drift(
-        white=math.sqrt(max(variance - slow, 0.0)), slow=math.sqrt(slow), memory_frames=(lags - 1.0 - 2.0) / decay
-    )
+    return Drift(white=math.sqrt(max(variance - slow, 0.0)), slow=math.sqrt(slow), memory_frames=(LAGS - 3.0) / decay)

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import DESCRIPTOR_BYTES, Features
 from birdslam.trajectory import ego_pose, inverse, mount_pose
 from birdslam.types import NS_PER_S, Attitude, Estimate
-
-Floats = NDArray[np.float64]
 
 CAMERA = Camera(width_px=1242, height_px=375, fx_px=720.0, fy_px=720.0, cx_px=621.0, cy_px=180.0, height_m=1.65)
 CORNERS_PER_M = 4.0

@@ -10,17 +10,16 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.simulation.odometry import OdometryNoise, SimulatedOdometry, Walk
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import GroundPlane
+from birdslam.odometry.external import WithoutImages
 from birdslam.odometry.motion import Motion
 from birdslam.types import SpeedReading
 
-Floats = NDArray[np.float64]
 
-
-class TiltFromImages:
+class TiltFromImages(WithoutImages):
     """An EgoMotion: a simulated one, that reports the road's pitch and roll as the images would, while it drives.
 
     `grounds` are the true ones, by frame; where one is None, none is reported anew.
@@ -38,21 +37,13 @@ class TiltFromImages:
         self._cov = np.diag([noise.ground_rad.sigma**2, noise.roll_rad.sigma**2])
         self._reported = odometry.camera.ground
 
-    @property
-    def road_tracks(self) -> tuple[NDArray[np.int64], Floats]:
-        """Empty, as the simulated one's."""
-        return self._odometry.road_tracks
-
-    def track(self, image: NDArray[np.uint8]) -> None:
-        """Does nothing: no image is needed."""
-
     def estimate(
         self,
         tracks: None,
         frame_id: int,
         t_source_ns: int,
         vehicle_boxes_px: Floats,
-        road_mask: NDArray[np.bool_] | None = None,
+        road_mask: Bools | None = None,
         speeds: Sequence[SpeedReading] = (),
     ) -> Motion | None:
         """The simulated motion, with the road's tilt."""

@@ -17,16 +17,9 @@ from numpy.typing import NDArray
 from birdslam.bench.baselines import batch_se3, cubeslam, nair, namdev
 from birdslam.bench.baselines.shape_prior import Initialised
 from birdslam.bench.baselines.trajectories import LiveTrajectories, Method, Trajectories
+from birdslam.bench.figures import median
 from birdslam.bench.simulation.odometry import SimulatedOdometry
-from birdslam.bench.tracking.metrics import (
-    BoxFrame,
-    PathErrors,
-    count_boxes,
-    hota,
-    idf1,
-    match_vehicles,
-    path_errors,
-)
+from birdslam.bench.tracking.metrics import BoxFrame, PathErrors, count_boxes, hota, idf1, match_vehicles, path_errors
 from birdslam.frontend import EgoMotion, FrontEnd, FrontEndConfig, Pending
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
@@ -298,24 +291,19 @@ def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odome
                     frames=frames,
                     frames_labelled=labelled,
                     seeds=len(trials),
-                    ate_m=_median([errors.ate_m for errors in seen]),
+                    ate_m=median([errors.ate_m for errors in seen]),
                     ate_m_spread=float(np.std([errors.ate_m for errors in seen])) if seen else None,
-                    rpe_t_m=_median([errors.rpe_t_m for errors in seen]),
-                    rpe_r_deg=_median([errors.rpe_r_deg for errors in seen]),
-                    motion_error_m=_median([errors.motion_error_m for errors in seen]),
-                    hota=_median([trial.hota for trial in trials]) if is_ego else None,
-                    idf1=_median([trial.idf1 for trial in trials]) if is_ego else None,
+                    rpe_t_m=median([errors.rpe_t_m for errors in seen]),
+                    rpe_r_deg=median([errors.rpe_r_deg for errors in seen]),
+                    motion_error_m=median([errors.motion_error_m for errors in seen]),
+                    hota=median([trial.hota for trial in trials]) if is_ego else None,
+                    idf1=median([trial.idf1 for trial in trials]) if is_ego else None,
                     odometry=odometry,
                     detections=detections,
-                    tracks=_median([trial.tracks.get(body) for trial in trials]),
+                    tracks=median([trial.tracks.get(body) for trial in trials]),
                 )
             )
     return rows
-
-
-def _median(values: Iterable[float | None]) -> float | None:
-    numbers = [value for value in values if value is not None]
-    return float(np.median(numbers)) if numbers else None
 
 
 def mean_ate_m(rows: Iterable[Row], method: str, bodies: Mapping[str, Iterable[str]]) -> float | None:

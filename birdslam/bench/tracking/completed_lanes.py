@@ -21,7 +21,7 @@ from birdslam.types import LandmarkKind, Measurements
 CONFIG = LaneEdgesConfig(least_points=4)
 
 
-def with_completed_lanes(log: Sequence[Measurements], config: LaneEdgesConfig = CONFIG) -> list[Measurements]:
+def with_completed_lanes(log: Sequence[Measurements]) -> list[Measurements]:
     """The log with CP edges to stations of its completed lanes in place of those of lanes that single frames saw.
 
     A station is known across its lane, by the width of a marking, and as good as unknown along it.
@@ -34,10 +34,10 @@ def with_completed_lanes(log: Sequence[Measurements], config: LaneEdgesConfig = 
         if known:
             T_world_ego = ego[m.frame_id]
             points_m = T_world_ego @ np.array([[point.x_m, point.y_m] for point in known])
-            for landmark, point_m, along in stations(points_m, np.array([point.lane for point in known]), config):
+            for landmark, point_m, along in stations(points_m, np.array([point.lane for point in known]), CONFIG):
                 across = np.array([-along[1], along[0]])
-                cov = np.outer(across, across) * config.sigma_across_m**2
-                cov += np.outer(along, along) * config.sigma_along_m**2
+                cov = np.outer(across, across) * CONFIG.sigma_across_m**2
+                cov += np.outer(along, along) * CONFIG.sigma_along_m**2
                 cp.append(Station(landmark, point_m, cov).edge(m.frame_id, T_world_ego))
         out.append(replace(m, cp=tuple(cp)))
     return out

@@ -11,18 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.ego.trajectory_errors import rms
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.planar import between
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.kitti_tracking import VEHICLE_KINDS
 from birdslam.sources.label_projection import Label
 from birdslam.sources.recording import DatasetError
 from birdslam.vehicles.placement.localisation import iou
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MATCH_IOU = 0.5
 HOTA_IOU = np.arange(0.05, 0.99, 0.05)
@@ -145,15 +142,15 @@ def hota_parts(frames: Sequence[BoxFrame]) -> Hota | None:
 
 @dataclass(frozen=True)
 class Identities:
-    """CLEAR MOT (Bernardin and Stiefelhagen 2008) and IDF1 at one threshold."""
+    """CLEAR MOT (Bernardin and Stiefelhagen 2008) and IDF1 at MATCH_IOU."""
 
     mota: float
     idf1: float
     switches: int
 
 
-def identities(frames: Sequence[BoxFrame], least: float = MATCH_IOU) -> Identities:
-    """By motmetrics: a pair is possible where it overlaps by `least`, who was matched before stays so where it can.
+def identities(frames: Sequence[BoxFrame]) -> Identities:
+    """By motmetrics: a pair is possible where it overlaps by MATCH_IOU, who was matched before stays so where it can.
 
     Without labels MOTA and IDF1 are 0. Raises DatasetError where motmetrics is not installed.
     """
@@ -163,7 +160,7 @@ def identities(frames: Sequence[BoxFrame], least: float = MATCH_IOU) -> Identiti
         raise DatasetError("tracks are judged by motmetrics: pip install 'birdslam[evaluate]'") from None
     events = motmetrics.MOTAccumulator(auto_id=True)
     for frame in frames:
-        distance = np.where(frame.overlap >= least - 1e-9, 1.0 - frame.overlap, np.nan)
+        distance = np.where(frame.overlap >= MATCH_IOU - 1e-9, 1.0 - frame.overlap, np.nan)
         events.update(frame.labels.tolist(), frame.tracks.tolist(), distance)
     asked = ["mota", "idf1", "num_switches"]
     found = motmetrics.metrics.create().compute(events, metrics=asked, return_dataframe=False)

@@ -1,7 +1,7 @@
-"""Which tracks of labelled vehicles are told to drive though they stand, and how soon those that drive are told.
+"""Which tracks of standing vehicles are reported to drive, and how soon those of driving ones are.
 
-A track is one of our ids on one label, by the boxes' overlap. Whether it stands or drives is told by its labels half a
-second before and after. It is told to drive where an estimate has decided so, and has a speed that shows in a picture.
+A track is one of our ids on one label, by the boxes' overlap. Whether it stands or drives is judged by its labels half
+a second before and after. It is reported to drive where an estimate says so with a speed that shows in a picture.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SOON_S = 1.0
 
 
 class FalseMover(msgspec.Struct, frozen=True, kw_only=True):
-    """A standing vehicle at the first sight at which it was told to drive."""
+    """A standing vehicle at the first sight at which it was reported to drive."""
 
     vehicle: int
     label: int
@@ -32,11 +32,11 @@ class FalseMover(msgspec.Struct, frozen=True, kw_only=True):
     x_m: float  # ahead of the ego
     y_m: float
     told_mps: float
-    sights: int  # at which it was told so
+    sights: int  # at which it was reported so
 
 
 class MoversRow(msgspec.Struct, frozen=True, kw_only=True):
-    """Tracks of one sequence. `soon`: told to drive within SOON_S of the first sight of it driving."""
+    """Tracks of one sequence. `soon`: reported to drive within SOON_S of the first sight of it driving."""
 
     sequence: str
     odometry: str
@@ -93,7 +93,7 @@ def label_speeds_mps(sequence: TrackingSequence) -> dict[tuple[int, int], float]
     return out
 
 
-def is_told_to_drive(vehicle: VehicleEstimate) -> bool:
+def is_reported_driving(vehicle: VehicleEstimate) -> bool:
     return vehicle.moves is Moves.DRIVING and math.hypot(*vehicle.velocity_mps) > REPORTED_DRIVING_MPS
 
 
@@ -104,10 +104,10 @@ def _stands(seen: Sequence[tuple[int, float, VehicleEstimate]]) -> bool:
 def _false_mover(
     sequence: TrackingSequence, vehicle: int, label: int, seen: Sequence[tuple[int, float, VehicleEstimate]]
 ) -> FalseMover | None:
-    told = [(frame, estimate) for frame, _, estimate in seen if is_told_to_drive(estimate)]
-    if not told:
+    reported = [(frame, estimate) for frame, _, estimate in seen if is_reported_driving(estimate)]
+    if not reported:
         return None
-    frame, estimate = told[0]
+    frame, estimate = reported[0]
     (truth,) = [one for one in sequence.labels_of(frame) if one.track == label]
     at = sequence.vehicle_truth(truth, frame)
     return FalseMover(
@@ -117,7 +117,7 @@ def _false_mover(
         x_m=at.x_m,
         y_m=at.y_m,
         told_mps=math.hypot(*estimate.velocity_mps),
-        sights=len(told),
+        sights=len(reported),
     )
 
 
@@ -126,5 +126,5 @@ def _delay_s(seen: Sequence[tuple[int, float, VehicleEstimate]]) -> float | None
     drives = [frame for frame, speed, _ in seen if speed > DRIVES_MPS]
     if len(drives) < SOON_S * KITTI_RATE_HZ:
         return None
-    told = [frame for frame, _, estimate in seen if frame >= drives[0] and is_told_to_drive(estimate)]
-    return (told[0] - drives[0]) / KITTI_RATE_HZ if told else math.inf
+    reported = [frame for frame, _, estimate in seen if frame >= drives[0] and is_reported_driving(estimate)]
+    return (reported[0] - drives[0]) / KITTI_RATE_HZ if reported else math.inf

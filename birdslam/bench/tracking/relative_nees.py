@@ -12,17 +12,15 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.ego.motion_consistency import STRETCH_M, MotionConsistency, Motions
 from birdslam.bench.tracking.benchmark import Live, Truth
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.trajectory import inverse
 from birdslam.types import Measurements
-
-Floats = NDArray[np.float64]
 
 PLACE = 2  # degrees of freedom
 SIMULATED = ("simulate", "truth")  # odometries that err from the true poses themselves
@@ -46,11 +44,11 @@ def nees_rows(sequence: TrackingSequence, log: Sequence[Measurements], live: Liv
     """The rows of one log; vehicles as `live` has them."""
     truth, motions = Truth.of(sequence, log), Motions(sequence.camera.ground)
     graph = PoseGraph(live.graph, live.weights)
-    told = []
+    estimated = []
     for m in log:
         motions.add(m)
         graph.optimise(m)
-        told.append(graph.vehicles_in_ego())
+        estimated.append(graph.vehicles_in_ego())
     first = log[0].frame_id
     poses = sequence.camera_poses[first : first + len(log)]
     camera = inverse(poses[0]) @ poses
@@ -60,9 +58,9 @@ def nees_rows(sequence: TrackingSequence, log: Sequence[Measurements], live: Liv
     per_stretch: dict[int, list[float]] = defaultdict(list)
     for k, m in enumerate(log):
         for label, vehicle in truth.matches[m.frame_id].items():
-            if vehicle not in told[k] or m.frame_id not in truth.vehicles[label]:
+            if vehicle not in estimated[k] or m.frame_id not in truth.vehicles[label]:
                 continue
-            (T_ego_vehicle, cov), goal = told[k][vehicle], truth.vehicles[label][m.frame_id]
+            (T_ego_vehicle, cov), goal = estimated[k][vehicle], truth.vehicles[label][m.frame_id]
             per_frame[label].append(_nees(T_ego_vehicle, cov[:2, :2], truth.ego[m.frame_id].between(goal)))
             if k in stretches:
                 begin, T_begin_ego, cov_ego = stretches[k]
@@ -128,6 +126,6 @@ def _ego_rows(sequence: str, odometry: str, per: str, found: MotionConsistency) 
     return [ego, scale]
 
 
-def _nees(told: SE2, cov: Floats, goal: SE2) -> float:
-    error = np.array([told.x_m - goal.x_m, told.y_m - goal.y_m])
+def _nees(estimated: SE2, cov: Floats, goal: SE2) -> float:
+    error = np.array([estimated.x_m - goal.x_m, estimated.y_m - goal.y_m])
     return float(error @ np.linalg.solve(cov, error))

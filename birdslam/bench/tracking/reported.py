@@ -2,7 +2,7 @@
 
 Unlike the paper's tables this needs no track to overlap a label in the image: a car is *found* where an estimate stands
 within 20 % of its distance ahead and 1.5 m across. Asked for are cars that KITTI would ask for as moderate: 25 px or
-more high, hardly occluded, not truncated. Whether one stands or drives is told by its labels half a second before and
+more high, hardly occluded, not truncated. Whether one stands or drives is judged by its labels half a second before and
 after, since a label jitters by some centimetres from frame to frame.
 """
 
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from birdslam.bench.figures import median
 from birdslam.bench.tracking.localisation import MEASURED_KIND, RANGES_M
 from birdslam.bench.tracking.metrics import LEAST_HEIGHT_PX, least_cost
 from birdslam.sources.kitti import KITTI_RATE_HZ
@@ -109,11 +110,11 @@ def _sight(
 def _matched(
     sequence: TrackingSequence, asked: Sequence[Label], seen: Sequence[Sight], estimate: Estimate
 ) -> list[Sight]:
-    told = [(v, estimate.T_world_ego.between(v.T_world_vehicle)) for v in estimate.vehicles]
-    if not asked or not told:
+    reported = [(v, estimate.T_world_ego.between(v.T_world_vehicle)) for v in estimate.vehicles]
+    if not asked or not reported:
         return list(seen)
     truths = [sequence.vehicle_truth(label, label.frame) for label in asked]
-    errors = np.array([[(p.x_m - t.x_m, p.y_m - t.y_m) for _, p in told] for t in truths])
+    errors = np.array([[(p.x_m - t.x_m, p.y_m - t.y_m) for _, p in reported] for t in truths])
     ahead_m = np.maximum(np.array([[t.x_m] for t in truths]), 1e-3)
     may_be = (np.abs(errors[..., 0]) <= FOUND_AHEAD_REL * ahead_m) & (np.abs(errors[..., 1]) <= FOUND_ACROSS_M)
     distance = np.hypot(errors[..., 0] / (FOUND_AHEAD_REL * ahead_m), errors[..., 1] / FOUND_ACROSS_M)
@@ -125,8 +126,8 @@ def _matched(
                 out[i].x_m,
                 out[i].velocity_mps,
                 (float(errors[i, j, 0]), float(errors[i, j, 1])),
-                _velocity_in_ego(told[j][0], estimate),
-                _sigma_of_speed(told[j][0]),
+                _velocity_in_ego(reported[j][0], estimate),
+                _sigma_of_speed(reported[j][0]),
             )
     return out
 
@@ -176,14 +177,14 @@ def _range_row(sequence: str, span: str, seen: Sequence[Sight]) -> RangeRow:
 def motion_row(sequence: str, seen: Sequence[Sight]) -> MotionRow:
     """Over all found cars whose label's speed is known."""
     known = [(s.velocity_mps, s.reported_mps, s.reported_sigma_mps) for s in seen]
-    pairs = [(truth, told, sigma) for truth, told, sigma in known if truth is not None and told is not None]
-    errors = [math.dist(truth, told) for truth, told, _ in pairs]
-    standing = [(math.hypot(*told), sigma) for truth, told, sigma in pairs if math.hypot(*truth) < STANDS_MPS]
-    driving = [(math.hypot(*told), sigma) for truth, told, sigma in pairs if math.hypot(*truth) > DRIVES_MPS]
+    pairs = [(truth, reported, sigma) for truth, reported, sigma in known if truth is not None and reported is not None]
+    errors = [math.dist(truth, reported) for truth, reported, _ in pairs]
+    standing = [(math.hypot(*reported), sigma) for truth, reported, sigma in pairs if math.hypot(*truth) < STANDS_MPS]
+    driving = [(math.hypot(*reported), sigma) for truth, reported, sigma in pairs if math.hypot(*truth) > DRIVES_MPS]
     return MotionRow(
         sequence=sequence,
         asked=len(pairs),
-        velocity_error_median_mps=float(np.median(errors)) if errors else None,
+        velocity_error_median_mps=median(errors),
         standing=len(standing),
         false_movers=sum(speed > REPORTED_DRIVING_MPS for speed, _ in standing),
         false_movers_sure=sum(speed - 2.0 * sigma > REPORTED_DRIVING_MPS for speed, sigma in standing),

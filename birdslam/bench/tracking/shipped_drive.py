@@ -11,17 +11,16 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.ego.trajectory_errors import compare, from_first
+from birdslam.bench.figures import median
 from birdslam.bench.tracking.metrics import least_cost, path_errors
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.sources.shipped_drive import DemoRecording, TrueBody
 from birdslam.trajectory import CameraTrajectory, as_poses, ego_pose, inverse, mount_pose, split_pose
 from birdslam.types import Estimate, VehicleEstimate
-
-Floats = NDArray[np.float64]
 
 VEHICLES = ("car", "van", "truck", "bus")
 ASKED_VISIBLE, ASKED_TRUNCATED, ASKED_RANGE_M = 0.5, 0.2, (4.0, 40.0)  # bodies that are to be found
@@ -117,9 +116,9 @@ def grade(recording: DemoRecording, estimates: Sequence[Estimate]) -> DemoGrade:
         ego_ate_pct=ego.ate_pct,
         ego_scale_error=ego.scale_error,
         vehicles=len(ates),
-        vehicle_ate_m=float(np.median(ates)) if ates else None,
-        vehicle_centre_m=float(np.median(distance)) if errors else None,
-        vehicle_centre_rel=float(np.median(distance / reach)) if errors else None,
+        vehicle_ate_m=median(ates),
+        vehicle_centre_m=median(distance),
+        vehicle_centre_rel=median(distance / reach),
         found=found / asked if asked else None,
         reported=reported / asked if asked else None,
     )

@@ -8,10 +8,10 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
+from birdslam.bench.figures import markdown, mean, number
 from birdslam.bench.tracking.benchmark import EGO, Row, mean_ate_m
 from birdslam.bench.tracking.movers import MoversRow
 from birdslam.bench.tracking.relative_nees import NeesRow
@@ -146,17 +146,17 @@ def methods_table(rows: Sequence[Row], published: Published, ego: bool) -> str:
                 any_row = next(iter(of.values()), None)
                 line = [sequence, body, odometry_title(odometry)]
                 line.append("" if any_row is None else f"{any_row.frames:g} of {any_row.frames_labelled}")
-                line += [_number(table.ate_m.get(name, {}).get(sequence, {}).get(body)) for name in METHOD_TITLES]
+                line += [number(table.ate_m.get(name, {}).get(sequence, {}).get(body)) for name in METHOD_TITLES]
                 line += [_row_number(of.get(name)) for name in (*redone, *own)]
                 lines.append(line)
     for odometry in dict.fromkeys(row.odometry for row in rows) or ("",):
         alike = [row for row in rows if row.odometry == odometry]
         present = _present(alike, bodies)
         means: list[str] = ["mean", "of those at hand", odometry_title(odometry), ""]
-        means += [_number(_published_mean(table.ate_m.get(name, {}), present)) for name in METHOD_TITLES]
-        means += [_number(mean_ate_m(alike, name, present)) for name in (*redone, *own)]
+        means += [number(_published_mean(table.ate_m.get(name, {}), present)) for name in METHOD_TITLES]
+        means += [number(mean_ate_m(alike, name, present)) for name in (*redone, *own)]
         lines.append(means)
-    return _markdown(head, lines)
+    return markdown(head, lines)
 
 
 def odometry_title(odometry: str) -> str:
@@ -179,15 +179,15 @@ def variants_table(rows: Sequence[Row], published: Published, table: PublishedTa
             of = {row.method: row for row in rows if (row.sequence, row.body) == (sequence, body)}
             line = [sequence, body]
             for column in columns:
-                line.append(_number(table.ate_m[column].get(sequence, {}).get(body)))
+                line.append(number(table.ate_m[column].get(sequence, {}).get(body)))
                 line += [_row_number(of.get(prefix + column), spread=False) for _, prefix in sources]
             lines.append(line)
     present = _present(rows, bodies)
     means = ["mean", "of those at hand"]
     for column in columns:
-        means.append(_number(_published_mean(table.ate_m[column], present)))
-        means += [_number(mean_ate_m(rows, prefix + column, present)) for _, prefix in sources]
-    return _markdown(head, [*lines, means])
+        means.append(number(_published_mean(table.ate_m[column], present)))
+        means += [number(mean_ate_m(rows, prefix + column, present)) for _, prefix in sources]
+    return markdown(head, [*lines, means])
 
 
 def ideas_table(rows: Sequence[Row], published: Published) -> str:
@@ -198,11 +198,11 @@ def ideas_table(rows: Sequence[Row], published: Published) -> str:
     lines = []
     for name in _chosen(rows):
         of = {(row.sequence, row.body): row for row in rows if row.method == name}
-        means = [_mean(of[at].ate_m for at in some if at in of) for some in (cars, egos)]
+        means = [mean(of[at].ate_m for at in some if at in of) for some in (cars, egos)]
         cells = [_row_number(of.get(at)) for at in (*cars, *egos)]
-        lines.append([name.removeprefix("ideas/"), *cells, *map(_number, means)])
+        lines.append([name.removeprefix("ideas/"), *cells, *map(number, means)])
     titles = [f"{sequence}/{body}" for sequence, body in (*cars, *egos)]
-    return _markdown(["ours over the paper", *titles, "mean, cars", "mean, ego"], lines)
+    return markdown(["ours over the paper", *titles, "mean, cars", "mean, ego"], lines)
 
 
 def lanes_table(rows: Sequence[Row], published: Published) -> str:
@@ -222,14 +222,14 @@ def lanes_table(rows: Sequence[Row], published: Published) -> str:
             for odometry in dict.fromkeys(row.odometry for row in here) or ("",):
                 of = {row.method: row for row in here if row.odometry == odometry}
                 any_row = next(iter(of.values()), None)
-                line = [sequence, body, odometry_title(odometry), _number(frames, 0)]
+                line = [sequence, body, odometry_title(odometry), number(frames, 0)]
                 line.append("" if any_row is None else f"{any_row.frames:g}")
                 for column in LANES:
-                    line.append(_number(table.ate_m[column].get(sequence, {}).get(body)))
+                    line.append(number(table.ate_m[column].get(sequence, {}).get(body)))
                     line.append(_row_number(of.get(column), spread=False))
                 line += [_row_number(of.get(column), spread=False) for column in LANES_OF_IMAGES]
                 lines.append(line)
-    return _markdown(head, lines)
+    return markdown(head, lines)
 
 
 def tracks_table(rows: Sequence[Row], method: str) -> str:
@@ -244,14 +244,14 @@ def tracks_table(rows: Sequence[Row], method: str) -> str:
         line = [
             ego.sequence,
             odometry_title(ego.odometry),
-            _number(ego.hota, 3),
-            _number(ego.idf1, 3),
-            _number(ego.rpe_t_m, 3),
+            number(ego.hota, 3),
+            number(ego.idf1, 3),
+            number(ego.rpe_t_m, 3),
         ]
-        line += [_number(ego.rpe_r_deg, 3), str(len(cars)), _number(_mean(car.tracks for car in cars))]
-        line += [_number(_mean(getattr(car, name) for car in cars)) for name in ("ate_m", "rpe_t_m", "rpe_r_deg")]
-        lines.append([*line, _number(_mean(car.motion_error_m for car in cars))])
-    return _markdown(head, lines)
+        line += [number(ego.rpe_r_deg, 3), str(len(cars)), number(mean(car.tracks for car in cars))]
+        line += [number(mean(getattr(car, name) for car in cars)) for name in ("ate_m", "rpe_t_m", "rpe_r_deg")]
+        lines.append([*line, number(mean(car.motion_error_m for car in cars))])
+    return markdown(head, lines)
 
 
 def ranges_table(rows: Sequence[RangeRow]) -> str:
@@ -262,36 +262,45 @@ def ranges_table(rows: Sequence[RangeRow]) -> str:
             row.sequence,
             row.range,
             str(row.asked),
-            _number(row.found / row.asked if row.asked else None),
+            number(row.found / row.asked if row.asked else None),
             _percent(row.depth_error_median_rel),
             _percent(row.depth_bias_median_rel),
-            _number(row.across_error_median_m),
+            number(row.across_error_median_m),
         ]
         for row in rows
     ]
-    return _markdown(head, lines)
+    return markdown(head, lines)
 
 
 def motion_table(rows: Sequence[MotionRow]) -> str:
-    """Of the found cars: their velocities, and how many standing and driving ones were told as the other."""
+    """Of the found cars: their velocities, and how many standing and driving ones were reported as the other."""
     head = ["Seq", "sights", "velocity error m/s", "standing", "false movers", "sure of it"]
     head += ["driving", "missed movers", "sure of it"]
     lines = [
         [
             row.sequence,
             str(row.asked),
-            _number(row.velocity_error_median_mps),
+            number(row.velocity_error_median_mps),
             *map(str, (row.standing, row.false_movers, row.false_movers_sure)),
             *map(str, (row.driving, row.missed_movers, row.missed_movers_sure)),
         ]
         for row in rows
     ]
-    return _markdown(head, lines)
+    return markdown(head, lines)
 
 
 def movers_table(rows: Sequence[MoversRow]) -> str:
-    """Tracks of standing vehicles that are told to drive, and of driving ones that are told so, and in all."""
-    head = ["Seq", "odometry", "standing", "told to drive", "driving", "told", "soon", "where (ahead, left in m: m/s)"]
+    """Tracks of standing vehicles that are reported to drive, and of driving ones that are, and in all."""
+    head = [
+        "Seq",
+        "odometry",
+        "standing",
+        "reported to drive",
+        "driving",
+        "reported",
+        "soon",
+        "where (ahead, left in m: m/s)",
+    ]
     lines = [
         [
             row.sequence,
@@ -304,7 +313,7 @@ def movers_table(rows: Sequence[MoversRow]) -> str:
     sums = [
         sum(count) for count in zip(*((r.standing, len(r.false), r.driving, r.told, r.soon) for r in rows), strict=True)
     ]
-    return _markdown(head, [*lines, ["all", "", *map(str, sums), ""]])
+    return markdown(head, [*lines, ["all", "", *map(str, sums), ""]])
 
 
 def nees_table(rows: Sequence[NeesRow]) -> str:
@@ -317,12 +326,12 @@ def nees_table(rows: Sequence[NeesRow]) -> str:
             row.of,
             row.per,
             f"{row.n} of {row.bodies}" if row.of == "vehicles" else str(row.n),
-            _number(row.nees),
-            _number(row.nees_median),
+            number(row.nees),
+            number(row.nees_median),
         ]
         for row in rows
     ]
-    return _markdown(head, lines)
+    return markdown(head, lines)
 
 
 def _percent(value: float | None) -> str:
@@ -340,16 +349,7 @@ def _present(rows: Iterable[Row], bodies: Mapping[str, Sequence[str]]) -> dict[s
 
 def _published_mean(cells: Cells, bodies: Mapping[str, Sequence[str]]) -> float | None:
     numbers = [cells.get(sequence, {}).get(body) for sequence, names in bodies.items() for body in names]
-    return _mean(numbers) if None not in numbers else None
-
-
-def _mean(numbers: Iterable[Any]) -> float | None:
-    known = [float(number) for number in numbers if number is not None]
-    return sum(known) / len(known) if known else None
-
-
-def _number(value: float | None, digits: int = 2) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+    return mean(numbers) if None not in numbers else None
 
 
 def _row_number(row: Row | None, spread: bool = True) -> str:
@@ -358,8 +358,3 @@ def _row_number(row: Row | None, spread: bool = True) -> str:
     return f"{row.ate_m:.2f}" + (
         f" ± {row.ate_m_spread:.2f}" if spread and row.seeds > 1 and row.ate_m_spread is not None else ""
     )
-
-
-def _markdown(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    rows = [head, ["---"] * len(head), *lines]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"

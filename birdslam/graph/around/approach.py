@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from birdslam.graph.costs import Complexes, Floats
+from birdslam.geometry.arrays import Floats
+from birdslam.graph.costs import Complexes
 from birdslam.types import Approach
 
 HORIZON_S = 30.0  # a later approach is told as it would be then

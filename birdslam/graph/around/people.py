@@ -13,9 +13,9 @@ from itertools import chain
 
 import numpy as np
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.approach import approaches
-from birdslam.graph.costs import Floats
 from birdslam.types import FollowedPerson, RoadUser
 
 MOST = 60  # the nearest; a message and a frame's time have their limits

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.graph.costs import Floats, Triple
+from birdslam.graph.costs import Triple
 from birdslam.graph.edges import PoseEdges
 from birdslam.graph.vehicles import Associations, VehicleNodes
 from birdslam.graph.window import Window

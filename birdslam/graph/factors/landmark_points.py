@@ -14,7 +14,8 @@ from itertools import chain
 import msgspec
 import numpy as np
 
-from birdslam.graph.costs import Complexes, Floats, Rows, inflation, point_costs
+from birdslam.geometry.arrays import Floats
+from birdslam.graph.costs import Complexes, Rows, inflation, point_costs
 from birdslam.graph.edges import LARGEST_M
 from birdslam.graph.factors.factor import Factor, GraphFrame, Linearised
 from birdslam.graph.graph_config import GraphConfig

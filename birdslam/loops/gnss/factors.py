@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import PlaceFactor, close_loops, inliers
 from birdslam.loops.gnss.earth import LEAST_FIXES, Earth, EarthError, GnssFix, fit
-from birdslam.loops.keyframe import Fixed, Floats, Link, Placed
+from birdslam.loops.keyframe import Fixed, Link, Placed
 from birdslam.types import NS_PER_S
 
 REACH_M = 6.0  # from a fix to its keyframe, along the way
@@ -46,7 +46,7 @@ class OnEarth:
 
 
 def fixed_keyframes(
-    earth: Earth, t_ns: NDArray[np.int64], poses: Sequence[SE2], fixes: Sequence[GnssFix], keyframes: Sequence[Placed]
+    earth: Earth, t_ns: Ints, poses: Sequence[SE2], fixes: Sequence[GnssFix], keyframes: Sequence[Placed]
 ) -> dict[int, Fixed]:
     """The fix nearest to each keyframe, of a drive that `earth` was laid over."""
     from scipy.spatial import cKDTree  # here: only who has fixes needs it
@@ -86,10 +86,7 @@ def tie(earth: Earth, keyframes: Sequence[Placed], links: Sequence[Link], fixed:
         nodes = [Node(each.number, T_earth_map @ each.T_map_keyframe) for each in keyframes]
         factors = [
             PlaceFactor(
-                number,
-                (float(x), float(y)),
-                fixed[number].sigma_m / earth.scale,
-                fixed[number].weighed_m / earth.scale,
+                number, (float(x), float(y)), fixed[number].sigma_m / earth.scale, fixed[number].weighed_m / earth.scale
             )
             for number, (x, y) in zip(numbers, flat.xy(degrees), strict=True)
         ]

@@ -17,8 +17,8 @@ class NmeaReader:
     """`take` each line; a fix comes once the next one begins, `finish` has the last."""
 
     def __init__(self) -> None:
-        self._waiting: tuple[str, float, float, float, float | None] | None = None  # the time as it was told, then ...
-        self._accuracy: dict[str, float] = {}  # by the time as it was told
+        self._waiting: tuple[str, float, float, float, float | None] | None = None  # the time as it was sent, then ...
+        self._accuracy: dict[str, float] = {}  # by the time as it was sent
 
     @property
     def waits(self) -> str:
@@ -49,23 +49,23 @@ class NmeaReader:
         """The fix that waits for its accuracy."""
         if self._waiting is None:
             return None
-        told, utc_s, latitude_deg, longitude_deg, speed_mps = self._waiting
-        sigma_m = self._accuracy.get(told, DEFAULT_SIGMA_M)
+        time_text, utc_s, latitude_deg, longitude_deg, speed_mps = self._waiting
+        sigma_m = self._accuracy.get(time_text, DEFAULT_SIGMA_M)
         self._waiting = None
-        self._accuracy = {time: sigma for time, sigma in [*self._accuracy.items()][-2:] if time != told}
+        self._accuracy = {time: sigma for time, sigma in [*self._accuracy.items()][-2:] if time != time_text}
         return utc_s, latitude_deg, longitude_deg, sigma_m, speed_mps
 
 
 def _words(line: str) -> list[str] | None:
     """Of a sentence whose sum is right."""
-    body, star, told = line.strip().partition("*")
+    body, star, checksum = line.strip().partition("*")
     if not body.startswith("$") or not star:
         return None
     total = 0
     for byte in body[1:].encode("utf-8"):
         total ^= byte
     try:
-        return body[1:].split(",") if int(told[:2], 16) == total else None
+        return body[1:].split(",") if int(checksum[:2], 16) == total else None
     except ValueError:
         return None
 

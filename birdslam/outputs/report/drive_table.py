@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.drive_files import FRAME_COLUMNS, FRAMES_FILE, ResultsError
 
-Floats = NDArray[np.float64]
 PEOPLE = frozenset({"pedestrian", "person", "cyclist", "rider", "bicycle"})
 FILES = {  # what the page hands out, where it is there
     "ego.tum.txt": "the ego's way, TUM lines",
@@ -55,13 +54,13 @@ class DriveTable:
     """
 
     name: str
-    frame: NDArray[np.int64]
+    frame: Ints
     t_s: Floats
     xy_m: Floats
     yaw_rad: Floats
     speed_mps: Floats  # NaN where an epoch begins
     scale_sigma_rel: Floats
-    valid: NDArray[np.bool_]
+    valid: Bools
     statuses: list[tuple[str, ...]]
     tracks: list[TrackTable]
     lanes_m: Floats  # (M, 2)
@@ -85,7 +84,7 @@ def read_drive(directory: Path) -> DriveTable:
         to_plane = _epochs(numbers)
         poses = [to_plane[int(row[2])] @ SE2(*row[3:6]) for row in numbers]
         lanes, landmarks = (_map_points(directory / "map.csv", kind, to_plane) for kind in ("lane", "landmark"))
-        camera = directory / "camera.toml"
+        camera, tracks = directory / "camera.toml", _tracks(directory / "tracks", to_plane, numbers[0, 1])
         return DriveTable(
             name=directory.resolve().name,
             frame=numbers[:, 0].astype(np.int64),
@@ -96,7 +95,7 @@ def read_drive(directory: Path) -> DriveTable:
             scale_sigma_rel=numbers[:, 7],
             valid=numbers[:, 8] > 0.5,
             statuses=[tuple(row["status"].split()) for row in rows],
-            tracks=_longest(_tracks(directory / "tracks", to_plane, numbers[0, 1])),
+            tracks=sorted(tracks, key=lambda track: -len(track.t_s))[:MOST_TRACKS],
             lanes_m=lanes,
             lines=_lines(directory / "map.geojson", to_plane),
             earth_deg=_earth(directory / "ego.geojson"),
@@ -180,7 +179,3 @@ def _tracks(directory: Path, to_plane: dict[int, SE2], begin_s: float) -> Iterat
                 xy_m.append((placed.x_m, placed.y_m))
         if len(t_s) >= FEWEST_ROWS:
             yield TrackTable(path.name.removesuffix(".tum.txt"), label, np.array(t_s), np.array(xy_m))
-
-
-def _longest(tracks: Iterator[TrackTable]) -> list[TrackTable]:
-    return sorted(tracks, key=lambda track: -len(track.t_s))[:MOST_TRACKS]

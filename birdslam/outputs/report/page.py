@@ -8,14 +8,13 @@ from __future__ import annotations
 import base64
 import html
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.outputs.plain_words import MEANINGS, meaning
 from birdslam.outputs.report.drive_table import FILES, DriveTable, TrackTable
@@ -72,7 +71,7 @@ def report_page(drive: DriveTable, video: Path | None = None, plotly: str = "") 
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<style>{STYLE.read_text(encoding='utf-8')}</style></head><body>",
             f"<header><h1>{name}</h1><p>{_facts(drive)}</p></header>",
-            f'<section class="verdict"><h2>How far to believe it</h2><ul>{_items(_verdict(drive))}</ul></section>',
+            f'<section class="verdict"><h2>How far to believe it</h2><ul>{_verdict(drive)}</ul></section>',
             f'<main><section id="map" class="plot"></section>{film}</main>',
             '<section class="slider"><input id="at" type="range" min="0" step="1" value="0" aria-label="moment">'
             '<output id="words"></output></section>',
@@ -94,7 +93,7 @@ def report_page(drive: DriveTable, video: Path | None = None, plotly: str = "") 
 # --- what is drawn ---
 
 
-def _map_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
+def _map_traces(drive: DriveTable, shown: Ints) -> list[Trace]:
     traces = [
         _points("road landmarks", drive.landmarks_m, "#8b95a5", 2),
         _points("lanes", drive.lanes_m, "#b48a00", 3) if not drive.lines else _lines(drive),
@@ -106,17 +105,12 @@ def _map_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
     for number, (name, colour) in enumerate(KINDS):
         here = shown[kinds == number]
         if len(here):
-            traces.append(
-                {
-                    **_points(f"own way: {name}", drive.xy_m[here], colour, 6),
-                    "text": [_frame_words(drive, k) for k in here],
-                    "hoverinfo": "text",
-                }
-            )
+            words = {"text": [_frame_words(drive, k) for k in here], "hoverinfo": "text"}
+            traces.append(_points(f"own way: {name}", drive.xy_m[here], colour, 6) | words)
     return [trace for trace in traces if len(trace["x"])]
 
 
-def _points(name: str, xy_m: NDArray[np.float64], colour: str, size: int) -> Trace:
+def _points(name: str, xy_m: Floats, colour: str, size: int) -> Trace:
     return {
         "name": name,
         "type": "scatter",
@@ -160,7 +154,7 @@ def _track(track: TrackTable, kind: str, first: bool) -> Trace:
     }
 
 
-def _speed_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
+def _speed_traces(drive: DriveTable, shown: Ints) -> list[Trace]:
     speed, t_s = _smoothed(drive)[shown], drive.t_s[shown]
     sigma = speed * drive.scale_sigma_rel[shown]
     sure = drive.valid[shown] & np.isfinite(speed)
@@ -179,7 +173,7 @@ def _speed_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
     ]
 
 
-def _speed_line(name: str, t_s: NDArray[np.float64], speed: NDArray[np.float64], colour: str) -> Trace:
+def _speed_line(name: str, t_s: Floats, speed: Floats, colour: str) -> Trace:
     line = {"name": name, "type": "scatter", "mode": "lines", "line": {"color": colour, "width": 2}}
     return {**line, "x": _rounded(t_s), "y": _rounded(speed), "hovertemplate": "%{y:.1f} m/s<extra></extra>"}
 
@@ -219,14 +213,14 @@ def _kind(drive: DriveTable, k: int) -> int:
     return 2 if drive.statuses[k] else 3
 
 
-def _smoothed(drive: DriveTable) -> NDArray[np.float64]:
+def _smoothed(drive: DriveTable) -> Floats:
     """The mean of the speed over SMOOTHED_S, of frames that have one."""
     step_s = float(np.median(np.diff(drive.t_s))) if len(drive.t_s) > 1 else SMOOTHED_S
     window = np.ones(max(1, round(SMOOTHED_S / max(step_s, 1e-3))))
     known = np.isfinite(drive.speed_mps)
     total = np.convolve(np.where(known, drive.speed_mps, 0.0), window, mode="same")[: len(known)]
     count = np.convolve(known.astype(np.float64), window, mode="same")[: len(known)]
-    out: NDArray[np.float64] = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+    out: Floats = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
     return out
 
 
@@ -235,25 +229,22 @@ def _smoothed(drive: DriveTable) -> NDArray[np.float64]:
 
 def _frame_words(drive: DriveTable, k: int) -> str:
     speed = drive.speed_mps[k]
-    told = "" if np.isnan(speed) else f", {speed:.1f} m/s (+- {drive.scale_sigma_rel[k]:.0%})"
+    speed_text = "" if np.isnan(speed) else f", {speed:.1f} m/s (+- {drive.scale_sigma_rel[k]:.0%})"
     said = "; ".join(meaning(name) for name in drive.statuses[k])
     state = "valid" if drive.valid[k] else "NOT VALID"
-    return html.escape(f"{drive.t_s[k]:.1f} s, frame {drive.frame[k]}{told}: {state}{'; ' if said else ''}{said}")
+    return html.escape(f"{drive.t_s[k]:.1f} s, frame {drive.frame[k]}{speed_text}: {state}{'; ' if said else ''}{said}")
 
 
 def _facts(drive: DriveTable) -> str:
-    seen = drive.summary
-    source = html.escape(str(seen.get("source", "")))
-    return f"{source}<br>{len(drive.t_s)} frames, {drive.t_s[-1]:.1f} s, {float(seen.get('path_m', 0.0)):.0f} m"
+    source = html.escape(str(drive.summary.get("source", "")))
+    return (
+        f"{source}<br>{len(drive.t_s)} frames, {drive.t_s[-1]:.1f} s, {float(drive.summary.get('path_m', 0.0)):.0f} m"
+    )
 
 
-def _verdict(drive: DriveTable) -> list[str]:
-    said = drive.summary.get("verdict", [])
-    return [str(line) for line in said] if isinstance(said, list) else []
-
-
-def _items(lines: Sequence[str]) -> str:
-    return "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+def _verdict(drive: DriveTable) -> str:
+    lines = drive.summary.get("verdict")
+    return "".join(f"<li>{html.escape(str(line))}</li>" for line in (lines if isinstance(lines, list) else ()))
 
 
 def _names(drive: DriveTable) -> list[str]:
@@ -271,7 +262,7 @@ def _status_rows(drive: DriveTable) -> str:
     for name in _names(drive):
         count = sum(name in statuses for statuses in drive.statuses)
         frames = f"{count} frame{'s' * (count != 1)}"
-        effect = "not valid" if _invalidates(name) else "told only"
+        effect = "not valid" if _invalidates(name) else "reported only"
         words = html.escape(MEANINGS[Status(name)])
         rows.append(f"<tr><td>{html.escape(name)}</td><td>{frames}</td><td>{effect}</td><td>{words}</td></tr>")
     return "".join(rows) or "<tr><td>none: all is well</td></tr>"
@@ -294,9 +285,13 @@ def _latency_rows(drive: DriveTable) -> str:
 def _earth_words(drive: DriveTable) -> str:
     assert drive.earth_deg is not None
     (lat, lon), (to_lat, to_lon) = drive.earth_deg[0], drive.earth_deg[-1]
-    about = drive.summary.get("earth", {})
-    told = about if isinstance(about, dict) else {}
-    fit = f"; {told['fixes']} fixes, {told['outliers']} left out, RMS {told['rms_m']} m" if "rms_m" in told else ""
+    said = drive.summary.get("earth", {})
+    fit_of = said if isinstance(said, dict) else {}
+    fit = (
+        f"; {fit_of['fixes']} fixes, {fit_of['outliers']} left out, RMS {fit_of['rms_m']} m"
+        if "rms_m" in fit_of
+        else ""
+    )
     return f"<p>from {lat:.6f}, {lon:.6f} to {to_lat:.6f}, {to_lon:.6f} (WGS 84){html.escape(fit)}</p>"
 
 
@@ -339,11 +334,11 @@ def _pictures(video: Path) -> list[tuple[float, str]]:
     return out
 
 
-def _thinned(count: int, most: int = MOST_POINTS) -> NDArray[np.int64]:
+def _thinned(count: int, most: int = MOST_POINTS) -> Ints:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
-def _rounded(values: NDArray[np.float64]) -> list[float | None]:
+def _rounded(values: Floats) -> list[float | None]:
     return [round(float(value), 3) if np.isfinite(value) else None for value in values]
 
 

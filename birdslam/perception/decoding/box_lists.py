@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Floats32, Ints
 from birdslam.perception.decoding.detection import (
     MOST_CANDIDATES,
     Candidates,
@@ -17,9 +17,6 @@ from birdslam.perception.decoding.detection import (
 )
 from birdslam.perception.manifest import BoxList, Input, ManifestMismatch, Scoring, Ssd
 from birdslam.perception.views import View
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 LARGEST_LOG = 20.0  # of a size over its prior's, and of a logit: past it numbers have gone wild
 
@@ -33,9 +30,7 @@ class _ListDecoder:
         self._groups = rival_groups(table.classes, table.labels, table.rivals)
         self._wanted = np.array(sorted(table.labels))
 
-    def chosen(
-        self, numbers: NDArray[np.float32], scoring: Scoring
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
+    def chosen(self, numbers: Floats32, scoring: Scoring) -> tuple[Ints, Ints, Floats]:
         """Rows, classes and scores of the best candidates; `numbers` (N, classes)."""
         scores = _scores(numbers, scoring)[:, self._wanted]
         rows, columns = np.nonzero(scores >= self._detector.score_threshold)
@@ -64,7 +59,7 @@ class SsdDecoder(_ListDecoder):
                     f"detector.{key}", f"{output} of shape {(1, priors[0], channels)}", shapes[output]
                 )
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Candidates:
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> Candidates:
         """The boxes of one run above the score threshold, in the image and cut to it."""
         rows, classes, scores = self.chosen(tensors[self.table.scores][0], self.table.scoring)
         priors = tensors[self.table.priors][rows].astype(np.float64)
@@ -97,7 +92,7 @@ class BoxListDecoder(_ListDecoder):
         if len(counts) != 1:
             raise ManifestMismatch("detector.scores", f"as many as {table.boxes} has boxes", shapes[table.scores])
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Candidates:
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> Candidates:
         """The boxes of one run above the score threshold, in the image and cut to it."""
         table = self.table
         boxes = self._rows(tensors[table.boxes])
@@ -111,11 +106,11 @@ class BoxListDecoder(_ListDecoder):
             found = found * np.tile(self._input_px, 2)
         return candidates_in_image(found, scores, classes, view)
 
-    def _rows(self, tensor: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _rows(self, tensor: Floats32) -> Floats32:
         return tensor[0] if self.table.layout == "boxes" else tensor[0].T
 
 
-def _scores(numbers: NDArray[np.float32], scoring: Scoring) -> Floats:
+def _scores(numbers: Floats32, scoring: Scoring) -> Floats:
     values = numbers.astype(np.float64)
     if scoring == "sigmoid":
         return 1.0 / (1.0 + np.exp(-np.clip(values, -LARGEST_LOG, LARGEST_LOG)))

@@ -14,14 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.geometry.camera import Camera
 from birdslam.world.rendering import materials as m
 from birdslam.world.rendering.light import SKY_SLOTS
 from birdslam.world.rendering.scene import Bodies, Rendered
 from birdslam.world.truth import CLASSES
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 LEVEL_CLASSES = tuple(CLASSES.index(name) for name in ("road", "lane", "pavement"))
 PAINTED_CLASSES = tuple(CLASSES.index(name) for name in ("road", "lane"))

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from birdslam.geometry.arrays import Floats
 
 STEP_M = 0.5  # of the table of the centre line
 # Greatest curvature of a street of a kind, 1/m

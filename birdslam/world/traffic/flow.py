@@ -10,21 +10,11 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.world.rendering import materials as m
 from birdslam.world.street.street import Street
-from birdslam.world.traffic.fleet import (
-    Body,
-    draw_cyclist,
-    draw_pedestrian,
-    draw_shape,
-    draw_truck,
-    draw_vehicle,
-)
+from birdslam.world.traffic.fleet import Body, draw_cyclist, draw_pedestrian, draw_shape, draw_truck, draw_vehicle
 from birdslam.world.traffic.parking import Lot, Row, kerb_rows
-
-Floats = NDArray[np.float64]
 
 ACCELERATION_MPS2, BRAKING_MPS2, GAP_S, GAP_M = 1.5, 2.2, 1.3, 2.2
 CHANGE_S = 3.5  # how long a change of lane takes

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.world.rendering import materials as m
 from birdslam.world.rendering.scene import Bodies
 from birdslam.world.street.street import Street
 from birdslam.world.traffic.flow import Mover
 from birdslam.world.traffic.placement import Standing
-
-Floats = NDArray[np.float64]
 
 
 def ego_pose(street: Street, s_m: float, d_m: float, turn_rad: float) -> Floats:

@@ -42,13 +42,7 @@ def to_onnx(network: MultiTask, width_px: int, height_px: int) -> bytes:
     image = torch.zeros(1, 3, height_px, width_px)
     file = io.BytesIO()
     torch.onnx.export(
-        network,
-        (image,),
-        file,
-        input_names=[INPUT],
-        output_names=list(OUTPUTS),
-        opset_version=17,
-        dynamo=False,
+        network, (image,), file, input_names=[INPUT], output_names=list(OUTPUTS), opset_version=17, dynamo=False
     )
     return file.getvalue()
 

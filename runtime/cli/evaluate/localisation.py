@@ -95,39 +95,31 @@ def _in_columns(cells: Iterable[tuple[float | None, str]]) -> str:
     return "".join("-".rjust(len(format(0.0, form))) if value is None else format(value, form) for value, form in cells)
 
 
+_PLACES = f"{'depth':>9}{'bias':>9}{'across m':>10}{'1 sigma':>9}{'2 sigma':>9}"
+
+
+def _places(row: PeopleRow | LocalisationRow) -> str:
+    """The columns of _PLACES."""
+    rels = (row.depth_error_median_rel, "9.1%"), (row.depth_bias_median_rel, "+9.1%")
+    shares = (row.inside_1_sigma, "9.0%"), (row.inside_2_sigma, "9.0%")
+    return _in_columns((*rels, (row.lateral_error_median_m, "10.2f"), *shares))
+
+
 def _table_of_people(rows: Sequence[PeopleRow]) -> str:
-    titles = f"{'depth':>9}{'bias':>9}{'across m':>10}{'1 sigma':>9}{'2 sigma':>9}{'walking':>9}{'standing':>9}"
+    titles = f"{_PLACES}{'walking':>9}{'standing':>9}"
     lines = [f"{'sequence':11}{'range m':>9}{'n':>7}{titles}  (m/s: error of who walks, speed of who stands)"]
     for row in rows:
-        cells = (
-            (row.depth_error_median_rel, "9.1%"),
-            (row.depth_bias_median_rel, "+9.1%"),
-            (row.lateral_error_median_m, "10.2f"),
-            (row.inside_1_sigma, "9.0%"),
-            (row.inside_2_sigma, "9.0%"),
-            (row.walking_speed_error_median_mps, "9.2f"),
-            (row.standing_speed_median_mps, "9.2f"),
-        )
-        numbers = _in_columns(cells)
-        lines.append(f"{row.sequence:11}{row.range:>9}{row.n:>7}{numbers}")
+        speeds = (row.walking_speed_error_median_mps, "9.2f"), (row.standing_speed_median_mps, "9.2f")
+        lines.append(f"{row.sequence:11}{row.range:>9}{row.n:>7}{_places(row)}{_in_columns(speeds)}")
     return "\n".join(lines)
 
 
 def _table(rows: Sequence[LocalisationRow]) -> str:
-    titles = f"{'depth':>9}{'bias':>9}{'across m':>10}{'1 sigma':>9}{'2 sigma':>9}{'NEES':>7}{'yaw >10':>9}"
+    titles = f"{_PLACES}{'NEES':>7}{'yaw >10':>9}"
     lines = [f"{'':12}{'range m':>9}{'cars':>6}{'n':>7}{titles}"]
     for row in rows:
-        cells = (
-            (row.depth_error_median_rel, "9.1%"),
-            (row.depth_bias_median_rel, "+9.1%"),
-            (row.lateral_error_median_m, "10.2f"),
-            (row.inside_1_sigma, "9.0%"),
-            (row.inside_2_sigma, "9.0%"),
-            (row.nees, "7.2f"),
-            (row.yaw_off_10_deg, "9.0%"),
-        )
-        numbers = _in_columns(cells)
-        lines.append(f"{row.sequence:12}{row.range:>9}{row.cars:>6}{row.n:>7}{numbers}")
+        more = (row.nees, "7.2f"), (row.yaw_off_10_deg, "9.0%")
+        lines.append(f"{row.sequence:12}{row.range:>9}{row.cars:>6}{row.n:>7}{_places(row)}{_in_columns(more)}")
     return "\n".join(lines)
 
 

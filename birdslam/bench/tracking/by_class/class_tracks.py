@@ -14,16 +14,14 @@ from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.tracking.metrics import LEAST_HEIGHT_PX, BoxFrame, assign, hota_parts, identities, mostly_inside
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import DONT_CARE, Label
 from birdslam.types import IN_SIGHT_NS, Measurements
 from birdslam.vehicles.placement.localisation import iou
-
-Floats = NDArray[np.float64]
 
 KINDS = {"car": ("Car",), "pedestrian": ("Pedestrian",), "cyclist": ("Cyclist",)}  # of the labels
 NEUTRAL = {
@@ -39,7 +37,7 @@ METRES, IMAGE = "metres", "image"
 class Followed:
     """Who is followed in one frame: ids (N,), places in ego (N, 2) and boxes (N, 4)."""
 
-    ids: NDArray[np.int64]
+    ids: Ints
     at_m: Floats
     boxes_px: Floats
 
@@ -89,21 +87,21 @@ def class_tracks(sequence: TrackingSequence, measurements: Iterable[Measurements
     """What records say of a class in every frame, beside the labels."""
     out = ClassTracks(kind, sequence.name)
     for m in measurements:
-        here, told = sequence.labels_of(m.frame_id), followed(m, kind)
+        here, tracks = sequence.labels_of(m.frame_id), followed(m, kind)
         for view, similarity in SIMILARITIES.items():
-            out.views[view].append(_frame(sequence, here, told, kind, similarity))
+            out.views[view].append(_frame(sequence, here, tracks, kind, similarity))
     return out
 
 
-def _by_place(sequence: TrackingSequence, labels: Sequence[Label], told: Followed) -> Floats:
+def _by_place(sequence: TrackingSequence, labels: Sequence[Label], tracks: Followed) -> Floats:
     truth = [sequence.vehicle_truth(label, label.frame) for label in labels]
     places = np.array([[t.x_m, t.y_m] for t in truth]).reshape(-1, 2)
-    away = np.linalg.norm(places[:, None] - told.at_m[None], axis=-1)
+    away = np.linalg.norm(places[:, None] - tracks.at_m[None], axis=-1)
     return np.asarray(np.maximum(0.0, 1.0 - away / (2.0 * HALF_AT_M)))
 
 
-def _by_box(_: TrackingSequence, labels: Sequence[Label], told: Followed) -> Floats:
-    return iou(np.array([label.box_px for label in labels]).reshape(-1, 4), told.boxes_px)
+def _by_box(_: TrackingSequence, labels: Sequence[Label], tracks: Followed) -> Floats:
+    return iou(np.array([label.box_px for label in labels]).reshape(-1, 4), tracks.boxes_px)
 
 
 SIMILARITIES: dict[str, Callable[[TrackingSequence, Sequence[Label], Followed], Floats]] = {
@@ -115,23 +113,23 @@ SIMILARITIES: dict[str, Callable[[TrackingSequence, Sequence[Label], Followed], 
 def _frame(
     sequence: TrackingSequence,
     here: Sequence[Label],
-    told: Followed,
+    tracks: Followed,
     kind: str,
     similarity_of: Callable[[TrackingSequence, Sequence[Label], Followed], Floats],
 ) -> BoxFrame:
     """Similarities of labels and tracks; left out is who is followed where a label is that nobody asks for."""
     near = [label for label in here if label.kind in (*KINDS[kind], *NEUTRAL[kind])]
-    similarity = similarity_of(sequence, near, told)
+    similarity = similarity_of(sequence, near, tracks)
     asked = np.array([n.kind in KINDS[kind] and n.occluded <= 2 and n.truncated <= 0 for n in near], dtype=np.bool_)
     matched = {int(j): bool(asked[i]) for i, j in zip(*assign(similarity), strict=True)}
     regions = np.array([label.box_px for label in here if label.kind == DONT_CARE]).reshape(-1, 4)
     counts = [
         matched[j] if j in matched else box[3] - box[1] > LEAST_HEIGHT_PX and not mostly_inside(box, regions)
-        for j, box in enumerate(told.boxes_px)
+        for j, box in enumerate(tracks.boxes_px)
     ]
     kept = np.array(counts, dtype=np.bool_)
     labels = np.array([n.track for n, a in zip(near, asked, strict=True) if a], dtype=np.int64)
-    return BoxFrame(labels, told.ids[kept], similarity[asked][:, kept])
+    return BoxFrame(labels, tracks.ids[kept], similarity[asked][:, kept])
 
 
 def tracks_row(name: str, view: str, group: Sequence[ClassTracks]) -> TracksRow:

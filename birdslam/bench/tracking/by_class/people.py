@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.bench.figures import median
 from birdslam.bench.tracking.by_class.class_tracks import (
     KINDS,
     METRES,
@@ -25,13 +25,12 @@ from birdslam.bench.tracking.by_class.class_tracks import (
 )
 from birdslam.bench.tracking.localisation import INSIDE_1_SIGMA, INSIDE_2_SIGMA
 from birdslam.bench.tracking.metrics import assign
+from birdslam.geometry.arrays import Floats
 from birdslam.perception import Detections
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import Label, hull_px
 from birdslam.types import FollowedPerson, Measurements, Moves
 from birdslam.vehicles.placement.localisation import iou
-
-Floats = NDArray[np.float64]
 
 PEOPLE = ("pedestrian", "cyclist")
 RANGES_M = ((5.0, 15.0), (15.0, 30.0), (30.0, 50.0))
@@ -45,7 +44,7 @@ HULL_MEMORY = 0.7  # of a box's error, from frame to frame at 10 Hz
 
 @dataclass(frozen=True)
 class PersonError:
-    """One person in one frame: true depth, error in ego (2,), its square over its covariance; speeds, true and told."""
+    """One person in one frame: true depth, error in ego (2,), its square over its covariance; both speeds."""
 
     sequence: str
     label: int
@@ -55,7 +54,7 @@ class PersonError:
     mahalanobis2: float
     log_det_cov: float
     true_mps: Floats  # (2,) in ego
-    told_mps: Floats
+    estimated_mps: Floats
     stands: bool
     occluded: int
     ego_mps: float
@@ -138,8 +137,8 @@ def judge(sequence: TrackingSequence, measurements: Iterable[Measurements], kind
     for m in measurements:
         here = sequence.labels_of(m.frame_id)
         asked = [label for label in here if label.kind in KINDS[kind]]
-        told = [p for p in m.people if p.label == kind]
-        seen = [p for p in told if p.age_ns == 0]
+        tracks = [p for p in m.people if p.label == kind]
+        seen = [p for p in tracks if p.age_ns == 0]
         overlap = iou(
             np.array([a.box_px for a in asked]).reshape(-1, 4), np.array([p.box_px for p in seen]).reshape(-1, 4)
         )
@@ -172,10 +171,14 @@ def _true_velocity(places: dict[int, Floats], frame: int) -> Floats:
 
 
 def _error(
-    sequence: TrackingSequence, label: Label, told: FollowedPerson, places: dict[int, dict[int, Floats]], ego_mps: float
+    sequence: TrackingSequence,
+    label: Label,
+    person: FollowedPerson,
+    places: dict[int, dict[int, Floats]],
+    ego_mps: float,
 ) -> PersonError:
     truth = sequence.vehicle_truth(label, label.frame)
-    error = np.array([told.x_m - truth.x_m, told.y_m - truth.y_m])
+    error = np.array([person.x_m - truth.x_m, person.y_m - truth.y_m])
     R = sequence.ego_truth(0)[label.frame].rotation()
     return PersonError(
         sequence=sequence.name,
@@ -183,11 +186,11 @@ def _error(
         frame=label.frame,
         depth_m=truth.x_m,
         error_m=error,
-        mahalanobis2=float(error @ np.linalg.solve(np.reshape(told.cov, (2, 2)), error)),
-        log_det_cov=float(np.linalg.slogdet(np.reshape(told.cov, (2, 2)))[1]),
+        mahalanobis2=float(error @ np.linalg.solve(np.reshape(person.cov, (2, 2)), error)),
+        log_det_cov=float(np.linalg.slogdet(np.reshape(person.cov, (2, 2)))[1]),
         true_mps=_true_velocity(places[label.track], label.frame) @ R,
-        told_mps=np.array([told.vx_mps, told.vy_mps]),
-        stands=told.moves is Moves.STANDING,
+        estimated_mps=np.array([person.vx_mps, person.vy_mps]),
+        stands=person.moves is Moves.STANDING,
         occluded=label.occluded,
         ego_mps=ego_mps,
     )
@@ -216,7 +219,7 @@ def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
     along, across = np.array([e.error_m for e in errors]).T
     spread = np.array([e.mahalanobis2 for e in errors])
     true = np.array([e.true_mps for e in errors])
-    told = np.array([e.told_mps for e in errors])
+    estimated = np.array([e.estimated_mps for e in errors])
     speed = np.linalg.norm(true, axis=1)
     walking, standing = speed > WALKING_MPS, speed < STANDING_MPS
     return PeopleRow(
@@ -228,10 +231,6 @@ def _row(sequence: str, span: str, errors: Sequence[PersonError]) -> PeopleRow:
         lateral_error_median_m=float(np.median(np.abs(across))),
         inside_1_sigma=float(np.mean(spread <= INSIDE_1_SIGMA)),
         inside_2_sigma=float(np.mean(spread <= INSIDE_2_SIGMA)),
-        walking_speed_error_median_mps=_median(np.linalg.norm(told - true, axis=1)[walking]),
-        standing_speed_median_mps=_median(np.linalg.norm(told, axis=1)[standing]),
+        walking_speed_error_median_mps=median(np.linalg.norm(estimated - true, axis=1)[walking]),
+        standing_speed_median_mps=median(np.linalg.norm(estimated, axis=1)[standing]),
     )
-
-
-def _median(values: Floats) -> float | None:
-    return float(np.median(values)) if len(values) else None

@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 Buffer = tuple[Any, ...]
-Floats32 = NDArray[np.float32]
 
 
 def new_buffer(capacity: int) -> Buffer:
