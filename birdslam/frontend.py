@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.landmark_edges import StaticMapConfig, landmark_edges
@@ -82,13 +83,13 @@ class EgoMotion(Protocol):
         tracks: Any,
         frame_id: int,
         t_source_ns: int,
-        vehicle_boxes_px: NDArray[np.float64],
-        road_mask: NDArray[np.bool_] | None,
+        vehicle_boxes_px: Floats,
+        road_mask: Bools | None,
         speeds: Sequence[SpeedReading],
     ) -> Motion | None: ...
 
     @property
-    def road_tracks(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]: ...
+    def road_tracks(self) -> tuple[Ints, Floats]: ...
 
 
 class FrontEnd:
@@ -244,7 +245,7 @@ class FrontEnd:
         )
 
 
-def _boxes_px(perception: Perception) -> NDArray[np.float64]:
+def _boxes_px(perception: Perception) -> Floats:
     return np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px
 
 

@@ -41,6 +41,7 @@ PAPER = SlamConfig(
             sigma_edge_rel=0.0,
             sigma_tilt_rad=1e-6,
             sigma_crown_rad=0.0,
+            sigma_common_crown_rad=0.0,
         ),
     ),
     # Eq. 4: one information matrix for each type of edge; Eq. 7: CP edges are of the ego and of vehicles

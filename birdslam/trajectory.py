@@ -14,13 +14,13 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.types import NS_PER_S, Attitude
 
-Transform = NDArray[np.float64]  # (..., 4, 4) homogeneous, metres; one or many
+Transform = Floats  # (..., 4, 4) homogeneous, metres; one or many
 
 
 def ego_pose(T_world_ego: SE2, attitude: Attitude) -> Transform:
@@ -61,7 +61,7 @@ def inverse(T_a_b: Transform) -> Transform:
     return out
 
 
-def as_poses(rows: NDArray[np.float64]) -> Transform:
+def as_poses(rows: Floats) -> Transform:
     """(N, 4, 4) of KITTI rows (N, 3, 4)."""
     out = np.tile(np.eye(4), (len(rows), 1, 1))
     out[:, :3] = rows
@@ -83,7 +83,7 @@ def tum_row(t_ns: int, T_world_i: Transform) -> str:
     return f"{sign}{t_ns // NS_PER_S}.{t_ns % NS_PER_S:09d} {numbers}"
 
 
-def _read_numbers(path: Path, width: int, what: str) -> NDArray[np.float64]:
+def _read_numbers(path: Path, width: int, what: str) -> Floats:
     try:
         lines = path.read_text(encoding="ascii").splitlines()
     except OSError as error:
@@ -104,7 +104,7 @@ def _read_numbers(path: Path, width: int, what: str) -> NDArray[np.float64]:
     return np.array(rows, dtype=np.float64).reshape(len(rows), width)
 
 
-def read_kitti(path: Path) -> NDArray[np.float64]:
+def read_kitti(path: Path) -> Floats:
     """Rows (N, 3, 4) of a KITTI pose file. Raises ValueError naming path and line."""
     rows = _read_numbers(path, 12, "KITTI pose").reshape(-1, 3, 4)
     R = rows[:, :, :3]
@@ -115,7 +115,7 @@ def read_kitti(path: Path) -> NDArray[np.float64]:
     return rows
 
 
-def read_tum(path: Path) -> tuple[NDArray[np.float64], Transform]:
+def read_tum(path: Path) -> tuple[Floats, Transform]:
     """Times (N,) in seconds and poses (N, 4, 4) of a TUM file, comments skipped. Raises ValueError naming the line."""
     from scipy.spatial.transform import Rotation  # here: few processes need it
 

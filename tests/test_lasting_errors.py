@@ -36,7 +36,7 @@ def box_of(x_m: float, y_m: float, ground: GroundPlane, height_m: float, edge_m:
 def test_errors_that_last_for_a_track_are_in_its_sigma_after_many_frames() -> None:
     """Cars are followed past, each with a height, a lower edge and a road of its own, which all its boxes share."""
     rng, squares = np.random.default_rng(5), {"young": [], "old": []}
-    for _ in range(25):
+    for _ in range(10):
         ground_size = GroundSizeFilter(CAMERA, CONFIG)
         pitch_rad = rng.normal(0.0, CONFIG.sigma_pitch_rad)
         tracker = Tracker(CAMERA, TrackingConfig(), LOCALISATION, ground_size)

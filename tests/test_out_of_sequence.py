@@ -201,8 +201,8 @@ def sizes(seed: int) -> tuple[float, ...]:
 
 @pytest.mark.parametrize("delay", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_late_vehicles_are_where_their_covariance_says(delay: int) -> None:
-    late = [deviations(drive(delay, seed, 1.0, sizes(seed))) for seed in range(12)]
-    punctual = [deviations(drive(0, seed, 1.0, sizes(seed))) for seed in range(12)]
+    late = [deviations(drive(delay, seed, 1.0, sizes(seed))) for seed in range(4)]
+    punctual = [deviations(drive(0, seed, 1.0, sizes(seed))) for seed in range(4)]
     squared, metres = (np.concatenate(numbers) for numbers in zip(*late, strict=True))
     _, metres_punctual = (np.concatenate(numbers) for numbers in zip(*punctual, strict=True))
     assert len(metres) > 0.9 * len(metres_punctual)

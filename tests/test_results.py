@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.bev_picture import Track
-from birdslam.outputs.drive_files import Recorder, ResultsError, Thinned, claim_directory
+from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
+from birdslam.outputs.scene_recorder import Thinned
 from birdslam.trajectory import read_kitti, read_tum
 from birdslam.types import Attitude, Estimate, MapUpdate, SpeedSource, Status, VehicleEstimate
 

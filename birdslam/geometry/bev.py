@@ -9,22 +9,22 @@ from __future__ import annotations
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 
-Numbers = TypeVar("Numbers", float, NDArray[np.float64])
+Numbers = TypeVar("Numbers", float, Floats)
 
 MAX_RANGE_M = 200.0  # beyond it a pixel row covers tens of metres
 
 
-def meet_road(rays: NDArray[np.float64], fall: NDArray[np.float64], height_m: float) -> NDArray[np.float64]:
+def meet_road(rays: Floats, fall: Floats, height_m: float) -> Floats:
     """Eq. 1: where rays from a camera `height_m` above the road meet it, in metres, in the axes of the rays.
 
     `fall` is the component of a ray towards the road, -n . ray for the road's unit normal n. Rays (N, 3) with `fall`
     (N, 1), or one component of each ray, (N,) with `fall` (N,).
     """
-    out: NDArray[np.float64] = height_m * rays / fall  # Eq. 1
+    out: Floats = height_m * rays / fall  # Eq. 1
     return out
 
 
@@ -33,14 +33,14 @@ def road_slope(depth_m: Numbers, height_m: Numbers | float) -> Numbers:
     return height_m / depth_m
 
 
-def rays_cam(camera: Camera, px: NDArray[np.float64]) -> NDArray[np.float64]:
+def rays_cam(camera: Camera, px: Floats) -> Floats:
     """(N, 3) rays of z = 1 in camera axes, K^-1 x, of pixels (N, 2)."""
     rays = np.ones((len(px), 3))
     rays[:, :2] = camera.to_xy(px)
     return rays
 
 
-def bearing_and_slope(camera: Camera, ground: GroundPlane, px: NDArray[np.float64]) -> NDArray[np.float64]:
+def bearing_and_slope(camera: Camera, ground: GroundPlane, px: Floats) -> Floats:
     """(N, 2) of the rays of pixels (N, 2): bearing y/x in ego, and slope -z/x, the fall for each metre ahead.
 
     Such a ray (1, bearing, -slope) meets the road at x = `meet_road(1, slope, H)`. Above the horizon slopes are
@@ -50,7 +50,7 @@ def bearing_and_slope(camera: Camera, ground: GroundPlane, px: NDArray[np.float6
     return np.column_stack([y / x, -z / x])
 
 
-def road_point_cam(camera: Camera, ground: GroundPlane, px: NDArray[np.float64]) -> NDArray[np.float64]:
+def road_point_cam(camera: Camera, ground: GroundPlane, px: Floats) -> Floats:
     """Road points in camera axes, (N, 3) in metres, of pixels (N, 2); NaN where the ray misses the road (Eq. 1)."""
     rays = rays_cam(camera, np.atleast_2d(np.asarray(px, dtype=np.float64)))
     fall = -(rays @ ground.normal_cam)
@@ -60,12 +60,12 @@ def road_point_cam(camera: Camera, ground: GroundPlane, px: NDArray[np.float64])
     return points
 
 
-def pixel_to_ego(camera: Camera, ground: GroundPlane, px: NDArray[np.float64]) -> NDArray[np.float64]:
+def pixel_to_ego(camera: Camera, ground: GroundPlane, px: Floats) -> Floats:
     """Road points in ego, (N, 2) in metres, of pixels (N, 2); NaN above the horizon or past MAX_RANGE_M."""
     return (road_point_cam(camera, ground, px) @ ground.R_ego_cam.T)[:, :2]
 
 
-def ego_to_pixel(camera: Camera, ground: GroundPlane, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def ego_to_pixel(camera: Camera, ground: GroundPlane, points: Floats) -> Floats:
     """Pixels (N, 2) of points in ego, (N, 2) on the road or (N, 3); NaN behind the camera."""
     points = np.atleast_2d(np.asarray(points, dtype=np.float64))
     if points.shape[1] == 2:
@@ -80,11 +80,11 @@ def ego_to_pixel(camera: Camera, ground: GroundPlane, points: NDArray[np.float64
 def road_point_cov(
     camera: Camera,
     ground: GroundPlane,
-    px: NDArray[np.float64],
-    sigma_px: NDArray[np.float64] | float,
+    px: Floats,
+    sigma_px: Floats | float,
     sigma_pitch_rad: float = 0.0,
     sigma_height_rel: float = 0.0,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Covariances (N, 2, 2) in m^2 of `pixel_to_ego`, to first order.
 
     `sigma_px` is the pixel noise, one for all, or (2,) for u and v. Pitch and height errors are common to all points of
@@ -98,7 +98,7 @@ def road_point_cov(
         5, -1, 2
     )
 
-    def tilted(d_rad: float) -> NDArray[np.float64]:
+    def tilted(d_rad: float) -> Floats:
         return pixel_to_ego(camera, GroundPlane(ground.height_m, ground.pitch_rad + d_rad, ground.roll_rad), px)
 
     columns = [
@@ -108,5 +108,5 @@ def road_point_cov(
         here * sigma_height_rel,
     ]
     J = np.stack(columns, axis=-1)  # (N, 2, 4), already scaled by the sigmas
-    out: NDArray[np.float64] = J @ np.swapaxes(J, 1, 2)
+    out: Floats = J @ np.swapaxes(J, 1, 2)
     return out

@@ -11,6 +11,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
+
 # Camera axes (x right, y down, z forward) to REP-103 axes (x forward, y left, z up).
 AXES_EGO_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -25,30 +27,28 @@ class GroundPlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     roll_rad: float = 0.0
 
     @property
-    def R_ego_cam(self) -> NDArray[np.float64]:
+    def R_ego_cam(self) -> Floats:
         """(3, 3): turns vectors of the camera into ego; read-only."""
         return _rotation(self.pitch_rad, self.roll_rad)
 
     @property
-    def normal_cam(self) -> NDArray[np.float64]:
+    def normal_cam(self) -> Floats:
         """(3,): the road's unit normal in camera axes, up; [0, -1, 0] on level ground as in Eq. 1."""
         return self.R_ego_cam[2]
 
 
 @lru_cache(maxsize=64)  # a frame uses the same few rotations tens of times
-def _rotation(pitch_rad: float, roll_rad: float) -> NDArray[np.float64]:
+def _rotation(pitch_rad: float, roll_rad: float) -> Floats:
     cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
     cr, sr = math.cos(roll_rad), math.sin(roll_rad)
     Ry = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
     Rx = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    out: NDArray[np.float64] = Ry @ Rx @ AXES_EGO_CAM
+    out: Floats = Ry @ Rx @ AXES_EGO_CAM
     out.flags.writeable = False
     return out
 
 
-def plane_normal(
-    pitch_rad: float, roll_rad: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def plane_normal(pitch_rad: float, roll_rad: float) -> tuple[Floats, Floats, Floats]:
     """The road's upward unit normal in camera axes and its derivatives by pitch and by roll, (3,) each."""
     cp, sp, cr, sr = np.cos(pitch_rad), np.sin(pitch_rad), np.cos(roll_rad), np.sin(roll_rad)
     return (
@@ -58,7 +58,7 @@ def plane_normal(
     )
 
 
-def plane_tilt(normal: NDArray[np.float64]) -> tuple[float, float]:
+def plane_tilt(normal: Floats) -> tuple[float, float]:
     """(pitch_rad, roll_rad) of a unit normal in camera axes: the inverse of `plane_normal`."""
     return float(-np.arcsin(np.clip(normal[2], -1.0, 1.0))), float(np.arctan2(-normal[0], -normal[1]))
 
@@ -114,18 +114,18 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"camera: a fisheye's distortion needs 4 coefficients, got {len(self.distortion)}")
 
     @property
-    def K(self) -> NDArray[np.float64]:
+    def K(self) -> Floats:
         """(3, 3) intrinsic matrix in pixels."""
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
 
-    def to_xy(self, px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_xy(self, px: Floats) -> Floats:
         """(N, 2) rays of z = 1 from pixels (N, 2)."""
         out = np.empty(px.shape)
         out[:, 0] = (px[:, 0] - self.cx_px) / self.fx_px
         out[:, 1] = (px[:, 1] - self.cy_px) / self.fy_px
         return out
 
-    def to_px(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_px(self, xy: Floats) -> Floats:
         """(N, 2) pixels of rays (N, 2) of z = 1."""
         out = np.empty(xy.shape)
         out[:, 0] = xy[:, 0] * self.fx_px + self.cx_px

@@ -11,7 +11,8 @@ from typing import overload
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
+
+from birdslam.geometry.arrays import Floats
 
 _SMALL_ANGLE_RAD = 1e-9  # below it the first order is exact in double precision
 
@@ -38,8 +39,8 @@ class SE2(msgspec.Struct, frozen=True, array_like=True, gc=False):
     @overload
     def __matmul__(self, other: SE2) -> SE2: ...
     @overload
-    def __matmul__(self, other: NDArray[np.float64]) -> NDArray[np.float64]: ...
-    def __matmul__(self, other: SE2 | NDArray[np.float64]) -> SE2 | NDArray[np.float64]:
+    def __matmul__(self, other: Floats) -> Floats: ...
+    def __matmul__(self, other: SE2 | Floats) -> SE2 | Floats:
         """`T_a_b @ T_b_c -> T_a_c`; `T_a_b @ p_b -> p_a` for points (..., 2) in metres."""
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         if isinstance(other, SE2):
@@ -65,7 +66,7 @@ class SE2(msgspec.Struct, frozen=True, array_like=True, gc=False):
         return self.inverse() @ other
 
     @staticmethod
-    def exp(xi: NDArray[np.float64]) -> SE2:
+    def exp(xi: Floats) -> SE2:
         """The motion of the constant twist `xi` = (x_m, y_m, yaw_rad) over one unit of time."""
         vx, vy, w = (float(v) for v in xi)
         if abs(w) < _SMALL_ANGLE_RAD:
@@ -74,24 +75,24 @@ class SE2(msgspec.Struct, frozen=True, array_like=True, gc=False):
             a, b = math.sin(w) / w, 2.0 * math.sin(w / 2.0) ** 2 / w  # 1 - cos w would lose digits
         return SE2(a * vx - b * vy, b * vx + a * vy, wrap(w))
 
-    def log(self) -> NDArray[np.float64]:
+    def log(self) -> Floats:
         """The twist (3,) in (m, m, rad) whose `exp` is this motion; yaw in [-pi, pi)."""
         w = wrap(self.yaw_rad)
         half = w / 2.0
         a = 1.0 if abs(w) < _SMALL_ANGLE_RAD else half / math.tan(half)
         return np.array([a * self.x_m + half * self.y_m, -half * self.x_m + a * self.y_m, w])
 
-    def adjoint(self) -> NDArray[np.float64]:
+    def adjoint(self) -> Floats:
         """(3, 3): moves a twist of frame b to frame a, `T @ exp(xi) == exp(Ad xi) @ T`."""
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return np.array([[c, -s, self.y_m], [s, c, -self.x_m], [0.0, 0.0, 1.0]])
 
-    def rotation(self) -> NDArray[np.float64]:
+    def rotation(self) -> Floats:
         """(2, 2) rotation part of `T_a_b`: turns vectors of b into a."""
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return np.array([[c, -s], [s, c]])
 
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Floats:
         """(3, 3) homogeneous matrix."""
         out = np.eye(3)
         out[:2, :2] = self.rotation()

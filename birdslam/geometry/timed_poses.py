@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.pose import Pose
 
 
@@ -14,8 +14,8 @@ from birdslam.geometry.pose import Pose
 class TimedPoses:
     """`poses` (N, 4, 4) in a world of their own, metres, at `t_ns` (N,), growing; None: one a frame, from 0 on."""
 
-    poses: NDArray[np.float64]
-    t_ns: NDArray[np.int64] | None
+    poses: Floats
+    t_ns: Ints | None
 
     def at(self, frame_id: int, t_ns: int, longest_gap_ns: int) -> Pose | None:
         """The pose of a frame at a time, interpolated over `longest_gap_ns` at the most; None where there is none."""
@@ -37,5 +37,5 @@ class TimedPoses:
         return Pose(R, (1.0 - share) * before[:3, 3] + share * behind[:3, 3])
 
 
-def _pose(T: NDArray[np.float64]) -> Pose:
+def _pose(T: Floats) -> Pose:
     return Pose(T[:3, :3], T[:3, 3])

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 
 Complexes = NDArray[np.complex128]
-Rows = NDArray[np.int64]
+Rows = Ints
 Triple = tuple[float, float, float]
 Cov = tuple[float, ...]  # row-major, of (x_m, y_m, yaw_rad)
 

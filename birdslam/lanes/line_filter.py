@@ -12,15 +12,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis, moved, slope_basis
 from birdslam.lanes.paint import LinePoints
 from birdslam.lanes.road_view import tilted
 
-Ids = NDArray[np.int64]
+Ids = Ints
 
 # Prior of a road's shape in an image without a past: heading, curvature, its rate, beside what the search has found
 SIGMA_SHAPE = np.array([0.0, 0.03, 0.004, 2e-4])
@@ -68,7 +67,7 @@ class LineFilter:
         part = slice(4 * k, 4 * k + 4)
         return self.cov[part, part]
 
-    def begin(self, offsets_m: Floats, headings: Floats, curvature_per_m: float, edges: NDArray[np.bool_]) -> None:
+    def begin(self, offsets_m: Floats, headings: Floats, curvature_per_m: float, edges: Bools) -> None:
         """Lines (n,) of an image without a past, by what the search has found; `edges` are those of the road."""
         count = len(offsets_m)
         self.curves = np.zeros((count, 4))
@@ -112,13 +111,13 @@ class LineFilter:
         self.cov += np.outer(sideways, sideways) * STEP_SIGMA_M**2 * step_m
         self.cov += np.outer(turned, turned) * STEP_SIGMA_RAD**2 * step_m
 
-    def sound(self) -> NDArray[np.bool_]:
+    def sound(self) -> Bools:
         """(n,) which curves are those of a line still; none where the covariance is not."""
         variances = self.cov.diagonal()
         if not (np.isfinite(self.cov).all() and np.all(variances > 0.0)):
             return np.zeros(len(self.curves), bool)
         near = (np.abs(self.curves[:, 0]) < FARTHEST_M) & (np.abs(self.curves[:, 1]) < STEEPEST)
-        out: NDArray[np.bool_] = np.isfinite(self.curves).all(axis=1) & near
+        out: Bools = np.isfinite(self.curves).all(axis=1) & near
         return out
 
     def across_sigma_m(self, k: int, x_m: Floats) -> Floats:
@@ -130,8 +129,8 @@ class LineFilter:
     def update(
         self,
         points: LinePoints,
-        of: NDArray[np.int64],
-        classes: NDArray[np.int64],
+        of: Ints,
+        classes: Ints,
         height_m: float,
         sigma_tilt_rad: float,
         travelled_m: float,
@@ -170,9 +169,7 @@ class LineFilter:
         self.cov = 0.5 * (cov + cov.T)[:-1, :-1]
         return seen, float(state[-1])
 
-    def _owners(
-        self, x: Floats, y: Floats, points: LinePoints, curves: Floats, of: Ids, classes: Ids
-    ) -> NDArray[np.int64]:
+    def _owners(self, x: Floats, y: Floats, points: LinePoints, curves: Floats, of: Ids, classes: Ids) -> Ints:
         """(N,) the line that each point is on, -1: none."""
         at = basis(x)
         gap = np.abs(y[:, None] - at @ curves.T)

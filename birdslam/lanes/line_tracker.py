@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis
@@ -153,7 +153,7 @@ class LineTracker:
         self._tracks = [Track(kind, score=1.0) for kind, _ in found]
         return shape.tilt_rad
 
-    def _with_edges(self, view: RoadView, paint: LinePoints) -> tuple[LinePoints, NDArray[np.int64]]:
+    def _with_edges(self, view: RoadView, paint: LinePoints) -> tuple[LinePoints, Ints]:
         """All points of the image, and the class of each; edges are looked for from the way ahead."""
         shape = self._filter.curves[self._reference()].copy()
         shape[0] = 0.0
@@ -211,7 +211,7 @@ class LineTracker:
             elif track.kind != PAINT:
                 track.looks += 1.0
 
-    def _add_lines(self, points: LinePoints, of: NDArray[np.int64], seen: list[Support], height_m: float) -> None:
+    def _add_lines(self, points: LinePoints, of: Ints, seen: list[Support], height_m: float) -> None:
         """Lines of points that lie on none that is known."""
         free = np.ones(len(points), bool)
         for support in seen:

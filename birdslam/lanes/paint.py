@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Bools, Floats
+from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
 from birdslam.lanes.road_view import LATTICE_M, RoadView, tilted
 
 SIDE_M = 0.28  # from a line's middle to the asphalt beside it; lines are up to 0.3 m wide
@@ -55,7 +54,7 @@ class LinePoints:
     def __len__(self) -> int:
         return len(self.x_m)
 
-    def of(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> LinePoints:
+    def of(self, chosen: Bools | Ints) -> LinePoints:
         """Some of them."""
         fields = (self.x_m, self.y_m, self.sigma_m, self.weight, self.masked, self.yellow)
         return LinePoints(*(field[chosen] for field in fields))  # type: ignore[arg-type]
@@ -96,7 +95,7 @@ def paint_points(view: RoadView) -> LinePoints:
     )
 
 
-def _response(view: RoadView) -> NDArray[np.float32]:
+def _response(view: RoadView) -> Floats32:
     """(R, C) of the step filter, in grey levels over the brighter side."""
     smooth = cv2.blur(view.grey, (3, 1))
     t = round(SIDE_M / LATTICE_M)
@@ -105,7 +104,7 @@ def _response(view: RoadView) -> NDArray[np.float32]:
     return np.asarray(smooth - np.maximum(left, right), np.float32)  # half of Nieto's
 
 
-def _bar(view: RoadView, response: NDArray[np.float32]) -> tuple[float, Bools]:
+def _bar(view: RoadView, response: Floats32) -> tuple[float, Bools]:
     """The least response of a ridge, and where one may be: on the road and at its border."""
     reach = 2 * round(ROAD_REACH_M / LATTICE_M) + 1
     on_road = cv2.dilate(view.road.view(np.uint8), np.ones((1, reach), np.uint8)) > 0
@@ -119,7 +118,7 @@ def _bar(view: RoadView, response: NDArray[np.float32]) -> tuple[float, Bools]:
     return max(LEAST_CONTRAST, NOISE_FACTOR * spread + min(middle, 0.0)), usable
 
 
-def _symbols(view: RoadView, response: NDArray[np.float32], usable: Bools, least: float) -> Bools:
+def _symbols(view: RoadView, response: Floats32, usable: Bools, least: float) -> Bools:
     """(R, C) arrows and letters: short connected paint, as bright as the brightest, that is wider than a line."""
     out = np.zeros(usable.shape, bool)
     strong = response[usable & (response > least)]
@@ -144,7 +143,7 @@ def _symbols(view: RoadView, response: NDArray[np.float32], usable: Bools, least
     return out
 
 
-def _runs(mask: Bools) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def _runs(mask: Bools) -> tuple[Ints, Ints, Ints]:
     """Row, first column and the column past the last of each run of a mask (R, C)."""
     padded = np.zeros((mask.shape[0], mask.shape[1] + 2), np.int8)
     padded[:, 1:-1] = mask
@@ -154,9 +153,7 @@ def _runs(mask: Bools) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np
     return row, first, past
 
 
-def _ridges(
-    view: RoadView, response: NDArray[np.float32], least: float, usable: Bools
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Bools]:
+def _ridges(view: RoadView, response: Floats32, least: float, usable: Bools) -> tuple[Ints, Ints, Bools]:
     """Rows and columns of the ridges' crests on the road, and whether the mask has paint there."""
     apart = 2 * round(APART_M / LATTICE_M) + 1
     crest = cv2.blur(response, (3, 1))
@@ -169,7 +166,7 @@ def _ridges(
     return rows, columns, near_paint[rows, columns] > 0
 
 
-def _shift_m(view: RoadView, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
+def _shift_m(view: RoadView, rows: Ints, columns: Ints) -> Floats:
     """From a crest's column to the middle of the bright band around it."""
     reach = round(SIDE_M / LATTICE_M)
     steps = np.arange(-reach, reach + 1)
@@ -181,9 +178,7 @@ def _shift_m(view: RoadView, rows: NDArray[np.int64], columns: NDArray[np.int64]
     return out
 
 
-def _mask_middles(
-    view: RoadView, symbols: Bools, rows: NDArray[np.int64], columns: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], Floats]:
+def _mask_middles(view: RoadView, symbols: Bools, rows: Ints, columns: Ints) -> tuple[Ints, Floats]:
     """Rows and y of the middles of the mask's bands that have no ridge."""
     row, first, past = _runs(view.paint)
     wide = (past - first) * LATTICE_M
@@ -231,7 +226,7 @@ def edge_points(view: RoadView, middle_m: Floats) -> tuple[LinePoints, LinePoint
     return out[0], out[1]
 
 
-def _beside(hidden: Bools, rows: NDArray[np.int64], columns: NDArray[np.int64], side: int) -> Bools:
+def _beside(hidden: Bools, rows: Ints, columns: Ints, side: int) -> Bools:
     """Whether a vehicle stands within half a metre beyond."""
     reach = round(0.5 / LATTICE_M)
     steps = np.clip(columns[:, None] + side * np.arange(reach), 0, hidden.shape[1] - 1)

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
-from birdslam.geometry.arrays import Bools, Floats
+from birdslam.geometry.arrays import Bools, Floats, Floats32
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import Segmentation
 
-Grid = NDArray[np.float32]
+Grid = Floats32
 
 NEAREST_M = 3.0  # of a row; most cameras see the road from 5 m on
 FARTHEST_M = 50.0

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.keyframe import Link, Placed
 
@@ -73,7 +72,7 @@ def close_loops(
     return out
 
 
-def inliers(keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[PlaceFactor]) -> NDArray[np.bool_]:
+def inliers(keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[PlaceFactor]) -> Bools:
     """(N,) whether each fix fits the others and odometry."""
     import gtsam  # here: only who has fixes needs it
 
@@ -96,7 +95,7 @@ def inliers(keyframes: Sequence[Placed], links: Sequence[Link], fixes: Sequence[
     solver = gtsam.GncLMOptimizer(graph, start, params)
     solver.setInlierCostThresholds(GNC_COST)
     solver.optimize()
-    out: NDArray[np.bool_] = np.array(solver.getWeights())[size:] > 0.5
+    out: Bools = np.array(solver.getWeights())[size:] > 0.5
     return out
 
 

@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
+
 DESCRIPTOR_BYTES = 32
 MOST_FEATURES = 900  # of an image
 SUMMED = 8  # entries of SIFT that each bit adds, and as many that it takes away
@@ -31,8 +33,8 @@ class FeatureKind(enum.StrEnum):
 class Features:
     """Corners of one undistorted image, in the image's own pixels."""
 
-    px: NDArray[np.float64]  # (N, 2)
-    sigma_px: NDArray[np.float64]  # (N,) 1-sigma of a coordinate: coarse scales are less exact
+    px: Floats  # (N, 2)
+    sigma_px: Floats  # (N,) 1-sigma of a coordinate: coarse scales are less exact
     descriptors: NDArray[np.uint8]  # (N, 32)
 
     def __len__(self) -> int:
@@ -44,7 +46,7 @@ WORKING_WIDTH_PX = {FeatureKind.SIFT: 700, FeatureKind.ORB: 1400}
 FINEST_PX = {FeatureKind.SIFT: 2.0, FeatureKind.ORB: 31.0}
 
 
-def _differences() -> NDArray[np.float32]:
+def _differences() -> Floats32:
     """(128, 256): each column adds SUMMED entries of a SIFT descriptor and takes away as many others."""
     random = np.random.default_rng(_SEED)
     out = np.zeros((128, 8 * DESCRIPTOR_BYTES), np.float32)
@@ -89,7 +91,7 @@ class FeatureExtractor:
         sigma_px = scale * np.clip(0.5 * np.sqrt(size / FINEST_PX[self._kind]), 0.5, 4.0)
         return Features(px, sigma_px, descriptors)
 
-    def _bits(self, descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
+    def _bits(self, descriptors: Floats32) -> NDArray[np.uint8]:
         root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6))
         return np.packbits(root @ self._differences > 0.0, axis=1)
 
@@ -100,7 +102,7 @@ def _once(corners: tuple[cv2.KeyPoint, ...]) -> list[cv2.KeyPoint]:
     return list(seen.values())
 
 
-def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int64]:
+def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> Ints:
     """(N, M) distances in bits of descriptors (N, 32) and (M, 32)."""
     if not len(a) or not len(b):
         return np.zeros((len(a), len(b)), np.int64)
@@ -114,9 +116,7 @@ def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int64]:
 NEVER = 10_000  # bits: more than any two descriptors differ by
 
 
-def match(
-    distance: NDArray[np.int64], most_bits: int, ratio: float, allowed: NDArray[np.bool_] | None = None
-) -> NDArray[np.int64]:
+def match(distance: Ints, most_bits: int, ratio: float, allowed: Bools | None = None) -> Ints:
     """(K, 2) pairs (row, column) that are each other's nearest, clearly so by Lowe's ratio test."""
     if distance.shape[0] < 1 or distance.shape[1] < 2:
         return np.zeros((0, 2), np.int64)

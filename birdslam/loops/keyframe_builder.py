@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import Features
@@ -95,7 +95,7 @@ class KeyframeBuilder:
         return View(look.features, ego_pose(look.T_odom_ego, look.attitude) @ self._mount)
 
 
-def _spread(points: Points, px: Floats, size_px: tuple[int, int]) -> NDArray[np.int64]:
+def _spread(points: Points, px: Floats, size_px: tuple[int, int]) -> Ints:
     """At most MOST_POINTS rows: in turn the best of each cell of the image, by frames that saw it and depth."""
     cells = np.floor(px / size_px * GRID_CELLS).astype(int) @ (1, GRID_CELLS[0])
     quality = np.minimum(points.frames, 8) - 20.0 * points.sigma_depth_rel - points.p_cam_m[:, 2] / 30.0

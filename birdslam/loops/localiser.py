@@ -11,9 +11,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import LOOP_YAW_RAD, ODOMETRY_SCALE_REL, drift_after, is_exact, moved
@@ -138,7 +137,7 @@ class Localiser:
                 hypothesis.cov = moved(hypothesis.cov, step)
         self._T_odom_ego = T_odom_ego
 
-    def look(self, features: Features, among: NDArray[np.bool_] | None = None) -> bool:
+    def look(self, features: Features, among: Bools | None = None) -> bool:
         """Corrects the pose by a frame at the pose that it has moved to; `among`: keyframes that may be used.
 
         Says whether a fix came of it.
@@ -153,7 +152,7 @@ class Localiser:
                 return True
         return self._recognise(features, among)
 
-    def _follow(self, features: Features, guess: SE2, cov: Floats, among: NDArray[np.bool_] | None) -> Fix | None:
+    def _follow(self, features: Features, guess: SE2, cov: Floats, among: Bools | None) -> Fix | None:
         """A fix where the ego is thought to be, if it is one by inliers and by chi-square."""
         rows = self.map.near(guess, FOLLOW_M, among)
         if not rows:
@@ -179,7 +178,7 @@ class Localiser:
         self.attitude = split_pose(fix.keyframe.T_map @ ego_pose(fix.T_keyframe_ego, fix.attitude))[1]
         self.fix, self.since_fix_m = fix, 0.0
 
-    def _recognise(self, features: Features, among: NDArray[np.bool_] | None) -> bool:
+    def _recognise(self, features: Features, among: Bools | None) -> bool:
         """Confirms hypotheses, or makes new ones of places that look alike."""
         assert self._T_odom_ego is not None
         self._hypotheses = [h for h in self._hypotheses if self.travelled_m - h.travelled_m < HYPOTHESIS_M]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
 from birdslam.loops.features import DESCRIPTOR_BYTES, hamming
 
 MOST_WORDS, LEAST_WORDS = 1024, 16
@@ -42,16 +42,16 @@ def learn_words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.packbits(words > 0.0, axis=1)
 
 
-def _signs(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _signs(descriptors: NDArray[np.uint8]) -> Floats32:
     return np.unpackbits(descriptors, axis=1).astype(np.float32) * 2.0 - 1.0
 
 
-def words_of(descriptors: NDArray[np.uint8], words: NDArray[np.uint8]) -> NDArray[np.int64]:
+def words_of(descriptors: NDArray[np.uint8], words: NDArray[np.uint8]) -> Ints:
     """(N,) the nearest word of each descriptor."""
     if not len(words) or not len(descriptors):
         return np.zeros(0, np.int64)
     if len(descriptors) < 64:
-        out: NDArray[np.int64] = hamming(descriptors, words).argmin(axis=1)
+        out: Ints = hamming(descriptors, words).argmin(axis=1)
         return out
     signs = _signs(words).T
     step = 8192  # at a time, so that memory stays small
@@ -64,7 +64,7 @@ class PlaceIndex:
 
     def __init__(self, words: NDArray[np.uint8]) -> None:
         self.words = words
-        self._counts: list[tuple[NDArray[np.int64], Floats]] = []
+        self._counts: list[tuple[Ints, Floats]] = []
         self._matrix: Any = None
         self._built = 0  # keyframes in the matrix
         self._idf: Floats = np.zeros(len(words))
@@ -77,7 +77,7 @@ class PlaceIndex:
         present, count = np.unique(words_of(descriptors, self.words), return_counts=True)
         self._counts.append((present, np.sqrt(count)))
 
-    def look_up(self, descriptors: NDArray[np.uint8], most: int, among: NDArray[np.bool_] | None = None) -> list[int]:
+    def look_up(self, descriptors: NDArray[np.uint8], most: int, among: Bools | None = None) -> list[int]:
         """The numbers of the `most` keyframes most like these descriptors, the best first; `among` (N,): only those."""
         if not self._counts or not len(descriptors) or not len(self.words):
             return []

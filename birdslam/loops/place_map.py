@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.earth import Earth
@@ -98,7 +99,7 @@ class PlaceMap:
         elif self._index is not None:
             self._index.add(keyframe.descriptors)
 
-    def place(self, poses: dict[int, tuple[SE2, NDArray[np.float64]]]) -> None:
+    def place(self, poses: dict[int, tuple[SE2, Floats]]) -> None:
         """Moves keyframes, by number, to other poses with their covariances."""
         self.keyframes = [
             keyframe.at(*poses[keyframe.number]) if keyframe.number in poses else keyframe
@@ -116,7 +117,7 @@ class PlaceMap:
         self.keyframes = [replace(each, gnss=found.fixed.get(each.number)) for each in self.keyframes]
         self.earth = found.earth
 
-    def on_earth(self, T_map_ego: SE2, cov: NDArray[np.float64]) -> EarthPose | None:
+    def on_earth(self, T_map_ego: SE2, cov: Floats) -> EarthPose | None:
         """An ego with its covariance (3, 3) of the tangent; None: the map is not on Earth, or not where the ego is."""
         rows = self.near(T_map_ego, EARTH_REACH_M)
         if self.earth is None or not rows:
@@ -140,14 +141,14 @@ class PlaceMap:
         self.words, self._index = None, None
         self.index()
 
-    def poses(self) -> NDArray[np.float64]:
+    def poses(self) -> Floats:
         """(N, 3): x, y and yaw of every keyframe."""
         if len(self._poses) != len(self.keyframes):
             placed = [keyframe.T_map_keyframe for keyframe in self.keyframes]
             self._poses = np.array([(T.x_m, T.y_m, T.yaw_rad) for T in placed]).reshape(-1, 3)
         return self._poses
 
-    def near(self, T_map_ego: SE2, radius_m: float, among: NDArray[np.bool_] | None = None) -> list[int]:
+    def near(self, T_map_ego: SE2, radius_m: float, among: Bools | None = None) -> list[int]:
         """Rows of keyframes within the radius that look the same way, the nearest first."""
         poses = self.poses()
         if not len(poses):
@@ -160,7 +161,7 @@ class PlaceMap:
         rows = np.flatnonzero(fits)
         return [int(row) for row in rows[np.argsort(distance[rows], kind="stable")]]
 
-    def around(self, row: int, among: NDArray[np.bool_] | None = None) -> LocalMap:
+    def around(self, row: int, among: Bools | None = None) -> LocalMap:
         """A keyframe with those beside it."""
         own = self.keyframes[row]
         rows = [other for other in self.near(own.T_map_keyframe, NEIGHBOUR_M, among) if other != row]

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops, held
@@ -173,7 +173,7 @@ class MapSession:
         if self._extend and estimate.valid:
             self._take(self._builder.add(look))
 
-    def _among(self) -> NDArray[np.bool_] | None:
+    def _among(self) -> Bools | None:
         """Keyframes that the drive may be found by: all but those that it has just made itself."""
         recent = [row for row, way_m in self._own if self._travelled_m - way_m < OWN_WAY_M]
         if not recent:

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_exp, rotation_log
 from birdslam.loops.features import Features, hamming, match
@@ -41,10 +40,10 @@ class View:
 class Points:
     """Of a keyframe, in its camera's axes; `feature` is the row of each in the keyframe's features."""
 
-    feature: NDArray[np.int64]
+    feature: Ints
     p_cam_m: Floats  # (N, 3)
     sigma_depth_rel: Floats  # (N,)
-    frames: NDArray[np.int64]  # (N,) that saw it
+    frames: Ints  # (N,) that saw it
 
 
 def triangulate(camera: Camera, keyframe: View, others: Sequence[View]) -> Points:
@@ -81,7 +80,7 @@ def triangulate(camera: Camera, keyframe: View, others: Sequence[View]) -> Point
     return Points(kept, rays[kept] / rho[kept, None], np.maximum(sigma_rel[kept], 0.01), frames[kept])
 
 
-def _observations(own: Features, others: Sequence[View]) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, Floats]:
+def _observations(own: Features, others: Sequence[View]) -> tuple[Ints, Ints, Floats, Floats]:
     """(O,) the keyframe's feature, (O,) the frame, (O, 2) the pixel there and (O,) its sigma."""
     rows, views, px, sigma = [], [], [], []
     for number, view in enumerate(others):
@@ -101,23 +100,14 @@ def _projected(rays: Floats, rho: Floats, T: Transform) -> tuple[Floats, Floats]
     return p, np.maximum(p[:, 2], 1e-3)
 
 
-def _residuals(
-    rays: Floats, rho: Floats, poses: Transform, rows: NDArray[np.int64], views: NDArray[np.int64], xy: Floats
-) -> Floats:
+def _residuals(rays: Floats, rho: Floats, poses: Transform, rows: Ints, views: Ints, xy: Floats) -> Floats:
     p, z = _projected(rays[rows], rho[rows], poses[views])
     out: Floats = xy - p[:, :2] / z[:, None]
     return out
 
 
 def _depths(
-    rays: Floats,
-    rho: Floats,
-    poses: Transform,
-    rows: NDArray[np.int64],
-    views: NDArray[np.int64],
-    xy: Floats,
-    sigma: Floats,
-    good: NDArray[np.bool_],
+    rays: Floats, rho: Floats, poses: Transform, rows: Ints, views: Ints, xy: Floats, sigma: Floats, good: Bools
 ) -> tuple[Floats, Floats]:
     """Inverse depths by Gauss-Newton with Cauchy weights, and their information."""
     T = poses[views]

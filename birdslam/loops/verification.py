@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_exp
 from birdslam.geometry.se2 import SE2
@@ -111,9 +111,7 @@ def _camera_pose(camera: Camera, T_keyframe_ego: Transform) -> Transform:
     return inverse(T_keyframe_ego @ mount_pose(camera.ground))
 
 
-def _ransac(
-    camera: Camera, features: Features, local: LocalMap, pairs: NDArray[np.int64]
-) -> tuple[Transform | None, NDArray[np.int64]]:
+def _ransac(camera: Camera, features: Features, local: LocalMap, pairs: Ints) -> tuple[Transform | None, Ints]:
     if len(pairs) < 8:
         return None, pairs
     found, rotated, moved, inliers = cv2.solvePnPRansac(
@@ -140,9 +138,7 @@ def _ransac(
     return pose, pairs[inliers.ravel()]
 
 
-def _guided(
-    camera: Camera, features: Features, local: LocalMap, pose: Transform, radius_px: float
-) -> NDArray[np.int64]:
+def _guided(camera: Camera, features: Features, local: LocalMap, pose: Transform, radius_px: float) -> Ints:
     """Matches within `radius_px` of where the pose puts each point."""
     T = _camera_pose(camera, pose)
     p = local.points_m @ T[:3, :3].T + T[:3, 3]
@@ -155,8 +151,8 @@ def _guided(
 
 
 def _adjust(
-    camera: Camera, features: Features, local: LocalMap, pairs: NDArray[np.int64], pose: Transform
-) -> tuple[Transform, Floats, NDArray[np.bool_]] | None:
+    camera: Camera, features: Features, local: LocalMap, pairs: Ints, pose: Transform
+) -> tuple[Transform, Floats, Bools] | None:
     """Gauss-Newton with Cauchy weights: T_keyframe_ego (4, 4), the covariance of (x, y, yaw), and the inliers."""
     if len(pairs) < 8:
         return None
@@ -166,7 +162,7 @@ def _adjust(
     xy = camera.to_xy(features.px[pairs[:, 1]])
     noise = (features.sigma_px[pairs[:, 1]] ** 2 + OTHER_VIEW_PX**2) / camera.fx_px**2
     prior = np.array([0.0, 0.0, SIGMA_Z_M**-2, SIGMA_TILT_RAD**-2, SIGMA_TILT_RAD**-2, 0.0])
-    good: NDArray[np.bool_] = np.ones(len(pairs), bool)
+    good: Bools = np.ones(len(pairs), bool)
     H: Floats = np.eye(6)
     for _ in range(ITERATIONS):
         p_ego = (points - pose[:3, 3]) @ pose[:3, :3]

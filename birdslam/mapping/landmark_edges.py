@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.geometry import bev
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.types import LandmarkEdge
 
@@ -28,8 +28,8 @@ class StaticMapConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def landmark_edges(
-    ids: NDArray[np.int64],
-    px: NDArray[np.float64],
+    ids: Ints,
+    px: Floats,
     frame_id: int,
     camera: Camera,
     ground: GroundPlane,

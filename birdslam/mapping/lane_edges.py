@@ -11,15 +11,14 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.geometry import bev
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.types import LandmarkEdge, LandmarkKind
 
-Ids = NDArray[np.int64]
+Ids = Ints
 
 _CELLS = 1 << 20  # stations of one lane along one axis, before their ids repeat: 4000 km
 _MIN_SPAN = 0.7  # of a station's length that its points must span: a line through fewer follows their noise

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.se2 import SE2
 
-Ids = NDArray[np.int64]
+Ids = Ints
 
 NO_LANE = -1  # of a point that lies on no known lane
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.ego_lane import EgoLane
@@ -30,7 +30,7 @@ from birdslam.mapping.lanes import AmodalLanes, Completion, LanesConfig, LaneVie
 from birdslam.perception import Segmentation
 from birdslam.types import LandmarkEdge, LanePoint, Lanes, Status
 
-Ids = NDArray[np.int64]
+Ids = Ints
 Submit = Callable[..., Future[Any]]  # (function, *arguments), as of an executor
 
 REMEMBERED_FRAMES = 64  # whose poses are kept for late segmentations

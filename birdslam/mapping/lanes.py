@@ -18,16 +18,15 @@ from typing import Protocol
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Bools, Floats
+from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.lane_ids import LaneCloud, LaneIds
 from birdslam.perception import Segmentation
 
-Points = NDArray[np.float32]  # (N, 1, 2), as OpenCV takes them: x and y
-Grids = NDArray[np.float32]
+Points = Floats32  # (N, 1, 2), as OpenCV takes them: x and y
+Grids = Floats32
 
 ROAD, BOUNDARY = 0, 1  # the channels of a pair of grids
 
@@ -208,7 +207,7 @@ def count_cells(clouds: Sequence[Points], config: LanesConfig) -> Grids:
     return np.asarray(cv2.calcHist([points], [0, 1], None, [rows, columns], [0, rows, 0, columns]), np.float32)
 
 
-def _cells_of(centres_m: Floats, config: LanesConfig) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _cells_of(centres_m: Floats, config: LanesConfig) -> tuple[Ints, Ints]:
     """Rows and columns of cells, given their centres (N, 2) in ego."""
     row, column = np.floor((centres_m + _origin_m(config)) / config.cell_m).astype(np.int64).T
     return row, column
@@ -288,7 +287,7 @@ def _lengths_m(pieces: Floats) -> Floats:
     return out
 
 
-def _adjacent(piece: NDArray[np.int64], cells: Bools, count: int) -> Bools:
+def _adjacent(piece: Ints, cells: Bools, count: int) -> Bools:
     """(P, P) which segments have adjacent cells; `piece` is the segment of each cell that is set, or -1."""
     grid = np.full(np.add(cells.shape, 2), -1)
     grid[1:-1, 1:-1][cells] = piece
@@ -301,7 +300,7 @@ def _adjacent(piece: NDArray[np.int64], cells: Bools, count: int) -> Bools:
     return out | out.T
 
 
-def _merge_pieces(pieces: Floats, adjacent: Bools, config: LanesConfig) -> NDArray[np.int64]:
+def _merge_pieces(pieces: Floats, adjacent: Bools, config: LanesConfig) -> Ints:
     """(P,) the lane of each segment: segments are joined if adjacent in a bend, or if one ends on the other's line.
 
     Beyond the other's end up to a dashed line's gap. A stop line is adjacent too, but at too large an angle.

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.types import FIRST_PERSON, PEOPLE
 
 DPI = 160
@@ -39,7 +39,7 @@ class Track:
     label: str
     length_m: float
     width_m: float
-    poses: NDArray[np.float64]
+    poses: Floats
     frames: int
     speed_mps: float
     farthest_m: float  # the longest distance it was seen from
@@ -60,16 +60,16 @@ class Scene:
     """All that the picture shows: ego poses (N, 3), points (M, 2) of the map, places (K, 2) where an epoch began."""
 
     name: str
-    ego: NDArray[np.float64]
-    breaks: NDArray[np.float64]
+    ego: Floats
+    breaks: Floats
     tracks: list[Track]
-    lanes: NDArray[np.float64]
-    landmarks: NDArray[np.float64]
+    lanes: Floats
+    landmarks: Floats
     path_m: float
     frames: int
     track_count: int
     sigma_rel: float = 0.0  # 1-sigma of all lengths, where the camera's height or lens is an estimate
-    lines: tuple[NDArray[np.float64], ...] = ()  # polylines (N, 2) of lane lines and road edges
+    lines: tuple[Floats, ...] = ()  # polylines (N, 2) of lane lines and road edges
 
 
 def draw(scene: Scene, path: Path) -> None:
@@ -118,7 +118,7 @@ def draw(scene: Scene, path: Path) -> None:
     figure.savefig(path, dpi=DPI, facecolor=PAPER)
 
 
-def _paper(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _paper(points: Floats) -> Floats:
     """World (N, >= 2) to paper (N, 2): forward up, left to the left."""
     return np.column_stack([-points[:, 1], points[:, 0]])
 
@@ -152,7 +152,7 @@ def colour_of(vehicle: int) -> tuple[float, float, float]:
     return colorsys.hsv_to_rgb((0.02 + vehicle * 0.6180339887) % 1.0, 0.62, 1.0)
 
 
-def _footprint(pose: NDArray[np.float64], length_m: float, width_m: float, ahead_m: float) -> NDArray[np.float64]:
+def _footprint(pose: Floats, length_m: float, width_m: float, ahead_m: float) -> Floats:
     """Outline (5, 2) on paper of a vehicle with a pointed nose, whose front is `ahead_m` before its pose."""
     half, back = width_m / 2.0, ahead_m - length_m
     shoulder = ahead_m - 0.22 * length_m
@@ -169,7 +169,7 @@ def _draw_map(axes: Any, scene: Scene) -> None:
         axes.plot(*_paper(line).T, color=LINE, linewidth=1.1, alpha=0.9)
 
 
-def _draw_track(axes: Any, track: Track, ego: NDArray[np.float64]) -> None:
+def _draw_track(axes: Any, track: Track, ego: Floats) -> None:
     from matplotlib.patches import Polygon
 
     colour = colour_of(track.vehicle)

@@ -18,14 +18,13 @@ from typing import Any, Self, TextIO
 import msgspec
 import numpy as np
 import scipy.spatial.transform  # noqa: F401  # at the start of a drive, not with its first frame (trajectory.py)
-from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
-from birdslam.geometry.se2 import SE2
-from birdslam.outputs.bev_picture import Scene, Track, draw
+from birdslam.outputs.bev_picture import draw
 from birdslam.outputs.final_trajectories import EGO_FILES
 from birdslam.outputs.line_map import LineMap
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, readme, verdict
+from birdslam.outputs.scene_recorder import MOST_POSES, MOST_TRACKS, SceneRecorder, Thinned
 from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row, tum_row
 from birdslam.types import INVALIDATING, Attitude, Estimate, MapUpdate, Status, VehicleEstimate
 
@@ -46,7 +45,6 @@ FILES = {  # what README.txt says of each that is there
     "camera.toml": "the camera as the first pass found it, for `--camera` next time",
     "logs": "what each process said",
 }
-MOST_POSES, MOST_TRACK_POSES, MOST_POINTS, MOST_TRACKS = 4000, 100, 20_000, 200  # in the picture; under 3 MB in all
 
 
 class ResultsError(ValueError):
@@ -68,50 +66,6 @@ def claim_directory(directory: Path) -> None:
 def write_json(path: Path, report: object) -> None:
     """Writes structs, or lists of them, for people to read too."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(report), indent=2) + b"\n")
-
-
-class Thinned:
-    """Rows of numbers, at most `keep` of them: past that, every second one goes, and every second one to come.
-
-    Room for `begin` rows is there from the start (None: for all), and doubles where that is not enough.
-    """
-
-    def __init__(self, width: int, keep: int, begin: int | None = None) -> None:
-        self._keep = keep
-        self._rows = np.full((keep if begin is None else min(begin, keep), width), np.nan)  # written to: it is there
-        self._kept = 0
-        self._step = 1
-        self._seen = 0
-
-    def add(self, *row: float) -> None:
-        """Keep this row, or pass over it."""
-        if self._seen % self._step == 0:
-            if self._kept >= self._keep:
-                left = self._rows[: self._kept : 2].copy()
-                self._rows[: len(left)], self._kept = left, len(left)
-                self._step *= 2
-            if self._seen % self._step == 0:
-                if self._kept == len(self._rows):
-                    more = np.full((min(2 * self._kept, self._keep) - self._kept, self._rows.shape[1]), np.nan)
-                    self._rows = np.concatenate([self._rows, more])
-                self._rows[self._kept] = row
-                self._kept += 1
-        self._seen += 1
-
-    def array(self) -> NDArray[np.float64]:
-        """(N, width) of the rows kept."""
-        return self._rows[: self._kept].copy()
-
-
-class _TrackHistory:
-    def __init__(self) -> None:
-        self.poses = Thinned(3, MOST_TRACK_POSES, begin=16)
-        self.speeds = Thinned(1, MOST_TRACK_POSES, begin=16)
-        self.described = ""
-        self.last: VehicleEstimate | None = None
-        self.T_picture_vehicle = SE2()
-        self.epoch = -1
-        self.farthest_m = 0.0
 
 
 class Recorder:
@@ -156,10 +110,8 @@ class Recorder:
         self._last: Estimate | None = None
         self._epoch: int | None = None
         self._epoch_count = 0
-        self._T_picture_world = SE2()
-        self._ego, self._breaks = Thinned(3, MOST_POSES), Thinned(2, MOST_POSES)
-        self._lanes, self._landmarks = Thinned(2, MOST_POINTS), Thinned(2, MOST_POINTS)
-        self._tracks: dict[int, _TrackHistory] = {}
+        self._scene = SceneRecorder()
+        self._tracks: dict[int, tuple[str, int]] = {}  # of the vehicles seen last: the comment on its class, its epoch
         self._track_count = 0
 
     def _open(self, name: str) -> TextIO:
@@ -196,27 +148,22 @@ class Recorder:
         pose = ego_pose(estimate.T_world_ego, estimate.attitude)
         self._tum.write(tum_row(estimate.t_source_ns, pose) + "\n")
         self._write_row(estimate, pose)
-        T_picture_ego = self._T_picture_world @ estimate.T_world_ego
-        self._ego.add(T_picture_ego.x_m, T_picture_ego.y_m, T_picture_ego.yaw_rad)
-        self._lines.add(estimate, self._T_picture_world)
+        self._scene.add(estimate)
+        self._lines.add(estimate, self._scene.T_picture_world)
         for vehicle in estimate.road_users:
             if vehicle.age_ns == 0:
-                self._add_vehicle(estimate, vehicle)
+                self._write_vehicle(estimate, vehicle)
         self._last = estimate
 
     def add_map(self, update: MapUpdate) -> None:
         """What the map gained."""
-        for kind, points, lanes, kept in (
-            ("landmark", update.landmarks_m, (), self._landmarks),
-            ("lane", update.lanes_m, update.lane_ids, self._lanes),
-        ):
+        for kind, points, lanes in (("landmark", update.landmarks_m, ()), ("lane", update.lanes_m, update.lane_ids)):
             self._map.writelines(
                 f"{update.epoch},{kind},{x_m:.3f},{y_m:.3f},{lane}\n"
                 for (x_m, y_m), lane in zip(points, lanes or (-1,) * len(points), strict=True)
             )
-            if update.epoch == self._epoch:  # of an older epoch: its place is not known any more
-                for x_m, y_m in self._T_picture_world @ np.array(points).reshape(-1, 2):
-                    kept.add(float(x_m), float(y_m))
+        if update.epoch == self._epoch:  # of an older epoch: its place is not known any more
+            self._scene.add_map(update)
 
     def finish(self, summary: dict[str, Any], lengths_by: LengthsBy | None = None) -> list[str]:
         """Write summary.json (`summary` over the recorder's own counts; a number that is not finite becomes null),
@@ -243,9 +190,12 @@ class Recorder:
         sentences = verdict(DriveCounts(**known, lengths_by=lengths_by or self._stated()))
         encoded = msgspec.json.encode({**counts, "verdict": sentences, **summary}, enc_hook=_plain)
         (self._directory / "summary.json").write_bytes(msgspec.json.format(encoded, indent=2) + b"\n")
-        draw(self._scene(), self._directory / "bev.png")
+        name, lines = self._directory.resolve().name, tuple(self._lines.drawn())
+        counted = {"path_m": self._path_m, "frames": self._frames, "track_count": self._track_count}
+        scene = self._scene.scene(name=name, sigma_rel=self._camera.scale_sigma_rel, lines=lines, **counted)
+        draw(scene, self._directory / "bev.png")
         there = {name: what for name, what in FILES.items() if (self._directory / name).exists()}
-        text = readme(self._directory.resolve().name, sentences, there)
+        text = readme(name, sentences, there)
         (self._directory / "README.txt").write_text(text, encoding="utf-8")
         return sentences
 
@@ -266,12 +216,8 @@ class Recorder:
         return LengthsBy(height_sigma_rel=sigma_rel)
 
     def _begin_epoch(self, estimate: Estimate) -> None:
-        """Put the new world where the last one was left."""
         if self._last is not None:
             self._tum.write(f"# epoch {estimate.epoch}: a new world frame begins\n")
-            T_picture_ego = self._T_picture_world @ self._last.T_world_ego
-            self._T_picture_world = T_picture_ego @ estimate.T_world_ego.inverse()
-            self._breaks.add(T_picture_ego.x_m, T_picture_ego.y_m)
         self._epoch = estimate.epoch
         self._epoch_count += 1
 
@@ -282,72 +228,25 @@ class Recorder:
         self._kitti.write(kitti_row(self._trajectory.add(estimate.epoch, T_world_ego)) + "\n")
         self._next_row = estimate.frame_id + 1
 
-    def _add_vehicle(self, estimate: Estimate, vehicle: VehicleEstimate) -> None:
+    def _write_vehicle(self, estimate: Estimate, vehicle: VehicleEstimate) -> None:
         path = self._tracks_directory / f"{vehicle.vehicle}.tum.txt"
-        track = self._tracks.pop(vehicle.vehicle, None)
-        lines = []
-        if track is None:
-            track = _TrackHistory()
-            if not path.exists():
-                self._track_count += 1
-                lines.append(
-                    f"# vehicle {vehicle.vehicle}: t_s x_m y_m z_m qx qy qz qw of its footprint's centre in world"
-                )
-                lines.append("# z is the height of the road under the ego: a vehicle's own is not estimated")
-        self._tracks[vehicle.vehicle] = track  # the one seen last stands last
-        if len(self._tracks) > MOST_TRACKS:
-            del self._tracks[next(iter(self._tracks))]
-        if track.epoch not in (-1, estimate.epoch):
+        known, lines = self._tracks.pop(vehicle.vehicle, None), []
+        if known is None and not path.exists():
+            self._track_count += 1
+            lines.append(f"# vehicle {vehicle.vehicle}: t_s x_m y_m z_m qx qy qz qw of its footprint's centre in world")
+            lines.append("# z is the height of the road under the ego: a vehicle's own is not estimated")
+        if known is not None and known[1] != estimate.epoch:
             lines.append(f"# epoch {estimate.epoch}: a new world frame begins")
         described = f"# class {vehicle.label}, length_m {vehicle.length_m:.1f}, width_m {vehicle.width_m:.1f}"
-        if described != track.described:
+        if known is None or described != known[0]:
             lines.append(described)
         pose = ego_pose(vehicle.T_world_vehicle, Attitude(z_m=estimate.attitude.z_m))
         lines.append(tum_row(estimate.t_source_ns, pose))
         with path.open("a", encoding="ascii", errors="backslashreplace") as file:  # so many tracks, so few descriptors
             file.write("\n".join(lines) + "\n")
-        track.described, track.epoch, track.last = described, estimate.epoch, vehicle
-        track.T_picture_vehicle = placed = self._T_picture_world @ vehicle.T_world_vehicle
-        track.poses.add(placed.x_m, placed.y_m, placed.yaw_rad)
-        seen_from = estimate.T_world_ego.between(vehicle.T_world_vehicle)
-        track.farthest_m = max(track.farthest_m, math.hypot(seen_from.x_m, seen_from.y_m))
-        track.speeds.add(math.hypot(*vehicle.velocity_mps))
-
-    def _scene(self) -> Scene:
-        tracks = [
-            Track(
-                vehicle=vehicle,
-                label=track.last.label,
-                length_m=track.last.length_m,
-                width_m=track.last.width_m,
-                poses=np.vstack([track.poses.array(), _numbers(track.T_picture_vehicle)]),
-                frames=track.last.frames,
-                speed_mps=float(np.median(track.speeds.array())),
-                farthest_m=track.farthest_m,
-            )
-            for vehicle, track in sorted(self._tracks.items())
-            if track.last is not None
-        ]
-        ego = self._ego.array()
-        if self._last is not None:
-            ego = np.vstack([ego, _numbers(self._T_picture_world @ self._last.T_world_ego)])
-        return Scene(
-            name=self._directory.resolve().name,
-            sigma_rel=self._camera.scale_sigma_rel,
-            ego=ego,
-            breaks=self._breaks.array(),
-            tracks=tracks,
-            lanes=self._lanes.array(),
-            landmarks=self._landmarks.array(),
-            path_m=self._path_m,
-            frames=self._frames,
-            track_count=self._track_count,
-            lines=tuple(self._lines.drawn()),
-        )
-
-
-def _numbers(pose: SE2) -> tuple[float, float, float]:
-    return pose.x_m, pose.y_m, pose.yaw_rad
+        self._tracks[vehicle.vehicle] = described, estimate.epoch  # the one seen last stands last
+        if len(self._tracks) > MOST_TRACKS:
+            del self._tracks[next(iter(self._tracks))]
 
 
 def _plain(value: object) -> object:

@@ -9,9 +9,8 @@ from pathlib import Path
 from xml.sax.saxutils import escape, quoteattr
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.types import NS_PER_S
 
 SUFFIXES = ".geojson", ".gpx", ".kml"
@@ -22,7 +21,7 @@ class Way:
     """A line on Earth: (N, 2) latitude and longitude in degrees; times of the recording, 0 where there are none."""
 
     name: str
-    degrees: NDArray[np.float64]
+    degrees: Floats
     t_ns: Sequence[int] = ()
     about: dict[str, float | int | str] | None = None
 

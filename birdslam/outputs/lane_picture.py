@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig, LaneView
 
 TITLES = (
@@ -23,12 +24,7 @@ HIDDEN_ALPHA = 0.25  # of cells, behind lanes
 
 
 def draw_lanes(
-    title: str,
-    image: NDArray[np.uint8],
-    view: LaneView,
-    config: LanesConfig,
-    path: Path,
-    later: NDArray[np.float32] | None = None,
+    title: str, image: NDArray[np.uint8], view: LaneView, config: LanesConfig, path: Path, later: Floats32 | None = None
 ) -> None:
     """`image` (H, W) grey or (H, W, 3) BGR above; below it the grids from above, forward up and left to the left.
 

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.geometry import bev
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.perception import Detections
 from birdslam.perception.decoding.detection import EdgeSigma
@@ -156,7 +155,7 @@ def _without_copies(boxes: Floats) -> Floats:
     return boxes[kept]
 
 
-def _occupants(people: Floats, cars: Floats) -> NDArray[np.bool_]:
+def _occupants(people: Floats, cars: Floats) -> Bools:
     """(N,): who sits in a vehicle, its wheels lower than the person's lower edge and its roof above the head."""
     if not len(people) or not len(cars):
         return np.zeros(len(people), dtype=np.bool_)
@@ -186,7 +185,7 @@ def _riders(people: Floats, mounts: Floats) -> dict[int, int]:
     return {int(i): int(j) for i, j in zip(rows, columns_of, strict=True) if fits[i, j]}
 
 
-def _covered_feet(boxes: Floats, detections: Detections) -> NDArray[np.bool_]:
+def _covered_feet(boxes: Floats, detections: Detections) -> Bools:
     """(N,): whose lower edge a nearer box, whose own is lower, covers."""
     x1, y1, x2, y2 = (boxes[:, k, None] for k in range(4))
     n1, m1, n2, m2 = (detections.boxes_px[None, :, k] for k in range(4))

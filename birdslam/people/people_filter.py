@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.people.box_model import MIN_SLOPE, TALL, UNUSED, WIDTH, expected_boxes, hide_feet, measured_boxes
 from birdslam.people.people_boxes import PersonBox
@@ -203,7 +203,7 @@ class PeopleFilter:
         R[:, WIDTH, WIDTH] = np.where(uses, self._sizes[at, 3], UNUSED) ** 2
         return z, R
 
-    def moments(self, after_s: float = 0.0, stands: NDArray[np.bool_] | None = None) -> Moments:
+    def moments(self, after_s: float = 0.0, stands: Bools | None = None) -> Moments:
         """Of everybody, `after_s` later, as they move.
 
         The velocity is the one of whoever moves, or none of whom `stands` (N,); its covariance is about that, with the

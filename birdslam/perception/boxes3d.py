@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 
 
@@ -23,20 +23,20 @@ class Boxes3d:
     image's width; `in_metres` converts them.
     """
 
-    centre_px: NDArray[np.float64]  # (N, 2) the body's centre in the undistorted image, also beyond its edge
-    depth_m: NDArray[np.float64]  # (N,) of that centre along the optical axis
-    size_m: NDArray[np.float64]  # (N, 3) length, width, height
-    alpha_rad: NDArray[np.float64]  # (N,) in (-pi, pi]
-    sigma_depth_m: NDArray[np.float64]  # (N,)
-    sigma_size_m: NDArray[np.float64]  # (N, 3)
-    sigma_alpha_rad: NDArray[np.float64]  # (N,) of the axis, in a Gaussian near its peak
-    flip: NDArray[np.float64]  # (N,) in [0, 0.5]
+    centre_px: Floats  # (N, 2) the body's centre in the undistorted image, also beyond its edge
+    depth_m: Floats  # (N,) of that centre along the optical axis
+    size_m: Floats  # (N, 3) length, width, height
+    alpha_rad: Floats  # (N,) in (-pi, pi]
+    sigma_depth_m: Floats  # (N,)
+    sigma_size_m: Floats  # (N, 3)
+    sigma_alpha_rad: Floats  # (N,) of the axis, in a Gaussian near its peak
+    flip: Floats  # (N,) in [0, 0.5]
     canonical_focal_rel: float = 0.0
 
     def __len__(self) -> int:
         return len(self.depth_m)
 
-    def take(self, rows: NDArray[np.int64] | Sequence[int]) -> Boxes3d:
+    def take(self, rows: Ints | Sequence[int]) -> Boxes3d:
         """The given rows, in that order."""
         return Boxes3d(
             self.centre_px[rows],
@@ -59,13 +59,13 @@ class Boxes3d:
             self, depth_m=self.depth_m * factor, sigma_depth_m=self.sigma_depth_m * factor, canonical_focal_rel=0.0
         )
 
-    def centres_cam_m(self, camera: Camera) -> NDArray[np.float64]:
+    def centres_cam_m(self, camera: Camera) -> Floats:
         """(N, 3) the bodies' centres in the camera frame."""
         x = (self.centre_px[:, 0] - camera.cx_px) / camera.fx_px
         y = (self.centre_px[:, 1] - camera.cy_px) / camera.fy_px
         return self.in_metres(camera).depth_m[:, None] * np.column_stack([x, y, np.ones_like(x)])
 
-    def in_ego(self, camera: Camera, ground: GroundPlane) -> NDArray[np.float64]:
+    def in_ego(self, camera: Camera, ground: GroundPlane) -> Floats:
         """(N, 3) x_m, y_m, yaw_rad in ego: the bodies projected onto the road."""
         centres_m = self.centres_cam_m(camera) @ ground.R_ego_cam.T
         yaw_rad = self.alpha_rad + np.arctan2(centres_m[:, 1], centres_m[:, 0])

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.perception.manifest import ModelError
 
 SHIPPED = Path(__file__).parent / "shipped" / "lanes.onnx"
@@ -39,8 +39,8 @@ class GridCompletion:
         self._input = self._session.get_inputs()[0].name
         self(np.zeros((2, *shape), dtype=np.float32))  # warm-up
 
-    def __call__(self, grids: NDArray[np.float32]) -> NDArray[np.float32]:
+    def __call__(self, grids: Floats32) -> Floats32:
         """Grids (2, rows, columns) completed."""
         (out,) = self._session.run(None, {self._input: grids[None]})
-        completed: NDArray[np.float32] = out[0]
+        completed: Floats32 = out[0]
         return completed

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.perception.decoding.detection import Detections, EdgeSigma
 from birdslam.perception.manifest import LowerEdge
@@ -52,7 +53,7 @@ def external_detections(
     return Detections(boxes, sure, tuple(labels), None, edge_sigma, lower_edge, ids)
 
 
-def undistort_boxes(camera: Camera, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
+def undistort_boxes(camera: Camera, boxes_px: Floats) -> Floats:
     """Boxes (N, 4) of the camera's own images as they are in undistorted ones: by the middles of their sides."""
     if not (camera.distortion and len(boxes_px)):
         return boxes_px

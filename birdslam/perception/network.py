@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.perception.decoding.box_lists import BoxListDecoder, SsdDecoder
 from birdslam.perception.decoding.centernet import CenterNetDecoder
 from birdslam.perception.decoding.depth import DisparityDecoder, MetricDepthDecoder
@@ -59,7 +60,7 @@ class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Decoder(Protocol):
     """Decodes a network's outputs to findings: `read` those of each view, then `merge` those of one image."""
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Any: ...
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> Any: ...
 
     def merge(self, parts: Any, views: Any) -> Any: ...
 
@@ -88,7 +89,7 @@ DECODINGS: dict[type, tuple[Callable[..., Decoder], str, Callable[[Any], tuple[s
 class _Bound:
     """A session whose input is `image` and whose outputs are buffers of its own, made once."""
 
-    def __init__(self, session: Any, name: str, image: NDArray[np.float32], outputs: Sequence[str]) -> None:
+    def __init__(self, session: Any, name: str, image: Floats32, outputs: Sequence[str]) -> None:
         self._session = session
         first = session.run(outputs, {name: image})  # the first run: what is really there
         self.tensors = {output: np.empty(out.shape, np.float32) for output, out in zip(outputs, first, strict=True)}
@@ -231,7 +232,7 @@ class Network:
             return found
         return replace(found, segmentation=replace(masks, road=without_verge(masks.road, image)))
 
-    def answer(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
+    def answer(self, image: NDArray[np.uint8]) -> dict[str, Floats32]:
         """The outputs as they are for an image's first view."""
         self.prepare(image, self.views(image)[0])
         self.infer()

@@ -16,9 +16,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.geometry.camera import Camera
 from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.manifest import ManifestMismatch, ModelError, Schedule
@@ -37,7 +36,7 @@ MIN_HALF_SPAN = 1e-6  # of a box, at a depth of 1
 class Frustum:
     """The network's input for one box, and how to turn its output back to camera axes."""
 
-    features: NDArray[np.float32]  # (C, count)
+    features: Floats32  # (C, count)
     azimuth_rad: float  # of the box's middle, to the right of the optical axis
     middle_m: Floats  # (3,) what the points lie about, in the turned axes; zero where they are not centred
 
@@ -116,10 +115,10 @@ class PointNet:
         names = _outputs_of(table)
         return dict(zip(names, ((1, 3), (1, bins), (1, bins), (1, sizes), (1, sizes, 3)), strict=True))
 
-    def _run(self, boxes: NDArray[np.float32], labels: Sequence[str]) -> dict[str, NDArray[np.float32]]:
+    def _run(self, boxes: Floats32, labels: Sequence[str]) -> dict[str, Floats32]:
         """Outputs for N boxes; a network of a fixed batch is run as often as need be."""
         points, step = self.manifest.points, self._batch or max(len(boxes), 1)
-        parts: list[list[NDArray[np.float32]]] = []
+        parts: list[list[Floats32]] = []
         for start in range(0, len(boxes), step):
             part = boxes[start : start + step]
             filled = np.zeros((step, *part.shape[1:]), np.float32)

@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools
+
 SHRINK = 4  # downscaling: single blades and the camera's noise do not count
 # Above the road's level, of a pixel that shows grass. On five images of KITTI tracking 0005 the lane's pixels lie
 # within 0.03 of their median, and 19 of 20 of the verge's 0.1 to 0.3 above it
@@ -21,7 +23,7 @@ DARKEST = 60.0  # of R + G + B: darker pixels have no reliable colour
 LEAST_PIXELS = 50  # of a downscaled mask, for the level
 
 
-def without_verge(road: NDArray[np.bool_], image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def without_verge(road: Bools, image: NDArray[np.uint8]) -> Bools:
     """The road mask (H, W) without its green pixels in the BGR image (H, W, 3); unchanged for a grey one (H, W)."""
     if image.ndim != 3:
         return road

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.perception.manifest import FitPad, Input, Tiles
 
 
@@ -29,23 +30,23 @@ class View:
     height_px: int
 
     @property
-    def ratio(self) -> NDArray[np.float64]:
+    def ratio(self) -> Floats:
         """(2,): input pixels in an image pixel, along x and y."""
         return np.array([self.width_px / (self.x1_px - self.x0_px), self.height_px / self.image_height_px])
 
-    def crop(self, plane: NDArray[np.float32], input: Input) -> NDArray[np.float32]:
+    def crop(self, plane: Floats32, input: Input) -> Floats32:
         """(h, w), not copied: the rectangle of this view in a map (H, W) over the whole input, coarser or not."""
         fy, fx = plane.shape[0] / input.height_px, plane.shape[1] / input.width_px
         rows = slice(round(self.top_px * fy), max(round((self.top_px + self.height_px) * fy), 1))
         columns = slice(round(self.left_px * fx), max(round((self.left_px + self.width_px) * fx), 1))
         return plane[rows, columns]
 
-    def to_image(self, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_image(self, boxes_px: Floats) -> Floats:
         """Boxes (N, 4) of the input in the image."""
         corners = boxes_px.reshape(-1, 2, 2) - [self.left_px, self.top_px]
         return (corners / self.ratio + [self.x0_px, 0.0]).reshape(-1, 4)
 
-    def to_network(self, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_network(self, boxes_px: Floats) -> Floats:
         """Boxes (N, 4) of the image in the input."""
         corners = boxes_px.reshape(-1, 2, 2) - [self.x0_px, 0.0]
         return (corners * self.ratio + [self.left_px, self.top_px]).reshape(-1, 4)

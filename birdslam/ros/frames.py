@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.ros.bag import Bag
 from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
@@ -50,7 +50,7 @@ class StaticFrames:
 
     def _to_root(self, frame: str) -> dict[str, Transform]:
         """Each ancestor of a frame, itself first, with `T_ancestor_frame`."""
-        T_ancestor_frame: NDArray[np.float64] = np.eye(4)
+        T_ancestor_frame: Floats = np.eye(4)
         out = {frame: T_ancestor_frame}
         while frame in self._from_parent:
             frame, T_parent_child = self._from_parent[frame]

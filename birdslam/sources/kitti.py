@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.ros.bag import BagTopics
 from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
@@ -149,7 +150,7 @@ def _read_lines(path: Path) -> list[str]:
         raise DatasetError(f"{path}: can't be read: {error.strerror}") from None
 
 
-def read_projection(path: Path, key: str) -> NDArray[np.float64]:
+def read_projection(path: Path, key: str) -> Floats:
     """(3, 4) projection matrix of a KITTI calibration file."""
     lines = _read_lines(path)
     words = next((line.split()[1:] for line in lines if line.split()[:1] in ([f"{key}:"], [key])), None)
@@ -265,7 +266,7 @@ class KittiRecording(Recording):
         """The folder of the images; what else was recorded (LiDAR) stands beside it."""
         return self._layout.images
 
-    def truth_poses(self) -> NDArray[np.float64] | None:
+    def truth_poses(self) -> Floats | None:
         """(N, 3, 4) camera-0 rows of the frames. Raises DatasetError where the file is torn or too short."""
         path = self._layout.truth
         if path is None or not path.is_file():
@@ -278,7 +279,7 @@ class KittiRecording(Recording):
             raise DatasetError(f"{path}: {len(rows)} poses, but the images go on to number {max(self._images)}")
         return rows[list(self.numbers)]
 
-    def T_cam0_cam(self) -> NDArray[np.float64]:
+    def T_cam0_cam(self) -> Floats:
         """(4, 4) from the calibration (rectified cameras share their axes); identity where there is none.
 
         P = K [I | t] takes points of camera 0, so this camera stands at -t.

@@ -11,9 +11,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.trajectory import Transform, inverse
 
@@ -62,7 +62,7 @@ def project_labels(labels: Iterable[Label], camera: Camera, T_cam0_camera: Trans
     return out
 
 
-def hull_px(label: Label, camera: Camera, T_cam0_camera: Transform) -> NDArray[np.float64] | None:
+def hull_px(label: Label, camera: Camera, T_cam0_camera: Transform) -> Floats | None:
     """(4,) x1, y1, x2, y2 of the body's outline in pixels, not cut by the image; None where it lies behind."""
     R_cam0_body = Rotation.from_euler("y", label.rotation_y_rad).as_matrix()
     size_m = np.array([label.length_m, label.height_m, label.width_m])

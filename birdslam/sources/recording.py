@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, Undistorter
 from birdslam.ros.bag import BagTopics
 from birdslam.ros.sensor import Lens
@@ -95,11 +96,11 @@ class Recording(ABC):
             status = (Status.FRAME_UNREADABLE,) if image is None else ()
             yield Frame(frame_id, recorded.t_source_ns, recorded.t_source_ns, 0, image, status, recorded.speeds)
 
-    def truth_poses(self) -> NDArray[np.float64] | None:
+    def truth_poses(self) -> Floats | None:
         """(N, 3, 4) poses of camera 0 as KITTI rows in metres, one a frame; None where there are none."""
         return None
 
-    def T_cam0_cam(self) -> NDArray[np.float64]:
+    def T_cam0_cam(self) -> Floats:
         """(4, 4) this camera in the axes of camera 0, whose poses the truth gives: the lever arm between the two."""
         return np.eye(4)
 

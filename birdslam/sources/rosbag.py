@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.ros.bag import Bag, BagError, BagMessage, BagTopics, stamp_ns
 from birdslam.ros.frames import StaticFrames
@@ -167,7 +168,7 @@ class RosbagRecording(Recording):
         except BagError as error:
             raise DatasetError(str(error)) from None
 
-    def truth_poses(self) -> NDArray[np.float64] | None:
+    def truth_poses(self) -> Floats | None:
         """(N, 3, 4) rows of the camera at the frames, by the topic of truth; nan outside its time."""
         if not self._topics.truth:
             return None

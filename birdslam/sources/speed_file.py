@@ -12,8 +12,8 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.sources.recording import DatasetError, Recording, check_times
 from birdslam.sources.speed_log import SpeedLog
 from birdslam.sources.speed_tables import names_columns, table_readings
@@ -40,7 +40,7 @@ def read_speeds(path: Path) -> SpeedLog:
     return SpeedLog(readings)
 
 
-def read_speed_curve(path: Path) -> NDArray[np.float64]:
+def read_speed_curve(path: Path) -> Floats:
     """(N, 2) of a file: time in s, growing, and speed in m/s. Raises DatasetError where a line is no car's."""
     lines = list(_lines(path))
     for number, reading in lines:

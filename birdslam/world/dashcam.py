@@ -18,9 +18,8 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats, Image
+from birdslam.geometry.arrays import Floats, Floats32, Image
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_exp, rotation_log
 from birdslam.types import NS_PER_S
@@ -170,7 +169,7 @@ class _Exposure:
         self._share = 1.0 - math.exp(-1.0 / (adapts_s * rate_hz)) if adapts_s > 0.0 else 1.0
         self._log: float | None = None
 
-    def metered(self, light: NDArray[np.float32], whole: float) -> float:
+    def metered(self, light: Floats32, whole: float) -> float:
         log = math.log(max(metered(light, whole), 1e-3))
         self._log = log if self._log is None else self._log + self._share * (log - self._log)
         return math.exp(self._log)
@@ -189,7 +188,7 @@ class _Optics:
         yaws = (np.arange(count) - 0.5 * (count - 1)) * math.radians(dashcam.fov_deg) / count
         self._views = [_view(camera, self._rays, yaw, math.radians(dashcam.fov_deg) / count) for yaw in yaws]
 
-    def light(self, renderer: Renderer, moment: Moment, motion: Floats) -> NDArray[np.float32]:
+    def light(self, renderer: Renderer, moment: Moment, motion: Floats) -> Floats32:
         """(H, W, 3) linear BGR; `motion` (6,) is the camera's turn and shift a second, in its own axes."""
         rendered = []
         shaken = moment.shaken(self._dashcam.camera)
@@ -204,10 +203,10 @@ class _Optics:
         blurred = [
             self._seen(rendered, motion, ((k + 0.5) / steps - 0.5) * self._dashcam.exposure_s) for k in range(steps)
         ]
-        out: NDArray[np.float32] = np.mean(blurred, axis=0, dtype=np.float32)
+        out: Floats32 = np.mean(blurred, axis=0, dtype=np.float32)
         return out
 
-    def _seen(self, rendered: list[Any], motion: Floats, late_s: float) -> NDArray[np.float32]:
+    def _seen(self, rendered: list[Any], motion: Floats, late_s: float) -> Floats32:
         """Each row at its own time: its rays are turned and moved to where the views were rendered from."""
         at_s = self._row_s + late_s
         moves = bool(self._dashcam.readout_s or late_s)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 
@@ -55,7 +55,7 @@ class WorldFrame:
     """One rendered image and all that is true of it."""
 
     image: NDArray[np.uint8]  # (H, W, 3) BGR
-    depth_m: NDArray[np.float32]  # (H, W) along the optical axis, inf is sky
+    depth_m: Floats32  # (H, W) along the optical axis, inf is sky
     classes: NDArray[np.uint8]  # (H, W) indices of CLASSES
     instances: NDArray[np.uint16]  # (H, W) object_id + 1, 0 is none
     objects: tuple[WorldObject, ...]

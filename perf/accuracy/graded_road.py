@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats, Floats32
 from birdslam.geometry.camera import Camera
 
 TEXEL_M, SIDE, LEVELS = 0.02, 1024, 6
@@ -99,14 +99,14 @@ class GradedRoad:
         return np.clip(image, 0.0, 255.0).astype(np.uint8)
 
 
-def _painted(across: Floats, way: Floats) -> NDArray[np.bool_]:
+def _painted(across: Floats, way: Floats) -> Bools:
     edge = np.abs(np.abs(across) - 3.4) < 0.07
     dash = (np.abs(across + 1.7) < 0.06) & (way % 9.0 < 3.0)
-    out: NDArray[np.bool_] = edge | dash
+    out: Bools = edge | dash
     return out
 
 
-def _texture(seed: int) -> list[NDArray[np.float32]]:
+def _texture(seed: int) -> list[Floats32]:
     """Blotches and tiles of all sizes, and its pyramid."""
     rng = np.random.default_rng(seed)
     image = np.zeros((SIDE, SIDE), np.float32)
@@ -120,7 +120,7 @@ def _texture(seed: int) -> list[NDArray[np.float32]]:
     return levels
 
 
-def _sample(levels: list[NDArray[np.float32]], a_m: Floats, b_m: Floats, footprint_m: Floats) -> NDArray[np.float32]:
+def _sample(levels: list[Floats32], a_m: Floats, b_m: Floats, footprint_m: Floats) -> Floats32:
     """The texture at (a, b), mirrored at its edges, between the two levels that suit the pixel's footprint."""
     level = np.clip(np.log2(np.maximum(footprint_m / TEXEL_M, 1.0)), 0.0, LEVELS - 1.01)
     out = np.zeros(a_m.shape, np.float32)

@@ -12,8 +12,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32, Ints
 from birdslam.mapping.lanes import BOUNDARY, ROAD, LanesConfig
 from birdslam.perception.completion import SHIPPED, GridCompletion
 from birdslam.perf.errors import PerfError
@@ -23,7 +23,7 @@ from birdslam.perf.reporting.figures import Ledger
 label = "amodal lanes in bird's-eye view, with and without their completion"
 
 
-def overlap(grids: NDArray[np.float32], truth: NDArray[np.float32], config: LanesConfig) -> NDArray[np.int64]:
+def overlap(grids: Floats32, truth: Floats32, config: LanesConfig) -> Ints:
     """(2, 2): intersection and union, in cells, of road and boundary."""
     out = np.zeros((2, 2), dtype=np.int64)
     for channel in (ROAD, BOUNDARY):

@@ -10,13 +10,12 @@ from __future__ import annotations
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from birdslam.bench.ego.trajectory_errors import from_first
 from birdslam.bench.simulation.odometry import OdometryNoise, fit_drift
 from birdslam.geometry import bev
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
@@ -80,7 +79,7 @@ def fit(clips: list[tuple[Recording, int]]) -> OdometryNoise:
     )
 
 
-def measure(recording: Recording, left_out: int) -> tuple[Floats, list[tuple[NDArray[np.int64], Floats]], float]:
+def measure(recording: Recording, left_out: int) -> tuple[Floats, list[tuple[Ints, Floats]], float]:
     """The errors (N, len(COLUMNS)), the road tracks of each frame, and how far they scatter (px)."""
     odometry = Odometry(recording.camera)
     T_cam0_cam = recording.T_cam0_cam()
@@ -125,11 +124,7 @@ def _pitch_rad(poses: Transform, recording: Recording) -> float:
 
 
 def _gaps_px(
-    recording: Recording,
-    step: Transform,
-    motion: Motion,
-    before: tuple[NDArray[np.int64], Floats],
-    after: tuple[NDArray[np.int64], Floats],
+    recording: Recording, step: Transform, motion: Motion, before: tuple[Ints, Floats], after: tuple[Ints, Floats]
 ) -> Floats:
     """Where road tracks are against where their last sight, laid on the road and moved as the camera did, puts them."""
     _, a, b = np.intersect1d(before[0], after[0], return_indices=True)

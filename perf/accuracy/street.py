@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 
 WIDTH_PX, HEIGHT_PX, F_PX, HEIGHT_M = 480, 160, 260.0, 1.65
 LOOP_FRAMES, TEXELS, TEXELS_PER_M = 128, 2048, 24.0
@@ -62,7 +62,7 @@ class Texture:
         return rows
 
 
-def _place(at: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
+def _place(at: Floats) -> tuple[Floats, Ints, Floats]:
     """Turns of the texture, the texel in it, and the share of that one."""
     turns, at = np.divmod(at, TEXELS)
     i = np.minimum(at.astype(np.int64), TEXELS - 1)  # a turn less a rounding error is a turn

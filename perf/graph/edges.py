@@ -11,28 +11,29 @@ Of 00 and 06 the first frames are left out, whose true poses are interpolated.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.bench.baselines.trajectories import LiveTrajectories, Trajectories
+from birdslam.bench.figures import markdown
 from birdslam.bench.simulation.edge_statistics import EdgeStatistics, edge_statistics
 from birdslam.bench.simulation.odometry import SimulatedOdometry, SimulationConfig
 from birdslam.bench.tracking.benchmark import LEAST_FRAMES, Live, Truth, make_log, ours
 from birdslam.bench.tracking.localisation import CAMERA_OF_BOXES
 from birdslam.bench.tracking.metrics import path_errors
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.paper import NO_GATE
 from birdslam.perception import Pending, Perception, Ready
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
+from birdslam.perf.reporting.figures import write_json
 from birdslam.runtime.batch.offline import pipeline
 from birdslam.runtime.cli.arguments import add_config, add_settings
 from birdslam.runtime.configuration import Configuration
@@ -239,7 +240,7 @@ def _nees_of_cars(graph: PoseGraph, m: Measurements, truth: Truth) -> list[float
     return out
 
 
-def _nees(error: NDArray[np.float64], cov: NDArray[np.float64]) -> float:
+def _nees(error: Floats, cov: Floats) -> float:
     return float(error @ np.linalg.solve(cov + 1e-9 * np.eye(len(cov)), error))
 
 
@@ -265,26 +266,23 @@ def table(grades: Mapping[str, Mapping[str, Mapping[str, float]]], drawn: Mappin
     columns: list[tuple[str, list[str], str]] = [(f"{case} {what}", [case], what) for case in single for what in WHAT]
     columns += [(f"{name} {what}", [*names], what) for name, names in drawn.items() for what in WHAT]
     columns = [c for c in columns if any(c[2] in grades["default"][case] for case in c[1])]
-    lines = ["| edges | " + " | ".join(title for title, _, _ in columns) + " |", "| --- " * (len(columns) + 1) + "|"]
+    lines = []
     for variant, by in grades.items():
         cells = []
         for _, names, what in columns:
             values = np.array([by[case][what] for case in names])
             cells.append(f"{values.mean():.2f}" + (f" ± {values.std():.2f}" if len(values) > 1 else ""))
-        lines.append(f"| {variant} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append([variant, *cells])
+    return markdown(["edges", *(title for title, _, _ in columns)], lines)
 
 
 def statistics_table(cases: Sequence[Case]) -> str:
     """A row for each log: what its CC and CP edges are worth."""
-    fields = EdgeStatistics.__struct_fields__
-    lines = ["| log | " + " | ".join(name.replace("_", " ") for name in fields) + " |"]
-    lines.append("| --- " * (len(fields) + 1) + "|")
+    fields, lines = EdgeStatistics.__struct_fields__, []
     for case in cases:
         found = edge_statistics(case.log, case.ego)
-        cells = ["-" if found is None else f"{getattr(found, name):.3g}" for name in fields]
-        lines.append(f"| {case.name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append([case.name, *("-" if found is None else f"{getattr(found, name):.3g}" for name in fields)])
+    return markdown(["log", *(name.replace("_", " ") for name in fields)], lines)
 
 
 WHAT = ("ego", "cars, live", "cars, final", "NEES of the ego", "NEES of cars")
@@ -320,8 +318,4 @@ def run(arguments: list[str]) -> None:
     for what in ("ego", "cars, live"):
         print(f"\nBest on the others, {what}, left one out:", *left_out(grades, what), sep="\n  ")
     if options.output is not None:
-        _write(options.output, grades)
-
-
-def _write(path: Path, grades: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(grades, indent=1) + "\n", encoding="utf-8")
+        write_json(options.output, grades)

@@ -9,7 +9,6 @@ the same edges; by it `--lag` frames later; by the batch of the whole sequence. 
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -26,6 +25,7 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.perf.reporting.arguments import benchmark_parser
+from birdslam.perf.reporting.figures import Ledger
 from birdslam.slam import SlamConfig
 from birdslam.types import Measurements
 
@@ -33,7 +33,6 @@ label = "batch over incremental: time and accuracy on one sequence"
 
 PUBLISHED_RATIO = 1.9 / 0.016
 REPEATS = 3
-METHODS = 4  # rows of a length
 SAMPLES = 8  # frames of a drive whose poses are compared
 EQ_6 = GraphConfig(constant_velocity=False), WeightsConfig(leave_out=("cp",))
 WHO = ("incremental", "batch of the same edges", "batch after the lag", "batch of the whole sequence")
@@ -47,27 +46,22 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--seeds", type=int, default=8, help="drives over which accuracy is taken; 0: time alone")
     parser.add_argument("--lag", type=int, default=10, help="frames")
     options = parser.parse_args(arguments)
-    rows: list[dict[str, Any]] = []
-    print(f"{'':40} {'frames':>6} {'sequence':>10} {'ratio':>8} {'newest pose':>12} {'ratio':>8}  iterations")
-    for frames in sorted(int(n) for n in options.frames.split(",")):
-        config = DriveConfig(frames=frames, vehicles=options.vehicles, rate_hz=10.0)
-        rows += time_rows(drive(config, options.seed).measurements)
-        for row in rows[-METHODS:]:
-            print(
-                f"{row['method']:40} {row['frames']:6} {row['seconds']:8.3f} s {_ratio(row['ratio'])} "
-                f"{row['newest_s'] * 1e3:9.2f} ms {_ratio(row['newest_ratio'])}  {_ended(row)}",
-                flush=True,
-            )
-    print(f"{'published (one figure, either reading)':40} {414:6} {'':10} {PUBLISHED_RATIO:8.1f}")
-    accuracy = accuracy_rows(config, options.seeds, options.lag) if options.seeds else []
-    if accuracy:
+    print(f"{'':44} {'frames':>6} {'sequence':>10} {'ratio':>8} {'newest pose':>12} {'ratio':>8}  iterations")
+    with Ledger(options.output, label, vehicles=options.vehicles, seeds=options.seeds, lag=options.lag) as ledger:
+        for frames in sorted(int(n) for n in options.frames.split(",")):
+            config = DriveConfig(frames=frames, vehicles=options.vehicles, rate_hz=10.0)
+            for row in time_rows(drive(config, options.seed).measurements):
+                times = f"{row['seconds']:8.3f} s {_ratio(row['ratio'])} {row['newest_s'] * 1e3:9.2f} ms"
+                line = f"{row['frames']:6} {times} {_ratio(row['newest_ratio'])}  {_ended(row)}"
+                ledger.add(row["method"], line, **row)
+        print(f"{'published (one figure, either reading)':44} {414:6} {'':10} {PUBLISHED_RATIO:8.1f}")
+        ledger.set(accuracy=accuracy_rows(config, options.seeds, options.lag) if options.seeds else [])
+    if options.seeds:
         title = f"ATE over {options.seeds} drives, m"
-        print(f"\n{title:40} {'ego':>8} {'ratio':>8} {'vehicles':>9} {'ratio':>8}")
-    for row in accuracy:
+        print(f"\n{title:44} {'ego':>8} {'ratio':>8} {'vehicles':>9} {'ratio':>8}")
+    for row in ledger.content["accuracy"]:
         ratios = f"{row['ego_ratio']:8.3f} {row['vehicle_ate_m']:9.3f} {row['vehicle_ratio']:8.3f}"
-        print(f"{row['method']:40} {row['ego_ate_m']:8.3f} {ratios}")
-    if options.output:
-        options.output.write_text(json.dumps({"rows": rows, "accuracy": accuracy}, indent=2) + "\n", encoding="utf-8")
+        print(f"{row['method']:44} {row['ego_ate_m']:8.3f} {ratios}")
 
 
 # --- time ---

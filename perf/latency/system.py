@@ -16,8 +16,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.perf.latency import convoy
 from birdslam.perf.latency.live import Ask, Run, add_run_options, drive
 from birdslam.perf.reporting.arguments import benchmark_parser, numbers
@@ -144,21 +144,21 @@ def parts(message: Message) -> Iterator[tuple[str, float]]:
     yield from stages(message.trace, message.t_received_ns)
 
 
-def split(messages: Sequence[Message]) -> dict[str, NDArray[np.float64]]:
+def split(messages: Sequence[Message]) -> dict[str, Floats]:
     """Part -> (N,) ms of each message; NaN where its way did not lead there (a coasted frame had no perceive)."""
-    out: dict[str, NDArray[np.float64]] = {}
+    out: dict[str, Floats] = {}
     for number, message in enumerate(messages):
         for name, ms in parts(message):
             out.setdefault(name, np.full(len(messages), np.nan))[number] = ms
     return out
 
 
-def gone(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def gone(values: Floats) -> Floats:
     """Those of the messages whose way led there."""
     return values[~np.isnan(values)]
 
 
-def lateness(messages: Sequence[Message], rate_hz: float | None) -> NDArray[np.float64]:
+def lateness(messages: Sequence[Message], rate_hz: float | None) -> Floats:
     """(N,) ms from when a frame would have been due, by the one that kept the pace best, to its capture."""
     if not messages or rate_hz is None:
         return np.zeros(0)
@@ -167,7 +167,7 @@ def lateness(messages: Sequence[Message], rate_hz: float | None) -> NDArray[np.f
     return (offsets - offsets.min()) / 1e6
 
 
-def _mean(values: NDArray[np.float64]) -> float:
+def _mean(values: Floats) -> float:
     """Over all messages, those without the part counted as none of it: so the parts' means add up."""
     return round(float(np.nansum(values)) / values.size, 4) if values.size else 0.0
 
@@ -194,9 +194,7 @@ def _noise_of_cpu(cpu: dict[str, list[float]]) -> dict[str, list[float]]:
     return {"cpu_cores": [round(float(block.mean()), 4) for block in np.array_split(total, BLOCKS)]}
 
 
-def budgets(
-    configured: dict[str, float], age_ms: NDArray[np.float64], parts_ms: dict[str, NDArray[np.float64]]
-) -> Iterator[dict[str, Any]]:
+def budgets(configured: dict[str, float], age_ms: Floats, parts_ms: dict[str, Floats]) -> Iterator[dict[str, Any]]:
     """Each budget of the configuration, what it was held against, and whether it was met."""
     limits = msgspec.convert(configured, BudgetsConfig)
     measured = {"end_to_end_ms": age_ms}

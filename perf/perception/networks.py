@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections, Findings, ModelSpec, Network, load_network
 from birdslam.perception.decoding.multitask import MultiTaskDecoder
@@ -117,8 +118,8 @@ def real(network: Network, folder: Path, models: Path) -> dict[str, float]:
     T_cam_cam0 = np.linalg.inv(recording.T_cam0_cam())
     road, lane, shares = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64), []
     agreed = np.zeros(4, dtype=np.int64)  # theirs found, theirs, ours confirmed, ours
-    sizes: list[NDArray[np.float64]] = []  # of ours over theirs, see `extents`
-    depths: list[NDArray[np.float64]] = []  # (N, 3): said, LiDAR's, on the road
+    sizes: list[Floats] = []  # of ours over theirs, see `extents`
+    depths: list[Floats] = []  # (N, 3): said, LiDAR's, on the road
     for number, image in _images(recording.frames()):
         found = _findings(network, image)
         lidar = folder / "lidar_cam0" / f"{number:06d}.npy"
@@ -179,7 +180,7 @@ def _images(frames: Iterator[Any]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
             yield number, cast(NDArray[np.uint8], frame.image)
 
 
-def _beside_lidar(found: Findings, points_m: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+def _beside_lidar(found: Findings, points_m: Floats, camera: Camera) -> Floats:
     """(N, 3) said depth, LiDAR depth, 1 on the predicted road, of the returns in the image."""
     assert found.depth is not None
     assert found.segmentation is not None
@@ -193,7 +194,7 @@ def _beside_lidar(found: Findings, points_m: NDArray[np.float64], camera: Camera
     return np.column_stack([said_m[inside], points_m[inside, 2], on_road])
 
 
-def _depth_figures(depths: NDArray[np.float64]) -> dict[str, float]:
+def _depth_figures(depths: Floats) -> dict[str, float]:
     said_m, lidar_m, on_road = depths.T
     road = on_road > 0.0
     scale = float(np.median(lidar_m / said_m))
@@ -206,7 +207,7 @@ def _depth_figures(depths: NDArray[np.float64]) -> dict[str, float]:
     }
 
 
-def _agreement(ours: Detections, theirs: Detections) -> NDArray[np.int64]:
+def _agreement(ours: Detections, theirs: Detections) -> Ints:
     """(4,) theirs found among ours, theirs, ours confirmed by theirs, ours: vehicles over the bars."""
     ours, theirs = ours.only(VEHICLES), theirs.only(VEHICLES)
     shared = box_ious(theirs.boxes_px[theirs.scores > MIN_SCORE], ours.boxes_px)
@@ -226,7 +227,7 @@ def _agreement(ours: Detections, theirs: Detections) -> NDArray[np.int64]:
     )
 
 
-def _sizes(ours: Detections, theirs: Detections, width_px: int) -> list[NDArray[np.float64]]:
+def _sizes(ours: Detections, theirs: Detections, width_px: int) -> list[Floats]:
     """Of each vehicle that both see whole, over the bars: our box over theirs."""
     ours, theirs = ours.only(VEHICLES), theirs.only(VEHICLES)
     out = []

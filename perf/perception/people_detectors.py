@@ -15,9 +15,9 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.tracking.metrics import assign
+from birdslam.geometry.arrays import Floats
 from birdslam.people.people_boxes import PeopleBoxesConfig, people_boxes
 from birdslam.perception import ModelSpec, load_network
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
@@ -92,7 +92,7 @@ def measure(path: str, sequences: Sequence[TrackingSequence], every: int) -> dic
     return {**of_kinds, "frames": len(times_ms), "median_ms": round(float(np.median(times_ms)), 1)}
 
 
-def _count(counts: Counts, here: Sequence[Label], kinds: Sequence[str], boxes: NDArray[np.float64]) -> None:
+def _count(counts: Counts, here: Sequence[Label], kinds: Sequence[str], boxes: Floats) -> None:
     every = [o for o in here if o.kind in kinds]
     clear = np.array(
         [o.truncated <= 0 and o.occluded <= 1 and o.box_px[3] - o.box_px[1] >= LEAST_PX for o in every], dtype=np.bool_

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.perception import DepthMap, ModelSpec, Network, load_network
@@ -175,7 +175,7 @@ def by_bottom(seen: Observation, ground: GroundPlane, config: LocalisationConfig
 
 def _observed(
     frame: WorldFrame,
-    boxes_px: NDArray[np.float64],
+    boxes_px: Floats,
     labels: Sequence[str],
     truth: Sequence[WorldObject],
     edge_sigma: EdgeSigma | None = None,

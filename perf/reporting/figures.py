@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from birdslam.geometry.arrays import Floats
 from birdslam.perf.reporting.machine import Steal, describe
 
 BLOCKS = 10  # a series is cut into so many pieces one after the other; how they differ is its noise
@@ -38,7 +39,7 @@ def noise(name: str, values: ArrayLike) -> dict[str, list[float]]:
 
 def curve(values: ArrayLike) -> list[list[float]]:
     """(percent, value) pairs of the cumulative distribution, denser where the tail is, as far as samples reach."""
-    series: NDArray[np.float64] = np.asarray(values, dtype=np.float64)
+    series: Floats = np.asarray(values, dtype=np.float64)
     if not series.size:
         return []
     levels = [level for level in _LEVELS if level <= 100.0 * (1.0 - 1.0 / series.size)]

@@ -22,9 +22,9 @@ TRIED = {  # half and twice of each, all others as they are; of the gate 1.5 and
     **{"tracking.parallax.side_outlier": (0.015, 0.06), "tracking.parallax.sigma_side_outlier_rel": (0.15, 0.6)},
     **{"ground_size.sigma_pitch_rad": (0.005, 0.02), "ground_size.sigma_pitch_step_rad": (0.0004, 0.0016)},
     **{"ground_size.sigma_roll_rad": (0.01, 0.04), "ground_size.sigma_edge_rel": (0.011, 0.044)},
-    **{"ground_size.sigma_kerb_m": (0.009, 0.036), "ground_size.sigma_crown_rad": (0.0024, 0.0094)},
-    **{"ground_size.sigma_tilt_rad": (0.0009, 0.0034), "tracking.heading.oblique": (0.05, 0.2)},
-    **{"localisation.vehicles.car.height_m": (1.47, 1.53)},
+    **{"ground_size.sigma_kerb_m": (0.009, 0.036), "ground_size.sigma_crown_rad": (0.0019, 0.0076)},
+    **{"ground_size.sigma_tilt_rad": (0.0008, 0.003), "ground_size.sigma_common_crown_rad": (0.006, 0.024)},
+    **{"tracking.heading.oblique": (0.05, 0.2), "localisation.vehicles.car.height_m": (1.47, 1.53)},
     **{"ground_size.box_memory_s": (0.25, 1.0), "ground_size.gate_sigma": (1.5, 3.0)},
     **{"ground_size.driving_mps": (0.5, 2.0), "ground_size.bend_per_m": (0.0025, 0.01)},
 }

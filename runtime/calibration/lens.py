@@ -12,6 +12,7 @@ from birdslam.calibration.calibration import CalibrationError
 from birdslam.calibration.intrinsics import Intrinsics
 from birdslam.calibration.lens import followed_corners, self_calibrate
 from birdslam.calibration.lens_adjustment import IMAGES
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.runtime.calibration.given import Given, focal_length_of
 from birdslam.runtime.calibration.height import UNKNOWN_HEIGHT_M
@@ -40,7 +41,7 @@ def lens_of_drive(
     frames = max(1, round(_LENS_S * recording.rate_hz))
     with Inference(complete(configuration, camera, recording.rate_hz)) as inference:
 
-        def images() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float64]]]:
+        def images() -> Iterator[tuple[NDArray[np.uint8], Floats]]:
             seen = islice(offline_frames(RecordedSource(recording, configuration.source)), frames)
             for frame in with_progress(seen, "lens", min(frames, len(recording)) or None):
                 if frame.image is not None:

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import moved
@@ -74,7 +74,7 @@ def _nodes(way: Sequence[SE2]) -> tuple[list[Node], list[Link]]:
     return nodes, links
 
 
-def _bent(way: Sequence[SE2], nodes: Sequence[Placed], found: OnEarth) -> NDArray[np.float64]:
+def _bent(way: Sequence[SE2], nodes: Sequence[Placed], found: OnEarth) -> Floats:
     """(N, 2) the drive's way as its nearest keyframes lie now."""
     before = [node.T_map_keyframe for node in nodes]
     moves = [found.poses[node.number][0] @ T.inverse() for node, T in zip(nodes, before, strict=True)]

@@ -16,8 +16,8 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.runtime.configuration import ConfigurationError
@@ -160,7 +160,7 @@ class Viewer:
             "world/vehicles/ellipse", self._loops([ellipse(v.T_world_vehicle, v.cov) for v in vehicles], SEEN)
         )
 
-    def _loops(self, outlines_m: list[NDArray[np.float64]], color: tuple[int, int, int]) -> Any:
+    def _loops(self, outlines_m: list[Floats], color: tuple[int, int, int]) -> Any:
         loops = [np.vstack([outline, outline[:1]]) for outline in outlines_m]
         strips = [np.column_stack([loop, np.full(len(loop), self._height_m)]) for loop in loops]
         return rr.LineStrips3D(strips, colors=color)
@@ -204,12 +204,12 @@ def _turned(yaw_rad: float) -> tuple[float, float, float, float]:
     return 0.0, 0.0, math.sin(yaw_rad / 2.0), math.cos(yaw_rad / 2.0)
 
 
-def _footprint(T_ego_body: SE2, length_m: float, width_m: float) -> NDArray[np.float64]:
+def _footprint(T_ego_body: SE2, length_m: float, width_m: float) -> Floats:
     corners = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0)]) * (length_m / 2.0, width_m / 2.0)
     return T_ego_body @ corners
 
 
-def _above(points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _above(points_m: Floats) -> Floats:
     """Points of ego on a picture in which x, forward, is up and y, left, is left."""
     return np.column_stack([-points_m[:, 1], -points_m[:, 0]])
 

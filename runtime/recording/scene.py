@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.runtime.recording.foxglove import (
@@ -105,7 +106,7 @@ def from_estimate(estimate: Estimate, t_ns: int) -> Iterator[Drawn]:
     yield "/scene", SceneUpdate(deletions=(gone,), entities=tuple(entities))
 
 
-def curve_points(curve: LaneLine | Lane) -> NDArray[np.float64]:
+def curve_points(curve: LaneLine | Lane) -> Floats:
     """(N, 2) in ego: a line, or a lane's centre line, as far as it is known."""
     x = np.arange(0.0, max(curve.to_m, 0.0) + LINE_STEP_M, LINE_STEP_M)
     a, h, c, d = curve.offset_m, curve.slope, curve.curvature_per_m, curve.curvature_rate_per_m2
@@ -197,13 +198,13 @@ def from_image(image: NDArray[np.uint8], jpeg_quality: int, t_ns: int) -> Drawn:
     return "/camera/image", CompressedImage(timestamp=timestamp(t_ns), frame_id="camera", data=data, format="jpeg")
 
 
-def ellipse(T_world_body: SE2, cov: tuple[float, ...], sigmas: float = 2.0) -> NDArray[np.float64]:
+def ellipse(T_world_body: SE2, cov: tuple[float, ...], sigmas: float = 2.0) -> Floats:
     """(ELLIPSE_POINTS, 2) in world: where the body lies, by its covariance in the tangent at its pose."""
     place = np.array(cov).reshape(3, 3)[:2, :2]
     spread, axes = np.linalg.eigh((place + place.T) / 2.0)
     angle = np.linspace(0.0, 2.0 * math.pi, ELLIPSE_POINTS, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    around: NDArray[np.float64] = T_world_body @ (sigmas * circle * np.sqrt(np.maximum(spread, 0.0)) @ axes.T)
+    around: Floats = T_world_body @ (sigmas * circle * np.sqrt(np.maximum(spread, 0.0)) @ axes.T)
     return around
 
 

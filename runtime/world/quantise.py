@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.perception.decoding.multitask import OUTPUTS
 from birdslam.perception.manifest import Input
 from birdslam.perception.manifest_file import read_manifest
@@ -37,7 +37,7 @@ class Frames(CalibrationDataReader):
         self._size, self._preparation = size, Preparation(size)
         self._seeds = iter(range(VALIDATION_SEEDS, VALIDATION_SEEDS + count))
 
-    def get_next(self) -> dict[str, NDArray[np.float32]] | None:
+    def get_next(self) -> dict[str, Floats32] | None:
         """The next input; None at the end."""
         from birdslam.world.world import sample
 

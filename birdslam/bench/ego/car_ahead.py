@@ -9,8 +9,8 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.sources.kitti import KittiRecording
 from birdslam.sources.recording import Recording
@@ -106,9 +106,7 @@ def near_face_m(estimate: Estimate, vehicle: VehicleEstimate) -> float:
     return T_ego_vehicle.x_m - 0.5 * vehicle.length_m * abs(float(np.cos(T_ego_vehicle.yaw_rad)))
 
 
-def lidar_distance_m(
-    camera: Camera, mount: GroundPlane, points_cam: NDArray[np.float64], box_px: tuple[float, ...]
-) -> float | None:
+def lidar_distance_m(camera: Camera, mount: GroundPlane, points_cam: Floats, box_px: tuple[float, ...]) -> float | None:
     """Distance ahead (ego's x) to the near face of what fills the box, of returns (N, 3) in camera axes.
 
     None where fewer than FEWEST_RETURNS lie in the inner part of the box and off the road.

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.ego import truth_quality
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.graph_config import GraphConfig
@@ -134,11 +133,7 @@ class Motions:
         return end
 
     def _judge(
-        self,
-        motions: list[tuple[int, int, SE2, Floats]],
-        truth: Transform,
-        interpolated: NDArray[np.bool_],
-        noise: Floats,
+        self, motions: list[tuple[int, int, SE2, Floats]], truth: Transform, interpolated: Bools, noise: Floats
     ) -> MotionConsistency:
         if not motions:
             return MotionConsistency(n=0)

@@ -14,12 +14,12 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from birdslam.bench.ego.car_ahead import CarAhead, CarAheadReport
 from birdslam.bench.ego.consistency import Consistency, ConsistencyReport
 from birdslam.bench.ego.motion_consistency import MotionConsistencyReport, Motions
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.outputs.drive_files import Recorder, claim_directory, write_json
 from birdslam.sources.recording import DatasetError, Recording
 from birdslam.trajectory import Transform, as_poses, inverse, read_kitti
@@ -55,7 +55,7 @@ class OdometryReport(msgspec.Struct, frozen=True, kw_only=True):
     segment_r_deg_per_m: float | None = None  # what the truth's first poses lack touches only those that begin there
 
 
-def rms(errors: NDArray[np.float64]) -> float:
+def rms(errors: Floats) -> float:
     """Root mean square of (N,) errors; 0 of none."""
     return float(np.sqrt(np.mean(np.square(errors)))) if errors.size else 0.0
 
@@ -195,9 +195,9 @@ def compare(
     )
 
 
-def _check_known(name: str, truth: NDArray[np.float64], compared: slice) -> None:
+def _check_known(name: str, truth: Floats, compared: slice) -> None:
     """Raises DatasetError where the truth of a frame to be compared is not known (nan)."""
-    known: NDArray[np.bool_] = np.atleast_1d(np.isfinite(truth).all(axis=(1, 2)))
+    known: Bools = np.atleast_1d(np.isfinite(truth).all(axis=(1, 2)))
     if not known[compared].all():
         first, last = np.flatnonzero(known)[[0, -1]].tolist()
         raise DatasetError(

@@ -8,10 +8,9 @@ the images (every third step of tracking 0005 is a tenth too long), and poses by
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from birdslam.geometry.arrays import Bools, Floats
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.trajectory import Transform, inverse, mount_pose, split_pose
@@ -62,7 +61,7 @@ def step_noise(poses: Transform, mount: GroundPlane) -> Floats:
     return out / np.sqrt(6.0)
 
 
-def implausible(poses: Transform, t_ns: NDArray[np.int64]) -> Bools:
+def implausible(poses: Transform, t_ns: Ints) -> Bools:
     """(N,) the frames whose step, against the one before or after, is an acceleration that no car has."""
     out = np.zeros(len(poses), bool)
     if len(poses) < 3:
@@ -75,6 +74,6 @@ def implausible(poses: Transform, t_ns: NDArray[np.int64]) -> Bools:
     return out
 
 
-def doubtful(poses: Transform, t_ns: NDArray[np.int64]) -> Bools:
+def doubtful(poses: Transform, t_ns: Ints) -> Bools:
     """(N,) the frames whose step is interpolated or implausible."""
     return interpolated(poses) | implausible(poses, t_ns)

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.geometry import bev
-from birdslam.geometry.arrays import Bools
+from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.lanes import (
@@ -34,7 +33,7 @@ from birdslam.mapping.lanes import (
 )
 from birdslam.perception import Segmentation
 
-Grids = NDArray[np.float32]
+Grids = Floats32
 
 LATER_LOOKS = 75  # whose points are the truth: at 0.4 m from one to the next the ego has passed by then
 LEAST_LOOKED = 6.0  # points of later frames in a cell, for it to be known
@@ -80,9 +79,7 @@ class HiddenCells:
         self._centres_m = cell_centres_m(np.ones(config.shape, bool), config)
         self._looks: list[_Look] = []
 
-    def add(
-        self, T_world_ego: SE2, ground: GroundPlane, segmentation: Segmentation, boxes_px: NDArray[np.float64]
-    ) -> int:
+    def add(self, T_world_ego: SE2, ground: GroundPlane, segmentation: Segmentation, boxes_px: Floats) -> int:
         """One frame with the boxes (B, 4) of its vehicles; its look's number, -1 where the ego has not moved."""
         if not self._amodal.has_moved(T_world_ego):
             return -1
@@ -95,7 +92,7 @@ class HiddenCells:
         self._looks.append(_Look(T_world_ego, (road, line, looked), view, self._hidden(ground, boxes_px, view.seen)))
         return len(self._looks) - 1
 
-    def _hidden(self, ground: GroundPlane, boxes_px: NDArray[np.float64], seen: Grids) -> Bools:
+    def _hidden(self, ground: GroundPlane, boxes_px: Floats, seen: Grids) -> Bools:
         """(rows, columns) the cells that a box covers and that nobody has seen yet."""
         px = bev.ego_to_pixel(self.camera, ground, self._centres_m)
         x, y = px.T
@@ -149,7 +146,7 @@ class HiddenCells:
         )
         return HiddenReport(drive=drive, frames=frames, cells=known_cells, road_iou=road, line_iou=line), best
 
-    def _overlap(self, grids: Grids, later: Grids, judged: Bools) -> NDArray[np.int64]:
+    def _overlap(self, grids: Grids, later: Grids, judged: Bools) -> Ints:
         out = np.zeros((2, 2), np.int64)
         for channel in (ROAD, BOUNDARY):
             found, true = grids[channel] >= self.config.least_occupancy, later[channel] > 0.0

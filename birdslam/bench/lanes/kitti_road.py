@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry import bev
-from birdslam.geometry.arrays import Bools
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.lanes.line_tracker import still_lines
 from birdslam.lanes.outline import lane_mask, line_px, visible
@@ -127,9 +127,7 @@ class Still:
     area: Bools  # (H, W) of the ego's lane, as far as the image shows it
 
 
-def find_lane(
-    camera: Camera, image: NDArray[np.uint8], segmentation: Segmentation, boxes_px: NDArray[np.float64]
-) -> Still:
+def find_lane(camera: Camera, image: NDArray[np.uint8], segmentation: Segmentation, boxes_px: Floats) -> Still:
     """The lines and the ego's lane of one image without a past."""
     lines, ground = still_lines(camera, image, segmentation, boxes_px)
     row = lane_row(lines)
@@ -156,7 +154,7 @@ def score(name: str, camera: Camera, still: Still, mask: NDArray[np.uint8]) -> S
     )
 
 
-def grid_px(camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def grid_px(camera: Camera) -> tuple[Ints, Ints]:
     """Rows and columns of the pixels that a grid on the road falls on, to FARTHEST_M, by the camera's own ground."""
     x_m = np.arange(1.0, FARTHEST_M, CELL_M)
     y_m = np.arange(-HALF_WIDTH_M, HALF_WIDTH_M, CELL_M)

@@ -15,11 +15,10 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from birdslam.geometry import bev
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.pose import Pose
 from birdslam.geometry.se2 import SE2
@@ -132,7 +131,7 @@ class SimulatedOdometry(WithoutImages):
         frame_id: int,
         t_source_ns: int,
         vehicle_boxes_px: Floats,
-        road_mask: NDArray[np.bool_] | None = None,
+        road_mask: Bools | None = None,
         speeds: Sequence[SpeedReading] = (),
     ) -> Motion | None:
         """The motion since the last frame; None for the first one. The car's own speed is not simulated."""

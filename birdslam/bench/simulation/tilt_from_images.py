@@ -10,10 +10,9 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.simulation.odometry import OdometryNoise, SimulatedOdometry, Walk
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import GroundPlane
 from birdslam.odometry.external import WithoutImages
 from birdslam.odometry.motion import Motion
@@ -44,7 +43,7 @@ class TiltFromImages(WithoutImages):
         frame_id: int,
         t_source_ns: int,
         vehicle_boxes_px: Floats,
-        road_mask: NDArray[np.bool_] | None = None,
+        road_mask: Bools | None = None,
         speeds: Sequence[SpeedReading] = (),
     ) -> Motion | None:
         """The simulated motion, with the road's tilt."""

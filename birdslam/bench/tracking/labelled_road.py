@@ -1,7 +1,7 @@
 """The road's tilt by labelled vehicles: without images nothing else says how the camera leans over the road.
 
-A label's bottom stands on the road: its slope below the camera's axis is H / z - pitch + roll y/x (Eq. 1), less what
-the road differs by at each vehicle.
+A label's bottom stands on the road: its slope below the camera's axis is H / z - pitch + roll y/x + crown |y|/x
+(Eq. 1), less what the road differs by at each vehicle. The crown tells the ego's road from streets beside it.
 """
 
 from __future__ import annotations
@@ -55,9 +55,8 @@ def _fitted(
     z, bearing, slope = np.array([numbers for _, *numbers in labels]).T
     variance = road.sigma_tilt_rad**2 + (road.sigma_kerb_m / z) ** 2 + (road.sigma_crown_rad * bearing) ** 2
     weight = 1.0 / (variance * np.array([times[track] for track, *_ in labels]))
-    J = np.column_stack([-np.ones_like(bearing), bearing])
-    information = (J.T * weight) @ J + np.diag([road.sigma_pitch_rad**-2, road.sigma_roll_rad**-2])
-    cov = np.linalg.inv(information)
-    pitch_rad, roll_rad = (cov @ (J.T * weight) @ slope).tolist()
-    sigma_pitch, sigma_roll = np.sqrt(np.diag(cov)).tolist()
+    J = np.column_stack([-np.ones_like(bearing), bearing, np.abs(bearing)])
+    cov = np.linalg.inv((J.T * weight) @ J + np.diag(1.0 / road.road_var))
+    pitch_rad, roll_rad, _ = (cov @ (J.T * weight) @ slope).tolist()
+    sigma_pitch, sigma_roll, _ = np.sqrt(np.diag(cov)).tolist()
     return LabelledGround(GroundPlane(height_m, pitch_rad, roll_rad), sigma_pitch, sigma_roll, len(times))

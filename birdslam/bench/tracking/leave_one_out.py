@@ -12,9 +12,9 @@ from typing import Protocol
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.tracking.localisation import MOST
+from birdslam.geometry.arrays import Floats
 
 
 class PlaceError(Protocol):
@@ -23,7 +23,7 @@ class PlaceError(Protocol):
     @property
     def depth_m(self) -> float: ...
     @property
-    def error_m(self) -> NDArray[np.float64]: ...
+    def error_m(self) -> Floats: ...
     @property
     def mahalanobis2(self) -> float: ...
     @property

@@ -23,6 +23,7 @@ from birdslam.bench.tracking.benchmark import make_log
 from birdslam.bench.tracking.labelled_road import LEAST_VEHICLES, labelled_grounds
 from birdslam.bench.tracking.metrics import match_vehicles
 from birdslam.frontend import EgoMotion, FrontEndConfig
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import wrap
 from birdslam.perception import Detections, Perception, Ready
 from birdslam.sources.kitti import KITTI_RATE_HZ
@@ -48,7 +49,7 @@ class CarError:
     frame: int
     label: int
     depth_m: float
-    error_m: NDArray[np.float64]
+    error_m: Floats
     mahalanobis2: float
     yaw_error_rad: float
     log_det_cov: float  # of the place's covariance (2, 2), in m^4
@@ -128,13 +129,13 @@ def match_cars(sequence: TrackingSequence, measurements: Iterable[Measurements])
     return errors
 
 
-def ego_speeds_mps(sequence: TrackingSequence) -> NDArray[np.float64]:
+def ego_speeds_mps(sequence: TrackingSequence) -> Floats:
     """(N,) by its poses 0.2 s before and after."""
     frames = np.arange(len(sequence))
     before, after = np.maximum(frames - 2, 0), np.minimum(frames + 2, len(frames) - 1)
     at = sequence.camera_poses[:, :3, 3]
     way_m = np.linalg.norm(at[after] - at[before], axis=1)
-    out: NDArray[np.float64] = way_m * KITTI_RATE_HZ / np.maximum(after - before, 1)
+    out: Floats = way_m * KITTI_RATE_HZ / np.maximum(after - before, 1)
     return out
 
 

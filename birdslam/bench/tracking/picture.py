@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.baselines.trajectories import Trajectories
 from birdslam.bench.tracking.benchmark import Truth
+from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 
 LEAST_FRAMES = 10  # vehicles matched in fewer are left out
@@ -42,12 +42,12 @@ def draw_sequence(title: str, truth: Truth, result: Trajectories, path: Path) ->
     figure.savefig(path)
 
 
-def _forward_up(poses: Mapping[int, SE2]) -> NDArray[np.float64]:
+def _forward_up(poses: Mapping[int, SE2]) -> Floats:
     """(N, 2) in the picture: metres to the right, metres ahead."""
     return np.array([[-pose.y_m, pose.x_m] for _, pose in sorted(poses.items())])
 
 
-def draw_runtime(updates_ms: Mapping[str, NDArray[np.float64]], path: Path) -> None:
+def draw_runtime(updates_ms: Mapping[str, Floats], path: Path) -> None:
     """How long each update of the graph took, (frames,) milliseconds for each scenario."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from birdslam.bench.tracking import tables
 from birdslam.bench.tracking.benchmark import Row
 from birdslam.bench.tracking.movers import MoversRow
 from birdslam.bench.tracking.relative_nees import NeesRow
 from birdslam.bench.tracking.reported import MotionRow, RangeRow
 from birdslam.bench.tracking.tables import ODOMETRIES, Published
+from birdslam.geometry.arrays import Floats
 
 ABOUT_REPORTED = (
     "Live, in the ego's frame: cars labelled 25 px or more high, hardly occluded and not truncated; found is an "
@@ -90,7 +88,7 @@ class Outcome:
     motion: list[MotionRow]
     timings: list[Timing]  # by the number of frames
     nees: list[NeesRow]
-    updates_ms: dict[str, NDArray[np.float64]]
+    updates_ms: dict[str, Floats]
     movers: MoversRow | None = None
 
 

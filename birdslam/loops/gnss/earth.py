@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.se2 import SE2, wrap
 from birdslam.loops.map_pose import EarthPose
 from birdslam.types import NS_PER_S
@@ -132,7 +131,7 @@ class Earth:
         )
 
 
-def place_on_earth(t_ns: NDArray[np.int64], poses: list[SE2], fixes: list[GnssFix]) -> Earth:
+def place_on_earth(t_ns: Ints, poses: list[SE2], fixes: list[GnssFix]) -> Earth:
     """The map's frame on Earth, by a drive's poses in it (times growing) and its fixes. Raises EarthError."""
     import pymap3d  # here: only who goes to Earth needs it
 

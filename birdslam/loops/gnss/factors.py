@@ -15,9 +15,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import PlaceFactor, close_loops, inliers
 from birdslam.loops.gnss.earth import LEAST_FIXES, Earth, EarthError, GnssFix, fit
@@ -47,7 +46,7 @@ class OnEarth:
 
 
 def fixed_keyframes(
-    earth: Earth, t_ns: NDArray[np.int64], poses: Sequence[SE2], fixes: Sequence[GnssFix], keyframes: Sequence[Placed]
+    earth: Earth, t_ns: Ints, poses: Sequence[SE2], fixes: Sequence[GnssFix], keyframes: Sequence[Placed]
 ) -> dict[int, Fixed]:
     """The fix nearest to each keyframe, of a drive that `earth` was laid over."""
     from scipy.spatial import cKDTree  # here: only who has fixes needs it

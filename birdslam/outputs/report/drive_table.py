@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.drive_files import FRAME_COLUMNS, FRAMES_FILE, ResultsError
 
@@ -55,13 +54,13 @@ class DriveTable:
     """
 
     name: str
-    frame: NDArray[np.int64]
+    frame: Ints
     t_s: Floats
     xy_m: Floats
     yaw_rad: Floats
     speed_mps: Floats  # NaN where an epoch begins
     scale_sigma_rel: Floats
-    valid: NDArray[np.bool_]
+    valid: Bools
     statuses: list[tuple[str, ...]]
     tracks: list[TrackTable]
     lanes_m: Floats  # (M, 2)

@@ -13,8 +13,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.outputs.drive_files import ResultsError
 from birdslam.outputs.plain_words import MEANINGS, meaning
 from birdslam.outputs.report.drive_table import FILES, DriveTable, TrackTable
@@ -93,7 +93,7 @@ def report_page(drive: DriveTable, video: Path | None = None, plotly: str = "") 
 # --- what is drawn ---
 
 
-def _map_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
+def _map_traces(drive: DriveTable, shown: Ints) -> list[Trace]:
     traces = [
         _points("road landmarks", drive.landmarks_m, "#8b95a5", 2),
         _points("lanes", drive.lanes_m, "#b48a00", 3) if not drive.lines else _lines(drive),
@@ -110,7 +110,7 @@ def _map_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
     return [trace for trace in traces if len(trace["x"])]
 
 
-def _points(name: str, xy_m: NDArray[np.float64], colour: str, size: int) -> Trace:
+def _points(name: str, xy_m: Floats, colour: str, size: int) -> Trace:
     return {
         "name": name,
         "type": "scatter",
@@ -154,7 +154,7 @@ def _track(track: TrackTable, kind: str, first: bool) -> Trace:
     }
 
 
-def _speed_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
+def _speed_traces(drive: DriveTable, shown: Ints) -> list[Trace]:
     speed, t_s = _smoothed(drive)[shown], drive.t_s[shown]
     sigma = speed * drive.scale_sigma_rel[shown]
     sure = drive.valid[shown] & np.isfinite(speed)
@@ -173,7 +173,7 @@ def _speed_traces(drive: DriveTable, shown: NDArray[np.int64]) -> list[Trace]:
     ]
 
 
-def _speed_line(name: str, t_s: NDArray[np.float64], speed: NDArray[np.float64], colour: str) -> Trace:
+def _speed_line(name: str, t_s: Floats, speed: Floats, colour: str) -> Trace:
     line = {"name": name, "type": "scatter", "mode": "lines", "line": {"color": colour, "width": 2}}
     return {**line, "x": _rounded(t_s), "y": _rounded(speed), "hovertemplate": "%{y:.1f} m/s<extra></extra>"}
 
@@ -213,14 +213,14 @@ def _kind(drive: DriveTable, k: int) -> int:
     return 2 if drive.statuses[k] else 3
 
 
-def _smoothed(drive: DriveTable) -> NDArray[np.float64]:
+def _smoothed(drive: DriveTable) -> Floats:
     """The mean of the speed over SMOOTHED_S, of frames that have one."""
     step_s = float(np.median(np.diff(drive.t_s))) if len(drive.t_s) > 1 else SMOOTHED_S
     window = np.ones(max(1, round(SMOOTHED_S / max(step_s, 1e-3))))
     known = np.isfinite(drive.speed_mps)
     total = np.convolve(np.where(known, drive.speed_mps, 0.0), window, mode="same")[: len(known)]
     count = np.convolve(known.astype(np.float64), window, mode="same")[: len(known)]
-    out: NDArray[np.float64] = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+    out: Floats = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
     return out
 
 
@@ -334,11 +334,11 @@ def _pictures(video: Path) -> list[tuple[float, str]]:
     return out
 
 
-def _thinned(count: int, most: int = MOST_POINTS) -> NDArray[np.int64]:
+def _thinned(count: int, most: int = MOST_POINTS) -> Ints:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
-def _rounded(values: NDArray[np.float64]) -> list[float | None]:
+def _rounded(values: Floats) -> list[float | None]:
     return [round(float(value), 3) if np.isfinite(value) else None for value in values]
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Floats32, Ints
 from birdslam.perception.decoding.detection import (
     MOST_CANDIDATES,
     Candidates,
@@ -31,9 +30,7 @@ class _ListDecoder:
         self._groups = rival_groups(table.classes, table.labels, table.rivals)
         self._wanted = np.array(sorted(table.labels))
 
-    def chosen(
-        self, numbers: NDArray[np.float32], scoring: Scoring
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
+    def chosen(self, numbers: Floats32, scoring: Scoring) -> tuple[Ints, Ints, Floats]:
         """Rows, classes and scores of the best candidates; `numbers` (N, classes)."""
         scores = _scores(numbers, scoring)[:, self._wanted]
         rows, columns = np.nonzero(scores >= self._detector.score_threshold)
@@ -62,7 +59,7 @@ class SsdDecoder(_ListDecoder):
                     f"detector.{key}", f"{output} of shape {(1, priors[0], channels)}", shapes[output]
                 )
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Candidates:
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> Candidates:
         """The boxes of one run above the score threshold, in the image and cut to it."""
         rows, classes, scores = self.chosen(tensors[self.table.scores][0], self.table.scoring)
         priors = tensors[self.table.priors][rows].astype(np.float64)
@@ -95,7 +92,7 @@ class BoxListDecoder(_ListDecoder):
         if len(counts) != 1:
             raise ManifestMismatch("detector.scores", f"as many as {table.boxes} has boxes", shapes[table.scores])
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Candidates:
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> Candidates:
         """The boxes of one run above the score threshold, in the image and cut to it."""
         table = self.table
         boxes = self._rows(tensors[table.boxes])
@@ -109,11 +106,11 @@ class BoxListDecoder(_ListDecoder):
             found = found * np.tile(self._input_px, 2)
         return candidates_in_image(found, scores, classes, view)
 
-    def _rows(self, tensor: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _rows(self, tensor: Floats32) -> Floats32:
         return tensor[0] if self.table.layout == "boxes" else tensor[0].T
 
 
-def _scores(numbers: NDArray[np.float32], scoring: Scoring) -> Floats:
+def _scores(numbers: Floats32, scoring: Scoring) -> Floats:
     values = numbers.astype(np.float64)
     if scoring == "sigmoid":
         return 1.0 / (1.0 + np.exp(-np.clip(values, -LARGEST_LOG, LARGEST_LOG)))

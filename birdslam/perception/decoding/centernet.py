@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.perception.decoding.detection import (
     MOST_CANDIDATES,
     Candidates,
@@ -40,7 +40,7 @@ class CenterNetDecoder:
         self._groups = rival_groups(table.classes, table.labels, table.rivals)
         self._wanted = np.array(sorted(table.labels))
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Candidates:
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> Candidates:
         """The peaks of one run above the score threshold, as boxes in the image and cut to it."""
         table = self.table
         heat = tensors[table.heat_map][0, self._wanted]

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.geometry.camera import Camera
 from birdslam.perception.manifest import Disparity, Input, ManifestMismatch, MetricDepth
 from birdslam.perception.views import View
@@ -26,7 +26,7 @@ class DepthMap:
     gives (birdslam/vehicles/placement/pseudolidar.py).
     """
 
-    depth_m: NDArray[np.float32]
+    depth_m: Floats32
     image_width_px: int
     image_height_px: int
     sigma_rel: float = 0.1  # 1-sigma of a pixel's depth, as a fraction of it
@@ -38,7 +38,7 @@ class DepthMap:
         """Pixels of the map in a pixel of the image, along x and y."""
         return self.depth_m.shape[1] / self.image_width_px, self.depth_m.shape[0] / self.image_height_px
 
-    def at(self, points_px: NDArray[np.float64]) -> NDArray[np.float32]:
+    def at(self, points_px: Floats) -> Floats32:
         """(N,) depths at points (N, 2) of the image, each of the nearest pixel of the map; a point outside has NaN."""
         x, y = np.floor((points_px + 0.5) * self.scale).astype(np.int64).T
         height, width = self.depth_m.shape
@@ -56,7 +56,7 @@ class DepthMap:
         y1, y2 = (min(max(int(np.ceil(y * sy - 0.5)), 0), height) for y in (box_px[1], box_px[3]))
         return slice(y1, max(y1, y2)), slice(x1, max(x1, x2))
 
-    def points_cam_m(self, camera: Camera, rows: slice, columns: slice) -> NDArray[np.float64]:
+    def points_cam_m(self, camera: Camera, rows: slice, columns: slice) -> Floats:
         """(N, 3) the pseudo-lidar of a block of the map: its pixels' centres at their depth, in the camera frame."""
         sx, sy = self.scale
         depth = self.depth_m[rows, columns].astype(np.float64)
@@ -97,7 +97,7 @@ class _MapDecoder(Generic[Table]):
 class DisparityDecoder(_MapDecoder[Disparity]):
     """Reads sigmoid disparity (see `manifest.Disparity`)."""
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> DepthMap:
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> DepthMap:
         """The depth of one run over the whole image."""
         table = self.table
         far, near = np.float32(1.0 / table.max_depth_m), np.float32(1.0 / table.min_depth_m)
@@ -114,7 +114,7 @@ class DisparityDecoder(_MapDecoder[Disparity]):
 class MetricDepthDecoder(_MapDecoder[MetricDepth]):
     """Reads depth as it is (see `manifest.MetricDepth`)."""
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> DepthMap:
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> DepthMap:
         """The depth of one run over the whole image."""
         table = self.table
         depth = _of_image(tensors[table.output], view, self.input) * np.float32(table.metres_per_unit)
@@ -132,6 +132,6 @@ def _check_map(output: str, shape: tuple[int, ...]) -> None:
         raise ManifestMismatch("depth.output", f"{output} of shape (1, 1, h, w) or (1, h, w)", shape)
 
 
-def _of_image(tensor: NDArray[np.float32], view: View, input: Input) -> NDArray[np.float32]:
+def _of_image(tensor: Floats32, view: View, input: Input) -> Floats32:
     """(h, w): the part of a map over the whole input that lies over the image, a copy."""
     return view.crop(tensor.reshape(tensor.shape[-2], tensor.shape[-1]), input).copy()

@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
 from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.manifest import BoxSigma, DetectorTable, DrawnInside, Input, LowerEdge, ManifestMismatch, Yolox
 from birdslam.perception.views import View
@@ -36,13 +36,13 @@ class Detections:
     tracker's, negative where it follows none; None: tracks are ours.
     """
 
-    boxes_px: NDArray[np.float64]
-    scores: NDArray[np.float64]
+    boxes_px: Floats
+    scores: Floats
     labels: tuple[str, ...]
     boxes3d: Boxes3d | None = None
     edge_sigma: EdgeSigma | None = None
     lower_edge: LowerEdge = "body"
-    track_ids: NDArray[np.int64] | None = None
+    track_ids: Ints | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -70,10 +70,10 @@ class Candidates:
     `cut` (N, 2): whether a box goes on behind the view's left, right edge.
     """
 
-    boxes_px: NDArray[np.float64]
-    scores: NDArray[np.float64]
-    classes: NDArray[np.int64]
-    cut: NDArray[np.bool_]
+    boxes_px: Floats
+    scores: Floats
+    classes: Ints
+    cut: Bools
 
 
 class YoloxDecoder:
@@ -96,7 +96,7 @@ class YoloxDecoder:
         self._groups = rival_groups(table.classes, table.labels, table.rivals)
         self._wanted = np.isin(np.arange(table.classes), list(table.labels))
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Candidates:
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> Candidates:
         """The boxes of one run above the score threshold, in the image and cut to it."""
         raw = tensors[self.table.output][0]
         rows = np.flatnonzero(raw[:, 4] >= self.table.score_threshold)  # class scores are <= 1
@@ -126,17 +126,17 @@ def edge_sigma(table: BoxSigma | None, view: View) -> EdgeSigma | None:
     return EdgeSigma((left, right, upper, lower), table.px / float(view.ratio.min()))
 
 
-def drawn_out(boxes_px: NDArray[np.float64], inside: DrawnInside, view: View) -> NDArray[np.float64]:
+def drawn_out(boxes_px: Floats, inside: DrawnInside, view: View) -> Floats:
     """Boxes (N, 4) of the image with each edge moved out to where the object ends; one at the border stays there."""
     width, height = (boxes_px[:, 2:] - boxes_px[:, :2]).T
     moves = [-inside.left * width, -inside.upper * height, inside.right * width, inside.lower * height]
     limits = np.array([view.image_width_px, view.image_height_px] * 2, dtype=np.float64)
     at_border = (boxes_px <= 0.0) | (boxes_px >= limits)
-    out: NDArray[np.float64] = np.where(at_border, boxes_px, np.clip(boxes_px + np.column_stack(moves), 0.0, limits))
+    out: Floats = np.where(at_border, boxes_px, np.clip(boxes_px + np.column_stack(moves), 0.0, limits))
     return out
 
 
-def rival_groups(classes: int, labels: Mapping[int, str], rivals: Sequence[Sequence[str]]) -> NDArray[np.int64]:
+def rival_groups(classes: int, labels: Mapping[int, str], rivals: Sequence[Sequence[str]]) -> Ints:
     """(classes,): classes that compete in NMS share a number, that of their group; every other has its own."""
     group_of = {label: i for i, group in enumerate(rivals) for label in group}
     groups = np.arange(classes) + len(rivals)
@@ -145,9 +145,7 @@ def rival_groups(classes: int, labels: Mapping[int, str], rivals: Sequence[Seque
     return groups
 
 
-def candidates_in_image(
-    boxes_px: NDArray[np.float64], scores: NDArray[np.float64], classes: NDArray[np.int64], view: View
-) -> Candidates:
+def candidates_in_image(boxes_px: Floats, scores: Floats, classes: Ints, view: View) -> Candidates:
     """Boxes (N, 4) of the network's input, in the image and cut to the view; slivers are left out."""
     boxes = view.to_image(boxes_px)
     margin_px = CUT_MARGIN * (view.x1_px - view.x0_px)
@@ -163,9 +161,7 @@ def candidates_in_image(
     return Candidates(boxes[solid], scores[solid], classes[solid], cut[solid])
 
 
-def merge_views(
-    parts: Sequence[Candidates], views: Sequence[View], groups: NDArray[np.int64], table: DetectorTable
-) -> Detections:
+def merge_views(parts: Sequence[Candidates], views: Sequence[View], groups: Ints, table: DetectorTable) -> Detections:
     """The boxes of all views of one image, each object once; `groups` (classes,) as `rival_groups` gives them."""
     boxes, scores, classes, cut = (
         np.concatenate([getattr(part, field) for part in parts]) for field in ("boxes_px", "scores", "classes", "cut")
@@ -181,7 +177,7 @@ def merge_views(
     return Detections(outlines, scores[order], labels, edge_sigma=sigma, lower_edge=table.lower_edge)
 
 
-def _grid(width_px: int, height_px: int, strides: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _grid(width_px: int, height_px: int, strides: Sequence[int]) -> tuple[Floats, Floats]:
     """Cells (N, 2) as x, y and their strides (N, 1), row by row, one stride after the other."""
     cells, sizes = [], []
     for stride in strides:
@@ -191,21 +187,15 @@ def _grid(width_px: int, height_px: int, strides: Sequence[int]) -> tuple[NDArra
     return np.vstack(cells).astype(np.float64), np.vstack(sizes).astype(np.float64)
 
 
-def intersections(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+def intersections(boxes: Floats) -> Floats:
     """(N, N) areas that each two of the boxes (N, 4) share."""
     low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
-    out: NDArray[np.float64] = np.prod(np.clip(high - low, 0.0, None), axis=-1)
+    out: Floats = np.prod(np.clip(high - low, 0.0, None), axis=-1)
     return out
 
 
-def suppress(
-    boxes: NDArray[np.float64],
-    scores: NDArray[np.float64],
-    groups: NDArray[np.int64],
-    cut: NDArray[np.bool_],
-    nms_iou: float,
-) -> NDArray[np.int64]:
+def suppress(boxes: Floats, scores: Floats, groups: Ints, cut: Bools, nms_iou: float) -> Ints:
     """Indices that survive NMS within each group, best first: whole boxes before cut ones, then by score (stable).
 
     A cut box (N, 2: on its left, on its right) yields to one that covers it, since the overlap over union of a part
@@ -226,9 +216,7 @@ def suppress(
     return order[alive[order]]
 
 
-def join_halves(
-    boxes: NDArray[np.float64], groups: NDArray[np.int64], cut: NDArray[np.bool_], slack_px: float
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def join_halves(boxes: Floats, groups: Ints, cut: Bools, slack_px: float) -> tuple[Floats, Ints]:
     """An object wider than the overlap leaves a half in two neighbouring tiles: they become one box, left to right.
 
     Such halves both span the overlap, to `slack_px`. Returns the boxes and the indices of those that stand.
@@ -267,7 +255,7 @@ def with_bodies(detections: Detections, others: Detections | None) -> Detections
     return replace(detections, boxes3d=_unknown_unless(bodies.take(best), overlap[np.arange(n), best] >= MIN_BODY_IOU))
 
 
-def _unknown_unless(bodies: Boxes3d, known: NDArray[np.bool_]) -> Boxes3d:
+def _unknown_unless(bodies: Boxes3d, known: Bools) -> Boxes3d:
     return replace(
         bodies,
         sigma_depth_m=np.where(known, bodies.sigma_depth_m, np.inf),

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Floats32, Ints
 from birdslam.perception.boxes3d import Boxes3d
 from birdslam.perception.decoding.depth import DepthMap
 from birdslam.perception.decoding.detection import Detections, drawn_out, edge_sigma, suppress
@@ -83,7 +83,7 @@ class MultiTaskDecoder:
         self._cell = np.array([input.width_px / shapes["heat"][3], input.height_px / shapes["heat"][2]])
         self._kernel = np.ones((3, 3), dtype=np.uint8)
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Findings:
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> Findings:
         """The findings of one run over the whole image."""
         # The canonical focal length is a share of what the network sees; padding makes it another share of the image.
         focal_rel = CANONICAL_FOCAL * self.input.width_px / float(view.width_px)
@@ -98,7 +98,7 @@ class MultiTaskDecoder:
         (part,) = parts
         return part
 
-    def _segmentation(self, logits: NDArray[np.float32], view: View) -> Segmentation:
+    def _segmentation(self, logits: Floats32, view: View) -> Segmentation:
         """Logits and not masks are resized: the border is smooth at the image's resolution."""
         size = (view.image_width_px, view.image_height_px)
         road, lane = (
@@ -106,7 +106,7 @@ class MultiTaskDecoder:
         )
         return Segmentation(road=road > self.table.road_logit, lane=lane > self.table.lane_logit)
 
-    def _depth(self, log_depth: NDArray[np.float32], view: View, focal_rel: float) -> DepthMap:
+    def _depth(self, log_depth: Floats32, view: View, focal_rel: float) -> DepthMap:
         return DepthMap(
             np.exp(view.crop(log_depth, self.input)),
             view.image_width_px,
@@ -115,9 +115,7 @@ class MultiTaskDecoder:
             canonical_focal_rel=focal_rel,
         )
 
-    def _detections(
-        self, heat: NDArray[np.float32], body: NDArray[np.float32], view: View, focal_rel: float
-    ) -> Detections:
+    def _detections(self, heat: Floats32, body: Floats32, view: View, focal_rel: float) -> Detections:
         """The peaks of the heat map with the body's channels there, each box once, the best score first."""
         classes, ys, xs = self._peaks(heat)
         at = body[:, ys, xs].T.astype(np.float64)  # (N, channels)
@@ -138,7 +136,7 @@ class MultiTaskDecoder:
         sigma = edge_sigma(self.table.box_sigma, view)
         return Detections(outlines, scores[rows], labels, bodies, sigma, self.table.lower_edge)
 
-    def _peaks(self, heat: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def _peaks(self, heat: Floats32) -> tuple[Ints, Ints, Ints]:
         """Class, row and column of the cells that are hotter than their neighbours, best first."""
         bar = math.log(self.table.score_threshold / (1.0 - self.table.score_threshold))
         peaks = [(plane >= cv2.dilate(plane, self._kernel)) & (plane > bar) for plane in heat]
@@ -146,7 +144,7 @@ class MultiTaskDecoder:
         best = np.argsort(-heat[classes, ys, xs], kind="stable")[:MOST_CANDIDATES]
         return classes[best], ys[best], xs[best]
 
-    def _bodies(self, at: NDArray[np.float64], cells: NDArray[np.float64], view: View, focal_rel: float) -> Boxes3d:
+    def _bodies(self, at: Floats, cells: Floats, view: View, focal_rel: float) -> Boxes3d:
         """The bodies (N) by their channels `at` (N, channels), at the cells (N, 2)."""
         centres = np.tile((cells + at[:, _BODY["offset"]]) * self._cell, 2)
         depth_m = np.exp(at[:, _BODY["log_depth"]][:, 0])

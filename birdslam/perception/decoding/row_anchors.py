@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.perception.decoding.segmentation import Segmentation
 from birdslam.perception.manifest import Input, ManifestMismatch, RowAnchors
 from birdslam.perception.views import View
@@ -26,7 +26,7 @@ class RowAnchorsDecoder:
         if tuple(shapes[table.output]) != stated:
             raise ManifestMismatch("segmenter.output", f"{table.output} of shape {stated}", shapes[table.output])
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Segmentation:
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> Segmentation:
         """The lines of one run, drawn into the mask of paint; the network knows no road."""
         lane = np.zeros((view.image_height_px, view.image_width_px), np.uint8)
         width_px = max(1, round(LINE_REL * view.image_width_px))
@@ -39,7 +39,7 @@ class RowAnchorsDecoder:
         (part,) = parts
         return part
 
-    def points_px(self, logits: NDArray[np.float32], view: View) -> list[NDArray[np.float64]]:
+    def points_px(self, logits: Floats32, view: View) -> list[Floats]:
         """(N, 2) pixels of the image for each line that was found; `logits` (columns + 1, rows, lines).
 
         The column is the mean over the softmax of all columns but the last, which says that the line is not in the row.

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats32
 from birdslam.perception.manifest import ClassMap, ClassMaps, Input, ManifestMismatch, Meaning
 from birdslam.perception.views import View
 
@@ -17,8 +17,8 @@ from birdslam.perception.views import View
 class Segmentation:
     """Masks (H, W) bool of the undistorted image; all false where the network has no such meaning."""
 
-    road: NDArray[np.bool_]
-    lane: NDArray[np.bool_]
+    road: Bools
+    lane: Bools
 
 
 class ClassMapsDecoder:
@@ -36,7 +36,7 @@ class ClassMapsDecoder:
                 has = f"{shape[1]} in {entry.output} {shape}"
                 raise ManifestMismatch(f"segmenter.maps[{index}].channels", entry.channels, has)
 
-    def read(self, tensors: Mapping[str, NDArray[np.float32]], view: View) -> Segmentation:
+    def read(self, tensors: Mapping[str, Floats32], view: View) -> Segmentation:
         """The masks of one run over the whole image."""
         masks = {entry.meaning: self._mask(tensors[entry.output][0], entry, view) for entry in self.table.maps}
         meanings: tuple[Meaning, ...] = ("road", "lane")
@@ -48,7 +48,7 @@ class ClassMapsDecoder:
         (part,) = parts
         return part
 
-    def _mask(self, scores: NDArray[np.float32], entry: ClassMap, view: View) -> NDArray[np.bool_]:
+    def _mask(self, scores: Floats32, entry: ClassMap, view: View) -> Bools:
         """(H, W): where the margin of the channel over its threshold, resized to the image, is above zero.
 
         Resizing the margin and not the mask keeps the border smooth at the image's resolution.

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.perception.onnx_files.openvino_ir import IrError, Layer, read_layers
 
 INPUT = "image"
@@ -75,7 +76,7 @@ def weights_sha256(onnx_file: bytes) -> str:
     return hashlib.sha256(b"".join(sorted(_digest(a) for a in arrays if a.dtype == np.float32))).hexdigest()
 
 
-def _digest(array: NDArray[np.float32]) -> bytes:
+def _digest(array: Floats32) -> bytes:
     numbers = np.ascontiguousarray(array, dtype="<f4")
     return hashlib.sha256(repr(numbers.shape).encode() + numbers.tobytes()).digest()
 

@@ -2,8 +2,9 @@
 
 z is the depth of the nearest face, r on to the roof's far edge, y/x the box's bearing, H the camera's height:
 
-    bottom = (H + edge) / z - pitch - tilt + roll y/x      (Eq. 1)
-    top = (H - h) / (z + r) - pitch - tilt + roll y/x      log width = log w + log(class's outline) - log z
+    bottom = (H + edge) / z - pitch - tilt + roll y/x + crown |y|/x      (Eq. 1)
+    top = (H - h) / (z + r) - pitch - tilt + roll y/x + crown |y|/x
+    log width = log w + log(class's outline) - log z
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from birdslam.geometry import bev
 
 Floats = NDArray[np.float64]
 
-# States of all vehicles: tilt of the camera over the road, its mean over the drive, lasting errors of the images' tilt,
-# what the sizes and what the lower edges have in common
-PITCH, ROLL, MEAN_PITCH, MEAN_ROLL, IMAGE_PITCH, IMAGE_ROLL, SIZE, LOWER = range(8)
-COMMON, OWN = 8, 4  # and of each vehicle:
+# States of all vehicles: tilt of the camera over the road, its crown, lasting errors of the images' tilt, what the
+# sizes and what the lower edges have in common
+PITCH, ROLL, CROWN, IMAGE_PITCH, IMAGE_ROLL, SIZE, LOWER = range(7)
+COMMON, OWN = 7, 4  # and of each vehicle:
 HEIGHT, OUTLINE, EDGE, TILT = range(OWN)
 Cue = Literal["bottom", "top", "width"]
 CUES: tuple[Cue, ...] = ("bottom", "top", "width")  # measurements of each box, in this order
@@ -41,12 +42,13 @@ def expected_boxes(
     below = height_m + x[at + EDGE]
     far = np.where(height_m > height, depth + reach, depth)
     level = x[PITCH] - tilt_rad[0] + x[at + TILT]
-    lean = (x[ROLL] - tilt_rad[1]) * bearing
+    lean = (x[ROLL] - tilt_rad[1]) * bearing + x[CROWN] * np.abs(bearing)
     bottom = bev.road_slope(depth, below) - level + lean  # Eq. 1
     top = (height_m - height) / far - level + lean
     J = np.zeros((len(CUES) * n, m + n))
     J[: 2 * n, PITCH] = -1.0
     J[:n, ROLL] = J[n : 2 * n, ROLL] = bearing
+    J[:n, CROWN] = J[n : 2 * n, CROWN] = np.abs(bearing)
     J[rows, at + TILT] = J[n + rows, at + TILT] = -1.0
     J[rows, at + EDGE] = 1.0 / depth
     J[rows, m + rows] = -below / depth

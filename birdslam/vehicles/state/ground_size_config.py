@@ -4,8 +4,6 @@ data chose.
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +16,8 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     sigma_pitch_rad: float = 0.010  # of the camera over real roads against its calibration, all together
     sigma_roll_rad: float = 0.02  # the same
-    # Of these variances the share that lasts for a drive: the mount, the load, the camera file
-    mean_tilt_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.7
-    pitch_memory_s: float = 5.0  # of driving: how long the pitch's deviation from the drive's mean lasts
-    roll_memory_s: float = 20.0  # of driving: how long the roll's deviation lasts
+    pitch_memory_s: float = 5.0  # of driving: how long the pitch's deviation from the calibration lasts
+    roll_memory_s: float = 20.0  # of driving: how long the roll's deviation lasts, and a crown
     sigma_pitch_step_rad: float = 0.0008  # a frame of driving: the road's change of grade, and the odometry's error
     sigma_pitch_blind_rad: float = 0.003  # a frame without odometry
     # Road and views change with time far above this speed, and with the way far below it: of a second, 1 - exp(-speed /
@@ -34,8 +30,10 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_kerb_m: float = 0.018  # how far the road under a vehicle lies off the ego's plane, whatever its distance
     sigma_common_edge_rel: float = 0.015  # of its height: where a detector draws the lower edges of all vehicles alike
     sigma_edge_rel: float = 0.022  # of its height: a detector draws the lower edge of one vehicle alike in all frames
-    sigma_tilt_rad: float = 0.0017  # of the road at a vehicle against the ego's
-    sigma_crown_rad: float = 0.0047  # and the more the farther it stands to the side, a unit of y/x
+    sigma_tilt_rad: float = 0.0015  # of the road at a vehicle against the ego's
+    sigma_crown_rad: float = 0.0038  # and the more the farther it stands to the side, a unit of y/x
+    # By how much both sides of the road fall off, or rise, against the plane under the ego: its crown, other streets
+    sigma_common_crown_rad: float = 0.012
     tilt_memory_s: float = 5.0  # of driving: how long that tilt lasts
     width_drift_rel: float = 0.002  # of the outline, a frame
     width_turn_rel: float = 1.0  # of the outline, a radian that the line of sight turned: the yaw is not known as well
@@ -59,11 +57,11 @@ class GroundSizeConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return np.square([self.sigma_image_pitch_rad, self.sigma_image_roll_rad])
 
     @property
-    def mean_tilt_var(self) -> NDArray[np.float64]:
-        """(2,) of the drive's means of pitch and roll."""
-        return np.square([self.sigma_pitch_rad, self.sigma_roll_rad]) * self.mean_tilt_share
+    def road_var(self) -> NDArray[np.float64]:
+        """(3,) of pitch and roll about the calibration, and of the crown."""
+        return np.square([self.sigma_pitch_rad, self.sigma_roll_rad, self.sigma_common_crown_rad])
 
     @property
-    def tilt_var(self) -> NDArray[np.float64]:
-        """(2,) of pitch and roll about those means."""
-        return np.square([self.sigma_pitch_rad, self.sigma_roll_rad]) * (1.0 - self.mean_tilt_share)
+    def road_memory_s(self) -> NDArray[np.float64]:
+        """(3,) of driving: how long each of them lasts."""
+        return np.array([self.pitch_memory_s, self.roll_memory_s, self.roll_memory_s])

@@ -1,16 +1,15 @@
 """The road's tilt and the vehicles' sizes, each from the other, by the boxes of the vehicles alone.
 
-    x = [pitch, roll, their means, errors of the images' tilt, common size and edge,
+    x = [pitch, roll, crown, errors of the images' tilt, common size and edge,
          and of every vehicle: log h, log w, edge, tilt]      and, for one frame only, of every box: log z
 
 One Kalman filter holds them all; ground_measurements.py has the measurements.
 
-What is wrong for as long as a drive lasts is a state of the drive: the mean of the tilt, by how much its vehicles are
-taller than their classes (size_prior.py), how low their boxes end, and by how much the tilt that images see before the
-ego is off where vehicles are. What is wrong with one vehicle for as long as it is in sight is a state of the
-vehicle, so that its many frames don't average it away: `edge` is by how much its box ends lower than the ego's plane at
-its face (m: the kerb, and where the detector draws its edge), `tilt` by how much the road at it is tilted against the
-ego's (rad).
+What is wrong for as long as a drive lasts is a state of the drive: by how much its vehicles are taller than their
+classes (size_prior.py), how low their boxes end, and by how much the tilt that images see before the ego is off where
+vehicles are. What is wrong with one vehicle for as long as it is in sight is a state of the vehicle, so that its many
+frames don't average it away: `edge` is by how much its box ends lower than the ego's plane at its face (m: the kerb,
+and where the detector draws its edge), `tilt` by how much the road at it is tilted against the ego's (rad).
 """
 
 from __future__ import annotations
@@ -27,14 +26,13 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.vehicles.placement.localisation import Observation
 from birdslam.vehicles.state.ground_measurements import (
     COMMON,
+    CROWN,
     CUES,
     EDGE,
     HEIGHT,
     IMAGE_PITCH,
     IMAGE_ROLL,
     LOWER,
-    MEAN_PITCH,
-    MEAN_ROLL,
     OUTLINE,
     OWN,
     PITCH,
@@ -53,7 +51,7 @@ Floats = NDArray[np.float64]
 ITERATIONS = 2
 DEPTH_UNKNOWN = 2.0  # 1-sigma of log z before a frame is seen
 UNUSED = 1e3  # 1-sigma of a cue that is not used
-_TILTS, _MEANS, _IMAGES = slice(PITCH, ROLL + 1), slice(MEAN_PITCH, MEAN_ROLL + 1), slice(IMAGE_PITCH, IMAGE_ROLL + 1)
+_TILTS, _ROAD, _IMAGES = slice(PITCH, ROLL + 1), slice(PITCH, CROWN + 1), slice(IMAGE_PITCH, IMAGE_ROLL + 1)
 _MIN_DT_S = 1e-3
 _MIN_SHARE = 1e-6  # of a second, that counts as driving
 
@@ -72,8 +70,8 @@ class Depths:
 class GroundSizeFilter:
     """predict() once a frame, then estimate_depths() of its boxes.
 
-    State: pitch and roll (rad) of the camera over the road, their means over the drive and the lasting errors of the
-    images' of them; the log of a factor on all heights, and where all boxes end as a share of the height; of each
+    State: pitch and roll (rad) of the camera over the road, by how much its sides fall off (rad), and lasting errors of
+    the images' tilt; the log of a factor on all heights, and where all boxes end as a share of the height; of each
     vehicle the log of its height in metres, the log of its outline's width as a factor, its edge (m) and tilt (rad).
     Measurements: of each box the slopes of bottom and top and the log of its width (see the module); pitch and roll
     (rad) by the images. `placing.Placing` reads depths and heights; `ground` is read by `localisation.observe_boxes`,
@@ -86,11 +84,9 @@ class GroundSizeFilter:
         self._unseen_s = np.zeros(0)  # of each vehicle
         self._driven_s = np.zeros(0)  # and how much of that counts as driving of the ego
         self._sigma_tilt = np.zeros(0)
-        mean = config.mean_tilt_var
-        self._x = np.array([camera.pitch_rad, camera.roll_rad] * 2 + [0.0] * 4)
+        self._x = np.array([camera.pitch_rad, camera.roll_rad, *np.zeros(COMMON - 2)])
         common = np.square([config.sigma_common_rel, config.sigma_common_edge_rel])
-        self._P = np.diag([*mean + config.tilt_var, *mean, *config.image_var, *common])
-        self._P[[PITCH, ROLL, MEAN_PITCH, MEAN_ROLL], [MEAN_PITCH, MEAN_ROLL, PITCH, ROLL]] = np.tile(mean, 2)
+        self._P = np.diag([*config.road_var, *config.image_var, *common])
         self._sizes = SizePrior(config.sigma_common_rel, config.size_dof)
         self._image_ground = camera.ground
 
@@ -170,18 +166,16 @@ class GroundSizeFilter:
         self._unseen_s = self._unseen_s + dt_s
         self._driven_s = self._driven_s + share * dt_s
         self._x[PITCH] += turn_rad or 0.0
-        keep = np.exp(-share * dt_s / np.array([config.pitch_memory_s, config.roll_memory_s]))
+        keep = np.exp(-share * dt_s / config.road_memory_s)
         keep_image = np.exp(-share * dt_s / np.array([config.image_pitch_memory_s, config.image_roll_memory_s]))
         keep_tilt = math.exp(-share * dt_s / config.tilt_memory_s)
         scale = np.ones(len(self._x))
-        scale[_TILTS], scale[_IMAGES], scale[COMMON + TILT :: OWN] = keep, keep_image, keep_tilt
+        scale[_ROAD], scale[_IMAGES], scale[COMMON + TILT :: OWN] = keep, keep_image, keep_tilt
         self._x *= scale
-        self._x[_TILTS] += (1.0 - keep) * self._x[_MEANS]
+        self._x[_ROAD] += (1.0 - keep) * [self.camera.pitch_rad, self.camera.roll_rad, 0.0]
         self._P *= np.outer(scale, scale)
-        self._P[_TILTS] += (1.0 - keep)[:, None] * self._P[_MEANS]
-        self._P[:, _TILTS] += (1.0 - keep) * self._P[:, _MEANS]
         noise = np.zeros(len(self._x))
-        noise[_TILTS] = (1.0 - keep**2) * config.tilt_var
+        noise[_ROAD] = (1.0 - keep**2) * config.road_var
         noise[_IMAGES] = (1.0 - keep_image**2) * config.image_var
         noise[COMMON + TILT :: OWN] = (1.0 - keep_tilt**2) * np.square(self._sigma_tilt)
         step = config.sigma_pitch_blind_rad if turn_rad is None else config.sigma_pitch_step_rad

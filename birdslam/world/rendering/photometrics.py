@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats32
+from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.world.rendering.light import SKY_SLOTS
 from birdslam.world.rendering.textures import GRAIN, noise_bank
 
@@ -36,7 +36,7 @@ class Lens:
     fixed: float = 0.0  # the light that becomes middle grey where none is metered: all the gain that a camera has
 
 
-def draw_sky(rng: np.random.Generator) -> NDArray[np.float64]:
+def draw_sky(rng: np.random.Generator) -> Floats:
     """Light as `light` describes it: noon or low sun, deep or pale shade, overcast, haze, wet road."""
     u = rng.random(24)
     sky = np.zeros(SKY_SLOTS)

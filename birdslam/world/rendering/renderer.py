@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats, Floats32
+from birdslam.geometry.arrays import Floats, Floats32, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.world.rendering import ground
 from birdslam.world.rendering import materials as m
@@ -88,7 +88,7 @@ class _Mesh:
     material: NDArray[np.int32]
     owner: NDArray[np.int32]
     count: int
-    ranges: NDArray[np.int64]
+    ranges: Ints
     parameters: Floats32
     R: Floats
     t: Floats
@@ -117,7 +117,7 @@ class _View:
         )  # fmt: skip
         return nearest, front
 
-    def boxes(self, mesh: _Mesh, moving: NDArray[np.int64], seen: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    def boxes(self, mesh: _Mesh, moving: Ints, seen: Ints) -> tuple[Floats, Floats]:
         """Of each moving body its box (n, 4) in pixels, and the share (n,) of its samples in the image that is seen."""
         boxes, visible = np.full((len(moving), 4), np.nan), np.zeros(len(moving))
         stamp = np.full(self._samples, -1, np.int32)
@@ -254,7 +254,7 @@ class Renderer:
                 )  # fmt: skip
         return fine, coarse, lean, fine_origin, coarse_origin, np.array([_FINE_PER_M, _COARSE_PER_M])
 
-    def _contact(self, scene: Bodies, R: Floats, t: Floats, moving: NDArray[np.int64]) -> tuple[Floats32, Floats]:
+    def _contact(self, scene: Bodies, R: Floats, t: Floats, moving: Ints) -> tuple[Floats32, Floats]:
         shade_map = np.empty((280, 160), np.float32)
         wide = moving[np.isin(scene.kind[moving], (m.VEHICLE, m.TRUCK))]
         poses = np.column_stack([t[wide, 0], t[wide, 1], np.arctan2(R[wide, 1, 0], R[wide, 0, 0])])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats, Floats32
+from birdslam.geometry.arrays import Bools, Floats, Floats32, Ints
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Bodies:
     slope: Floats  # of the road under it along its own x, dz/dx; 0 for what stands upright on a slope
     object_id: NDArray[np.int32]  # -1 for what can't move
 
-    def subset(self, keep: NDArray[np.bool_]) -> Bodies:
+    def subset(self, keep: Bools) -> Bodies:
         """The rows to keep."""
         return Bodies(*(column[keep] for column in self.__dict__.values()))
 
@@ -40,5 +40,5 @@ class Rendered:
     classes: NDArray[np.uint8]
     instances: NDArray[np.uint16]
     boxes_px: Floats  # of bodies that move, in the order of `moving`
-    moving: NDArray[np.int64]
+    moving: Ints
     visible: Floats  # of each of them: the share of its samples inside the image that nothing hides

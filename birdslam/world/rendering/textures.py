@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats32
+from birdslam.geometry.arrays import Floats, Floats32
 
 SIZE_PX = 256
 LEVELS = 7
@@ -17,14 +17,14 @@ MASK_PX = 128
 MASKS = 24
 
 
-def _coloured(rng: np.random.Generator, exponent: float, size_px: int = SIZE_PX) -> NDArray[np.float64]:
+def _coloured(rng: np.random.Generator, exponent: float, size_px: int = SIZE_PX) -> Floats:
     """Tileable noise of zero mean and unit deviation whose amplitude falls as 1 / f^exponent."""
     f = np.hypot(np.fft.fftfreq(size_px)[:, None], np.fft.fftfreq(size_px)[None, :])
     f[0, 0] = 1.0
     spectrum = np.fft.fft2(rng.standard_normal((size_px, size_px))) / f**exponent
     spectrum[0, 0] = 0.0
     out = np.fft.ifft2(spectrum).real
-    result: NDArray[np.float64] = out / out.std()
+    result: Floats = out / out.std()
     return result
 
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.world.street.course import STEP_M, Course
 
 # Surfaces of a band of the cross-section
@@ -43,10 +42,10 @@ class Street:
     y_m: Floats
     z_m: Floats
     yaw_rad: Floats
-    bands: NDArray[np.float32]
-    lines: NDArray[np.float32]
-    crossings: NDArray[np.float32]
-    marks: NDArray[np.float32]
+    bands: Floats32
+    lines: Floats32
+    crossings: Floats32
+    marks: Floats32
     lanes: tuple[Lane, ...]
     parking: tuple[tuple[float, int], ...]  # (d, direction) of the middle of parking strips
     right_m: float  # edges of what is driven on, parking strips too

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.world.street.course import SHARPEST, Course, draw_course
 from birdslam.world.street.street import (
     ARROW,
@@ -199,7 +199,7 @@ def _lines(
     return rows
 
 
-def _crossings(rng: np.random.Generator, kind: str, length_m: float, ego_s_m: float) -> NDArray[np.float32]:
+def _crossings(rng: np.random.Generator, kind: str, length_m: float, ego_s_m: float) -> Floats32:
     rows: list[tuple[float, ...]] = []
     if kind in ("motorway",):
         return np.zeros((0, len(CROSSING)), np.float32)
@@ -215,9 +215,9 @@ def _crossings(rng: np.random.Generator, kind: str, length_m: float, ego_s_m: fl
 
 
 def _marks(
-    rng: np.random.Generator, kind: str, length_m: float, ego_s_m: float, crossings: NDArray[np.float32],
+    rng: np.random.Generator, kind: str, length_m: float, ego_s_m: float, crossings: Floats32,
     lanes: list[Lane], width: float, edges: tuple[float, float], painted: bool,
-) -> NDArray[np.float32]:  # fmt: skip
+) -> Floats32:  # fmt: skip
     rows: list[tuple[float, ...]] = []
     right, left = edges
     for s, half, *_ in crossings.tolist():

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.world.rendering import materials as m
 
 # Linear light
@@ -92,7 +92,7 @@ class Body:
 
     label: str
     kind: int
-    parameters: NDArray[np.float32]
+    parameters: Floats32
 
 
 def draw_vehicle(rng: np.random.Generator, parked: bool = False) -> Body:
@@ -140,7 +140,7 @@ def draw_shape(rng: np.random.Generator, name: str) -> Body:
     return Body(shape.label, m.VEHICLE, P)
 
 
-def _paint(rng: np.random.Generator, P: NDArray[np.float32], label: str) -> None:
+def _paint(rng: np.random.Generator, P: Floats32, label: str) -> None:
     u = rng.random(12)
     paint = _PAINTS[int(rng.choice(len(_PAINTS), p=_PAINT_ODDS))] * (0.8 + 0.4 * u[0])
     if label in ("van", "truck") and u[1] < 0.5:
@@ -204,7 +204,7 @@ def draw_cyclist(rng: np.random.Generator) -> Body:
     return Body("cyclist", m.CYCLIST, P)
 
 
-def _clothes(rng: np.random.Generator, P: NDArray[np.float32]) -> None:
+def _clothes(rng: np.random.Generator, P: Floats32) -> None:
     P[:3] = rng.uniform(0.01, 0.5, 3) ** 1.3 if rng.random() < 0.6 else rng.uniform(0.01, 0.6)
     P[m.CARGO_RED : m.CARGO_BLUE + 1] = (
         rng.uniform(0.01, 0.4, 3) if rng.random() < 0.3 else np.array([0.02, 0.025, 0.05]) * rng.uniform(0.5, 4)

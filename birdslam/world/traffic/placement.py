@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.world.rendering import materials as m
 from birdslam.world.street.street import Street
 
@@ -26,11 +26,9 @@ class Standing:
     s_m: list[float]
     d_m: list[float]
     turn_rad: list[float]
-    parameters: list[NDArray[np.float32]]
+    parameters: list[Floats32]
 
-    def add(
-        self, kind: int, s_m: float, d_m: float, turn_rad: float, size: tuple[float, float, float]
-    ) -> NDArray[np.float32]:
+    def add(self, kind: int, s_m: float, d_m: float, turn_rad: float, size: tuple[float, float, float]) -> Floats32:
         """A new one; its parameters, to be filled further."""
         P = np.zeros(m.SLOTS, np.float32)
         P[m.LENGTH], P[m.WIDTH], P[m.HEIGHT] = size

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.world.training.targets import Window
 
 
@@ -92,7 +93,7 @@ def photometric(image: NDArray[np.uint8], config: AugmentationConfig, rng: np.ra
     return pixels
 
 
-def _light(width_px: int, height_px: int, rng: np.random.Generator) -> NDArray[np.float32]:
+def _light(width_px: int, height_px: int, rng: np.random.Generator) -> Floats32:
     """Uneven light: a smooth field, or a shadow with a hard edge."""
     coarse = rng.uniform(0.5, 1.4, (3, 5)).astype(np.float32)
     field = cv2.resize(coarse, (width_px, height_px), interpolation=cv2.INTER_CUBIC)
@@ -106,7 +107,7 @@ def _light(width_px: int, height_px: int, rng: np.random.Generator) -> NDArray[n
     return field.astype(np.float32, copy=False)
 
 
-def _blur(out: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+def _blur(out: Floats32, rng: np.random.Generator) -> Floats32:
     if rng.random() < 0.6:
         return cv2.GaussianBlur(out, (0, 0), rng.uniform(0.4, 1.6)).astype(np.float32, copy=False)
     length = int(rng.integers(3, 8))

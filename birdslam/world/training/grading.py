@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.perception import Detections, Findings
 from birdslam.world.truth import CLASSES, WorldFrame, WorldObject
 
@@ -42,18 +42,18 @@ class Grades:
     config: GradingConfig = field(default_factory=GradingConfig)
     frames: int = 0
     absrel: list[float] = field(default_factory=list)  # a frame's mean
-    road: NDArray[np.int64] = field(default_factory=lambda: np.zeros(2, dtype=np.int64))  # common, either
-    lane: NDArray[np.int64] = field(default_factory=lambda: np.zeros(2, dtype=np.int64))
+    road: Ints = field(default_factory=lambda: np.zeros(2, dtype=np.int64))  # common, either
+    lane: Ints = field(default_factory=lambda: np.zeros(2, dtype=np.int64))
     scores: list[float] = field(default_factory=list)
     hits: list[bool] = field(default_factory=list)
     vehicles: int = 0
     axis_rad: list[float] = field(default_factory=list)  # error of the axis alone
     flipped: list[bool] = field(default_factory=list)
     centre_rel: list[float] = field(default_factory=list)  # of the depth, at near_m to far_m
-    size_rel: list[NDArray[np.float64]] = field(default_factory=list)
+    size_rel: list[Floats] = field(default_factory=list)
     depth_z: list[float] = field(default_factory=list)  # error over stated sigma
     edge_rel: list[float] = field(default_factory=list)  # of each edge of a box that nothing hides, over its side
-    extents: list[NDArray[np.float64]] = field(default_factory=list)  # of such boxes, see `extents`
+    extents: list[Floats] = field(default_factory=list)  # of such boxes, see `extents`
 
     def add(self, findings: Findings, frame: WorldFrame) -> None:
         """One frame. Findings are of its image at any network size."""
@@ -155,30 +155,30 @@ class Grades:
         }
 
 
-def _boxes_of(bodies: Sequence[WorldObject]) -> NDArray[np.float64]:
+def _boxes_of(bodies: Sequence[WorldObject]) -> Floats:
     """(N, 4) in the coordinates of pixels' edges, as boxes found are."""
     return np.array([body.box_px for body in bodies], dtype=np.float64).reshape(-1, 4) + 0.5
 
 
-def extents(said: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.float64]:
+def extents(said: Floats, true: Floats) -> Floats:
     """(3,) of two boxes: their widths' ratio, their heights', and the true box's width over its height."""
     said_px, true_px = said[2:] - said[:2], true[2:] - true[:2]
-    out: NDArray[np.float64] = np.append(said_px / true_px, true_px[0] / true_px[1])
+    out: Floats = np.append(said_px / true_px, true_px[0] / true_px[1])
     return out
 
 
-def overlap(guess: NDArray[np.bool_], truth: NDArray[np.bool_]) -> NDArray[np.int64]:
+def overlap(guess: Bools, truth: Bools) -> Ints:
     """(2,) pixels in both, pixels in either."""
     return np.array([np.count_nonzero(guess & truth), np.count_nonzero(guess | truth)])
 
 
-def box_ious(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def box_ious(a: Floats, b: Floats) -> Floats:
     """(N, M) overlap over union of boxes (N, 4) and (M, 4)."""
     low = np.maximum(a[:, None, :2], b[None, :, :2])
     high = np.minimum(a[:, None, 2:], b[None, :, 2:])
     shared = np.prod(np.clip(high - low, 0.0, None), axis=-1)
     area_a, area_b = (np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) for boxes in (a, b))
-    out: NDArray[np.float64] = shared / np.maximum(area_a[:, None] + area_b[None, :] - shared, 1e-9)
+    out: Floats = shared / np.maximum(area_a[:, None] + area_b[None, :] - shared, 1e-9)
     return out
 
 
@@ -212,5 +212,5 @@ def _median(values: list[float]) -> float:
     return float(np.median(values)) if values else math.nan
 
 
-def _ratio(counts: NDArray[np.int64]) -> float:
+def _ratio(counts: Ints) -> float:
     return float(counts[0] / counts[1]) if counts[1] else math.nan

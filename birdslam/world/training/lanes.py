@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Floats32
 from birdslam.geometry.camera import GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.mapping.lanes import AmodalLanes, LanesConfig, points_of
@@ -130,7 +130,7 @@ def loss(logits: Tensor, target: Tensor) -> Tensor:
     return entropy + (1.0 - overlap / ((p + target).sum((0, 2, 3)) + 1.0)).mean()
 
 
-def truth_grids(frame: WorldFrame, config: LanesConfig) -> NDArray[np.float32]:
+def truth_grids(frame: WorldFrame, config: LanesConfig) -> Floats32:
     """(2, rows, columns) of 0 and 1: the road and its painted lines where they are, hidden or not, dashes joined."""
     out = np.zeros((2, *config.shape), dtype=np.float32)
     for polygon in frame.road_m:
@@ -150,7 +150,7 @@ def _cells(points_m: Floats, config: LanesConfig) -> NDArray[np.int32]:
 
 def samples(
     frames: Iterator[WorldFrame], rng: np.random.Generator, lanes: LanesConfig, config: LaneSamplesConfig
-) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+) -> Iterator[tuple[Floats32, Floats32]]:
     """Pairs (gathered grids, true grids) of a drive, its masks, odometry and ground plane as noisy as real ones."""
     gathered = AmodalLanes(lanes)
     scale = 1.0 + config.sigma_drift_rel * rng.standard_normal()

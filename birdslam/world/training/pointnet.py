@@ -12,12 +12,11 @@ import cv2
 import msgspec
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Bools, Floats, Floats32
 from birdslam.geometry.camera import Camera
 from birdslam.perception.decoding.depth import DepthMap
 from birdslam.perception.pointnet import frustum_of
@@ -61,8 +60,8 @@ class DepthErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class FrustumExample:
     """One body in one frame: the depth map around its box, and what is true of it."""
 
-    depth_m: NDArray[np.float32]  # (h, w) of the block; far where there is sky
-    own: NDArray[np.bool_]  # (h, w) the body's own pixels
+    depth_m: Floats32  # (h, w) of the block; far where there is sky
+    own: Bools  # (h, w) the body's own pixels
     corner: tuple[int, int]  # row and column of the block in the map
     camera: Camera  # its image is the map
     box_px: Floats  # (4,)
@@ -111,7 +110,7 @@ def frustum_example(o: WorldObject, frame: WorldFrame, config: FrustumConfig) ->
     )
 
 
-def erred(example: FrustumExample, config: DepthErrorConfig, rng: np.random.Generator) -> NDArray[np.float32]:
+def erred(example: FrustumExample, config: DepthErrorConfig, rng: np.random.Generator) -> Floats32:
     """(h, w) the block's depth as a network might have seen it."""
     log_depth = np.log(example.depth_m)
     own = example.own
@@ -133,7 +132,7 @@ def box_of(example: FrustumExample, config: DepthErrorConfig, rng: np.random.Gen
     return out
 
 
-def points_of(example: FrustumExample, depth_m: NDArray[np.float32], box_px: Floats) -> Floats:
+def points_of(example: FrustumExample, depth_m: Floats32, box_px: Floats) -> Floats:
     """(N, 3) pseudo-lidar of the block's pixels inside a box, in camera."""
     camera = example.camera
     whole = DepthMap(
@@ -152,7 +151,7 @@ def points_of(example: FrustumExample, depth_m: NDArray[np.float32], box_px: Flo
 
 def training_pair(
     example: FrustumExample, config: DepthErrorConfig, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+) -> tuple[Floats32, Floats32] | None:
     """Features (C, P) and targets (TARGETS,) of an example with drawn errors; None where too little is in the box."""
     frustum = frustum_of(points_of(example, erred(example, config, rng), box_of(example, config, rng)), POINTS)
     if frustum is None:
@@ -168,7 +167,7 @@ def training_pair(
     return features, np.concatenate([centre, log_size, [yaw_rad, 1.0]]).astype(np.float32)
 
 
-def mirrored(features: NDArray[np.float32]) -> NDArray[np.float32]:
+def mirrored(features: Floats32) -> Floats32:
     """The same points, left and right exchanged."""
     sign = np.array([-1.0 if name in ("x", "u") else 1.0 for name in POINTS.features], np.float32)
     return features * sign[:, None]

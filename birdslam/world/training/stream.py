@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats32
 from birdslam.world.training.augmentation import AugmentationConfig, draw_window, photometric
 from birdslam.world.training.targets import Example, TargetsConfig, encode
 from birdslam.world.truth import WorldFrame
@@ -39,10 +40,10 @@ class Examples:
     """B examples, stacked; see `targets.Example`."""
 
     image: NDArray[np.uint8]
-    masks: NDArray[np.float32]
-    log_depth: NDArray[np.float32]
-    sky: NDArray[np.bool_]
-    objects: NDArray[np.float32]
+    masks: Floats32
+    log_depth: Floats32
+    sky: Bools
+    objects: Floats32
 
 
 def examples(seed: int, config: StreamConfig, render: Render) -> Iterator[Examples]:

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Bools, Floats32
 from birdslam.perception.decoding.multitask import CANONICAL_FOCAL, CLASSES, KINDS
 from birdslam.world.truth import CLASSES as SURFACES
 from birdslam.world.truth import WorldFrame, WorldObject
@@ -63,10 +64,10 @@ class Example:
     """
 
     image: NDArray[np.uint8]
-    masks: NDArray[np.float32]
-    log_depth: NDArray[np.float32]
-    sky: NDArray[np.bool_]
-    objects: NDArray[np.float32]
+    masks: Floats32
+    log_depth: Floats32
+    sky: Bools
+    objects: Floats32
 
 
 def encode(frame: WorldFrame, window: Window, width_px: int, height_px: int, config: TargetsConfig) -> Example:
@@ -94,9 +95,7 @@ def encode(frame: WorldFrame, window: Window, width_px: int, height_px: int, con
     return Example(image, masks, log_depth, sky, objects)
 
 
-def _objects(
-    frame: WorldFrame, window: Window, size: tuple[int, int], zoom: float, config: TargetsConfig
-) -> NDArray[np.float32]:
+def _objects(frame: WorldFrame, window: Window, size: tuple[int, int], zoom: float, config: TargetsConfig) -> Floats32:
     rows = [row for body in frame.objects if (row := _row(frame, body, window, size, zoom, config)) is not None]
     rows.sort(key=lambda row: (row["y1_px"] - row["y2_px"]) * (row["x2_px"] - row["x1_px"]))
     out = np.zeros((MAX_OBJECTS, len(OBJECT_COLUMNS)), dtype=np.float32)

@@ -7,13 +7,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.perception.decoding.multitask import OUTPUTS, body_slices
 from birdslam.world.training.losses import Batch, LossConfig, loss
 from birdslam.world.training.network import MultiTask, NetworkConfig
@@ -119,7 +118,7 @@ class Trainer:
                 raise ValueError(f"weights of another network: {', '.join(unexpected[:3])}")
 
     @torch.no_grad()
-    def answer(self, image: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+    def answer(self, image: Floats32) -> dict[str, Floats32]:
         """What the average says of images (B, 3, H, W) in [-1, 1], by the names of the outputs."""
         self.average.eval()
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):

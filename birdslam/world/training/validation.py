@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from birdslam.geometry.arrays import Floats32
 from birdslam.perception.decoding.multitask import INPUT, MultiTaskDecoder
 from birdslam.perception.manifest import Input, MultiTask, Stretch
 from birdslam.perception.views import Preparation, make_views
@@ -14,8 +15,8 @@ from birdslam.world.training.augmentation import AugmentationConfig, photometric
 from birdslam.world.training.grading import Grades
 from birdslam.world.training.stream import HELD_OUT_SEEDS, Render
 
-Tensors = Mapping[str, NDArray[np.float32]]
-Answer = Callable[[NDArray[np.float32]], Tensors]  # (1, 3, H, W) in [-1, 1] -> the network's outputs by name
+Tensors = Mapping[str, Floats32]
+Answer = Callable[[Floats32], Tensors]  # (1, 3, H, W) in [-1, 1] -> the network's outputs by name
 
 LANE_LOGITS = (-1.5, -1.2, -0.9, -0.6, -0.3, 0.0)  # of a marking; the best is shipped
 LOW_SCORE = 0.05  # keeps nearly every box: the threshold is chosen from the figures

@@ -14,10 +14,9 @@ from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from birdslam.bench.tracking.metrics import LEAST_HEIGHT_PX, BoxFrame, assign, hota_parts, identities, mostly_inside
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.sources.kitti import KITTI_RATE_HZ
 from birdslam.sources.kitti_tracking import TrackingSequence
 from birdslam.sources.label_projection import DONT_CARE, Label
@@ -38,7 +37,7 @@ METRES, IMAGE = "metres", "image"
 class Followed:
     """Who is followed in one frame: ids (N,), places in ego (N, 2) and boxes (N, 4)."""
 
-    ids: NDArray[np.int64]
+    ids: Ints
     at_m: Floats
     boxes_px: Floats
 
