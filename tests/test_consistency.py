@@ -82,9 +82,8 @@ def test_equals_gtsam_with_the_constant_velocity_factor() -> None:
     assert_gtsam_agrees(world, config, WeightsConfig(leave_out=("cp", "vv")), 2e-3)
 
 
-@pytest.mark.parametrize(
-    "sigma_cv_rad", [pytest.param(0.05, marks=pytest.mark.slow), 0.1, pytest.param(0.2, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow  # test_graph.py measures the batch against the incremental graph
+@pytest.mark.parametrize("sigma_cv_rad", [0.05, 0.1, 0.2])
 def test_full_noise_costs_no_more_than_five_percent_of_the_batch(sigma_cv_rad: float) -> None:
     """One linearisation and the marginalisation of all but the newest poses, against the batch of all edges so far."""
     ours: dict[str, list[float]] = {"ego": [], "vehicle": []}

@@ -115,6 +115,7 @@ def drive(seed: int, edges: bool, weights: WeightsConfig, frames: int = 120) -> 
     return math.sqrt(np.mean(np.square(errors))), float(np.mean(nees))
 
 
+@pytest.mark.slow  # six drives, with and without
 def test_lanes_do_no_harm_to_the_ego_nor_to_what_it_says_of_itself() -> None:
     """Over six drives; by how much they help is not asked: odometry is surer than a marking within a window."""
     measured = WeightsConfig()

@@ -32,6 +32,7 @@ def box_of(x_m: float, y_m: float, ground: GroundPlane, height_m: float, edge_m:
     return np.array([*px.min(axis=0), px.max(axis=0)[0], px.max(axis=0)[1] + 721.5 * edge_m / near_m])
 
 
+@pytest.mark.slow  # test_ground_size_filter.py has the law
 def test_errors_that_last_for_a_track_are_in_its_sigma_after_many_frames() -> None:
     """Cars are followed past, each with a height, a lower edge and a road of its own, which all its boxes share."""
     rng, squares = np.random.default_rng(5), {"young": [], "old": []}

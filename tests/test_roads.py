@@ -42,8 +42,6 @@ BEGIN_AT = (0, 2, 4)  # one start alone is luck: a rounding decides between 4 an
 FRAMES = 26
 QUALITY = 70  # of the clips' WebP images
 TOWN_STRIDE, TOWN_FRAMES = 3, 44  # of the shipped drive: 44 m of a street; what comes, comes after half of them
-# Behind each effect one road in `make test`, the bare motorway, whose law is the strictest; the others with `slow`
-MOST = [pytest.param(effect, marks=pytest.mark.slow) for effect in EFFECTS if effect != "drops"]
 LEAST_VALID = 0.8  # of the frames: the first two or three of a cold start are in doubt
 
 
@@ -61,7 +59,7 @@ def test_a_cold_start(name: str) -> None:
     holds(measure(read(DemoRecording(directory=CLIPS / name)), BEGIN_AT), name)
 
 
-@pytest.mark.parametrize("effect", ["drops", *MOST])
+@pytest.mark.parametrize("effect", first(0, EFFECTS))
 def test_a_street_behind_a_windscreen(effect: str) -> None:
     town = DemoRecording(stride=TOWN_STRIDE, directory=DIRECTORY)
     holds(measure(read(town, EFFECTS[effect](), TOWN_FRAMES), BEGIN_AT), f"street+{effect}")

@@ -287,6 +287,7 @@ def test_the_height_is_not_judged_without_a_known_tilt() -> None:
     assert not any(told)
 
 
+@pytest.mark.slow  # a whole sequence
 def test_real_boxes_before_a_camera_that_stands_as_stated_raise_no_alarm(data_dir: Path) -> None:
     """KITTI tracking 0004: its camera looks down by half a degree, of which the file knows nothing."""
     root = data_dir / "kitti_tracking" / "training"

@@ -110,6 +110,7 @@ def test_road_and_sizes_before_an_ego_that_stands_are_known_as_well_as_so_many_s
         assert exact_boxes < ground_size.sigma_pitch_rad < 1.5 * exact_boxes
 
 
+@pytest.mark.slow  # many seeds
 def test_who_begins_standing_is_as_sure_of_road_and_depths_as_it_says() -> None:
     """Over seeds: cars of unknown sizes on a road of unknown pitch, whose boxes err alike in all frames."""
     of_pitch, of_depth = [], []
