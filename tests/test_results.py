@@ -221,7 +221,7 @@ def test_memory_of_a_long_drive_is_bounded(tmp_path: Path) -> None:
     for k in range(4500):
         recorder.add(estimate(k, SE2(0.5 * k, 0.0, 0.0), vehicles=(vehicle(k // 3, SE2(0.5 * k, 3.0, 0.0), 9),)))
     assert len(recorder._tracks) <= 1000  # private: what is held in memory shows nowhere else
-    assert len(recorder._ego.array()) <= 4000  # private: likewise
+    assert len(recorder._scene._ego.array()) <= 4000  # private: likewise
     recorder.finish({})
     assert json.loads((tmp_path / "summary.json").read_text())["tracks"] == 1500
     assert len(list((tmp_path / "tracks").iterdir())) == 1500
