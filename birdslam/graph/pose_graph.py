@@ -18,6 +18,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.around.hidden_road import hidden_fans
+from birdslam.graph.around.lane_users import lane_users
 from birdslam.graph.around.people import people_estimates
 from birdslam.graph.camera_scale import with_camera_scale
 from birdslam.graph.checkpoint import Checkpoint, CheckpointError, Epoch, pack, packed, plain, unpack, unpacked
@@ -36,7 +37,6 @@ from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.graph.window import Window
 from birdslam.lanes.occupancy import with_users
 from birdslam.lanes.traffic import Traffic
-from birdslam.lanes.users import UserInEgo, person_in_ego
 from birdslam.types import (
     INVALIDATING,
     BodyId,
@@ -302,21 +302,10 @@ class PoseGraph:
         return complex(self._motion.x_m, self._motion.y_m) / max(since_s, SHORTEST_S)
 
     def _lanes(self, lanes: Lanes, window: Window, vehicles: tuple[VehicleEstimate, ...]) -> Lanes:
-        """The front end's lanes, with who is in them; the covariances have nothing of the ego's error in world."""
-        T_ego_world, seen = window.world.inverse(), []
-        for row, (node, estimate) in enumerate(zip(self._vehicles.nodes, vehicles, strict=True)):
-            T_ego_vehicle = T_ego_world @ estimate.T_world_vehicle
-            states = window.layout.poses[row]
-            by_size = node.size_bias_rel * np.array([T_ego_vehicle.x_m, T_ego_vehicle.y_m, 0.0])  # see marginals.py
-            cov = window.P[np.ix_(states, states)] + np.outer(by_size, by_size)
-            yaw_rad = estimate.T_world_vehicle.yaw_rad
-            speed_mps = estimate.velocity_mps[0] * math.cos(yaw_rad) + estimate.velocity_mps[1] * math.sin(yaw_rad)
-            size = estimate.length_m
-            sigma_mps = math.sqrt(max(estimate.velocity_cov[0], estimate.velocity_cov[3], 0.0))
-            seen.append(UserInEgo(estimate.vehicle, T_ego_vehicle, cov, size, speed_mps, sigma_mps, estimate.standing))
+        """The front end's lanes, with who is in them."""
         passed_s = max((self._t_ns - self._t_before_ns) * 1e-9, SHORTEST_S)
-        seen += [person_in_ego(person) for person in self._people]
-        return with_users(lanes, seen, self._motion.x_m / passed_s, self._traffic)
+        users = lane_users(window, self._vehicles.nodes, vehicles, self._people)
+        return with_users(lanes, users, self._motion.x_m / passed_s, self._traffic)
 
     def _vehicle_estimates(self, m: Measurements, window: Window) -> tuple[VehicleEstimate, ...]:
         return vehicle_estimates(

@@ -241,14 +241,9 @@ def tracks_table(rows: Sequence[Row], method: str) -> str:
     for ego in (row for row in of_method if row.body == EGO):
         alike = [row for row in of_method if (row.sequence, row.odometry) == (ego.sequence, ego.odometry)]
         cars = [row for row in alike if row.body != EGO]
-        line = [
-            ego.sequence,
-            odometry_title(ego.odometry),
-            number(ego.hota, 3),
-            number(ego.idf1, 3),
-            number(ego.rpe_t_m, 3),
-        ]
-        line += [number(ego.rpe_r_deg, 3), str(len(cars)), number(mean(car.tracks for car in cars))]
+        own = (number(value, 3) for value in (ego.hota, ego.idf1, ego.rpe_t_m, ego.rpe_r_deg))
+        line = [ego.sequence, odometry_title(ego.odometry), *own]
+        line += [str(len(cars)), number(mean(car.tracks for car in cars))]
         line += [number(mean(getattr(car, name) for car in cars)) for name in ("ate_m", "rpe_t_m", "rpe_r_deg")]
         lines.append([*line, number(mean(car.motion_error_m for car in cars))])
     return markdown(head, lines)
@@ -259,12 +254,8 @@ def ranges_table(rows: Sequence[RangeRow]) -> str:
     head = ["Seq", "range m", "asked", "found", "depth error", "depth bias", "across m"]
     lines = [
         [
-            row.sequence,
-            row.range,
-            str(row.asked),
-            number(row.found / row.asked if row.asked else None),
-            _percent(row.depth_error_median_rel),
-            _percent(row.depth_bias_median_rel),
+            *(row.sequence, row.range, str(row.asked), number(row.found / row.asked if row.asked else None)),
+            *(_percent(row.depth_error_median_rel), _percent(row.depth_bias_median_rel)),
             number(row.across_error_median_m),
         ]
         for row in rows
@@ -291,29 +282,17 @@ def motion_table(rows: Sequence[MotionRow]) -> str:
 
 def movers_table(rows: Sequence[MoversRow]) -> str:
     """Tracks of standing vehicles that are reported to drive, and of driving ones that are, and in all."""
-    head = [
-        "Seq",
-        "odometry",
-        "standing",
-        "reported to drive",
-        "driving",
-        "reported",
-        "soon",
-        "where (ahead, left in m: m/s)",
-    ]
+    head = ["Seq", "odometry", "standing", "reported to drive", "driving", "reported", "soon"]
+    counts = [(row.standing, len(row.false), row.driving, row.told, row.soon) for row in rows]
     lines = [
         [
-            row.sequence,
-            odometry_title(row.odometry),
-            *map(str, (row.standing, len(row.false), row.driving, row.told, row.soon)),
+            *(row.sequence, odometry_title(row.odometry), *map(str, count)),
             "; ".join(f"{one.x_m:.0f}, {one.y_m:.0f}: {one.told_mps:.1f}" for one in row.false) or "-",
         ]
-        for row in rows
+        for row, count in zip(rows, counts, strict=True)
     ]
-    sums = [
-        sum(count) for count in zip(*((r.standing, len(r.false), r.driving, r.told, r.soon) for r in rows), strict=True)
-    ]
-    return markdown(head, [*lines, ["all", "", *map(str, sums), ""]])
+    sums = [str(sum(count)) for count in zip(*counts, strict=True)]
+    return markdown([*head, "where (ahead, left in m: m/s)"], [*lines, ["all", "", *sums, ""]])
 
 
 def nees_table(rows: Sequence[NeesRow]) -> str:

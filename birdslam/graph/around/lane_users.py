@@ -1,0 +1,34 @@
+"""Who may be in a lane: the vehicles and people of a frame, in ego."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from birdslam.graph.vehicles import VehicleNode
+from birdslam.graph.window import Window
+from birdslam.lanes.users import UserInEgo, person_in_ego
+from birdslam.types import FollowedPerson, VehicleEstimate
+
+
+def lane_users(
+    window: Window,
+    nodes: Sequence[VehicleNode],
+    vehicles: Sequence[VehicleEstimate],
+    people: Sequence[FollowedPerson],
+) -> list[UserInEgo]:
+    """Everybody; `vehicles` are the estimates of `nodes`. The covariances have nothing of the ego's error in world."""
+    T_ego_world, users = window.world.inverse(), []
+    for row, (node, estimate) in enumerate(zip(nodes, vehicles, strict=True)):
+        T_ego_vehicle = T_ego_world @ estimate.T_world_vehicle
+        states = window.layout.poses[row]
+        by_size = node.size_bias_rel * np.array([T_ego_vehicle.x_m, T_ego_vehicle.y_m, 0.0])  # see marginals.py
+        cov = window.P[np.ix_(states, states)] + np.outer(by_size, by_size)
+        yaw_rad = estimate.T_world_vehicle.yaw_rad
+        speed_mps = estimate.velocity_mps[0] * math.cos(yaw_rad) + estimate.velocity_mps[1] * math.sin(yaw_rad)
+        size = estimate.length_m
+        sigma_mps = math.sqrt(max(estimate.velocity_cov[0], estimate.velocity_cov[3], 0.0))
+        users.append(UserInEgo(estimate.vehicle, T_ego_vehicle, cov, size, speed_mps, sigma_mps, estimate.standing))
+    return [*users, *map(person_in_ego, people)]
