@@ -5,6 +5,7 @@ import struct
 import zlib
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -98,6 +99,29 @@ def test_the_covariance_grows_while_nothing_is_seen_until_it_is_no_localisation(
     assert states[19] is MapState.LOCALISED
     assert states[-1] is MapState.ODOMETRY_ONLY
     assert np.all(np.diff(sigma[20:]) > 0.0)
+
+
+def test_what_odometry_calls_invalid_carries_no_localisation(mapped: bytes) -> None:
+    states = {}
+    for valid in (True, False):
+        running = session(decode_map(mapped), extend=False)
+        for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 34), 3)):
+            estimate = msgspec.structs.replace(estimate, valid=valid or number < 20)
+            here = running.step(estimate, seen if number < 20 else None)  # type: ignore[arg-type]
+        states[valid] = here.state
+    assert states == {True: MapState.LOCALISED, False: MapState.ODOMETRY_ONLY}
+
+
+def test_a_new_map_begins_with_the_first_valid_frame() -> None:
+    keyframes = {}
+    for valid in (True, False):
+        place_map = PlaceMap(MapCamera.of(CAMERA))
+        running = session(place_map, extend=True)
+        for number, (estimate, seen, _) in enumerate(drive(STREET, range(30), 3)):
+            running.step(msgspec.structs.replace(estimate, valid=valid or number >= 3), seen)  # type: ignore[arg-type]
+        running.finish()
+        keyframes[valid] = place_map.keyframes[0]
+    assert np.trace(keyframes[False].cov) < 2.0 * np.trace(keyframes[True].cov)
 
 
 def test_a_kidnapped_car_is_found_again(mapped: bytes) -> None:

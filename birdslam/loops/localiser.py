@@ -123,8 +123,8 @@ class Localiser:
         self._hypotheses.clear()
         self.since_fix_m = math.inf
 
-    def move(self, T_odom_ego: SE2) -> None:
-        """By odometry."""
+    def move(self, T_odom_ego: SE2, valid: bool = True) -> None:
+        """By odometry, which says whether its step is valid."""
         if self._T_odom_ego is not None:
             step = self._T_odom_ego.between(T_odom_ego)
             way_m = math.hypot(step.x_m, step.y_m)
@@ -132,9 +132,9 @@ class Localiser:
             self.since_fix_m += way_m
             if self._T_map_ego is not None:
                 self._T_map_ego = self._T_map_ego @ step
-                self._cov = moved(self._cov, step)
+                self._cov = moved(self._cov, step, valid)
             for hypothesis in self._hypotheses:
-                hypothesis.cov = moved(hypothesis.cov, step)
+                hypothesis.cov = moved(hypothesis.cov, step, valid)
         self._T_odom_ego = T_odom_ego
 
     def look(self, features: Features, among: Bools | None = None) -> bool:

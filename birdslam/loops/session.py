@@ -123,7 +123,9 @@ class MapSession:
             step = self._last.T_world_ego.between(estimate.T_world_ego)
             self._travelled_m += math.hypot(step.x_m, step.y_m)
         self._last = estimate
-        self.localiser.move(estimate.T_world_ego)
+        self.localiser.move(estimate.T_world_ego, estimate.valid)
+        if self._new_map and self._extend and not len(self.map) and not estimate.valid:
+            self._place_origin(estimate)
 
     def _begin(self, estimate: Estimate) -> None:
         """Odometry's frame begins; a new map's frame is that of its first drive."""
@@ -136,8 +138,12 @@ class MapSession:
         elif self._resumed is not None and self._resumed.epoch == estimate.epoch:
             self._go_on(self._resumed)
         elif self._new_map and self._extend:
-            self.localiser.place(estimate.T_world_ego, estimate.T_world_ego, FIRST_COV)
+            self._place_origin(estimate)
         self._epoch = estimate.epoch
+
+    def _place_origin(self, estimate: Estimate) -> None:
+        """Of a new map, which begins with the first valid frame."""
+        self.localiser.place(estimate.T_world_ego, estimate.T_world_ego, FIRST_COV)
 
     def _go_on(self, pose: MapPose) -> None:
         """From a pose of this epoch; the last keyframe's link to the next one is odometry's, as ever."""
