@@ -33,8 +33,8 @@ from birdslam.types import SpeedReading, SpeedSource, Status
 _TOLD = 0.5  # of an alignment's information about the length (kalman_filter.py): with more it counts as told
 _COMPARISONS = 5  # time constant of the mean of what they tell
 _MIN_STEP_M = 0.1  # of a motion whose rotation gives the curvature of the path
-# The share of the least correlation that suffices where the landmarks agree, whose errors are independent: on a
-# rendered motorway behind a coarse encoder correlations reach 0.2
+# The share of the least correlation that suffices where the landmarks agree, whose errors are independent, or where
+# other lengths are far less likely: on a rendered motorway behind a coarse encoder correlations reach 0.2
 _AGREED_CORRELATION_SHARE = 0.5
 _MOVING_PX = 3.0  # flow of what is below the horizon, from one image to the next
 _MAX_BEND_PER_M = 0.2  # no car turns more tightly
@@ -335,7 +335,8 @@ class RoadScale:
         known = self._is_known() or self._car.measures
         expected = searched != 1.0 or not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
         least = cfg.min_correlation
-        if agrees(float(np.log(searched)) + fit.state[0], by_landmarks):
+        told = fit.length_information > cfg.doubt_sigma_rel**-2  # far likelier than other lengths
+        if told or agrees(float(np.log(searched)) + fit.state[0], by_landmarks):
             least *= _AGREED_CORRELATION_SHARE
         if fit.correlation < least or not expected:
             self._rejected += new
