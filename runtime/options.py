@@ -36,7 +36,7 @@ def overrides_of(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]
         else:
             raise ConfigurationError(f"--model {text}: expected ROLE=PATH, or the name of a model")
     keys = {"source": "source.uri", "rate": "source.rate", "stride": "source.stride", "speed": "source.speed"}
-    keys |= {"other_odometry": "source.odometry", "detections": "source.detections"}
+    keys |= {"other_odometry": "source.odometry", "other_detections": "source.detections"}
     keys |= {"record": "recording.file", "record_images": "recording.images"}
     keys |= {"topic": "source.topics.image", "camera_info_topic": "source.topics.camera_info"}
     keys |= {"speed_topic": "source.topics.speed", "truth_topic": "source.topics.truth"}

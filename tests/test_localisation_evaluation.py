@@ -86,6 +86,10 @@ def test_rows_are_medians_by_range_and_shares_inside_the_right_ellipses() -> Non
     gauss = rows["a", "15-30"]
     assert gauss.inside_1_sigma == pytest.approx(0.683, abs=0.01)
     assert gauss.inside_2_sigma == pytest.approx(0.954, abs=0.01)
+    assert gauss.inside_1_sigma_by_car == pytest.approx(0.683, abs=0.01)
+    once = [CarError("c", k, int(k == 0), 20.0, z[0], 9.0 * (k > 0), 0.0, 0.0) for k in range(10)]
+    (often,) = [row for row in summarise_ranges(once) if (row.sequence, row.range) == ("c", "15-30")]
+    assert (often.inside_1_sigma, often.inside_1_sigma_by_car) == pytest.approx((0.1, 0.5))
     far = rows["all", "30-50"]
     assert (far.n, far.depth_error_median_rel, far.lateral_error_median_m) == (
         1,

@@ -17,9 +17,9 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.bev_picture import Track
 from birdslam.outputs.drive_files import Recorder, ResultsError, claim_directory
-from birdslam.outputs.scene_recorder import Thinned
+from birdslam.outputs.scene_recorder import SceneRecorder, Thinned
 from birdslam.trajectory import read_kitti, read_tum
-from birdslam.types import Attitude, Estimate, MapUpdate, SpeedSource, Status, VehicleEstimate
+from birdslam.types import Attitude, Estimate, MapUpdate, Moves, SpeedSource, Status, VehicleEstimate
 
 CAMERA = Camera(640, 192, 400.0, 400.0, 320.0, 96.0, 1.65, pitch_rad=0.01)
 COV3, COV2 = (0.0,) * 9, (0.0,) * 4
@@ -221,7 +221,7 @@ def test_memory_of_a_long_drive_is_bounded(tmp_path: Path) -> None:
     for k in range(4500):
         recorder.add(estimate(k, SE2(0.5 * k, 0.0, 0.0), vehicles=(vehicle(k // 3, SE2(0.5 * k, 3.0, 0.0), 9),)))
     assert len(recorder._tracks) <= 1000  # private: what is held in memory shows nowhere else
-    assert len(recorder._ego.array()) <= 4000  # private: likewise
+    assert len(recorder._scene._ego.array()) <= 4000  # private: likewise
     recorder.finish({})
     assert json.loads((tmp_path / "summary.json").read_text())["tracks"] == 1500
     assert len(list((tmp_path / "tracks").iterdir())) == 1500
@@ -230,7 +230,10 @@ def test_memory_of_a_long_drive_is_bounded(tmp_path: Path) -> None:
 def test_the_picture_shows_the_way_and_the_moving_car(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, CAMERA)
     for k in range(40):
-        seen = (vehicle(1, SE2(15.0 + k, 3.5, 0.0), k + 1, 10.0), vehicle(2, SE2(30.0, -4.0, 0.0), k + 1, 0.1))
+        seen = (
+            vehicle(1, SE2(15.0 + k, 3.5, 0.0), k + 1, 10.0, moves=Moves.DRIVING),
+            vehicle(2, SE2(30.0, -4.0, 0.0), k + 1, 0.1),
+        )
         recorder.add(estimate(k, SE2(1.0 * k, 0.0, 0.0), vehicles=seen))
     recorder.finish({})
     image = cv2.imread(str(tmp_path / "bev.png"))
@@ -240,6 +243,16 @@ def test_the_picture_shows_the_way_and_the_moving_car(tmp_path: Path) -> None:
     ego = (blue > 200) & (green > 160) & (red < 90)
     rows, columns = np.nonzero(ego[:, : image.shape[1] // 2])
     assert np.ptp(rows) > 4 * np.ptp(columns)  # ahead is up
+
+
+@pytest.mark.parametrize("moves", list(Moves))
+def test_only_a_vehicle_that_is_told_to_drive_is_drawn_so(moves: Moves) -> None:
+    recorder = SceneRecorder()
+    for k in range(30):
+        seen = (vehicle(1, SE2(15.0 + k, 3.5, 0.0), k + 1, 10.0, moves=moves),)
+        recorder.add(estimate(k, SE2(1.0 * k, 0.0, 0.0), vehicles=seen))
+    (track,) = recorder.scene(name="", path_m=0.0, frames=30, track_count=1).tracks
+    assert track.moving is (moves is Moves.DRIVING)
 
 
 @pytest.mark.parametrize(("way_m", "speed_mps", "moving"), [(30.0, 8.0, True), (5.0, 8.0, False), (30.0, 0.2, False)])

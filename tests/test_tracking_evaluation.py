@@ -43,6 +43,7 @@ from birdslam.runtime.cli.evaluate.tracking import evaluate
 from birdslam.runtime.configuration import Configuration, ConfigurationError, SourceConfig, load
 from birdslam.runtime.evaluation.tracking import METHODS, PUBLISHED
 from birdslam.runtime.evaluation.tracking_job import EQ_1, frames_of
+from birdslam.runtime.options import configuration_of
 from birdslam.slam import SlamConfig
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.sources.recording import DatasetError
@@ -505,6 +506,11 @@ def test_a_mistake_is_named(tmp_path: Path, arguments: list[str], said: str) -> 
     asked = options("tracking", str(root), *arguments, "--jobs", "1", "--output", str(tmp_path / "out"))
     with pytest.raises((ConfigurationError, DatasetError), match=said):
         evaluate(asked, Configuration())
+
+
+def test_whose_boxes_are_judged_is_no_file_of_boxes_for_the_front_end(tmp_path: Path) -> None:
+    asked = options("tracking", str(tmp_path), "--detections", "network", "--output", str(tmp_path / "out"))
+    assert configuration_of(asked).source.detections == ""
 
 
 def test_a_speed_file_is_for_the_images_alone(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.bev_picture import Scene, Track
-from birdslam.types import Estimate, MapUpdate, RoadUser
+from birdslam.types import PEOPLE, Estimate, MapUpdate, Moves, RoadUser
 
 MOST_POSES, MOST_TRACK_POSES, MOST_POINTS, MOST_TRACKS = 4000, 100, 20_000, 200  # under 3 MB in all
 
@@ -92,7 +92,9 @@ class SceneRecorder:
         history.poses.add(*_numbers(placed))
         seen_from = estimate.T_world_ego.between(user.T_world_vehicle)
         history.farthest_m = max(history.farthest_m, math.hypot(seen_from.x_m, seen_from.y_m))
-        history.speeds.add(math.hypot(*user.velocity_mps))
+        # A vehicle that is not told to drive has a velocity too, by the error of its depth
+        told = user.moves is Moves.DRIVING or user.label in PEOPLE
+        history.speeds.add(math.hypot(*user.velocity_mps) if told else 0.0)
 
     def scene(self, **known: Any) -> Scene:
         """All of it; `known` are the other fields of the scene."""

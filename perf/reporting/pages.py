@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from birdslam.perf.__main__ import benchmark_modules
+from birdslam.perf.accuracy import tilt
 from birdslam.perf.cameras import lens
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting import all as everything
@@ -134,6 +135,13 @@ PAGES: tuple[Derived | Page, ...] = (
         {"docs/lens.md": ("lens.md", None)},
         (lens.run,),
         ("tests/dashcams",),
+    ),
+    Page(
+        "tilt",
+        ("python -m birdslam.perf tilt --data {data} --output {out}/tilt.json",),
+        {"docs/tilt.md": ("tilt.json", tilt.page)},
+        (tilt.run, tilt.page),
+        SHIPPED,
     ),
     Page(
         "batch",

@@ -34,7 +34,7 @@ def add_other_odometry(parser: argparse.ArgumentParser, metavar: str) -> None:
 def add_detections(parser: argparse.ArgumentParser) -> None:
     """Boxes of another detector in place of a network's."""
     text = "another detector's boxes over a recording: MOT challenge text, KITTI tracking text, or COCO results"
-    parser.add_argument("--detections", metavar="FILE", help=text)
+    parser.add_argument("--detections", dest="other_detections", metavar="FILE", help=text)
 
 
 def add_speeds(parser: argparse.ArgumentParser) -> None:

@@ -74,6 +74,9 @@ class LocalisationRow(msgspec.Struct, frozen=True, kw_only=True):
     cars: int = 0  # labelled tracks
     nees: float | None = None  # mean squared Mahalanobis distance over its expectation; a car counts 25 at the most
     yaw_off_10_deg: float | None = None  # share of those that are off by more
+    # The same shares with each car counted once, in however many frames: errors of one last while it is seen
+    inside_1_sigma_by_car: float | None = None
+    inside_2_sigma_by_car: float | None = None
 
 
 class TiltRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -208,6 +211,8 @@ def _row(sequence: str, span: str, errors: Sequence[CarError]) -> LocalisationRo
     depth_m = np.array([e.depth_m for e in errors])
     along, across = np.array([e.error_m for e in errors]).T
     spread = np.array([e.mahalanobis2 for e in errors])
+    _, car, sights = np.unique([f"{e.sequence} {e.label}" for e in errors], return_inverse=True, return_counts=True)
+    once = 1.0 / sights[car]
     # A heading and its opposite look alike in a box; the footprint is the same
     turned = np.array([abs(wrap(2.0 * e.yaw_error_rad)) / 2.0 for e in errors])
     return LocalisationRow(
@@ -220,7 +225,9 @@ def _row(sequence: str, span: str, errors: Sequence[CarError]) -> LocalisationRo
         inside_2_sigma=float(np.mean(spread <= INSIDE_2_SIGMA)),
         depth_bias_median_rel=float(np.median(along / depth_m)),
         yaw_error_median_deg=math.degrees(float(np.median(turned))),
-        cars=len({(e.sequence, e.label) for e in errors}),
+        cars=len(sights),
         nees=float(np.mean(np.minimum(spread, MOST))) / 2.0,
         yaw_off_10_deg=float(np.mean(turned > math.radians(10.0))),
+        inside_1_sigma_by_car=float(np.average(spread <= INSIDE_1_SIGMA, weights=once)),
+        inside_2_sigma_by_car=float(np.average(spread <= INSIDE_2_SIGMA, weights=once)),
     )

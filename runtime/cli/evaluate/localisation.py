@@ -115,11 +115,12 @@ def _table_of_people(rows: Sequence[PeopleRow]) -> str:
 
 
 def _table(rows: Sequence[LocalisationRow]) -> str:
-    titles = f"{_PLACES}{'NEES':>7}{'yaw >10':>9}"
+    titles = f"{_PLACES}{'NEES':>7}{'yaw >10':>9}{'1 sigma':>9}{'2 sigma':>9}  (the last two: each car once)"
     lines = [f"{'':12}{'range m':>9}{'cars':>6}{'n':>7}{titles}"]
     for row in rows:
-        more = (row.nees, "7.2f"), (row.yaw_off_10_deg, "9.0%")
-        lines.append(f"{row.sequence:12}{row.range:>9}{row.cars:>6}{row.n:>7}{_places(row)}{_in_columns(more)}")
+        shares = row.yaw_off_10_deg, row.inside_1_sigma_by_car, row.inside_2_sigma_by_car
+        more = _in_columns(((row.nees, "7.2f"), *((share, "9.0%") for share in shares)))
+        lines.append(f"{row.sequence:12}{row.range:>9}{row.cars:>6}{row.n:>7}{_places(row)}{more}")
     return "\n".join(lines)
 
 
