@@ -14,8 +14,7 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import is_exact, moved
-from birdslam.status import Word
-from birdslam.types import Cov2, Cov3, Estimate
+from birdslam.types import Cov2, Cov3, Estimate, Word
 
 
 class MapState(Word):
