@@ -194,6 +194,21 @@ def test_a_gap_within_a_film_is_told_too(tmp_path: Path) -> None:
     assert times_ms(seen)[4:] == pytest.approx([5080, 5120, 5160], abs=1)
 
 
+@pytest.mark.parametrize("prefix", [b"", b"\0\0\0\0"])  # cameras put a time before each packet
+def test_a_transport_stream_that_was_cut_off_says_so(prefix: bytes, tmp_path: Path) -> None:
+    whole = film(tmp_path / "whole.ts", range(0, 800, 40)).read_bytes()
+    whole = b"".join(prefix + whole[at : at + 188] for at in range(0, len(whole), 188))
+    for name, length in (("whole.ts", len(whole)), ("cut.ts", 2 * len(whole) // 3 // 188 * 188 + 50)):
+        (tmp_path / name).write_bytes(whole[:length])
+    assert [frame.error for frame in frames(tmp_path / "whole.ts")] == [None] * 20
+    *seen, last = frames(tmp_path / "cut.ts")
+    assert 5 < len(seen) < 20
+    assert not any(frame.error for frame in seen)
+    assert last.image is None
+    assert last.error is not None
+    assert last.error.endswith(f"cut.ts: ends within a packet, after {len(seen)} frames: cut off")
+
+
 def test_what_is_no_film_is_one_clear_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     whole = film(tmp_path / "whole.mp4", range(0, 2000, 40)).read_bytes()
     (tmp_path / "empty.mp4").write_bytes(b"")

@@ -54,6 +54,11 @@ def test_the_share_is_100_percent_only_where_all_is_valid_and_0_only_where_nothi
         assert share == pytest.approx(100.0 * (frames - invalid) / frames, abs=1.0)
 
 
+def test_a_film_that_was_cut_off_is_told_in_one_sentence() -> None:
+    assert sum("cut off" in said for said in verdict(drive(100, 1, ends_unreadable=True))) == 1
+    assert not any("cut off" in said for said in verdict(drive(100, 1, invalid_by={"frame_unreadable": 1})))
+
+
 def test_what_is_not_valid_is_told_with_its_reason_the_most_frequent_first() -> None:
     said = verdict(drive(100, 30, invalid_by={"camera_dark": 5, "scale_invalid": 30}, statuses={"scale_invalid": 30}))
     reasons = [line for line in said if line.startswith("Not valid")]

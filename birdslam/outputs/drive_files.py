@@ -104,6 +104,7 @@ class Recorder:
         self._trajectory = CameraTrajectory(camera.ground)
         self._next_row = 0
         self._frames = self._invalid = 0
+        self._ends_unreadable = False  # the newest picture was damaged or missing
         self._invalid_by: Counter[str] = Counter()
         self._path_m = self._valid_path_m = 0.0
         self._sigmas = Thinned(1, MOST_POSES)  # of the scale, in valid frames
@@ -144,6 +145,7 @@ class Recorder:
             self._sigmas.add(estimate.scale_sigma_rel)
         self.statuses.update(status.value for status in estimate.status)
         self.speed_sources.update(source.value for source in estimate.speed_sources)
+        self._ends_unreadable = Status.FRAME_UNREADABLE in estimate.status
         self._table.write(self._frame_row(estimate) + "\n")
         pose = ego_pose(estimate.T_world_ego, estimate.attitude)
         self._tum.write(tum_row(estimate.t_source_ns, pose) + "\n")
@@ -184,6 +186,7 @@ class Recorder:
             "tracks": self._track_count,
             "epochs": self._epoch_count,
             "statuses": dict(sorted(self.statuses.items())),
+            "ends_unreadable": self._ends_unreadable,
             "speed_sources": dict(sorted(self.speed_sources.items())),
         }
         known = {name: counts[name] for name in DriveCounts.__dataclass_fields__ if name in counts}

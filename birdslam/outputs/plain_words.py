@@ -89,6 +89,7 @@ class DriveCounts:
     scale_sigma_rel: float | None  # median of the valid frames
     camera_sigma_rel: float  # of that, by the camera's height and lens
     lengths_by: LengthsBy = AS_STATED  # otherwise where a first pass found them
+    ends_unreadable: bool = False  # its last picture was damaged or missing
 
 
 def verdict(drive: DriveCounts) -> list[str]:
@@ -110,6 +111,8 @@ def _validity(drive: DriveCounts) -> Iterable[str]:
         yield f"{share} is valid: {valid} of {drive.frames} frames, over {drive.valid_path_m:.0f} m."
     for name, frames in sorted(drive.invalid_by.items(), key=lambda item: -item[1]):
         yield f"Not valid: {_frames(frames)}, since {meaning(name)} ({name})."
+    if drive.ends_unreadable:
+        yield "It ends with a picture that is damaged or missing: the film was cut off there, and may have gone on."
     for status in WORTH_TELLING:
         frames = drive.statuses.get(status.value, 0)
         if frames and status not in INVALIDATING:

@@ -13,6 +13,7 @@ drove. A frame is valid as the front end has it: a speed that has been held for 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -131,3 +132,22 @@ def row_text(row: dict[str, Any]) -> str:
         f"({row['wrong_valid_truth_doubtful']} where the truth is doubtful)  standstill {row['standstill']}  "
         f"view_obstructed {row['obstructed']}  scale {scale}"
     )
+
+
+def page(kept: str) -> str:
+    """What `--output` wrote, as a page."""
+    lines = [
+        "# What comes to lie on the windscreen",
+        "",
+        "Drops in focus (60 large ones, or 1,200 of rain) and before it, and what else is named, drawn over recorded",
+        "drives; they stand still in the image. Figures are of the images that show it, by the odometry alone, without",
+        "networks. *Wrong* is a valid frame whose speed is off by more than a tenth.",
+        "",
+        "| drive, what is drawn | frames | valid | of them wrong | standstill while it drives | scale |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in json.loads(kept)["rows"]:
+        scale = "-" if row["scale_error"] is None else f"{row['scale_error']:+.1%}"
+        cells = (row["name"], *(row[name] for name in ("frames", "valid", "wrong_valid", "standstill")), scale)
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines) + "\n"

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from birdslam.perf.__main__ import benchmark_modules
-from birdslam.perf.accuracy import tilt
+from birdslam.perf.accuracy import films, overlays, tilt
 from birdslam.perf.cameras import lens
 from birdslam.perf.errors import PerfError
 from birdslam.perf.reporting import all as everything
@@ -54,6 +54,8 @@ EVALUATED: dict[str, tuple[Any, ...]] = {  # by the first word of `birdslam eval
 PROGRAMS = {"birdslam": ("-m", "birdslam.runtime.cli.main"), "python": ()}  # what Python is given for a first word
 REPORT = ("report.md", "age.png", "optimizer.png", "stages.png", "transport.png", "vehicles.png")
 DRIVES = " ".join(f"{{data}}/{each}" for each in (*everything.SEQUENCES, "kitti_odometry/sequences/01"))
+FILMS_S = 4  # of each variant: ten minutes of one core in all
+OVERLAYS = "drops rain drops_defocused"
 Text = Callable[[str], str]
 
 
@@ -142,6 +144,21 @@ PAGES: tuple[Derived | Page, ...] = (
         {"docs/tilt.md": ("tilt.json", tilt.page)},
         (tilt.run, tilt.page),
         SHIPPED,
+    ),
+    Page(
+        "films",
+        (
+            f"python -m birdslam.perf films --part sizes --part starts --seconds {FILMS_S} --data {{data}} "
+            "--output {out}",
+        ),
+        {"docs/films.md": ("films.md", None)},
+        (films.run,),
+    ),
+    Page(
+        "overlays",
+        (f"python -m birdslam.perf overlays --kinds {OVERLAYS} --data {{data}} --output {{out}}/overlays.json",),
+        {"docs/overlays.md": ("overlays.json", overlays.page)},
+        (overlays.run, overlays.page),
     ),
     Page(
         "batch",

@@ -114,7 +114,7 @@ def page(rows: list[dict[str, Any]]) -> str:
         "# One film, otherwise",
         "",
         "Each recording at hand at other sizes and rates, through H.264, with something in the way, and begun later",
-        "(`python -m perf films --networks`): does the same drive give the same metres? Valid frames and speed count",
+        "(`python -m perf films`): does the same drive give the same metres? Valid frames and speed count",
         "after the first 2 s; *over* is the speed over that of the unchanged film, the median over seconds;",
         "*deviation* is the median deviation of the speed over the truth from its own median. `town`: the truth is GPS",
         "at 1 Hz, in whole km/h; its lens is unknown: a constant factor is that of its focal length and height.",

@@ -34,6 +34,9 @@ _MAX_STEP = np.array([0.1, 0.1, 0.1, 0.005] + [0.1] * MOTION)  # of one iteratio
 _STEP_UNITS = np.array([1.0, 1.0, 1.0, 0.05] + [3.0] * MOTION)
 _MIN_DEPTH, _MIN_VISIBLE = 1e-3, 0.05  # depths, in m along the past camera's axis
 _MIN_DETERMINANT = 1e-3  # of the map from the present to the past image: a smaller area shows no gradient
+_OTHER_LENGTHS_LOG = (-0.35, -0.2, 0.2, 0.35)  # over which a fit must be likelier
+_MOST_SHARE = 0.99  # of the gain, by which the width of the maximum can still be told
+_LENGTH = np.eye(ROAD + MOTION)[0]
 _BEHIND_CREST = 0.01  # where a ray misses the parabola: the road is hidden by its crest
 
 
@@ -250,7 +253,28 @@ class RoadAligner:
         of_present = self._present_gradients(fine, present, px, T_past_present, at, gain)
         motion = slice(ROAD, ROAD + MOTION)
         state, cov = fit_without_prior(at, px, of_past, of_present, r, w, weight_prior[motion, motion])
-        return RoadFit(state, cov, _correlation(grey, fine.grey, w), int(seen.sum()))
+        shown = self._length_information(fine, past, T_past_present, at)
+        return RoadFit(state, cov, _correlation(grey, fine.grey, w), int(seen.sum()), shown)
+
+    def _length_information(self, view: _View, past: RoadImage, T_past_present: Pose, x: Floats) -> float:
+        """Information about the log length, given all else, by how much less likely the images are with other lengths.
+
+        The log likelihood of n normal residuals, of images that correlate by c, is -n/2 log(1 - c^2). Over a length
+        that is off by d it gains G (1 - exp(-d^2 / 2 w^2)), G being the gain over images that do not correlate: the
+        information is G / w^2, by the length that leaves the least. Where any is as likely it is 0, or less by chance.
+        """
+        out, unexplained = np.inf, 1.0
+        for off in (0.0, *_OTHER_LENGTHS_LOG):
+            seen, grey = self._values(past, self._places(view, T_past_present, x + off * _LENGTH))
+            c = _correlation(grey, view.grey, seen.astype(np.float64)) if seen.any() else 0.0
+            other = max(1.0 - max(c, 0.0) ** 2, 1e-6)
+            if off == 0.0:
+                unexplained, samples = float(np.clip(other, 1e-6, 1.0 - 1e-6)), int(seen.sum())
+                most = -0.5 * self.config.effective_sample_fraction * samples * float(np.log(unexplained))
+            else:
+                share = 1.0 - float(np.log(other)) / float(np.log(unexplained))
+                out = min(out, -2.0 * most * float(np.log1p(-min(share, _MOST_SHARE))) / off**2)
+        return out
 
     def warp(self, past: RoadImage, T_past_present: Pose, px: Ints, road: Floats) -> tuple[Floats, Bools]:
         """(N,) grey values of the past image, warped to the present pixels (N, 2) by a motion and a road state (4,).
@@ -258,7 +282,7 @@ class RoadAligner:
         And (N,) which of them it shows. Nothing is fitted.
         """
         places = self._places(self._view(past, px, T_past_present), T_past_present, np.append(road, np.zeros(MOTION)))
-        seen, grey, _, _ = self._sample_past(places, past)
+        seen, grey = self._values(past, places)
         return grey, seen
 
     def _view(self, present: RoadImage, px: Ints, T_past_present: Pose) -> _View:
@@ -283,15 +307,26 @@ class RoadAligner:
     def _sample_past(self, places: _Places, past: RoadImage) -> tuple[Bools, Floats, Floats, Floats]:
         """Which samples the past image shows, its grey values there, and its gradients by x and y at z = 1."""
         cam = self.camera
-        u = (cam.fx_px * places.x + cam.cx_px).astype(np.float32)
-        v = (cam.fy_px * places.y + (cam.cy_px - past.top_px)).astype(np.float32)
-        rows, cols = past.grey.shape
-        seen = (u > 1) & (u < cols - 2) & (v > 1) & (v < rows - 2) & (places.by_z < 1.0 / _MIN_VISIBLE)
+        u, v, seen = self._pixels_of_past(places, past)
         grey, by_u, by_v = (
             cv2.remap(image, u, v, cv2.INTER_LINEAR).ravel().astype(np.float64)
             for image in (past.grey, *past.gradients)
         )
         return seen, grey, by_u * cam.fx_px, by_v * cam.fy_px
+
+    def _values(self, past: RoadImage, places: _Places) -> tuple[Bools, Floats]:
+        """Which samples the past image shows, and its grey values there."""
+        u, v, seen = self._pixels_of_past(places, past)
+        return seen, cv2.remap(past.grey, u, v, cv2.INTER_LINEAR).ravel().astype(np.float64)
+
+    def _pixels_of_past(self, places: _Places, past: RoadImage) -> tuple[Grey, Grey, Bools]:
+        """The samples' columns and rows in the past image, and which of them it shows."""
+        cam = self.camera
+        u = (cam.fx_px * places.x + cam.cx_px).astype(np.float32)
+        v = (cam.fy_px * places.y + (cam.cy_px - past.top_px)).astype(np.float32)
+        rows, cols = past.grey.shape
+        seen = (u > 1) & (u < cols - 2) & (v > 1) & (v < rows - 2) & (places.by_z < 1.0 / _MIN_VISIBLE)
+        return u, v, seen
 
     def _present_gradients(
         self, view: _View, present: RoadImage, px: Ints, T_past_present: Pose, x: Floats, gain: float

@@ -10,7 +10,7 @@ past, present: a pixel's derivatives by either image's gradients; r, w: residual
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ ROAD = 4  # states: log lambda, pitch, roll, curvature
 MOTION = 5  # errors of the odometry's motion: rotation (3), direction of travel to the right and down (2)
 _MIN_INFORMATION = (1.0, 10.0, 10.0, 1e4)
 _MIN_BRIGHTNESS = 1e-6
+_NOTHING_SHOWN = 10.0  # 1-sigma of the log of a length that the images do not tell
 # Rows and columns over which gradients are compared; on rendered motorways, streets and nights behind windscreens and
 # an encoder, six images each, (10, 20) and (26, 52) fail as few
 _CELL_PX = (16, 32)
@@ -37,6 +38,14 @@ class RoadFit:
     cov: Floats
     correlation: float
     samples: int
+    length_information: float = np.inf  # about the log length, by how the images compare over lengths; 0: not at all
+
+    def limited(self, information: float) -> RoadFit:
+        """With no more information about the log length, given the tilt and the curvature, than this."""
+        lacks = 1.0 / max(information, _NOTHING_SHOWN**-2) - 1.0 / float(np.linalg.inv(self.cov)[0, 0])
+        cov = self.cov.copy()
+        cov[0, 0] += max(lacks, 0.0)
+        return replace(self, cov=cov)
 
 
 @dataclass(frozen=True)

@@ -281,15 +281,21 @@ class RoadFilter:
         innovation = fit.state - mean
         return innovation, noise, float(np.sqrt(innovation @ np.linalg.solve(cov + noise, innovation)))
 
+    def length(self, fit: RoadFit) -> tuple[float, float]:
+        """The log length by an alignment and what is known of the tilt, and its variance."""
+        _, noise, _ = self.innovation(fit)
+        mean, cov = self.prediction
+        prior = cov.copy()
+        prior[0, :] = prior[:, 0] = 0.0
+        prior[0, 0] = _NOTHING_KNOWN**2
+        by_prior, by_fit = np.linalg.inv(prior), np.linalg.inv(noise)
+        joined = np.linalg.inv(by_prior + by_fit)
+        return float((joined @ (by_prior @ mean + by_fit @ fit.state))[0]), float(joined[0, 0])
+
     def information(self, fit: RoadFit) -> float:
         """How much an alignment tells of the length, 0 to 1, given what is known of the tilt: 1 where it alone gives it
         to doubt_sigma_rel."""
-        _, noise, _ = self.innovation(fit)
-        prior = self.prediction[1].copy()
-        prior[0, :] = prior[:, 0] = 0.0
-        prior[0, 0] = _NOTHING_KNOWN**2
-        var = float(np.linalg.inv(np.linalg.inv(prior) + np.linalg.inv(noise))[0, 0])
-        return min(1.0, self.config.doubt_sigma_rel**2 / var)
+        return min(1.0, self.config.doubt_sigma_rel**2 / self.length(fit)[1])
 
     def update_alignment(self, fit: RoadFit, share: float = 1.0) -> float:
         """Updates with an alignment and returns lambda, by which the visual scale is to be multiplied.

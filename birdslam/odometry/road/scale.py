@@ -31,6 +31,7 @@ from birdslam.odometry.speed.scale import CarMotion, SpeedScale
 from birdslam.types import SpeedReading, SpeedSource, Status
 
 _TOLD = 0.5  # of an alignment's information about the length (kalman_filter.py): with more it counts as told
+_COMPARISONS = 5  # time constant of the mean of what they tell
 _MIN_STEP_M = 0.1  # of a motion whose rotation gives the curvature of the path
 # The share of the least correlation that suffices where the landmarks agree, whose errors are independent: on a
 # rendered motorway behind a coarse encoder correlations reach 0.2
@@ -62,6 +63,7 @@ class RoadScale:
         self._was_known = False  # a scale was known once: then the drive has shown how the camera is mounted
         self._rejected = 0.0  # alignments in a row, each by its new share of the path: those of one view err together
         self._rejections = 0  # and their number
+        self._shown, self._comparisons = 0.0, 0  # mean information of comparisons about the length, and their number
         self._since_m = 0.0  # travelled since the last alignment
         self._predicted = False  # the velocity prior gave a motion since an alignment was accepted
         self._direction_predicted = False  # and gave the newest one, whose direction the images do not show
@@ -339,6 +341,11 @@ class RoadScale:
             self._rejected += new
             self._rejections += 1
             return 1.0
+        # By chance one comparison may look like information; of those without any the mean is nothing
+        self._shown += (fit.length_information - self._shown) / min(self._comparisons + 1, _COMPARISONS)
+        self._comparisons += 1
+        if not agrees(float(np.log(searched)) + filter_.length(fit)[0], by_landmarks):
+            fit = fit.limited(min(fit.length_information, self._shown))
         self.fit = fit
         filter_.cov = prior_cov
         tells = filter_.information(fit)

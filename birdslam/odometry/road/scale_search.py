@@ -83,11 +83,16 @@ def best_alignment(
             log_length = float(np.log(start)) + other.state[0]
             if _contradicts(log_length, by_landmarks):
                 continue
-            if other.cov[0, 0] > _MAX_SIGMA_LOG**2 and not agrees(log_length, by_landmarks):
+            if _is_vague(other) and not agrees(log_length, by_landmarks):
                 continue
             if fit is None or other.correlation > fit.correlation + search.lead:
                 fit, factor, cov = other, start, loose
     return None if fit is None else (fit, factor, cov)
+
+
+def _is_vague(fit: RoadFit) -> bool:
+    """Whether a search has found no length: by the images' gradients, or since other lengths are as likely."""
+    return fit.cov[0, 0] > _MAX_SIGMA_LOG**2 or fit.length_information < _MAX_SIGMA_LOG**-2
 
 
 def _contradicts(log_length: float, by_landmarks: float | None) -> bool:

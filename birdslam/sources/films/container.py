@@ -19,6 +19,8 @@ from birdslam.sources.recording import DatasetError
 FULL_FRAME_MM = 36.0  # across
 _FOCAL_KEY = re.compile(rb"focal_length.*35mm", re.IGNORECASE)
 _MOST_BYTES = 1 << 26  # of the index: an hour has some MB
+# Of a transport stream: packets, of a camera's with a time of four bytes before each, begin with the same byte
+_PACKET_BYTES, _SYNC_BYTE, _SYNCED = {188: 0, 192: 4}, 0x47, 4
 _INSIDE = (b"moov", b"trak", b"udta", b"mdia")
 _STATED_MM = 5.0, 300.0  # what a focal length may be
 
@@ -42,6 +44,19 @@ def why_unreadable(path: Path) -> str:
         if b"moov" not in names:
             return "is cut off: its index, which a camera writes last, is missing (power lost while it recorded?)"
     return "is no video that OpenCV can open: no pictures in it, or of a codec that it has not"
+
+
+def is_torn(path: Path) -> bool:
+    """Whether an MPEG transport stream (ISO/IEC 13818-1) ends within a packet: it states no length, so that one that
+    was cut off looks whole. False of other files, and where it can't be read."""
+    try:
+        size, head = path.stat().st_size, _read(path, 0, _SYNCED * max(_PACKET_BYTES))
+    except OSError:
+        return False
+    for packet, begin in _PACKET_BYTES.items():
+        if len(head) == _SYNCED * max(_PACKET_BYTES) and set(head[begin : _SYNCED * packet : packet]) == {_SYNC_BYTE}:
+            return size % packet != 0
+    return False
 
 
 def stated_focal_rel(path: Path) -> float | None:

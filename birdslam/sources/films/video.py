@@ -15,7 +15,7 @@ import numpy as np
 
 from birdslam.geometry.camera import Camera
 from birdslam.ros.bag import BagTopics
-from birdslam.sources.films.container import films_in, stated_focal_rel, why_unreadable
+from birdslam.sources.films.container import films_in, is_torn, stated_focal_rel, why_unreadable
 from birdslam.sources.films.interlaced import is_undecoded
 from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.sources.schemes import VIDEO
@@ -127,6 +127,9 @@ class VideoRecording(Recording):
                 position += 1
             if film.ends_early(position, (t_ns - begin_ns) / NS_PER_S):
                 error = f"{film.path}: ends after {position} of {film.declared} frames: cut off"
+                yield RecordedFrame(index, t_ns + film.period_ns, None, error)
+            elif is_torn(film.path):
+                error = f"{film.path}: ends within a packet, after {position} frames: cut off"
                 yield RecordedFrame(index, t_ns + film.period_ns, None, error)
         finally:
             capture.release()
