@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from birdslam.geometry.se2 import SE2
 from birdslam.status import INVALIDATING as INVALIDATING
 from birdslam.status import Status as Status
-from birdslam.status import Word
+from birdslam.status import Word as Word
 
 Cov3 = Annotated[tuple[float, ...], msgspec.Meta(min_length=9, max_length=9)]
 Cov2 = Annotated[tuple[float, ...], msgspec.Meta(min_length=4, max_length=4)]

@@ -275,5 +275,7 @@ def test_a_killed_batch_resumes(tmp_path: Path) -> None:
     assert subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode == 0
     assert (output / DRIVES / "00" / "result.json").stat().st_mtime_ns == before
     run_drive(Job(made(drives)[1], str(alone)), lambda *at: None)
-    assert contents(output / DRIVES / "01") == contents(alone / DRIVES / "01")
+    found = contents(output / DRIVES / "01")
+    found.pop("report.html", None)  # of a batch where plotly is installed
+    assert found == contents(alone / DRIVES / "01")
     assert os.listdir(output / ".working") == []

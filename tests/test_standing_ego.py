@@ -121,7 +121,7 @@ def test_who_begins_standing_is_as_sure_of_road_and_depths_as_it_says() -> None:
         for x_m, y_m in CARS_M:
             box = box_px(x_m, y_m, 1.53 * math.exp(0.08 * float(rng.standard_normal())), pitch_rad)
             boxes.append(box + (0.7 + 0.02 * (box[3] - box[1])) * rng.standard_normal(4))
-        for _ in range(15):  # counted anew each time they would leave a quarter of the sigma
+        for _ in range(15):
             depths_m, sigmas = see(ground_size, boxes, 0.0)
         of_pitch.append((ground_size.ground.pitch_rad - pitch_rad) / ground_size.sigma_pitch_rad)
         truth_m = np.array([x_m - CAR.length_m / 2.0 for x_m, _ in CARS_M])

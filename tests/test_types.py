@@ -7,6 +7,7 @@ import msgspec
 import pytest
 
 from birdslam.geometry.se2 import SE2
+from birdslam.loops.map_pose import MapState
 from birdslam.types import (
     INVALIDATING,
     EgoEdge,
@@ -26,6 +27,7 @@ EYE3 = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 def test_a_status_of_a_newer_sender_is_unknown_not_an_error() -> None:
     assert msgspec.convert("quantum_fog", Status) is Status.UNKNOWN
     assert msgspec.convert("standstill", Status) is Status.STANDSTILL
+    assert msgspec.convert("nearly_lost", MapState) is MapState.LOST
     assert Status.UNKNOWN not in INVALIDATING  # `valid` was decided by the sender
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(3, Status)

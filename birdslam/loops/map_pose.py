@@ -6,7 +6,6 @@ joins them, and the ego in the map is `T_map_odom @ T_world_ego`, with the newes
 
 from __future__ import annotations
 
-import enum
 from dataclasses import dataclass
 
 import msgspec
@@ -15,15 +14,17 @@ import numpy as np
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import is_exact, moved
-from birdslam.types import Cov2, Cov3, Estimate
+from birdslam.types import Cov2, Cov3, Estimate, Word
 
 
-class MapState(enum.StrEnum):
+class MapState(Word):
     """What a pose in the map rests on."""
 
     LOCALISED = "localised"  # on the map: the pose is within its covariance
     ODOMETRY_ONLY = "odometry_only"  # on odometry since the last fix, or since the beginning of a new map
     LOST = "lost"  # there is no pose
+
+    NEWER = LOST
 
 
 class EarthPose(msgspec.Struct, frozen=True, kw_only=True):
