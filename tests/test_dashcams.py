@@ -55,6 +55,7 @@ def test_a_lens_from_the_film_is_within_its_sigma_or_refused(name: str, prior: f
     assert lens is None or abs(error) < 2.0 * lens.focal_sigma_rel
 
 
+@pytest.mark.slow  # docs/lens.md has it too
 def test_a_narrow_lens_with_distortion_is_not_taken_for_a_longer_one() -> None:
     """A sigma by interleaved windows once said +36.8 +- 3 % of such a film."""
     lens, error = lens_of("narrow", 1.15)

@@ -76,7 +76,7 @@ def errors_m(found: OnEarth, nodes: list[Node], true: list[SE2]) -> np.ndarray:
 
 
 def test_fixes_take_the_bend_out_of_odometry() -> None:
-    true, nodes, links = way(3000.0, seed=1)
+    true, nodes, links = way(2000.0, seed=1)
     before = np.hypot(
         *(np.array([nodes[-1].T_map_keyframe.x_m, nodes[-1].T_map_keyframe.y_m]) - (true[-1].x_m, true[-1].y_m))
     )
@@ -89,7 +89,7 @@ def test_fixes_take_the_bend_out_of_odometry() -> None:
 
 
 def test_fixes_fifteen_metres_off_for_ten_seconds_are_left_out() -> None:
-    true, nodes, links = way(2000.0, seed=2)
+    true, nodes, links = way(1200.0, seed=2)
     off = range(200, 226)  # ten seconds
     right = tied(true, nodes, links, fixes_of(true, 1.5))
     wrong = tied(true, nodes, links, fixes_of(true, 1.5, off))

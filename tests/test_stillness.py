@@ -139,7 +139,7 @@ def test_a_stop_behind_rain_is_found_within_a_second_and_a_half() -> None:
     assert np.array_equal(motions[-1].t_prev_curr_m, np.zeros(3))
 
 
-@pytest.mark.parametrize(("name", "share"), first(1, [("motorway_20", 0.0), ("night_street", 0.5)]))
+@pytest.mark.parametrize(("name", "share"), first(0, [("motorway_20", 0.0), ("night_street", 0.5)]))
 def test_rain_over_a_rendered_drive_stops_nobody(name: str, share: float) -> None:
     """By night, where drops have nearly all corners, and over smooth asphalt, where they have them from the start."""
     task = Task(str(Path(__file__).parent / "roads" / name), "", False, 1, 1, 0, None)
