@@ -292,8 +292,17 @@ class Listener:
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.heard: list[tuple[str, Any]] = []
+        self._process = process
         self._thread = threading.Thread(target=self._read, args=(process.stdout,), daemon=True)
         self._thread.start()
+
+    def __enter__(self) -> Listener:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        """The process ends, and with it what it says, before anybody closes the pipe."""
+        self._process.kill()
+        self._thread.join()
 
     def _read(self, lines: Any) -> None:
         for line in lines:
@@ -352,7 +361,7 @@ def test_a_listener_hears_each_message_and_again_after_the_router_was_gone(join:
             vehicle = Vehicle(join, base, port, domain=4)
             stack.enter_context(vehicle.bridge)
             wanted = topics(ODOMETRY, "/tf", "/tf_static", "/birdslam/vehicles", "/diagnostics")
-            listener = Listener(stack.enter_context(peer("hear", str(port), "4", *wanted)))
+            listener = stack.enter_context(Listener(stack.enter_context(peer("hear", str(port), "4", *wanted))))
             vehicle.until_heard(listener, ODOMETRY)
             sent = [vehicle.step() for _ in range(30)]
             until(lambda: place(listener.of(ODOMETRY)[-1]) == pytest.approx(sent[-1]), "messages are lost")
@@ -384,7 +393,7 @@ def test_in_a_namespace_topics_and_frames_are_the_vehicles_own(join: Any, base: 
         vehicle = Vehicle(join, base, port, domain=0, namespace="red")
         stack.enter_context(vehicle.bridge)
         wanted = topics(ODOMETRY, "/tf", namespace="/red")
-        listener = Listener(stack.enter_context(peer("hear", str(port), "0", *wanted)))
+        listener = stack.enter_context(Listener(stack.enter_context(peer("hear", str(port), "0", *wanted))))
         vehicle.until_heard(listener, f"/red{ODOMETRY}")
         until(lambda: listener.of("/tf"), "/tf is not heard")
         message = listener.of(f"/red{ODOMETRY}")[-1]
