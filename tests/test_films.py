@@ -224,6 +224,14 @@ def test_what_is_no_film_is_one_clear_line(tmp_path: Path, capfd: pytest.Capture
         silence = av.AudioFrame.from_ndarray(np.zeros((2, 1024), np.float32), "fltp", "stereo")
         silence.rate, silence.pts = 44100, 0
         container.mux([*sound.encode(silence), *sound.encode(None)])
+    with av.open(str(tmp_path / "timeless.mp4"), "w") as container:  # its frames say no times
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height = WIDTH, HEIGHT
+        for number in range(20):
+            picture = av.VideoFrame.from_ndarray(np.full((HEIGHT, WIDTH, 3), number, np.uint8), "bgr24")
+            picture.pts, picture.time_base = number, Fraction(1, 90_000)
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
     one = film(tmp_path / "one.mp4", [0])
     for name, said in (
         ("none.mp4", "no such file"),
@@ -231,6 +239,7 @@ def test_what_is_no_film_is_one_clear_line(tmp_path: Path, capfd: pytest.Capture
         ("cut.mp4", "cut.mp4: is cut off: its index"),
         ("text.mp4", "text.mp4: is no video that OpenCV can open"),
         ("sound.mp4", "sound.mp4: is no video that OpenCV can open: no pictures in it"),
+        ("timeless.mp4", "neither its container nor its frames tell a usable frame rate (nan)"),
         ("other", "has no films (.mp4,"),
         ("two", "2.mp4: is 64x64, but the camera given is 96x64"),
         (one.name, "its images do not show its lens"),

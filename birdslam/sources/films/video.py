@@ -143,7 +143,7 @@ def _film(path: Path, camera: Camera) -> _Film:
     if not _USUAL_HZ[0] <= rate_hz <= _USUAL_HZ[1]:  # not a number, too
         declared = round(declared / rate_hz) if math.isfinite(rate_hz) and rate_hz > 0.0 else 0  # as seconds
         rate_hz = _measured_hz(capture)
-        declared = round(declared * rate_hz)
+        declared = round(declared * rate_hz) if math.isfinite(rate_hz) else 0
     capture.release()
     if is_undecoded(path):
         raise DatasetError(
