@@ -1,10 +1,13 @@
-"""The other side at a router: a listener of the independent package zenoh-ros2-sdk, and a router as rmw_zenoh's is.
+"""The other side at a router: a listener and a car of the independent package zenoh-ros2-sdk, and a router as
+rmw_zenoh's is.
 
     python -m birdslam.perf.latency.ros_peer router PORT                        until its input ends
     python -m birdslam.perf.latency.ros_peer hear PORT DOMAIN TOPIC=TYPE...     a JSON line a message, until then
+    python -m birdslam.perf.latency.ros_peer car PORT DOMAIN URI HZ             a recording round and round, until then
 
-Each says "ready". The package reads message definitions from files; these are written from what rosbags knows, and it
-hashes them itself.
+Each says "ready". The car publishes images with their camera and its mount, 5 m/s as its speed, and fixes; it says the
+time (UTC, in ns) of each image. The package reads message definitions from files; these are written from what rosbags
+knows, and it hashes them itself.
 """
 
 from __future__ import annotations
@@ -17,12 +20,27 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import zenoh
 
 from birdslam.ros.message_types import MessageTypes
+from birdslam.ros.parts import BASE, CAMERA, MessageParts
+from birdslam.sources.opening import open_recording
+from birdslam.trajectory import mount_pose
+
+IMAGE = "/front/image"
+CAR_TOPICS = {
+    IMAGE: "sensor_msgs/msg/Image",
+    "/front/camera_info": "sensor_msgs/msg/CameraInfo",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/wheels": "geometry_msgs/msg/TwistStamped",
+    "/fix": "sensor_msgs/msg/NavSatFix",
+}
+SPEED_MPS = 5.0
 
 
 def write_definitions(folder: Path) -> None:
@@ -50,10 +68,15 @@ def definitions(port: int) -> Iterator[None]:
             session.close()
 
 
+def fields_of(message: Any) -> list[str]:
+    """The names of a message's fields."""
+    return [name for name in message.__dataclass_fields__ if name != "__msgtype__"]
+
+
 def plain(value: Any) -> Any:
     """A message's fields; of arrays of bytes their number."""
     if hasattr(value, "__dataclass_fields__"):
-        return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__ if name != "__msgtype__"}
+        return {name: plain(getattr(value, name)) for name in fields_of(value)}
     if hasattr(value, "dtype"):
         return len(value) if value.dtype == "uint8" else [None if math.isnan(x) else x for x in value.tolist()]
     return [plain(one) for one in value] if isinstance(value, list) else value
@@ -82,6 +105,54 @@ def hear(port: int, domain: int, topics: list[str]) -> None:
             subscriber.close()
 
 
+def car(port: int, domain: int, uri: str, rate_hz: float) -> None:
+    """Publishes what a car does, until the input ends."""
+    from zenoh_ros2_sdk import ROS2Publisher
+
+    recording, make = open_recording(uri), MessageTypes().make
+    camera = recording.camera
+    parts = MessageParts(make, "car")
+    publishers = {
+        topic: ROS2Publisher(topic, kind, domain_id=domain, router_port=port) for topic, kind in CAR_TOPICS.items()
+    }
+    over = threading.Event()
+
+    def end() -> None:
+        sys.stdin.read()
+        over.set()
+
+    threading.Thread(target=end, daemon=True).start()
+
+    def send(topic: str, **fields: Any) -> None:
+        message = make(CAR_TOPICS[topic], **fields)
+        publishers[topic].publish(**{name: getattr(message, name) for name in fields_of(message)})
+
+    print("ready", flush=True)
+    begin_s = time.monotonic()
+    for number, frame in enumerate(chain.from_iterable(recording.frames() for _ in count())):
+        if over.wait(max(0.0, begin_s + number / rate_hz - time.monotonic())):
+            break
+        now_ns = time.time_ns()
+        header = parts.header(CAMERA, now_ns)
+        if number % 10 == 0:  # the package keeps nothing for those that come late
+            send("/tf_static", transforms=[parts.transform(BASE, CAMERA, mount_pose(camera.ground), now_ns)])
+            send(
+                "/front/camera_info", header=header, width=camera.width_px, height=camera.height_px,
+                distortion_model="plumb_bob", d=np.array(camera.distortion or (0.0,) * 5),
+                k=camera.K.ravel(), r=np.eye(3).ravel(), p=np.column_stack([camera.K, np.zeros(3)]).ravel(),
+            )  # fmt: skip
+            send("/fix", header=header, latitude=49.0 + 1e-6 * number, longitude=8.4, altitude=math.nan)
+        forward = make("geometry_msgs/msg/Twist", linear=parts.vector(SPEED_MPS, 0.0, 0.0))
+        send("/wheels", header=header, twist=forward)
+        assert frame.image is not None
+        height_px, width_px, *colours = frame.image.shape
+        send(
+            IMAGE, header=header, height=height_px, width=width_px, step=frame.image.strides[0],
+            encoding="bgr8" if colours else "mono8", data=np.ascontiguousarray(frame.image).ravel(),
+        )  # fmt: skip
+        print(now_ns, flush=True)
+
+
 def route(port: int) -> None:
     """A router, until the input ends."""
     config = zenoh.Config()
@@ -94,7 +165,11 @@ def route(port: int) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "router":
-        route(int(sys.argv[2]))
+    mode, port = sys.argv[1], int(sys.argv[2])
+    if mode == "router":
+        route(port)
+    elif mode == "hear":
+        hear(port, int(sys.argv[3]), sys.argv[4:])
     else:
-        hear(int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])
+        with definitions(port):
+            car(port, int(sys.argv[3]), sys.argv[4], float(sys.argv[5]))

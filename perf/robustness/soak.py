@@ -22,6 +22,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -162,9 +163,9 @@ def ages(found: Ages) -> tuple[str, list[str]]:
     p50, p99 = np.percentile(found.ms[:quarter], (50, 99))
     end_p50, end_p99 = np.percentile(found.ms[-quarter:], (50, 99))
     said = f"age at the planner, first quarter p50 {p50:.1f}, p99 {p99:.1f} ms; last {end_p50:.1f}, {end_p99:.1f} ms"
-    for name, percent in (("p50", 50), ("p99", 99)):
-        gain, sigma = slope(found.t_s, found.ms, lambda block, percent=percent: float(np.percentile(block, percent)))
-        said += f"; {name} {gain:+.1f} +- {sigma:.1f} ms an hour"
+    for percent in (50, 99):
+        gain, sigma = slope(found.t_s, found.ms, partial(np.percentile, q=percent))
+        said += f"; p{percent} {gain:+.1f} +- {sigma:.1f} ms an hour"
     grew = end_p50 > (1.0 + AGE_GROWTH) * p50
     return said, [f"the age grew from {p50:.1f} to {end_p50:.1f} ms in the median"] if grew else []
 
