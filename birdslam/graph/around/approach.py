@@ -13,10 +13,10 @@ from birdslam.geometry.arrays import Floats
 from birdslam.graph.costs import Complexes
 from birdslam.types import Approach
 
-HORIZON_S = 30.0  # a later approach is told as it would be then
+HORIZON_S = 30.0  # a later approach is reported as it would be then
 NEARBY_S, NEARBY_M, NEARBY_SIGMA = 5.0, 2.0, 2.0
 SLOWEST_MPS2 = 0.01  # a squared velocity below it is none
-MOST = 1e9  # of any number that is told
+MOST = 1e9  # of any number that is reported
 
 
 def approaches(p: Complexes, v: Complexes, means: Floats, deviators: Complexes) -> list[Approach]:

@@ -30,9 +30,9 @@ _LIMITS = np.repeat([FARTHEST_M, FASTEST_MPS, FARTHEST_M**2, FASTEST_MPS**2], [2
 def people_estimates(
     people: Sequence[FollowedPerson], since_s: float, world: SE2, ego_cov: Floats, ego_mps: complex, way: SE2
 ) -> tuple[RoadUser, ...]:
-    """Everybody in world, `since_s` after they were told of in the ego's axes, over which the ego went on by `way`.
+    """Everybody in world, `since_s` after they were seen in the ego's axes, over which the ego went on by `way`.
 
-    `world` is T_world_ego when they were told of, `ego_cov` (3, 3) of its tangent; `ego_mps` is the ego's velocity.
+    `world` is T_world_ego when they were seen, `ego_cov` (3, 3) of its tangent; `ego_mps` is the ego's velocity.
     """
     if not people:
         return ()
