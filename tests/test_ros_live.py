@@ -26,8 +26,8 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.files import GNSS_FILE, GnssError, read_fixes
 from birdslam.loops.map_pose import MapPose, MapState
-from birdslam.perf.latency.ros import estimate, peer
-from birdslam.perf.latency.ros_drive import without
+from birdslam.perf.ros2.ros import estimate, peer
+from birdslam.perf.ros2.ros_drive import without
 from birdslam.perf.processes import free_port
 from birdslam.ros.bag import BagTopics
 from birdslam.ros.message_types import MessageTypes
@@ -115,7 +115,7 @@ def test_hashes_are_those_of_the_other_implementation(name: str, tmp_path: Path)
     from zenoh_ros2_sdk.message_registry import MessageRegistry
     from zenoh_ros2_sdk.utils import get_type_hash, load_dependencies_recursive
 
-    from birdslam.perf.latency.ros_peer import write_definitions
+    from birdslam.perf.ros2.ros_peer import write_definitions
 
     write_definitions(tmp_path)
     text = (tmp_path / f"{name}.msg").read_text()

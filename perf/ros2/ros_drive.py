@@ -23,8 +23,8 @@ import numpy as np
 
 from birdslam.geometry.arrays import Ints
 from birdslam.perf.errors import PerfError
-from birdslam.perf.latency.ros import LAST_S, Heard, check_peer, peer
-from birdslam.perf.latency.ros_peer import IMAGE
+from birdslam.perf.ros2.ros import LAST_S, Heard, check_peer, peer
+from birdslam.perf.ros2.ros_peer import IMAGE
 from birdslam.perf.processes import birdslam_command, free_port
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import spread, spread_text

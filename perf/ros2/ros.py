@@ -32,7 +32,7 @@ from birdslam.runtime.transport.bus import Bus, Publisher
 from birdslam.types import NS_PER_S, Estimate, VehicleEstimate
 
 label = "a listener of ROS 2: messages lost, and their age"
-PEER = "birdslam.perf.latency.ros_peer"
+PEER = "birdslam.perf.ros2.ros_peer"
 VEHICLE = "ros-perf"
 HEARD = {
     "/birdslam/odometry": "nav_msgs/msg/Odometry",
