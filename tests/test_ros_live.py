@@ -26,9 +26,9 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.files import GNSS_FILE, GnssError, read_fixes
 from birdslam.loops.map_pose import MapPose, MapState
+from birdslam.perf.processes import free_port
 from birdslam.perf.ros2.ros import estimate, peer
 from birdslam.perf.ros2.ros_drive import without
-from birdslam.perf.processes import free_port
 from birdslam.ros.bag import BagTopics
 from birdslam.ros.message_types import MessageTypes
 from birdslam.ros.messages import TOPICS, RosMessages

@@ -1,13 +1,10 @@
-"""A long drive at the full rate: memory, descriptors, watchdogs and drops of every process, from the first minute on.
+"""A long drive: what memory, descriptors and age of every process gain in an hour, with the sigma of it; watchdogs, drops.
 
     python -m perf soak [--minutes 30] [--rate 33] [--source demo] [--map] [--record] [--models DIR] [...]
 
-Further options are those of `birdslam run`. Without `--source` the software camera of the fault suite drives down its
-street; `--map` localises the drive in the map that it makes. The soak stands in systemd's place, and notices where the
-supervisor misses its watchdog. It says by how much memory, descriptors and age grow in an hour, with the sigma of each.
-Ends with status 1, and says why, where after the first minute a process grew by more than 1 % or held more descriptors,
-where a process was restarted, a watchdog was missed, or estimates came later to the planner at the end than at the
-beginning.
+Further options are those of `birdslam run`; without `--source` the software camera of the fault suite drives down its
+street. Ends with status 1, and says why, where after the first minute a process grew by more than 1 % or held more
+descriptors, was restarted or missed a watchdog (the soak stands in systemd's place), or estimates came later.
 """
 
 from __future__ import annotations

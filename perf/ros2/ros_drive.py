@@ -2,10 +2,9 @@
 
     python -m perf ros_drive [--source demo] [--seconds 30] [--rate 33] [--router-gone 3]
 
-A car of the independent package zenoh-ros2-sdk publishes a recording's images at a router; `birdslam run --source
-ros:/front/image` drives by them with the camera that it hears, `birdslam ros` says what it finds, and a listener of
-that package hears it: each a process of its own. With `--router-gone` the router is killed after that drive for so many
-seconds, and another one begun in its place. Ends with status 1 where an image got no estimate.
+A car of the package zenoh-ros2-sdk publishes a recording's images, `birdslam run --source ros:/front/image` drives by
+them, `birdslam ros` says what it finds, and a listener of that package hears it, each a process of its own. After it
+the router is killed for so many seconds, and another one begun. Status 1 where an image got no estimate.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ import numpy as np
 
 from birdslam.geometry.arrays import Ints
 from birdslam.perf.errors import PerfError
-from birdslam.perf.ros2.ros import LAST_S, Heard, check_peer, peer
-from birdslam.perf.ros2.ros_peer import IMAGE
 from birdslam.perf.processes import birdslam_command, free_port
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import spread, spread_text
+from birdslam.perf.ros2.ros import LAST_S, Heard, check_peer, peer
+from birdslam.perf.ros2.ros_peer import IMAGE
 from birdslam.ros.messages import ODOMETRY
 from birdslam.ros.parts import Level
 

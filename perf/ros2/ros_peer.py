@@ -1,13 +1,10 @@
-"""The other side at a router: a listener and a car of the independent package zenoh-ros2-sdk, and a router as
-rmw_zenoh's is.
+"""The other side at a router, by the independent package zenoh-ros2-sdk, and a router as rmw_zenoh's is.
 
-    python -m birdslam.perf.ros2.ros_peer router PORT                        until its input ends
-    python -m birdslam.perf.ros2.ros_peer hear PORT DOMAIN TOPIC=TYPE...     a JSON line a message, until then
-    python -m birdslam.perf.ros2.ros_peer car PORT DOMAIN URI HZ             a recording round and round, until then
+    python -m birdslam.perf.ros2.ros_peer router PORT                       until its input ends
+    python -m birdslam.perf.ros2.ros_peer hear PORT DOMAIN TOPIC=TYPE...    a JSON line a message, until then
+    python -m birdslam.perf.ros2.ros_peer car PORT DOMAIN URI HZ            a recording round and round; images' times
 
-Each says "ready". The car publishes images with their camera and its mount, 5 m/s as its speed, and fixes; it says the
-time (UTC, in ns) of each image. The package reads message definitions from files; these are written from what rosbags
-knows, and it hashes them itself.
+Each says "ready". The package reads definitions of messages from files, written here from what rosbags knows.
 """
 
 from __future__ import annotations
