@@ -1,4 +1,4 @@
-"""A long drive: what memory, descriptors and age of every process gain in an hour, with the sigma of it; watchdogs, drops.
+"""A long drive: what memory, descriptors and age of every process gain in an hour, with its sigma; watchdogs, drops.
 
     python -m perf soak [--minutes 30] [--rate 33] [--source demo] [--map] [--record] [--models DIR] [...]
 
