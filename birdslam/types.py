@@ -372,7 +372,7 @@ class Lane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class LaneChange(Word):
-    """The ego's change of lanes: told once, in the frame in which the middle of the ego has crossed the line."""
+    """The ego's change of lanes: reported once, in the frame in which the middle of the ego has crossed the line."""
 
     NONE = "none"
     LEFT = "left"

@@ -32,7 +32,7 @@ class ClassMapsDecoder:
     """Reads class channels (see `manifest.ClassMaps`)."""
 
     def __init__(self, table: ClassMaps, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises Misfit where an output's shape isn't what the manifest makes of it."""
+        """Raises ManifestMismatch where an output's shape isn't what the manifest makes of it."""
         self.table, self.input = table, input
         for index, entry in enumerate(table.maps):
             shape = shapes[entry.output]
