@@ -416,6 +416,7 @@ class Lanes(msgspec.Struct, frozen=True, kw_only=True):
     leader: Leader | None = None  # of an `Estimate`
     age_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # source time since the image that lines were last seen in
     tilt_rad: float = 0.0  # to be added to the pitch of `Ground`: so the lines of that image were parallel
+    road_from_m: float = 0.0  # x from which that image shows the road: nearer is the image's edge, or the own bonnet
 
     @property
     def ego(self) -> Lane | None:

@@ -19,7 +19,7 @@ from birdslam.lanes.curves import basis
 from birdslam.lanes.line_filter import LineFilter, Support
 from birdslam.lanes.paint import LinePoints, edge_points, paint_points
 from birdslam.lanes.parallel_search import Peak, find_lines, find_shape
-from birdslam.lanes.road_view import RoadView, road_view
+from birdslam.lanes.road_view import RoadView, nearest_m, road_view
 from birdslam.lanes.tracked_lines import LEFT_EDGE, PAINT, RIGHT_EDGE, Track, TrackedLines, existence_of
 from birdslam.perception import Segmentation
 from birdslam.types import LaneLine
@@ -57,6 +57,7 @@ class LineTracker:
         self._T_world_filter: SE2 | None = None
         self._standing = 0
         self.tilt_rad = 0.0  # of the last image against its pitch
+        self._road_from_m = 0.0
         self._height_m, self._sigma_roll_rad = self.camera.height_m, self.camera.tilt_sigma_rad  # of the last image
 
     def update(
@@ -68,9 +69,11 @@ class LineTracker:
         segmentation: Segmentation,
         boxes_px: Floats,
         search_tilt: bool = False,
+        bonnet_px: Floats | None = None,
     ) -> None:
         """One image: `ground` under its camera, its masks, and the boxes (B, 4) of vehicles in it.
 
+        `bonnet_px` (N, 2) is the edge of the car's own bonnet, where one is in view.
         `sigma_tilt_rad`: 1-sigma of the ground's pitch and roll. `search_tilt`: the pitch is as uncertain as that says,
         and this image alone has to show it.
         """
@@ -79,7 +82,8 @@ class LineTracker:
         travelled_m = self._advance(T_world_ego)
         if travelled_m is None:
             return
-        view = road_view(self.camera, ground, image, segmentation, boxes_px)
+        view = road_view(self.camera, ground, image, segmentation, boxes_px, bonnet_px)
+        self._road_from_m = nearest_m(self.camera, ground, bonnet_px)
         paint = paint_points(view)
         first_tilt_rad = 0.0
         if not len(self._filter):
@@ -265,6 +269,7 @@ class LineTracker:
             self.tilt_rad,
             self._height_m,
             self._sigma_roll_rad,
+            self._road_from_m,
         )
 
 

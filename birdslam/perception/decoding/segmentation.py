@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from birdslam.geometry.arrays import Bools, Floats32
+from birdslam.geometry.arrays import Bools, Floats, Floats32
 from birdslam.perception.manifest import ClassMap, ClassMaps, Input, ManifestMismatch, Meaning
 from birdslam.perception.views import View
 
@@ -19,6 +19,13 @@ class Segmentation:
 
     road: Bools
     lane: Bools
+
+    def above(self, edge_px: Floats) -> Segmentation:
+        """Without what lies below an edge (N, 2) from left to right."""
+        height, width = self.road.shape
+        last = np.interp(np.arange(width), *edge_px.T)
+        over = np.arange(height)[:, None] < last
+        return Segmentation(self.road & over, self.lane & over)
 
 
 class ClassMapsDecoder:
