@@ -94,14 +94,15 @@ def run(arguments: list[str]) -> int:
         heard = Heard(stack.enter_context(peer("hear", str(port), "0", *wanted)), HEARD)
         car = stack.enter_context(peer("car", str(port), "0", options.source, str(options.rate)))
         sent = Sent(car)
-        there = ("--vehicle", VEHICLE, "--router", f"tcp/127.0.0.1:{port}", "--domain", "0")
+        vehicle, router_at = ("--vehicle", VEHICLE), f"tcp/127.0.0.1:{port}"
+        node = ("--set", f"ros.router={router_at}", "--set", "ros.domain=0")
         output = ("--output", str(place / "out"), "--set", f"runtime.runtime_dir={place / 'rt'}")
         log = stack.enter_context((place / "run.log").open("w+"))
         drive = subprocess.Popen(
-            birdslam_command("run", "--source", f"ros:{IMAGE}", *there, *output, *more), stderr=log
+            birdslam_command("run", "--source", f"ros:{IMAGE}", *vehicle, *node, *output, *more), stderr=log
         )
         stack.callback(drive.kill)
-        bridge = subprocess.Popen(birdslam_command("ros", *there, "--runtime-dir", str(place / "rt")))
+        bridge = subprocess.Popen(birdslam_command("ros", *vehicle, *node, "--runtime-dir", str(place / "rt")))
         stack.callback(bridge.kill)
 
         def until(there: Callable[[], bool], limit_s: float, what: str) -> None:
