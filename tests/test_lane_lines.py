@@ -141,6 +141,23 @@ def test_ids_last_and_dashes_are_told_from_a_solid_line() -> None:
             assert abs(line.y_m(truth[0]) - truth[1]) < max(0.1, 3.0 * line.sigma_m(10.0))
 
 
+@pytest.mark.parametrize(("aside_m", "turned_rad"), [(0.0, 0.2), (1.5, -0.2), (1.6, 0.0)])
+def test_lines_that_the_paint_does_not_lie_on_are_looked_for_anew(aside_m: float, turned_rad: float) -> None:
+    tracker, pose = LineTracker(CAMERA), SE2()
+    off = []
+    for k in range(18):
+        if k:
+            pose = pose @ SE2(1.5, 0.0, 0.0)
+        if k == 10:
+            pose = pose @ SE2(0.0, aside_m, turned_rad)  # the odometry slips, or the road bends at once
+        image, masks = picture(SE2(1.5 * k, 0.0, 0.0), (1.75, -1.75), (True, False))
+        tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, NOBODY)
+        lines = tracker.lines().at(pose)
+        off.append([min((abs(line.y_m(8.0) - y) for line in lines), default=9.0) for y in (1.75, -1.75)])
+    assert max(map(max, off[4:10])) < 0.15
+    assert max(map(max, off[13:])) < 0.15
+
+
 def test_what_a_bonnet_mirrors_is_no_line_and_the_lane_is_not_drawn_over_it() -> None:
     edge_px = np.array([[0.0, 190.0], [320.0, 165.0], [639.0, 190.0]])
     image, masks = picture(SE2(), (1.75, -1.75), (False, False))
