@@ -308,6 +308,18 @@ def test_frames_before_a_place_was_confirmed_are_led_back_to(mapped: bytes, tmp_
     assert rows[1].split(",")[1] == "localised"
 
 
+def test_over_what_odometry_calls_invalid_nothing_is_led_back(mapped: bytes) -> None:
+    """A step of 1 m that no odometry measured: what it says of its length is nothing."""
+    running, trajectory = session(decode_map(mapped), extend=False), MapTrajectory()
+    rows = []
+    for number, (estimate, seen, _) in enumerate(drive(STREET, range(20, 50), 3)):
+        estimate = msgspec.structs.replace(estimate, valid=number != 1)
+        rows += trajectory.add(running.step(estimate, seen), estimate)  # type: ignore[arg-type]
+    rows += trajectory.finish()
+    assert trajectory.frames_before > 1
+    assert [row.state for row in rows[:3]] == [MapState.LOST, MapState.LOCALISED, MapState.LOCALISED]
+
+
 def test_without_a_place_the_trajectory_is_an_empty_file(tmp_path: Path) -> None:
     trajectory = MapTrajectory()
     place_map = PlaceMap(MapCamera.of(CAMERA))
