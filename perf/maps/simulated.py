@@ -23,6 +23,7 @@ from birdslam.loops.map_file import decode_map, encode_map
 from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
+from birdslam.outputs.placed import Place
 from birdslam.perf.reporting.figures import Ledger
 from birdslam.runtime.maps.drive_earth import write_earth
 from birdslam.types import NS_PER_S, Attitude
@@ -136,7 +137,8 @@ def gnss(ledger: Ledger, way_m: float) -> None:
             )
         begun_s = time.process_time()
         with tempfile.TemporaryDirectory() as folder:
-            about = write_earth(fixes, poses, CAMERA, Path(folder), None)
+            places = [Place(t_ns, 0, T, T) for t_ns, T in poses]
+            about, _ = write_earth(fixes, places, CAMERA, Path(folder), None)
             took_s = time.process_time() - begun_s
             features = msgspec.json.decode((Path(folder) / "ego.geojson").read_bytes())["features"]
         lon, lat = np.array(features[0]["geometry"]["coordinates"]).T
