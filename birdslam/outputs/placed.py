@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from birdslam.geometry.arrays import Floats
+from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.earth_files import SUFFIXES, Way, write_ways
 from birdslam.types import NS_PER_S
@@ -65,9 +65,13 @@ def write_around(directory: Path) -> list[str]:
     places = _Places(table)
     lines = list(_lines(directory / "map.geojson"))
     features = [
-        {"type": "Feature", "geometry": {"type": "LineString", "coordinates": p.round(3).tolist()}, "properties": about}
-        for points, about in lines
-        for p in [places.in_map(points, about["epoch"], about["first_seen_s"], about["last_seen_s"])]
+        {
+            "type": "Feature",
+            "geometry": {"type": "LineString", "coordinates": p.round(3).tolist()},
+            "properties": each.about,
+        }
+        for each in lines
+        for p in [places.in_map(each.points_m, each.epoch, *each.seen_s)]
     ]
     for kind, epoch, points in _points(directory / "map.csv"):
         geometry = {"type": "MultiPoint", "coordinates": places.in_map(points, epoch).round(3).tolist()}
@@ -77,8 +81,7 @@ def write_around(directory: Path) -> list[str]:
     written = [ROAD_IN_MAP]
     if places.on_earth:
         road = [
-            Way(f"{about['kind']} {about['line']}", places.degrees(p, about["epoch"], *_seen_s(about)), (), {**about})
-            for p, about in lines
+            Way(each.name, places.degrees(each.points_m, each.epoch, *each.seen_s), (), each.about) for each in lines
         ]
         tracks = [
             Way(path.name.partition(".")[0], places.degrees_at(rows), [round(t * NS_PER_S) for t in rows[:, 0]])
@@ -93,8 +96,15 @@ def write_around(directory: Path) -> list[str]:
     return written
 
 
-def _seen_s(about: dict[str, float]) -> tuple[float, float]:
-    return about["first_seen_s"], about["last_seen_s"]
+@dataclass(frozen=True)
+class _Line:
+    """A polyline (N, 2) of map.geojson, and what that says of it."""
+
+    points_m: Floats
+    epoch: int
+    seen_s: tuple[float, float]
+    name: str
+    about: dict[str, float | int | str]
 
 
 class _Places:
@@ -105,13 +115,13 @@ class _Places:
         self._odom, self._map, self._earth = table[:, 2:5], table[:, 5:8], table[:, 8:]
         self.on_earth = bool(np.isfinite(self._earth).all())
 
-    def _from_ego(self, points_m: Floats, rows: Floats) -> Floats:
+    def _from_ego(self, points_m: Floats, rows: Ints) -> Floats:
         """(N, 2) points of odometry's world, each in the ego's axes of its row."""
         x, y, yaw = self._odom[rows].T
         p, (c, s) = points_m - np.column_stack([x, y]), (np.cos(yaw), np.sin(yaw))
         return np.column_stack([c * p[:, 0] + s * p[:, 1], -s * p[:, 0] + c * p[:, 1]])
 
-    def _nearest(self, points_m: Floats, epoch: int, from_s: float, to_s: float) -> Floats:
+    def _nearest(self, points_m: Floats, epoch: int, from_s: float, to_s: float) -> Ints:
         """(N,) the row that each point was seen from: of the time, and else of the epoch, the nearest."""
         usable = (self._epoch == epoch) & (self._t_s > from_s - SLACK_S) & (self._t_s < to_s + SLACK_S)
         rows = np.flatnonzero(usable)
@@ -120,7 +130,7 @@ class _Places:
         if not len(rows):
             rows = np.arange(len(self._t_s))
         apart = np.hypot(*(points_m[:, None, :] - self._odom[None, rows, :2]).transpose(2, 0, 1))
-        out: Floats = rows[apart.argmin(axis=1)]
+        out: Ints = rows[apart.argmin(axis=1)]
         return out
 
     def in_map(self, points_m: Floats, epoch: int, from_s: float = -np.inf, to_s: float = np.inf) -> Floats:
@@ -135,7 +145,7 @@ class _Places:
         rows = np.abs(timed[:, :1] - self._t_s[None]).argmin(axis=1)
         return self._degrees(timed[:, 1:3], rows)
 
-    def _degrees(self, points_m: Floats, rows: Floats) -> Floats:
+    def _degrees(self, points_m: Floats, rows: Ints) -> Floats:
         import pymap3d  # here: only who goes to Earth needs it
 
         latitude_deg, longitude_deg, yaw_rad, scale = self._earth[rows].T
@@ -149,12 +159,13 @@ def _turned(p_m: Floats, yaw_rad: Floats) -> Floats:
     return np.column_stack([c * p_m[:, 0] - s * p_m[:, 1], s * p_m[:, 0] + c * p_m[:, 1]])
 
 
-def _lines(path: Path) -> Iterator[tuple[Floats, dict[str, float]]]:
-    """Polylines (N, 2) of map.geojson with what it says of them."""
+def _lines(path: Path) -> Iterator[_Line]:
     if path.is_file():
         for feature in json.loads(path.read_text("ascii"))["features"]:
-            about = {key: value for key, value in feature["properties"].items() if isinstance(value, int | float | str)}
-            yield np.array(feature["geometry"]["coordinates"], np.float64), about
+            points, said = np.array(feature["geometry"]["coordinates"], np.float64), feature["properties"]
+            about = {key: value for key, value in said.items() if isinstance(value, int | float | str)}
+            seen_s = said["first_seen_s"], said["last_seen_s"]
+            yield _Line(points, said["epoch"], seen_s, f"{said['kind']} {said['line']}", about)
 
 
 def _points(path: Path) -> Iterator[tuple[str, int, Floats]]:
