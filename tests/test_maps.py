@@ -217,6 +217,20 @@ def test_a_false_loop_is_switched_off() -> None:
     assert false not in held([*place_map.links, false], poses)
 
 
+def test_keyframes_tied_by_loops_that_are_switched_off_stay_where_they_are() -> None:
+    place_map = PlaceMap(MapCamera.of(CAMERA))
+    driven(place_map, STREET, range(60), extend=True)
+    first, cut, last = place_map.keyframes[0], place_map.keyframes[-3], place_map.keyframes[-1]
+    links = [
+        link for link in place_map.links if link.to_number != cut.number
+    ]  # the last three are a chain of their own
+    cov = np.diag([1e-4, 1e-4, 1e-6])
+    far = [Link(first.number, last.number, SE2(1e4 * sign, 5.0, 0.5), cov, loop=True) for sign in (1.0, -1.0)]
+    at, at_cov = close_loops(place_map.keyframes, [*links, *far])[last.number]
+    assert np.hypot(*last.T_map_keyframe.between(at).log()[:2]) < 1.0
+    assert at_cov[0, 0] > 1e3  # nothing says where it is
+
+
 # --- the file ---
 
 

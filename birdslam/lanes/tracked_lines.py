@@ -54,6 +54,7 @@ class TrackedLines:
     tilt_rad: float  # of their image against its pitch
     height_m: float  # of its camera
     sigma_roll_rad: float  # of its ground
+    road_from_m: float  # where the road straight ahead begins to be in its view
 
     def at(self, T_world_ego: SE2) -> tuple[LaneLine, ...]:
         """The lines in the ego's frame at `T_world_ego`, moved by the ego's motion, from left to right."""

@@ -49,9 +49,9 @@ def camera_of(width_px: int) -> Camera:
 
 @dataclass(frozen=True)
 class Road:
-    """A drive of `frames` images along a road; `told` says what is hard on it."""
+    """A drive of `frames` images along a road; `hard` says what is hard on it."""
 
-    told: str
+    hard: str
     scenario: Callable[[], Scenario]
     rate_hz: float
     frames: int = 100

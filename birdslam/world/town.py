@@ -42,9 +42,9 @@ _SEED = 17  # an urban street of two lanes forth and one back, cars parked on bo
 
 @dataclass(frozen=True)
 class TownDrive:
-    """A drive in the town; `told` says what is other than when its map was made."""
+    """A drive in the town; `differs` says what is other than when its map was made."""
 
-    told: str
+    differs: str
     frames: int
     begin_m: float = BEGIN_M
     lane: int = 0  # of those in the ego's direction, from the middle of the road

@@ -1,16 +1,10 @@
-"""The same road twice: how well places are found again, how exact poses in a map are, what closing a loop brings.
+"""The same road twice: recall and false loops of places, errors of localisation, what closing a loop brings.
 
-    python -m perf loops [--data DIR] [--output FILE.json] [--part recorded|town|loop|alike|gnss|size ...]
+    python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|gnss|size ...]
 
-`recorded`: the two passes of one KITTI street by cameras 0.537 m apart, each in the other's map, and three other
-streets against both; the whole pipeline offline with the shipped networks gives the estimates, and `--features`
-compares kinds.
-`town`: a rendered block of 2 km, driven twice, then in other traffic, lane, light, rain, by night, the other way, and
-cut from one drive to another. Rendered once into `--drives` (extra `train`, a quarter of an hour).
-`loop`: a street of corners with exact truth, driven twice, then in other light and lane.
-`alike`: streets of equal houses, straight and winding, in which every loop would be false.
-`gnss`: the same kind of street with fixes, without and with a jump of 15 m for ten seconds.
-`size`: bytes and processor time of a look-up in maps of 1, 10 and 100 km of simulated descriptors.
+`recorded`: two passes of one KITTI street in each other's map, three other streets against both. `town`: rendered once
+into --drives (extra `train`), driven twice, then otherwise. `loop`: corners without images, driven twice. `alike`: equal
+houses: each loop is false. `gnss`: fixes, with a jump of 15 m. `size`: simulated descriptors of 1, 10, 100 km.
 """
 
 from __future__ import annotations

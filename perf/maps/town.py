@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,39 +62,34 @@ def measure(ledger: Ledger, drives: Path, estimated: Estimated) -> None:
     place_map, T_world_map = _twice(ledger, drives / TWICE, estimated)
     kept = encode_map(place_map)
     before = {name: list(estimated(f"demo:{drives / name}")) for name in KIDNAPPED[:2]}
-    for name, told in names.items():
+    for name, differs in names.items():
         if name != TWICE:
             drive = _Drive.open(drives / name)
             frames = before.get(name) or estimated(f"demo:{drives / name}")
             found = _localise(kept, drive, frames)
             row = _judged(found, drive.truth, place_map, T_world_map)
-            ledger.add(f"town: {told}", row["text"], **row)
+            ledger.add(f"town: {differs}", row["text"], **row)
     _kidnapped(ledger, drives, kept, place_map, T_world_map, before)
 
 
 def render(folder: Path) -> dict[str, str]:
     """What there is of each drive, by its name, after rendering those that lack."""
     if importlib.util.find_spec("numba") is None:
-        told = folder / "told.json"
-        if not told.is_file():
+        known = folder / "drives.json"
+        if not known.is_file():
             raise PerfError("the town is rendered with numba: install the extra [train], or give --drives")
-        return msgspec.json.decode(told.read_bytes(), type=dict[str, str])
+        return msgspec.json.decode(known.read_bytes(), type=dict[str, str])
     from birdslam.world.roads import CAMERA
     from birdslam.world.town import DRIVES, RATE_HZ, frames
 
     for name, planned in DRIVES.items():
         if not (folder / name / BEGIN).is_file():
-            begin: list[Floats] = []
-
-            def passing(name: str = name, begin: list[Floats] = begin) -> Iterable[Any]:
-                for frame in frames(name):
-                    begin.append(frame.T_world_cam) if not begin else None
-                    yield frame
-
-            write(folder / name, with_progress(passing(), name, planned.frames), CAMERA, RATE_HZ, QUALITY)
-            np.save(folder / name / BEGIN, begin[0])
-    out = {name: planned.told for name, planned in DRIVES.items()}
-    (folder / "told.json").write_bytes(msgspec.json.encode(out))
+            rendered = with_progress(frames(name), name, planned.frames)
+            first = next(rendered)
+            write(folder / name, itertools.chain([first], rendered), CAMERA, RATE_HZ, QUALITY)
+            np.save(folder / name / BEGIN, first.T_world_cam)
+    out = {name: planned.differs for name, planned in DRIVES.items()}
+    (folder / "drives.json").write_bytes(msgspec.json.encode(out))
     return out
 
 

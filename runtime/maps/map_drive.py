@@ -94,7 +94,7 @@ class MapDrive:
         self._session.resume(pose)
 
     def step(self, estimate: Estimate, image: NDArray[np.uint8] | None) -> Localisation:
-        """One frame, undistorted; None: it is not looked at. One that is told again, corrected, has its row already."""
+        """One frame, undistorted; None: it is not looked at. One that comes again, corrected, has its row already."""
         if self._begin_ns is None:
             self._begin_ns = estimate.t_source_ns
         found = self._session.step(estimate, image)

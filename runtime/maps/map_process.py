@@ -100,17 +100,18 @@ class LiveMap:
             log.warning("where the map process had come to is not known: %s", error)
 
     def turn(self, timeout_s: float) -> bool:
-        """Takes up what has come; whether an estimate has."""
-        first = self._estimates.recv(timeout_s)
+        """Takes up one estimate, and the images that have come; whether there was one.
+
+        One, so that a process that can't keep up reports, saves and beats like any other.
+        """
+        message = self._estimates.recv(timeout_s)
         self._take_images()
-        message = first
-        while message is not None and not self.ended:
+        if message is not None and not self.ended:
             estimate: Estimate = message.record
             if Status.END_OF_SOURCE in estimate.status:
                 self.ended = True
             else:
                 self._step(estimate)
-            message = self._estimates.recv(0.0)
         now_ns = time.monotonic_ns()
         if now_ns - self._reported_ns >= HEALTH_NS:
             self._report(now_ns)
@@ -118,7 +119,7 @@ class LiveMap:
             self._save()
         self._vitals.count(frames=self._stepped, torn=self.torn, looks=self.looks)
         self._vitals.beat()
-        return first is not None
+        return message is not None
 
     def _take_images(self) -> None:
         """Pixels stay in the ring for a few frames only; of those that will not be looked at none is copied."""

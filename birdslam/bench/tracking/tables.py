@@ -283,11 +283,11 @@ def motion_table(rows: Sequence[MotionRow]) -> str:
 def movers_table(rows: Sequence[MoversRow]) -> str:
     """Tracks of standing vehicles that are reported to drive, and of driving ones that are, and in all."""
     head = ["Seq", "odometry", "standing", "reported to drive", "driving", "reported", "soon"]
-    counts = [(row.standing, len(row.false), row.driving, row.told, row.soon) for row in rows]
+    counts = [(row.standing, len(row.false), row.driving, row.reported, row.soon) for row in rows]
     lines = [
         [
             *(row.sequence, odometry_title(row.odometry), *map(str, count)),
-            "; ".join(f"{one.x_m:.0f}, {one.y_m:.0f}: {one.told_mps:.1f}" for one in row.false) or "-",
+            "; ".join(f"{one.x_m:.0f}, {one.y_m:.0f}: {one.reported_mps:.1f}" for one in row.false) or "-",
         ]
         for row, count in zip(rows, counts, strict=True)
     ]
