@@ -3,7 +3,7 @@
     python -m perf loops [--output FILE.json] [--part recorded|town|loop|alike|gnss|size ...]
 
 `recorded`: two passes of one KITTI street in each other's map, three other streets against both. `town`: rendered once
-into --drives (extra `train`), driven twice, then otherwise. `loop`: corners without images, driven twice. `alike`: equal
+into --drives (extra `train`), driven twice, then otherwise. `loop`: corners without images, twice. `alike`: equal
 houses: each loop is false. `gnss`: fixes, with a jump of 15 m. `size`: simulated descriptors of 1, 10, 100 km.
 """
 
