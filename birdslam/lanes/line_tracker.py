@@ -17,7 +17,7 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis
 from birdslam.lanes.line_filter import LineFilter, Support
-from birdslam.lanes.paint import LinePoints, edge_points, paint_points
+from birdslam.lanes.paint import LinePoints, double_share, edge_points, paint_points
 from birdslam.lanes.parallel_search import SEARCHED_M, Peak, Shape, find_lines, find_shape
 from birdslam.lanes.road_view import RoadView, nearest_m, road_view
 from birdslam.lanes.tracked_lines import LEFT_EDGE, PAINT, RIGHT_EDGE, Track, TrackedLines, existence_of
@@ -241,6 +241,10 @@ class LineTracker:
                 if len(yellow):
                     track.coloured = min(track.coloured + 1.0, 8.0)
                     track.yellow += (float(np.median(yellow)) - track.yellow) / track.coloured
+                double = double_share(view, mine.of(profile))
+                if double is not None:
+                    track.resolved = min(track.resolved + 1.0, 8.0)
+                    track.double += (double - track.double) / track.resolved
             elif track.kind != PAINT:
                 track.looks += 1.0
 
