@@ -13,7 +13,7 @@ CORES := $(or $(shell nproc 2>/dev/null),2)
 unexport PYTHONDONTWRITEBYTECODE
 ON_EACH_CHANGE := not slow and not faults and not onroad
 
-.PHONY: setup browser test test-slow wheel-test pages wheels fuzz faults onroad perf lint train demo demo-kitti clean
+.PHONY: setup browser test test-slow wheel-test index-test pages wheels fuzz faults onroad perf lint train demo demo-kitti clean
 
 setup: $(VENV)/.ready
 
@@ -45,6 +45,10 @@ test-slow: setup
 # What a user installs: the wheel in an empty environment, without the checkout
 wheel-test: setup
 	$(BIN)/python -m tests.installed_wheel
+
+# The same without an installation: uvx and pipx, from an index of this computer, on each Python that is here
+index-test: setup
+	$(BIN)/python -m tests.installed_index
 
 # docs/ as a site, in out/site; a broken link fails it
 site: $(SITE_VENV)/.ready

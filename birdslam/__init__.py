@@ -1,14 +1,11 @@
-"""Monocular multibody SLAM in bird's-eye view: what a program imports (docs/api.md has the page).
+"""Monocular multibody SLAM in bird's-eye view: what a program imports. docs/api.md is its page.
 
-    from birdslam import BirdSLAM, load_camera, open_recording
-
-    recording = open_recording("video:drive.mp4", load_camera(Path("camera.toml")))
     slam = BirdSLAM.with_shipped_networks(recording.camera, recording.rate_hz)
-    for frame in recording.undistorted_frames():
+    for frame in recording.undistorted_frames():  # open_recording("video:drive.mp4", load_camera("camera.toml"))
         measurements, estimate = slam.step(frame)
 
-A name is loaded when it is first asked for: `import birdslam` alone loads neither numpy nor any network, since BLAS
-reads the number of its threads from the environment when numpy is loaded (`runtime/environment.py` sets it first).
+A name is loaded when it is first asked for: BLAS reads the number of its threads from the environment when numpy is
+loaded, and `runtime/environment.py` sets it first.
 """
 
 from __future__ import annotations

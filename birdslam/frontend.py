@@ -91,6 +91,9 @@ class EgoMotion(Protocol):
     @property
     def road_tracks(self) -> tuple[Ints, Floats]: ...
 
+    @property
+    def bonnet_px(self) -> Floats | None: ...
+
 
 class FrontEnd:
     """One frame in, its `Measurements` out (`measure`). Deterministic; owns no thread."""
@@ -188,6 +191,8 @@ class FrontEnd:
         if motion is None:
             self._lanes.clear()
             return None, None
+        if Status.SCALE_INVALID in motion.status:
+            self._lanes.lose_way()
         return motion, self._dead_reckoning.advance(motion)
 
     def _localise_vehicles(
@@ -242,6 +247,7 @@ class FrontEnd:
             _boxes_px(perception),
             frame.image,
             frame.t_source_ns,
+            self.odometry.bonnet_px,
         )
 
 

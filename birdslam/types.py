@@ -372,7 +372,7 @@ class Lane(msgspec.Struct, frozen=True, kw_only=True, gc=False):
 
 
 class LaneChange(Word):
-    """The ego's change of lanes: told once, in the frame in which the middle of the ego has crossed the line."""
+    """The ego's change of lanes: reported once, in the frame in which the middle of the ego has crossed the line."""
 
     NONE = "none"
     LEFT = "left"
@@ -416,6 +416,7 @@ class Lanes(msgspec.Struct, frozen=True, kw_only=True):
     leader: Leader | None = None  # of an `Estimate`
     age_ns: Annotated[int, msgspec.Meta(ge=0)] = 0  # source time since the image that lines were last seen in
     tilt_rad: float = 0.0  # to be added to the pitch of `Ground`: so the lines of that image were parallel
+    road_from_m: float = 0.0  # x from which that image shows the road: nearer is the image's edge, or the own bonnet
 
     @property
     def ego(self) -> Lane | None:

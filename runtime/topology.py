@@ -1,12 +1,9 @@
-"""The whole system on one screen: which nodes there are, and which records pass between them.
+"""The whole system on one screen: which nodes there are, and which records pass between them (docs/interface.md).
 
-    the car's own speed, if it says it
-              v
-    camera -> [capture] -- frame --> [perceive] -- measurements --> [optimize] -- estimate, map --> planners
-                                 frame, estimate --> [map] -- map_pose --> planners
-
-A topic's key is `birdslam/<vehicle>/v1/<topic>`, its payload one record as plain MessagePack (runtime/wire.py). Each
-node declares the liveliness token `birdslam/<vehicle>/v1/alive/<node>` once it is ready for work.
+speed of the car, if it sends one
+          v
+camera -> [capture] -- frame --> [perceive] -- measurements --> [optimize] -- estimate, map --> planners
+                             frame, estimate --> [map] -- map_pose --> planners
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ import sys
 import tempfile
 import venv
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -66,20 +67,15 @@ def install(wheel: Path, environment: Path) -> Path:
     return programs
 
 
-def drive(programs: Path, folder: Path) -> None:
-    """The first frames of the shipped drive, of which none may be lost."""
-    folder.mkdir()
-    environment = {"PATH": os.environ["PATH"], "HOME": str(folder)}
-    where = call(
-        programs / "python", "-P", "-c", "import birdslam; print(birdslam.__file__)", cwd=folder, env=environment
-    )
-    assert Path(where.strip()).is_relative_to(programs.parent), where
+def drive(birdslam: Sequence[str | Path], folder: Path, **environment: str) -> None:
+    """The first frames of the shipped drive by this command, of which none may be lost."""
+    folder.mkdir(exist_ok=True)
     said = call(
-        *(programs / "birdslam", "run", "--source", "demo", "--rate", "max", "--set", f"source.frames={FRAMES}"),
+        *(*birdslam, "run", "--source", "demo", "--rate", "max", "--set", f"source.frames={FRAMES}"),
         *("--set", f"runtime.runtime_dir={folder / 'run'}", "--output", folder / "out"),
         *("--set", f"runtime.watchdog_ms={1e3 * LIMIT_S}"),  # a busy machine is no stalled node
         cwd=folder,
-        env=environment,
+        env={"PATH": os.environ["PATH"], "HOME": str(folder), **environment},
     )
     summary = json.loads((folder / "out" / "summary.json").read_text())
     assert summary["ended"] == "end of source", said
@@ -90,12 +86,21 @@ def drive(programs: Path, folder: Path) -> None:
     print("\n".join(line for line in said.splitlines() if not line.startswith(("frame ", "waiting"))))
 
 
+def check_place(programs: Path) -> None:
+    """The package that is imported is the installed one."""
+    code = "import birdslam; print(birdslam.__file__)"
+    where = call(programs / "python", "-P", "-c", code, cwd=programs, env={"PATH": os.environ["PATH"]})
+    assert Path(where.strip()).is_relative_to(programs.parent), where
+
+
 def main() -> None:
     with tempfile.TemporaryDirectory(prefix="wheel-") as folder:
         place = Path(folder)
         wheel = build(place / "dist")
         check_contents(wheel)
-        drive(install(wheel, place / "environment"), place / "elsewhere")
+        programs = install(wheel, place / "environment")
+        check_place(programs)
+        drive([programs / "birdslam"], place / "elsewhere")
 
 
 if __name__ == "__main__":

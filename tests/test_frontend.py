@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -54,6 +55,7 @@ class ScriptedOdometry:
     def __init__(self, script: dict[int, Motion]) -> None:
         self.script = script
         self.road_tracks = (np.array([7, 9, 11]), np.array([[600.0, 300.0], [700.0, 220.0], [600.0, 100.0]]))
+        self.bonnet_px = None
         self.boxes: list[np.ndarray] = []
 
     def track(self, image: np.ndarray) -> None:
@@ -184,14 +186,33 @@ def test_a_segmentation_that_comes_late_is_mapped_once_from_where_it_was_seen() 
     assert [p.x_m for p in out[2].lanes] == pytest.approx([p.x_m - 4.0 for p in now])
 
 
-def test_lanes_keep_their_ids_until_the_world_begins_anew() -> None:
+def road_view() -> Ready:
+    """A straight road with a line on either side, without vehicles."""
     rows, columns = np.mgrid[: CAMERA.height_px, : CAMERA.width_px]
     px = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
     y_m = bev.pixel_to_ego(CAMERA, CAMERA.ground, px)[:, 1].reshape(rows.shape)
     with np.errstate(invalid="ignore"):
         masks = Segmentation(road=np.abs(y_m) < 6.0, lane=(np.abs(y_m - 3.0) < 0.15) | (np.abs(y_m + 2.0) < 0.15))
     nobody = Detections(np.zeros((0, 4)), np.zeros(0), ())
-    views = [Ready(Perception(nobody, masks, {"detector": 0, "segmenter": 0}, ())) for _ in range(25)]
+    return Ready(Perception(nobody, masks, {"detector": 0, "segmenter": 0}, ()))
+
+
+def test_what_was_seen_before_a_way_of_unknown_length_is_dropped() -> None:
+    def seen(frames: int, *invalid: int) -> np.ndarray:
+        steps = {k: motion(k, SE2(1.0, 0.0, 0.0)) for k in range(1, frames)}
+        steps |= {k: msgspec.structs.replace(steps[k], status=(Status.SCALE_INVALID,)) for k in invalid}
+        front = FrontEnd(CAMERA, FrontEndConfig(), ScriptedOdometry(steps))
+        for k in range(frames):
+            front.measure(frame(k), road_view())
+        return front.lane_view().seen
+
+    assert np.array_equal(seen(8, 7), seen(1))  # begins anew
+    assert np.array_equal(seen(8, 3), seen(5))
+    assert seen(8).sum() > 1.2 * seen(5).sum()
+
+
+def test_lanes_keep_their_ids_until_the_world_begins_anew() -> None:
+    views = [road_view() for _ in range(25)]
     script = {k: motion(k, SE2(1.0, 0.0, 0.0)) for k in range(1, 25) if k != 18}
     out = run(script, views)
     sides = [{p.lane: round(p.y_m) for p in m.lanes if p.lane >= 0} for m in out]

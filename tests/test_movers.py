@@ -72,17 +72,17 @@ def told(sequence: TrackingSequence, drives: dict[int, range]) -> MoversRow:
 
 def test_a_parked_car_that_is_reported_to_drive_is_counted_once_with_its_place() -> None:
     row = told(sequence_of(), {0: range(12, 15), 2: range(0, FRAMES)})
-    assert (row.standing, row.driving, row.told, row.soon) == (2, 1, 1, 1)
+    assert (row.standing, row.driving, row.reported, row.soon) == (2, 1, 1, 1)
     (false,) = row.false
     assert (false.vehicle, false.label, false.frame, false.sights) == (10, 0, 12, 3)
-    assert (false.x_m, false.y_m, false.told_mps) == pytest.approx((15.0, 4.0, 5.0))
+    assert (false.x_m, false.y_m, false.reported_mps) == pytest.approx((15.0, 4.0, 5.0))
     assert "15, 4: 5.0" in movers_table([row])
 
 
 @pytest.mark.parametrize(("first", "soon"), [(15, 1), (16, 0), (FRAMES, 0)])
 def test_a_driver_is_told_soon_within_a_second_of_its_first_known_speed(first: int, soon: int) -> None:
     row = told(sequence_of(), {2: range(first, FRAMES)})
-    assert (row.driving, row.told, row.soon) == (1, int(first < FRAMES - 5), soon)
+    assert (row.driving, row.reported, row.soon) == (1, int(first < FRAMES - 5), soon)
     assert not row.false
 
 

@@ -143,7 +143,8 @@ def test_what_is_no_drive_is_one_line(tmp_path: Path, results: Path, capsys: pyt
         read_drive(results)
 
 
-def test_a_browser_draws_it_and_the_slider_moves(results: Path) -> None:
+@pytest.mark.parametrize(("dark", "width_px"), [(False, 1280), (True, 1280), (False, 390)])
+def test_a_browser_draws_it_and_the_slider_moves(results: Path, dark: bool, width_px: int) -> None:
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
     if browser is None:
         pytest.skip("no Chromium (Debian: apt install chromium)")
@@ -155,10 +156,13 @@ def test_a_browser_draws_it_and_the_slider_moves(results: Path) -> None:
       document.documentElement.dataset.at = String(document.getElementById("map").data.at(-1).y[0]);
       document.documentElement.dataset.plots = String(document.querySelectorAll(".plot .main-svg").length);
       document.documentElement.dataset.title = document.title;
+      document.documentElement.dataset.over = String(document.documentElement.scrollWidth - innerWidth);
+      document.documentElement.dataset.ground = getComputedStyle(document.body).backgroundColor;
     </script>"""
     path.write_text(path.read_text(encoding="utf-8").replace("</body>", moved + "</body>"), encoding="utf-8")
     done = subprocess.run(
         [browser, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom",
+         f"--blink-settings=preferredColorScheme={int(not dark)}", f"--window-size={width_px},900",
          "--virtual-time-budget=8000", path.as_uri()],
         capture_output=True, text=True, timeout=180, check=False,
     )  # fmt: skip
@@ -170,5 +174,7 @@ def test_a_browser_draws_it_and_the_slider_moves(results: Path) -> None:
     assert told["ready"] == told["moved"] == "yes"
     assert float(told["at"]) == pytest.approx(0.5 * 54)  # ahead of the start, in the plane of both epochs
     assert int(told["plots"]) >= 3
+    assert float(told["over"]) <= 0.0  # nothing stands out to the right
+    assert (sum(map(int, re.findall(r"\d+", told["ground"])[:3])) < 3 * 64) == dark
     assert told["title"].startswith("BirdSLAM: drive")  # what the files hold has run nothing
     assert "55" in re.findall(r'<output id="words">([^<]*)', done.stdout)[0]

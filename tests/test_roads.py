@@ -1,13 +1,11 @@
 """Hard roads hold for ever: motorways, ramps and nights of the built-in world, and what comes to lie on the windscreen.
 
-The clips in tests/roads are rendered by
+From the first, the third and the fifth image, without networks: no valid frame has a speed off by more than a tenth,
+no way is off by more than 5 %, nothing says standstill while the car drives, four frames in five are valid. Of some a
+few valid frames do not hold yet (NOT_YET). tests/roads was rendered by
 
     python -m perf roads motorway_20 motorway_40 ramp_20 ramp_21_glare night_street night_motorway \
         --frames 26 --quality 70 --keep tests/roads
-
-From the first, the third and the fifth image, without networks: no valid frame has a speed off by more than a tenth,
-no way is off by more than 5 %, nothing says standstill while the car drives, four frames in five are valid. Of
-some a few valid frames do not hold yet (NOT_YET).
 """
 
 from __future__ import annotations

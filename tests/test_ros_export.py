@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
+from birdslam.loops.map_pose import EarthPose, MapPose, MapState
 from birdslam.ros.bag import Bag, BagError
 from birdslam.ros.bag_writer import BagWriter
 from birdslam.ros.frames import StaticFrames
-from birdslam.ros.messages import UNKNOWN
+from birdslam.ros.parts import UNKNOWN
 from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import Configuration, SourceConfig, dump
 from birdslam.runtime.recording.recording import About, RecordingWriter
@@ -60,12 +61,16 @@ DRIVE = (
 )
 
 
-def recording(path: Path, uri: str = "kitti:drive", camera: Camera | None = CAMERA, records: Any = DRIVE) -> Path:
+def recording(
+    path: Path, uri: str = "kitti:drive", camera: Camera | None = CAMERA, records: Any = DRIVE, poses: Any = ()
+) -> Path:
     config = dump(Configuration(vehicle="bus", source=SourceConfig(uri=uri), camera=camera))
     writer = RecordingWriter(path, About(configuration=config, models={}, versions={}, utc_offset_ns=0), camera, 500.0)
     topics = {Measurements: "measurements", Estimate: "estimate", MapUpdate: "map"}
     for t_ns, record in enumerate(records):
         writer.add(topics[type(record)], record, t_ns)
+    for pose in poses:
+        writer.draw("/map_pose", pose, len(records))
     writer.close({})
     return path
 
@@ -182,6 +187,47 @@ def test_diagnostics(sent: dict[str, list[Any]]) -> None:
         "people": "0",
     }  # fmt: skip
     assert {status.hardware_id for status in found} == {"bus"}
+
+
+def map_pose(frame: int, epoch: int, state: MapState, **fields: Any) -> MapPose:
+    t_ns = FIRST_NS + frame * PERIOD_NS
+    return MapPose(
+        frame_id=frame, t_source_ns=t_ns, t_capture_ns=frame, t_utc_ns=t_ns + 5, epoch=epoch, state=state, **fields
+    )
+
+
+def test_a_drive_in_a_map_is_in_its_frame_and_on_earth(tmp_path: Path) -> None:
+    T_map_world, T_world_ego = SE2(100.0, 50.0, 1.2), DRIVE[-1].T_world_ego
+    earth = EarthPose(latitude_deg=49.0, longitude_deg=8.4, cov=(4.0, 1.0, 1.0, 9.0), yaw_rad=0.1, yaw_sigma_rad=0.02)
+    there = {"T_map_odom": T_map_world, "T_odom_ego": T_world_ego, "cov": COV, "earth": earth, "map_epoch": 3}
+    poses = (
+        map_pose(1, 0, MapState.LOST),
+        map_pose(2, 0, MapState.LOCALISED, **there),  # of the epoch that is over
+        map_pose(3, 1, MapState.LOCALISED, **there),
+    )
+    drive = recording(tmp_path / "d.mcap", poses=poses)
+    assert main(["export", str(drive), "--ros2", str(tmp_path / "bag")]) == 0
+    with Bag(tmp_path / "bag") as bag:
+        joined = [one for m in bag.messages("/tf") for one in m.content.transforms if one.child_frame_id == "odom"]
+        (pose,), (fix,) = (
+            [m.content for m in bag.messages(topic)] for topic in ("/birdslam/map_pose", "/birdslam/fix")
+        )
+        said = [one for m in bag.messages("/diagnostics") for one in m.content.status if one.name == "birdslam: map"]
+    assert [(one.message, one.level) for one in said] == [("lost", 1), ("localised", 0)]
+    (one,) = joined
+    T_map_ego = T_map_world @ T_world_ego
+    assert (one.header.frame_id, pose.header.frame_id) == ("map", "map")
+    level = matrix(one.transform) @ ego_pose(IN_ODOM[3], Attitude())  # through `odom`, which goes on over the epoch
+    assert np.abs(level - ego_pose(T_map_ego, Attitude())).max() < 1e-9
+    assert np.abs(matrix(pose.pose.pose) - ego_pose(T_map_ego, Attitude())).max() < 1e-9
+    c, s = math.cos(T_map_ego.yaw_rad), math.sin(T_map_ego.yaw_rad)
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    cov = pose.pose.covariance.reshape(6, 6)
+    assert np.abs(cov[np.ix_((0, 1, 5), (0, 1, 5))] - R @ np.reshape(COV, (3, 3)) @ R.T).max() < 1e-12
+    assert (fix.header.frame_id, fix.latitude, fix.longitude, fix.status.status) == ("base_link", 49.0, 8.4, 0)
+    assert fix.position_covariance.reshape(3, 3)[:2, :2].tolist() == [[4.0, 1.0], [1.0, 9.0]]
+    assert math.isnan(fix.altitude)
+    assert fix.position_covariance_type == 3
 
 
 def test_a_live_drive_has_utc(tmp_path: Path) -> None:

@@ -8,11 +8,9 @@ from __future__ import annotations
 import json
 import struct
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -27,8 +25,10 @@ from hypothesis import strategies as st
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.files import GNSS_FILE, GnssError, read_fixes
-from birdslam.perf.latency.ros import estimate, peer
+from birdslam.loops.map_pose import MapPose, MapState
 from birdslam.perf.processes import free_port
+from birdslam.perf.ros2.ros import estimate, peer
+from birdslam.perf.ros2.ros_drive import without
 from birdslam.ros.bag import BagTopics
 from birdslam.ros.message_types import MessageTypes
 from birdslam.ros.messages import TOPICS, RosMessages
@@ -59,7 +59,6 @@ from tests.test_bus import until
 
 sdk = pytest.importorskip("zenoh_ros2_sdk")
 processes = pytest.mark.processes
-ROOT = Path(__file__).resolve().parent.parent
 CAMERA = Camera(64, 32, 50.0, 50.0, 32.0, 16.0, 1.5, pitch_rad=0.05, roll_rad=-0.02)
 LIMIT_S = 60.0
 # Published: in the documentation of ROS 2 (Jazzy), `ros2 topic info --verbose`
@@ -116,7 +115,7 @@ def test_hashes_are_those_of_the_other_implementation(name: str, tmp_path: Path)
     from zenoh_ros2_sdk.message_registry import MessageRegistry
     from zenoh_ros2_sdk.utils import get_type_hash, load_dependencies_recursive
 
-    from birdslam.perf.latency.ros_peer import write_definitions
+    from birdslam.perf.ros2.ros_peer import write_definitions
 
     write_definitions(tmp_path)
     text = (tmp_path / f"{name}.msg").read_text()
@@ -284,6 +283,14 @@ def test_what_can_not_be_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[
         RosNode(RosConfig(), "birdslam")
 
 
+def test_images_without_an_estimate_are_told_by_their_times() -> None:
+    images = np.arange(10, dtype=np.int64) * 30_000_000
+    assert without(images, images + 40_000).size == 0
+    assert without(images, np.delete(images, [0, 4, 9]) - 40_000).tolist() == images[[0, 4, 9]].tolist()
+    assert without(images, images[:0]).tolist() == images.tolist()
+    assert without(images, images[3:4]).tolist() == np.delete(images, 3).tolist()
+
+
 # --- through a router ---
 
 
@@ -319,14 +326,20 @@ class Vehicle:
     def __init__(self, join: Any, base: Path, port: int, **config: Any) -> None:
         hub = join("supervisor", hub=True)
         QueryServer(Configuration(camera=CAMERA), hub)
-        self._out, self._frame = hub.publisher("estimate"), 0
+        self._out, self._map, self._frame = hub.publisher("estimate"), hub.publisher("map_pose"), 0
         self.bridge = RosBridge("car", RosNode(RosConfig(router=f"tcp/127.0.0.1:{port}", **config), "birdslam"), base)
         assert self._out.wait_matched(LIMIT_S)
+        assert self._map.wait_matched(LIMIT_S)
 
     def step(self) -> float:
         """Where the ego was."""
         told = estimate(self._frame, vehicles=2)
+        found = MapPose(
+            frame_id=self._frame, t_source_ns=told.t_source_ns, t_capture_ns=told.t_capture_ns, t_utc_ns=told.t_utc_ns,
+            epoch=0, state=MapState.LOCALISED, T_map_odom=T_MAP_ODOM, T_odom_ego=told.T_world_ego, cov=told.cov,
+        )  # fmt: skip
         self._frame += 1
+        self._map.put(found)
         self._out.put(told)
         self.bridge.step(LIMIT_S)
         return told.T_world_ego.x_m
@@ -344,6 +357,8 @@ def topics(*names: str, namespace: str = "") -> list[str]:
 
 
 ODOMETRY = "/birdslam/odometry"
+MAP_POSE = "/birdslam/map_pose"
+T_MAP_ODOM = SE2(7.0, -3.0, 0.5)
 
 
 def place(odometry: Any) -> float:
@@ -370,11 +385,13 @@ def test_a_listener_hears_each_message_and_again_after_the_router_was_gone(join:
             assert at[-30:] == pytest.approx(sent)
             assert at == sorted(at)
             until(lambda: len(listener.of("/birdslam/vehicles")) > 30, "boxes are lost")
-            until(lambda: len(listener.of("/diagnostics")) > 30 and listener.of("/tf"), "the rest is lost")
+            until(lambda: len(listener.of("/diagnostics")) > 60 and listener.of("/tf"), "the rest is lost")
             (_, box) = listener.of("/birdslam/vehicles")[-1]["detections"]
             assert (box["bbox"]["size"]["x"], box["id"]) == (4.2, "1")
-            assert listener.of("/tf")[-1]["transforms"][0]["child_frame_id"] == "base_link"
-            assert listener.of("/diagnostics")[-1]["status"][0]["message"] == "ok"
+            joined = {message["transforms"][0]["child_frame_id"] for message in listener.of("/tf")}
+            assert joined == {"base_link", "odom"}
+            states = {message["status"][0]["message"] for message in listener.of("/diagnostics")}
+            assert states == {"ok", "localised"}
             with zenoh.open(client(port)) as other:
                 said = [str(reply.ok.key_expr) for reply in other.liveliness().get("@ros2_lv/4/**") if reply.ok]
             found = {one.topic for token in said if (one := publication_of(token)) is not None}
@@ -392,12 +409,22 @@ def test_in_a_namespace_topics_and_frames_are_the_vehicles_own(join: Any, base: 
         stack.enter_context(peer("router", str(port)))
         vehicle = Vehicle(join, base, port, domain=0, namespace="red")
         stack.enter_context(vehicle.bridge)
-        wanted = topics(ODOMETRY, "/tf", namespace="/red")
+        wanted = topics(ODOMETRY, MAP_POSE, "/tf", namespace="/red")
         listener = stack.enter_context(Listener(stack.enter_context(peer("hear", str(port), "0", *wanted))))
         vehicle.until_heard(listener, f"/red{ODOMETRY}")
         until(lambda: listener.of("/tf"), "/tf is not heard")
         message = listener.of(f"/red{ODOMETRY}")[-1]
         assert (message["header"]["frame_id"], message["child_frame_id"]) == ("red/odom", "red/base_link")
+        vehicle.until_heard(listener, f"/red{MAP_POSE}")
+        assert listener.of(f"/red{MAP_POSE}")[-1]["header"]["frame_id"] == "red/map"
+
+        def joined() -> list[Any]:
+            every = [one for message in listener.of("/tf") for one in message["transforms"]]
+            return [one for one in every if one["child_frame_id"] == "red/odom"]
+
+        until(joined, "nothing joins the map and odometry")
+        at = joined()[-1]["transform"]["translation"]
+        assert (joined()[-1]["header"]["frame_id"], at["x"], at["y"]) == ("red/map", T_MAP_ODOM.x_m, T_MAP_ODOM.y_m)
 
 
 def client(port: int) -> zenoh.Config:
@@ -406,19 +433,6 @@ def client(port: int) -> zenoh.Config:
     config.insert_json5("connect/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
     config.insert_json5("scouting/multicast/enabled", "false")
     return config
-
-
-@contextmanager
-def car(port: int, uri: str, rate_hz: float, frames: int) -> Iterator[subprocess.Popen[str]]:
-    """A car that publishes a recording's images, ready to begin."""
-    command = [sys.executable, "-m", "tests.ros_peer", str(port), "0", uri, str(rate_hz), str(frames)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline().strip() == "ready"
-            yield process
-        finally:
-            process.kill()
 
 
 def configuration(port: int, output: Path, **source: Any) -> Configuration:
@@ -434,7 +448,7 @@ def configuration(port: int, output: Path, **source: Any) -> Configuration:
 @processes
 def test_images_of_a_topic_are_a_source_with_their_camera_speed_and_fixes(tmp_path: Path) -> None:
     port, recording = free_port(), open_recording("demo")
-    with peer("router", str(port)), car(port, "demo", 20.0, 10_000):
+    with peer("router", str(port)), peer("car", str(port), "0", "demo", "20"):
         source = open_source(configuration(port, tmp_path, frames=40))
         frames = list(source.frames())
     assert source.live
@@ -488,7 +502,7 @@ def test_a_source_without_images_says_why(tmp_path: Path) -> None:
     with peer("router", str(port)):
         with pytest.raises(SourceError, match="nobody publishes /front/image in domain 0"):
             open_source(short)
-        with car(port, "demo", 20.0, 10_000):
+        with peer("car", str(port), "0", "demo", "20"):
             other = msgspec.structs.replace(asked.source, uri="ros:/front/camera_info")
             with pytest.raises(SourceError, match="/front/camera_info is sensor_msgs/CameraInfo; expected"):
                 open_source(msgspec.structs.replace(asked, source=other))
@@ -503,7 +517,7 @@ def test_while_the_router_is_gone_frames_say_so_and_then_images_come_again(tmp_p
     with ExitStack() as stack:
         router = stack.enter_context(ExitStack())
         router.enter_context(peer("router", str(port)))
-        stack.enter_context(car(port, "demo", 20.0, 100_000))
+        stack.enter_context(peer("car", str(port), "0", "demo", "20"))
         source = open_source(configuration(port, tmp_path))
         frames = source.frames()
         stack.callback(source.close)

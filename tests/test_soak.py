@@ -6,11 +6,12 @@ import socket
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import pytest
 
 from birdslam.perf.robustness import soak
-from birdslam.perf.robustness.soak import Series, Systemd, ages, faults, sample, table
+from birdslam.perf.robustness.soak import Ages, Series, Systemd, ages, faults, sample, slope, table
 from tests.test_bus import until
 
 WELL: dict[str, Any] = {
@@ -27,7 +28,7 @@ def systemd(tmp_path: Path) -> Any:
 
 
 def series(mib: list[float], descriptors: list[int]) -> Series:
-    return Series(mib=mib, descriptors=descriptors, pids={1})
+    return Series([5.0 * k for k in range(len(mib))], mib, descriptors, {1})
 
 
 def test_a_flat_drive_is_well(systemd: Systemd) -> None:
@@ -42,7 +43,10 @@ def test_a_flat_drive_is_well(systemd: Systemd) -> None:
     [
         (series([100.0 + 0.1 * number for number in range(30)], [30] * 30), "perceive grew by 2.4%"),
         (series([100.0] * 24, [30] * 12 + [32, 33] * 6), "perceive holds 2 descriptors more"),
-        (Series(mib=[100.0] * 24, descriptors=[30] * 24, pids={1, 2}), "perceive was 2 processes, one after the other"),
+        (
+            Series([5.0 * k for k in range(24)], [100.0] * 24, [30] * 24, {1, 2}),
+            "perceive was 2 processes, one after the other",
+        ),
     ],
 )
 def test_what_grows_is_named(one: Series, said: str, systemd: Systemd) -> None:
@@ -50,10 +54,25 @@ def test_what_grows_is_named(one: Series, said: str, systemd: Systemd) -> None:
 
 
 def test_estimates_that_come_later_and_later_are_named() -> None:
-    flat = [20.0, 22.0, 21.0, 40.0] * 100
-    assert ages(flat) == ("age at the planner, first quarter p50 21.5, p99 40.0 ms; last 21.5, 40.0 ms", [])
-    _, said = ages([20.0 + 0.05 * k for k in range(400)])
-    assert said == ["the age grew from 22.5 to 37.5 ms in the median"]
+    t_s = [0.03 * k for k in range(400)]
+    said, bad = ages(Ages(t_s, [20.0, 22.0, 21.0, 40.0] * 100))
+    assert said.startswith("age at the planner, first quarter p50 21.5, p99 40.0 ms; last 21.5, 40.0 ms; p50 +0.0 +-")
+    assert bad == []
+    said, bad = ages(Ages(t_s, [20.0 + 0.05 * k for k in range(400)]))
+    assert bad == ["the age grew from 22.5 to 37.5 ms in the median"]
+    assert "p50 +6000.0 +- 0.0 ms an hour" in said  # 0.05 ms in 0.03 s
+
+
+def test_the_sigma_of_a_slope_is_what_a_slope_scatters() -> None:
+    t_s, rng = np.arange(0.0, 3600.0, 5.0), np.random.default_rng(5)
+    found = []
+    for _ in range(300):
+        swings = np.repeat(rng.normal(size=24), 30)  # what a process holds stays for minutes
+        found.append(slope(t_s, 100.0 + 0.5 * t_s / 3600.0 + swings))
+    gains, sigmas = np.transpose(found)
+    assert gains.mean() == pytest.approx(0.5, abs=3.0 * gains.std() / np.sqrt(300))
+    assert np.sqrt(np.mean(sigmas**2)) == pytest.approx(gains.std(), rel=0.2)
+    assert np.isnan(slope([1.0], [2.0])).all()
 
 
 def test_restarted_nodes_are_named(systemd: Systemd) -> None:

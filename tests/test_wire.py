@@ -134,6 +134,7 @@ _LANES = Lanes(
     leader=Leader(vehicle=7, gap_m=18.5, gap_sigma_m=0.75, time_gap_s=1.25, probability=0.5),
     age_ns=100_000_000,
     tilt_rad=0.00390625,
+    road_from_m=4.5,
 )
 # Every field holds something else than its default.
 EXAMPLES: tuple[msgspec.Struct, ...] = (

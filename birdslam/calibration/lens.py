@@ -173,7 +173,7 @@ def _with_focal_length(windows: Sequence[_Window], fitted: LensProblem, prior: F
     begun = (at_focal_length(fitted, prior.log_focal + by * prior.sigma) for by in _BEGUN)
     found = [adjust(problem, prior, _ROUGHLY) for problem in begun]
     best = min(found, key=lambda problem: cost_of(problem, prior))
-    # Which corners are outliers was told by another lens
+    # Which corners are outliers was decided with another lens
     again = _begin(windows, math.exp(best.log_focal), best.k1, best.sigma_px)
     return best if again is None else adjust(again, prior)
 

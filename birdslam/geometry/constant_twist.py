@@ -17,7 +17,7 @@ def advance(
 ) -> tuple[complex, complex, complex, complex]:
     """A pose with `heading` drives for `dt_s` with a constant twist: how far (m), and with which heading then.
 
-    `velocity` (m/s) is in the body's own axes, the way in those in which the heading is told. Beside it how errors of
+    `velocity` (m/s) is in the body's own axes, the way in those in which the heading is given. Beside it how errors of
     the velocity and of the turn move the end of the way: its partial derivatives by the complex velocity and by
     `turn_radps`.
     """

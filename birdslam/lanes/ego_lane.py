@@ -27,7 +27,7 @@ class EgoLane:
         self._width_m, self._sigma_m = WIDTH_M, WIDTH_SIGMA_M
         self._sides: dict[int, float] = {}  # line -> its side when it was last far enough: +1 left, -1 right
 
-    def lanes(self, lines: tuple[LaneLine, ...], age_ns: int, tilt_rad: float) -> Lanes:
+    def lanes(self, lines: tuple[LaneLine, ...], age_ns: int, tilt_rad: float, road_from_m: float = 0.0) -> Lanes:
         """The lanes between the lines (of a moment, in ego), and whether the ego has just changed."""
         row = lane_row(lines, self._width_m, self._sigma_m)
         own = None if row.ego is None else row.lanes[row.ego]
@@ -39,6 +39,7 @@ class EgoLane:
             change=self._changed(lines),
             age_ns=age_ns,
             tilt_rad=tilt_rad,
+            road_from_m=road_from_m,
         )
 
     def _learn_width(self, own: Lane | None) -> None:

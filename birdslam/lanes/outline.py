@@ -16,15 +16,15 @@ _FAR_PX = 20_000.0  # OpenCV draws no farther
 _CLOSE_PX = 9  # gaps of a mask that are closed: its border to paint, and noise
 
 
-def line_px(camera: Camera, ground: GroundPlane, line: LaneLine) -> Floats:
-    """(N, 2) pixels of a line from the nearest road in the image to where it is known."""
-    x_m = np.arange(FROM_M, line.to_m, STEP_M)
+def line_px(camera: Camera, ground: GroundPlane, line: LaneLine, from_m: float = FROM_M) -> Floats:
+    """(N, 2) pixels of a line from `from_m` to where it is known."""
+    x_m = np.arange(from_m, line.to_m, STEP_M)
     return _px(camera, ground, x_m, np.array([line.y_m(x) for x in x_m.tolist()]))
 
 
-def lane_px(camera: Camera, ground: GroundPlane, lane: Lane) -> Floats:
-    """(N, 2) pixels of the polygon around a lane, along its left bound and back along its right one."""
-    x_m = np.arange(FROM_M, lane.to_m, STEP_M)
+def lane_px(camera: Camera, ground: GroundPlane, lane: Lane, from_m: float = FROM_M) -> Floats:
+    """(N, 2) pixels of the polygon around a lane from `from_m`, along its left bound and back along its right one."""
+    x_m = np.arange(from_m, lane.to_m, STEP_M)
     left = _px(camera, ground, x_m, np.array([lane.left_m(x) for x in x_m.tolist()]))
     right = _px(camera, ground, x_m, np.array([lane.right_m(x) for x in x_m.tolist()]))
     return np.vstack([left, right[::-1]])

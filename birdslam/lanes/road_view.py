@@ -22,6 +22,7 @@ Grid = Floats32
 
 NEAREST_M = 3.0  # of a row; most cameras see the road from 5 m on
 FARTHEST_M = 50.0
+NEAR_BONNET_M = 15.0  # no bonnet covers more of the road
 ROW_M = 0.25  # between near rows
 HALF_WIDTH_M = 10.0  # of a row
 LATTICE_M = 0.04  # between columns: a painted line of 0.12 m has three
@@ -65,12 +66,23 @@ def _rows_m(fy_px: float, height_m: float) -> Floats:
 
 
 def road_view(
-    camera: Camera, ground: GroundPlane, image: NDArray[np.uint8], segmentation: Segmentation, boxes_px: Floats
+    camera: Camera,
+    ground: GroundPlane,
+    image: NDArray[np.uint8],
+    segmentation: Segmentation,
+    boxes_px: Floats,
+    bonnet_px: Floats | None = None,
 ) -> RoadView:
-    """`image` (H, W) grey or (H, W, 3) BGR; `boxes_px` (B, 4) of the vehicles in it."""
+    """`image` (H, W) grey or (H, W, 3) BGR; `boxes_px` (B, 4) of the vehicles in it.
+
+    `bonnet_px` (N, 2) is the upper edge of the car's own bonnet: below it the image mirrors road and paint.
+    """
     x_m, y_m = _rows_m(camera.fy_px, ground.height_m), _columns_m()
     u, v = _pixels(camera, ground, x_m, y_m)
     outside = (u < 0.0) | (u > camera.width_px - 1) | (v < 0.0) | (v > camera.height_px - 1)
+    if bonnet_px is not None:
+        near = x_m < NEAR_BONNET_M
+        outside[near] |= v[near] > np.interp(u[near], *bonnet_px.T)
 
     def seen(plane: NDArray[np.uint8], how: int) -> NDArray[np.uint8]:
         return np.asarray(cv2.remap(plane, u, v, how, borderMode=cv2.BORDER_REPLICATE))
@@ -103,6 +115,14 @@ def road_view(
         outside,
         excess,
     )
+
+
+def nearest_m(camera: Camera, ground: GroundPlane, bonnet_px: Floats | None) -> float:
+    """Where the road straight ahead begins to be in view: over the bonnet's edge, or the image's."""
+    lowest = camera.height_px - 1.0
+    v = lowest if bonnet_px is None else min(lowest, float(np.interp(camera.cx_px, *bonnet_px.T)))
+    x_m = float(bev.pixel_to_ego(camera, ground, np.array([[camera.cx_px, v]]))[0, 0])
+    return x_m if np.isfinite(x_m) else FARTHEST_M
 
 
 def _pixels(camera: Camera, ground: GroundPlane, x_m: Floats, y_m: Floats) -> tuple[Grid, Grid]:

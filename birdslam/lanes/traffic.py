@@ -2,7 +2,7 @@
 
 Whoever drives beside the ego's lane tells the direction of the road beyond the line between: all lanes farther out on
 that side run alike, or the other way from a later line on. One vehicle counts once at a line. So a car that has just
-come into view, whose front can't be told from its back yet, is taken for an oncoming one where others came before it.
+come into view, whose front is not known from its back yet, is taken for an oncoming one where others came before it.
 """
 
 from __future__ import annotations

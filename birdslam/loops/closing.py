@@ -20,7 +20,7 @@ from birdslam.loops.keyframe import Link, Placed
 
 DCS_PHI = 5.0  # chi-square at which a loop begins to count less
 ORIGIN_SIGMA = 1e-3, 1e-3, 1e-4  # the map's frame is that of its first keyframe
-LOOSE_SIGMA = 1e3, 1e3, 1e1  # of keyframes that no link ties to the first
+LOOSE_SIGMA = 1e3, 1e3, 1e1  # of keyframes that only loops, or nothing, tie to the first: a loop may be switched off
 GNC_COST = 0.5 * 11.3  # half the chi-square beyond which a factor is an outlier: 99 % of three degrees of freedom
 
 
@@ -123,9 +123,11 @@ def _chi2(link: Link, poses: dict[int, tuple[SE2, Floats]]) -> float:
 
 
 def _tied(first: int, links: Sequence[Link]) -> set[int]:
-    """The keyframes that links lead to from the first."""
+    """The keyframes that odometry's links lead to from the first."""
     beside: dict[int, list[int]] = {}
     for link in links:
+        if link.loop:
+            continue
         beside.setdefault(link.from_number, []).append(link.to_number)
         beside.setdefault(link.to_number, []).append(link.from_number)
     seen, waiting = {first}, [first]

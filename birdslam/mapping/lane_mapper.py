@@ -126,6 +126,7 @@ class LaneMapper:
         self._run: Future[_LaneResult] | None = None
         self._run_frame = -1
         self._run_outdated = False  # the run under way belongs to an earlier epoch
+        self._way_lost = False  # since the last run
         self._lanes_due_frame: int | None = None  # of the last run that detects lanes
         self._lanes_frame: int | None = None  # of the last run that has detected lanes
         self._stations: tuple[int, list[Station]] = (-1, [])  # and the frame that saw them
@@ -140,6 +141,13 @@ class LaneMapper:
         self._run_outdated = self._run is not None
         if not self._run_outdated:
             self._forget()
+
+    def lose_way(self) -> None:
+        """The way to this frame is not known in metres: what was seen before it lies nobody knows where.
+
+        The next segmentation begins anew, as a single image does.
+        """
+        self._way_lost = True
 
     def _forget(self) -> None:
         self._amodal.clear()
@@ -160,12 +168,13 @@ class LaneMapper:
         boxes_px: Floats,
         image: NDArray[np.uint8] | None = None,
         t_source_ns: int = 0,
+        bonnet_px: Floats | None = None,
     ) -> LaneOutput:
         """Lane points and edges of the segmentation of `segmented_frame`, if it is new and the ego has moved.
 
         `sigma_tilt_rad` are those of the pitch and the roll of `ground`. `boxes_px` (N, 4) are the vehicles' latest
-        boxes, within which nothing is used. Lines are found in the images, (H, W) grey or (H, W, 3) BGR, of which this
-        frame's is kept for its segmentation.
+        boxes, within which nothing is used, and `bonnet_px` (N, 2) the edge of the car's own bonnet. Lines are found
+        in the images, (H, W) grey or (H, W, 3) BGR, of which this frame's is kept for its segmentation.
         """
         self._frames.append(_PastFrame(frame_id, T_world_ego, ground, sigma_tilt_rad, t_source_ns))
         if image is not None:
@@ -184,7 +193,9 @@ class LaneMapper:
                     self._lanes_due_frame = frame_id if due else self._lanes_due_frame
                     self._run_frame = frame_id
                     seen = next((kept for kept_id, kept in self._images if kept_id == segmented_frame), None)
-                    run = (T_world_ego, then, segmentation, boxes_px, due, seen if due else None)
+                    road = segmentation if bonnet_px is None else segmentation.above(bonnet_px)
+                    run = (T_world_ego, then, road, boxes_px, bonnet_px, due, seen if due else None, self._way_lost)
+                    self._way_lost = False
                     self._run = self._submit(self._detect_lanes, *run)
         found = earlier or self._take_result()
         return self._output(found, frame_id, T_world_ego, status, self._lanes_at(T_world_ego, t_source_ns))
@@ -194,7 +205,8 @@ class LaneMapper:
         if self._lines is None:
             return None
         seen_ns, lines = self._lines
-        return self._ego_lane.lanes(lines.at(T_world_ego), max(0, t_source_ns - seen_ns), lines.tilt_rad)
+        age_ns = max(0, t_source_ns - seen_ns)
+        return self._ego_lane.lanes(lines.at(T_world_ego), age_ns, lines.tilt_rad, lines.road_from_m)
 
     def _take_result(self) -> _LaneResult | None:
         """The result of a run that has ended."""
@@ -241,12 +253,24 @@ class LaneMapper:
         then: _PastFrame,
         segmentation: Segmentation,
         boxes_px: Floats,
+        bonnet_px: Floats | None,
         due: bool,
         image: NDArray[np.uint8] | None,
+        anew: bool,
     ) -> _LaneResult:
+        if anew:
+            self._forget()
         lines = None
         if image is not None:
-            self._tracker.update(then.T_world_ego, then.ground, then.sigma_tilt_rad, image, segmentation, boxes_px)
+            self._tracker.update(
+                then.T_world_ego,
+                then.ground,
+                then.sigma_tilt_rad,
+                image,
+                segmentation,
+                boxes_px,
+                bonnet_px=bonnet_px,
+            )
             lines = self._tracker.lines()
         road_m, boundary_m = points_of(segmentation, self.camera, then.ground, boxes_px, self._amodal.config)
         on_world_m = then.T_world_ego @ boundary_m

@@ -46,6 +46,8 @@ class ExternalConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class WithoutImages:
     """What is the same of every EgoMotion that sees no image."""
 
+    bonnet_px: Floats | None = None
+
     @property
     def road_tracks(self) -> tuple[NDArray[np.int64], Floats]:
         """Empty: no corners are tracked."""

@@ -45,6 +45,10 @@ class MetricScale(Protocol):
     vanishing_point: VanishingPoint | None  # of the newest image, where it was accepted
 
     @property
+    def bonnet_px(self) -> NDArray[np.float64] | None:
+        """(W, 2) the upper edge of the car's own bonnet in the image; None: none is seen."""
+
+    @property
     def ground(self) -> GroundPlane:
         """The present camera over the road; the height is the calibrated one, by which all lengths are measured."""
 

@@ -99,6 +99,12 @@ class Odometry:
         return ids, self._resolution.given_px(px)
 
     @property
+    def bonnet_px(self) -> Floats | None:
+        """(N, 2) the upper edge of the car's own bonnet in the image, from left to right; None: none is seen."""
+        px = self._scale.bonnet_px
+        return None if px is None else self._resolution.given_px(px)
+
+    @property
     def road_fit(self) -> RoadFit | None:
         """The last motion's alignment of the road without its prior, where it was accepted."""
         return self._scale.fit

@@ -19,7 +19,7 @@ from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats, Image
 from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
-from birdslam.lanes.outline import lane_px, line_px
+from birdslam.lanes.outline import FROM_M, lane_px, line_px
 from birdslam.outputs.bev_picture import (
     EGO,
     EGO_AXLE_M,
@@ -129,16 +129,17 @@ class SideBySide:
         return view
 
     def _draw_lanes(self, view: Image, ground: GroundPlane, lanes: Lanes) -> None:
-        """The ego's lane as a shade, and the lines: paint, and dimmer the road's edges."""
+        """The ego's lane as a shade, and the lines, not over the bonnet: paint, and dimmer the road's edges."""
+        from_m = max(lanes.road_from_m, FROM_M)
         ground = GroundPlane(ground.height_m, ground.pitch_rad + lanes.tilt_rad, ground.roll_rad)
         if lanes.ego is not None:
-            area = (lane_px(self._camera, ground, lanes.ego) + 0.5) * self._scale - 0.5
+            area = (lane_px(self._camera, ground, lanes.ego, from_m) + 0.5) * self._scale - 0.5
             shade = view.copy()
             if len(area) > 2:
                 cv2.fillPoly(shade, [_fixed(area)], _bgr(EGO), cv2.LINE_AA, SHIFT)
             cv2.addWeighted(shade, LANE_ALPHA, view, 1.0 - LANE_ALPHA, 0.0, view)
         for line in lanes.lines:
-            px = (line_px(self._camera, ground, line) + 0.5) * self._scale - 0.5
+            px = (line_px(self._camera, ground, line, from_m) + 0.5) * self._scale - 0.5
             colour = _bgr(FAINT if line.kind is LineKind.EDGE else LINE)
             cv2.polylines(view, [_fixed(px)], False, colour, 2, cv2.LINE_AA, SHIFT)
 

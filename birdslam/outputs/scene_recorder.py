@@ -92,9 +92,9 @@ class SceneRecorder:
         history.poses.add(*_numbers(placed))
         seen_from = estimate.T_world_ego.between(user.T_world_vehicle)
         history.farthest_m = max(history.farthest_m, math.hypot(seen_from.x_m, seen_from.y_m))
-        # A vehicle that is not told to drive has a velocity too, by the error of its depth
-        told = user.moves is Moves.DRIVING or user.label in PEOPLE
-        history.speeds.add(math.hypot(*user.velocity_mps) if told else 0.0)
+        # A vehicle that is not reported to drive has a velocity too, by the error of its depth
+        reported = user.moves is Moves.DRIVING or user.label in PEOPLE
+        history.speeds.add(math.hypot(*user.velocity_mps) if reported else 0.0)
 
     def scene(self, **known: Any) -> Scene:
         """All of it; `known` are the other fields of the scene."""

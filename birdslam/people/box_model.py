@@ -1,14 +1,11 @@
-"""What the box of somebody looks like, and how its numbers err.
-
-With H the camera's height, b the kerb (the road under the feet lies b lower than the ego's plane), and slopes that
-count downwards from the plane of the road, the box of somebody at depth X, whose nearest foot is at X - reach, measures
+"""What the box of somebody looks like at depth X, and how its numbers err.
 
     bearing = Y / X,   bottom = (H + b) / (X - reach) - tilt + foot h / X (Eq. 1),
     log of the height = log(h) - log(X) + log(1 + reach (H + b) / ((X - reach) h)) + foot - head,
     log of the width = log(w) - log(X).
 
-The logarithms keep the derivatives the same from frame to frame; with the top's slope in their place a filter grows too
-sure of itself. Where feet are hidden the box ends higher by a share of h / X, and is so much shorter.
+H is the camera's height; the road under the feet lies b lower than the ego's plane (kerb); the nearest foot is at
+X - reach; a hidden foot lets the box end `foot` of h / X higher. In logarithms the derivatives stay the same.
 """
 
 from __future__ import annotations

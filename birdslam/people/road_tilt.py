@@ -17,7 +17,7 @@ from birdslam.people.people_config import PeopleConfig
 def tilts_of(boxes: Sequence[PersonBox], sigma_pitch_rad: float, height_m: float, config: PeopleConfig) -> Floats:
     """(N, 2): mean and variance of the road's tilt against the front end's ground, as everybody else's box has it.
 
-    A box alone tells it by the height of its kind; its own must not be told to it twice. Of several the mean is
+    A box alone tells it by the height of its kind; its own must not be counted twice. Of several the mean is
     known no better than the mean of heights is.
     """
     n = len(boxes)

@@ -125,8 +125,8 @@ class Network:
     ) -> None:
         """`unread` are outputs that are not to be computed, `apart` those that `run_without` leaves out too.
 
-        A `provider` that is not there, or fails later, gives way to the CPU: `fell_back` then says why. Raises Misfit
-        where manifest and network contradict each other, an onnxruntime error where it can't run.
+        A `provider` that is not there, or fails later, gives way to the CPU: `fell_back` then says why. Raises
+        ManifestMismatch where manifest and network disagree, an onnxruntime error where it can't run.
         """
         self.name = name
         self.role: Role = manifest.role

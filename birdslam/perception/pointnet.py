@@ -76,7 +76,7 @@ class PointNet:
     """A loaded and warmed-up Frustum-PointNet. Attributes as those of `network.Network`."""
 
     def __init__(self, path: Path, manifest: PointNetManifest, sha256: str, content: bytes, schedule: Schedule) -> None:
-        """Raises Misfit where manifest and network contradict each other, an onnxruntime error where it can't run."""
+        """Raises ManifestMismatch where manifest and network disagree, an onnxruntime error where it can't run."""
         self.name = self.role = "pointnet"
         self.path, self.manifest, self.sha256, self.schedule = path, manifest, sha256, schedule
         from birdslam.perception.session import plain_session  # here, as in network.py

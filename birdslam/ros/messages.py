@@ -1,28 +1,38 @@
 """Our records as ROS messages, for a bag or for a live ROS 2; docs/ros.md lists the topics.
 
 Axes are REP-103's as everywhere in types.py. REP-105: `odom` is our world, continued where a new epoch begins (at the
-pose where the last one ended: the motion between is unknown); `base_link` is ego, the camera's foot on the road. Our
-covariances are in the body's own axes; ROS has those of a pose in the axes of the parent frame, those of a twist in
-the child's. What is not estimated has the variance UNKNOWN.
+pose where the last one ended: the motion between is unknown); `base_link` is ego, the camera's foot on the road; `map`
+is the map of places, where the drive has one.
 """
 
 from __future__ import annotations
 
-import enum
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
+from birdslam.loops.map_pose import EarthPose, MapPose, MapState
+from birdslam.ros.parts import (
+    BASE,
+    CAMERA,
+    MAP,
+    ODOM,
+    UNKNOWN,
+    Level,
+    Make,
+    MessageParts,
+    Sent,
+    rotated,
+    six,
+)
 from birdslam.trajectory import Transform, ego_pose, mount_pose
-from birdslam.types import NS_PER_S, EgoEdge, Estimate, Lanes, LineColour, LineKind, MapUpdate, RoadUser
-
-Sent = tuple[str, Any]  # topic, message
+from birdslam.types import NS_PER_S, Attitude, EgoEdge, Estimate, Lanes, LineColour, LineKind, MapUpdate, RoadUser
 
 ODOMETRY, DETECTIONS, MARKERS = (
     "nav_msgs/msg/Odometry",
@@ -41,42 +51,29 @@ TOPICS = {  # topic -> type of its messages
     "/birdslam/lanes": MARKERS,
     "/birdslam/lane_lines": MARKERS,
     "/birdslam/ego_lane": "nav_msgs/msg/Path",
+    "/birdslam/map_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "/birdslam/fix": "sensor_msgs/msg/NavSatFix",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
 LATCHED = ("/tf_static", "/birdslam/path")  # what comes once must wait for those who come later
 
-ODOM, BASE, CAMERA = "odom", "base_link", "camera_optical_frame"
-UNKNOWN = 1e6  # variance of what is not estimated
 VEHICLE_HEIGHT_M = 1.5  # of boxes of a height that is not known
 LANE_WIDTH_M = 0.15  # drawn
 CURVE_STEP_M = 2.0  # between two points of a line or a lane
 COLOURS = {LineColour.YELLOW: (1.0, 0.8, 0.0)}  # others are white
 EDGE_COLOUR = (0.5, 0.5, 0.5)
-PLANE = (0, 1, 5)  # x, y and yaw among ROS' six: x, y, z, about x, about y, about z
+COVARIANCE_KNOWN = 3  # of sensor_msgs/NavSatFix
 
 
-class Level(enum.IntEnum):
-    """Of diagnostic_msgs/DiagnosticStatus."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
-
-
-class Make(Protocol):
-    """Makes a message of its full name, as "nav_msgs/msg/Odometry"; fields that are not given are zero."""
-
-    def __call__(self, name: str, /, **fields: Any) -> Any: ...
-
-
-class RosMessages:
+class RosMessages(MessageParts):
     """Of one drive, in order: it remembers where the last epoch ended and, with `keep_path`, all poses.
 
     `frames` stands before the names of all frames ("red/"), so that several cars are in one tree.
     """
 
     def __init__(self, make: Make, camera: Camera, name: str, keep_path: bool = False, frames: str = "") -> None:
-        self._make, self._camera, self._name, self._frames = make, camera, name, frames
+        super().__init__(make, name, frames)
+        self._camera = camera
         self._T_odom_world = SE2()
         self._last: tuple[Estimate, SE2] | None = None  # and T_odom_ego
         self._keep_path = keep_path
@@ -85,8 +82,8 @@ class RosMessages:
 
     def fixed(self, t_ns: int) -> Sent:
         """The camera's mount on the car."""
-        mount = self._transform(BASE, CAMERA, mount_pose(self._camera.ground), t_ns)
-        return "/tf_static", self._make("tf2_msgs/msg/TFMessage", transforms=[mount])
+        mount = self.transform(BASE, CAMERA, mount_pose(self._camera.ground), t_ns)
+        return "/tf_static", self.make("tf2_msgs/msg/TFMessage", transforms=[mount])
 
     def of_estimate(self, estimate: Estimate, t_ns: int, motion: EgoEdge | None = None) -> Iterator[Sent]:
         """One frame; `motion` is the ego's since the frame before, as it was measured."""
@@ -98,10 +95,10 @@ class RosMessages:
         self._last = estimate, T_odom_ego
         if self._keep_path:
             self._path.append((t_ns, pose))
-        yield "/tf", self._make("tf2_msgs/msg/TFMessage", transforms=[self._transform(ODOM, BASE, pose, t_ns)])
-        cov = _rotated(np.reshape(estimate.cov, (3, 3)), T_odom_ego.yaw_rad)
+        yield "/tf", self.make("tf2_msgs/msg/TFMessage", transforms=[self.transform(ODOM, BASE, pose, t_ns)])
+        cov = rotated(np.reshape(estimate.cov, (3, 3)), T_odom_ego.yaw_rad)
         twist, twist_cov = _twist(estimate, before, T_odom_ego, motion)
-        yield "/birdslam/odometry", self._odometry(BASE, self._pose(pose), cov, twist, twist_cov, t_ns)
+        yield "/birdslam/odometry", self._odometry(BASE, self.pose(pose), cov, twist, twist_cov, t_ns)
         yield "/birdslam/vehicles", self._detections(estimate, estimate.vehicles, t_ns)
         for vehicle in estimate.vehicles:
             yield "/birdslam/vehicles/odometry", self._vehicle(vehicle, estimate.attitude.z_m, t_ns)
@@ -120,33 +117,66 @@ class RosMessages:
         z_m = self._last[0].attitude.z_m
         ids = update.lane_ids or (-1,) * len(update.lanes_m)
         for lane, (x_m, y_m) in zip(ids, (self._T_odom_world @ np.array(update.lanes_m)).tolist(), strict=True):
-            lanes.setdefault(lane, []).append(self._make("geometry_msgs/msg/Point", x=x_m, y=y_m, z=z_m))
+            lanes.setdefault(lane, []).append(self.make("geometry_msgs/msg/Point", x=x_m, y=y_m, z=z_m))
         markers = [self._marker(lane, points, t_ns) for lane, points in sorted(lanes.items())]
-        yield "/birdslam/lanes", self._make(MARKERS, markers=markers)
+        yield "/birdslam/lanes", self.make(MARKERS, markers=markers)
+
+    def of_map_pose(self, found: MapPose, t_ns: int) -> Iterator[Sent]:
+        """Where `odom` lies in `map`, the ego in it, and on Earth where the map is; of a lost one its diagnostic alone.
+
+        None of an epoch that is over. `map` is a plane, as our poses in it are.
+        """
+        if self._last is None or found.epoch != self._last[0].epoch:
+            return
+        values = {"map_epoch": found.map_epoch, "inliers": found.inliers, "keyframes": found.keyframes}
+        level = Level.OK if found.state is MapState.LOCALISED else Level.WARN
+        yield self.diagnostic("map", level, found.state.value, values, t_ns)
+        if found.T_map_odom is None or found.T_odom_ego is None or found.cov is None:
+            return
+        T_map_odom = found.T_map_odom @ self._T_odom_world.inverse()  # odometry's world of this epoch lies in `odom`
+        joined = self.transform(MAP, ODOM, ego_pose(T_map_odom, Attitude()), t_ns)
+        yield "/tf", self.make("tf2_msgs/msg/TFMessage", transforms=[joined])
+        T_map_ego = found.T_map_odom @ found.T_odom_ego
+        cov = rotated(np.reshape(found.cov, (3, 3)), T_map_ego.yaw_rad)
+        pose = self.make("geometry_msgs/msg/PoseWithCovariance", pose=self.level(T_map_ego, 0.0), covariance=six(cov))
+        header = self.header(MAP, t_ns)
+        yield "/birdslam/map_pose", self.make(TOPICS["/birdslam/map_pose"], header=header, pose=pose)
+        if found.earth is not None:
+            yield "/birdslam/fix", self._fix(found.earth, t_ns)
+
+    def _fix(self, earth: EarthPose, t_ns: int) -> Any:
+        """The ego's place on Earth; its height is not known."""
+        cov = np.diag([0.0, 0.0, UNKNOWN])
+        cov[:2, :2] = np.reshape(earth.cov, (2, 2))
+        return self.make(
+            TOPICS["/birdslam/fix"], header=self.header(BASE, t_ns), latitude=earth.latitude_deg,
+            longitude=earth.longitude_deg, altitude=math.nan, position_covariance=cov.ravel(),
+            position_covariance_type=COVARIANCE_KNOWN,
+        )  # fmt: skip
 
     def _lanes(self, lanes: Lanes, t_ns: int) -> Iterator[Sent]:
         """The lines of one frame, which replace those of the frame before, and the middle of the ego's lane."""
-        markers = [self._make("visualization_msgs/msg/Marker", header=self._header(BASE, t_ns), action=3)]  # DELETEALL
+        markers = [self.make("visualization_msgs/msg/Marker", header=self.header(BASE, t_ns), action=3)]  # DELETEALL
         for line in lanes.lines:
             points = self._curve(line.y_m, line.seen_from_m, line.to_m)
             colour = EDGE_COLOUR if line.kind is LineKind.EDGE else COLOURS.get(line.colour, (1.0, 1.0, 1.0))
             marker = self._marker_of(BASE, line.kind.value, line.line, points, t_ns)
             marker.type = marker.LINE_STRIP
-            marker.color = self._colour(*colour, line.existence)
+            marker.color = self.colour(*colour, line.existence)
             markers.append(marker)
-        yield "/birdslam/lane_lines", self._make(MARKERS, markers=markers)
+        yield "/birdslam/lane_lines", self.make(MARKERS, markers=markers)
         if lanes.ego is not None:
-            header = self._header(BASE, t_ns)
+            header = self.header(BASE, t_ns)
             poses = [
-                self._make("geometry_msgs/msg/PoseStamped", header=header, pose=self._at(point))
+                self.make("geometry_msgs/msg/PoseStamped", header=header, pose=self.at(point))
                 for point in self._curve(lanes.ego.centre_m, 0.0, lanes.ego.to_m)
             ]
-            yield "/birdslam/ego_lane", self._make("nav_msgs/msg/Path", header=header, poses=poses)
+            yield "/birdslam/ego_lane", self.make("nav_msgs/msg/Path", header=header, poses=poses)
 
     def _curve(self, y_m: Callable[[float], float], from_m: float, to_m: float) -> list[Any]:
         steps = max(2, round(abs(to_m - from_m) / CURVE_STEP_M) + 1)
         return [
-            self._make("geometry_msgs/msg/Point", x=x_m, y=y_m(x_m), z=0.0)
+            self.make("geometry_msgs/msg/Point", x=x_m, y=y_m(x_m), z=0.0)
             for x_m in np.linspace(from_m, to_m, steps).tolist()
         ]
 
@@ -154,16 +184,16 @@ class RosMessages:
         """The whole path, when the drive is over; nothing without `keep_path`."""
         if self._path:
             poses = [
-                self._make("geometry_msgs/msg/PoseStamped", header=self._header(ODOM, t_ns), pose=self._pose(pose))
+                self.make("geometry_msgs/msg/PoseStamped", header=self.header(ODOM, t_ns), pose=self.pose(pose))
                 for t_ns, pose in self._path
             ]
-            header = self._header(ODOM, self._path[-1][0])
-            yield "/birdslam/path", self._make("nav_msgs/msg/Path", header=header, poses=poses)
+            header = self.header(ODOM, self._path[-1][0])
+            yield "/birdslam/path", self.make("nav_msgs/msg/Path", header=header, poses=poses)
 
     def _vehicle(self, vehicle: RoadUser, z_m: float, t_ns: int, kind: str = "vehicle") -> Any:
         T_odom_vehicle = self._T_odom_world @ vehicle.T_world_vehicle
-        pose = self._level(T_odom_vehicle, z_m)
-        cov = _rotated(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
+        pose = self.level(T_odom_vehicle, z_m)
+        cov = rotated(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
         c, s = math.cos(vehicle.T_world_vehicle.yaw_rad), math.sin(vehicle.T_world_vehicle.yaw_rad)
         R_vehicle_world = np.array([[c, s], [-s, c]])
         vx, vy = (R_vehicle_world @ vehicle.velocity_mps).tolist()
@@ -172,30 +202,28 @@ class RosMessages:
         return self._odometry(f"{kind}_{vehicle.vehicle}", pose, cov, (vx, vy, 0.0), twist_cov, t_ns)
 
     def _detections(self, estimate: Estimate, users: Sequence[RoadUser], t_ns: int) -> Any:
-        header, detections = self._header(ODOM, t_ns), []
+        header, detections = self.header(ODOM, t_ns), []
         for vehicle in users:
             height_m = vehicle.height_m or VEHICLE_HEIGHT_M
             T_odom_vehicle = self._T_odom_world @ vehicle.T_world_vehicle
             z_m = estimate.attitude.z_m
-            foot = self._level(T_odom_vehicle, z_m)
-            middle = self._level(T_odom_vehicle, z_m + height_m / 2.0)
-            cov = _rotated(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
-            hypothesis = self._make(
+            foot = self.level(T_odom_vehicle, z_m)
+            middle = self.level(T_odom_vehicle, z_m + height_m / 2.0)
+            cov = rotated(np.reshape(vehicle.cov, (3, 3)), T_odom_vehicle.yaw_rad)
+            hypothesis = self.make(
                 "vision_msgs/msg/ObjectHypothesisWithPose",
-                hypothesis=self._make(
-                    "vision_msgs/msg/ObjectHypothesis", class_id=vehicle.label, score=_score(vehicle)
-                ),
-                pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=foot, covariance=_six(cov)),
+                hypothesis=self.make("vision_msgs/msg/ObjectHypothesis", class_id=vehicle.label, score=_score(vehicle)),
+                pose=self.make("geometry_msgs/msg/PoseWithCovariance", pose=foot, covariance=six(cov)),
             )
-            size = self._vector(vehicle.length_m, vehicle.width_m, height_m)
-            box = self._make("vision_msgs/msg/BoundingBox3D", center=middle, size=size)
+            size = self.vector(vehicle.length_m, vehicle.width_m, height_m)
+            box = self.make("vision_msgs/msg/BoundingBox3D", center=middle, size=size)
             detections.append(
-                self._make(
+                self.make(
                     "vision_msgs/msg/Detection3D", header=header, results=[hypothesis], bbox=box,
                     id=str(vehicle.vehicle),
                 )
             )  # fmt: skip
-        return self._make(DETECTIONS, header=header, detections=detections)
+        return self.make(DETECTIONS, header=header, detections=detections)
 
     def _diagnostics(self, estimate: Estimate, t_ns: int) -> Any:
         statuses = ", ".join(status.value for status in estimate.status)
@@ -211,92 +239,32 @@ class RosMessages:
         level = Level.ERROR if not estimate.valid else Level.WARN if estimate.status else Level.OK
         return self.diagnostic("estimate", level, statuses or "ok", values, t_ns)[1]
 
-    def diagnostic(self, what: str, level: Level, text: str, values: Mapping[str, object], t_ns: int) -> Sent:
-        """The state of a part of the system."""
-        status = self._make(
-            "diagnostic_msgs/msg/DiagnosticStatus",
-            name=f"birdslam: {what}",
-            message=text,
-            hardware_id=self._name,
-            level=int(level),
-            values=[self._make("diagnostic_msgs/msg/KeyValue", key=key, value=str(v)) for key, v in values.items()],
-        )
-        header = self._header("", t_ns)
-        return "/diagnostics", self._make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status])
-
     def _marker(self, lane: int, points: list[Any], t_ns: int) -> Any:
         space = "lane" if lane < 0 else f"lane {lane}"
         self._markers[space] += 1  # each stays, so that the map grows
         return self._marker_of(ODOM, space, self._markers[space], points, t_ns)
 
     def _marker_of(self, frame: str, space: str, number: int, points: list[Any], t_ns: int) -> Any:
-        return self._make(
-            "visualization_msgs/msg/Marker", header=self._header(frame, t_ns), ns=space, id=number, type=8, action=0,
-            pose=self._pose(np.eye(4)), scale=self._vector(LANE_WIDTH_M, LANE_WIDTH_M, 0.0),
-            color=self._colour(1.0, 1.0, 1.0, 1.0), points=points,
+        return self.make(
+            "visualization_msgs/msg/Marker", header=self.header(frame, t_ns), ns=space, id=number, type=8, action=0,
+            pose=self.pose(np.eye(4)), scale=self.vector(LANE_WIDTH_M, LANE_WIDTH_M, 0.0),
+            color=self.colour(1.0, 1.0, 1.0, 1.0), points=points,
         )  # fmt: skip
-
-    def _colour(self, red: float, green: float, blue: float, alpha: float) -> Any:
-        return self._make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha)
-
-    def _at(self, point: Any) -> Any:
-        turn = self._make("geometry_msgs/msg/Quaternion", w=1.0)
-        return self._make("geometry_msgs/msg/Pose", position=point, orientation=turn)
 
     def _odometry(
         self, child: str, pose: Any, cov: Floats, twist: tuple[float, ...], twist_cov: Floats, t_ns: int
     ) -> Any:
         vx, vy, yaw_rate = twist
-        moving = self._make(
-            "geometry_msgs/msg/Twist", linear=self._vector(vx, vy, 0.0), angular=self._vector(0.0, 0.0, yaw_rate)
+        moving = self.make(
+            "geometry_msgs/msg/Twist", linear=self.vector(vx, vy, 0.0), angular=self.vector(0.0, 0.0, yaw_rate)
         )
-        return self._make(
+        return self.make(
             ODOMETRY,
-            header=self._header(ODOM, t_ns),
-            child_frame_id=self._frames + child,
-            pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=_six(cov)),
-            twist=self._make("geometry_msgs/msg/TwistWithCovariance", twist=moving, covariance=_six(twist_cov)),
+            header=self.header(ODOM, t_ns),
+            child_frame_id=self.frames + child,
+            pose=self.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=six(cov)),
+            twist=self.make("geometry_msgs/msg/TwistWithCovariance", twist=moving, covariance=six(twist_cov)),
         )
-
-    def _transform(self, parent: str, child: str, T_parent_child: Transform, t_ns: int) -> Any:
-        pose = self._pose(T_parent_child)
-        at = pose.position
-        moved = self._make(
-            "geometry_msgs/msg/Transform", translation=self._vector(at.x, at.y, at.z), rotation=pose.orientation
-        )
-        header = self._header(parent, t_ns)
-        return self._make(
-            "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=self._frames + child, transform=moved
-        )
-
-    def _header(self, frame: str, t_ns: int) -> Any:
-        sec, nanosec = divmod(max(t_ns, 0), NS_PER_S)
-        stamp = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame and self._frames + frame)
-
-    def _pose(self, T: Transform) -> Any:
-        from scipy.spatial.transform import Rotation  # here, as in trajectory.py
-
-        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist()
-        at_x, at_y, at_z = T[:3, 3].tolist()
-        return self._make(
-            "geometry_msgs/msg/Pose",
-            position=self._make("geometry_msgs/msg/Point", x=at_x, y=at_y, z=at_z),
-            orientation=self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-        )
-
-    def _level(self, T: SE2, z_m: float) -> Any:
-        """Of a body on the road, without pitch and roll."""
-        return self._make(
-            "geometry_msgs/msg/Pose",
-            position=self._make("geometry_msgs/msg/Point", x=T.x_m, y=T.y_m, z=z_m),
-            orientation=self._make(
-                "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(T.yaw_rad / 2.0), w=math.cos(T.yaw_rad / 2.0)
-            ),
-        )
-
-    def _vector(self, x: float, y: float, z: float) -> Any:
-        return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
 def _score(user: RoadUser) -> float:
@@ -318,21 +286,6 @@ def _twist(
     return (step.x_m / dt_s, step.y_m / dt_s, step.yaw_rad / dt_s), unknown
 
 
-def _rotated(cov: Floats, yaw_rad: float) -> Floats:
-    """A covariance (3, 3) of a body's own axes in those of the frame in which it has this yaw."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    out: Floats = R @ cov @ R.T
-    return out
-
-
-def _six(cov: Floats) -> Floats:
-    """(36,) of ROS: x, y, z and the turns about them; what the road leaves out is UNKNOWN."""
-    out = UNKNOWN * np.eye(6)
-    out[np.ix_(PLANE, PLANE)] = cov
-    return out.ravel()
-
-
-def t_of(estimate: Estimate, live: bool) -> int:
+def t_of(record: Estimate | MapPose, live: bool) -> int:
     """The time of a message: UTC of a live camera, else the recording's own clock, as in the bag that it came from."""
-    return estimate.t_utc_ns if live and estimate.t_utc_ns else estimate.t_source_ns
+    return record.t_utc_ns if live and record.t_utc_ns else record.t_source_ns

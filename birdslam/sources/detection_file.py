@@ -1,13 +1,10 @@
-"""Boxes of another detector or tracker over a recording, as a file: MOT challenge, KITTI tracking, or COCO results.
+"""Boxes of another detector or tracker over a recording, as a file, in px of the undistorted images.
 
-- MOT challenge text: `frame,id,left,top,width,height,score,...`, frames from 1, id -1 where nothing was tracked. It
-  says no class: all are cars.
-- KITTI tracking text: `frame id type truncated occluded alpha x1 y1 x2 y2 ...` by blanks, frames from 0; a score in the
-  18th column.
-- COCO results: a JSON list of {"image_id", "category_id", "bbox": [left, top, width, height], "score"}, and "track_id"
-  where something was tracked; `image_id` is the frame, from 0, `category_id` that of COCO's 2017 set.
-
-Boxes are in px of the undistorted images. Errors are DatasetError and name the file and the first line that is wrong.
+MOT challenge text: `frame,id,left,top,width,height,score,...`, frames from 1, id -1: not tracked; all are cars.
+KITTI tracking text: `frame id type truncated occluded alpha x1 y1 x2 y2 ...`, frames from 0, the score the 18th column.
+COCO results: a JSON list of {"image_id", "category_id", "bbox": [left, top, width, height], "score"}, with "track_id"
+where something was tracked; `image_id` is the frame, from 0, `category_id` that of COCO's 2017 set.
+Errors are DatasetError and name the file and the first line that is wrong.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ class Assignment:
 
     @property
     def yaw_known(self) -> bool:
-        """Whether motion or body have told it."""
+        """Whether motion or body have given it."""
         if self.track is None:
             return self.by_depth is not None and self.by_depth.front_seen
         return self.track.yaw_known
@@ -223,15 +223,15 @@ class Placing:
         fan = look_at_yaws(seen, depths.log_depth, yaws, self.localisation.reach_rel)
         weight = weigh_yaws(fan, depths.variance, prior, self.heading)
         near = yaws.shape[1] - len(self.yaw_by_outline.grid_rad)
-        untold = [k for k, a in enumerate(assignments) if not a.yaw_known]
-        if untold:
-            weight[untold, :near] = 0.0
-            weight[untold, near:] = self.yaw_by_outline.weigh(
-                [assignments[k].row for k in untold],
-                fan.residual[untold, near:],
-                fan.box_variance[untold],
-                depths.variance[untold],
-                np.exp(depths.log_depth[untold]),
+        unknown = [k for k, a in enumerate(assignments) if not a.yaw_known]
+        if unknown:
+            weight[unknown, :near] = 0.0
+            weight[unknown, near:] = self.yaw_by_outline.weigh(
+                [assignments[k].row for k in unknown],
+                fan.residual[unknown, near:],
+                fan.box_variance[unknown],
+                depths.variance[unknown],
+                np.exp(depths.log_depth[unknown]),
             )
         shift_m, cov = fan.marginalised(weight)
         numbers = zip(seen, depths.log_depth.tolist(), depths.variance.tolist(), yaws_rad, shift_m, cov, strict=True)

@@ -4,9 +4,7 @@
                          [--networks] [--model ROLE=PATH ...]
     python -m perf films FILM --run DIR     # what `birdslam run --output DIR` left of it, by seconds
 
-A film is a name of FILMS. Its camera is found as `birdslam run` finds it, once, and kept in DIR/NAME.toml, from where
-it is taken again. Each variant of a part (film_variants.py) is driven for some seconds by the odometry alone; the
-networks look at the unchanged film. Rows: film_figures.py. Writes films.json, films.md, films.png.
+The camera is found once, as `birdslam run` finds it; then the odometry alone drives each variant (film_variants.py).
 """
 
 from __future__ import annotations

@@ -3,12 +3,8 @@
     python -m perf overlays [SEQUENCE ...] [--kinds KIND ...] [--seeds N ...] [--output FILE.json] [--data DIR]
         [--networks] [--model ROLE=PATH ...]
 
-SEQUENCE is kitti:DIR, a folder of --data, or one with a rendered `drive.npz` (tests/roads/*).
-Each is drawn over each sequence from its first image on and from its middle on, seeded, and stands still in the image
-(`windscreen.Overlay`); `night` blackens all but the end of the street, over 30 images from the middle on, after which
-the road is back. Counts the frames since then that were called valid with a speed off by more than a tenth (and how
-many of them where the truth is interpolated or accelerates as no car does), and those called standstill while the car
-drove. A frame is valid as the front end has it: a speed that has been held for too long is not.
+SEQUENCE is kitti:DIR, a folder of --data, or one with a rendered `drive.npz`. Each kind (`windscreen.Overlay`) is drawn
+from the first and from the middle image on. Counts valid frames with a speed off by over a tenth, false standstills.
 """
 
 from __future__ import annotations

@@ -2,11 +2,9 @@
 
     python -m perf tilt [--output JSON] [--data DIR] [--model ROLE=PATH ...]
 
-Drives: KITTI tracking 0005 and 0002 by their images, against the road by labelled vehicles; the raw clip, against the
-plane through its LiDAR's returns about 20 m ahead. *Filed* is the camera file's, *images* what the odometry measures,
-*placed* what the front end places vehicles by, after their boxes. Median errors in mrad; `sigmas` is the RMS of errors
-over the estimate's own sigma and the truth's (1: honest). Last comes how the errors of the images go on from frame to
-frame, as `birdslam evaluate localisation` feeds them (`simulation.odometry.OdometryNoise`).
+*Filed* is the camera file's, *images* what the odometry measures, *placed* what the front end places vehicles by. The
+truth is the road by labelled vehicles (0005, 0002), or the LiDAR's plane 20 m ahead (raw clip). Medians in mrad;
+`sigmas` is the RMS of errors over the stated sigma and the truth's (1: honest).
 """
 
 from __future__ import annotations

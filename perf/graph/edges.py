@@ -2,11 +2,9 @@
 
     python -m perf edges --logs DIR [--model ROLE=PATH ...] [--clips 0005,0002] [--seeds 3] [--output FILE]
 
-Logs of images are recorded once, by the whole front end with its lane head, and kept in DIR as MessagePack; those of
-simulated drives are made anew. ATE is in m, nothing aligned; NEES is over its degrees of freedom: the ego's of its pose
-in the world, a vehicle's of its place in the ego's frame. Statistics of real and simulated edges stand side by side
-(bench/simulation/edge_statistics.py). Vehicles are those that KITTI labels, in five frames or more.
-Of 00 and 06 the first frames are left out, whose true poses are interpolated.
+Logs of images are recorded once by the whole front end and kept in DIR; simulated ones are made anew. ATE in m, nothing
+aligned; NEES over its degrees of freedom, the ego's in the world, a vehicle's in the ego's frame. Vehicles are those
+labelled in five frames or more; 00 and 06 begin where their true poses are no longer interpolated.
 """
 
 from __future__ import annotations

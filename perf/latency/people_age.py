@@ -81,7 +81,7 @@ def render(place: Path, people: int, vehicles: int, rate_hz: float, count: int) 
 
 
 def in_view(result: Run) -> dict[str, Any]:
-    """How many people and vehicles the planner was told of, at the median."""
+    """How many people and vehicles the planner received, at the median."""
     estimates = [message.record for message in result.messages]
     return {
         "people_in_view": int(np.median([sum(p.in_sight for p in e.people) for e in estimates])),

@@ -71,7 +71,7 @@ def run(arguments: list[str]) -> None:
 
 @dataclass(frozen=True)
 class Step:
-    """One frame: what is true, what is told, and what it took."""
+    """One frame: what is true, what is reported, and what it took."""
 
     truth: WorldFrame
     estimate: Estimate
@@ -124,7 +124,7 @@ def true_place(truth: WorldFrame, body: WorldObject) -> tuple[Floats, Floats]:
 
 
 def in_a_fan(estimate: Estimate, at_m: Floats) -> bool:
-    """Whether the road there is told to be hidden."""
+    """Whether the road there is reported to be hidden."""
     return any(Outline(fan.corners_m).contains_points(at_m[None])[0] for fan in estimate.hidden)
 
 

@@ -4,9 +4,7 @@
     python -m perf pages --write [NAME ...]        # those that are old, or these; the quickest first
     python -m perf pages --write --only-quick      # of those that take less than a minute
 
-A page that is measured is old once the code that its command reaches (`code_digest.py`), a file that ships with it, the
-command itself or a recording is another one than when it was written (`docs/pages.json`). After a failure the others
-go on.
+A page is old once code, shipped file, command or recording differ from those it was written with (docs/pages.json).
 """
 
 from __future__ import annotations
@@ -27,6 +25,7 @@ from birdslam.perf.__main__ import benchmark_modules
 from birdslam.perf.accuracy import films, overlays, tilt
 from birdslam.perf.cameras import lens
 from birdslam.perf.errors import PerfError
+from birdslam.perf.maps import loops
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import foxglove, leave_one_out, measured, results
 from birdslam.perf.reporting.arguments import benchmark_parser
@@ -146,6 +145,13 @@ PAGES: tuple[Derived | Page, ...] = (
         SHIPPED,
     ),
     Page(
+        "loops",
+        ("python -m birdslam.perf loops --part recorded loop alike gnss size --data {data} --output {out}/loops.json",),
+        {"docs/loops.md": ("loops.json", loops.page)},
+        (loops.run, loops.page),
+        SHIPPED,
+    ),
+    Page(
         "films",
         (
             f"python -m birdslam.perf films --part sizes --part starts --seconds {FILMS_S} --data {{data}} "
@@ -175,7 +181,7 @@ PAGES: tuple[Derived | Page, ...] = (
             "python -m birdslam.perf foxglove {out}/drive.mcap --at 64.5 --output {out}/foxglove.jpg",
         ),
         {"docs/foxglove.jpg": ("foxglove.jpg", None)},
-        (foxglove.run,),  # it shows the layout; what was driven is told elsewhere
+        (foxglove.run,),  # it shows the layout; what was driven is shown elsewhere
         (str(foxglove.LAYOUT),),
     ),
     Page(

@@ -57,7 +57,7 @@ METHODS = {
     "birdslam": "**ours, final**",
 }
 
-Kept = Any  # plain JSON
+Figures = Any  # plain JSON
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,14 @@ class Evaluation:
     """A report: the command that writes it, and what of it is kept."""
 
     command: str  # of `birdslam evaluate`
-    keep: Callable[[Any], Kept]
+    keep: Callable[[Any], Figures]
 
     def kept(self, report: str) -> str:
         """The text of docs/results/NAME.json, of the report's."""
         return json.dumps(self.keep(json.loads(report)), indent=1) + "\n"
 
 
-def _odometry(report: Sequence[Mapping[str, Any]]) -> Kept:
+def _odometry(report: Sequence[Mapping[str, Any]]) -> Figures:
     kept = []
     for row in report:
         ego, ahead = row["ego"], row["car_ahead"]
@@ -83,7 +83,7 @@ def _odometry(report: Sequence[Mapping[str, Any]]) -> Kept:
     return _short(kept)
 
 
-def _localisation(report: Sequence[Mapping[str, Any]]) -> Kept:
+def _localisation(report: Sequence[Mapping[str, Any]]) -> Figures:
     names = ("range", "n", "depth_error_median_rel", "lateral_error_median_m", "inside_1_sigma", "inside_2_sigma")
     whole = [row for row in report if row["sequence"] == "all"]
     worst = {
@@ -97,7 +97,7 @@ def _localisation(report: Sequence[Mapping[str, Any]]) -> Kept:
     return _short([{name: row[name] for name in names} | {"worst_sequence_rel": worst[row["range"]]} for row in whole])
 
 
-def _tracking(report: Sequence[Mapping[str, Any]]) -> Kept:
+def _tracking(report: Sequence[Mapping[str, Any]]) -> Figures:
     every = msgspec.convert(report, list[Row])
     rows = [row for row in every if row.odometry != "images"]
     egos = dict.fromkeys(CARS, (EGO,))
@@ -193,7 +193,7 @@ def texts() -> dict[str, str]:
     return {"docs/results.md": page(found, when), "README.md": readme(README.read_text(encoding="utf-8"), found, when)}
 
 
-def readme(text: str, found: Mapping[str, Kept], when: Mapping[str, measured.Measured]) -> str:
+def readme(text: str, found: Mapping[str, Figures], when: Mapping[str, measured.Measured]) -> str:
     """With the one table, and what it was measured with under it."""
     there = rf"\| what \| how good \| command \|\n(?:\|.*\n)+\n(?:{measured.BEGINNING}(?:.+\n)+\n)?"
     made = f"{summary(found)}\n\n{measured.line(when, README_PARTS)}\n\n"
@@ -215,14 +215,14 @@ def tables_page(report: str) -> str:
     return f"{title}\n\n{about}{rest}"
 
 
-def kept() -> dict[str, Kept]:
+def kept() -> dict[str, Figures]:
     """What is kept of each report, by its name. Raises PerfError where the checkout's docs are not there."""
     if not TEXT.is_file():
         raise PerfError(f"{TEXT} is not there: the page is part of the checkout, and no wheel has it")
     return {name: json.loads((KEPT / f"{name}.json").read_text()) for name in EVALUATIONS}
 
 
-def page(found: Mapping[str, Kept], when: Mapping[str, measured.Measured]) -> str:
+def page(found: Mapping[str, Figures], when: Mapping[str, measured.Measured]) -> str:
     """The whole of docs/results.md."""
     ahead = _ahead(found["odometry"])
     return TEXT.read_text().format(
@@ -242,7 +242,7 @@ def page(found: Mapping[str, Kept], when: Mapping[str, measured.Measured]) -> st
     )
 
 
-def summary(found: Mapping[str, Kept]) -> str:
+def summary(found: Mapping[str, Figures]) -> str:
     """The one table of the README: what, how good, and the command of each row."""
     rows = [("what", "how good", "command")]
     names = {
@@ -289,7 +289,7 @@ def _ahead(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
     return found
 
 
-def _odometry_table(found: Mapping[str, Kept]) -> str:
+def _odometry_table(found: Mapping[str, Figures]) -> str:
     head = ("sequence", *(title for _, title, _, _ in COLUMNS))
     body = [
         (f"{row['sequence']}{kind}", *(_cell(row[field], form, after) for field, _, form, after in COLUMNS))
@@ -307,7 +307,7 @@ def _percent(share: float, form: str = ".1") -> str:
     return f"{share:{form}%}".replace("%", " %")
 
 
-def _localisation_table(found: Mapping[str, Kept]) -> str:
+def _localisation_table(found: Mapping[str, Figures]) -> str:
     head = ("range", "cars seen", "depth error, median", "worst sequence", "paper mode", "lateral error, median")
     body = [
         (

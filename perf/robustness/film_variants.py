@@ -16,7 +16,7 @@ from birdslam.geometry.arrays import Image
 from birdslam.geometry.camera import Camera
 
 Timed = tuple[int, Image]  # t_source_ns, the raw image
-Shown = Callable[[int, Image], Image]  # of an image's index and the image
+Change = Callable[[int, Image], Image]  # of an image's index and the image
 
 LEAST_WIDTH_PX, MOST_WIDTH_PX = 320, 3840
 _ENCODER = "libx264"
@@ -31,7 +31,7 @@ class Variant:
     every: int = 1  # each n-th image alone
     repeats: int = 1  # how often each image comes, as films of another rate have it
     crf: int | None = None  # of H.264: 18 is fine, 35 coarse
-    shown: Shown | None = None
+    shown: Change | None = None
 
     def camera(self, camera: Camera) -> Camera:
         """The camera whose images these are; `camera` is that of the film at hand."""

@@ -1,11 +1,10 @@
-"""A long drive at the full rate: memory, descriptors, watchdogs and drops of every process, from the first minute on.
+"""A long drive: what memory, descriptors and age of every process gain in an hour, with its sigma; watchdogs, drops.
 
-    python -m perf soak [--minutes 30] [--rate 33] [--source demo] [--record] [--models DIR] [...]
+    python -m perf soak [--minutes 30] [--rate 33] [--source demo] [--map] [--record] [--models DIR] [...]
 
-Further options are those of `birdslam run`. Without `--source` the software camera of the fault suite drives down its
-street. The soak stands in systemd's place, and notices where the supervisor misses its watchdog. Ends with status 1,
-and says why, where after the first minute a process grew by more than 1 % or held more descriptors, where a process was
-restarted, a watchdog was missed, or estimates came later to the planner at the end than at the beginning.
+Further options are those of `birdslam run`; without `--source` the software camera of the fault suite drives down its
+street. Ends with status 1, and says why, where after the first minute a process grew by more than 1 % or held more
+descriptors, was restarted or missed a watchdog (the soak stands in systemd's place), or estimates came later.
 """
 
 from __future__ import annotations
@@ -18,15 +17,19 @@ import tempfile
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
+from numpy.typing import ArrayLike
 
+from birdslam.geometry.arrays import Floats
 from birdslam.perf.reporting.arguments import benchmark_parser
+from birdslam.perf.reporting.figures import BLOCKS
 from birdslam.perf.robustness.faulty_vehicle import Vehicle, ends_with_its_vehicle, model_options, record_options
 from birdslam.runtime.transport.closing import Closing
 
@@ -78,6 +81,7 @@ class Systemd(Closing):
 class Series:
     """One process, sample by sample from the end of the first minute on."""
 
+    t_s: list[float] = field(default_factory=list)
     mib: list[float] = field(default_factory=list)
     descriptors: list[int] = field(default_factory=list)
     pids: set[int] = field(default_factory=set)
@@ -99,10 +103,36 @@ class Series:
         return min(self.descriptors[-span:]) - max(self.descriptors[:span])
 
 
+@dataclass
+class Ages:
+    """Of estimates at the planner, from the end of the first minute on."""
+
+    t_s: list[float] = field(default_factory=list)
+    ms: list[float] = field(default_factory=list)
+
+
+def slope(t_s: ArrayLike, values: ArrayLike, of: Callable[[Floats], float] = np.mean) -> tuple[float, float]:
+    """What a series gains in an hour, and the sigma of that; NaN where it is too short to tell.
+
+    A line through blocks of the series, each by its mean or what else stands for it: samples that follow each other are
+    not independent, blocks nearly are. The sigma is by what the blocks are off that line.
+    """
+    t, y = np.asarray(t_s, dtype=np.float64) / 3600.0, np.asarray(values, dtype=np.float64)
+    if t.size < 2 * BLOCKS:
+        return float("nan"), float("nan")
+    x = np.array([block.mean() for block in np.array_split(t, BLOCKS)])
+    z = np.array([of(block) for block in np.array_split(y, BLOCKS)])
+    x -= x.mean()
+    gain = float(x @ z / (x @ x))
+    left = z - z.mean() - gain * x
+    return gain, float(np.sqrt(left @ left / (BLOCKS - 2) / (x @ x)))
+
+
 def sample(processes: Mapping[str, psutil.Process], into: Mapping[str, Series]) -> None:
     """Adds what each process holds now."""
     for name, process in processes.items():
         with contextlib.suppress(psutil.NoSuchProcess), process.oneshot():
+            into[name].t_s.append(time.monotonic())
             into[name].mib.append(process.memory_info().rss / 2**20)
             into[name].descriptors.append(process.num_fds())
             into[name].pids.add(process.pid)
@@ -124,12 +154,15 @@ def faults(series: Mapping[str, Series], summary: dict[str, Any], systemd: Syste
         yield f"the supervisor missed its watchdog {systemd.missed} times"
 
 
-def ages(found_ms: Sequence[float]) -> tuple[str, list[str]]:
+def ages(found: Ages) -> tuple[str, list[str]]:
     """Of estimates after the first minute: p50 and p99 in the first and the last quarter, and what is not well."""
-    quarter = max(1, len(found_ms) // 4)
-    p50, p99 = np.percentile(found_ms[:quarter], (50, 99))
-    end_p50, end_p99 = np.percentile(found_ms[-quarter:], (50, 99))
+    quarter = max(1, len(found.ms) // 4)
+    p50, p99 = np.percentile(found.ms[:quarter], (50, 99))
+    end_p50, end_p99 = np.percentile(found.ms[-quarter:], (50, 99))
     said = f"age at the planner, first quarter p50 {p50:.1f}, p99 {p99:.1f} ms; last {end_p50:.1f}, {end_p99:.1f} ms"
+    for percent in (50, 99):
+        gain, sigma = slope(found.t_s, found.ms, partial(np.percentile, q=percent))
+        said += f"; p{percent} {gain:+.1f} +- {sigma:.1f} ms an hour"
     grew = end_p50 > (1.0 + AGE_GROWTH) * p50
     return said, [f"the age grew from {p50:.1f} to {end_p50:.1f} ms in the median"] if grew else []
 
@@ -144,20 +177,25 @@ def table(series: Mapping[str, Series], summary: dict[str, Any], systemd: System
     """For a person."""
     begun_anew = restarts(summary) | {"supervisor": systemd.missed}
     dropped = summary["dropped_by"] | {"record": summary.get("recording", {}).get("dropped", 0)}
-    columns = "MiB at 1 min", "MiB at end", "growth", "descriptors", "watchdogs missed", "drops"
+    columns = (
+        *("MiB at 1 min", "MiB at end", "growth", "MiB an hour", "descriptors", "descriptors an hour"),
+        *("watchdogs missed", "drops"),
+    )
     lines = ["| process | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for name, one in series.items():
         before, after = one.ends()
+        mib, descriptors = slope(one.t_s, one.mib), slope(one.t_s, one.descriptors)
         cells = (
-            *(f"{before:.1f}", f"{after:.1f}", f"{one.growth:+.2%}", f"{one.descriptors[0]} -> {one.descriptors[-1]}"),
+            *(f"{before:.1f}", f"{after:.1f}", f"{one.growth:+.2%}", "{:+.2f} +- {:.2f}".format(*mib)),
+            *(f"{one.descriptors[0]} -> {one.descriptors[-1]}", "{:+.2f} +- {:.2f}".format(*descriptors)),
             *(str(begun_anew.get(name, "")), str(dropped.get(name, ""))),
         )
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
-def drive(vehicle: Vehicle, minutes: float) -> tuple[dict[str, Series], list[float]]:
-    """Samples until the time is over, and the ages of estimates in ms; both after the first minute.
+def drive(vehicle: Vehicle, minutes: float) -> tuple[dict[str, Series], Ages]:
+    """Samples until the time is over, and the ages of estimates; both after the first minute.
 
     Raises RuntimeError where the run ends before.
     """
@@ -165,12 +203,13 @@ def drive(vehicle: Vehicle, minutes: float) -> tuple[dict[str, Series], list[flo
     until_s = begun_s + max(60.0 * minutes, WARM_S + 2 * SAMPLE_S)
     due_s, said_s, frames = begun_s + WARM_S, begun_s, 0
     series: dict[str, Series] = defaultdict(Series)
-    ages_ms: list[float] = []
+    found = Ages()
     while (now_s := time.monotonic()) < until_s:
         estimate = vehicle.planner.wait(1.0)
         frames += estimate is not None
         if estimate is not None and now_s >= begun_s + WARM_S:
-            ages_ms.append((time.monotonic_ns() - estimate.t_capture_ns) / 1e6)
+            found.t_s.append(now_s)
+            found.ms.append((time.monotonic_ns() - estimate.t_capture_ns) / 1e6)
         if vehicle.process.poll() is not None:
             raise RuntimeError(f"the run has ended by itself: {(vehicle.place / 'run.log').read_text()[-1000:]}")
         if now_s >= due_s:
@@ -180,7 +219,7 @@ def drive(vehicle: Vehicle, minutes: float) -> tuple[dict[str, Series], list[flo
             said_s += SAID_S
             held = ", ".join(f"{name} {one.mib[-1]:.1f} ({one.growth:+.2%})" for name, one in series.items())
             print(f"{(now_s - begun_s) / 60.0:5.1f} min  {frames} estimates  {held or 'warming up'}", flush=True)
-    return dict(series), ages_ms
+    return dict(series), found
 
 
 def run(arguments: list[str]) -> int:
@@ -189,6 +228,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--rate", type=float, default=33.0, metavar="HZ")
     parser.add_argument("--source", default="", metavar="URI", help="goes round and round; left out: a software camera")
+    parser.add_argument("--map", action="store_true", help="localised in a map that it makes")
     parser.add_argument("--record", action="store_true", help="with a recorder beside it")
     parser.add_argument("--models", type=Path, help="folder of networks")
     options, more = parser.parse_known_args(arguments)
@@ -197,9 +237,10 @@ def run(arguments: list[str]) -> int:
         place = Path(folder)
         recorded = record_options(place) if options.record else []
         os.environ.update(systemd.environment)
-        extra = [*model_options(options.models), *recorded, *more]
+        mapped = ["--set", f"results.map={place / 'soak.map'}"] if options.map else []
+        extra = [*model_options(options.models), *recorded, *mapped, *more]
         with Vehicle(place, *extra, rate_hz=options.rate, source=options.source) as vehicle:
-            series, ages_ms = drive(vehicle, options.minutes)
+            series, found_ages = drive(vehicle, options.minutes)
             status = vehicle.stop()
             summary = json.loads((vehicle.output / "summary.json").read_text())
     print(table(series, summary, systemd))
@@ -207,7 +248,7 @@ def run(arguments: list[str]) -> int:
         f"frames {summary['frames_in']}, rate {summary['rate_hz']} Hz, age {summary['age_ms']} ms, {summary['budget']}"
     )
     print(f"longest silence of the supervisor's watchdog: {systemd.longest_s:.1f} s of {WATCHDOG_S:g}")
-    said, late = ages(ages_ms)
+    said, late = ages(found_ages)
     print(said)
     found = [*faults(series, summary, systemd), *late, *([f"the run ended with status {status}"] if status else [])]
     for line in found:

@@ -26,6 +26,7 @@ from birdslam.loops.gnss.files import GnssError
 from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_file import MapError
 from birdslam.loops.map_pose import MapPose
+from birdslam.outputs.placed import Place, write_places
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.environment import USER_ERROR_STATUS
 from birdslam.runtime.maps.drive_earth import write_earth
@@ -99,17 +100,18 @@ class LiveMap:
             log.warning("where the map process had come to is not known: %s", error)
 
     def turn(self, timeout_s: float) -> bool:
-        """Takes up what has come; whether an estimate has."""
-        first = self._estimates.recv(timeout_s)
+        """Takes up one estimate, and the images that have come; whether there was one.
+
+        One, so that a process that can't keep up reports, saves and beats like any other.
+        """
+        message = self._estimates.recv(timeout_s)
         self._take_images()
-        message = first
-        while message is not None and not self.ended:
+        if message is not None and not self.ended:
             estimate: Estimate = message.record
             if Status.END_OF_SOURCE in estimate.status:
                 self.ended = True
             else:
                 self._step(estimate)
-            message = self._estimates.recv(0.0)
         now_ns = time.monotonic_ns()
         if now_ns - self._reported_ns >= HEALTH_NS:
             self._report(now_ns)
@@ -117,7 +119,7 @@ class LiveMap:
             self._save()
         self._vitals.count(frames=self._stepped, torn=self.torn, looks=self.looks)
         self._vitals.beat()
-        return first is not None
+        return message is not None
 
     def _take_images(self) -> None:
         """Pixels stay in the ring for a few frames only; of those that will not be looked at none is copied."""
@@ -229,8 +231,9 @@ class LiveMap:
             reason = f"{self._output}: can't be written: {failure.strerror}"
         try:
             summary["map"] = self._drive.summary()
-            self._come_to_earth(summary)
+            places = self._come_to_earth(summary)
             self._drive.write(summary["map"])
+            write_places(self._output, places)
         except (MapError, OSError) as failure:
             reason = str(failure)
         if reason:
@@ -241,20 +244,22 @@ class LiveMap:
             reason = reason or f"{self._output}: can't be written: {failure.strerror}"
         return reason
 
-    def _come_to_earth(self, summary: dict[str, Any]) -> None:
-        """What is wrong with the fixes costs the map nothing."""
+    def _come_to_earth(self, summary: dict[str, Any]) -> list[Place]:
+        """The drive's places. What is wrong with the fixes costs the map nothing."""
         fixes: Fixes | list[GnssFix] | None = self._recorded
         if self._receiver is not None:
             fixes = [*self._fixes, *self._receiver.take(self._clock_ns)]
             self._receiver.close()
         if fixes is None:
-            return
+            return self._drive.places
         assert self._config.camera is not None
         try:
-            poses = self._drive.poses
-            summary["earth"] = write_earth(fixes, poses, self._config.camera, self._output, self._drive.map)
+            places = self._drive.places
+            summary["earth"], places = write_earth(fixes, places, self._config.camera, self._output, self._drive.map)
+            return places
         except (GnssError, EarthError) as error:
             log.warning("the drive is not on Earth: %s", error)
+            return self._drive.places
 
 
 def localise(configuration: Configuration, assignment: Assignment, vitals: Vitals, stop: Stop) -> int:

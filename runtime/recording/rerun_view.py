@@ -229,22 +229,24 @@ def _blueprint() -> Any:
     )
 
 
-def _stream(save: Path | None) -> Any:
-    """Where it goes: a file, or the viewer, which is started. Raises ConfigurationError where neither can be."""
+def _stream(to: Path | str | None) -> Any:
+    """Where it goes: a file, a server, or the viewer, which is started. Raises ConfigurationError where none can be."""
     stream = rr.RecordingStream(APPLICATION)
     try:
-        if save is not None:
-            stream.save(save)
+        if isinstance(to, str):
+            stream.connect_grpc(to)
+        elif to is not None:
+            stream.save(to)
         else:
             stream.spawn()
     except (RuntimeError, OSError) as error:
-        raise ConfigurationError(f"view: {error}; without a display: --save FILE.rrd") from None
+        raise ConfigurationError(f"view: {error}; without a display: --save FILE.rrd or --web") from None
     return stream
 
 
-def show_recording(recording: Recording, save: Path | None) -> None:
-    """Sends a whole recording to rerun's viewer, or with `save` to a file. Raises ConfigurationError."""
-    stream = _stream(save)
+def show_recording(recording: Recording, to: Path | str | None) -> None:
+    """Sends a whole recording to rerun's viewer, or `to` a file or a server's URL. Raises ConfigurationError."""
+    stream = _stream(to)
     send_recording(recording, Viewer(stream))
     stream.flush()
     stream.disconnect()
@@ -270,9 +272,9 @@ def send_recording(recording: Recording, viewer: Viewer) -> None:
             viewer.map(decode(message.data, MapUpdate))
 
 
-def show_live(vehicle: str, runtime_dir: Path | None, save: Path | None, seconds: float | None) -> bool:
+def show_live(vehicle: str, runtime_dir: Path | None, to: Path | str | None, seconds: float | None) -> bool:
     """What goes on now, until the source ends, or for some seconds; gives whether anything came."""
-    stream = _stream(save)
+    stream = _stream(to)
     viewer = Viewer(stream)
     with Bus(vehicle, f"view-{os.getpid()}", runtime_dir=runtime_dir) as bus:
         _ask_camera(bus, viewer)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
+
+from birdslam.loops.map_pose import MapPose
 from birdslam.ros.bag_writer import BagWriter, Storage
 from birdslam.ros.messages import RosMessages, t_of
 from birdslam.runtime.configuration import SourceConfig
@@ -26,10 +30,13 @@ def write_bag(recording: Recording, directory: Path, storage: Storage) -> int:
         vehicle = str(recording.about.configuration.get("vehicle", ""))
         messages = RosMessages(bag.make, recording.camera, vehicle, keep_path=True)
         motion: EgoEdge | None = None
+        map_poses = _MapPoses(recording)
         for record in recorded_drive([recording]):
             if isinstance(record, Estimate):
                 t_ns = t_of(record, live)
                 sent = [*([] if frames else [messages.fixed(t_ns)]), *messages.of_estimate(record, t_ns, motion)]
+                for pose in map_poses.until(record.frame_id):
+                    sent += messages.of_map_pose(pose, t_of(pose, live))
                 frames, motion = frames + 1, None
             elif isinstance(record, MapUpdate):
                 sent = list(messages.of_map(record, t_ns))
@@ -42,3 +49,17 @@ def write_bag(recording: Recording, directory: Path, storage: Storage) -> int:
         for topic, message in messages.path():
             bag.write(topic, message, t_ns)
     return frames
+
+
+class _MapPoses:
+    """A recording's poses in the map, frame by frame."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._rest = (msgspec.json.decode(one.data, type=MapPose) for one in recording.messages(("/map_pose",)))
+        self._next = next(self._rest, None)
+
+    def until(self, frame_id: int) -> Iterator[MapPose]:
+        """Those up to a frame that were not given yet."""
+        while self._next is not None and self._next.frame_id <= frame_id:
+            yield self._next
+            self._next = next(self._rest, None)

@@ -15,7 +15,8 @@ import msgspec
 import zenoh
 
 from birdslam.geometry.camera import Camera
-from birdslam.ros.messages import LATCHED, TOPICS, Level, RosMessages, Sent, t_of
+from birdslam.ros.messages import LATCHED, TOPICS, RosMessages, t_of
+from birdslam.ros.parts import Level, Sent
 from birdslam.ros.rmw_zenoh import LATCHED_QOS, Qos
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.process import signals
@@ -54,6 +55,7 @@ class RosBridge(Closing):
         self._estimates = self._bus.subscriber("estimate", _DEPTH)
         self._measurements = self._bus.subscriber("measurements", _DEPTH)
         self._maps = self._bus.subscriber("map")
+        self._map_poses = self._bus.subscriber("map_pose")
         self._healths = {name: self._bus.subscriber(f"health/{name}") for name in PROCESSES}
         self._messages: RosMessages | None = None
         self._motions: dict[int, EgoEdge] = {}  # by the frame that each leads to
@@ -125,6 +127,9 @@ class RosBridge(Closing):
             if self._messages is not None:
                 for sent in self._messages.of_map(update, time.time_ns()):
                     self._send(sent)
+        if (newest := self._map_poses.recv(0.0)) is not None and self._messages is not None:
+            for sent in self._messages.of_map_pose(newest.record, t_of(newest.record, live=True)):
+                self._send(sent)
 
     def _say_healths(self) -> None:
         for subscriber in self._healths.values():

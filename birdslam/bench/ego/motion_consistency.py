@@ -3,7 +3,7 @@
 A pose's own consistency (`consistency.py`) is that after the alignment of the first poses, which KITTI's first poses
 spoil. Here each motion is held to the truth's motion between the same frames, and so are stretches of STRETCH_M, which
 the pose graph makes of the motions alone (over those the error of the scale lasts). What the truth itself is worth is
-measured on the truth alone (`truth_quality.py`), and told beside the plain figures.
+measured on the truth alone (`truth_quality.py`), and printed beside the plain figures.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Motions:
         """Against `T_first_i` (N, 4, 4) of the camera in its own axes, of all frames of the recording.
 
         `exact`: the motions were simulated from these very poses, which have no noise of their own and no
-        interpolated steps then. None where not every frame has told its measurements.
+        interpolated steps then. None where not every frame has reported its measurements.
         """
         if len(self._t_ns) != len(truth):
             return None

@@ -133,7 +133,7 @@ def _without_vv(base: Live) -> Live:
 
 
 def _without_cv(base: Live) -> Live:
-    """Nor CP edges of vehicles, which tell once more what the CV edges told."""
+    """Nor CP edges of vehicles, which repeat what the CV edges measured."""
     if base.weights.mode == "paper":
         return _reweighted(base, cv_near=NO_WEIGHT, cv_far=NO_WEIGHT, cp_vehicles=None)
     return replace(base, cv_inflation=1.0 / NO_WEIGHT)

@@ -31,7 +31,7 @@ class FalseMover(msgspec.Struct, frozen=True, kw_only=True):
     frame: int
     x_m: float  # ahead of the ego
     y_m: float
-    told_mps: float
+    reported_mps: float
     sights: int  # at which it was reported so
 
 
@@ -43,7 +43,7 @@ class MoversRow(msgspec.Struct, frozen=True, kw_only=True):
     standing: int
     false: tuple[FalseMover, ...]
     driving: int
-    told: int
+    reported: int
     soon: int
 
 
@@ -72,7 +72,7 @@ def movers_row(
         standing=len(standing),
         false=tuple(one for one in found if one is not None),
         driving=len(driving),
-        told=sum(math.isfinite(delay) for delay in driving),
+        reported=sum(math.isfinite(delay) for delay in driving),
         soon=sum(delay <= SOON_S for delay in driving),
     )
 
@@ -116,13 +116,13 @@ def _false_mover(
         frame=frame,
         x_m=at.x_m,
         y_m=at.y_m,
-        told_mps=math.hypot(*estimate.velocity_mps),
+        reported_mps=math.hypot(*estimate.velocity_mps),
         sights=len(reported),
     )
 
 
 def _delay_s(seen: Sequence[tuple[int, float, VehicleEstimate]]) -> float | None:
-    """From the first sight of it driving until it is told so, inf: never; None: it never drove for as long."""
+    """From the first sight of it driving until it is reported so, inf: never; None: it never drove for as long."""
     drives = [frame for frame, speed, _ in seen if speed > DRIVES_MPS]
     if len(drives) < SOON_S * KITTI_RATE_HZ:
         return None

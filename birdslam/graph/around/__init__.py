@@ -1,1 +1,1 @@
-"""What is told of those around the ego beside the joint graph: people, closest approaches, the road that is hidden."""
+"""Those around the ego beside the joint graph: people, closest approaches, the road that is hidden."""

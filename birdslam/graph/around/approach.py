@@ -13,10 +13,10 @@ from birdslam.geometry.arrays import Floats
 from birdslam.graph.costs import Complexes
 from birdslam.types import Approach
 
-HORIZON_S = 30.0  # a later approach is told as it would be then
+HORIZON_S = 30.0  # a later approach is reported as it would be then
 NEARBY_S, NEARBY_M, NEARBY_SIGMA = 5.0, 2.0, 2.0
 SLOWEST_MPS2 = 0.01  # a squared velocity below it is none
-MOST = 1e9  # of any number that is told
+MOST = 1e9  # of any number that is reported
 
 
 def approaches(p: Complexes, v: Complexes, means: Floats, deviators: Complexes) -> list[Approach]:
@@ -31,15 +31,18 @@ def approaches(p: Complexes, v: Complexes, means: Floats, deviators: Complexes) 
     time = np.minimum(np.maximum(free, 0.0), HORIZON_S)
     at = p + v * time
     distance = np.abs(at)
-    towards = at / np.maximum(distance, 1e-6)
     # How time goes with p and v, and distance with them: a variance a'Ca is m |a|^2 + Re(d* a^2)
-    a = np.array([[v / square, (p + 2.0 * free * v) / square], [towards, towards * time]])
-    variances = means * (a * a.conj()).real + (deviators.conj() * a * a).real
-    sigma_s, sigma_m = np.sqrt(np.maximum(variances.sum(axis=1), 0.0))
-    sigma_s[(free <= 0.0) | (free >= HORIZON_S)] = 0.0
+    a = np.empty((2, 2, len(p)), np.complex128)
+    a[0] = v, p + 2.0 * free * v
+    a[0] /= square
+    a[1] = at / np.maximum(distance, 1e-6)  # towards them
+    a[1, 1] *= time
+    variances = means * (a.real**2 + a.imag**2) + (deviators.conj() * a * a).real
+    sigma_s, sigma_m = np.sqrt(np.maximum(variances[:, 0] + variances[:, 1], 0.0))
+    sigma_s *= free == time
     soon = (time <= NEARBY_S) & (distance - NEARBY_SIGMA * sigma_m <= NEARBY_M)
-    rows = np.minimum([time, sigma_s, distance, sigma_m], MOST).tolist()
+    rows = np.minimum(np.array([time, sigma_s, distance, sigma_m]), MOST).T.tolist()
     return [
         Approach(time_s=t, sigma_s=s, distance_m=d, sigma_m=e, nearby=near)
-        for t, s, d, e, near in zip(*rows, soon.tolist(), strict=True)
+        for (t, s, d, e), near in zip(rows, soon.tolist(), strict=True)
     ]

@@ -7,6 +7,7 @@ the ego's covariance, and where frames bring no picture the way that they went o
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from itertools import chain
@@ -22,7 +23,6 @@ MOST = 60  # the nearest; a message and a frame's time have their limits
 YAW_UNKNOWN = math.pi**2 / 3.0  # the variance of a direction of which nothing is known
 CHANGE_MPS = 0.8  # 1-sigma by which a velocity changes within a second, as in `people_config.Sizes`
 TURNS_MPS = 0.5  # who moves slower has no yaw
-AS_COMPLEX = np.array([1.0, 1.0j])
 FARTHEST_M, FASTEST_MPS = 1e4, 1e3  # somebody beyond is no person, but numbers that no front end made
 _LIMITS = np.repeat([FARTHEST_M, FASTEST_MPS, FARTHEST_M**2, FASTEST_MPS**2], [2, 2, 4, 4])
 
@@ -30,9 +30,9 @@ _LIMITS = np.repeat([FARTHEST_M, FASTEST_MPS, FARTHEST_M**2, FASTEST_MPS**2], [2
 def people_estimates(
     people: Sequence[FollowedPerson], since_s: float, world: SE2, ego_cov: Floats, ego_mps: complex, way: SE2
 ) -> tuple[RoadUser, ...]:
-    """Everybody in world, `since_s` after they were told of in the ego's axes, over which the ego went on by `way`.
+    """Everybody in world, `since_s` after they were seen in the ego's axes, over which the ego went on by `way`.
 
-    `world` is T_world_ego when they were told of, `ego_cov` (3, 3) of its tangent; `ego_mps` is the ego's velocity.
+    `world` is T_world_ego when they were seen, `ego_cov` (3, 3) of its tangent; `ego_mps` is the ego's velocity.
     """
     if not people:
         return ()
@@ -44,35 +44,36 @@ def people_estimates(
         nearest = sorted(np.flatnonzero(sane).tolist(), key=lambda k: (away_m[k], people[k].person))[:MOST]
         kept = sorted(nearest, key=lambda k: people[k].person)
         people, table = [people[k] for k in kept], table[kept]
-    p, v = table[:, :2], table[:, 2:4]
-    P, U = table[:, 4:8].reshape(-1, 2, 2), table[:, 8:].reshape(-1, 2, 2)
+    p, v = np.ascontiguousarray(table[:, :4]).view(np.complex128).T
+    xx, xy, yy = (table[:, first::4].T for first in (4, 5, 7))
+    means, deviators = 0.5 * (xx + yy), 0.5 * (xx - yy) + 1j * xy  # of place and velocity, as costs.py has them
     if since_s > 0.0:
         p = p + v * since_s
-        P = P + U * since_s**2 + np.eye(2) * (CHANGE_MPS**2 * since_s**3 / 3.0)
-        U = U + np.eye(2) * (CHANGE_MPS**2 * since_s)
-    both = np.array([P, U])
-    means = 0.5 * (both[..., 0, 0] + both[..., 1, 1])
-    deviators = 0.5 * (both[..., 0, 0] - both[..., 1, 1]) + 1j * both[..., 0, 1]
-    near = approaches(p @ AS_COMPLEX - complex(way.x_m, way.y_m), v @ AS_COMPLEX - ego_mps, means, deviators)
+        means[0] += means[1] * since_s**2 + CHANGE_MPS**2 * since_s**3 / 3.0
+        deviators[0] += deviators[1] * since_s**2
+        means[1] += CHANGE_MPS**2 * since_s
+    near = approaches(p - complex(way.x_m, way.y_m), v - ego_mps, means, deviators)
+    speed = np.abs(v)
+    heading = np.where(speed > TURNS_MPS, v / np.maximum(speed, TURNS_MPS), 1.0)  # against the ego
     # The ego's error moves everybody: by its place, and by its yaw the more the farther they are
-    J = np.zeros((len(p), 2, 3))
-    J[:, 0, 0] = J[:, 1, 1] = 1.0
-    J[:, 0, 2], J[:, 1, 2] = -p[:, 1], p[:, 0]
-    P = P + J @ ego_cov @ J.transpose(0, 2, 1)
-    across = np.stack([-v[:, 1], v[:, 0]], axis=1)
-    U = U + max(float(ego_cov[2, 2]), 0.0) * across[:, :, None] * across[:, None, :]
-    speed = np.hypot(v[:, 0], v[:, 1])
-    heading = np.where(speed > TURNS_MPS, np.arctan2(v[:, 1], v[:, 0]), 0.0)  # against the ego
-    c, s = np.cos(heading), np.sin(heading)
-    R_ego_own = np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)
-    own = (R_ego_own.transpose(0, 2, 1) @ P @ R_ego_own).tolist()
-    sideways = (across[:, None, :] @ U @ across[:, :, None])[:, 0, 0] / np.maximum(speed, TURNS_MPS) ** 4
-    yaw_var = np.where(speed > TURNS_MPS, np.minimum(sideways, YAW_UNKNOWN), YAW_UNKNOWN).tolist()
-    R = world.rotation()
-    in_world, velocity = (world @ p).tolist(), (v @ R.T).tolist()
-    velocity_cov = (R @ U @ R.T).tolist()
+    (exx, exy, ext), (_, eyy, eyt), (*_, ett) = ego_cov.tolist()
+    yaw_var, with_yaw = max(ett, 0.0), complex(ext, eyt)
+    lever, across = levers = 1j * np.array([p, v])
+    means += 0.5 * yaw_var * (levers.real**2 + levers.imag**2)
+    deviators += 0.5 * yaw_var * levers * levers
+    means[0] += 0.5 * (exx + eyy) + (lever.conj() * with_yaw).real
+    deviators[0] += complex(0.5 * (exx - eyy), exy) + lever * with_yaw
+    along = deviators[0] * (heading * heading).conj()  # in their own axes
+    sideways = means[1] * speed**2 + (deviators[1].conj() * across * across).real
+    yaw_vars = np.where(speed > TURNS_MPS, sideways / np.maximum(speed, TURNS_MPS) ** 4, YAW_UNKNOWN)
+    turn = cmath.rect(1.0, world.yaw_rad)
+    at, velocity, turning = p * turn + complex(world.x_m, world.y_m), v * turn, deviators[1] * turn * turn
+    columns = (
+        at.real, at.imag, velocity.real, velocity.imag, np.angle(heading * turn), np.minimum(yaw_vars, YAW_UNKNOWN),
+        means[0] + along.real, along.imag, means[0] - along.real,
+        means[1] + turning.real, turning.imag, means[1] - turning.real,
+    )  # fmt: skip
     later_ns = round(since_s * 1e9)
-    yaws = np.arctan2(np.sin(heading + world.yaw_rad), np.cos(heading + world.yaw_rad)).tolist()
     return tuple(
         RoadUser(
             vehicle=f.person,
@@ -93,7 +94,7 @@ def people_estimates(
             child=f.child,
             approach=approach,
         )
-        for f, (x, y), (vx, vy), ((xx, xy), (_, yy)), ((uxx, uxy), (_, uyy)), yaw_rad, yaw, approach in zip(
-            people, in_world, velocity, own, velocity_cov, yaws, yaw_var, near, strict=True
+        for f, approach, (x, y, vx, vy, yaw_rad, yaw, xx, xy, yy, uxx, uxy, uyy) in zip(
+            people, near, np.array(columns).T.tolist(), strict=True
         )
     )

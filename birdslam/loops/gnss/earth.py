@@ -25,7 +25,7 @@ DELAY_SIGMA_S = 0.5
 WINDOW_S, MOST_WINDOWS = 60.0, 10  # in which fixes are compared with odometry for their delay
 ITERATIONS, WINDOW_ITERATIONS = 30, 16
 DEFAULT_SIGMA_M = 5.0  # of a fix that does not say its own
-HINT_SIGMAS, HINT_REL = 3.0, 0.02  # a wrong height is told where it is that sure, and that large
+HINT_SIGMAS, HINT_REL = 3.0, 0.02  # a wrong height is reported where it is that sure, and that large
 
 
 class GnssFix(msgspec.Struct, frozen=True, kw_only=True):

@@ -22,7 +22,7 @@ class NmeaReader:
 
     @property
     def waits(self) -> str:
-        """The time, as it was told, of the fix at hand; "": there is none."""
+        """The time, as it was sent, of the fix at hand; "": there is none."""
         return "" if self._waiting is None else self._waiting[0]
 
     def take(self, line: str) -> Sentence | None:

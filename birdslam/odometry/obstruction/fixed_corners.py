@@ -2,7 +2,7 @@
 
 They agree perfectly with one another on no motion and are never lost, so that after some seconds they outvote the
 street. A corner of the street below the horizon must move at least as far as the road behind it, which the travelled
-distance gives. Above the horizon dirt can't be told from what is far away. So, where enough corners below the horizon
+distance gives. Above the horizon dirt looks like what is far away. So, where enough corners below the horizon
 are fixed, the windscreen is taken to be dirty, and fixed corners above the horizon are left out too.
 """
 

@@ -45,6 +45,10 @@ class MovingMedianScale:
         self._carried_m = 0.0  # travelled since a frame gave a scale
 
     @property
+    def bonnet_px(self) -> None:
+        """None: not looked for."""
+
+    @property
     def ground(self) -> GroundPlane:
         """The calibrated ground plane."""
         return self.camera.ground

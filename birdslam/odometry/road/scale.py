@@ -68,6 +68,12 @@ class RoadScale:
         self.vanishing_point: VanishingPoint | None = None  # of the newest image, where it was accepted
 
     @property
+    def bonnet_px(self) -> NDArray[np.float64] | None:
+        """(W, 2) the upper edge of the car's own bonnet in the image; None: none is seen."""
+        rows = self._bonnet.rows
+        return None if rows is None else np.column_stack([np.arange(len(rows)), rows]).astype(np.float64)
+
+    @property
     def ground(self) -> GroundPlane:
         """The present camera over the road; the height is the calibrated one, by which all lengths are measured."""
         pitch_rad, roll_rad = self._filter.chord[0]

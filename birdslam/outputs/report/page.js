@@ -8,12 +8,14 @@ const config = { responsive: true, displaylogo: false, scrollZoom: true };
 const here = { name: "now", type: "scatter", mode: "markers", x: [data.x[0]], y: [data.y[0]], hoverinfo: "skip",
   marker: { size: 15, symbol: "circle-open", line: { width: 3 }, color: "#e8487f" } };
 
+const below = { orientation: "h", yref: "container", y: 0, yanchor: "bottom" };
+
 function layout(more) {
   const style = getComputedStyle(document.documentElement);
   const [ink, line, faint] = ["--ink", "--line", "--faint"].map((name) => style.getPropertyValue(name).trim());
   const axis = { gridcolor: line, zerolinecolor: line, automargin: true };
   const out = { paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: ink },
-    margin: { l: 60, r: 15, t: 40, b: 50 }, modebar: { bgcolor: "rgba(0,0,0,0)", color: faint, activecolor: ink }, ...more };
+    margin: { l: 60, r: 15, t: 40, b: 60 }, modebar: { bgcolor: "rgba(0,0,0,0)", color: faint, activecolor: ink }, ...more };
   out.title = { text: more.title, font: { size: 14 }, x: 0.01, xanchor: "left" };
   out.xaxis = { ...axis, ...more.xaxis };
   out.yaxis = { ...axis, ...more.yaxis };
@@ -27,11 +29,11 @@ const moment = (t) => [{ type: "line", x0: t, x1: t, yref: "paper", y0: 0, y1: 1
 function draw() {
   const time = { title: { text: "time (s)" }, range: [0, last] };
   Plotly.react("map", [...data.map, here], layout({
-    title: "from above", legend: { orientation: "h", y: -0.2 },
+    title: "from above", legend: below,
     xaxis: { title: { text: "right of the start (m)" } },
     yaxis: { title: { text: "ahead of the start (m)" }, scaleanchor: "x", scaleratio: 1 } }), config);
   Plotly.react("speed", data.speeds, layout({
-    title: "speed (m/s)", legend: { orientation: "h", y: -0.32 },
+    title: "speed (m/s)", legend: below,
     xaxis: time, yaxis: { rangemode: "tozero" }, shapes: moment(data.t[slider.value]) }), config);
   Plotly.react("statuses", data.statuses, layout({
     title: "statuses", xaxis: time, shapes: moment(data.t[slider.value]),

@@ -47,7 +47,7 @@ class SsdDecoder(_ListDecoder):
     """Reads SSD outputs (see `manifest.Ssd`)."""
 
     def __init__(self, table: Ssd, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises Misfit where the outputs' shapes aren't what the manifest makes of them."""
+        """Raises ManifestMismatch where the outputs' shapes aren't what the manifest makes of them."""
         super().__init__(table, input)
         self.table = table
         priors = shapes[table.priors]
@@ -75,7 +75,7 @@ class BoxListDecoder(_ListDecoder):
     """Reads decoded boxes with a score for each class (see `manifest.BoxList`)."""
 
     def __init__(self, table: BoxList, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises Misfit where the outputs' shapes aren't what the manifest makes of them."""
+        """Raises ManifestMismatch where the outputs' shapes aren't what the manifest makes of them."""
         super().__init__(table, input)
         self.table = table
         wanted = {table.boxes: 4, table.scores: table.classes} if table.scores else {table.boxes: 4 + table.classes}

@@ -26,7 +26,7 @@ class CenterNetDecoder:
     """Reads CenterNet outputs (see `manifest.CenterNet`)."""
 
     def __init__(self, table: CenterNet, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises Misfit where the outputs' shapes aren't what the manifest makes of them."""
+        """Raises ManifestMismatch where the outputs' shapes aren't what the manifest makes of them."""
         self.table = table
         heat = shapes[table.heat_map]
         if len(heat) != 4 or heat[0] != 1:

@@ -83,7 +83,7 @@ class _MapDecoder(Generic[Table]):
     """Reads one map over the whole image."""
 
     def __init__(self, table: Table, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises Misfit where the output is no map."""
+        """Raises ManifestMismatch where the output is no map."""
         self.table: Table = table
         self.input = input
         _check_map(table.output, shapes[table.output])

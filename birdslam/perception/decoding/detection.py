@@ -80,7 +80,7 @@ class YoloxDecoder:
     """Reads YOLOX outputs (see `manifest.Yolox`)."""
 
     def __init__(self, table: Yolox, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises Misfit where the output's shape isn't what the manifest makes of it."""
+        """Raises ManifestMismatch where the output's shape isn't what the manifest makes of it."""
         self.table = table
         cells, strides = _grid(input.width_px, input.height_px, table.strides)
         shape = shapes[table.output]

@@ -69,7 +69,7 @@ class MultiTaskDecoder:
     """Reads the four outputs (see `manifest.MultiTask`). Depths stay canonical, and say so: no camera is known here."""
 
     def __init__(self, table: MultiTask, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises Misfit where an output's shape isn't what the manifest makes of it."""
+        """Raises ManifestMismatch where an output's shape isn't what the manifest makes of it."""
         self.table, self.input = table, input
         channels = (len(MASKS), 1, len(CLASSES), sum(BODY_CHANNELS.values()))
         for output, count in zip(OUTPUTS, channels, strict=True):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from birdslam.geometry.arrays import Bools, Floats32
+from birdslam.geometry.arrays import Bools, Floats, Floats32
 from birdslam.perception.manifest import ClassMap, ClassMaps, Input, ManifestMismatch, Meaning
 from birdslam.perception.views import View
 
@@ -20,12 +20,19 @@ class Segmentation:
     road: Bools
     lane: Bools
 
+    def above(self, edge_px: Floats) -> Segmentation:
+        """Without what lies below an edge (N, 2) from left to right."""
+        height, width = self.road.shape
+        last = np.interp(np.arange(width), *edge_px.T)
+        over = np.arange(height)[:, None] < last
+        return Segmentation(self.road & over, self.lane & over)
+
 
 class ClassMapsDecoder:
     """Reads class channels (see `manifest.ClassMaps`)."""
 
     def __init__(self, table: ClassMaps, input: Input, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raises Misfit where an output's shape isn't what the manifest makes of it."""
+        """Raises ManifestMismatch where an output's shape isn't what the manifest makes of it."""
         self.table, self.input = table, input
         for index, entry in enumerate(table.maps):
             shape = shapes[entry.output]

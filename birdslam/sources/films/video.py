@@ -21,7 +21,7 @@ from birdslam.sources.recording import DatasetError, RecordedFrame, Recording
 from birdslam.sources.schemes import VIDEO
 from birdslam.types import NS_PER_S
 
-GAP_NS = NS_PER_S  # a longer time between two frames is told as a frame without an image
+GAP_NS = NS_PER_S  # a longer time between two frames is reported as a frame without an image
 NAME_RESOLUTION_S = 2.0  # names tell times by the second, and each of two may be rounded
 _COUNTED = (".mp4", ".mov", ".m4v", ".avi", ".3gp")  # containers that say how many frames there are
 _USUAL_HZ = 1.0, 240.0  # a rate that a container states outside of these is measured

@@ -42,7 +42,7 @@ class HeadingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # turned by 10 to 70 degrees at their first sight of 25 px
     oblique: Share = 0.1
     sigma_across_rad: float = 0.2  # of those across the ego's way
-    bend_m: float = 5.0  # of the way, over which its bend is told
+    bend_m: float = 5.0  # of the way, over which its bend is known
     box_memory_s: float = 0.5  # for so long the width of a box has the same error
     least_width_rel: float = 0.03  # 1-sigma of a box's width, at least
 

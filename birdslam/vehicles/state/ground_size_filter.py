@@ -3,13 +3,8 @@
     x = [pitch, roll, crown, errors of the images' tilt, common size and edge,
          and of every vehicle: log h, log w, edge, tilt]      and, for one frame only, of every box: log z
 
-One Kalman filter holds them all; ground_measurements.py has the measurements.
-
-What is wrong for as long as a drive lasts is a state of the drive: by how much its vehicles are taller than their
-classes (size_prior.py), how low their boxes end, and by how much the tilt that images see before the ego is off where
-vehicles are. What is wrong with one vehicle for as long as it is in sight is a state of the vehicle, so that its many
-frames don't average it away: `edge` is by how much its box ends lower than the ego's plane at its face (m: the kerb,
-and where the detector draws its edge), `tilt` by how much the road at it is tilted against the ego's (rad).
+One Kalman filter holds them all. What is wrong as long as a drive or a track lasts is a state of the drive or of the
+track, so that many frames don't average it away. Measurements: ground_measurements.py; states: docs/vehicles.md.
 """
 
 from __future__ import annotations

@@ -2,11 +2,9 @@
 
     log h = log h_class + common + own,   own ~ t(dof, scale)
 
-Of cars one in thirty is over 15 % taller than its class, far more than a normal distribution of their spread has. A t
-is a normal distribution whose variance is scale^2 / w with an unknown weight w; given `own` the mean of that variance
-has w = (dof - 1) / (dof + E[own^2] / scale^2), which is the t's own variance where nothing is known of `own`. So each
-vehicle has its weight in the joint Kalman filter, and as its height is learned the weight that its prior was counted
-with is replaced by the new one: a change of information along `own`, whose inverse is of rank one (Sherman, Morrison).
+One car in thirty is over 15 % taller than its class: more than a normal distribution has. A t is a normal distribution
+of variance scale^2 / w, with the mean weight w = (dof - 1) / (dof + E[own^2] / scale^2) once `own` is known. As a
+height is learned, its prior's weight is replaced: a change of information of rank one (Sherman, Morrison).
 """
 
 from __future__ import annotations

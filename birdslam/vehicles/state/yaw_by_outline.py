@@ -1,13 +1,11 @@
-"""The yaw of a vehicle that neither motion nor body has told yet, by how wide it looks from all around.
+"""The yaw of a vehicle that neither motion nor body has given yet, by how wide its boxes are from all around.
 
-The width of a box measures how much a vehicle is turned, not to which side; as the ego drives by, the line of sight
-turns, and of the yaws that fitted one width only the true one fits them all. An outline's error (a longer car, a depth
-that is off) lasts for the whole track: with residuals r of variance w each and a lasting error of variance s2,
+One width has several yaws that fit, but as the ego drives by, only the true yaw fits all widths. With residuals r of
+variance w each and an error of the outline of variance s2 that lasts for the whole track (a longer car, a wrong depth),
 
-    -2 log L(yaw) = sum(r^2 / w) - s2 sum(r / w)^2 / (1 + s2 sum(1 / w)),
+    -2 log L(yaw) = sum(r^2 / w) - s2 sum(r / w)^2 / (1 + s2 sum(1 / w)).
 
-so that a thousand frames of the same sight tell no more than one. Before that, a vehicle stands along the ego's way or
-across it, and the surer so the straighter the road to it is.
+The prior has vehicles along the ego's way or across it, and is narrower where the road to them is straight.
 """
 
 from __future__ import annotations

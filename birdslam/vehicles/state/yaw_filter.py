@@ -14,7 +14,7 @@ from birdslam.vehicles.state.ground_size_filter import GroundSizeFilter
 from birdslam.vehicles.state.yaw_by_outline import YawByOutline
 from birdslam.vehicles.track import Track, TrackingConfig
 
-LEAST_TURN_RAD = 0.02  # a smaller turn is none, so that yaws that are not told don't quiver
+LEAST_TURN_RAD = 0.02  # a smaller turn is none, so that yaws that are not known don't quiver
 MOTION_LOGIT = 6.0  # log odds of the front of a vehicle that was seen to move
 
 
@@ -72,7 +72,7 @@ class YawFilter:
         self._correct(row, track, turn, (self.config.body_yaw_inflation * by_depth.sigma_yaw_rad) ** 2)
 
     def correct_by_outline(self, row: int, track: Track, outline: YawByOutline) -> None:
-        """To the likeliest yaw by its widths so far, while neither motion nor body has told it."""
+        """To the likeliest yaw by its widths so far, while neither motion nor body has given it."""
         if track.yaw_known or track.observation.cut_side:
             return
         yaw_rad, track.sigma_yaw_rad = outline.estimate(row, track.yaw_rad)

@@ -12,16 +12,33 @@ from birdslam.runtime.recording.recording import Recording
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What is shown, and where."""
     parser.add_argument("what", metavar=f"{RECORDING}|live")
-    parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a file for rerun instead of showing it")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a file for rerun instead of showing it")
+    text = "show it in a browser of this computer, and nobody else's, until Ctrl-C; default port: 9090"
+    where.add_argument("--web", type=int, nargs="?", const=9090, metavar="PORT", help=text)
     add_vehicle(parser)
     parser.add_argument("--seconds", type=float, metavar="S", help="of live: end after so long")
 
 
 def run(options: argparse.Namespace) -> int:
     """Shows it; 1 where nothing came from a vehicle."""
-    from birdslam.runtime.recording.rerun_view import show_live, show_recording  # rerun is an extra
+    if options.web is None:
+        return _show(options, options.save)
+    from birdslam.runtime.recording.rerun_web import WebViewer  # rerun is an extra
+
+    with WebViewer(options.web) as viewer:
+        print(f"open {viewer.page}", flush=True)
+        status = _show(options, viewer.data)
+        if options.seconds is None and not status:
+            print("it is over; Ctrl-C ends the viewer too", flush=True)
+            viewer.wait()
+    return status
+
+
+def _show(options: argparse.Namespace, to: Path | str | None) -> int:
+    from birdslam.runtime.recording.rerun_view import show_live, show_recording
 
     if options.what == "live":
-        return int(not show_live(options.vehicle, options.runtime_dir, options.save, options.seconds))
-    show_recording(Recording(Path(options.what)), options.save)
+        return int(not show_live(options.vehicle, options.runtime_dir, to, options.seconds))
+    show_recording(Recording(Path(options.what)), to)
     return 0

@@ -194,7 +194,7 @@ def vehicle(B, body, P):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def person(B, body, P, z_hip, lean, seated):  # type: ignore[no-untyped-def]
-    """Legs, trunk, arms and head of someone HEIGHT tall whose hip is at `z_hip`; clothes are told apart by face."""
+    """Legs, trunk, arms and head of someone HEIGHT tall whose hip is at `z_hip`; clothes are distinguished by face."""
     h = P[m.HEIGHT] if not seated else 1.75
     k = h / 1.75
     stride = 0.0 if seated else 0.32 * math.sin(P[m.PHASE])

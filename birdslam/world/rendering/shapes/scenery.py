@@ -1,13 +1,4 @@
-"""Meshes of what stands: buildings, trees, hedges, posts, signs, fences, bridges. Compiled by numba.
-
-Slots of the parameters from 8 on, by kind:
-BUILDING 8 roof rise, 9 storey height, 10 window spacing, 11 window width, 12 window height, 13 style,
-         14-16 roof colour, 17 balconies, 18 ground floor (0 plain, 1 shop, 2 garage), 19 shutters,
-         20 picture or -1, 21 chimney
-TREE 8 trunk height, 9 cards, 10 crown width, 11 first mask, 12 kind (0 crown, 1 bush, 2 conifer), 13-15 view direction
-POST 8 arm length, 9 lamps   SIGN 8 plate height, 9 shape (0 disc, 1 triangle, 2 square, 3 board), 10 plate width
-WALLING 8 kind (0 wall, 1 planks, 2 mesh, 3 guard rail)   CRATE 8 kind (0 container, 1 bin, 2 kiosk, 3 cabinet)
-"""
+"""Meshes of what stands: buildings, trees, hedges, posts, signs, fences, bridges. Compiled by numba."""
 
 from __future__ import annotations
 
@@ -17,6 +8,15 @@ from numba import njit
 
 from birdslam.world.rendering import materials as m
 from birdslam.world.rendering.shapes.solids import ball, begin, box, card, corner, gable, limb
+
+# Slots of the parameters from 8 on, by kind:
+# BUILDING 8 roof rise, 9 storey height, 10 window spacing, 11 window width, 12 window height, 13 style,
+#          14-16 roof colour, 17 balconies, 18 ground floor (0 plain, 1 shop, 2 garage), 19 shutters,
+#          20 picture or -1, 21 chimney
+# TREE 8 trunk height, 9 cards, 10 crown width, 11 first mask, 12 kind (0 crown, 1 bush, 2 conifer), 13-15 view
+#      direction
+# POST 8 arm length, 9 lamps   SIGN 8 plate height, 9 shape (0 disc, 1 triangle, 2 square, 3 board), 10 plate width
+# WALLING 8 kind (0 wall, 1 planks, 2 mesh, 3 guard rail)   CRATE 8 kind (0 container, 1 bin, 2 kiosk, 3 cabinet)
 
 
 @njit(cache=True, nogil=True)

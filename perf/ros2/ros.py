@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,13 +25,14 @@ from birdslam.geometry.se2 import SE2
 from birdslam.perf.errors import PerfError
 from birdslam.perf.processes import birdslam_command, free_port
 from birdslam.perf.reporting.arguments import benchmark_parser
+from birdslam.perf.reporting.figures import spread, spread_text
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.supervision.query_server import QueryServer
 from birdslam.runtime.transport.bus import Bus, Publisher
 from birdslam.types import NS_PER_S, Estimate, VehicleEstimate
 
 label = "a listener of ROS 2: messages lost, and their age"
-PEER = "birdslam.perf.latency.ros_peer"
+PEER = "birdslam.perf.ros2.ros_peer"
 VEHICLE = "ros-perf"
 HEARD = {
     "/birdslam/odometry": "nav_msgs/msg/Odometry",
@@ -40,6 +42,12 @@ HEARD = {
 LIMIT_S = 60.0
 LAST_S = 10.0  # for the last ones to come
 COV = tuple(np.diag([0.01, 0.01, 1e-4]).ravel().tolist())
+
+
+def check_peer() -> None:
+    """Raises PerfError where the other side is not installed."""
+    if importlib.util.find_spec("zenoh_ros2_sdk") is None:
+        raise PerfError("the other side is the package zenoh-ros2-sdk: pip install zenoh-ros2-sdk")
 
 
 @contextmanager
@@ -72,11 +80,24 @@ def estimate(frame: int, vehicles: int) -> Estimate:
     )  # fmt: skip
 
 
-class Heard:
-    """What a listener prints, read on a thread of its own: the ages of messages by topic, in ms."""
+class Told(NamedTuple):
+    """A message of a listener: its time, when it came (both UTC), and its fields."""
 
-    def __init__(self, listener: subprocess.Popen[str]) -> None:
-        self.ages: dict[str, list[float]] = {topic: [] for topic in HEARD}
+    t_ns: int
+    came_ns: int
+    message: dict[str, Any]
+
+    @property
+    def age_ms(self) -> float:
+        """When it came."""
+        return (self.came_ns - self.t_ns) / 1e6
+
+
+class Heard:
+    """What a listener prints, read on a thread of its own: messages by topic."""
+
+    def __init__(self, listener: subprocess.Popen[str], topics: Iterable[str]) -> None:
+        self.told: dict[str, list[Told]] = {topic: [] for topic in topics}
         self._since_ns = 0
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._read, args=(listener.stdout,), daemon=True)
@@ -87,23 +108,24 @@ class Heard:
             said = json.loads(line)
             message = said["message"]
             stamp = (message.get("header") or message["transforms"][0]["header"])["stamp"]
-            t_ns = stamp["sec"] * NS_PER_S + stamp["nanosec"]
+            told = Told(stamp["sec"] * NS_PER_S + stamp["nanosec"], said["came_ns"], message)
             with self._changed:
-                if t_ns >= self._since_ns:
-                    self.ages[said["topic"]].append((said["came_ns"] - t_ns) / 1e6)
+                if told.t_ns >= self._since_ns:
+                    self.told[said["topic"]].append(told)
                     self._changed.notify_all()
 
     def wait(self, count: int, timeout_s: float) -> bool:
         """Until so many of each topic were heard; False where they were not within the time."""
         with self._changed:
-            return self._changed.wait_for(lambda: min(map(len, self.ages.values())) >= count, timeout_s)
+            return self._changed.wait_for(lambda: min(map(len, self.told.values())) >= count, timeout_s)
 
-    def begin(self) -> None:
-        """From now on it counts, and only what was sent from now on."""
+    def begin(self) -> int:
+        """From now on it counts, and only what was sent from now on; gives that time."""
         with self._changed:
             self._since_ns = time.time_ns()
-            for found in self.ages.values():
+            for found in self.told.values():
                 found.clear()
+            return self._since_ns
 
 
 def run(arguments: list[str]) -> int:
@@ -113,8 +135,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--rate", type=float, default=33.0)
     parser.add_argument("--vehicles", type=int, default=10)
     options = parser.parse_args(arguments)
-    if importlib.util.find_spec("zenoh_ros2_sdk") is None:
-        raise PerfError("the listener is the package zenoh-ros2-sdk: pip install zenoh-ros2-sdk")
+    check_peer()
     port, camera = free_port(), Camera(640, 480, 500.0, 500.0, 320.0, 240.0, 1.5)
     frames = round(options.seconds * options.rate)
     with ExitStack() as stack:
@@ -130,14 +151,15 @@ def run(arguments: list[str]) -> int:
         stack.callback(bridge.kill)
         if not out.wait_matched(LIMIT_S):
             raise PerfError("birdslam ros did not begin")
-        heard = Heard(listener)
+        heard = Heard(listener, HEARD)
         _drive(out, heard, frames, options.rate, options.vehicles)
         bridge.terminate()
         bridge.wait(LIMIT_S)
-    for topic, found in heard.ages.items():
-        p50, p99 = np.percentile(found, (50, 99)) if found else (np.nan, np.nan)
-        print(f"{topic:24}heard {len(found)} of {frames}   age p50 {p50:5.1f}  p99 {p99:5.1f} ms")
-    return int(any(len(found) != frames for found in heard.ages.values()))
+    for topic, told in heard.told.items():
+        print(
+            f"{topic:24}heard {len(told)} of {frames}   age {spread_text(spread([one.age_ms for one in told]), 'ms')}"
+        )
+    return int(any(len(told) != frames for told in heard.told.values()))
 
 
 def _drive(out: Publisher, heard: Heard, frames: int, rate_hz: float, vehicles: int) -> None:
