@@ -20,7 +20,6 @@ from birdslam.loops.features import Features
 from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import PlaceMap
 from birdslam.loops.verification import Fix, locate
-from birdslam.trajectory import ego_pose, split_pose
 from birdslam.types import Attitude
 
 CANDIDATES = 6  # places that are verified by geometry in one frame
@@ -35,9 +34,9 @@ CHI2_GATE = 16.27  # of three degrees of freedom, 99.9 %
 FOLLOW_M = 12.0  # keyframes within it are looked for
 SEARCH_PX, MOST_SEARCH_PX = 25.0, 120.0
 FARTHEST_M = 1e5
-# What fixes of one map share: its points' scale (as odometry tells its own, docs/method.md), the camera's foot as the
-# car tilts by half a degree, and the mounting's yaw
-SHARED_SCALE_REL, SHARED_TILT_RAD, SHARED_YAW_RAD = 0.012, 0.008, LOOP_YAW_RAD
+# What fixes of one map share: its points' scale (as odometry tells its own, docs/method.md), and the mounting's yaw.
+# That the car tilts is no such error: a pose is of the camera's foot (foot.py)
+SHARED_SCALE_REL, SHARED_YAW_RAD = 0.012, LOOP_YAW_RAD
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +163,7 @@ class Localiser:
         if fix is None or fix.inliers < KEPT_INLIERS or fix.places < KEPT_PLACES:
             return None
         error = guess.between(fix.T_map_ego).log()
-        total = cov + fix.cov + shared(fix, self._camera)
+        total = cov + fix.cov + shared(fix)
         return fix if float(error @ np.linalg.solve(total, error)) < CHI2_GATE else None
 
     def _correct(self, fix: Fix) -> None:
@@ -174,8 +173,8 @@ class Localiser:
         self._T_map_ego = self._T_map_ego @ SE2.exp(gain @ error)
         self._cov = (np.eye(3) - gain) @ self._cov
         self._cov = 0.5 * (self._cov + self._cov.T)
-        self._shared = shared(fix, self._camera)
-        self.attitude = split_pose(fix.keyframe.T_map @ ego_pose(fix.T_keyframe_ego, fix.attitude))[1]
+        self._shared = shared(fix)
+        self.attitude = fix.attitude_in_map(self._camera)
         self.fix, self.since_fix_m = fix, 0.0
 
     def _recognise(self, features: Features, among: Bools | None) -> bool:
@@ -189,7 +188,7 @@ class Localiser:
             hypothesis.confirmed += 1
             enough = KIDNAPPED_CONFIRMATIONS if hypothesis.kidnapped else CONFIRMATIONS
             hypothesis.T_map_odom = fix.T_map_ego @ self._T_odom_ego.inverse()
-            hypothesis.cov = fix.cov + shared(fix, self._camera)
+            hypothesis.cov = fix.cov + shared(fix)
             if hypothesis.confirmed >= enough:
                 self.was_kidnapped = hypothesis.kidnapped
                 self._believe(fix)
@@ -203,7 +202,7 @@ class Localiser:
             if kidnapped and row in self.own_way_m:  # a street that looks like an earlier one
                 continue
             T_map_odom = found.T_map_ego @ self._T_odom_ego.inverse()
-            cov = found.cov + shared(found, self._camera)
+            cov = found.cov + shared(found)
             new = _Hypothesis(T_map_odom, cov, self.travelled_m, kidnapped=kidnapped)
             self._hypotheses = [*self._hypotheses, new][-HYPOTHESES:]
             break
@@ -221,8 +220,8 @@ class Localiser:
 
     def _believe(self, fix: Fix) -> None:
         self._T_map_ego, self._cov = fix.T_map_ego, fix.cov
-        self._shared = shared(fix, self._camera)
-        self.attitude = split_pose(fix.keyframe.T_map @ ego_pose(fix.T_keyframe_ego, fix.attitude))[1]
+        self._shared = shared(fix)
+        self.attitude = fix.attitude_in_map(self._camera)
         self.fix, self.since_fix_m = fix, 0.0
         self.map_epoch += 1
         self._hypotheses.clear()
@@ -233,9 +232,8 @@ def is_place(fix: Fix) -> bool:
     return fix.inliers >= FOUND_INLIERS and fix.places >= FOUND_PLACES and fix.inliers >= FOUND_SHARE * fix.matches
 
 
-def shared(fix: Fix, camera: Camera) -> Floats:
+def shared(fix: Fix) -> Floats:
     """(3, 3) covariance of what further fixes here will be wrong by as well."""
     x_m, y_m = fix.T_keyframe_ego.x_m, fix.T_keyframe_ego.y_m
     scale_m = SHARED_SCALE_REL * math.hypot(x_m, y_m)
-    foot_m = SHARED_TILT_RAD * camera.height_m
-    return np.diag([scale_m**2 + foot_m**2, scale_m**2 + foot_m**2, SHARED_YAW_RAD**2])
+    return np.diag([scale_m**2, scale_m**2, SHARED_YAW_RAD**2])

@@ -25,6 +25,7 @@ from birdslam.perf.__main__ import benchmark_modules
 from birdslam.perf.accuracy import films, overlays, tilt
 from birdslam.perf.cameras import lens
 from birdslam.perf.errors import PerfError
+from birdslam.perf.maps import loops
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import foxglove, leave_one_out, measured, results
 from birdslam.perf.reporting.arguments import benchmark_parser
@@ -141,6 +142,13 @@ PAGES: tuple[Derived | Page, ...] = (
         ("python -m birdslam.perf tilt --data {data} --output {out}/tilt.json",),
         {"docs/tilt.md": ("tilt.json", tilt.page)},
         (tilt.run, tilt.page),
+        SHIPPED,
+    ),
+    Page(
+        "loops",
+        ("python -m birdslam.perf loops --part recorded loop alike gnss size --data {data} --output {out}/loops.json",),
+        {"docs/loops.md": ("loops.json", loops.page)},
+        (loops.run, loops.page),
         SHIPPED,
     ),
     Page(

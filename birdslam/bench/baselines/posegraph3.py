@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import msgspec
@@ -60,7 +60,8 @@ class Convergence:
 
 def optimise_batch(log: Sequence[Measurements], config: BatchConfig) -> Trajectories:
     """The trajectories that minimise the graph, laid on the road. An empty log gives none."""
-    return solve_batch(log, config)[0]
+    found, ended = solve_batch(log, config, check=True)
+    return replace(found, converged=ended.converged)
 
 
 def solve_batch(
