@@ -188,7 +188,8 @@ def double_share(view: RoadView, points: LinePoints) -> float | None:
     rows, y_m = rows[fine := view.sigma_y_m[rows] < DOUBLE_PIXEL_M], points.y_m[fine]
     if len(rows) < LEAST_DOUBLE:
         return None
-    rows, y_m = (values[:: 1 + len(rows) // MOST_DOUBLE] for values in (rows, y_m))
+    every = 1 + len(rows) // MOST_DOUBLE
+    rows, y_m = rows[::every], y_m[::every]
     reach = round(2.0 * SIDE_M / LATTICE_M)
     middle = np.round((y_m - view.y_m[0]) / LATTICE_M).astype(np.int64)
     at = np.clip(middle[:, None] + np.arange(-reach, reach + 1), 0, len(view.y_m) - 1)
