@@ -28,6 +28,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 STATES = ROAD + 3  # log lambda, pitch, roll, curvature; the mount's pitch and roll; the drift of log lambda
 DRIFT = STATES - 1
 _NOTHING_KNOWN = 10.0  # 1-sigma of the log of a length of which nothing is known
+_WRONG_PITCH_SIGMAS = 2.0  # of the first direction of travel, where it shows that the camera file's pitch is wrong
 _MAX_FACTOR_SIGMAS = 1.5  # of the factor's prior; two rendered nights chose between 1.5 and 2
 CAR_FACTOR, CAR_DELAY, ROAD_ERROR = STATES, STATES + 1, STATES + 2  # with the car's own speed
 
@@ -107,9 +108,9 @@ class RoadFilter:
       (`update_alignment`); distances by the car's own speed (`update_car_speed`).
     - Readers: `RoadScale`, for the factor on all lengths, the ground plane and its sigma, and `MountChangeDetector`.
 
-    The mount is a state, so that its correlation with the tilt is known. So is the drift: it goes on for 100 m, and an
-    alignment, which trades length against pitch, would give most of each metre's to the pitch. The odometry is rescaled after each update, so
-    that log lambda is 0 between updates and only its variance is carried.
+    The mount is a state, so that its correlation with the tilt is known. So is the drift, which lasts: an alignment
+    trades length against pitch, and would give most of each metre's to the pitch. The odometry is rescaled after each
+    update, so that log lambda is 0 between updates and only its variance is carried.
     """
 
     def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:
@@ -246,11 +247,16 @@ class RoadFilter:
         H = np.zeros((1, len(self.x)))
         H[0, 1:3] = by_pitch @ d, by_roll @ d
         share = travelled_m / 1.0
-        # Over one metre: errors of the positions do not add up over many short steps
-        corners_rad = sigma_across_m / max(travelled_m, 1.0)
-        var = self.config.sigma_travel_rad**2 + self.config.travel_correlation_m * corners_rad**2
-        noise = np.array([[var / share]])
+        noise = np.array([[self._travel_var(travelled_m, sigma_across_m) / share]])
         self._update(np.array([-(normal @ d)]), H, noise)
+
+    def _travel_var(self, travelled_m: float, sigma_across_m: float) -> float:
+        """Of the direction of travel against the road, rad^2, over one metre.
+
+        Errors of the positions do not add up over many short steps.
+        """
+        corners_rad = sigma_across_m / max(travelled_m, 1.0)
+        return self.config.sigma_travel_rad**2 + self.config.travel_correlation_m * corners_rad**2
 
     def update_vanishing_point(self, vanishing_point: VanishingPoint) -> bool:
         """The vanishing point lies in the road, as the direction of travel does. False: rejected, other lines."""
@@ -267,18 +273,23 @@ class RoadFilter:
         self._update(np.array([innovation]), H, np.array([[var]]))
         return True
 
-    def initialise_pitch(self, t_prev_curr: Floats) -> None:
-        """Takes the pitch from the first direction of travel, where the camera file's is far off."""
+    def initialise_pitch(self, t_prev_curr: Floats, sigma_across_m: float) -> None:
+        """Takes the pitch from the first direction of travel, where the camera file's is far off.
+
+        `sigma_across_m` is as in `update_travel`: corners on drops show any direction, and no wrong file.
+        """
         length = float(np.linalg.norm(t_prev_curr))
         if length <= 0.0 or t_prev_curr[2] < 0.9 * length:
             return  # not forwards
         off_rad = float(np.arctan2(-t_prev_curr[1], t_prev_curr[2])) - float(self.x[1])
-        if abs(off_rad) < self.config.wrong_pitch_rad or abs(off_rad) > self.config.max_wrong_pitch_rad:
+        var = self._travel_var(length, sigma_across_m)
+        wrong_rad = max(self.config.wrong_pitch_rad, _WRONG_PITCH_SIGMAS * float(np.sqrt(var)))
+        if abs(off_rad) < wrong_rad or abs(off_rad) > self.config.max_wrong_pitch_rad:
             return
         self.cov[np.ix_([1, 4], [1, 4])] += off_rad**2
         H = np.zeros((1, len(self.x)))
         H[0, 1] = 1.0
-        self._update(np.array([off_rad]), H, np.array([[self.config.sigma_travel_rad**2]]))
+        self._update(np.array([off_rad]), H, np.array([[var]]))
 
     def innovation(self, fit: RoadFit) -> tuple[Floats, Floats, float]:
         """An alignment's innovation (4,), its noise (4, 4), and the innovation in sigmas."""
