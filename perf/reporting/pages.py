@@ -25,6 +25,7 @@ from birdslam.perf.__main__ import benchmark_modules
 from birdslam.perf.accuracy import films, overlays, tilt
 from birdslam.perf.cameras import lens
 from birdslam.perf.errors import PerfError
+from birdslam.perf.graph import agents, edges
 from birdslam.perf.maps import loops
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import foxglove, leave_one_out, measured, results
@@ -150,6 +151,19 @@ PAGES: tuple[Derived | Page, ...] = (
         {"docs/loops.md": ("loops.json", loops.page)},
         (loops.run, loops.page),
         SHIPPED,
+    ),
+    Page(
+        "edges",
+        (f"python -m birdslam.perf edges --data {{data}} --logs {{out}} {results.REAL} --output {{out}}/edges.json",),
+        {"docs/edges.md": ("edges.json", edges.page)},
+        (edges.run, edges.page),
+        NETWORKS,
+    ),
+    Page(
+        "agents",
+        ("python -m birdslam.perf agents --output {out}",),
+        {"docs/agents.md": ("agents.md", None), "docs/agents.png": ("agents.png", None)},
+        (agents.run,),
     ),
     Page(
         "films",
