@@ -80,7 +80,8 @@ def variants() -> dict[str, Variant]:
 
     moved = graph(vehicles_move_ego=True)
     gates = {"detection_gate_sigma": NO_GATE, "landmark_gate_sigma": NO_GATE}
-    bare = {"landmark_common_m": 0.0, "correlation_length_m": 0.0, "front_back_ambiguity": False}
+    apart = {"landmark_common_along_m": 0.0, "landmark_common_across_m": 0.0}
+    bare = {**apart, "correlation_length_m": 0.0, "front_back_ambiguity": False}
     found = {
         "default": Variant(base),
         "vehicles move the ego": moved,
@@ -99,6 +100,7 @@ def variants() -> dict[str, Variant]:
                 weights=msgspec.structs.replace(base.weights, leave_out=()),
             )
         ),
+        "landmarks share no error": graph(**apart),
         "without gates": graph(**gates),
         "gates alone": graph(**bare),
     }
