@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from birdslam.bench.tracking.by_class import people_page
 from birdslam.perf.__main__ import benchmark_modules
 from birdslam.perf.accuracy import films, overlays, tilt
 from birdslam.perf.cameras import lens
@@ -123,6 +124,18 @@ PAGES: tuple[Derived | Page, ...] = (
         (f"birdslam evaluate {results.PLACES} {leave_one_out.OPTIONS} --output {{out}}",),
         {leave_one_out.KEPT: ("leave_one_out.json", leave_one_out.kept)},
         (localisation.evaluate_left_out, leave_one_out.kept),
+    ),
+    *(
+        Page(
+            name,
+            (f"birdslam evaluate localisation {results.TRACKING} --class {kind} --output {{out}}",),
+            {f"docs/{name}.md": ("report.json", made)},
+            (localisation.evaluate_people, made),
+        )
+        for name, kind, made in (
+            ("people", "pedestrian", people_page.pedestrians),
+            ("cyclists", "cyclist", people_page.cyclists),
+        )
     ),
     Page(
         "lanes",
