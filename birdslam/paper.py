@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from birdslam.frontend import FrontEndConfig
 from birdslam.graph.graph_config import GraphConfig
-from birdslam.graph.weights import WeightsConfig
+from birdslam.graph.weights import PAPER_WEIGHTS
 from birdslam.odometry.odometry import OdometryConfig
 from birdslam.odometry.road.kalman_filter import RoadScaleConfig
 from birdslam.slam import SlamConfig
@@ -44,8 +44,7 @@ PAPER = SlamConfig(
             sigma_common_crown_rad=0.0,
         ),
     ),
-    # Eq. 4: one information matrix for each type of edge; Eq. 7: CP edges are of the ego and of vehicles
-    weights=WeightsConfig(mode="paper", cp_vehicles=10_000.0),
+    weights=PAPER_WEIGHTS,
     # Eqs. 5-8: CC, CP, CV and VV edges and nothing else
     graph=GraphConfig(
         constant_velocity=False,
