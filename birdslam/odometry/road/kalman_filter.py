@@ -70,8 +70,8 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scale_walk_rel_per_sqrt_m: Positive = 0.004  # random walk of the visual scale
     # ... and what of it lasts: the motorway clip drifts by -0.24 % a metre, KITTI 01 by -0.19, 00, 06 and 0005 by 0.04
     scale_drift_per_m: Positive = 0.0013
-    scale_drift_memory_m: Positive = 100.0
-    # ... and of the path's curvature: on KITTI 01's ramp of 21 m radius it drifts by 12 % over as many metres
+    scale_drift_memory_m: Positive = 100.0  # over which that drift lasts
+    # The walk by the path's curvature: on KITTI 01's ramp of 21 m radius it drifts by 12 % over as many metres
     scale_walk_bend_sqrt_m: Positive = 0.4
     max_bend_per_m: Positive = 0.15  # the path's curvature is clipped to it
     tilt_walk_rad_per_sqrt_m: Positive = 0.003  # crown and grade of the road
