@@ -144,6 +144,21 @@ def test_a_new_map_begins_with_the_first_valid_frame() -> None:
     assert np.trace(keyframes[False].cov) < 2.0 * np.trace(keyframes[True].cov)
 
 
+def test_who_looks_and_finds_nothing_soon_is_not_localised(mapped: bytes) -> None:
+    """In a mapped street, by an odometry that has left it: frames that nobody looked at count for nothing."""
+    states: dict[bool, list[MapState]] = {True: [], False: []}
+    for looked in states:
+        running = session(decode_map(mapped), extend=False)
+        elsewhere = [seen for _, seen, _ in drive(OTHER, range(60), 3)]
+        for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 70), 3)):
+            after = elsewhere[number] if looked else None
+            states[looked].append(running.step(estimate, seen if number < 20 else after).state)  # type: ignore[arg-type]
+    carried = {looked: sum(state is MapState.LOCALISED for state in found[20:]) for looked, found in states.items()}
+    assert states[True][19] is MapState.LOCALISED
+    assert 1 <= carried[True] <= 6
+    assert carried[False] > 2 * carried[True]
+
+
 def test_a_kidnapped_car_is_found_again(mapped: bytes) -> None:
     """Odometry goes on as if nothing had been, 50 m further along the street."""
     running = session(decode_map(mapped), extend=False)

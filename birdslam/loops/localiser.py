@@ -15,7 +15,7 @@ import numpy as np
 from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.drift import LOOP_YAW_RAD, ODOMETRY_SCALE_REL, drift_after, is_exact, moved
+from birdslam.loops.drift import ODOMETRY_SCALE_REL, drift_after, is_exact, moved
 from birdslam.loops.features import Features
 from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import PlaceMap
@@ -34,9 +34,13 @@ CHI2_GATE = 16.27  # of three degrees of freedom, 99.9 %
 FOLLOW_M = 12.0  # keyframes within it are looked for
 SEARCH_PX, MOST_SEARCH_PX = 25.0, 120.0
 FARTHEST_M = 1e5
-# What fixes of one map share: its points' scale (as odometry tells its own, docs/method.md), and the mounting's yaw.
-# That the car tilts is no such error: a pose is of the camera's foot (foot.py)
-SHARED_SCALE_REL, SHARED_YAW_RAD = 0.012, LOOP_YAW_RAD
+# What fixes by one keyframe share, by how far the ego is from it along its axis and aside: its points were seen along
+# the way only, and what their depths have in common shows from aside. That the car tilts is no such error (foot.py),
+# nor that all metres of the map are too long
+ALONG_REL, ASIDE_REL = 0.006, 0.02
+SHARED_YAW_RAD, ASIDE_YAW_RAD_PER_M = 0.0003, 0.0007
+# Of the way since the last fix where a frame was looked for and not found: an odometry that is right would have been
+MISSED_REL = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +84,7 @@ class Localiser:
         self._shared: Floats = np.zeros((3, 3))
         self._hypotheses: list[_Hypothesis] = []
         self.since_fix_m = math.inf
+        self._missed = False  # since the last fix a frame was looked for in the map, and not found
         self.own_way_m: dict[int, float] = {}  # rows of keyframes that this very drive made: the way at each
         self.was_kidnapped = False  # the newest fix contradicted odometry
 
@@ -93,7 +98,8 @@ class Localiser:
     @property
     def cov(self) -> Floats:
         """(3, 3) of the pose in the map, with what fixes share."""
-        scale_m = ODOMETRY_SCALE_REL * min(self.since_fix_m, FARTHEST_M)  # of odometry's own scale, all along the way
+        scale_rel = MISSED_REL if self._missed else ODOMETRY_SCALE_REL  # all along the way
+        scale_m = scale_rel * min(self.since_fix_m, FARTHEST_M)
         return self._cov + self._shared + np.diag([scale_m**2, scale_m**2, 0.0])
 
     @property
@@ -149,6 +155,7 @@ class Localiser:
             if fix is not None:
                 self._correct(fix)
                 return True
+            self._missed = bool(self.map.near(self._T_map_ego, FOLLOW_M, among))
         return self._recognise(features, among)
 
     def _follow(self, features: Features, guess: SE2, cov: Floats, among: Bools | None) -> Fix | None:
@@ -175,7 +182,7 @@ class Localiser:
         self._cov = 0.5 * (self._cov + self._cov.T)
         self._shared = shared(fix)
         self.attitude = fix.attitude_in_map(self._camera)
-        self.fix, self.since_fix_m = fix, 0.0
+        self.fix, self.since_fix_m, self._missed = fix, 0.0, False
 
     def _recognise(self, features: Features, among: Bools | None) -> bool:
         """Confirms hypotheses, or makes new ones of places that look alike."""
@@ -222,7 +229,7 @@ class Localiser:
         self._T_map_ego, self._cov = fix.T_map_ego, fix.cov
         self._shared = shared(fix)
         self.attitude = fix.attitude_in_map(self._camera)
-        self.fix, self.since_fix_m = fix, 0.0
+        self.fix, self.since_fix_m, self._missed = fix, 0.0, False
         self.map_epoch += 1
         self._hypotheses.clear()
 
@@ -235,5 +242,5 @@ def is_place(fix: Fix) -> bool:
 def shared(fix: Fix) -> Floats:
     """(3, 3) covariance of what further fixes here will be wrong by as well."""
     x_m, y_m = fix.T_keyframe_ego.x_m, fix.T_keyframe_ego.y_m
-    scale_m = SHARED_SCALE_REL * math.hypot(x_m, y_m)
-    return np.diag([scale_m**2, scale_m**2, SHARED_YAW_RAD**2])
+    variance_m2 = (ALONG_REL * x_m) ** 2 + (ASIDE_REL * y_m) ** 2
+    return np.diag([variance_m2, variance_m2, SHARED_YAW_RAD**2 + (ASIDE_YAW_RAD_PER_M * y_m) ** 2])

@@ -169,7 +169,7 @@ class RoadScale:
         if keyframe is not None:
             T = keyframe.pose.between(pose)
             if not self._was_known and not self._confirmation.begun and self.unknown:
-                self._filter.initialise_pitch(T.R.T @ T.p)
+                self._filter.initialise_pitch(T.R.T @ T.p, view.sigma_across_m)
             bend_per_m = _bend_per_m(step.R, travelled_m)
             wide = self._fixed_pattern.present
             px = self._aligner.samples(self._tilt, view.boxes_px, view.road_mask, bend_per_m, wide)
