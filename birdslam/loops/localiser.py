@@ -31,6 +31,7 @@ KIDNAPPED_CONFIRMATIONS = 12  # where odometry since the last fix contradicts th
 HYPOTHESES = 4
 HYPOTHESIS_M = 30.0  # after so much way without confirmation one is given up
 CHI2_GATE = 16.27  # of three degrees of freedom, 99.9 %
+FOLLOWED_M = 30.0  # of way since the last fix, along which the ego is looked for where odometry says
 FOLLOW_M = 12.0  # keyframes within it are looked for
 SEARCH_PX, MOST_SEARCH_PX = 25.0, 120.0
 FARTHEST_M = 1e5
@@ -150,9 +151,10 @@ class Localiser:
         self.fix = None
         if self._T_odom_ego is None or not len(self.map):
             return False
-        if self._T_map_ego is not None and self.state is MapState.LOCALISED:
+        if self._T_map_ego is not None and self.since_fix_m < FOLLOWED_M:
             fix = self._follow(features, self._T_map_ego, self.cov, among)
-            if fix is not None:
+            # Who is not localised any more has to find as much as who was lost
+            if fix is not None and (self.state is MapState.LOCALISED or is_place(fix)):
                 self._correct(fix)
                 return True
             self._missed = bool(self.map.near(self._T_map_ego, FOLLOW_M, among))
