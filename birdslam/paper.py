@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from birdslam.frontend import FrontEndConfig
 from birdslam.graph.graph_config import GraphConfig
-from birdslam.graph.weights import WeightsConfig
+from birdslam.graph.weights import PAPER_WEIGHTS
 from birdslam.odometry.odometry import OdometryConfig
 from birdslam.odometry.road.kalman_filter import RoadScaleConfig
 from birdslam.slam import SlamConfig
@@ -44,14 +44,14 @@ PAPER = SlamConfig(
             sigma_common_crown_rad=0.0,
         ),
     ),
-    # Eq. 4: one information matrix for each type of edge; Eq. 7: CP edges are of the ego and of vehicles
-    weights=WeightsConfig(mode="paper", cp_vehicles=10_000.0),
+    weights=PAPER_WEIGHTS,
     # Eqs. 5-8: CC, CP, CV and VV edges and nothing else
     graph=GraphConfig(
         constant_velocity=False,
         detection_gate_sigma=NO_GATE,
         landmark_gate_sigma=NO_GATE,
-        landmark_common_m=0.0,  # each CP edge counts alike, however many there are
+        landmark_common_along_m=0.0,  # each CP edge counts alike, however many there are
+        landmark_common_across_m=0.0,
         landmark_anchor="first_sight",  # X_p of Eq. 3 is a point of the world, and known
         correlation_length_m=0.0,  # no error but those of the edges
         zero_velocity_update=False,

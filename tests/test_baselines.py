@@ -105,6 +105,20 @@ def test_a_batch_stopped_at_its_cap_gets_no_ratio(monkeypatch: pytest.MonkeyPatc
     assert rows["batch SE(3), metric odometry"]["ratio"] > 0.0
 
 
+def test_a_place_that_the_log_does_not_know_is_none_in_the_batch(world: Drive) -> None:
+    """A box cut to a sliver stands anywhere, and the paper's weights can't say so."""
+    log = list(world.measurements)
+    first, *others = log[20].cv
+    far, vague = SE2(180.0, 150.0, 3.0), (1e4, 0.0, 0.0, 0.0, 1e4, 0.0, 0.0, 0.0, 0.1)
+    sliver = msgspec.structs.replace(first, T_ego_vehicle=far, cov=vague)
+    log[20] = msgspec.structs.replace(log[20], cv=(sliver, *others))
+    result = batch_se3.run(log, CAMERA)
+    assert 20 not in result.vehicles[first.vehicle]
+    ego_m, car_m = worst_m(world, result)
+    assert ego_m < 0.05
+    assert car_m < 0.05
+
+
 def test_lanes_can_be_left_out(world: Drive) -> None:
     """Lane points that lie pull the ego aside; left out, they are as if the log had none."""
     lying = [

@@ -34,6 +34,8 @@ REAL = EdgeStatistics(
     cp_stated=0.0659,
     seen=0.59,
     seen_sigma=1.02,
+    common_along_m=0.291,
+    common_across_m=0.051,
 )
 
 
@@ -73,7 +75,7 @@ def test_exact_edges_have_no_error(sequence: TrackingSequence) -> None:
     log = simulated(sequence, EXACT, 0)
     found = edge_statistics(log, dict(enumerate(sequence.ego_truth(0))))
     assert found is not None
-    assert max(found.cc, found.cp) < 1e-3
+    assert max(found.cc, found.cp, np.nan_to_num(found.common_along_m), np.nan_to_num(found.common_across_m)) < 1e-3
 
 
 @pytest.mark.parametrize(("scale_of_points", "seen"), [(1.0, 1.0), (1.05, 0.0)])
@@ -96,6 +98,8 @@ def test_landmarks_that_share_the_odometrys_error_see_nothing_of_it(scale_of_poi
     assert found.spans == 50 - SPAN
     assert found.seen == pytest.approx(seen, abs=0.15)
     assert math.exp(found.cc) - 1.0 < 0.02
+    assert np.nan_to_num(found.common_along_m) == pytest.approx((scale_of_points - 1.0) * SPAN, abs=1e-6)
+    assert np.nan_to_num(found.common_across_m) < 1e-6
 
 
 def test_vehicles_edges_leave_the_ego_where_it_is_unless_they_may_move_it() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import pty
@@ -21,6 +22,7 @@ from birdslam.loops.gnss.earth import EarthError, GnssFix, place_on_earth
 from birdslam.loops.gnss.factors import Node, OnEarth, fixed_keyframes, tie
 from birdslam.loops.gnss.sentences import NmeaReader
 from birdslam.loops.keyframe import Link
+from birdslam.outputs.placed import Place, write_around, write_places
 from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.runtime.maps.drive_earth import write_earth
 from birdslam.runtime.maps.gnss_input import Receiver, recorded_fixes
@@ -143,13 +145,46 @@ def test_a_map_seen_from_another_frame_is_at_the_same_place() -> None:
 def test_what_is_written_opens_elsewhere(tmp_path: Path) -> None:
     true, nodes, _ = way(400.0, seed=5)
     poses = [(int(t_ns), node.T_map_keyframe) for t_ns, node in zip(times(len(nodes)), nodes, strict=True)]
-    about = write_earth(fixes_of(true, 1.5), poses, CAMERA, tmp_path, None)
+    seen_from = [Place(t_ns, 0, T, T) for t_ns, T in poses]
+    about, _ = write_earth(fixes_of(true, 1.5), seen_from, CAMERA, tmp_path, None)
     assert about["fixes"] > 40
     features = geojson.loads((tmp_path / "ego.geojson").read_text())
     assert features.is_valid
     lon, lat = features.features[0].geometry.coordinates[0]
     assert (lat, lon) == pytest.approx(ORIGIN, abs=1e-4)
     assert len(gpxpy.parse((tmp_path / "ego.gpx").read_text()).tracks[0].segments[0].points) == len(poses)
+
+
+def test_road_and_tracks_lie_beside_the_way_on_earth(tmp_path: Path) -> None:
+    """A line 2 m left of the way and a car 10 m ahead, by an odometry that bends away by metres."""
+    true, nodes, _ = way(1500.0, seed=6)
+    t_ns = [int(each) for each in times(len(nodes))]
+    seen_from = [Place(t, 0, node.T_map_keyframe, node.T_map_keyframe) for t, node in zip(t_ns, nodes, strict=True)]
+    _, places = write_earth(fixes_of(true, 1.5), seen_from, CAMERA, tmp_path, None)
+    write_places(tmp_path, places)
+    beside = [place.T_odom_ego @ np.array([[0.0, 2.0]]) for place in places]
+    line = {"line": 7, "epoch": 0, "kind": "dashed", "sigma_m": [0.1], "first_seen_s": 0.0, "last_seen_s": 1e9}
+    geometry = {"type": "LineString", "coordinates": [p[0].tolist() for p in beside]}
+    lines = {"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": geometry, "properties": line}]}
+    (tmp_path / "map.geojson").write_text(json.dumps(lines))
+    (tmp_path / "tracks").mkdir()
+    ahead = [(place.t_source_ns / 1e9, *(place.T_odom_ego @ np.array([[10.0, 0.0]]))[0]) for place in places]
+    rows = (f"{t:.6f} {x:.4f} {y:.4f} 0 0 0 0 1\n" for t, x, y in ahead)
+    (tmp_path / "tracks" / "3.tum.txt").write_text("# vehicle 3\n" + "".join(rows))
+    assert set(write_around(tmp_path)) == {"road.map.geojson", "road.geojson", "tracks.geojson"}
+    open_m = np.hypot(nodes[-1].T_map_keyframe.x_m - true[-1].x_m, nodes[-1].T_map_keyframe.y_m - true[-1].y_m)
+    assert open_m > 10.0
+    for name, x_m, y_m in (("road", 0.0, 2.0), ("tracks", 10.0, 0.0)):
+        found = geojson.loads((tmp_path / f"{name}.geojson").read_text())
+        assert found.is_valid
+        lon, lat = np.array(found.features[0].geometry.coordinates).T
+        east, north, _ = pymap3d.geodetic2enu(lat, lon, 0.0, *ORIGIN, 0.0)
+        wanted = np.array([(T @ np.array([[x_m, y_m]]))[0] for T in true])
+        assert np.hypot(east - wanted[:, 0], north - wanted[:, 1]).max() < 3.0
+        assert (tmp_path / f"{name}.kml").is_file()
+    in_map = json.loads((tmp_path / "road.map.geojson").read_text())["features"][0]["geometry"]["coordinates"]
+    left_m = [place.T_map_ego.inverse() @ np.array([p]) for place, p in zip(places, in_map, strict=True)]
+    assert np.array(left_m).reshape(-1, 2) == pytest.approx(np.array([[0.0, 2.0]] * len(places)), abs=0.01)
 
 
 # --- where fixes come from ---

@@ -13,7 +13,8 @@ from birdslam.odometry.corners.initialisation import InitialisationConfig, Motio
 from birdslam.odometry.corners.two_view import initial_two_view, two_view_from_prior
 from birdslam.odometry.motion import Motion
 from birdslam.odometry.odometry import Odometry
-from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner, RoadImage
+from birdslam.odometry.road.alignment import RoadAlignConfig, RoadAligner
+from birdslam.odometry.road.road_image import RoadImage
 from birdslam.odometry.road.scale_search import best_correlation, far_changed_pixels
 from birdslam.perf.accuracy.drives import Task, mirrored_camera, read
 from birdslam.perf.accuracy.overlays import measure

@@ -66,7 +66,12 @@ def test_the_derivative_of_a_moved_curve(curve: tuple[float, ...], step: tuple[f
 
 
 def picture(
-    T_world_ego: SE2, offsets_m: tuple[float, ...], dashed: tuple[bool, ...], bend: float = 0.0, pitch_rad: float = 0.0
+    T_world_ego: SE2,
+    offsets_m: tuple[float, ...],
+    dashed: tuple[bool, ...],
+    bend: float = 0.0,
+    pitch_rad: float = 0.0,
+    stripe_m: float = 0.14,
 ) -> tuple[np.ndarray, Segmentation]:
     """A grey road between edges at +-8 m with lines along world's x, and what a network says of it."""
     ground = GroundPlane(CAMERA.height_m, pitch_rad)
@@ -91,7 +96,7 @@ def picture(
         pieces = [(s, s + DASH_M) for s in np.arange(first, 80.0, PERIOD_M)] if gaps else [(2.0, x[-1])]
         for start, end in pieces:
             if end > 2.5:
-                band(offset - 0.07, offset + 0.07, max(start, 2.0), end, [(image, 220), (lane, 1)])
+                band(offset - 0.5 * stripe_m, offset + 0.5 * stripe_m, max(start, 2.0), end, [(image, 220), (lane, 1)])
     return cv2.GaussianBlur(image, (3, 3), 0), Segmentation(road=road > 0, lane=lane > 0)
 
 
@@ -141,6 +146,23 @@ def test_ids_last_and_dashes_are_told_from_a_solid_line() -> None:
             assert abs(line.y_m(truth[0]) - truth[1]) < max(0.1, 3.0 * line.sigma_m(10.0))
 
 
+@pytest.mark.parametrize(("aside_m", "turned_rad"), [(0.0, 0.2), (1.5, -0.2), (1.6, 0.0)])
+def test_lines_that_the_paint_does_not_lie_on_are_looked_for_anew(aside_m: float, turned_rad: float) -> None:
+    tracker, pose = LineTracker(CAMERA), SE2()
+    off = []
+    for k in range(18):
+        if k:
+            pose = pose @ SE2(1.5, 0.0, 0.0)
+        if k == 10:
+            pose = pose @ SE2(0.0, aside_m, turned_rad)  # the odometry slips, or the road bends at once
+        image, masks = picture(SE2(1.5 * k, 0.0, 0.0), (1.75, -1.75), (True, False))
+        tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, NOBODY)
+        lines = tracker.lines().at(pose)
+        off.append([min((abs(line.y_m(8.0) - y) for line in lines), default=9.0) for y in (1.75, -1.75)])
+    assert max(map(max, off[4:10])) < 0.15
+    assert max(map(max, off[13:])) < 0.15
+
+
 def test_what_a_bonnet_mirrors_is_no_line_and_the_lane_is_not_drawn_over_it() -> None:
     edge_px = np.array([[0.0, 190.0], [320.0, 165.0], [639.0, 190.0]])
     image, masks = picture(SE2(), (1.75, -1.75), (False, False))
@@ -159,6 +181,19 @@ def test_what_a_bonnet_mirrors_is_no_line_and_the_lane_is_not_drawn_over_it() ->
     assert lanes.road_from_m == pytest.approx(CAMERA.height_m * CAMERA.fy_px / (165.0 - CAMERA.cy_px), rel=0.02)
     area = lane_px(CAMERA, CAMERA.ground, lanes.ego, lanes.road_from_m)
     assert area[:, 1].max() <= 166.0
+
+
+@pytest.mark.parametrize("gap_m", [0.1, 0.15])
+def test_two_stripes_side_by_side_are_one_double_line(gap_m: float) -> None:
+    tracker = LineTracker(CAMERA)
+    for k in range(8):
+        pose = SE2(1.5 * k, 0.0, 0.0)
+        apart = 0.5 * (0.1 + gap_m)
+        image, masks = picture(pose, (1.75 + apart, 1.75 - apart, -1.75), (False, False, True), stripe_m=0.1)
+        tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, NOBODY)
+    found = [line for line in tracker.lines().at(pose) if line.kind is not LineKind.EDGE]
+    assert [line.kind for line in found] == [LineKind.DOUBLE, LineKind.DASHED]
+    assert found[0].y_m(8.0) == pytest.approx(1.75, abs=0.1)
 
 
 def test_a_line_behind_a_car_stays() -> None:

@@ -1,5 +1,6 @@
 """Cars placed by the front end against labels: of a world made here, and of KITTI tracking where it is at hand."""
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +21,10 @@ from birdslam.frontend import FrontEndConfig
 from birdslam.geometry.camera import Camera
 from birdslam.paper import PAPER
 from birdslam.perception import Detections
+from birdslam.runtime.cli.main import main
 from birdslam.sources.kitti_tracking import TrackingSequence, open_tracking, read_detections
 from birdslam.sources.label_projection import Label
+from tests import tracking_world
 
 CAMERA = Camera(1242, 375, 721.5, 721.5, 609.6, 172.9, 1.65)
 HEIGHT_M, WIDTH_M, LENGTH_M = 1.5, 1.6, 4.0
@@ -111,3 +114,15 @@ def test_real_boxes_of_cars_beat_the_level_ground(data_dir: Path) -> None:
     )
     for span in ("15-30", "30-50"):
         assert depth_error(ours, span) < min(0.08, 0.5 * depth_error(paper, span))
+
+
+def test_constants_of_the_command_line_count_in_paper_mode_too(tmp_path: Path) -> None:
+    root = tracking_world.write(tmp_path / "root")
+    rows = {}
+    for reach in ("0.0", "1.0"):
+        asked = ["--mode", "paper", "--constant", f"slam.frontend.localisation.reach_rel={reach}"]
+        assert main(["evaluate", "localisation", str(root), *asked, "--output", str(tmp_path / reach)]) == 0
+        rows[reach] = json.loads((tmp_path / reach / "report.json").read_text())
+    at_face, at_centre = ([row["depth_bias_median_rel"] for row in rows[reach] if row["n"]] for reach in ("0.0", "1.0"))
+    assert at_face  # Eq. 1 puts the nearest face where the centre should be
+    assert all(face < centre for face, centre in zip(at_face, at_centre, strict=True))

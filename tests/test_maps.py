@@ -15,6 +15,7 @@ from birdslam.bench.simulation.places import CAMERA, OTHER_LIGHT_BITS, Street, a
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.closing import close_loops, held
 from birdslam.loops.features import hamming, match
+from birdslam.loops.foot import body_pose, foot
 from birdslam.loops.keyframe import Link
 from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_file import HEAD, MAGIC, MapError, decode_map, encode_map
@@ -29,6 +30,7 @@ from birdslam.runtime.cli.commands import parse
 from birdslam.runtime.configuration import ConfigurationError, load
 from birdslam.runtime.maps.map_drive import MapChoice
 from birdslam.runtime.maps.map_store import read_map, write_map
+from birdslam.types import Attitude
 from tests.cases import first
 
 STREET = build(along([0.0] * 70 + [0.004] * 90), seed=1)
@@ -79,6 +81,24 @@ def test_a_second_drive_is_localised(mapped: bytes, how: dict[str, float]) -> No
     assert np.degrees(np.abs(error[:, 2])).max() < 1.5
 
 
+def test_a_nodding_car_is_where_its_camera_stands_over_the_road(mapped: bytes) -> None:
+    """A pitch of a degree would move the foot of a rigid car by 3 cm."""
+    along = []
+    for nod_rad in (0.0, math.radians(1.0)):
+        found = driven(decode_map(mapped), STREET, range(30, 60), seed=7, nod_rad=nod_rad)
+        along.append(np.array([here.T_map_ego.x_m for here, _ in found[5:] if here.T_map_ego]))
+    assert np.std(along[1] - along[0]) < 0.012
+
+
+def test_the_body_is_tilted_about_the_camera_over_its_foot() -> None:
+    T, attitude = SE2(1.0, 2.0, 0.3), Attitude(z_m=0.2, pitch_rad=0.1, roll_rad=-0.05)
+    body = body_pose(T, attitude, 1.65)
+    assert (body @ (0.0, 0.0, 1.65, 1.0))[:3] == pytest.approx([1.0, 2.0, 0.2 + 1.65])
+    found = foot(body, 1.65)
+    assert found[0].between(T).log() == pytest.approx(np.zeros(3), abs=1e-12)
+    assert msgspec.to_builtins(found[1]) == pytest.approx(msgspec.to_builtins(attitude))
+
+
 def test_another_street_is_never_this_one(mapped: bytes) -> None:
     assert {here.state for here, _ in driven(decode_map(mapped), OTHER, range(60))} == {MapState.LOST}
 
@@ -122,6 +142,21 @@ def test_a_new_map_begins_with_the_first_valid_frame() -> None:
         running.finish()
         keyframes[valid] = place_map.keyframes[0]
     assert np.trace(keyframes[False].cov) < 2.0 * np.trace(keyframes[True].cov)
+
+
+def test_who_looks_and_finds_nothing_soon_is_not_localised(mapped: bytes) -> None:
+    """In a mapped street, by an odometry that has left it: frames that nobody looked at count for nothing."""
+    states: dict[bool, list[MapState]] = {True: [], False: []}
+    for looked in states:
+        running = session(decode_map(mapped), extend=False)
+        elsewhere = [seen for _, seen, _ in drive(OTHER, range(60), 3)]
+        for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 70), 3)):
+            after = elsewhere[number] if looked else None
+            states[looked].append(running.step(estimate, seen if number < 20 else after).state)  # type: ignore[arg-type]
+    carried = {looked: sum(state is MapState.LOCALISED for state in found[20:]) for looked, found in states.items()}
+    assert states[True][19] is MapState.LOCALISED
+    assert 1 <= carried[True] <= 6
+    assert carried[False] > 2 * carried[True]
 
 
 def test_a_kidnapped_car_is_found_again(mapped: bytes) -> None:
@@ -300,6 +335,18 @@ def test_frames_before_a_place_was_confirmed_are_led_back_to(mapped: bytes, tmp_
     rows = (tmp_path / "localisation.csv").read_text().splitlines()
     assert len(rows) == 31
     assert rows[1].split(",")[1] == "localised"
+
+
+def test_over_what_odometry_calls_invalid_nothing_is_led_back(mapped: bytes) -> None:
+    """A step of 1 m that no odometry measured: what it says of its length is nothing."""
+    running, trajectory = session(decode_map(mapped), extend=False), MapTrajectory()
+    rows = []
+    for number, (estimate, seen, _) in enumerate(drive(STREET, range(20, 50), 3)):
+        estimate = msgspec.structs.replace(estimate, valid=number != 1)
+        rows += trajectory.add(running.step(estimate, seen), estimate)  # type: ignore[arg-type]
+    rows += trajectory.finish()
+    assert trajectory.frames_before > 1
+    assert [row.state for row in rows[:3]] == [MapState.LOST, MapState.LOCALISED, MapState.LOCALISED]
 
 
 def test_without_a_place_the_trajectory_is_an_empty_file(tmp_path: Path) -> None:

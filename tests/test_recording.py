@@ -390,7 +390,7 @@ def test_a_recorder_is_restarted_with_a_new_file_and_ends_where_the_disk_is_full
         out = run.stop()
     assert f"record {cause}; it is restarted" in out
     assert "the recording has ended: File too large" in out
-    assert "restarted 1 times" in out
+    assert "restarted 1 times, CUT OFF" in out
     assert set(run.summary()["restarts"].values()) == {0}
     summary = run.summary()["recording"]
     assert summary["files"] == [str(file) for file in files]

@@ -130,7 +130,7 @@ def test_a_tilt_that_is_not_known_hides_the_length() -> None:
     steep = np.array([1.0, 0.1, 0.0, 0.0])  # a tenth of a radian of pitch for all of the length
     fit = RoadFit(np.zeros(4), np.diag([1e-4, 1e-6, 1e-6, 1e-8]) + np.outer(steep, steep), 0.9, 1000)
     unsure, sure = RoadFilter(CAMERA, RoadScaleConfig()), RoadFilter(CAMERA, RoadScaleConfig())
-    sure.cov[1:, 1:] = np.diag([1e-6, 1e-6, 1e-8, 1e-6, 1e-6])
+    sure.cov[1:, 1:] = np.diag([1e-6, 1e-6, 1e-8, 1e-6, 1e-6, 1e-6])
     assert unsure.information(fit) < 0.7 * sure.information(fit)
 
 
@@ -145,3 +145,26 @@ def test_a_carried_scale_is_known_the_worse_the_longer_it_is_carried() -> None:
         sigma_rel.append(math.sqrt(filter_.cov[0, 0]))
     assert 0.06 < sigma_rel[0] < 0.12
     assert sigma_rel[1] > 1.7 * sigma_rel[0]
+
+
+def pitch_under_drift(config: RoadScaleConfig) -> float:
+    """The pitch (rad) after 100 m of a level road, on which the unit of length shrinks by 0.25 % a metre."""
+    steep = np.array([1.0, 0.2, 0.0, 0.0])  # 8 mrad of pitch for 4 % of length
+    cov = np.diag([0.005**2, 1e-4, 1e-4, 1e-7]) + 0.5**2 * np.outer(steep, steep)
+    filter_, off_log = RoadFilter(CAMERA, config), 0.0
+    filter_.reset_scale(0.05)
+    for _ in range(100):
+        filter_.predict(np.eye(3), 1.0)
+        off_log -= 0.0025 + filter_.pending_log
+        filter_.pending_log = 0.0
+        fit = RoadFit(np.array([off_log, 0.0, 0.0, 0.0]), cov, 0.9, 1000)
+        off_log -= math.log(filter_.update_alignment(fit)) + filter_.pending_log
+        filter_.pending_log = 0.0
+    return abs(float(filter_.tilt[0]))
+
+
+def test_a_drift_of_the_unit_does_not_tilt_the_road() -> None:
+    """Where only lengths walk, the trade of length against pitch gives most of a drift to the pitch."""
+    without = pitch_under_drift(RoadScaleConfig(scale_drift_per_m=1e-9))
+    assert without > 0.004
+    assert pitch_under_drift(RoadScaleConfig()) < without / 3.0

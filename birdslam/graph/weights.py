@@ -51,6 +51,10 @@ class WeightsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return float(self.cv_near * (self.cv_far / self.cv_near) ** share)
 
 
+# The paper's: Eq. 4 has one information matrix for each type of edge, Eq. 7 CP edges of ego and vehicles
+PAPER_WEIGHTS = WeightsConfig(mode="paper", cp_vehicles=10_000.0)
+
+
 def effective_cov(weight: float, dimensions: int) -> tuple[float, ...]:
     """Row-major covariance of an edge whose information matrix is `weight` (lambda) times the unit matrix."""
     variance = 1.0 / weight  # Eq. 4, inverted

@@ -17,8 +17,8 @@ from birdslam.geometry.camera import Camera, GroundPlane
 from birdslam.geometry.se2 import SE2
 from birdslam.lanes.curves import basis
 from birdslam.lanes.line_filter import LineFilter, Support
-from birdslam.lanes.paint import LinePoints, edge_points, paint_points
-from birdslam.lanes.parallel_search import Peak, find_lines, find_shape
+from birdslam.lanes.paint import LinePoints, double_share, edge_points, paint_points
+from birdslam.lanes.parallel_search import SEARCHED_M, Peak, Shape, find_lines, find_shape
 from birdslam.lanes.road_view import RoadView, nearest_m, road_view
 from birdslam.lanes.tracked_lines import LEFT_EDGE, PAINT, RIGHT_EDGE, Track, TrackedLines, existence_of
 from birdslam.perception import Segmentation
@@ -37,6 +37,9 @@ FORGOTTEN_M = -2.0  # a line that ended so far behind the ego is dropped
 NEAR_M, FAR_M = 5.0, 25.0  # where a line that is there has to be seen
 PAST_EDGE_M, MOST_ROAD_PAST = 0.8, 0.35  # so far past an edge there is no road along so much of it
 LEAST_EXISTENCE, LOOKS_OF_A_SCRAP = 0.4, 4.0  # what has less after so many images is dropped
+AFRESH_M = 10.0  # travelled, as it were, before an image without a past
+# Lines are lost where less than this share of so much paint lies on them, and a search explains so much more of it
+LOST_M, LOST_SHARE, BETTER = 5.0, 0.5, 1.5
 PROFILE_M = 4.0, 22.0  # where paint and gaps are resolved
 
 
@@ -87,14 +90,17 @@ class LineTracker:
         paint = paint_points(view)
         first_tilt_rad = 0.0
         if not len(self._filter):
-            first_tilt_rad = self._begin(view, paint, ground, sigma_pitch_rad, search_tilt)
+            shape, found = self._search(view, paint, sigma_pitch_rad if search_tilt else 0.0)
+            first_tilt_rad = self._begin(shape, found)
         if not len(self._filter):
             return
-        points, of = self._with_edges(view, paint)
-        classes = np.array([track.kind for track in self._tracks])
-        seen, self.tilt_rad = self._filter.update(
-            points, of, classes, ground.height_m, sigma_pitch_rad, travelled_m, first_tilt_rad
-        )
+        points, of, seen = self._correct(view, paint, sigma_pitch_rad, travelled_m, first_tilt_rad)
+        if self._is_lost(paint, seen):
+            shape, found = self._search(view, paint, 0.0)
+            before = _explained_m(paint, self._tracks, seen)
+            if sum(peak.evidence_m for kind, peak in found if kind == PAINT) > BETTER * before:
+                self._begin(shape, found)
+                points, of, seen = self._correct(view, paint, sigma_pitch_rad, AFRESH_M, 0.0)
         if not self._filter.sound().all():
             self._keep_sound()
             return
@@ -106,7 +112,7 @@ class LineTracker:
         """Moves the filter to the ego; the distance since its last update, None where it is too short for another."""
         if self._T_world_filter is None:
             self._T_world_filter = T_world_ego
-            return 10.0
+            return AFRESH_M
         step = self._T_world_filter.between(T_world_ego)
         distance = float(np.hypot(step.x_m, step.y_m))
         if distance < MOVED_M:
@@ -128,34 +134,57 @@ class LineTracker:
             self._filter.keep(kept)
             self._tracks = [self._tracks[k] for k in kept.tolist()]
 
-    def _begin(
-        self, view: RoadView, paint: LinePoints, ground: GroundPlane, sigma_pitch_rad: float, search_tilt: bool
-    ) -> float:
-        """Lines of an image without a past; gives the tilt that was found with them."""
+    def _search(
+        self, view: RoadView, paint: LinePoints, sigma_tilt_rad: float
+    ) -> tuple[Shape | None, list[tuple[int, Peak]]]:
+        """The lines of an image without a past, each with its class, and the shape that they share."""
         left, right = edge_points(view, np.zeros(len(view.x_m)))
         edges = (replace(edge, weight=EDGE_WEIGHT * edge.weight) for edge in (left, right))
-        shape = find_shape(_joined(paint, *edges), ground.height_m, sigma_pitch_rad if search_tilt else 0.0)
-        if shape is None:
-            return 0.0
-        curve = np.array([0.0, shape.heading, shape.curvature_per_m, 0.0])
+        shape = find_shape(_joined(paint, *edges), self._height_m, sigma_tilt_rad)
         found: list[tuple[int, Peak]] = []
+        if shape is None:
+            return None, found
+        curve = np.array([0.0, shape.heading, shape.curvature_per_m, 0.0])
         for kind, points, least_m, most in (
             (PAINT, paint, LEAST_PAINT_M, MOST_LINES - 2),
             (LEFT_EDGE, left, LEAST_EDGE_M, 1),
             (RIGHT_EDGE, right, LEAST_EDGE_M, 1),
         ):
-            turned = points.tilted(ground.height_m, shape.tilt_rad)
+            turned = points.tilted(self._height_m, shape.tilt_rad)
             found += [(kind, peak) for peak in find_lines(turned, curve, least_m, APART_M, most)]
             if kind == PAINT and found:  # paint says better than a mask's border where the road goes
                 curve[1] = np.average([p.heading for _, p in found], weights=[p.evidence_m for _, p in found])
+        return shape, found
+
+    def _begin(self, shape: Shape | None, found: list[tuple[int, Peak]]) -> float:
+        """Only these lines; gives the tilt that was found with them."""
+        self._tracks = [Track(kind, score=1.0) for kind, _ in found]
+        if shape is None:
+            self._filter = LineFilter()
+            return 0.0
         self._filter.begin(
             np.array([peak.offset_m for _, peak in found]),
             np.array([peak.heading for _, peak in found]),
             shape.curvature_per_m,
             np.array([kind != PAINT for kind, _ in found], dtype=bool),
         )
-        self._tracks = [Track(kind, score=1.0) for kind, _ in found]
         return shape.tilt_rad
+
+    def _correct(
+        self, view: RoadView, paint: LinePoints, sigma_pitch_rad: float, travelled_m: float, first_tilt_rad: float
+    ) -> tuple[LinePoints, Ints, list[Support]]:
+        """Corrects the filter by one image: its points, the class of each, and what was seen of each line."""
+        points, of = self._with_edges(view, paint)
+        classes = np.array([track.kind for track in self._tracks])
+        seen, self.tilt_rad = self._filter.update(
+            points, of, classes, self._height_m, sigma_pitch_rad, travelled_m, first_tilt_rad
+        )
+        return points, of, seen
+
+    def _is_lost(self, paint: LinePoints, seen: list[Support]) -> bool:
+        """Whether most of what a network calls paint lies on none of the lines."""
+        near_m = float(paint.weight[paint.masked & (paint.x_m < SEARCHED_M)].sum())
+        return near_m > LOST_M and _explained_m(paint, self._tracks, seen) < LOST_SHARE * near_m
 
     def _with_edges(self, view: RoadView, paint: LinePoints) -> tuple[LinePoints, Ints]:
         """All points of the image, and the class of each; edges are looked for from the way ahead."""
@@ -212,6 +241,10 @@ class LineTracker:
                 if len(yellow):
                     track.coloured = min(track.coloured + 1.0, 8.0)
                     track.yellow += (float(np.median(yellow)) - track.yellow) / track.coloured
+                double = double_share(view, mine.of(profile))
+                if double is not None:
+                    track.resolved = min(track.resolved + 1.0, 8.0)
+                    track.double += (double - track.double) / track.resolved
             elif track.kind != PAINT:
                 track.looks += 1.0
 
@@ -271,6 +304,13 @@ class LineTracker:
             self._sigma_roll_rad,
             self._road_from_m,
         )
+
+
+def _explained_m(paint: LinePoints, tracks: list[Track], seen: list[Support]) -> float:
+    """Metres of the paint that lies on lines; paint's points come first among those of an update."""
+    on = [support.points for track, support in zip(tracks, seen, strict=True) if track.kind == PAINT]
+    mine = np.concatenate([np.zeros(0, np.int64), *on])
+    return float(paint.weight[mine][paint.masked[mine] & (paint.x_m[mine] < SEARCHED_M)].sum())
 
 
 def _joined(*parts: LinePoints) -> LinePoints:

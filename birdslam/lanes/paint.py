@@ -33,6 +33,10 @@ MOST_ROW_M = 0.4  # of road that a far row counts for
 UNSEEN_WEIGHT = 0.5  # of a ridge that no mask knows, as evidence
 ROAD_REACH_M = 0.4  # a line at the road's edge lies partly outside its mask
 GAP_M = 0.25  # of the road's mask: what is less is a mark's border, or noise; a kerb is wider
+# Two stripes are a double line: so far apart from middle to middle at the most, alike, with asphalt between
+DOUBLE_M, STRIPE_SHARE, GAP_SHARE = 0.4, 0.5, 0.6
+DOUBLE_PIXEL_M = 0.025  # the coarsest that shows their gap
+LEAST_DOUBLE, MOST_DOUBLE = 6, 16  # rows of an image that are looked at
 SIGMA_EDGE_M = 0.25
 EDGE_PIXELS = 3.0  # sigma of a mask's border in pixels: networks see a half or a quarter of the resolution
 
@@ -176,6 +180,28 @@ def _shift_m(view: RoadView, rows: Ints, columns: Ints) -> Floats:
     share = np.maximum(values - floor, 0.0)
     out: Floats = (share * steps).sum(axis=1) / np.maximum(share.sum(axis=1), 1e-6) * LATTICE_M
     return out
+
+
+def double_share(view: RoadView, points: LinePoints) -> float | None:
+    """The share of a line's points that two stripes side by side make; None where the image does not resolve them."""
+    rows = np.clip(np.searchsorted(view.x_m, points.x_m), 0, len(view.x_m) - 1)
+    rows, y_m = rows[fine := view.sigma_y_m[rows] < DOUBLE_PIXEL_M], points.y_m[fine]
+    if len(rows) < LEAST_DOUBLE:
+        return None
+    every = 1 + len(rows) // MOST_DOUBLE
+    rows, y_m = rows[::every], y_m[::every]
+    reach = round(2.0 * SIDE_M / LATTICE_M)
+    middle = np.round((y_m - view.y_m[0]) / LATTICE_M).astype(np.int64)
+    at = np.clip(middle[:, None] + np.arange(-reach, reach + 1), 0, len(view.y_m) - 1)
+    grey = view.grey[rows[:, None], at]
+    above = grey - np.sort(grey, axis=1)[:, reach // 2, None]  # over the asphalt
+    double, between = np.zeros(len(rows), bool), above[:, 1:-1]
+    for apart in range(2, round(DOUBLE_M / LATTICE_M) + 1):
+        weaker = np.minimum(above[:, :-apart], above[:, apart:])
+        stripes = (weaker > LEAST_CONTRAST) & (weaker > STRIPE_SHARE * above.max(axis=1, keepdims=True))
+        double |= (stripes & (between < GAP_SHARE * weaker)).any(axis=1)
+        between = np.minimum(between[:, :-1], above[:, apart:-1])
+    return float(double.mean())
 
 
 def _mask_middles(view: RoadView, symbols: Bools, rows: Ints, columns: Ints) -> tuple[Ints, Floats]:

@@ -22,6 +22,7 @@ SIGMA_HEIGHT_REL = 0.02  # of the camera's height, as of landmarks (mapping.Stat
 SIGMA_OFFSET_M = 0.025  # of the paint's middle
 SOLID, DASHED = 0.8, 0.6  # share of a line that is painted
 LEAST_PAINTED = 0.2  # of a dashed line; less of it is an arrow, or a scrap
+DOUBLE, LEAST_RESOLVED = 0.5, 3.0  # share of two stripes of a double line, over so many images: kerbs may show two
 YELLOW = 25.0  # excess of yellow over the road's
 
 AHEAD_M = np.arange(5.0, TO_M + 1.0, 5.0)
@@ -41,6 +42,8 @@ class Track(msgspec.Struct):
     looks: float = 0.0  # weight of that mean
     yellow: float = 0.0
     coloured: float = 0.0
+    double: float = 0.0  # share of what the image resolves that two stripes make, a running mean
+    resolved: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,8 @@ def existence_of(track: Track) -> float:
 def _kind(track: Track) -> LineKind:
     if track.kind != PAINT:
         return LineKind.EDGE
+    if track.double > DOUBLE and track.resolved >= LEAST_RESOLVED:
+        return LineKind.DOUBLE
     if track.looks < 1.0:
         return LineKind.UNKNOWN
     return LineKind.SOLID if track.painted > SOLID else LineKind.DASHED if track.painted < DASHED else LineKind.UNKNOWN

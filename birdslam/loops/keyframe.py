@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
-from birdslam.trajectory import Transform, ego_pose
+from birdslam.loops.foot import body_pose
+from birdslam.trajectory import Transform
 from birdslam.types import Attitude
 
 
@@ -51,8 +52,8 @@ class Keyframe:
 
     @property
     def T_map(self) -> Transform:
-        """(4, 4) with height and tilt."""
-        return ego_pose(self.T_map_keyframe, self.attitude)
+        """(4, 4) of the car's axes, in which its points are."""
+        return body_pose(self.T_map_keyframe, self.attitude, self.camera_height_m)
 
     def at(self, T_map_keyframe: SE2, cov: Floats | None = None) -> Keyframe:
         """The same, elsewhere in the map: its points move along."""

@@ -12,8 +12,9 @@ from birdslam.geometry.arrays import Floats, Ints
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import Features
+from birdslam.loops.foot import body_pose
 from birdslam.loops.triangulation import Points, View, triangulate
-from birdslam.trajectory import ego_pose, mount_pose
+from birdslam.trajectory import mount_pose
 from birdslam.types import Attitude
 
 SPACING_M = 4.0  # between keyframes: with MOST_POINTS below 2 MB a km
@@ -92,7 +93,7 @@ class KeyframeBuilder:
         return NewKeyframe(look, p_ego, points.sigma_depth_rel[kept], look.features.descriptors[points.feature[kept]])
 
     def _view(self, look: Look) -> View:
-        return View(look.features, ego_pose(look.T_odom_ego, look.attitude) @ self._mount)
+        return View(look.features, body_pose(look.T_odom_ego, look.attitude, self._camera.height_m) @ self._mount)
 
 
 def _spread(points: Points, px: Floats, size_px: tuple[int, int]) -> Ints:

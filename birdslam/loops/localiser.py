@@ -15,12 +15,11 @@ import numpy as np
 from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.drift import LOOP_YAW_RAD, ODOMETRY_SCALE_REL, drift_after, is_exact, moved
+from birdslam.loops.drift import ODOMETRY_SCALE_REL, drift_after, is_exact, moved
 from birdslam.loops.features import Features
 from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import PlaceMap
 from birdslam.loops.verification import Fix, locate
-from birdslam.trajectory import ego_pose, split_pose
 from birdslam.types import Attitude
 
 CANDIDATES = 6  # places that are verified by geometry in one frame
@@ -32,12 +31,17 @@ KIDNAPPED_CONFIRMATIONS = 12  # where odometry since the last fix contradicts th
 HYPOTHESES = 4
 HYPOTHESIS_M = 30.0  # after so much way without confirmation one is given up
 CHI2_GATE = 16.27  # of three degrees of freedom, 99.9 %
+FOLLOWED_M = 30.0  # of way since the last fix, along which the ego is looked for where odometry says
 FOLLOW_M = 12.0  # keyframes within it are looked for
 SEARCH_PX, MOST_SEARCH_PX = 25.0, 120.0
 FARTHEST_M = 1e5
-# What fixes of one map share: its points' scale (as odometry tells its own, docs/method.md), the camera's foot as the
-# car tilts by half a degree, and the mounting's yaw
-SHARED_SCALE_REL, SHARED_TILT_RAD, SHARED_YAW_RAD = 0.012, 0.008, LOOP_YAW_RAD
+# What fixes by one keyframe share, by how far the ego is from it along its axis and aside: its points were seen along
+# the way only, and what their depths have in common shows from aside. That the car tilts is no such error (foot.py),
+# nor that all metres of the map are too long
+ALONG_REL, ASIDE_REL = 0.006, 0.02
+SHARED_YAW_RAD, ASIDE_YAW_RAD_PER_M = 0.0003, 0.0007
+# Of the way since the last fix where a frame was looked for and not found: an odometry that is right would have been
+MISSED_REL = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +85,7 @@ class Localiser:
         self._shared: Floats = np.zeros((3, 3))
         self._hypotheses: list[_Hypothesis] = []
         self.since_fix_m = math.inf
+        self._missed = False  # since the last fix a frame was looked for in the map, and not found
         self.own_way_m: dict[int, float] = {}  # rows of keyframes that this very drive made: the way at each
         self.was_kidnapped = False  # the newest fix contradicted odometry
 
@@ -94,7 +99,8 @@ class Localiser:
     @property
     def cov(self) -> Floats:
         """(3, 3) of the pose in the map, with what fixes share."""
-        scale_m = ODOMETRY_SCALE_REL * min(self.since_fix_m, FARTHEST_M)  # of odometry's own scale, all along the way
+        scale_rel = MISSED_REL if self._missed else ODOMETRY_SCALE_REL  # all along the way
+        scale_m = scale_rel * min(self.since_fix_m, FARTHEST_M)
         return self._cov + self._shared + np.diag([scale_m**2, scale_m**2, 0.0])
 
     @property
@@ -145,11 +151,13 @@ class Localiser:
         self.fix = None
         if self._T_odom_ego is None or not len(self.map):
             return False
-        if self._T_map_ego is not None and self.state is MapState.LOCALISED:
+        if self._T_map_ego is not None and self.since_fix_m < FOLLOWED_M:
             fix = self._follow(features, self._T_map_ego, self.cov, among)
-            if fix is not None:
+            # Who is not localised any more has to find as much as who was lost
+            if fix is not None and (self.state is MapState.LOCALISED or is_place(fix)):
                 self._correct(fix)
                 return True
+            self._missed = bool(self.map.near(self._T_map_ego, FOLLOW_M, among))
         return self._recognise(features, among)
 
     def _follow(self, features: Features, guess: SE2, cov: Floats, among: Bools | None) -> Fix | None:
@@ -164,7 +172,7 @@ class Localiser:
         if fix is None or fix.inliers < KEPT_INLIERS or fix.places < KEPT_PLACES:
             return None
         error = guess.between(fix.T_map_ego).log()
-        total = cov + fix.cov + shared(fix, self._camera)
+        total = cov + fix.cov + shared(fix)
         return fix if float(error @ np.linalg.solve(total, error)) < CHI2_GATE else None
 
     def _correct(self, fix: Fix) -> None:
@@ -174,9 +182,9 @@ class Localiser:
         self._T_map_ego = self._T_map_ego @ SE2.exp(gain @ error)
         self._cov = (np.eye(3) - gain) @ self._cov
         self._cov = 0.5 * (self._cov + self._cov.T)
-        self._shared = shared(fix, self._camera)
-        self.attitude = split_pose(fix.keyframe.T_map @ ego_pose(fix.T_keyframe_ego, fix.attitude))[1]
-        self.fix, self.since_fix_m = fix, 0.0
+        self._shared = shared(fix)
+        self.attitude = fix.attitude_in_map(self._camera)
+        self.fix, self.since_fix_m, self._missed = fix, 0.0, False
 
     def _recognise(self, features: Features, among: Bools | None) -> bool:
         """Confirms hypotheses, or makes new ones of places that look alike."""
@@ -189,7 +197,7 @@ class Localiser:
             hypothesis.confirmed += 1
             enough = KIDNAPPED_CONFIRMATIONS if hypothesis.kidnapped else CONFIRMATIONS
             hypothesis.T_map_odom = fix.T_map_ego @ self._T_odom_ego.inverse()
-            hypothesis.cov = fix.cov + shared(fix, self._camera)
+            hypothesis.cov = fix.cov + shared(fix)
             if hypothesis.confirmed >= enough:
                 self.was_kidnapped = hypothesis.kidnapped
                 self._believe(fix)
@@ -203,7 +211,7 @@ class Localiser:
             if kidnapped and row in self.own_way_m:  # a street that looks like an earlier one
                 continue
             T_map_odom = found.T_map_ego @ self._T_odom_ego.inverse()
-            cov = found.cov + shared(found, self._camera)
+            cov = found.cov + shared(found)
             new = _Hypothesis(T_map_odom, cov, self.travelled_m, kidnapped=kidnapped)
             self._hypotheses = [*self._hypotheses, new][-HYPOTHESES:]
             break
@@ -221,9 +229,9 @@ class Localiser:
 
     def _believe(self, fix: Fix) -> None:
         self._T_map_ego, self._cov = fix.T_map_ego, fix.cov
-        self._shared = shared(fix, self._camera)
-        self.attitude = split_pose(fix.keyframe.T_map @ ego_pose(fix.T_keyframe_ego, fix.attitude))[1]
-        self.fix, self.since_fix_m = fix, 0.0
+        self._shared = shared(fix)
+        self.attitude = fix.attitude_in_map(self._camera)
+        self.fix, self.since_fix_m, self._missed = fix, 0.0, False
         self.map_epoch += 1
         self._hypotheses.clear()
 
@@ -233,9 +241,8 @@ def is_place(fix: Fix) -> bool:
     return fix.inliers >= FOUND_INLIERS and fix.places >= FOUND_PLACES and fix.inliers >= FOUND_SHARE * fix.matches
 
 
-def shared(fix: Fix, camera: Camera) -> Floats:
+def shared(fix: Fix) -> Floats:
     """(3, 3) covariance of what further fixes here will be wrong by as well."""
     x_m, y_m = fix.T_keyframe_ego.x_m, fix.T_keyframe_ego.y_m
-    scale_m = SHARED_SCALE_REL * math.hypot(x_m, y_m)
-    foot_m = SHARED_TILT_RAD * camera.height_m
-    return np.diag([scale_m**2 + foot_m**2, scale_m**2 + foot_m**2, SHARED_YAW_RAD**2])
+    variance_m2 = (ALONG_REL * x_m) ** 2 + (ASIDE_REL * y_m) ** 2
+    return np.diag([variance_m2, variance_m2, SHARED_YAW_RAD**2 + (ASIDE_YAW_RAD_PER_M * y_m) ** 2])

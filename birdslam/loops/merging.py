@@ -13,7 +13,7 @@ from birdslam.loops.closing import close_loops, held
 from birdslam.loops.features import Features
 from birdslam.loops.gnss.factors import tie
 from birdslam.loops.keyframe import Keyframe, Link
-from birdslam.loops.localiser import SHARED_SCALE_REL, SHARED_TILT_RAD, SHARED_YAW_RAD, is_place
+from birdslam.loops.localiser import is_place, shared
 from birdslam.loops.place_map import PlaceMap
 from birdslam.loops.verification import Fix, locate
 
@@ -47,7 +47,7 @@ def merged(first: PlaceMap, second: PlaceMap) -> tuple[PlaceMap, int]:
         for link in second.links
     ]
     loops = [
-        Link(fix.keyframe.number, number[own.number], fix.T_keyframe_ego, fix.cov + _shared(fix), loop=True)
+        Link(fix.keyframe.number, number[own.number], fix.T_keyframe_ego, fix.cov + shared(fix), loop=True)
         for own, fix in agreeing
     ]
     keyframes, every = [*first.keyframes, *moved], [*first.links, *links, *loops]
@@ -114,12 +114,6 @@ def _agreeing(meetings: list[tuple[Keyframe, Fix]]) -> list[tuple[Keyframe, Fix]
                 agreeing.append(row)
         best = max(best, agreeing, key=len)
     return [meetings[row] for row in best]
-
-
-def _shared(fix: Fix) -> np.ndarray:
-    x_m, y_m = fix.T_keyframe_ego.x_m, fix.T_keyframe_ego.y_m
-    sigma2 = (SHARED_SCALE_REL * math.hypot(x_m, y_m)) ** 2 + (SHARED_TILT_RAD * fix.keyframe.camera_height_m) ** 2
-    return np.diag([sigma2, sigma2, SHARED_YAW_RAD**2])
 
 
 def _renumbered(keyframe: Keyframe, number: int, drives: int, T_first_second: SE2) -> Keyframe:

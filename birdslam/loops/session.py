@@ -193,7 +193,7 @@ class MapSession:
         fix = self.localiser.fix
         if fix is not None and self._travelled_m - self._linked_m >= LOOP_EVERY_M:
             self._linked_m = self._travelled_m
-            cov = fix.cov + shared(fix, self._camera)
+            cov = fix.cov + shared(fix)
             self._fixes.append((look.travelled_m, look.T_odom_ego, fix.keyframe.number, fix.T_keyframe_ego, cov))
 
     def _take(self, made: list[NewKeyframe]) -> None:

@@ -20,6 +20,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import rotation_exp
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import Features, hamming, match
+from birdslam.loops.foot import body_pose, foot
 from birdslam.loops.keyframe import Keyframe
 from birdslam.loops.triangulation import cross
 from birdslam.trajectory import Transform, ego_pose, inverse, mount_pose, split_pose
@@ -74,6 +75,11 @@ class Fix:
     def T_map_ego(self) -> SE2:
         return self.keyframe.T_map_keyframe @ self.T_keyframe_ego
 
+    def attitude_in_map(self, camera: Camera) -> Attitude:
+        """Of the ego, with the keyframe's own."""
+        T = self.keyframe.T_map @ body_pose(self.T_keyframe_ego, self.attitude, camera.height_m)
+        return foot(T, camera.height_m)[1]
+
 
 def locate(
     camera: Camera, features: Features, local: LocalMap, guess: SE2 | None, radius_px: float = 60.0
@@ -100,7 +106,7 @@ def locate(
     if found is None:
         return None
     pose, cov, good = found
-    T_keyframe_ego, attitude = split_pose(pose)
+    T_keyframe_ego, attitude = foot(pose, camera.height_m)
     cells = np.floor(features.px[pairs[good, 1]] / (camera.width_px, camera.height_px) * GRID_CELLS).astype(int)
     places = len(np.unique(cells, axis=0))
     return Fix(local.keyframe, T_keyframe_ego, cov, int(good.sum()), len(pairs), places, attitude)
@@ -196,5 +202,7 @@ def _adjust(
             break
     if not good.any() or abs(pose[2, 3]) > 1.5 or math.hypot(*pose[:2, 3]) > 60.0:
         return None
-    cov: Floats = np.linalg.inv(H)[np.ix_([0, 1, 5], [0, 1, 5])].astype(np.float64)
+    h = camera.height_m
+    J_foot = np.array([[1, 0, 0, 0, h, 0], [0, 1, 0, -h, 0, 0], [0, 0, 0, 0, 0, 1]])  # the foot, by a step of the body
+    cov: Floats = J_foot @ np.linalg.inv(H) @ J_foot.T
     return pose, cov, good

@@ -24,7 +24,6 @@ from birdslam.odometry.corners.resection import InlierLimits, PoseEstimate, pose
 from birdslam.odometry.corners.selection import Corners, CornerSelector
 from birdslam.odometry.corners.sliding_window import match_ids
 from birdslam.odometry.corners.two_view import initial_two_view
-from birdslam.odometry.median import quantile
 from birdslam.odometry.metric_scale import MetricScale, RoadView
 from birdslam.odometry.motion import Motion, planar, step_cov, violates_nonholonomic
 from birdslam.odometry.motion_model import NO_MOTION, MotionModel
@@ -38,8 +37,8 @@ from birdslam.odometry.road.scale import RoadScale
 from birdslam.odometry.road.vanishing_point import VanishingPoint
 from birdslam.odometry.speed.constant_velocity import ConstantVelocityPrior, largest_sigma_m
 from birdslam.odometry.speed.scale import MOVING_M, CarMotion
-from birdslam.odometry.speed.stillness import NearRoadStillness
-from birdslam.odometry.speed.zero_velocity import is_stationary, near_road_flow_px
+from birdslam.odometry.speed.standing import StandingDetector
+from birdslam.odometry.speed.zero_velocity import near_road_flow_px
 from birdslam.odometry.working_resolution import WorkingResolution
 from birdslam.types import SpeedReading, Status
 
@@ -53,8 +52,6 @@ _MIN_INTERVAL_S = 0.004
 _KNOWN_SCALE_SIGMA_REL = 0.3  # of a scale by which the travelled distance is used
 _MOVING_MPS = 3.0  # from one image to the next a car does not stop from this
 _TWO_VIEW_INFORMATION = np.diag([1e4] * 3 + [6e4] * 3)  # of a step by two images alone: 1 cm, 0.25 deg
-_STILL_OUTER_PX = 1.5  # four of five corners have moved less where the median has not
-_MAX_HELD = 1.5  # times as long as a standstill takes to be told
 _NO_TRACKS = np.zeros(0, np.int64), np.zeros((0, 2))
 _STRATEGIES: dict[str, type[RoadScale] | type[MovingMedianScale]] = {"kalman": RoadScale, "paper": MovingMedianScale}
 
@@ -89,7 +86,7 @@ class Odometry:
         self._records = MotionRecords(cfg.motion, cfg.start.camera_ahead_m, self._scale, self._model)
         self._velocity_prior = ConstantVelocityPrior(cfg.constant_velocity)
         self._selector = CornerSelector(self.camera, cfg.fixed_corners, cfg.below_plane)
-        self._stillness = NearRoadStillness(self.camera, cfg.stillness)
+        self._standing = StandingDetector(self.camera, cfg.zero_velocity, cfg.stillness, cfg.min_fitting)
         self._obstructed = False  # fixed corners were left out of the newest motion
         self._fixed = 0  # corners of the newest image that are fixed to it
         self._searched: Pose | None = None  # the step to the present image, where it was searched for
@@ -178,18 +175,20 @@ class Odometry:
             return motion
 
         cfg = self.config
-        self._stillness.update(tracks.image, t_source_ns, boxes_px)
+        self._standing.near_road.update(tracks.image, t_source_ns, boxes_px)
         corners, located = self._relative_pose(tracks, boxes_px, dt_s, car)
         on_glass = corners.ids[corners.fixed]
         flow_px = near_road_flow_px(
             self.camera, self._scale.ground, self._tracker.reference, tracks, boxes_px, on_glass
         )
-        stationary = located is not None and self._is_stationary(
-            self._pose.between(located[0]), corners, flow_px, dt_s, car
+        speed_mps = self._model.speed_mps
+        stationary = located is not None and self._standing.is_stationary(
+            self._pose.between(located[0]), corners.displacement_px, flow_px, speed_mps, dt_s, car
         )
-        seems_still = stationary or self._seems_still(corners)
-        if seems_still and self._needs_proof(stationary, dt_s, car):
-            if not self._stillness.proven:
+        if (stationary or self._seems_still(corners)) and self._standing.needs_proof(
+            stationary, self._scale.unknown, self._selector.obstructed, speed_mps, dt_s, car
+        ):
+            if not self._standing.near_road.proven:
                 return self._hold(tracks, frame_id, t_source_ns, boxes_px, dt_s, car)
             stationary, located = True, (self._pose, _TWO_VIEW_INFORMATION)
         slips = False
@@ -319,48 +318,16 @@ class Odometry:
 
     # --- moving, standing, coasting ---
 
-    def _is_stationary(
-        self, step: Pose, corners: Corners, flow_px: float | None, dt_s: float, car: CarMotion | None
-    ) -> bool:
-        cfg = self.config
-        if len(corners.displacement_px) < cfg.min_fitting:
-            return False
-        speed_mps = self._model.speed_mps
-        if car is not None:
-            speed_mps = abs(car.forward_m) / dt_s
-            if car.is_moving(cfg.zero_velocity.length_m) and (flow_px is None or car.agreed):
-                return False
-        return is_stationary(cfg.zero_velocity, step, corners.displacement_px, flow_px, speed_mps, dt_s)
-
     def _seems_still(self, corners: Corners) -> bool:
-        """Whether the corners have hardly moved, be they of the street or on the glass."""
-        displacement_px = corners.displacement_px
-        if len(displacement_px) < self.config.min_fitting <= self._fixed:
-            return True  # all that is seen stands
-        return len(displacement_px) >= self.config.min_fitting and (
-            quantile(displacement_px, 0.5) < self.config.zero_velocity.still_px
-            and quantile(displacement_px, 0.8) < _STILL_OUTER_PX
-        )
-
-    def _needs_proof(self, stationary: bool, dt_s: float, car: CarMotion | None) -> bool:
-        """Whether corners that stand are no evidence of a car that stands: they may be on the glass.
-
-        Where the scale is known, nothing was found on the glass and brakes could have stopped the car, they are the
-        street's, which has moved before; those that are not `stationary` are far away.
-        """
-        standing = self.config.zero_velocity
-        if car is not None and car.agreed and not car.is_moving(standing.length_m):
-            return False
-        too_fast = self._model.speed_mps > standing.braking_mps2 * dt_s + standing.speed_mps
-        return self._scale.unknown or self._selector.obstructed or (stationary and too_fast)
+        return self._standing.seems_still(corners.displacement_px, self._fixed)
 
     def _hold(
         self, tracks: Tracks, frame_id: int, t_source_ns: int, boxes_px: Floats, dt_s: float, car: CarMotion | None
     ) -> Motion:
         """The speed is held: what has not moved may be on the glass. After a while the window begins anew."""
-        obstructed = self._selector.obstructed or self._stillness.contradicted
+        obstructed = self._selector.obstructed or self._standing.near_road.contradicted
         motion = self._coast(frame_id, dt_s, [Status.VIEW_OBSTRUCTED] * obstructed, car)
-        if dt_s > _MAX_HELD * self.config.stillness.long_s:  # what moves has left the image; what stands would be told
+        if self._standing.held_too_long(dt_s):
             self._start_window(tracks, frame_id, t_source_ns, boxes_px)
             self._scale.lose_tilt()
         return motion

@@ -23,6 +23,7 @@ from birdslam.geometry.camera import Camera
 from birdslam.outputs.bev_picture import draw
 from birdslam.outputs.final_trajectories import EGO_FILES
 from birdslam.outputs.line_map import LineMap
+from birdslam.outputs.placed import AROUND_FILES, PLACES_FILE, ROAD_IN_MAP, write_around
 from birdslam.outputs.plain_words import DriveCounts, LengthsBy, readme, verdict
 from birdslam.outputs.scene_recorder import MOST_POSES, MOST_TRACKS, SceneRecorder, Thinned
 from birdslam.trajectory import CameraTrajectory, Transform, ego_pose, kitti_row, tum_row
@@ -42,6 +43,10 @@ FILES = {  # what README.txt says of each that is there
     "tracks": "the way of each other vehicle, as ego.tum.txt; ID.final.tum.txt: smoothed",
     "map.csv": "points of the road and of the lanes, in metres",
     "map.geojson": "lane lines and road edges as polylines, in metres",
+    PLACES_FILE: "where the car was in the map and on Earth, a line a metre, as all is known in the end",
+    ROAD_IN_MAP: "map.geojson and map.csv in the map's metres",
+    "road.geojson": "the road's lines on Earth; road.gpx and road.kml too",
+    "tracks.geojson": "the ways of other vehicles on Earth; tracks.gpx and tracks.kml too",
     "camera.toml": "the camera as the first pass found it, for `--camera` next time",
     "logs": "what each process said",
 }
@@ -85,7 +90,7 @@ class Recorder:
             self._tracks_directory.mkdir(exist_ok=True)
             later = (
                 directory / name
-                for name in ("summary.json", "bev.png", "README.txt", "report.html", *EGO_FILES.values())
+                for name in ("summary.json", "bev.png", "README.txt", "report.html", *EGO_FILES.values(), *AROUND_FILES)
             )
             for old in (*self._tracks_directory.glob("*.tum.txt"), *later):
                 old.unlink(missing_ok=True)  # stale tracks beside new ones would be taken for this run's
@@ -174,6 +179,7 @@ class Recorder:
         `lengths_by`: what the camera's height and lens rest on; None: what is stated of them.
         """
         self.close()
+        write_around(self._directory)
         sigmas = self._sigmas.array()
         counts: dict[str, Any] = {
             "frames": self._frames,

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import is_exact, moved
 from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_pose import MapState
@@ -35,7 +34,7 @@ class MapTrajectory:
     """
 
     def __init__(self) -> None:
-        self._waiting: deque[tuple[Localisation, SE2, int]] = deque()  # with T_odom_ego and the epoch of odometry
+        self._waiting: deque[tuple[Localisation, Estimate]] = deque()
         self.counts = {state.value: 0 for state in MapState}  # settled frames by their state
         self.first_ns: int | None = None  # source time of the first frame that was localised while driving
         self.frames_before = 0  # that came before it
@@ -46,7 +45,7 @@ class MapTrajectory:
         if localised and self.first_ns is None:
             self.first_ns = localisation.t_source_ns
         self.frames_before += self.first_ns is None
-        self._waiting.append((localisation, estimate.T_world_ego, estimate.epoch))
+        self._waiting.append((localisation, estimate))
         if localised:
             self._lead_back()
             return self.finish()
@@ -57,14 +56,14 @@ class MapTrajectory:
 
     def finish(self) -> list[Localisation]:
         """All that wait, as they are."""
-        out = [localisation for localisation, _, _ in self._waiting]
+        out = [localisation for localisation, _ in self._waiting]
         self._waiting.clear()
         return self._settled(out)
 
     def _too_far(self, estimate: Estimate) -> bool:
-        _, T_odom_ego, epoch = self._waiting[0]
-        step = T_odom_ego.between(estimate.T_world_ego)
-        return epoch != estimate.epoch or math.hypot(step.x_m, step.y_m) > MOST_BACK_M
+        _, first = self._waiting[0]
+        step = first.T_world_ego.between(estimate.T_world_ego)
+        return first.epoch != estimate.epoch or math.hypot(step.x_m, step.y_m) > MOST_BACK_M
 
     def _settled(self, rows: list[Localisation]) -> list[Localisation]:
         for row in rows:
@@ -72,22 +71,22 @@ class MapTrajectory:
         return rows
 
     def _lead_back(self) -> None:
-        found, T_odom_found, epoch = self._waiting[-1]
+        found, newest = self._waiting[-1]
         assert found.T_map_ego is not None
-        cov, way_m, T_later = found.cov, 0.0, T_odom_found
+        cov, way_m, later = found.cov, 0.0, newest
         for place in range(len(self._waiting) - 2, -1, -1):
-            lost, T_odom_ego, of_epoch = self._waiting[place]
-            step = T_later.between(T_odom_ego)
+            lost, estimate = self._waiting[place]
+            step = later.T_world_ego.between(estimate.T_world_ego)
             way_m += math.hypot(step.x_m, step.y_m)
-            cov = moved(cov, step)
-            if of_epoch != epoch or way_m > MOST_BACK_M or not is_exact(cov):
+            cov = moved(cov, step, later.valid)
+            if estimate.epoch != newest.epoch or way_m > MOST_BACK_M or not is_exact(cov):
                 return
-            T_map_ego = found.T_map_ego @ T_odom_found.between(T_odom_ego)
+            T_map_ego = found.T_map_ego @ newest.T_world_ego.between(estimate.T_world_ego)
             led = Localisation(
                 *(lost.frame_id, lost.t_source_ns, MapState.LOCALISED, T_map_ego, cov, found.attitude),
                 map_epoch=found.map_epoch,
             )
-            self._waiting[place], T_later = (led, T_odom_ego, of_epoch), T_odom_ego
+            self._waiting[place], later = (led, estimate), estimate
 
 
 class TrajectoryFiles(contextlib.AbstractContextManager["TrajectoryFiles"]):

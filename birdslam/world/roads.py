@@ -82,7 +82,7 @@ def motorway(
     movers = _traffic(rng, street, own.d_m, speed_mps) if traffic else ()
     return Scenario(
         street, standing, movers, ego, _sunny() if night is None else even_sky(),
-        _camera() if night is None else _dark_camera(), seed, AXLE_M, night,
+        _camera() if night is None else dark_camera(), seed, AXLE_M, night,
     )  # fmt: skip
 
 
@@ -120,7 +120,7 @@ def night_street(seed: int, speed_mps: float) -> Scenario:
         for shape, at in (("hatchback", 70.0), ("suv", 190.0), ("van", 330.0))
     ]
     return Scenario(
-        street, standing, (ahead, *coming), ego, even_sky(0.25), _dark_camera(), seed, AXLE_M, Night()
+        street, standing, (ahead, *coming), ego, even_sky(0.25), dark_camera(), seed, AXLE_M, Night()
     )  # fmt: skip
 
 
@@ -221,7 +221,7 @@ def _camera(exposure: float = 1.0) -> Lens:
     return Lens(exposure, 1.0 / 2.2, 1.05, (1.0, 1.0, 1.0), 0.4, 0.002, 0.004, 0.1, 0.0, 0.8, 0, 0.0)
 
 
-def _dark_camera() -> Lens:
+def dark_camera() -> Lens:
     """The same with all the gain that it has: noise, a glow about lamps."""
     return Lens(
         1.0, 1.0 / 2.2, 1.05, (1.0, 1.0, 1.0), 0.6, 0.0015, 0.015, 0.2, 0.1, 0.6, 0, 0.0, fixed=NIGHT_GREY

@@ -29,6 +29,7 @@ from birdslam.world.truth import WorldFrame
 
 STREET_M = 1500.0  # of a drawn drive
 SIGHT_M = 190.0  # what stands farther away is left out
+_AWAKE_M = 700.0  # along the street: who is farther away waits there
 _STEPS = 4  # of the drivers' model within a frame
 
 
@@ -123,8 +124,9 @@ def moments(scenario: Scenario, count: int, rate_hz: float) -> Iterator[Moment]:
         scene = scenario.standing.subset(near).plus(everybody.subset(close))
         shaken = shake.at(t_s, ego.speed_mps, ego.acceleration_mps2)
         yield Moment(frame_id, t_s, T_world_ego, ego.s_m, ego.speed_mps, bend, shaken, movers, scene)
+        awake = [mover for mover in movers if abs(mover.s_m - ego.s_m) < _AWAKE_M]
         for step in range(_STEPS):
-            advance(movers, ego, street, t_s + step * dt_s / _STEPS, dt_s / _STEPS)
+            advance(awake, ego, street, t_s + step * dt_s / _STEPS, dt_s / _STEPS)
 
 
 def drive(scenario: Scenario, camera: Camera, count: int, rate_hz: float, samples: int = 2) -> Iterator[WorldFrame]:

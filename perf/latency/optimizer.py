@@ -44,6 +44,7 @@ class Contender(Protocol):
     def between(self) -> None: ...
 
 
+WINDOWS = (2, 4, 8, 16)  # lengths of the window, in poses of the ego
 _WARM_UP = 100  # frames before memory is looked at
 _PARTS = 50  # of a drive, for the plot over its frames
 _LAG_FRAMES = GraphConfig().ego_nodes
@@ -54,7 +55,7 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--vehicles", default="0,1,3,6,10,15", help="in sight, a list")
     parser.add_argument("--people", type=int, default=0, help="followed beside the vehicles, of `ours` and `ours_live`")
     parser.add_argument("--frames", type=int, default=10_000)
-    parser.add_argument("--contenders", default=",".join(CONTENDERS), help="a list")
+    parser.add_argument("--contenders", default=",".join(name for name in CONTENDERS if " " not in name), help="a list")
     parser.add_argument("--limit-s", type=float, default=60.0, help="time for each contender's frames")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
@@ -97,7 +98,7 @@ def summary(row: dict[str, Any]) -> str:
 
 
 def measure(contender: str, vehicles: int, log: Path, limit_s: float) -> dict[str, Any]:
-    """One contender in a process of its own."""
+    """One contender in a process of its own; `log` is what `write_log` left."""
     one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     program = [sys.executable, "-m", "birdslam.perf.latency.optimizer"]
     command = [*program, contender, str(vehicles), str(log), str(limit_s)]
@@ -183,9 +184,14 @@ class _Ours:
         self.graph.map_update()
 
 
+def _of_window(ego_nodes: int) -> tuple[Callable[[], Contender], int]:
+    return lambda: _Ours(GraphConfig(ego_nodes=ego_nodes), WeightsConfig()), ego_nodes
+
+
 CONTENDERS: dict[str, tuple[Callable[[], Contender], int | None]] = {
     "ours": (lambda: _Ours(GraphConfig(constant_velocity=False), WeightsConfig(leave_out=())), _LAG_FRAMES),
     "ours_live": (lambda: _Ours(GraphConfig(), WeightsConfig()), _LAG_FRAMES),
+    **{f"ours_live of {n} poses": _of_window(n) for n in WINDOWS},
     "isam2": (lambda: Smoother("isam2", _LAG_FRAMES), None),
     "incremental_fixed_lag_qr": (lambda: Smoother("incremental_fixed_lag_qr", _LAG_FRAMES), _LAG_FRAMES),
     "incremental_fixed_lag_cholesky": (lambda: Smoother("incremental_fixed_lag_cholesky", _LAG_FRAMES), _LAG_FRAMES),

@@ -1,8 +1,9 @@
 """Age at the planner with many people and vehicles in view: a rendered street, boxes of its truth, the real processes.
 
     python -m perf people_age [--people 20] [--vehicles 10] [--rate 33] [--seconds 12] [--output F.json]
+                               [--street DIR] [--render-only]
 
-The street is rendered first (extra `train`), then driven once by `birdslam run --detections FILE`.
+The street is rendered first (extra `train`), or taken from DIR, then driven once by `birdslam run --detections FILE`.
 """
 
 from __future__ import annotations
@@ -38,11 +39,19 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--vehicles", type=int, default=10)
     parser.add_argument("--rate", type=float, default=33.0, help="Hz")
     parser.add_argument("--seconds", type=float, default=12.0, help="of the street, with the first three")
+    parser.add_argument("--street", type=Path, metavar="DIR", help="where the street is kept, and taken from")
+    parser.add_argument("--render-only", action="store_true", help="keeps the street: measure on a quiet machine")
     options = parser.parse_args(arguments)
+    if options.render_only and options.street is None:
+        raise PerfError("--render-only: --street says where to keep it")
     settings = {name: getattr(options, name) for name in ("people", "vehicles", "rate", "seconds")}
     with Ledger(options.output, label, **settings) as ledger, tempfile.TemporaryDirectory(prefix="perf") as folder:
-        place = Path(folder)
-        render(place, options.people, options.vehicles, options.rate, round(options.rate * options.seconds))
+        place = options.street or Path(folder)
+        if not (place / "boxes.txt").exists():
+            place.mkdir(parents=True, exist_ok=True)
+            render(place, options.people, options.vehicles, options.rate, round(options.rate * options.seconds))
+        if options.render_only:
+            return
         ask = Ask(
             source=f"demo:{place / 'street'}",
             rate=options.rate,

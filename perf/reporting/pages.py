@@ -21,10 +21,13 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from birdslam.bench.tracking.by_class import people_page
 from birdslam.perf.__main__ import benchmark_modules
 from birdslam.perf.accuracy import films, overlays, tilt
 from birdslam.perf.cameras import lens
 from birdslam.perf.errors import PerfError
+from birdslam.perf.graph import agents, edges
+from birdslam.perf.maps import loops
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import foxglove, leave_one_out, measured, results
 from birdslam.perf.reporting.arguments import benchmark_parser
@@ -122,6 +125,18 @@ PAGES: tuple[Derived | Page, ...] = (
         {leave_one_out.KEPT: ("leave_one_out.json", leave_one_out.kept)},
         (localisation.evaluate_left_out, leave_one_out.kept),
     ),
+    *(
+        Page(
+            name,
+            (f"birdslam evaluate localisation {results.TRACKING} --class {kind} --output {{out}}",),
+            {f"docs/{name}.md": ("report.json", made)},
+            (localisation.evaluate_people, made),
+        )
+        for name, kind, made in (
+            ("people", "pedestrian", people_page.pedestrians),
+            ("cyclists", "cyclist", people_page.cyclists),
+        )
+    ),
     Page(
         "lanes",
         ("birdslam evaluate lanes demo --frame 60 --output {out}",),
@@ -142,6 +157,28 @@ PAGES: tuple[Derived | Page, ...] = (
         {"docs/tilt.md": ("tilt.json", tilt.page)},
         (tilt.run, tilt.page),
         SHIPPED,
+    ),
+    Page(
+        "loops",
+        (
+            "python -m birdslam.perf loops --part recorded loop alike gnss size --equal-houses 1000 --data {data} --output {out}/loops.json",
+        ),
+        {"docs/loops.md": ("loops.json", loops.page)},
+        (loops.run, loops.page),
+        SHIPPED,
+    ),
+    Page(
+        "edges",
+        (f"python -m birdslam.perf edges --data {{data}} --logs {{out}} {results.REAL} --output {{out}}/edges.json",),
+        {"docs/edges.md": ("edges.json", edges.page)},
+        (edges.run, edges.page),
+        NETWORKS,
+    ),
+    Page(
+        "agents",
+        ("python -m birdslam.perf agents --output {out}",),
+        {"docs/agents.md": ("agents.md", None), "docs/agents.png": ("agents.png", None)},
+        (agents.run,),
     ),
     Page(
         "films",

@@ -54,7 +54,8 @@ def evaluate_hidden(configuration: Configuration, drive: str) -> HiddenReport:
                 epoch, images = estimate.epoch, {}
                 cells = HiddenCells(recording.camera, lanes, shipped_completion(lanes.shape))
             boxes = np.zeros((0, 4)) if perception.detections is None else perception.detections.boxes_px
-            look = cells.add(estimate.T_world_ego, slam.frontend.vehicles.road.ground, perception.segmentation, boxes)
+            ground, bonnet_px = slam.frontend.vehicles.road.ground, slam.frontend.odometry.bonnet_px
+            look = cells.add(estimate.T_world_ego, ground, perception.segmentation, boxes, bonnet_px)
             if look >= 0:
                 images[look] = frame.frame_id, frame.image
     report, best = cells.report(recording.name)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.drift import moved
@@ -21,30 +21,38 @@ from birdslam.loops.keyframe import Link, Placed
 from birdslam.loops.keyframe_builder import SPACING_M
 from birdslam.loops.place_map import PlaceMap
 from birdslam.outputs.earth_files import SUFFIXES, Way, write_ways
+from birdslam.outputs.placed import Place
 from birdslam.runtime.maps.gnss_input import Fixes
-from birdslam.runtime.maps.map_drive import Poses
 from birdslam.types import Estimate
 
 
-def poses_of(estimates: list[Estimate]) -> Poses:
-    """Those of the longest epoch: between epochs the way is unknown."""
+def places_of(estimates: list[Estimate]) -> list[Place]:
+    """Those of the longest epoch: between epochs the way is unknown. Their world is the map."""
     if not estimates:
         return []
     longest = Counter(estimate.epoch for estimate in estimates).most_common(1)[0][0]
-    return [(each.t_source_ns, each.T_world_ego) for each in estimates if each.epoch == longest]
+    return [
+        Place(each.t_source_ns, each.epoch, each.T_world_ego, each.T_world_ego)
+        for each in estimates
+        if each.epoch == longest
+    ]
 
 
 def write_earth(
-    fixes_from: Fixes | Sequence[GnssFix], poses: Poses, camera: Camera, output: Path, place_map: PlaceMap | None
-) -> dict[str, Any]:
-    """Writes ego.geojson, ego.gpx and ego.kml, and brings the map to Earth; what summary.json says.
+    fixes_from: Fixes | Sequence[GnssFix],
+    places: Sequence[Place],
+    camera: Camera,
+    output: Path,
+    place_map: PlaceMap | None,
+) -> tuple[dict[str, Any], list[Place]]:
+    """Writes ego.geojson, ego.gpx and ego.kml, and brings the map to Earth; what summary.json says, and the places.
 
-    `poses` are in the map's frame where there is a map. Raises GnssError, EarthError, OSError.
+    Raises GnssError, EarthError, OSError.
     """
-    if not poses:
+    if not places:
         raise EarthError("the drive has no pose")
-    fixes = list(fixes_from(poses[0][0]) if callable(fixes_from) else fixes_from)
-    t_ns, way = np.array([t_ns for t_ns, _ in poses], np.int64), [pose for _, pose in poses]
+    fixes = list(fixes_from(places[0].t_source_ns) if callable(fixes_from) else fixes_from)
+    t_ns, way = np.array([each.t_source_ns for each in places], np.int64), [each.T_map_ego for each in places]
     earth = place_on_earth(t_ns, way, fixes)
     nodes: Sequence[Placed]
     if place_map is not None and len(place_map):
@@ -52,15 +60,19 @@ def write_earth(
     else:
         nodes, links, before = *_nodes(way), {}
     found = tie(earth, nodes, links, before | fixed_keyframes(earth, t_ns, way, fixes, nodes))
-    degrees = found.earth.wgs84(_bent(way, nodes, found))
+    bent = _bent(way, nodes, found)
+    degrees = found.earth.wgs84(np.array([(pose.x_m, pose.y_m) for pose in bent]))
     about = figures(found.earth, camera)
     properties = {key: value for key, value in about.items() if isinstance(value, int | float | str)}
-    line = Way("ego", degrees, [t_ns for t_ns, _ in poses], properties)
+    line = Way("ego", degrees, t_ns.tolist(), properties)
     for suffix in SUFFIXES:
         write_ways(output / f"ego{suffix}", [line])
     if place_map is not None and len(place_map):
         place_map.come_to_earth(found)
-    return about
+    return about, [
+        replace(place, T_map_ego=pose, earth=(lat, lon, found.earth.yaw_rad + pose.yaw_rad, found.earth.scale))
+        for place, pose, (lat, lon) in zip(places, bent, degrees.tolist(), strict=True)
+    ]
 
 
 def _nodes(way: Sequence[SE2]) -> tuple[list[Node], list[Link]]:
@@ -74,14 +86,13 @@ def _nodes(way: Sequence[SE2]) -> tuple[list[Node], list[Link]]:
     return nodes, links
 
 
-def _bent(way: Sequence[SE2], nodes: Sequence[Placed], found: OnEarth) -> Floats:
-    """(N, 2) the drive's way as its nearest keyframes lie now."""
+def _bent(way: Sequence[SE2], nodes: Sequence[Placed], found: OnEarth) -> list[SE2]:
+    """The drive's way as its nearest keyframes lie now."""
     before = [node.T_map_keyframe for node in nodes]
     moves = [found.poses[node.number][0] @ T.inverse() for node, T in zip(nodes, before, strict=True)]
     tree = cKDTree(np.array([(T.x_m, T.y_m) for T in before]))
     _, nearest = tree.query(np.array([(pose.x_m, pose.y_m) for pose in way]))
-    bent = [moves[int(row)] @ pose for row, pose in zip(nearest, way, strict=True)]
-    return np.array([(pose.x_m, pose.y_m) for pose in bent])
+    return [moves[int(row)] @ pose for row, pose in zip(nearest, way, strict=True)]
 
 
 def figures(earth: Earth, camera: Camera) -> dict[str, Any]:

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
+from birdslam.outputs.placed import write_places
 from birdslam.runtime.configuration import Configuration, ConfigurationError
-from birdslam.runtime.maps.drive_earth import poses_of, write_earth
+from birdslam.runtime.maps.drive_earth import places_of, write_earth
 from birdslam.runtime.maps.gnss_input import Fixes, Receiver, is_serial, recorded_fixes
 from birdslam.runtime.maps.map_drive import MapChoice, MapDrive
 from birdslam.runtime.progress import Progress
@@ -69,13 +70,19 @@ class DriveMap:
         Raises MapError, GnssError, EarthError, OSError or ConfigurationError.
         """
         if self._choice is None:
-            poses = poses_of(self._estimates)
-            return {} if self._gnss is None else {"earth": write_earth(self._gnss, poses, camera, output, None)}
+            if self._gnss is None:
+                return {}
+            earth, places = write_earth(self._gnss, places_of(self._estimates), camera, output, None)
+            write_places(output, places)
+            return {"earth": earth}
         drive = MapDrive(self._choice, camera, output)
         self._localise(drive, frames)
         summary: dict[str, Any] = {"map": drive.summary()}
         if self._gnss is not None:
-            summary["earth"] = write_earth(self._gnss, drive.poses, camera, output, drive.map)
+            summary["earth"], places = write_earth(self._gnss, drive.places, camera, output, drive.map)
+            write_places(output, places)
+        else:
+            write_places(output, drive.places)
         drive.write(summary["map"])
         return summary
 

@@ -9,7 +9,7 @@ import numpy as np
 from birdslam.loops.map_file import MapError
 from birdslam.loops.place_map import PlaceMap
 from birdslam.outputs.earth_files import SUFFIXES, Way, write_ways
-from birdslam.trajectory import tum_row
+from birdslam.trajectory import ego_pose, tum_row
 
 FORMATS = ".g2o, .tum.txt, .geojson, .gpx, .kml"
 
@@ -21,9 +21,8 @@ def export_map(place_map: PlaceMap, path: Path) -> str:
             path.write_text("".join(f"{line}\n" for line in _g2o(place_map)), encoding="ascii")
             return f"{len(place_map)} poses and {len(place_map.links)} edges"
         if path.name.endswith(".tum.txt"):
-            path.write_text(
-                "".join(f"{tum_row(each.t_source_ns, each.T_map)}\n" for each in place_map.keyframes), encoding="ascii"
-            )
+            rows = [(each.t_source_ns, ego_pose(each.T_map_keyframe, each.attitude)) for each in place_map.keyframes]
+            path.write_text("".join(f"{tum_row(*row)}\n" for row in rows), encoding="ascii")
             return f"{len(place_map)} keyframes"
         if path.suffix.lower() in SUFFIXES:
             ways = [

@@ -26,6 +26,7 @@ from birdslam.loops.gnss.files import GnssError
 from birdslam.loops.localiser import Localisation
 from birdslam.loops.map_file import MapError
 from birdslam.loops.map_pose import MapPose
+from birdslam.outputs.placed import Place, write_places
 from birdslam.runtime.configuration import Configuration, ConfigurationError
 from birdslam.runtime.environment import USER_ERROR_STATUS
 from birdslam.runtime.maps.drive_earth import write_earth
@@ -230,8 +231,9 @@ class LiveMap:
             reason = f"{self._output}: can't be written: {failure.strerror}"
         try:
             summary["map"] = self._drive.summary()
-            self._come_to_earth(summary)
+            places = self._come_to_earth(summary)
             self._drive.write(summary["map"])
+            write_places(self._output, places)
         except (MapError, OSError) as failure:
             reason = str(failure)
         if reason:
@@ -242,20 +244,22 @@ class LiveMap:
             reason = reason or f"{self._output}: can't be written: {failure.strerror}"
         return reason
 
-    def _come_to_earth(self, summary: dict[str, Any]) -> None:
-        """What is wrong with the fixes costs the map nothing."""
+    def _come_to_earth(self, summary: dict[str, Any]) -> list[Place]:
+        """The drive's places. What is wrong with the fixes costs the map nothing."""
         fixes: Fixes | list[GnssFix] | None = self._recorded
         if self._receiver is not None:
             fixes = [*self._fixes, *self._receiver.take(self._clock_ns)]
             self._receiver.close()
         if fixes is None:
-            return
+            return self._drive.places
         assert self._config.camera is not None
         try:
-            poses = self._drive.poses
-            summary["earth"] = write_earth(fixes, poses, self._config.camera, self._output, self._drive.map)
+            places = self._drive.places
+            summary["earth"], places = write_earth(fixes, places, self._config.camera, self._output, self._drive.map)
+            return places
         except (GnssError, EarthError) as error:
             log.warning("the drive is not on Earth: %s", error)
+            return self._drive.places
 
 
 def localise(configuration: Configuration, assignment: Assignment, vitals: Vitals, stop: Stop) -> int:

@@ -88,6 +88,7 @@ class RecordingFiles:
             "file": str(self.paths[0]),
             "files": [str(path) for path in self.paths],
             "complete": bool(recorder.process.vitals["ended"]) and not recorder.restarts.count,
+            "cut_off": not recorder.process.vitals["ended"],  # the newest file has no end
             "restarts": recorder.restarts.count,
             "messages": recorder.total("frames"),
             "dropped": recorder.total("dropped"),

@@ -111,8 +111,7 @@ def _readings(speeds: dict[str, int]) -> str:
 
 def _recorded(recording: dict[str, Any]) -> str:
     lost = recording["dropped"] + recording["images_torn"]
-    state = "" if recording["complete"] else ", CUT OFF"
-    if recording["restarts"]:
-        state = f", restarted {recording['restarts']} times"
+    state = f", restarted {recording['restarts']} times" if recording["restarts"] else ""
+    state += ", CUT OFF" if recording["cut_off"] else ""
     size = f"{recording['messages']} messages, {lost} lost, {recording['bytes'] / 1e6:.1f} MB"
     return f"{', '.join(recording['files'])}: {size}{state}"

@@ -1,7 +1,7 @@
 """The paper's own batch baseline: a pose graph in SE(3) over odometry of unknown scale (Sec. 4, its Tables 1, 2, 5).
 
 Kept: SE(3) nodes, one batch, CC, CV and VV edges with the paper's weights, odometry stripped of its scale, which the
-CV edges bring to metres; lane constraints (Eq. 3) as the log's CP landmarks, or none. Not kept: ORB-SLAM2's odometry,
+CV edges bring to metres; CP edges of ego and vehicles (Eqs. 3 and 7), or none. Not kept: ORB-SLAM2's odometry,
 vehicles by shape priors, points of amodal lanes; here all come from the log. Its VV edges are predictions in metres of
 a tracker on metric odometry, so that they carry scale too. ORB's drift of scale is only in as far as the log's is.
 """
@@ -15,10 +15,11 @@ from msgspec.structs import replace
 from birdslam.bench.baselines.posegraph3 import BatchConfig, optimise_batch
 from birdslam.bench.baselines.trajectories import Trajectories
 from birdslam.geometry.camera import Camera
+from birdslam.graph.weights import PAPER_WEIGHTS
 from birdslam.types import Measurements
 
 label = "Batch SE(3), unscaled odometry"
-CONFIG = BatchConfig(metric=False, landmarks=True)
+CONFIG = BatchConfig(metric=False, landmarks=True, weights=PAPER_WEIGHTS)
 
 
 def run(log: Sequence[Measurements], camera: Camera, lanes: bool = True) -> Trajectories:

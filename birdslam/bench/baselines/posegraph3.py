@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import msgspec
@@ -20,7 +20,7 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.graph.weights import WeightsConfig, weighted
 from birdslam.trajectory import ego_pose, inverse, split_pose
-from birdslam.types import Attitude, LandmarkEdge, LandmarkKind, Measurements
+from birdslam.types import Attitude, LandmarkEdge, LandmarkKind, Measurements, VehicleEdge
 
 
 class BatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -37,6 +37,7 @@ class BatchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     iterations: int = 500  # at the most; `Convergence` says whether they were enough
 
 
+_UNKNOWN_REL = 0.3  # 1-sigma of a place, as a share of its range, that is none
 _WIDE_SCALE = 1e3  # 1-sigma of an unknown scale, so that a log without any vehicle can be solved
 _SCALE_STEP = 1e-4  # for its derivative
 _SCALE_TOLERANCE = 1e-7  # of it
@@ -59,14 +60,15 @@ class Convergence:
 
 def optimise_batch(log: Sequence[Measurements], config: BatchConfig) -> Trajectories:
     """The trajectories that minimise the graph, laid on the road. An empty log gives none."""
-    return solve_batch(log, config)[0]
+    found, ended = solve_batch(log, config, check=True)
+    return replace(found, converged=ended.converged)
 
 
 def solve_batch(
     log: Sequence[Measurements], config: BatchConfig, check: bool = False
 ) -> tuple[Trajectories, Convergence]:
     """The same, and how the solver ended; without `check` the step is not taken, and is NaN."""
-    log = [weighted(m, config.weights) for m in log]
+    log = [weighted(_placed(m), config.weights) for m in log]
     builder = _Builder(config)
     for m in log:
         builder.add_frame(m, 1.0 if config.metric else _mean_step_m(log))
@@ -75,6 +77,19 @@ def solve_batch(
     if config.steady_motion is not None:
         builder.add_steady_motion(np.array(config.steady_motion))
     return builder.solve(check)
+
+
+def _placed(m: Measurements) -> Measurements:
+    """Without CV edges whose own covariance says that the vehicle's place is unknown, which the paper's weights can't.
+
+    One such edge (0005, a box cut to a sliver: 235 +- 100 m) turns its vehicle about, and no solver converges.
+    """
+
+    def is_known(edge: VehicleEdge) -> bool:
+        range_m = math.hypot(edge.T_ego_vehicle.x_m, edge.T_ego_vehicle.y_m)
+        return math.sqrt(edge.cov[0] + edge.cov[4]) < _UNKNOWN_REL * range_m
+
+    return msgspec.structs.replace(m, cv=tuple(edge for edge in m.cv if is_known(edge)))
 
 
 def _mean_step_m(log: Sequence[Measurements]) -> float:

@@ -17,6 +17,7 @@ class Trajectories:
 
     ego: dict[int, SE2] = field(default_factory=dict)
     vehicles: dict[int, dict[int, SE2]] = field(default_factory=dict)
+    converged: bool = True  # False: of a solver that ended short of its minimum
 
     def put_vehicle(self, vehicle: int, frame: int, pose: SE2) -> None:
         self.vehicles.setdefault(vehicle, {})[frame] = pose

@@ -79,13 +79,26 @@ class HiddenCells:
         self._centres_m = cell_centres_m(np.ones(config.shape, bool), config)
         self._looks: list[_Look] = []
 
-    def add(self, T_world_ego: SE2, ground: GroundPlane, segmentation: Segmentation, boxes_px: Floats) -> int:
-        """One frame with the boxes (B, 4) of its vehicles; its look's number, -1 where the ego has not moved."""
+    def add(
+        self,
+        T_world_ego: SE2,
+        ground: GroundPlane,
+        segmentation: Segmentation,
+        boxes_px: Floats,
+        bonnet_px: Floats | None = None,
+    ) -> int:
+        """One frame with the boxes (B, 4) of its vehicles; its look's number, -1 where the ego has not moved.
+
+        Nothing is seen below `bonnet_px` (N, 2), the upper edge of the car's own bonnet.
+        """
         if not self._amodal.has_moved(T_world_ego):
             return -1
+        shown = np.ones_like(segmentation.road)
+        everywhere = Segmentation(shown, shown)
+        if bonnet_px is not None:
+            segmentation, everywhere = segmentation.above(bonnet_px), everywhere.above(bonnet_px)
         road_m, line_m = points_of(segmentation, self.camera, ground, boxes_px, self.config)
-        everywhere = np.ones_like(segmentation.road)
-        looked_m, _ = points_of(Segmentation(everywhere, everywhere), self.camera, ground, boxes_px, self.config)
+        looked_m, _ = points_of(everywhere, self.camera, ground, boxes_px, self.config)
         self._amodal.add(T_world_ego, road_m, line_m)
         view = lane_view(self._amodal, T_world_ego)
         road, line, looked = (points.astype(np.float32)[:, None] for points in (road_m, line_m, looked_m))

@@ -20,6 +20,7 @@ from birdslam.types import LandmarkEdge, Measurements
 SPAN = 4  # frames: as far as the graph ties a key frame to the one before
 LEAST_M = 1.0  # a shorter way's length says nothing of the scale
 WILD = 0.5  # a CP edge whose length is farther off, as a logarithm, is no measurement of it
+OUTLIER = 3.0  # sigmas: an error past it is of no landmark
 NORMAL = 1.4826  # of a normal error: sigma over the median of its size
 
 
@@ -38,6 +39,10 @@ class EdgeStatistics(msgspec.Struct, frozen=True, kw_only=True):
     # 1-sigma, by the spread of both
     seen: float
     seen_sigma: float
+    # 1-sigma of what the landmarks of a span share, along the ego's axis and across it: by the products of the errors
+    # of any two of them. NaN: they share less than that shows
+    common_along_m: float
+    common_across_m: float
 
 
 def edge_statistics(log: Sequence[Measurements], ego: Mapping[int, SE2]) -> EdgeStatistics | None:
@@ -46,6 +51,7 @@ def edge_statistics(log: Sequence[Measurements], ego: Mapping[int, SE2]) -> Edge
     table = np.array(rows).reshape(-1, 4)
     cc, cp, stated, shared = table.T
     both = np.abs(cp) < WILD  # False where there is no CP
+    along_m, across_m = _common(log, ego)
     if both.sum() < 10:
         return None
     e, d = cc[both], cp[both]
@@ -66,7 +72,30 @@ def edge_statistics(log: Sequence[Measurements], ego: Mapping[int, SE2]) -> Edge
         seen=seen,
         # Spans overlap: so many are independent
         seen_sigma=float(np.sqrt((d * d).sum() / errors2 / max(both.sum() / SPAN, 1.0))),
+        common_along_m=along_m,
+        common_across_m=across_m,
     )
+
+
+def _common(log: Sequence[Measurements], ego: Mapping[int, SE2]) -> tuple[float, float]:
+    spans = []
+    for first, last in zip(log, log[SPAN:], strict=False):
+        then = {(e.kind, e.landmark): np.array([e.x_m, e.y_m]) for e in first.cp}
+        now = {(e.kind, e.landmark): np.array([e.x_m, e.y_m]) for e in last.cp}
+        if both := then.keys() & now.keys():
+            T = ego[first.frame_id].between(ego[last.frame_id])
+            spans.append(np.array([T @ now[key] - then[key] for key in sorted(both)]))  # Eq. 3, the motion known
+    if not spans:
+        return math.nan, math.nan
+    limit = OUTLIER * NORMAL * np.median(np.abs(np.concatenate(spans)), axis=0)
+    products, weight = np.zeros(2), 0
+    for errors in spans:
+        errors = errors[(np.abs(errors) <= limit).all(axis=1)]
+        pairs = len(errors) * (len(errors) - 1)
+        products += errors.sum(axis=0) ** 2 - (errors**2).sum(axis=0)
+        weight += pairs
+    along, across = (math.sqrt(p / weight) if weight and p > 0.0 else math.nan for p in products.tolist())
+    return along, across
 
 
 def _spread(x: Floats) -> float:

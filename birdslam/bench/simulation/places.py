@@ -17,7 +17,8 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import DESCRIPTOR_BYTES, Features
-from birdslam.trajectory import ego_pose, inverse, mount_pose
+from birdslam.loops.foot import body_pose
+from birdslam.trajectory import inverse, mount_pose
 from birdslam.types import NS_PER_S, Attitude, Estimate
 
 CAMERA = Camera(width_px=1242, height_px=375, fx_px=720.0, fy_px=720.0, cx_px=621.0, cy_px=180.0, height_m=1.65)
@@ -37,9 +38,12 @@ class Street:
     corners_m: Floats  # (M, 3)
     descriptors: NDArray[np.uint8]  # (M, 32)
 
-    def see(self, T_world_ego: SE2, chance: np.random.Generator, bits: float = SAME_BITS) -> Features:
+    def see(
+        self, T_world_ego: SE2, chance: np.random.Generator, bits: float = SAME_BITS, pitch_rad: float = 0.0
+    ) -> Features:
         """The corners in the camera's image, each a little wrong."""
-        T = inverse(ego_pose(T_world_ego, Attitude()) @ mount_pose(CAMERA.ground))
+        body = body_pose(T_world_ego, Attitude(pitch_rad=pitch_rad), CAMERA.height_m)
+        T = inverse(body @ mount_pose(CAMERA.ground))
         near = np.flatnonzero(np.hypot(*(self.corners_m[:, :2] - (T_world_ego.x_m, T_world_ego.y_m)).T) < SIGHT_M)
         p = self.corners_m[near] @ T[:3, :3].T + T[:3, 3]
         ahead = p[:, 2] > 2.0
@@ -89,10 +93,19 @@ def build(route: Floats, seed: int, house_m: float = 0.0) -> Street:
 
 
 def drive(
-    street: Street, rows: range, seed: int, lateral_m: float = 0.0, bits: float = SAME_BITS, first_frame: int = 0
+    street: Street,
+    rows: range,
+    seed: int,
+    lateral_m: float = 0.0,
+    bits: float = SAME_BITS,
+    first_frame: int = 0,
+    nod_rad: float = 0.0,
 ) -> Iterator[tuple[Estimate, Features, SE2]]:
-    """A drive along rows of the route, `lateral_m` left of it: odometry's estimate, what is seen, and the truth."""
-    chance = np.random.default_rng(seed)
+    """A drive along rows of the route, `lateral_m` left of it: odometry's estimate, what is seen, and the truth.
+
+    The car nods by `nod_rad` (1-sigma), of which odometry's attitude says nothing.
+    """
+    chance, nods = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     scale = 1.0 + SCALE_DRIFT * float(chance.standard_normal())
     T_odom, T_last = SE2(), None
     for number, row in enumerate(rows):
@@ -114,4 +127,4 @@ def drive(
             cov=(0.0,) * 9,
             valid=True,
         )
-        yield estimate, street.see(T_world_ego, chance, bits), T_world_ego
+        yield estimate, street.see(T_world_ego, chance, bits, nod_rad * nods.standard_normal()), T_world_ego

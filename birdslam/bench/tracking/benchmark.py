@@ -238,6 +238,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     odometry: str = ""
     detections: str = ""
     tracks: float | None = None  # how many of our tracks held the vehicle; the same for every method
+    unconverged: int = 0  # the seeds in which the method's solver ended short of its minimum
 
 
 @dataclass(frozen=True)
@@ -249,6 +250,7 @@ class Trial:
     tracks: Mapping[str, int]  # body -> tracks that held it
     hota: float | None
     idf1: float | None
+    unconverged: frozenset[str] = frozenset()  # methods whose solver ended short of its minimum
 
 
 def run_trial(
@@ -269,7 +271,8 @@ def run_trial(
     truth = Truth.of(sequence, log)
     labelled = {EGO: len(truth.ego)} | {str(label): len(poses) for label, poses in truth.vehicles.items()}
     errors = {name: truth.errors(solved[method], bodies) for name, method in chosen.items()}
-    return Trial(errors, labelled, truth.tracks(), hota(truth.boxes), idf1(truth.boxes))
+    unconverged = frozenset(name for name, method in chosen.items() if not solved[method].converged)
+    return Trial(errors, labelled, truth.tracks(), hota(truth.boxes), idf1(truth.boxes), unconverged)
 
 
 def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odometry: str, detections: str) -> list[Row]:
@@ -301,6 +304,7 @@ def summarise(sequence: str, trials: Sequence[Trial], keep: Iterable[str], odome
                     odometry=odometry,
                     detections=detections,
                     tracks=median([trial.tracks.get(body) for trial in trials]),
+                    unconverged=sum(method in trial.unconverged for trial in trials),
                 )
             )
     return rows

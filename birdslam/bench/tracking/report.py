@@ -164,8 +164,11 @@ def _preface(setting: Setting, outcomes: Sequence[Outcome]) -> str:
         "our front end; methods differ in their back ends alone. *Live* is what a planner gets in each frame, which "
         "knows nothing of later ones. *Final* is the vehicles' ways once the sequence is over, from the live ones by "
         "one smoother for both (birdslam/vehicles/rts_smoother.py); the egos' are the live ones. A batch knows the "
-        "whole sequence without that smoother. Tables 3 and 4 compare live estimates. What is placed *by Eq. 1* alone "
-        "departs from that: its log is of the paper's own placing of vehicles (Eq. 1 under the box on level ground). "
+        "whole sequence without that smoother; one with \\* ended short of its minimum in a seed or more. Tables 3 and "
+        "4 compare live estimates. What is placed *by Eq. 1* alone "
+        "departs from that: its log is of the paper's own placing of vehicles (Eq. 1 under the box on level ground), "
+        "and on images of its whole front end: metres by a moving median, and within 20 m the places that "
+        "Frustum-PointNet reads from the depth network's points. "
         "So does what has the *shape prior*, with which the paper initialises its baselines: a wireframe fitted to "
         "each box and the log's distance, as no network for keypoints is at hand "
         "(birdslam/bench/baselines/shape_prior.py).",

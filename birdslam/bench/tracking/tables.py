@@ -1,6 +1,7 @@
 """The paper's Tables 1-5 as Markdown: published, re-implemented and ours in columns of their own.
 
-A row is a body here and a method a column, so that the three sources stand side by side; numbers are ATE (RMS, metres).
+A row is a body here and a method a column, so that the three sources stand side by side; numbers are ATE (RMS, metres),
+with `*` where a solver ended short of its minimum.
 """
 
 from __future__ import annotations
@@ -49,6 +50,7 @@ REDONE_TITLES = {  # of the re-implemented; a batch knows the whole log, as what
     "paper_eq1": "BirdSLAM by Eq. 1, live",
     "paper_eq1_final": "BirdSLAM by Eq. 1, final",
 }
+UNCONVERGED = " \\*"  # of a batch that ended short of its minimum
 VARIANT_TITLES = {
     "without_cc": "without CC",
     "without_cv": "without CV",
@@ -154,7 +156,11 @@ def methods_table(rows: Sequence[Row], published: Published, ego: bool) -> str:
         present = _present(alike, bodies)
         means: list[str] = ["mean", "of those at hand", odometry_title(odometry), ""]
         means += [number(_published_mean(table.ate_m.get(name, {}), present)) for name in METHOD_TITLES]
-        means += [number(mean_ate_m(alike, name, present)) for name in (*redone, *own)]
+        for name in (*redone, *own):
+            cut = any(
+                row.unconverged for row in alike if row.method == name and row.body in present.get(row.sequence, ())
+            )
+            means.append(number(mean_ate_m(alike, name, present)) + UNCONVERGED * cut)
         lines.append(means)
     return markdown(head, lines)
 
@@ -334,6 +340,5 @@ def _published_mean(cells: Cells, bodies: Mapping[str, Sequence[str]]) -> float 
 def _row_number(row: Row | None, spread: bool = True) -> str:
     if row is None or row.ate_m is None:
         return "-"
-    return f"{row.ate_m:.2f}" + (
-        f" ± {row.ate_m_spread:.2f}" if spread and row.seeds > 1 and row.ate_m_spread is not None else ""
-    )
+    spread_m = row.ate_m_spread if spread and row.seeds > 1 else None
+    return f"{row.ate_m:.2f}" + ("" if spread_m is None else f" ± {spread_m:.2f}") + UNCONVERGED * (row.unconverged > 0)

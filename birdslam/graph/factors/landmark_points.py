@@ -105,7 +105,9 @@ class LandmarkPoints(Factor):
         self._capacity = config.max_landmarks
         self._in_world = config.landmark_anchor == "first_sight"
         self._gate = config.landmark_gate_sigma**2
-        self._common_variance = config.landmark_common_m**2  # m^2 of what all landmarks of a frame share
+        # Mean and deviator of what all landmarks of a frame share, m^2
+        along, across = config.landmark_common_along_m**2, config.landmark_common_across_m**2
+        self._common = 0.5 * (along + across), 0.5 * (along - across)
         self._least_frames = config.landmark_least_frames
         self.begin()
 
@@ -177,7 +179,7 @@ class LandmarkPoints(Factor):
             excess = inflation(distances, self._gate)
             means, deviators = means * excess, deviators * excess
         gap, m, d = sum_of_points(residuals, means, deviators)  # Eq. 7
-        m += self._common_variance
+        m, d = m + self._common[0], d + self._common[1]
         return Linearised([gap.real, gap.imag], place, np.array([[[m + d.real, d.imag], [d.imag, m - d.real]]]))
 
     def known_in_ego(self, window: Window) -> tuple[Complexes, Complexes, complex] | None:

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.pose import Pose, rotation_exp
-from birdslam.odometry.road.alignment import RoadAligner, RoadImage
+from birdslam.odometry.road.alignment import RoadAligner
+from birdslam.odometry.road.road_image import RoadImage
 from birdslam.odometry.road.scale_search import best_correlation, correlations, far_changed_pixels
 
 Floats = NDArray[np.float64]

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from birdslam.odometry.road.alignment import Grey, RoadImage
+from birdslam.odometry.road.road_image import Grey, RoadImage
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 

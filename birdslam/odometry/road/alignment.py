@@ -21,10 +21,11 @@ from birdslam.geometry.camera import Camera, plane_normal
 from birdslam.geometry.pose import Pose, rotation_exp
 from birdslam.odometry.median import upper_median
 from birdslam.odometry.road.fit import MOTION, ROAD, Gradients, RoadFit, fit_without_prior
+from birdslam.odometry.road.length_information import OTHER_LENGTHS_LOG, length_information
+from birdslam.odometry.road.road_image import Grey, RoadImage
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Grey = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
@@ -34,8 +35,6 @@ _MAX_STEP = np.array([0.1, 0.1, 0.1, 0.005] + [0.1] * MOTION)  # of one iteratio
 _STEP_UNITS = np.array([1.0, 1.0, 1.0, 0.05] + [3.0] * MOTION)
 _MIN_DEPTH, _MIN_VISIBLE = 1e-3, 0.05  # depths, in m along the past camera's axis
 _MIN_DETERMINANT = 1e-3  # of the map from the present to the past image: a smaller area shows no gradient
-_OTHER_LENGTHS_LOG = (-0.35, -0.2, 0.2, 0.35)  # over which a fit must be likelier
-_MOST_SHARE = 0.99  # of the gain, by which the width of the maximum can still be told
 _LENGTH = np.eye(ROAD + MOTION)[0]
 _BEHIND_CREST = 0.01  # where a ray misses the parabola: the road is hidden by its crest
 
@@ -106,44 +105,6 @@ def _translation(T_past_present: Pose, x: Floats) -> Floats:
     return out
 
 
-class RoadImage:
-    """The part of a grey image that can show road, with local brightness and contrast normalised.
-
-    Otherwise the edges of shadows, and of the dark below other cars, outweigh the road's texture.
-    """
-
-    def __init__(self, grey: NDArray[np.uint8], top_px: int, config: RoadAlignConfig) -> None:
-        self.top_px = top_px
-        smooth = cv2.GaussianBlur(grey[top_px:], (5, 5), 1.0)
-        window = (config.contrast_window_px, config.contrast_window_px)
-        mean = cv2.boxFilter(smooth, cv2.CV_32F, window)
-        contrast = cv2.sqrBoxFilter(smooth, cv2.CV_32F, window)
-        cv2.subtract(contrast, cv2.multiply(mean, mean), dst=contrast)
-        cv2.sqrt(np.maximum(contrast, 0.0, out=contrast), dst=contrast)
-        np.add(contrast, np.float32(config.contrast_floor_grey), out=contrast)
-        difference = cv2.subtract(smooth, mean, dst=mean, dtype=cv2.CV_32F)
-        self.grey: Grey = cv2.divide(difference, contrast, dst=mean, scale=10.0)  # type: ignore[assignment]
-        self._gradients: tuple[Grey, Grey] | None = None
-
-    @classmethod
-    def of(cls, grey: Grey, top_px: int) -> RoadImage:
-        """Of rows from `top_px` on that are not to be normalised."""
-        image = cls.__new__(cls)
-        image.top_px, image.grey, image._gradients = top_px, grey, None
-        return image
-
-    @property
-    def gradients(self) -> tuple[Grey, Grey]:
-        """d grey / du and d grey / dv, grey levels per pixel."""
-        if self._gradients is None:
-            self._gradients = (
-                cv2.Scharr(self.grey, cv2.CV_32F, 1, 0, scale=1.0 / 32.0),
-                cv2.Scharr(self.grey, cv2.CV_32F, 0, 1, scale=1.0 / 32.0),
-            )  # type: ignore[assignment]
-        assert self._gradients is not None
-        return self._gradients
-
-
 class RoadAligner:
     """Aligns two images of the road of one camera."""
 
@@ -161,7 +122,7 @@ class RoadAligner:
         self._grid = (u, v, (u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px)
 
     def image(self, grey: NDArray[np.uint8]) -> RoadImage:
-        return RoadImage(grey, self.top_px, self.config)
+        return RoadImage(grey, self.top_px, self.config.contrast_window_px, self.config.contrast_floor_grey)
 
     def samples(
         self,
@@ -253,28 +214,15 @@ class RoadAligner:
         of_present = self._present_gradients(fine, present, px, T_past_present, at, gain)
         motion = slice(ROAD, ROAD + MOTION)
         state, cov = fit_without_prior(at, px, of_past, of_present, r, w, weight_prior[motion, motion])
-        shown = self._length_information(fine, past, T_past_present, at)
+        others = [self._correlation_at(fine, past, T_past_present, at + off * _LENGTH) for off in OTHER_LENGTHS_LOG]
+        samples = cfg.effective_sample_fraction * int(seen.sum())
+        shown = length_information(_correlation(grey, fine.grey, seen.astype(np.float64)), others, samples)
         return RoadFit(state, cov, _correlation(grey, fine.grey, w), int(seen.sum()), shown)
 
-    def _length_information(self, view: _View, past: RoadImage, T_past_present: Pose, x: Floats) -> float:
-        """Information about the log length, given all else, by how much less likely the images are with other lengths.
-
-        The log likelihood of n normal residuals, of images that correlate by c, is -n/2 log(1 - c^2). Over a length
-        that is off by d it gains G (1 - exp(-d^2 / 2 w^2)), G being the gain over images that do not correlate: the
-        information is G / w^2, by the length that leaves the least. Where any is as likely it is 0, or less by chance.
-        """
-        out, unexplained = np.inf, 1.0
-        for off in (0.0, *_OTHER_LENGTHS_LOG):
-            seen, grey = self._values(past, self._places(view, T_past_present, x + off * _LENGTH))
-            c = _correlation(grey, view.grey, seen.astype(np.float64)) if seen.any() else 0.0
-            other = max(1.0 - max(c, 0.0) ** 2, 1e-6)
-            if off == 0.0:
-                unexplained, samples = float(np.clip(other, 1e-6, 1.0 - 1e-6)), int(seen.sum())
-                most = -0.5 * self.config.effective_sample_fraction * samples * float(np.log(unexplained))
-            else:
-                share = 1.0 - float(np.log(other)) / float(np.log(unexplained))
-                out = min(out, -2.0 * most * float(np.log1p(-min(share, _MOST_SHARE))) / off**2)
-        return out
+    def _correlation_at(self, view: _View, past: RoadImage, T_past_present: Pose, x: Floats) -> float:
+        """How the images correlate by the state `x`; 0 where the past image shows none of the samples."""
+        seen, grey = self._values(past, self._places(view, T_past_present, x))
+        return _correlation(grey, view.grey, seen.astype(np.float64)) if seen.any() else 0.0
 
     def warp(self, past: RoadImage, T_past_present: Pose, px: Ints, road: Floats) -> tuple[Floats, Bools]:
         """(N,) grey values of the past image, warped to the present pixels (N, 2) by a motion and a road state (4,).

@@ -25,8 +25,10 @@ from birdslam.odometry.speed.readings import CarSpeedConfig
 Floats = NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 
-STATES = ROAD + 2  # log lambda, pitch, roll, curvature; the mount's pitch and roll
+STATES = ROAD + 3  # log lambda, pitch, roll, curvature; the mount's pitch and roll; the drift of log lambda
+DRIFT = STATES - 1
 _NOTHING_KNOWN = 10.0  # 1-sigma of the log of a length of which nothing is known
+_WRONG_PITCH_SIGMAS = 2.0  # of the first direction of travel, where it shows that the camera file's pitch is wrong
 _MAX_FACTOR_SIGMAS = 1.5  # of the factor's prior; two rendered nights chose between 1.5 and 2
 CAR_FACTOR, CAR_DELAY, ROAD_ERROR = STATES, STATES + 1, STATES + 2  # with the car's own speed
 
@@ -65,10 +67,11 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_wrong_pitch_rad: Positive = 0.08  # a direction that is off by more is no car's and is not used
     sigma_mount_rad: Positive = 0.02  # of the calibrated pitch and roll
     sigma_unseen_rad: Positive = 0.03  # of the tilt after the camera turned without being seen
-    scale_walk_rel_per_sqrt_m: Positive = 0.004  # drift of the visual scale
-    # ... whose errors go together over this distance: 0005 with its road hidden is off by 8 % after 120 m
-    scale_walk_correlation_m: Positive = 30.0
-    # ... and of the path's curvature: on KITTI 01's ramp of 21 m radius it drifts by 12 % over as many metres
+    scale_walk_rel_per_sqrt_m: Positive = 0.004  # random walk of the visual scale
+    # ... and what of it lasts: the motorway clip drifts by -0.24 % a metre, KITTI 01 by -0.19, 00, 06 and 0005 by 0.04
+    scale_drift_per_m: Positive = 0.0013
+    scale_drift_memory_m: Positive = 100.0  # over which that drift lasts
+    # The walk by the path's curvature: on KITTI 01's ramp of 21 m radius it drifts by 12 % over as many metres
     scale_walk_bend_sqrt_m: Positive = 0.4
     max_bend_per_m: Positive = 0.15  # the path's curvature is clipped to it
     tilt_walk_rad_per_sqrt_m: Positive = 0.003  # crown and grade of the road
@@ -93,10 +96,11 @@ class RoadScaleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class RoadFilter:
     """State, measurements and readers:
 
-    - `x` (6,): log lambda (lambda: metres per unit of the odometry's length); pitch and roll (rad) of the camera
+    - `x` (7,): log lambda (lambda: metres per unit of the odometry's length); pitch and roll (rad) of the camera
       against the plane that touches the road under it; the road's curvature (1/m, > 0 in a sag); pitch and roll (rad)
-      of the mount, which is the mean of the tilt. `cov` (6, 6). With the car's own speed (`add_car_states`) also the
-      log of its scale factor, its delay (s), and the log of the road's systematic scale error.
+      of the mount, which is the mean of the tilt; the drift of log lambda (1/m). `cov` (7, 7). With the car's own speed
+      (`add_car_states`) also the log of its scale factor, its delay (s), and the log of the road's systematic scale
+      error.
     - Prediction: by the camera's rotation and the distance travelled (`predict`). Over a crest or a sag the touching
       plane turns by curvature times distance.
     - Measurements: the mount's tilt, in the mean (in `predict`); the direction of travel, which lies in the road
@@ -104,15 +108,18 @@ class RoadFilter:
       (`update_alignment`); distances by the car's own speed (`update_car_speed`).
     - Readers: `RoadScale`, for the factor on all lengths, the ground plane and its sigma, and `MountChangeDetector`.
 
-    The mount is a state, so that its correlation with the tilt is known. The odometry is rescaled after each update, so
-    that log lambda is 0 between updates and only its variance is carried.
+    The mount is a state, so that its correlation with the tilt is known. So is the drift, which lasts: an alignment
+    trades length against pitch, and would give most of each metre's to the pitch. The odometry is rescaled after each
+    update, so that log lambda is 0 between updates and only its variance is carried.
     """
 
     def __init__(self, camera: Camera, config: RoadScaleConfig) -> None:
         self.config = config
-        self.x = np.array([0.0, camera.pitch_rad, camera.roll_rad, 0.0, camera.pitch_rad, camera.roll_rad])
+        self.x = np.array([0.0, camera.pitch_rad, camera.roll_rad, 0.0, camera.pitch_rad, camera.roll_rad, 0.0])
         mount, tilt = config.sigma_mount_rad**2, config.sigma_mount_rad**2 + config.sigma_bounce_rad**2
-        self.cov: Floats = np.diag([1.0, tilt, tilt, config.sigma_curvature_per_m**2, mount, mount])
+        self.cov: Floats = np.diag(
+            [1.0, tilt, tilt, config.sigma_curvature_per_m**2, mount, mount, config.scale_drift_per_m**2]
+        )
         self.cov[[1, 2, 4, 5], [4, 5, 1, 2]] = mount
         self.pending_log = 0.0  # correction of log lambda that the caller has yet to apply
         # Travelled since the road has told the length, less the share that each alignment tells of it
@@ -189,10 +196,14 @@ class RoadFilter:
         self.x[1:ROAD] = pitch_rad + self.x[3] * travelled_m, roll_rad, keep * self.x[3]
         F = np.eye(len(self.x))
         F[1, 3], F[3, 3] = travelled_m, keep
+        lasts = float(np.exp(-travelled_m / cfg.scale_drift_memory_m))
+        F[0, DRIFT], F[DRIFT, DRIFT] = travelled_m, lasts
+        self.pending_log += float(self.x[DRIFT]) * travelled_m
+        self.x[DRIFT] *= lasts
         walk = cfg.tilt_walk_rad_per_sqrt_m**2 * travelled_m + 1e-8
         mount = cfg.mount_walk_rad_per_sqrt_m**2 * travelled_m
         bend = (1.0 - keep**2) * cfg.sigma_curvature_per_m**2
-        noise = [0.0, walk, walk, bend, mount, mount]
+        noise = [0.0, walk, walk, bend, mount, mount, (1.0 - lasts**2) * cfg.scale_drift_per_m**2]
         if self.has_car_states:
             lasts = float(np.exp(-travelled_m / cfg.car.road_error_m))
             F[ROAD_ERROR, ROAD_ERROR] = lasts
@@ -204,7 +215,6 @@ class RoadFilter:
         turned_rad = float(np.arctan2(R_prev_curr[0, 2], R_prev_curr[2, 2]))
         bend_per_m = min(abs(turned_rad) / max(travelled_m, 0.1), cfg.max_bend_per_m)
         drift = cfg.scale_walk_rel_per_sqrt_m**2 + (cfg.scale_walk_bend_sqrt_m * bend_per_m) ** 2
-        drift *= 1.0 + self.carried_m / cfg.scale_walk_correlation_m
         self.cov[0, 0] = min(self.cov[0, 0] + drift * travelled_m, 1.0)
         self.carried_m += travelled_m
         self.unaligned_m += travelled_m
@@ -237,11 +247,16 @@ class RoadFilter:
         H = np.zeros((1, len(self.x)))
         H[0, 1:3] = by_pitch @ d, by_roll @ d
         share = travelled_m / 1.0
-        # Over one metre: errors of the positions do not add up over many short steps
-        corners_rad = sigma_across_m / max(travelled_m, 1.0)
-        var = self.config.sigma_travel_rad**2 + self.config.travel_correlation_m * corners_rad**2
-        noise = np.array([[var / share]])
+        noise = np.array([[self._travel_var(travelled_m, sigma_across_m) / share]])
         self._update(np.array([-(normal @ d)]), H, noise)
+
+    def _travel_var(self, travelled_m: float, sigma_across_m: float) -> float:
+        """Of the direction of travel against the road, rad^2, over one metre.
+
+        Errors of the positions do not add up over many short steps.
+        """
+        corners_rad = sigma_across_m / max(travelled_m, 1.0)
+        return self.config.sigma_travel_rad**2 + self.config.travel_correlation_m * corners_rad**2
 
     def update_vanishing_point(self, vanishing_point: VanishingPoint) -> bool:
         """The vanishing point lies in the road, as the direction of travel does. False: rejected, other lines."""
@@ -258,18 +273,23 @@ class RoadFilter:
         self._update(np.array([innovation]), H, np.array([[var]]))
         return True
 
-    def initialise_pitch(self, t_prev_curr: Floats) -> None:
-        """Takes the pitch from the first direction of travel, where the camera file's is far off."""
+    def initialise_pitch(self, t_prev_curr: Floats, sigma_across_m: float) -> None:
+        """Takes the pitch from the first direction of travel, where the camera file's is far off.
+
+        `sigma_across_m` is as in `update_travel`: corners on drops show any direction, and no wrong file.
+        """
         length = float(np.linalg.norm(t_prev_curr))
         if length <= 0.0 or t_prev_curr[2] < 0.9 * length:
             return  # not forwards
         off_rad = float(np.arctan2(-t_prev_curr[1], t_prev_curr[2])) - float(self.x[1])
-        if abs(off_rad) < self.config.wrong_pitch_rad or abs(off_rad) > self.config.max_wrong_pitch_rad:
+        var = self._travel_var(length, sigma_across_m)
+        wrong_rad = max(self.config.wrong_pitch_rad, _WRONG_PITCH_SIGMAS * float(np.sqrt(var)))
+        if abs(off_rad) < wrong_rad or abs(off_rad) > self.config.max_wrong_pitch_rad:
             return
         self.cov[np.ix_([1, 4], [1, 4])] += off_rad**2
         H = np.zeros((1, len(self.x)))
         H[0, 1] = 1.0
-        self._update(np.array([off_rad]), H, np.array([[self.config.sigma_travel_rad**2]]))
+        self._update(np.array([off_rad]), H, np.array([[var]]))
 
     def innovation(self, fit: RoadFit) -> tuple[Floats, Floats, float]:
         """An alignment's innovation (4,), its noise (4, 4), and the innovation in sigmas."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from birdslam.geometry.pose import Pose
-from birdslam.odometry.road.alignment import RoadImage
+from birdslam.odometry.road.road_image import RoadImage
 
 Floats = NDArray[np.float64]
 

@@ -20,18 +20,18 @@ from birdslam.odometry.metric_scale import RoadView
 from birdslam.odometry.motion import planar
 from birdslam.odometry.obstruction.bonnet import Bonnet
 from birdslam.odometry.obstruction.fixed_pattern import FixedPattern
-from birdslam.odometry.road.alignment import RoadAligner, RoadImage
+from birdslam.odometry.road.alignment import RoadAligner
 from birdslam.odometry.road.fit import RoadFit
 from birdslam.odometry.road.kalman_filter import RoadFilter, RoadScaleConfig
 from birdslam.odometry.road.keyframe_images import RoadFrame, RoadKeyframe, RoadKeyframes
 from birdslam.odometry.road.mount_change import MountChangeDetector
+from birdslam.odometry.road.road_image import RoadImage
+from birdslam.odometry.road.scale_confirmation import TOLD, ScaleConfirmation
 from birdslam.odometry.road.scale_search import LengthSearch, agrees, best_alignment, scale_from_landmarks
 from birdslam.odometry.road.vanishing_point import VanishingPoint, VanishingPointDetector
 from birdslam.odometry.speed.scale import CarMotion, SpeedScale
 from birdslam.types import SpeedReading, SpeedSource, Status
 
-_TOLD = 0.5  # of an alignment's information about the length (kalman_filter.py): with more it counts as told
-_COMPARISONS = 5  # time constant of the mean of what they tell
 _MIN_STEP_M = 0.1  # of a motion whose rotation gives the curvature of the path
 # The share of the least correlation that suffices where the landmarks agree, whose errors are independent, or where
 # other lengths are far less likely: on a rendered motorway behind a coarse encoder correlations reach 0.2
@@ -57,13 +57,10 @@ class RoadScale:
         self._bonnet = Bonnet(config.bonnet)
         self._vanishing_points = VanishingPointDetector(camera, config.vanishing_point)
         self._keyframes = RoadKeyframes(config.keyframes)
-        self._confirmations = 0.0  # what alignments in a row tell of the length, each 0 to 1
+        self._confirmation = ScaleConfirmation(config)
         self._on_glass = False  # corners are fixed to the windscreen
         self._informed = False  # the newest image's alignment told the length
         self._was_known = False  # a scale was known once: then the drive has shown how the camera is mounted
-        self._rejected = 0.0  # alignments in a row, each by its new share of the path: those of one view err together
-        self._rejections = 0  # and their number
-        self._shown, self._comparisons = 0.0, 0  # mean information of comparisons about the length, and their number
         self._since_m = 0.0  # travelled since the last alignment
         self._predicted = False  # the velocity prior gave a motion since an alignment was accepted
         self._direction_predicted = False  # and gave the newest one, whose direction the images do not show
@@ -109,11 +106,11 @@ class RoadScale:
         self._keyframes.clear()
         if not self._fixed_pattern.present:
             self._keyframes.insert(RoadFrame(image, image), pose, 0.0)
-        if not self._has_begun:
+        if not self._confirmation.begun:
             sigma_rel = 1.0
         self._filter.reset_scale(sigma_rel)
         if sigma_rel > self.config.doubt_sigma_rel:
-            self._confirmations = 0.0
+            self._confirmation.forget()
         self._car.restart()
 
     def speed_predicted(self, sigma_rel: float) -> None:
@@ -147,7 +144,7 @@ class RoadScale:
         self._car.rescale(by_road)
         travelled_m = by_road * float(np.linalg.norm(step.p))
         forward_m = float(planar(Pose(step.R, step.p * by_road), self.ground).log()[0])
-        by_car = self._car.update(*view.interval_ns, forward_m, travelled_m, self._is_known())
+        by_car = self._car.update(*view.interval_ns, forward_m, travelled_m, self._confirmation.known)
         if by_car != 1.0:
             self._car.rescale(by_car)
             self._keyframes.rescale(view.pose.p, by_car)
@@ -171,8 +168,8 @@ class RoadScale:
         keyframe = self._keyframe(pose)
         if keyframe is not None:
             T = keyframe.pose.between(pose)
-            if not self._was_known and not self._has_begun and self.unknown:
-                self._filter.initialise_pitch(T.R.T @ T.p)
+            if not self._was_known and not self._confirmation.begun and self.unknown:
+                self._filter.initialise_pitch(T.R.T @ T.p, view.sigma_across_m)
             bend_per_m = _bend_per_m(step.R, travelled_m)
             wide = self._fixed_pattern.present
             px = self._aligner.samples(self._tilt, view.boxes_px, view.road_mask, bend_per_m, wide)
@@ -187,7 +184,7 @@ class RoadScale:
                     by_landmarks = self._car.scale_factor / factor
                 T = Pose(T.R, T.p * factor)
                 factor *= self._align_and_update(keyframe.corrected, frame.corrected, T, px, by_landmarks, view)
-        measured = self._informed and self._is_known()  # here, in metres
+        measured = self._informed and self._confirmation.known  # here, in metres
         self._mount_change.update(self._filter.tilt, factor * travelled_m, measured)
         self._insert_keyframe(frame, pose, factor)
         return factor
@@ -232,18 +229,18 @@ class RoadScale:
     def _update_bonnet(self, view: RoadView, travelled_m: float) -> None:
         """Where a bonnet has been taken for road until it was found, scale and tilt are dropped."""
         driven_m = travelled_m
-        if not self._has_begun:  # the length is not known: optical flow tells whether the car has moved
+        if not self._confirmation.begun:  # the length is not known: optical flow tells whether the car has moved
             if view.flow_px < _MOVING_PX:
                 return
             driven_m = np.inf
         if self._bonnet.update(view.grey, self._aligner.top_px, driven_m):
             self._filter.reset_scale(1.0)
             self._filter.lose_tilt()
-            self._confirmations = 0.0
+            self._confirmation.forget()
 
     def _landmark_scale(self, window: SlidingWindow) -> float | None:
         """Metres in the window's unit of length by its landmarks on the road, where the scale is doubtful."""
-        if not (self._is_doubtful() or self._rejected):
+        if not (self._is_doubtful() or self._confirmation.contradicted):
             return None
         return scale_from_landmarks(self.camera, self._tilt, window)
 
@@ -270,16 +267,16 @@ class RoadScale:
 
     def _sees_road(self) -> bool:
         seen = self._filter.carried_m <= self.config.carried_after_m and not self._predicted
-        return seen and self._has_begun
+        return seen and self._confirmation.begun
 
     def status(self) -> list[Status]:
         """What is wrong with the scale, the ground plane or the mount."""
-        cfg, out = self.config, []
+        out: list[Status] = []
         if not self._sees_road() and not self._car.measures:
             out.append(Status.SCALE_CARRIED)
         if self.unknown:
             out.append(Status.SCALE_INVALID)
-        if self._rejected >= cfg.violated_after:
+        if self._confirmation.violated:
             out.append(Status.GROUND_VIOLATED)
         if self._fixed_pattern.present or self._bonnet.present:
             out.append(Status.VIEW_OBSTRUCTED)
@@ -292,22 +289,14 @@ class RoadScale:
         ground = self.ground
         return ground.pitch_rad, ground.roll_rad
 
-    @property
-    def _has_begun(self) -> bool:
-        """Whether an alignment has told a length since it was last unknown."""
-        return self._confirmations >= _TOLD
-
-    def _is_known(self) -> bool:
-        return self._confirmations > self.config.confirmations - _TOLD
-
     def _is_doubtful(self) -> bool:
-        return self.sigma_rel > self.config.doubt_sigma_rel or self._rejected >= self.config.doubt_after
+        return self.sigma_rel > self.config.doubt_sigma_rel or self._confirmation.doubted
 
     def _keyframe(self, pose: Pose) -> RoadKeyframe | None:
         """The keyframe image to align with: that with the baseline nearest to the target."""
         if self._is_doubtful():
             # Lengths are not known: the longest baseline, then, after a rejection, the shortest, and so on.
-            return self._keyframes.candidate(self._rejections)
+            return self._keyframes.candidate(self._confirmation.rejections)
         return self._keyframes.at_baseline(pose, self.config.target_baseline_m, self.config.min_baseline_m)
 
     def _align_and_update(
@@ -323,7 +312,7 @@ class RoadScale:
 
         `by_landmarks` is that factor by the landmarks on the road; None where it is unknown or not needed.
         """
-        cfg, filter_ = self.config, self._filter
+        cfg, filter_, confirmation = self.config, self._filter, self._confirmation
         length = float(np.linalg.norm(T.p))
         if length < 1e-6:
             return 1.0
@@ -332,40 +321,37 @@ class RoadScale:
         search = None
         if self._is_doubtful():
             # A confirmed scale must be beaten clearly: the dark below a car ahead correlates with standing still
-            lead = 0.02 if not self._has_begun else 0.1
-            search = LengthSearch(self._tilt, lead, cfg.sigma_unseen_rad if self._rejected >= cfg.doubt_after else 0.0)
+            lead = 0.02 if not confirmation.begun else 0.1
+            search = LengthSearch(self._tilt, lead, cfg.sigma_unseen_rad if confirmation.doubted else 0.0)
         found = best_alignment(self._aligner, filter_, past, present, T, px, by_landmarks, sigma_motion, search)
         if found is None:
             return 1.0
         fit, searched, prior_cov = found
-        known = self._is_known() or self._car.measures
+        known = confirmation.known or self._car.measures
         expected = searched != 1.0 or not known or filter_.innovation(fit)[2] < cfg.max_innovation_sigma
         least = cfg.min_correlation
         told = fit.length_information > cfg.doubt_sigma_rel**-2  # far likelier than other lengths
         if told or agrees(float(np.log(searched)) + fit.state[0], by_landmarks):
             least *= _AGREED_CORRELATION_SHARE
         if fit.correlation < least or not expected:
-            self._rejected += new
-            self._rejections += 1
+            confirmation.reject(new)
             return 1.0
-        # By chance one comparison may look like information; of those without any the mean is nothing
-        self._shown += (fit.length_information - self._shown) / min(self._comparisons + 1, _COMPARISONS)
-        self._comparisons += 1
+        shown = confirmation.mean_information(fit.length_information)
         if not agrees(float(np.log(searched)) + filter_.length(fit)[0], by_landmarks):
-            fit = fit.limited(min(fit.length_information, self._shown))
+            fit = fit.limited(min(fit.length_information, shown))
         self.fit = fit
         filter_.cov = prior_cov
         tells = filter_.information(fit)
-        self._rejected *= 1.0 - tells  # one that agrees ends the row by as much as it tells of the length
-        self._informed = tells >= _TOLD
+        confirmation.agree(tells)
+        self._informed = tells >= TOLD
         if self._informed:
-            self._rejections, self._predicted = 0, False
+            self._predicted = False
         factor = searched * filter_.update_alignment(fit, min(1.0, filter_.unaligned_m / length))
         if abs(np.log(factor)) > cfg.doubt_sigma_rel:
             self._car.road_contradicts(float(np.log(factor)))
-        self._confirmations = tells if abs(np.log(factor)) > 0.3 else self._confirmations + tells
-        self._was_known = self._was_known or self._is_known()
-        if not self._is_known() and not self._car.measures:
+        confirmation.confirm(tells, float(np.log(factor)))
+        self._was_known = self._was_known or confirmation.known
+        if not confirmation.known and not self._car.measures:
             filter_.cov[0, 0] = max(filter_.cov[0, 0], (1.1 * cfg.doubt_sigma_rel) ** 2)
         return factor
 

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from birdslam.geometry.camera import Camera, plane_normal
 from birdslam.geometry.pose import Pose
 from birdslam.odometry.corners.sliding_window import SlidingWindow
-from birdslam.odometry.road.alignment import RoadAligner, RoadImage
+from birdslam.odometry.road.alignment import RoadAligner
 from birdslam.odometry.road.fit import ROAD, RoadFit
 from birdslam.odometry.road.kalman_filter import RoadFilter
+from birdslam.odometry.road.road_image import RoadImage
 
 Floats = NDArray[np.float64]
 

@@ -25,6 +25,8 @@ FILES = {  # what the page hands out, where it is there
     "ego.geojson": "the way on Earth, GeoJSON",
     "frames.csv": "a line a frame",
     "map.geojson": "the road's lines",
+    "road.geojson": "the road's lines on Earth, GeoJSON",
+    "tracks.geojson": "other vehicles' ways on Earth, GeoJSON",
 }
 MOST_FILE_BYTES = 1_500_000  # of one that the page holds
 MOST_TRACKS, FEWEST_ROWS = 150, 5  # a track of fewer frames is mostly a false alarm

@@ -12,7 +12,6 @@ from birdslam.bench.tracking.leave_one_out import LeftOut
 from birdslam.bench.tracking.localisation import LocalisationRow, TiltRow
 from birdslam.bench.tracking.tables import movers_table
 from birdslam.outputs.drive_files import claim_directory, write_json
-from birdslam.paper import PAPER
 from birdslam.runtime.cli.arguments import add_config, add_settings, add_tracking_root
 from birdslam.runtime.configuration import ConfigurationError
 from birdslam.runtime.evaluation.localisation import (
@@ -44,6 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Writes report.json, or leave_one_out.json, and prints a table of it."""
+    if options.mode == "paper":
+        options.set = ["method=paper", *options.set]
     configuration = configuration_of(options)
     output = Path(options.output)
     sweeps = [read_sweep(text, configuration) for text in options.leave_one_out]
@@ -66,8 +67,8 @@ def run(options: argparse.Namespace) -> int:
         print(_table_of_people(people))
         print(table_of_tracks(tracks))
     else:
-        used = PAPER if options.mode == "paper" else configuration.slam
-        rows, tilts, movers = evaluate_localisation(options.root, names, options.detections, used, tilt_from_images)
+        slam = configuration.slam
+        rows, tilts, movers = evaluate_localisation(options.root, names, options.detections, slam, tilt_from_images)
         write_json(output / "report.json", rows)
         write_json(output / "tilt.json", tilts)
         write_json(output / "movers.json", movers)

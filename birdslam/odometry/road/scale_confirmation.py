@@ -1,0 +1,70 @@
+"""Whether the metric scale is known: what the road's alignments in a row have told of the length, and which failed."""
+
+from __future__ import annotations
+
+from birdslam.odometry.road.kalman_filter import RoadScaleConfig
+
+TOLD = 0.5  # of an alignment's information about the length (kalman_filter.py): with more it counts as told
+_COMPARISONS = 5  # time constant of the mean of what they tell
+_ANOTHER_LOG = 0.3  # of the factor on the length by an alignment: a larger one begins the row anew
+
+
+class ScaleConfirmation:
+    """State: the rows of alignments that agree and of those that are rejected. Reader: `RoadScale`."""
+
+    def __init__(self, config: RoadScaleConfig) -> None:
+        self.config = config
+        self._told = 0.0  # by alignments in a row, each 0 to 1
+        self._rejected = 0.0  # in a row, each by its new share of the path: those of one view err together
+        self.rejections = 0  # their number
+        self._mean, self._comparisons = 0.0, 0  # mean information of comparisons about the length, and their number
+
+    @property
+    def begun(self) -> bool:
+        """Whether an alignment has told a length since it was last unknown."""
+        return self._told >= TOLD
+
+    @property
+    def known(self) -> bool:
+        """Whether enough have."""
+        return self._told > self.config.confirmations - TOLD
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the last alignment was rejected, or did not tell enough to end a row of those."""
+        return self._rejected > 0.0
+
+    @property
+    def doubted(self) -> bool:
+        """Whether so many were rejected that the length is searched for."""
+        return self._rejected >= self.config.doubt_after
+
+    @property
+    def violated(self) -> bool:
+        """Whether so many were rejected that the ground is doubtful."""
+        return self._rejected >= self.config.violated_after
+
+    def forget(self) -> None:
+        """The length is unknown."""
+        self._told = 0.0
+
+    def reject(self, new: float) -> None:
+        """An alignment was rejected, of which this share of the path is new."""
+        self._rejected += new
+        self.rejections += 1
+
+    def mean_information(self, information: float) -> float:
+        """The mean of what comparisons tell with this one: by chance a single one may look like information."""
+        self._mean += (information - self._mean) / min(self._comparisons + 1, _COMPARISONS)
+        self._comparisons += 1
+        return self._mean
+
+    def agree(self, tells: float) -> None:
+        """An alignment agrees and tells so much of the length, 0 to 1: it ends a row of rejections by as much."""
+        self._rejected *= 1.0 - tells
+        if tells >= TOLD:
+            self.rejections = 0
+
+    def confirm(self, tells: float, log_factor: float) -> None:
+        """It has changed the length by this factor."""
+        self._told = tells if abs(log_factor) > _ANOTHER_LOG else self._told + tells

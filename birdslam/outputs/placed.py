@@ -1,0 +1,185 @@
+"""Where a drive's world lies in the map and on Earth, metre by metre, and its road and tracks brought there.
+
+`places.csv` has a row a metre, as all is known when the drive is over: what was seen from there moves with the
+keyframe nearest to it. From it come `road.map.geojson` (lines and points of the road in the map's metres), and
+`road` and `tracks` as .geojson, .gpx and .kml where the drive is on Earth.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from birdslam.geometry.arrays import Floats, Ints
+from birdslam.geometry.se2 import SE2
+from birdslam.outputs.earth_files import SUFFIXES, Way, write_ways
+from birdslam.types import NS_PER_S
+
+PLACES_FILE, ROAD_IN_MAP = "places.csv", "road.map.geojson"
+COLUMNS = (
+    *("t_s", "epoch", "odom_x_m", "odom_y_m", "odom_yaw_rad", "map_x_m", "map_y_m", "map_yaw_rad"),
+    *("latitude_deg", "longitude_deg", "yaw_from_east_rad", "earth_over_map"),
+)
+AROUND_FILES = (PLACES_FILE, ROAD_IN_MAP, *(f"{name}{suffix}" for name in ("road", "tracks") for suffix in SUFFIXES))
+SLACK_S = 5.0  # around the time in which something was seen, of the places that it may have been seen from
+
+
+@dataclass(frozen=True)
+class Place:
+    """Of one moment: the ego in odometry's world of its epoch, in the map, and on Earth where it is known."""
+
+    t_source_ns: int
+    epoch: int
+    T_odom_ego: SE2
+    T_map_ego: SE2
+    earth: tuple[float, float, float, float] | None = None  # as the last COLUMNS
+
+
+def write_places(directory: Path, places: Sequence[Place]) -> None:
+    """Raises OSError."""
+    with (directory / PLACES_FILE).open("w", encoding="ascii", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(COLUMNS)
+        for place in places:
+            poses = [f"{v:.4f}" for T in (place.T_odom_ego, place.T_map_ego) for v in (T.x_m, T.y_m, T.yaw_rad)]
+            earth = ["", "", "", ""] if place.earth is None else [f"{number:.9g}" for number in place.earth]
+            if place.earth is not None:
+                earth[:2] = [f"{number:.8f}" for number in place.earth[:2]]
+            rows.writerow([f"{place.t_source_ns / NS_PER_S:.6f}", str(place.epoch), *poses, *earth])
+
+
+def write_around(directory: Path) -> list[str]:
+    """What was seen from the places of a drive's folder; gives the files. Raises OSError."""
+    try:
+        table = np.genfromtxt(directory / PLACES_FILE, delimiter=",", skip_header=1, ndmin=2)
+    except FileNotFoundError:
+        return []
+    if not table.size:
+        return []
+    places = _Places(table)
+    lines = list(_lines(directory / "map.geojson"))
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "LineString", "coordinates": p.round(3).tolist()},
+            "properties": each.about,
+        }
+        for each in lines
+        for p in [places.in_map(each.points_m, each.epoch, *each.seen_s)]
+    ]
+    for kind, epoch, points in _points(directory / "map.csv"):
+        geometry = {"type": "MultiPoint", "coordinates": places.in_map(points, epoch).round(3).tolist()}
+        features.append({"type": "Feature", "geometry": geometry, "properties": {"kind": kind, "epoch": epoch}})
+    collection = {"type": "FeatureCollection", "birdslam": {"metres_of": "the map"}, "features": features}
+    (directory / ROAD_IN_MAP).write_bytes(msgspec.json.encode(collection) + b"\n")
+    written = [ROAD_IN_MAP]
+    if places.on_earth:
+        road = [
+            Way(each.name, places.degrees(each.points_m, each.epoch, *each.seen_s), (), each.about) for each in lines
+        ]
+        tracks = [
+            Way(path.name.partition(".")[0], places.degrees_at(rows), [round(t * NS_PER_S) for t in rows[:, 0]])
+            for path in sorted((directory / "tracks").glob("*.tum.txt"))
+            if not path.name.endswith(".final.tum.txt")
+            for rows in [_tum(path)]
+        ]
+        for name, ways in (("road", road), ("tracks", tracks)):
+            for suffix in SUFFIXES:
+                write_ways(directory / f"{name}{suffix}", ways)
+            written.append(f"{name}.geojson")
+    return written
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A polyline (N, 2) of map.geojson, and what that says of it."""
+
+    points_m: Floats
+    epoch: int
+    seen_s: tuple[float, float]
+    name: str
+    about: dict[str, float | int | str]
+
+
+class _Places:
+    """The rows of places.csv (N, 12)."""
+
+    def __init__(self, table: Floats) -> None:
+        self._t_s, self._epoch = table[:, 0], table[:, 1]
+        self._odom, self._map, self._earth = table[:, 2:5], table[:, 5:8], table[:, 8:]
+        self.on_earth = bool(np.isfinite(self._earth).all())
+
+    def _from_ego(self, points_m: Floats, rows: Ints) -> Floats:
+        """(N, 2) points of odometry's world, each in the ego's axes of its row."""
+        x, y, yaw = self._odom[rows].T
+        p, (c, s) = points_m - np.column_stack([x, y]), (np.cos(yaw), np.sin(yaw))
+        return np.column_stack([c * p[:, 0] + s * p[:, 1], -s * p[:, 0] + c * p[:, 1]])
+
+    def _nearest(self, points_m: Floats, epoch: int, from_s: float, to_s: float) -> Ints:
+        """(N,) the row that each point was seen from: of the time, and else of the epoch, the nearest."""
+        usable = (self._epoch == epoch) & (self._t_s > from_s - SLACK_S) & (self._t_s < to_s + SLACK_S)
+        rows = np.flatnonzero(usable)
+        if not len(rows):
+            rows = np.flatnonzero(self._epoch == epoch)
+        if not len(rows):
+            rows = np.arange(len(self._t_s))
+        apart = np.hypot(*(points_m[:, None, :] - self._odom[None, rows, :2]).transpose(2, 0, 1))
+        out: Ints = rows[apart.argmin(axis=1)]
+        return out
+
+    def in_map(self, points_m: Floats, epoch: int, from_s: float = -np.inf, to_s: float = np.inf) -> Floats:
+        rows = self._nearest(points_m, epoch, from_s, to_s)
+        return _turned(self._from_ego(points_m, rows), self._map[rows, 2]) + self._map[rows, :2]
+
+    def degrees(self, points_m: Floats, epoch: int, from_s: float, to_s: float) -> Floats:
+        return self._degrees(points_m, self._nearest(points_m, epoch, from_s, to_s))
+
+    def degrees_at(self, timed: Floats) -> Floats:
+        """Of rows of time and place."""
+        rows = np.abs(timed[:, :1] - self._t_s[None]).argmin(axis=1)
+        return self._degrees(timed[:, 1:3], rows)
+
+    def _degrees(self, points_m: Floats, rows: Ints) -> Floats:
+        import pymap3d  # here: only who goes to Earth needs it
+
+        latitude_deg, longitude_deg, yaw_rad, scale = self._earth[rows].T
+        east, north = (scale[:, None] * _turned(self._from_ego(points_m, rows), yaw_rad)).T
+        lat, lon, _ = pymap3d.enu2geodetic(east, north, np.zeros(len(east)), latitude_deg, longitude_deg, 0.0)
+        return np.column_stack([np.atleast_1d(lat), np.atleast_1d(lon)])
+
+
+def _turned(p_m: Floats, yaw_rad: Floats) -> Floats:
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.column_stack([c * p_m[:, 0] - s * p_m[:, 1], s * p_m[:, 0] + c * p_m[:, 1]])
+
+
+def _lines(path: Path) -> Iterator[_Line]:
+    if path.is_file():
+        for feature in json.loads(path.read_text("ascii"))["features"]:
+            points, said = np.array(feature["geometry"]["coordinates"], np.float64), feature["properties"]
+            about = {key: value for key, value in said.items() if isinstance(value, int | float | str)}
+            seen_s = said["first_seen_s"], said["last_seen_s"]
+            yield _Line(points, said["epoch"], seen_s, f"{said['kind']} {said['line']}", about)
+
+
+def _points(path: Path) -> Iterator[tuple[str, int, Floats]]:
+    """Points (N, 2) of map.csv, by kind and epoch."""
+    found: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    if path.is_file():
+        with path.open(encoding="ascii", newline="") as file:
+            for row in csv.DictReader(file):
+                key = row["kind"], int(row["epoch"])
+                found.setdefault(key, []).append((float(row["x_m"]), float(row["y_m"])))
+    for (kind, epoch), points in found.items():
+        yield kind, epoch, np.array(points)
+
+
+def _tum(path: Path) -> Floats:
+    """(N, 3) time, x and y."""
+    return np.loadtxt(path, ndmin=2)[:, :3]

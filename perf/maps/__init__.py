@@ -1,0 +1,1 @@
+"""Maps that are kept: places found again, poses in a map, loops closed."""

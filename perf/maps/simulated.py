@@ -1,0 +1,221 @@
+"""Streets of corners without images, with exact truth: a loop, equal houses, fixes of GNSS, maps of 100 km."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pymap3d
+
+from birdslam.bench.simulation.places import CAMERA, OTHER_LIGHT_BITS, SAME_BITS, Street, along, block, build, drive
+from birdslam.geometry.se2 import SE2
+from birdslam.loops.features import DESCRIPTOR_BYTES
+from birdslam.loops.gnss.earth import GnssFix
+from birdslam.loops.keyframe import Keyframe
+from birdslam.loops.keyframe_builder import MOST_POINTS, SPACING_M
+from birdslam.loops.localiser import Localisation
+from birdslam.loops.map_file import decode_map, encode_map
+from birdslam.loops.map_pose import MapState
+from birdslam.loops.place_map import MapCamera, PlaceMap
+from birdslam.loops.session import MapSession
+from birdslam.outputs.placed import Place
+from birdslam.perf.reporting.figures import Ledger
+from birdslam.runtime.maps.drive_earth import write_earth
+from birdslam.types import NS_PER_S, Attitude
+
+LENGTHS_KM = 1, 10, 100
+LOOK_UPS = 20
+ORIGIN, FIX_M = (51.05, -114.05), 2.5
+LEG_M, CORNER_M = 400, 19  # of the winding street of equal houses: straight on, and each of two corners of 12 m radius
+
+
+def loop(ledger: Ledger, way_m: float) -> None:
+    """A loop driven twice, then localised in."""
+    street = build(block(way_m / 4.0), seed=1)
+    around = len(street.route)
+    place_map = PlaceMap(MapCamera.of(CAMERA))
+    session = _session(place_map, extend=True)
+    ends: list[tuple[SE2, SE2, Localisation]] = []
+    truth: dict[int, SE2] = {}
+    odometry: dict[int, SE2] = {}
+    first: SE2 | None = None
+    for estimate, seen, T in drive(street, range(2 * around), seed=5):
+        first = first or T
+        truth[estimate.t_source_ns] = first.between(T)
+        odometry[estimate.t_source_ns] = estimate.T_world_ego
+        ends.append((truth[estimate.t_source_ns], estimate.T_world_ego, session.step(estimate, seen)))  # type: ignore[arg-type]
+    T_true, T_odom, last = ends[-1]
+    before_m = _apart(T_true, T_odom)
+    session.finish()
+    open_m = max(_apart(truth[each.t_source_ns], odometry[each.t_source_ns]) for each in place_map.keyframes)
+    closed_m = max(_apart(truth[each.t_source_ns], each.T_map_keyframe) for each in place_map.keyframes)
+    # Scale is no loop's to find: the frame is the first drive's, whose metres are off by a share of the way
+    end_m = _apart(T_true, last.T_map_ego or T_odom)
+    row: dict[str, Any] = {
+        "way_m": 2 * around,
+        "end_by_odometry_m": round(before_m, 3),
+        "end_in_the_map_m": round(end_m, 3),
+        "worst_keyframe_by_odometry_m": round(open_m, 3),
+        "worst_keyframe_in_the_map_m": round(closed_m, 3),
+        "loops": sum(link.loop for link in place_map.links),
+    }
+    text = (
+        f"end {before_m:.2f} m off by odometry ({before_m / around * 50.0:.2f} % of the way), {end_m:.2f} m in the map "
+        f"({end_m / around * 50.0:.2f} %); worst keyframe {open_m:.2f} m off by odometry, {closed_m:.2f} m in the map"
+    )
+    ledger.add(f"loop of {around} m, twice", text, **row, text=text)
+    kept = encode_map(place_map)
+    rows = range(around // 4, around // 4 + 300)
+    for name, lateral_m, bits in (
+        ("same lane and light", 0.0, SAME_BITS),
+        ("other lane, 3 m", 3.0, SAME_BITS),
+        ("other light", 0.0, OTHER_LIGHT_BITS),
+        ("other light and lane", 3.0, OTHER_LIGHT_BITS),
+    ):
+        share, worst_m = _again(kept, street, rows, lateral_m, bits, first or SE2())
+        text = f"{100 * share:.0f} % localised, worst {worst_m:.2f} m"
+        ledger.add(f"loop: {name}", text, localised=share, worst_m=worst_m, text=text)
+
+
+def alike(ledger: Ledger, equal_m: float) -> None:
+    """Streets of equal houses: straight on, and winding to and fro, so that a street looks like the one beside it."""
+    straight = [0.0] * round(equal_m + 70.0)
+    for name, turns in (("straight", straight), ("winding", _winding(len(straight)))):
+        houses = build(along(turns), seed=3, house_m=20.0)
+        session = _session(PlaceMap(MapCamera.of(CAMERA)), extend=True)
+        localised = 0
+        for estimate, seen, _ in drive(houses, range(round(equal_m)), seed=5):
+            localised += session.step(estimate, seen).state is MapState.LOCALISED  # type: ignore[arg-type]
+        session.finish()
+        false = sum(link.loop for link in session.map.links)
+        text = f"{false} false closures in {equal_m / 1e3:g} km, {localised} frames falsely localised"
+        ledger.add(f"equal houses, {name}", text, false=false, localised=localised, way_m=equal_m, text=text)
+
+
+def _winding(count: int) -> list[float]:
+    """Turns of a metre each: two corners to the left, two to the right, and so on."""
+    out: list[float] = []
+    side = 1.0
+    while len(out) < count:
+        for straight in (LEG_M, LEG_M // 10):
+            out += [0.0] * straight + [side * math.pi / 2.0 / CORNER_M] * CORNER_M
+        side = -side
+    return out[:count]
+
+
+def gnss(ledger: Ledger, way_m: float) -> None:
+    """A drive with fixes each second; what is left of its way's errors on Earth."""
+    street = build(block(way_m / 4.0), seed=1)
+    chance = np.random.default_rng(7)
+    driven = [(estimate, T) for estimate, _, T in drive(street, range(len(street.route)), seed=5)]
+    poses = [(estimate.t_source_ns, estimate.T_world_ego) for estimate, _ in driven]
+    true = np.array([(T.x_m, T.y_m) for _, T in driven])
+    first = driven[0][1]
+    placed = [first @ T for _, T in poses]
+    begun_m = float(np.hypot(*(np.array([(T.x_m, T.y_m) for T in placed]) - true).T).max())
+    every = max(1, round(NS_PER_S / (poses[1][0] - poses[0][0])))
+    for name, wrong in (
+        ("fixes of 2.5 m", ()),
+        ("with a jump of 15 m for 10 s", range(len(true) // 3, len(true) // 3 + 10 * every)),
+    ):
+        fixes = []
+        for row in range(0, len(true), every):
+            east, north = true[row] + FIX_M * chance.standard_normal(2) + ((12.0, 9.0) if row in wrong else (0.0, 0.0))
+            latitude_deg, longitude_deg, _ = pymap3d.enu2geodetic(east, north, 0.0, *ORIGIN, 0.0)
+            fixes.append(
+                GnssFix(
+                    t_source_ns=poses[row][0],
+                    latitude_deg=float(latitude_deg),
+                    longitude_deg=float(longitude_deg),
+                    sigma_m=FIX_M,
+                )
+            )
+        begun_s = time.process_time()
+        with tempfile.TemporaryDirectory() as folder:
+            places = [Place(t_ns, 0, T, T) for t_ns, T in poses]
+            about, _ = write_earth(fixes, places, CAMERA, Path(folder), None)
+            took_s = time.process_time() - begun_s
+            features = msgspec.json.decode((Path(folder) / "ego.geojson").read_bytes())["features"]
+        lon, lat = np.array(features[0]["geometry"]["coordinates"]).T
+        east, north, _ = pymap3d.geodetic2enu(lat, lon, 0.0, *ORIGIN, 0.0)
+        worst_m = float(np.hypot(east - true[:, 0], north - true[:, 1]).max())
+        text = (
+            f"way of {len(true)} m: worst {begun_m:.2f} m off by odometry, {worst_m:.2f} m with the fixes; "
+            f"{about['outliers']} of {about['fixes']} outliers, {len(wrong) // every} wrong; {took_s:.1f} s of a core"
+        )
+        worst = {"worst_by_odometry_m": round(begun_m, 3), "worst_m": round(worst_m, 3)}
+        ledger.add(f"GNSS: {name}", text, **worst, **about, text=text)
+
+
+def _session(place_map: PlaceMap, extend: bool) -> MapSession:
+    return MapSession(CAMERA, place_map, extend, lambda features: features)  # type: ignore[arg-type]
+
+
+def _apart(a: SE2, b: SE2) -> float:
+    return float(np.hypot(a.x_m - b.x_m, a.y_m - b.y_m))
+
+
+def _again(kept: bytes, street: Street, rows: range, lateral_m: float, bits: float, first: SE2) -> tuple[float, float]:
+    """The share of frames that are localised, and the worst of them against the nearest keyframe's own error."""
+    session = _session(decode_map(kept), extend=False)
+    frames, errors = 0, [0.0]
+    localised_frames = 0
+    for estimate, seen, T in drive(street, rows, 9, lateral_m, bits):
+        found = session.step(estimate, seen)  # type: ignore[arg-type]
+        frames += 1
+        if found.state is MapState.LOCALISED and found.T_map_ego is not None:
+            localised_frames += 1
+            errors.append(_apart(found.T_map_ego, first.between(T)))
+    return round(localised_frames / frames, 3), round(max(errors), 3)
+
+
+def size(ledger: Ledger) -> None:
+    """Descriptors of streets that share some, as those of houses do, in place of drives."""
+    chance = np.random.default_rng(0)
+    common = chance.integers(0, 256, (4000, DESCRIPTOR_BYTES), dtype=np.uint8)
+    for length_km in LENGTHS_KM:
+        place_map = PlaceMap(MapCamera.of(CAMERA))
+        count = round(1000.0 * length_km / SPACING_M)
+        for number in range(count):
+            flips = np.packbits(chance.random((MOST_POINTS, 8 * DESCRIPTOR_BYTES)) < 0.2, axis=1)
+            descriptors = common[chance.integers(0, len(common), MOST_POINTS)] ^ flips
+            points = chance.uniform(-20.0, 20.0, (MOST_POINTS, 3))
+            T = SE2(SPACING_M * number, 0.0, 0.0)
+            place_map.add(
+                Keyframe(
+                    *(number, 0, number, T, np.zeros((3, 3)), Attitude(), points),
+                    *(np.full(MOST_POINTS, 0.05), descriptors, CAMERA.height_m),
+                )
+            )
+        begun = time.process_time()
+        index = place_map.index()
+        index.look_up(place_map.keyframes[0].descriptors, 6)
+        built_s = time.process_time() - begun
+        took_ms, right = [], 0
+        for number in range(0, count, max(1, count // LOOK_UPS)):
+            own = place_map.keyframes[number].descriptors
+            seen = own ^ np.packbits(chance.random((MOST_POINTS, 8 * DESCRIPTOR_BYTES)) < SAME_BITS, axis=1)
+            begun = time.process_time()
+            found = index.look_up(seen, 6)
+            took_ms.append(1e3 * (time.process_time() - begun))
+            right += number in found
+        data = len(encode_map(place_map))
+        p50_ms, worst_ms = float(np.median(took_ms)), max(took_ms)
+        text = (
+            f"{count} keyframes, {data / 1e6:.1f} MB ({data / 1e6 / length_km:.2f} a km); look-up {p50_ms:.1f} ms, "
+            f"worst {worst_ms:.1f}; index made in {built_s:.1f} s; right place among six {right} of {len(took_ms)}"
+        )
+        ledger.add(
+            f"map of {length_km} km",
+            text,
+            text=text,
+            keyframes=count,
+            bytes=data,
+            look_up_ms=[round(each, 3) for each in took_ms],
+            built_s=round(built_s, 2),
+        )
