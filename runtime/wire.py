@@ -9,6 +9,7 @@ Versions: fields that a newer sender appended are ignored; a changed meaning is 
 from __future__ import annotations
 
 import math
+import threading
 from typing import Annotated, Any, TypeVar
 
 import msgpack
@@ -143,6 +144,21 @@ def encode(record: msgspec.Struct) -> bytes:
     return data
 
 
+_LEARNED: set[type[msgspec.Struct]] = set()  # by msgspec, which looks at a type's fields when it is first asked for it
+_LEARNING = threading.Lock()
+
+
+def _converted(plain: Any, record: type[_Record]) -> _Record:
+    """`plain` as a record. msgspec crashes where two threads ask it for the same new type at once."""
+    if record in _LEARNED:
+        return msgspec.convert(plain, record)
+    with _LEARNING:
+        try:
+            return msgspec.convert(plain, record)
+        finally:
+            _LEARNED.add(record)
+
+
 def decode(data: bytes, record: type[_Record], max_bytes: int = MAX_MESSAGE_BYTES) -> _Record:
     """The record in `data`. Raises WireError, and nothing else, where `data` is not exactly one valid `record`."""
     if len(data) > max_bytes:
@@ -157,6 +173,6 @@ def decode(data: bytes, record: type[_Record], max_bytes: int = MAX_MESSAGE_BYTE
             max_map_len=_MAX_ITEMS,
         )
         _check_finite(plain, record)
-        return msgspec.convert(plain, record)
+        return _converted(plain, record)
     except (ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise WireError(f"{record.__name__}: {str(error) or type(error).__name__}") from error

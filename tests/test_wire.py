@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 import random
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -645,3 +647,37 @@ if __name__ == "__main__":
             file = GOLDEN / (f"{name}.{len(known)}.msgpack" if known else f"{name}.msgpack")
             file.write_bytes(encode(example))
             print(f"wrote {file}")
+
+
+FOUR_AT_ONCE = """
+import sys, threading
+from typing import Optional
+
+import msgspec
+
+from birdslam.runtime.wire import decode
+
+sys.setswitchinterval(1e-6)
+plain = {f"g{j}": {f"f{i}": 1 for i in range(10)} for j in range(10)}
+data = msgspec.msgpack.encode(plain)
+for _ in range(60):  # types that nobody has decoded yet; without the lock one in some ten ends the process
+    for j in range(10):
+        fields = "".join(f"    f{i}: 'Optional[int]' = None\\n" for i in range(10))
+        exec(f"class Inner{j}(msgspec.Struct):\\n{fields}")
+    exec("class Outer(msgspec.Struct):\\n" + "".join(f"    g{j}: 'Inner{j} | None' = None\\n" for j in range(10)))
+    start = threading.Barrier(4)
+    found = []
+    threads = [threading.Thread(target=lambda: (start.wait(), found.append(decode(data, Outer)))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(msgspec.to_builtins(one) == plain for one in found) and len(found) == 4
+"""
+
+
+@pytest.mark.processes
+def test_threads_that_decode_a_new_record_at_once_end_no_process() -> None:
+    """msgspec looks at a type's fields when it is first asked for it, and crashes where two threads ask at once."""
+    done = subprocess.run([sys.executable, "-c", FOUR_AT_ONCE], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

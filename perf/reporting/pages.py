@@ -161,7 +161,8 @@ PAGES: tuple[Derived | Page, ...] = (
     Page(
         "loops",
         (
-            "python -m birdslam.perf loops --part recorded loop alike gnss size --equal-houses 1000 --data {data} --output {out}/loops.json",
+            "python -m birdslam.perf loops --part recorded loop alike gnss size --equal-houses 1000 "
+            "--data {data} --output {out}/loops.json",
         ),
         {"docs/loops.md": ("loops.json", loops.page)},
         (loops.run, loops.page),
