@@ -9,9 +9,8 @@ labelled in five frames or more; 00 and 06 begin where their true poses are no l
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,6 +30,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.paper import NO_GATE
 from birdslam.perception import Pending, Perception, Ready
+from birdslam.perf.graph.edges_table import left_out, table
 from birdslam.perf.reporting.arguments import add_data, benchmark_parser
 from birdslam.perf.reporting.figures import write_json
 from birdslam.runtime.batch.offline import pipeline
@@ -245,36 +245,7 @@ def _nees(error: Floats, cov: Floats) -> float:
     return float(error @ np.linalg.solve(cov + 1e-9 * np.eye(len(cov)), error))
 
 
-# --- the table ---
-
-
-def left_out(grades: Mapping[str, Mapping[str, Mapping[str, float]]], what: str) -> list[str]:
-    """For each case: the variant that is best on all others by the mean logarithm, and what it is worth on this one."""
-    names = [case for case, by in next(iter(grades.values())).items() if math.isfinite(by.get(what, math.nan))]
-    lines = []
-    for case in names:
-        others = [each for each in names if each != case]
-        score = {v: float(np.mean([math.log(by[each][what]) for each in others])) for v, by in grades.items()}
-        best = min(score, key=lambda v: score[v])
-        lines.append(f"{case}: {best}, {grades[best][case][what]:.2f} (default {grades['default'][case][what]:.2f})")
-    return lines
-
-
-def table(grades: Mapping[str, Mapping[str, Mapping[str, float]]], drawn: Mapping[str, Sequence[str]]) -> str:
-    """A row for each variant; `drawn` are the cases whose mean and spread over draws are one column."""
-    cases = [*next(iter(grades.values()))]
-    single = [case for case in cases if case not in {each for names in drawn.values() for each in names}]
-    columns: list[tuple[str, list[str], str]] = [(f"{case} {what}", [case], what) for case in single for what in WHAT]
-    columns += [(f"{name} {what}", [*names], what) for name, names in drawn.items() for what in WHAT]
-    columns = [c for c in columns if any(c[2] in grades["default"][case] for case in c[1])]
-    lines = []
-    for variant, by in grades.items():
-        cells = []
-        for _, names, what in columns:
-            values = np.array([by[case][what] for case in names])
-            cells.append(f"{values.mean():.2f}" + (f" ± {values.std():.2f}" if len(values) > 1 else ""))
-        lines.append([variant, *cells])
-    return markdown(["edges", *(title for title, _, _ in columns)], lines)
+# --- the statistics ---
 
 
 def statistics_table(cases: Sequence[Case]) -> str:
@@ -284,18 +255,6 @@ def statistics_table(cases: Sequence[Case]) -> str:
         found = edge_statistics(case.log, case.ego)
         lines.append([case.name, *("-" if found is None else f"{getattr(found, name):.3g}" for name in fields)])
     return markdown(["log", *(name.replace("_", " ") for name in fields)], lines)
-
-
-WHAT = ("ego", "cars, live", "cars, final", "NEES of the ego", "NEES of cars")
-ABOUT = (
-    "[ablations.md](ablations.md) says what follows from it. Logs of images are those of the whole front end with its "
-    "lane head; simulated drives take true poses and recorded boxes, three draws each."
-)
-ABOUT_TABLE = (
-    "ATE in m of the ego and of the mean car, nothing aligned; NEES over its degrees of freedom (1: honest), the ego's "
-    "of its pose in the world, a car's of its place in the ego's frame. Of simulated drives the mean and the spread "
-    "over draws."
-)
 
 
 def run(arguments: list[str]) -> None:
@@ -332,20 +291,3 @@ def run(arguments: list[str]) -> None:
     if output is not None:
         kept = {"statistics": statistics_table([*cases, *drives]), "table": table(grades, drawn), "left": left}
         write_json(output, kept | {"grades": grades})
-
-
-def page(text: str) -> str:
-    """docs/edges.md of what `--output` wrote."""
-    kept = json.loads(text)
-    lines = [
-        "# What each edge of the graph is worth",
-        "",
-        "Written by `python -m perf pages --write edges`.",
-        ABOUT,
-        "",
-    ]
-    lines += ["## Statistics of real and of simulated edges", "", kept["statistics"]]
-    lines += ["## ATE and NEES by variant", "", ABOUT_TABLE, "", kept["table"]]
-    for what, found in kept["left"].items():
-        lines += [f"## The best variant on all other logs: {what}", "", *(f"- {line}" for line in found), ""]
-    return "\n".join(lines)

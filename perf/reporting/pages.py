@@ -26,7 +26,7 @@ from birdslam.perf.__main__ import benchmark_modules
 from birdslam.perf.accuracy import films, overlays, tilt
 from birdslam.perf.cameras import lens
 from birdslam.perf.errors import PerfError
-from birdslam.perf.graph import agents, edges
+from birdslam.perf.graph import agents, edges, edges_table
 from birdslam.perf.maps import loops
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import foxglove, leave_one_out, measured, results
@@ -171,8 +171,8 @@ PAGES: tuple[Derived | Page, ...] = (
     Page(
         "edges",
         (f"python -m birdslam.perf edges --data {{data}} --logs {{out}} {results.REAL} --output {{out}}/edges.json",),
-        {"docs/edges.md": ("edges.json", edges.page)},
-        (edges.run, edges.page),
+        {"docs/edges.md": ("edges.json", edges_table.page)},
+        (edges.run, edges_table.page),
         NETWORKS,
     ),
     Page(
