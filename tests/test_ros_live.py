@@ -10,6 +10,7 @@ import struct
 import subprocess
 import threading
 import time
+from collections import Counter
 from contextlib import ExitStack, suppress
 from itertools import islice
 from pathlib import Path
@@ -49,9 +50,10 @@ from birdslam.runtime.cli.main import main
 from birdslam.runtime.configuration import Configuration, ConfigurationError, ResultsConfig, RosConfig, SourceConfig
 from birdslam.runtime.maps.drive_map import DriveMap
 from birdslam.runtime.nodes.sources import SourceError, open_source
+from birdslam.runtime.process.sender import RateLimit
 from birdslam.runtime.ros.camera import CLOCK_FRAMES, GNSS_HEAD, SenderClock
 from birdslam.runtime.ros.publisher import RosBridge
-from birdslam.runtime.ros.session import NoRouter, RosNode
+from birdslam.runtime.ros.session import NoRouter, RosNode, RosPublisher
 from birdslam.runtime.supervision.query_server import QueryServer
 from birdslam.sources.opening import open_recording
 from birdslam.types import Estimate, Lane, LaneLine, Lanes, LineColour, LineKind
@@ -323,11 +325,12 @@ class Listener:
 class Vehicle:
     """A vehicle's bus with its node of ROS beside it; a step sends an estimate, and is it passed on."""
 
-    def __init__(self, join: Any, base: Path, port: int, **config: Any) -> None:
+    def __init__(self, join: Any, base: Path, port: int, rate_hz: float | None = None, **config: Any) -> None:
         hub = join("supervisor", hub=True)
         QueryServer(Configuration(camera=CAMERA), hub)
         self._out, self._map, self._frame = hub.publisher("estimate"), hub.publisher("map_pose"), 0
-        self.bridge = RosBridge("car", RosNode(RosConfig(router=f"tcp/127.0.0.1:{port}", **config), "birdslam"), base)
+        node = RosNode(RosConfig(router=f"tcp/127.0.0.1:{port}", **config), "birdslam")
+        self.bridge = RosBridge("car", node, base, rate_hz)
         assert self._out.wait_matched(LIMIT_S)
         assert self._map.wait_matched(LIMIT_S)
 
@@ -425,6 +428,29 @@ def test_in_a_namespace_topics_and_frames_are_the_vehicles_own(join: Any, base: 
         until(joined, "nothing joins the map and odometry")
         at = joined()[-1]["transform"]["translation"]
         assert (joined()[-1]["header"]["frame_id"], at["x"], at["y"]) == ("red/map", T_MAP_ODOM.x_m, T_MAP_ODOM.y_m)
+
+
+@processes
+def test_a_rate_thins_estimates_and_places_in_the_map(join: Any, base: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: Counter[str] = Counter()
+    monkeypatch.setattr(RosPublisher, "publish", lambda self, message: said.update([message.__msgtype__]))
+    port, in_map = free_port(), TOPICS[MAP_POSE]
+    with peer("router", str(port)):
+        vehicle = Vehicle(join, base, port, rate_hz=0.001, domain=0)
+        with vehicle.bridge:
+            until(lambda: vehicle.step() >= 0.0 and said[in_map], "no place in the map is said")
+            for _ in range(20):
+                vehicle.step()
+    assert (said[in_map], said[TOPICS["/birdslam/vehicles"]]) == (1, 2)  # boxes: of vehicles, and of people
+
+
+def test_a_rate_holds_in_the_mean_and_a_pause_is_not_made_up_for() -> None:
+    limit, everything = RateLimit(10.0), RateLimit(None)
+    times = [30_000_000 * k for k in range(100)] + [10**11 + 30_000_000 * k for k in range(100)]
+    passed = [t for t in times if limit.passes(t)]
+    assert sum(t < 10**11 for t in passed) == pytest.approx(30, abs=1)
+    assert sum(t >= 10**11 for t in passed) == pytest.approx(30, abs=1)
+    assert all(map(everything.passes, times))
 
 
 def client(port: int) -> zenoh.Config:
