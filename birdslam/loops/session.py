@@ -123,7 +123,7 @@ class MapSession:
             step = self._last.T_world_ego.between(estimate.T_world_ego)
             self._travelled_m += math.hypot(step.x_m, step.y_m)
         self._last = estimate
-        self.localiser.move(estimate.T_world_ego, estimate.valid)
+        self.localiser.move(estimate)
         if self._new_map and self._extend and not len(self.map) and not estimate.valid:
             self._place_origin(estimate)
 
