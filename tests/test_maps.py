@@ -320,7 +320,7 @@ def test_what_is_no_whole_map_is_refused(mapped: bytes) -> None:
         (mapped[:16], "cut off"),
         (mapped[:-100], "torn"),
         (bytes(flipped), "CRC"),
-        (newer, "version 3"),
+        (newer, "version 4"),
         (MAGIC + HEAD.pack(version, 1, zlib.crc32(b"\xc1")) + b"\xc1", "something that is no map"),
     ):
         with pytest.raises(MapError, match=why):
