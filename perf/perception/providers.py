@@ -17,8 +17,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import onnxruntime
-
 from birdslam.bench.figures import markdown
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS
 from birdslam.perception.network import ModelSpec
@@ -53,8 +51,7 @@ def measure(
             for provider, one in found.items():
                 said = one.problem or f"{one.ms:7.2f} ms a run, off by {one.off_rel:.2%} (RMS)"
                 row = {"network": file.name, "provider": provider, "ms": one.ms, "off_rel": one.off_rel}
-                version = f"onnxruntime {onnxruntime.__version__}"
-                ledger.add(f"{file.name} {provider}", said, version=version, agrees=one.agrees, **row)
+                ledger.add(f"{file.name} {provider}", said, agrees=one.agrees, **row)
         if package:
             _by_another(package, asked, models, threads, ledger)
 
