@@ -359,6 +359,11 @@ def topics(*names: str, namespace: str = "") -> list[str]:
     return [f"{namespace * name.startswith('/birdslam')}{name}={TOPICS[name]}" for name in names]
 
 
+def states(listener: Listener) -> Counter[str]:
+    """How often the diagnostics said what."""
+    return Counter(message["status"][0]["message"] for message in listener.of("/diagnostics"))
+
+
 ODOMETRY = "/birdslam/odometry"
 MAP_POSE = "/birdslam/map_pose"
 T_MAP_ODOM = SE2(7.0, -3.0, 0.5)
@@ -388,13 +393,14 @@ def test_a_listener_hears_each_message_and_again_after_the_router_was_gone(join:
             assert at[-30:] == pytest.approx(sent)
             assert at == sorted(at)
             until(lambda: len(listener.of("/birdslam/vehicles")) > 30, "boxes are lost")
-            until(lambda: len(listener.of("/diagnostics")) > 60 and listener.of("/tf"), "the rest is lost")
+            until(lambda: listener.of("/tf"), "/tf is lost")
+            # Of places in the map only the newest is passed on: how many come hangs on the computer
+            until(lambda: states(listener)["ok"] > 30 and states(listener)["localised"], "diagnostics are lost")
             (_, box) = listener.of("/birdslam/vehicles")[-1]["detections"]
             assert (box["bbox"]["size"]["x"], box["id"]) == (4.2, "1")
             joined = {message["transforms"][0]["child_frame_id"] for message in listener.of("/tf")}
             assert joined == {"base_link", "odom"}
-            states = {message["status"][0]["message"] for message in listener.of("/diagnostics")}
-            assert states == {"ok", "localised"}
+            assert set(states(listener)) == {"ok", "localised"}
             with zenoh.open(client(port)) as other:
                 said = [str(reply.ok.key_expr) for reply in other.liveliness().get("@ros2_lv/4/**") if reply.ok]
             found = {one.topic for token in said if (one := publication_of(token)) is not None}

@@ -3,11 +3,13 @@
     python -m perf reports DIR|FILE.html... --output DIR
 
 DIR is that of a `birdslam run --output` or a `birdslam batch`: its report.html. The pictures go to --output. Status 1
-where a page says something on its console, does not follow its slider, stands out to the right or is over 15 MB.
+where a page says something on its console, does not follow its slider, stands out to the right or has more than 15 MB
+beside the film's pictures.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -60,14 +62,14 @@ def shown(page: Path, output: Path) -> list[str]:
     if not page.is_file():
         raise PerfError(f"{page} is not there")
     name, size_mb = page.resolve().parent.name, page.stat().st_size / 1e6
-    found = [f"{page}: {size_mb:.1f} MB"] if size_mb > MOST_MB else []
+    film_mb = sum(map(len, re.findall(r'"jpeg":"([^"]*)"', page.read_text(encoding="utf-8")))) / 1e6
+    found = [f"{page}: {size_mb - film_mb:.1f} MB without its film"] if size_mb - film_mb > MOST_MB else []
     for way in LOOKS:
         seen = moved(page, output / f"{name}-{way}.png", way)
         found += [f"{page}, {way}: {line}" for line in faults(seen, way)]
         said = " ".join(f"{key} {value}" for key, value in seen.said.items() if key not in ("title", "ground", "at"))
-        print(
-            f"{name:20} {way:7} {size_mb:5.1f} MB  console {len(seen.console)}  {said}  at: {seen.said.get('at', '')}"
-        )
+        print(f"{name:20} {way:7} {size_mb:5.1f} MB ({film_mb:.1f} of film)  console {len(seen.console)}  {said}")
+        print(f"{'':28} {seen.said.get('at', '')}")
     return found
 
 

@@ -19,6 +19,8 @@ MOST_POINTS = 4000  # of a line
 MOST_TRACK_POINTS = 200
 # A frame is of the first of these that it fits
 KINDS = (("not valid", "#d1342f"), ("stands", "#8b95a5"), ("valid, with remarks", "#e0a100"), ("valid", "#1f9d6b"))
+# No remarks: networks look at some pictures alone, and their answers hold until the next
+BY_SCHEDULE = {each.value for each in (Status.DETECTIONS_CARRIED, Status.SEGMENTATION_CARRIED, Status.DEPTH_CARRIED)}
 TRACK_COLOURS = {"vehicles": "#5b7fd6", "people": "#c455b8"}
 LINE_COLOUR, LANDMARK_COLOUR = "#b48a00", "#8b95a5"
 
@@ -139,7 +141,7 @@ def _kind(drive: DriveTable, k: int) -> int:
         return 0
     if Status.STANDSTILL.value in drive.statuses[k]:
         return 1
-    return 2 if drive.statuses[k] else 3
+    return 2 if set(drive.statuses[k]) - BY_SCHEDULE else 3
 
 
 def _points(name: str, right: Floats, up: Floats, colour: str, size: int, digits: int = 3) -> Trace:
