@@ -12,7 +12,7 @@ import threading
 import time
 from collections import Counter
 from contextlib import ExitStack, suppress
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,7 @@ from birdslam.ros.rmw_zenoh import (
     attachment,
     check_namespace,
     publication_of,
+    sequence_of,
     topic_key,
     type_of_key,
 )
@@ -110,6 +111,7 @@ def test_an_attachment_is_that_of_zenohs_serializer_and_of_the_other_implementat
     said, gid = attachment(5, 1_700_000_000_000_000_001, bytes(range(16))), bytes(range(16))
     assert said == bytes(z_serialize((Int64(5), Int64(1_700_000_000_000_000_001), gid)))
     assert Attachment.from_bytes(said) == Attachment(5, 1_700_000_000_000_000_001, gid)
+    assert (sequence_of(said), sequence_of(said[:-1]), sequence_of(b"")) == (5, None, None)
 
 
 @pytest.mark.parametrize("name", sorted({*TOPICS.values(), *KNOWN_HASHES}))
@@ -541,6 +543,43 @@ def test_a_source_without_images_says_why(tmp_path: Path) -> None:
             given = msgspec.structs.replace(asked, camera=CAMERA)
             with pytest.raises(SourceError, match="the camera is for 64x32"):
                 open_source(given)
+
+
+@processes
+def test_images_that_were_lost_on_their_way_are_counted_by_their_numbers(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    port, types, over = free_port(), MessageTypes(), threading.Event()
+    key = topic_key(0, "/front/image", "sensor_msgs/msg/Image", types.type_hash("sensor_msgs/msg/Image"))
+
+    def send_every_third() -> None:
+        with zenoh.open(client(port)) as session:
+            for number in count(1, 3):
+                stamp = types.make("builtin_interfaces/msg/Time", sec=number, nanosec=0)
+                header = types.make("std_msgs/msg/Header", stamp=stamp, frame_id="camera")
+                image = types.make(
+                    "sensor_msgs/msg/Image", header=header, height=CAMERA.height_px, width=CAMERA.width_px,
+                    encoding="mono8", step=CAMERA.width_px, data=np.zeros(CAMERA.height_px * CAMERA.width_px, np.uint8),
+                )  # fmt: skip
+                session.put(key, types.cdr(image), attachment=attachment(number, 0, bytes(16)))
+                if over.wait(0.02):
+                    return
+
+    given = msgspec.structs.replace(configuration(port, tmp_path, rate=20.0), camera=CAMERA)
+    with peer("router", str(port)):
+        sender = threading.Thread(target=send_every_third)
+        sender.start()
+        try:
+            source = open_source(given)
+            assert all(frame.image is not None for frame in islice(source.frames(), 5))
+            source.close()
+        finally:
+            over.set()
+            sender.join()
+    (said,) = (record.getMessage() for record in caplog.records if "lost on their way" in record.getMessage())
+    came, lost = (int(word) for word in said.replace(":", " ").split() if word.isdecimal())
+    assert came >= 5
+    assert lost == 2 * (came - 1)
 
 
 @processes

@@ -57,10 +57,13 @@ class Sent:
 
 
 class OnTheBus:
-    """The times of a topic's frames (UTC, in ns) on the vehicle's own bus, read on a thread of its own."""
+    """The times of a topic's frames (UTC, in ns) on the vehicle's own bus, read on a thread of its own; of capture's
+    also how many had given way to newer ones by then.
+    """
 
     def __init__(self, bus: Bus, topic: str) -> None:
         self.t_ns: list[int] = []
+        self.gave_way: list[int] = []
         self._messages = bus.subscriber(topic, DEPTH)
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -70,6 +73,7 @@ class OnTheBus:
             while True:
                 if (message := self._messages.recv()) is not None:
                     self.t_ns.append(message.record.t_utc_ns)
+                    self.gave_way.append(getattr(message.record, "dropped", 0))
 
 
 def valid_times(heard: Heard) -> list[int]:
@@ -144,8 +148,10 @@ def run(arguments: list[str]) -> int:
         valid = sum(begin_ns <= t < end_ns for t in valid_times(heard))
         lost = without(images, (told.t_ns for told in poses))
         not_captured, not_estimated = without(images, captured.t_ns), without(images, estimated.t_ns)
+        gave_way = captured.gave_way[-1] - captured.gave_way[0]
         said = (
-            f"{not_captured.size} never reached the vehicle's bus, "
+            f"{not_captured.size} were not captured (of all since, {gave_way} gave way to newer ones there, others "
+            f"were lost on their way), "
             f"{np.setdiff1d(not_estimated, not_captured).size} were captured and got none, "
             f"{np.setdiff1d(lost, not_estimated).size} had one that was not heard"
         )
