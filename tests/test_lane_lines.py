@@ -23,6 +23,8 @@ from birdslam.lanes.ego_lane import EgoLane
 from birdslam.lanes.line_tracker import LineTracker, still_lines
 from birdslam.lanes.occupancy import with_users
 from birdslam.lanes.outline import lane_mask, lane_px
+from birdslam.lanes.paint import LinePoints, paint_points
+from birdslam.lanes.road_view import road_view
 from birdslam.lanes.topology import lane_row
 from birdslam.lanes.traffic import Traffic, TrafficState
 from birdslam.lanes.users import UserInEgo, person_in_ego
@@ -194,6 +196,34 @@ def test_two_stripes_side_by_side_are_one_double_line(gap_m: float) -> None:
     found = [line for line in tracker.lines().at(pose) if line.kind is not LineKind.EDGE]
     assert [line.kind for line in found] == [LineKind.DOUBLE, LineKind.DASHED]
     assert found[0].y_m(8.0) == pytest.approx(1.75, abs=0.1)
+
+
+def points_of(image: np.ndarray, masks: Segmentation) -> LinePoints:
+    return paint_points(road_view(CAMERA, GroundPlane(CAMERA.height_m), image, masks, NOBODY, None))
+
+
+def test_a_dash_between_cracks_is_no_symbol() -> None:
+    """Between two cracks asphalt is a bright band, which would make the dash an arrow."""
+    offset_m, seen = 1.7, []
+    for cracks_m in ((), (-0.35, 0.35)):
+        image, masks = picture(SE2(), (offset_m, -1.8), (True, False))
+        for aside_m in cracks_m:
+            ends_m = np.array([(9.3, offset_m + aside_m), (11.7, offset_m + aside_m)])
+            ends_px = bev.ego_to_pixel(CAMERA, GroundPlane(CAMERA.height_m), ends_m)
+            cv2.line(image, *np.round(ends_px).astype(int).tolist(), 20, 2)
+        points = points_of(image, masks)
+        on_dash = (np.abs(points.y_m - offset_m) < 0.15) & (points.x_m > 9.0) & (points.x_m < 12.0)
+        seen.append(int(on_dash.sum()))
+    clear, cracked = seen
+    assert cracked > 0.8 * clear > 5
+
+
+def test_grass_that_a_network_takes_for_road_and_paint_bears_no_line() -> None:
+    image, masks = picture(SE2(), (1.7, -1.8, -9.4), (True, False, False))
+    clear = points_of(image, masks)
+    cv2.circle(masks.road.view(np.uint8), (600, 135), 4, 1, -1)  # a scrap beside that line, beyond the road's edge
+    assert clear.y_m.min() > -8.5
+    assert points_of(image, masks).y_m.min() > -8.5
 
 
 def test_a_line_behind_a_car_stays() -> None:
