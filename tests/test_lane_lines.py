@@ -185,17 +185,30 @@ def test_what_a_bonnet_mirrors_is_no_line_and_the_lane_is_not_drawn_over_it() ->
     assert area[:, 1].max() <= 166.0
 
 
-@pytest.mark.parametrize("gap_m", [0.1, 0.15])
-def test_two_stripes_side_by_side_are_one_double_line(gap_m: float) -> None:
+def with_two_stripes(gap_m: float, road_to_m: float) -> list[LaneLine]:
+    """The painted lines of a drive with two stripes about 1.75 m to the left, on a road that ends at `road_to_m`."""
     tracker = LineTracker(CAMERA)
+    v, u = np.indices((CAMERA.height_px, CAMERA.width_px))
+    x_m = CAMERA.fy_px * CAMERA.height_m / np.maximum(v - CAMERA.cy_px, 1e-3)
+    off_road = (CAMERA.cx_px - u) * x_m / CAMERA.fx_px > road_to_m
     for k in range(8):
         pose = SE2(1.5 * k, 0.0, 0.0)
         apart = 0.5 * (0.1 + gap_m)
         image, masks = picture(pose, (1.75 + apart, 1.75 - apart, -1.75), (False, False, True), stripe_m=0.1)
+        masks.road[off_road] = False
         tracker.update(pose, CAMERA.ground, (0.003, 0.0), image, masks, NOBODY)
-    found = [line for line in tracker.lines().at(pose) if line.kind is not LineKind.EDGE]
+    return [line for line in tracker.lines().at(pose) if line.kind is not LineKind.EDGE]
+
+
+@pytest.mark.parametrize("gap_m", [0.1, 0.15])
+def test_two_stripes_side_by_side_are_one_double_line(gap_m: float) -> None:
+    found = with_two_stripes(gap_m, 8.0)
     assert [line.kind for line in found] == [LineKind.DOUBLE, LineKind.DASHED]
     assert found[0].y_m(8.0) == pytest.approx(1.75, abs=0.1)
+
+
+def test_a_line_with_a_kerb_beside_it_is_no_double_line() -> None:
+    assert LineKind.DOUBLE not in [line.kind for line in with_two_stripes(0.1, 2.0)]
 
 
 def points_of(image: np.ndarray, masks: Segmentation) -> LinePoints:

@@ -200,7 +200,10 @@ def _shift_m(view: RoadView, rows: Ints, columns: Ints) -> Floats:
 
 
 def double_share(view: RoadView, points: LinePoints) -> float | None:
-    """The share of a line's points that two stripes side by side make; None where the image does not resolve them."""
+    """The share of a line's points that two stripes side by side make, with road on either hand.
+
+    None where the image does not resolve them. Kerbs and gravel beside a line at the road's edge look like a stripe.
+    """
     rows = np.clip(np.searchsorted(view.x_m, points.x_m), 0, len(view.x_m) - 1)
     rows, y_m = rows[fine := view.sigma_y_m[rows] < DOUBLE_PIXEL_M], points.y_m[fine]
     if len(rows) < LEAST_DOUBLE:
@@ -218,7 +221,9 @@ def double_share(view: RoadView, points: LinePoints) -> float | None:
         stripes = (weaker > LEAST_CONTRAST) & (weaker > STRIPE_SHARE * above.max(axis=1, keepdims=True))
         double |= (stripes & (between < GAP_SHARE * weaker)).any(axis=1)
         between = np.minimum(between[:, :-1], above[:, apart:-1])
-    return float(double.mean())
+    beyond = round((DOUBLE_M + SIDE_M) / LATTICE_M)
+    either = np.clip(middle[:, None] + [-beyond, beyond], 0, len(view.y_m) - 1)
+    return float((double & view.road[rows[:, None], either].all(axis=1)).mean())
 
 
 def _mask_middles(view: RoadView, usable: Bools, rows: Ints, columns: Ints) -> tuple[Ints, Floats]:
