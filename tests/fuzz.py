@@ -32,7 +32,7 @@ from birdslam.geometry.se2 import SE2
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.loops.gnss.earth import Earth
 from birdslam.loops.gnss.files import GnssError, read_fixes
-from birdslam.loops.keyframe import Fixed, Keyframe, Link
+from birdslam.loops.keyframe import Fixed, Keyframe, LinePiece, Link
 from birdslam.loops.map_file import HEAD, MAGIC, VERSION, MapError, decode_map, encode_map
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.perception.manifest import Manifest, ModelError
@@ -48,7 +48,7 @@ from birdslam.sources.camera_file import load_camera
 from birdslam.sources.kitti import read_image, read_projection, read_times
 from birdslam.sources.recording import DatasetError
 from birdslam.sources.speed_file import read_speeds
-from birdslam.types import INVALIDATING, Attitude, FrameRef, Measurements
+from birdslam.types import INVALIDATING, Attitude, FrameRef, LineColour, LineKind, Measurements
 from tests.mutations import Chance, mutated, mutated_text, with_other_fields
 from tests.test_wire import BY_NAME, EXAMPLES
 
@@ -314,6 +314,7 @@ def maps() -> Target:
     keyframe = Keyframe(
         *(0, 0, 0, SE2(1.0, 2.0, 0.3), np.eye(3), Attitude(), np.ones((9, 3)), np.full(9, 0.1)),
         *(np.arange(288, dtype=np.uint8).reshape(9, 32), 1.65, Fixed(51.0, 7.0, 2.0, 5.0)),
+        lines=(LinePiece(0, 7, LineKind.DASHED, LineColour.WHITE, np.ones((3, 2)), 0.1),),
     )
     links = [Link(0, 0, SE2(), np.eye(3), loop=True)]
     camera = MapCamera("0" * 16, 640, 480, 500.0, 1.65)
@@ -338,6 +339,7 @@ def maps() -> Target:
         decode_map(encode_map(found))
         found.index()
         found.on_earth(SE2(1.0, 2.0, 0.3), np.eye(3))
+        found.lines()
         return True
 
     return target

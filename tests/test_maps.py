@@ -3,6 +3,7 @@
 import math
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -24,6 +25,7 @@ from birdslam.loops.merging import MergeError, merged
 from birdslam.loops.place_index import PlaceIndex, learn_words
 from birdslam.loops.place_map import MapCamera, PlaceMap
 from birdslam.loops.session import MapSession
+from birdslam.loops.verification import locate
 from birdslam.outputs.map_trajectory import MapTrajectory, TrajectoryFiles
 from birdslam.runtime.batch.one_map import DRIVE_MAP, join
 from birdslam.runtime.cli.commands import parse
@@ -159,6 +161,49 @@ def test_who_looks_and_finds_nothing_soon_is_not_localised(mapped: bytes) -> Non
     assert carried[False] > 2 * carried[True]
 
 
+def test_a_wrong_guess_is_left_for_the_place_that_near_points_show(mapped: bytes) -> None:
+    """A guess that is turned about what lies far ahead, where half of the matches are wrong."""
+    place_map, chance = decode_map(mapped), np.random.default_rng(2)
+    T = SE2(*(float(number) for number in STREET.route[40]))
+    seen = STREET.see(T, chance)
+    wrong = chance.random(len(seen)) < 0.5
+    px = seen.px + np.where(wrong[:, None], chance.uniform(-90.0, 90.0, seen.px.shape), 0.0)
+    local = place_map.around(place_map.near(T, 12.0)[0])
+    truth = locate(CAMERA, seen, local, None)
+    assert truth is not None
+    guess = truth.T_keyframe_ego @ SE2.exp(np.array([-1.2, 1.35, -0.03]))
+    found = locate(CAMERA, replace(seen, px=px), local, guess, 120.0)
+    assert found is not None
+    assert found.T_keyframe_ego.between(truth.T_keyframe_ego).log() == pytest.approx(np.zeros(3), abs=0.1)
+
+
+def test_a_step_that_no_car_makes_is_no_localisation(mapped: bytes) -> None:
+    """Odometry that calls itself valid goes back by 2 m within a tenth of a second."""
+    running = session(decode_map(mapped), extend=False)
+    states = {}
+    for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 40), 3)):
+        if number >= 20:
+            estimate = msgspec.structs.replace(estimate, T_world_ego=estimate.T_world_ego @ SE2(-3.0, 0.0, 0.0))
+        here = running.step(estimate, seen if number < 20 or number > 25 else None)  # type: ignore[arg-type]
+        states[number] = here.state
+    assert [states[number] for number in (19, 20, 25)] == [
+        MapState.LOCALISED, MapState.ODOMETRY_ONLY, MapState.ODOMETRY_ONLY,
+    ]  # fmt: skip
+    assert states[29] is MapState.LOCALISED
+
+
+def test_who_is_unsure_of_its_metres_is_localised_for_a_shorter_way(mapped: bytes) -> None:
+    carried = []
+    for scale_sigma_rel in (0.0, 0.06):
+        running = session(decode_map(mapped), extend=False)
+        states = []
+        for number, (estimate, seen, _) in enumerate(drive(STREET, range(10, 70), 3)):
+            estimate = msgspec.structs.replace(estimate, scale_sigma_rel=scale_sigma_rel)
+            states.append(running.step(estimate, seen if number < 20 else None).state)  # type: ignore[arg-type]
+        carried.append(sum(state is MapState.LOCALISED for state in states[20:]))
+    assert 4 <= carried[1] < carried[0] / 2
+
+
 def test_a_kidnapped_car_is_found_again(mapped: bytes) -> None:
     """Odometry goes on as if nothing had been, 50 m further along the street."""
     running = session(decode_map(mapped), extend=False)
@@ -275,7 +320,7 @@ def test_what_is_no_whole_map_is_refused(mapped: bytes) -> None:
         (mapped[:16], "cut off"),
         (mapped[:-100], "torn"),
         (bytes(flipped), "CRC"),
-        (newer, "version 3"),
+        (newer, "version 4"),
         (MAGIC + HEAD.pack(version, 1, zlib.crc32(b"\xc1")) + b"\xc1", "something that is no map"),
     ):
         with pytest.raises(MapError, match=why):

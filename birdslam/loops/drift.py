@@ -1,4 +1,8 @@
-"""How far odometry may be off after a way, by which poses in a map grow uncertain; and what still is a localisation."""
+"""How far odometry may be off after a way, by which poses in a map grow uncertain; and what still is a localisation.
+
+Odometry says itself how sure its metres are (`scale_sigma_rel`); and where two of its steps differ by more than a car
+can brake or speed up, the rest is its error.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +12,52 @@ import numpy as np
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
+from birdslam.types import NS_PER_S, Estimate
 
 LOST_SIGMA_M, LOST_SIGMA_RAD = 0.5, math.radians(1.5)  # a pose less exact than that is none
 # Odometry between fixes, 1-sigma: along and across as a share of the way, yaw by the root of it
 DRIFT_REL, DRIFT_M, DRIFT_YAW_RAD = 0.02, 0.01, 0.0012
 INVALID_REL, INVALID_YAW_RAD_PER_M = 1.0, 0.02  # of a step that odometry itself calls invalid: any length, any bend
-ODOMETRY_SCALE_REL = 0.012  # 1-sigma of its metric scale
+LEAST_SCALE_REL = 0.012  # 1-sigma of its metric scale, where it calls it surer
+MOST_MPS2 = 10.0  # by which a car changes its velocity: its tyres hold no more
 LOOP_SCALE_REL = 0.01  # by which the scale of odometry differs from one end of a way to the other
 LOOP_YAW_RAD = 0.0006
 
 
-def drift(step: SE2, valid: bool = True) -> Floats:
-    """(3, 3) covariance of a step of odometry, of the tangent at its end."""
+class Steps:
+    """An odometry's steps, estimate by estimate in one epoch."""
+
+    def __init__(self) -> None:
+        self._last: Estimate | None = None
+        self._velocity_mps: tuple[float, float] | None = None  # of the last step, in its ego
+        self.sum_m2 = 0.0  # variance of all errors that `add` has found so far
+
+    def add(self, estimate: Estimate) -> float:
+        """By how much the step that ends here is off for sure, in metres."""
+        last, self._last = self._last, estimate
+        before, self._velocity_mps = self._velocity_mps, None
+        if last is None or not estimate.valid:
+            return 0.0
+        dt_s = (estimate.t_source_ns - last.t_source_ns) / NS_PER_S
+        if dt_s <= 0.0:
+            return 0.0
+        step = last.T_world_ego.between(estimate.T_world_ego)
+        x_mps, y_mps = self._velocity_mps = step.x_m / dt_s, step.y_m / dt_s
+        if before is None:
+            return 0.0
+        changed_mps = math.hypot(x_mps - before[0], y_mps - before[1])
+        error_m = max(changed_mps - MOST_MPS2 * dt_s, 0.0) * dt_s
+        self.sum_m2 += error_m**2
+        return error_m
+
+
+def drift(step: SE2, valid: bool = True, scale_rel: float = 0.0, error_m: float = 0.0) -> Floats:
+    """(3, 3) covariance of a step of odometry, of the tangent at its end.
+
+    `scale_rel` is the sigma that odometry states of its metres, `error_m` what is known to be wrong (`Steps`).
+    """
     way_m = math.hypot(step.x_m, step.y_m)
-    sigma_m = DRIFT_REL * way_m + DRIFT_M * math.sqrt(way_m)
+    sigma_m = max(DRIFT_REL, scale_rel) * way_m + DRIFT_M * math.sqrt(way_m) + error_m
     yaw_rad = DRIFT_YAW_RAD * math.sqrt(way_m) + 0.02 * abs(step.yaw_rad)
     if not valid:
         sigma_m += INVALID_REL * way_m
@@ -36,10 +72,10 @@ def drift_after(way_m: float) -> Floats:
     return np.diag([sigma_m**2, sigma_m**2, yaw_rad**2])
 
 
-def moved(cov: Floats, step: SE2, valid: bool = True) -> Floats:
+def moved(cov: Floats, step: SE2, valid: bool = True, scale_rel: float = 0.0, error_m: float = 0.0) -> Floats:
     """A covariance at the beginning of a step, at its end, with the step's own."""
     Ad = step.inverse().adjoint()
-    out: Floats = Ad @ cov @ Ad.T + drift(step, valid)
+    out: Floats = Ad @ cov @ Ad.T + drift(step, valid, scale_rel, error_m)
     return out
 
 

@@ -1,4 +1,4 @@
-"""A keyframe: a place of the map, with points that were triangulated on the way past it."""
+"""A keyframe: a place of the map, with points that were triangulated on the way past it, and the road's lines there."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.foot import body_pose
 from birdslam.trajectory import Transform
-from birdslam.types import Attitude
+from birdslam.types import Attitude, LineColour, LineKind
 
 
 class Placed(Protocol):
@@ -35,6 +35,22 @@ class Fixed:
 
 
 @dataclass(frozen=True, eq=False)
+class LinePiece:
+    """A line of the road beside a keyframe, in its ego frame: it moves with it."""
+
+    drive: int  # that saw it
+    line: int  # its number in that drive
+    kind: LineKind
+    colour: LineColour
+    points_m: Floats  # (N, 2)
+    sigma_m: float  # 1-sigma across it, against the ego that saw it
+
+    def seen_from(self, T_other_keyframe: SE2) -> LinePiece:
+        """The same in another keyframe's frame."""
+        return replace(self, points_m=T_other_keyframe @ self.points_m)
+
+
+@dataclass(frozen=True, eq=False)
 class Keyframe:
     """Points are in the keyframe's ego frame: x forward, y left, z up, metres, from the camera's foot on the road."""
 
@@ -49,6 +65,7 @@ class Keyframe:
     descriptors: NDArray[np.uint8]  # (N, 32)
     camera_height_m: float
     gnss: Fixed | None = None
+    lines: tuple[LinePiece, ...] = ()
 
     @property
     def T_map(self) -> Transform:

@@ -1,4 +1,4 @@
-"""Keyframes of a drive, every few metres, made once the frames around each of them are there."""
+"""Keyframes of a drive, every few metres, made once the frames around each of them are there; and lines beside them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import Features
 from birdslam.loops.foot import body_pose
+from birdslam.loops.keyframe import LinePiece
 from birdslam.loops.triangulation import Points, View, triangulate
 from birdslam.trajectory import mount_pose
-from birdslam.types import Attitude
+from birdslam.types import Attitude, Estimate, LaneLine
 
 SPACING_M = 4.0  # between keyframes: with MOST_POINTS below 2 MB a km
 MOST_POINTS = 150
@@ -23,6 +24,10 @@ LEAST_POINTS = 25  # a keyframe with fewer can't be found again
 REACH_M = 5.0  # of the frames that triangulate a keyframe's points, before and after it
 LOOK_M, LOOK_NS = 0.4, 500_000_000  # a frame is looked at after so much way, or so much time
 GRID_CELLS = 8, 4
+NODE_AT_M = 6.0  # ahead of the ego: there a line is in view and known best
+NODE_EVERY_M = 2.0
+LEAST_EXISTENCE = 0.5
+HELD_M = 12.0  # from a node to the keyframe that it moves with
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +50,51 @@ class NewKeyframe:
     points_m: Floats
     sigma_depth_rel: Floats
     descriptors: NDArray[np.uint8]
+    lines: tuple[LinePiece, ...] = ()
+
+
+class LineNodes:
+    """Where the lines of the road were when the ego was NODE_AT_M before them; of one epoch."""
+
+    def __init__(self, drive: int) -> None:
+        self._drive = drive
+        self._nodes: list[tuple[float, LaneLine, tuple[float, float]]] = []  # the way there, and the point in odometry
+        self._next_m = 0.0
+
+    def add(self, estimate: Estimate, travelled_m: float) -> None:
+        """The lines of a frame, where one is due."""
+        if estimate.lanes is None or not estimate.valid or travelled_m < self._next_m:
+            return
+        self._next_m = travelled_m + NODE_EVERY_M
+        for line in estimate.lanes.lines:
+            if line.existence >= LEAST_EXISTENCE and line.seen_from_m < NODE_AT_M < line.seen_to_m:
+                x_m, y_m = (estimate.T_world_ego @ np.array([[NODE_AT_M, line.y_m(NODE_AT_M)]]))[0]
+                self._nodes.append((travelled_m + NODE_AT_M, line, (float(x_m), float(y_m))))
+
+    def take(self, look: Look) -> tuple[LinePiece, ...]:
+        """Those up to half of the way to the keyframe after this one."""
+        until_m = look.travelled_m + 0.5 * SPACING_M
+        taken = [node for node in self._nodes if look.travelled_m - HELD_M < node[0] <= until_m]
+        self._nodes = [node for node in self._nodes if node[0] > until_m]
+        back = look.T_odom_ego.inverse()
+        pieces = []
+        for number in sorted({line.line for _, line, _ in taken}):
+            mine = [(line, point) for _, line, point in taken if line.line == number]
+            newest = mine[-1][0]
+            sigma_m = max(line.sigma_m(NODE_AT_M) for line, _ in mine)
+            points_m = back @ np.array([point for _, point in mine])
+            pieces.append(LinePiece(self._drive, number, newest.kind, newest.colour, points_m, sigma_m))
+        return tuple(pieces)
 
 
 class KeyframeBuilder:
     """Of one epoch: poses are in its odometry frame."""
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, drive: int = 0) -> None:
         self._camera = camera
         self._mount = mount_pose(camera.ground)
         self._window: list[Look] = []
+        self.nodes = LineNodes(drive)
         self._next_m = 0.0  # the way at which the next keyframe is due
         self._open = False
 
@@ -90,7 +131,8 @@ class KeyframeBuilder:
         if len(kept) < LEAST_POINTS:
             return None
         p_ego = points.p_cam_m[kept] @ self._mount[:3, :3].T + self._mount[:3, 3]
-        return NewKeyframe(look, p_ego, points.sigma_depth_rel[kept], look.features.descriptors[points.feature[kept]])
+        seen = p_ego, points.sigma_depth_rel[kept], look.features.descriptors[points.feature[kept]]
+        return NewKeyframe(look, *seen, self.nodes.take(look))
 
     def _view(self, look: Look) -> View:
         return View(look.features, body_pose(look.T_odom_ego, look.attitude, self._camera.height_m) @ self._mount)

@@ -15,12 +15,12 @@ import numpy as np
 from birdslam.geometry.arrays import Bools, Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
-from birdslam.loops.drift import ODOMETRY_SCALE_REL, drift_after, is_exact, moved
+from birdslam.loops.drift import LEAST_SCALE_REL, Steps, drift_after, is_exact, moved
 from birdslam.loops.features import Features
 from birdslam.loops.map_pose import MapState
 from birdslam.loops.place_map import PlaceMap
 from birdslam.loops.verification import Fix, locate
-from birdslam.types import Attitude
+from birdslam.types import Attitude, Estimate
 
 CANDIDATES = 6  # places that are verified by geometry in one frame
 FOUND_INLIERS, FOUND_PLACES = 25, 7  # of a frame that nothing was known of
@@ -80,6 +80,8 @@ class Localiser:
         self.attitude = Attitude()  # in the map's frame, by the last fix
         self.travelled_m = 0.0
         self._T_odom_ego: SE2 | None = None
+        self.steps = Steps()
+        self._scale_rel = 0.0  # 1-sigma of odometry's metres, by its own word
         self._T_map_ego: SE2 | None = None
         self._cov: Floats = np.zeros((3, 3))
         self._shared: Floats = np.zeros((3, 3))
@@ -99,7 +101,7 @@ class Localiser:
     @property
     def cov(self) -> Floats:
         """(3, 3) of the pose in the map, with what fixes share."""
-        scale_rel = MISSED_REL if self._missed else ODOMETRY_SCALE_REL  # all along the way
+        scale_rel = max(MISSED_REL if self._missed else LEAST_SCALE_REL, self._scale_rel)  # all along the way
         scale_m = scale_rel * min(self.since_fix_m, FARTHEST_M)
         return self._cov + self._shared + np.diag([scale_m**2, scale_m**2, 0.0])
 
@@ -126,11 +128,14 @@ class Localiser:
     def lose(self) -> None:
         """Odometry began anew: nothing is known any more."""
         self._T_map_ego, self._T_odom_ego = None, None
+        self.steps = Steps()
         self._hypotheses.clear()
         self.since_fix_m = math.inf
 
-    def move(self, T_odom_ego: SE2, valid: bool = True) -> None:
-        """By odometry, which says whether its step is valid."""
+    def move(self, estimate: Estimate) -> None:
+        """By odometry, as sure as it says that it is."""
+        T_odom_ego, scale_rel = estimate.T_world_ego, estimate.scale_sigma_rel
+        error_m, self._scale_rel = self.steps.add(estimate), scale_rel
         if self._T_odom_ego is not None:
             step = self._T_odom_ego.between(T_odom_ego)
             way_m = math.hypot(step.x_m, step.y_m)
@@ -138,9 +143,9 @@ class Localiser:
             self.since_fix_m += way_m
             if self._T_map_ego is not None:
                 self._T_map_ego = self._T_map_ego @ step
-                self._cov = moved(self._cov, step, valid)
+                self._cov = moved(self._cov, step, estimate.valid, scale_rel, error_m)
             for hypothesis in self._hypotheses:
-                hypothesis.cov = moved(hypothesis.cov, step, valid)
+                hypothesis.cov = moved(hypothesis.cov, step, estimate.valid, scale_rel, error_m)
         self._T_odom_ego = T_odom_ego
 
     def look(self, features: Features, among: Bools | None = None) -> bool:

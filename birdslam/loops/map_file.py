@@ -1,7 +1,8 @@
 """A map as bytes: a mark, the version, the length and the CRC-32 of what follows, and MessagePack.
 
-Points are rounded to a centimetre and their depths' sigmas to 4 %; descriptors are as they are. No images. A file of
-another version is refused, not guessed at. Whatever the bytes, `decode_map` gives a whole map or raises MapError.
+Points and lines are rounded to a centimetre and depths' sigmas to 4 %; descriptors are as they are. No images. A file
+of version 2 has no lines and is read; one of another version is refused, not guessed at. Whatever the bytes,
+`decode_map` gives a whole map or raises MapError.
 """
 
 from __future__ import annotations
@@ -17,15 +18,17 @@ import numpy as np
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.features import DESCRIPTOR_BYTES
 from birdslam.loops.gnss.earth import Earth, is_on_earth
-from birdslam.loops.keyframe import Fixed, Keyframe, Link
+from birdslam.loops.keyframe import Fixed, Keyframe, LinePiece, Link
 from birdslam.loops.place_map import MapCamera, PlaceMap
-from birdslam.types import Attitude, Cov3
+from birdslam.types import Attitude, Cov3, LineColour, LineKind
 
-VERSION = 2
+VERSION = 3
+READ = 2, 3  # 2 had no lines
 MAGIC = b"BirdSLAM map\n"
 HEAD = struct.Struct("<HQI")  # version, bytes, CRC-32
 MOST_BYTES = 1 << 31  # 1,000 km
 MOST_KEYFRAMES, MOST_KEYFRAME_POINTS = 1_000_000, 2048
+MOST_PIECES, MOST_NODES = 64, 64  # of a keyframe's lines, and of each
 POINT_M = 0.01  # what a point's coordinate is rounded to, in 16 bits
 SIGMA_STEP = 0.04  # of the logarithm of a sigma, from LEAST_SIGMA on, in 8 bits
 LEAST_SIGMA = 1e-4
@@ -36,6 +39,17 @@ _Number = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
 class MapError(ValueError):
     """The bytes are no map that can be used; the message says why."""
+
+
+class PieceRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A line beside a keyframe in the file; `points` holds x, y (int16, cm)."""
+
+    drive: _Number
+    line: _Number
+    kind: LineKind
+    colour: LineColour
+    points: bytes
+    sigma_m: float
 
 
 class KeyframeRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -50,6 +64,7 @@ class KeyframeRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     camera_height_m: float
     points: bytes
     gnss: tuple[float, float, float, float] | None = None  # latitude_deg, longitude_deg, sigma_m, weighed_m
+    lines: tuple[PieceRecord, ...] = ()  # since version 3
 
 
 class LinkRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
@@ -117,8 +132,9 @@ def decode_map(data: bytes) -> PlaceMap:
     if len(data) < head:
         raise MapError("is cut off in its head")
     version, length, crc = HEAD.unpack(data[len(MAGIC) : head])
-    if version != VERSION:
-        raise MapError(f"is of version {version}, and this BirdSLAM reads version {VERSION}: drive it anew")
+    if version not in READ:
+        reads = " and ".join(map(str, READ))
+        raise MapError(f"is of version {version}, and this BirdSLAM reads versions {reads}: drive it anew")
     if length > MOST_BYTES:
         raise MapError(f"says that it has {length} bytes: more than {MOST_BYTES}")
     if len(data) - head != length:
@@ -193,7 +209,21 @@ def _keyframe_record(keyframe: Keyframe) -> KeyframeRecord:
         keyframe.camera_height_m,
         points.tobytes() + sigmas.tobytes() + keyframe.descriptors.tobytes(),
         None if fixed is None else (fixed.latitude_deg, fixed.longitude_deg, fixed.sigma_m, fixed.weighed_m),
+        tuple(_piece_record(piece) for piece in keyframe.lines),
     )
+
+
+def _piece_record(piece: LinePiece) -> PieceRecord:
+    points = np.clip(np.round(piece.points_m / POINT_M), -32768, 32767).astype("<i2")
+    return PieceRecord(piece.drive, piece.line, piece.kind, piece.colour, points.tobytes(), round(piece.sigma_m, 4))
+
+
+def _piece(record: PieceRecord) -> LinePiece:
+    count, rest = divmod(len(record.points), 4)
+    if rest or not 0 < count <= MOST_NODES or not 0.0 <= record.sigma_m < 1e3:
+        raise MapError(f"line {record.line}: its points are none")
+    points_m = np.frombuffer(record.points, "<i2").reshape(-1, 2) * POINT_M
+    return LinePiece(record.drive, record.line, record.kind, record.colour, points_m, record.sigma_m)
 
 
 def _keyframe(record: KeyframeRecord) -> Keyframe:
@@ -204,6 +234,8 @@ def _keyframe(record: KeyframeRecord) -> Keyframe:
         raise MapError(f"keyframe {record.number}: its attitude is none")
     if not 0.1 < record.camera_height_m < 10.0:
         raise MapError(f"keyframe {record.number}: its camera's height is none")
+    if len(record.lines) > MOST_PIECES:
+        raise MapError(f"keyframe {record.number}: has {len(record.lines)} lines: more than {MOST_PIECES}")
     fixed = None if record.gnss is None else Fixed(*record.gnss)
     if fixed is not None and not (
         is_on_earth(fixed.latitude_deg, fixed.longitude_deg) and 0.0 < fixed.sigma_m <= fixed.weighed_m < 1e9
@@ -224,6 +256,7 @@ def _keyframe(record: KeyframeRecord) -> Keyframe:
         descriptors.reshape(-1, DESCRIPTOR_BYTES),
         record.camera_height_m,
         fixed,
+        tuple(_piece(each) for each in record.lines),
     )
 
 

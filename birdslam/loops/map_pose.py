@@ -78,7 +78,8 @@ def in_map(pose: MapPose | None, estimate: Estimate) -> InMap:
         return NOWHERE
     if pose.epoch != estimate.epoch or pose.T_map_odom is None or pose.T_odom_ego is None or pose.cov is None:
         return InMap(MapState.LOST, None, np.full((3, 3), np.inf), pose.map_epoch, pose)
-    cov = moved(np.array(pose.cov).reshape(3, 3), pose.T_odom_ego.between(estimate.T_world_ego))
+    step = pose.T_odom_ego.between(estimate.T_world_ego)
+    cov = moved(np.array(pose.cov).reshape(3, 3), step, scale_rel=estimate.scale_sigma_rel)
     state = pose.state
     if state is MapState.LOCALISED and not is_exact(cov):
         state = MapState.ODOMETRY_ONLY

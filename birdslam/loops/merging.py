@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -118,4 +119,5 @@ def _agreeing(meetings: list[tuple[Keyframe, Fix]]) -> list[tuple[Keyframe, Fix]
 
 def _renumbered(keyframe: Keyframe, number: int, drives: int, T_first_second: SE2) -> Keyframe:
     placed = keyframe.at(T_first_second @ keyframe.T_map_keyframe)
-    return Keyframe(**{**placed.__dict__, "number": number, "drive": keyframe.drive + drives})
+    lines = tuple(replace(piece, drive=piece.drive + drives) for piece in keyframe.lines)
+    return replace(placed, number=number, drive=keyframe.drive + drives, lines=lines)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections import Counter
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -16,13 +17,15 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.loops.gnss.earth import Earth
 from birdslam.loops.gnss.factors import OnEarth
-from birdslam.loops.keyframe import Fixed, Keyframe, Link
+from birdslam.loops.keyframe import Fixed, Keyframe, LinePiece, Link
 from birdslam.loops.map_pose import EarthPose
 from birdslam.loops.place_index import LEARNED_FROM, PlaceIndex, index_of, learn_words
 from birdslam.loops.verification import LocalMap
+from birdslam.types import LineColour, LineKind
 
 NEIGHBOUR_M = 9.0  # keyframes this near help each other
 NEIGHBOURS = 3
+MOST_GAP_M = 8.0  # between two pieces of one line
 EARTH_REACH_M = 100.0  # a place on Earth is that of the keyframes around it
 SAME_HEADING_RAD = math.radians(60.0)
 OTHER_HEIGHT, OTHER_FOCAL_LENGTH = 0.1, 0.1  # logarithms of ratios
@@ -54,6 +57,18 @@ class MapCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 f"the map's was {self.fx_px:g} px of {self.width_px}"
             )
         return ""
+
+
+@dataclass(frozen=True, eq=False)
+class MapLine:
+    """A line of the road in the map."""
+
+    drive: int
+    line: int  # its number in that drive
+    kind: LineKind  # of most of its pieces
+    colour: LineColour
+    points_m: Floats  # (N, 2)
+    sigma_m: float  # the largest of its pieces
 
 
 class PlaceMap:
@@ -147,6 +162,26 @@ class PlaceMap:
             placed = [keyframe.T_map_keyframe for keyframe in self.keyframes]
             self._poses = np.array([(T.x_m, T.y_m, T.yaw_rad) for T in placed]).reshape(-1, 3)
         return self._poses
+
+    def lines(self) -> list[MapLine]:
+        """The road's lines as its keyframes lie now, each whole where its pieces follow one another."""
+        joined: dict[tuple[int, int], list[list[tuple[Floats, LinePiece]]]] = {}
+        for keyframe in self.keyframes:
+            for piece in keyframe.lines:
+                points_m = keyframe.T_map_keyframe @ piece.points_m
+                runs = joined.setdefault((piece.drive, piece.line), [])
+                if not runs or math.hypot(*(runs[-1][-1][0][-1] - points_m[0])) > MOST_GAP_M:
+                    runs.append([])
+                runs[-1].append((points_m, piece))
+        out = []
+        for (drive, line), runs in joined.items():
+            for run in runs:
+                points_m = np.concatenate([points for points, _ in run])
+                kind = Counter(piece.kind for _, piece in run).most_common(1)[0][0]
+                colour = Counter(piece.colour for _, piece in run).most_common(1)[0][0]
+                if len(points_m) > 1:
+                    out.append(MapLine(drive, line, kind, colour, points_m, max(piece.sigma_m for _, piece in run)))
+        return out
 
     def near(self, T_map_ego: SE2, radius_m: float, among: Bools | None = None) -> list[int]:
         """Rows of keyframes within the radius that look the same way, the nearest first."""

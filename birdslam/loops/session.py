@@ -7,6 +7,7 @@ Keyframes of a drive that is not in the map yet wait until it is.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,7 @@ class MapSession:
         self._new_map = not len(place_map)
         self._drive = place_map.drives
         self.localiser = Localiser(camera, place_map)
-        self._builder = KeyframeBuilder(camera)
+        self._builder = KeyframeBuilder(camera, self._drive)
         self._waiting: list[NewKeyframe] = []
         self._epoch: int | None = None
         self._last: Estimate | None = None
@@ -63,6 +64,8 @@ class MapSession:
     def step(self, estimate: Estimate, image: NDArray[np.uint8] | None) -> Localisation:
         """Where the ego of this frame is in the map."""
         self._move(estimate)
+        if self._extend:
+            self._builder.nodes.add(estimate, self._travelled_m)
         looked = image is not None and self._due(estimate)
         if looked:
             assert image is not None
@@ -123,7 +126,7 @@ class MapSession:
             step = self._last.T_world_ego.between(estimate.T_world_ego)
             self._travelled_m += math.hypot(step.x_m, step.y_m)
         self._last = estimate
-        self.localiser.move(estimate.T_world_ego, estimate.valid)
+        self.localiser.move(estimate)
         if self._new_map and self._extend and not len(self.map) and not estimate.valid:
             self._place_origin(estimate)
 
@@ -133,7 +136,7 @@ class MapSession:
             self._take(self._builder.finish())
             self.lost_keyframes += len(self._waiting)
             self._waiting, self._chain = [], None
-            self._builder = KeyframeBuilder(self._camera)
+            self._builder = KeyframeBuilder(self._camera, self._drive)
             self.localiser.lose()
         elif self._resumed is not None and self._resumed.epoch == estimate.epoch:
             self._go_on(self._resumed)
@@ -209,6 +212,7 @@ class MapSession:
         fix = self.localiser.fix
         joint = bool(self._fixes) and new.look.travelled_m - self._joint_m > JOINT_EVERY_M
         if covered and fix is not None and fix.inliers >= COVERED_INLIERS and not joint:
+            self._give_lines(covered[0], new, T_map_keyframe)
             return
         number = self.map.next_number
         cov = self._cov_at(new)
@@ -224,6 +228,7 @@ class MapSession:
                 new.sigma_depth_rel,
                 new.descriptors,
                 self._camera.height_m,
+                lines=new.lines,
             )
         )
         self.map.drives = self._drive + 1
@@ -235,6 +240,13 @@ class MapSession:
             self.map.links.append(Link(last, number, step, moved(np.zeros((3, 3)), step)))
         self._close(new, number)
         self._chain = number, new.look.T_odom_ego
+
+    def _give_lines(self, row: int, new: NewKeyframe, T_map_keyframe: SE2) -> None:
+        """To the map's keyframe in this place, if it has none."""
+        old = self.map.keyframes[row]
+        if not old.lines:
+            T_old_new = old.T_map_keyframe.between(T_map_keyframe)
+            self.map.keyframes[row] = replace(old, lines=tuple(piece.seen_from(T_old_new) for piece in new.lines))
 
     def _cov_at(self, new: NewKeyframe) -> Floats:
         """Of a keyframe in the map, by what the localiser knows now and the way between."""

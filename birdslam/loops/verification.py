@@ -32,7 +32,8 @@ GRID_CELLS = 8, 4  # across and down the image
 RANSAC_PX, RANSAC_LOOKS = 4.0, 400
 GATE = 3.0  # standard deviations of a coordinate
 SIGMA_Z_M, SIGMA_TILT_RAD = 0.15, 0.03  # of a car on a road that another drive mapped
-ITERATIONS = 8
+ITERATIONS = 12
+NARROWER = 3.0  # by which the weights' bell shrinks from one iteration to the next
 OTHER_VIEW_PX = 1.0  # 1-sigma of a corner found anew from another place and at another time, besides its own noise
 
 
@@ -159,7 +160,10 @@ def _guided(camera: Camera, features: Features, local: LocalMap, pose: Transform
 def _adjust(
     camera: Camera, features: Features, local: LocalMap, pairs: Ints, pose: Transform
 ) -> tuple[Transform, Floats, Bools] | None:
-    """Gauss-Newton with Cauchy weights: T_keyframe_ego (4, 4), the covariance of (x, y, yaw), and the inliers."""
+    """Gauss-Newton with Cauchy weights: T_keyframe_ego (4, 4), the covariance of (x, y, yaw), and the inliers.
+
+    Graduated (Black and Rangarajan 1996): the weights are wide at first, or far points alone would hold a wrong guess.
+    """
     if len(pairs) < 8:
         return None
     mount = mount_pose(camera.ground)
@@ -170,6 +174,7 @@ def _adjust(
     prior = np.array([0.0, 0.0, SIGMA_Z_M**-2, SIGMA_TILT_RAD**-2, SIGMA_TILT_RAD**-2, 0.0])
     good: Bools = np.ones(len(pairs), bool)
     H: Floats = np.eye(6)
+    width = math.inf  # of the weights' bell, in standard deviations, squared
     for _ in range(ITERATIONS):
         p_ego = (points - pose[:3, 3]) @ pose[:3, :3]
         p = (p_ego - mount[:3, 3]) @ R_cam_ego.T
@@ -185,7 +190,8 @@ def _adjust(
         error = xy - predicted
         chi2 = (error * (W @ error[:, :, None])[:, :, 0]).sum(axis=1)
         good = (chi2 < GATE**2) & (p[:, 2] > 0.5)
-        weight = (p[:, 2] > 0.5) / (1.0 + chi2 / 4.0)
+        width = max(min(width / NARROWER, float(np.median(chi2))), 4.0)
+        weight = (p[:, 2] > 0.5) / (1.0 + chi2 / width)
         weighed = (weight[:, None, None] * (W @ J)).reshape(-1, 6)
         H = weighed.T @ J.reshape(-1, 6)
         g = weighed.T @ error.ravel()
@@ -198,11 +204,13 @@ def _adjust(
         pose = pose.copy()
         pose[:3, 3] += pose[:3, :3] @ np.clip(step[:3], -2.0, 2.0)
         pose[:3, :3] = pose[:3, :3] @ rotation_exp(step[3:])
-        if float(np.abs(step).max()) < 1e-5:
+        if width == 4.0 and float(np.abs(step).max()) < 1e-5:
             break
     if not good.any() or abs(pose[2, 3]) > 1.5 or math.hypot(*pose[:2, 3]) > 60.0:
         return None
     h = camera.height_m
     J_foot = np.array([[1, 0, 0, 0, h, 0], [0, 1, 0, -h, 0, 0], [0, 0, 0, 0, 0, 1]])  # the foot, by a step of the body
     cov: Floats = J_foot @ np.linalg.inv(H) @ J_foot.T
+    # The a posteriori variance of unit weight: residuals of an image with few right matches are larger than foreseen
+    cov *= max(1.0, float((weight * chi2).sum() / (2.0 * weight.sum())))
     return pose, cov, good

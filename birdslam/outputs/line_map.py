@@ -15,11 +15,9 @@ import numpy as np
 
 from birdslam.geometry.arrays import Floats
 from birdslam.geometry.se2 import SE2
+from birdslam.loops.keyframe_builder import LEAST_EXISTENCE, NODE_AT_M, NODE_EVERY_M
 from birdslam.types import NS_PER_S, Estimate, LaneLine
 
-NODE_AT_M = 6.0  # ahead of the ego
-NODE_EVERY_M = 2.0
-LEAST_EXISTENCE = 0.5
 LEAST_NODES = 3
 ENDED_NS = 3 * NS_PER_S  # a line not seen for so long has ended
 MOST_DRAWN = 20_000  # vertices for the picture

@@ -1,4 +1,4 @@
-"""A map of places from above, as a PNG: keyframes by the drive that they are of, loops, and the points beside them."""
+"""A map of places from above, as a PNG: keyframes by the drive that they are of, loops, lines of the road, points."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from birdslam.loops.place_map import PlaceMap
 SIDE_IN, DPI = 9.0, 130
 NEAR_M = 30.0  # points farther from their keyframe are too inexact to be drawn
 PAPER, INK, FAINT, LOOP = "#12161d", "#e8ebf0", "#5f6b7c", "#ff9d3d"
+LINES = {"yellow": "#ffd54a", "edge": "#b08968"}  # else INK
 DRIVES = "#35d0ff", "#7bd88f", "#f3ecd2", "#ff8fa3", "#c39bff"
 
 
@@ -30,6 +31,11 @@ def draw_map(place_map: PlaceMap, path: Path) -> None:
     if points:
         x, y = np.concatenate(points).T
         axes.scatter(-y, x, s=0.6, c=FAINT, linewidths=0, rasterized=True)
+    lines = place_map.lines()
+    for line in lines:
+        colour = LINES.get(line.kind.value) or LINES.get(line.colour.value, INK)
+        x, y = line.points_m.T
+        axes.plot(-y, x, "--" if line.kind.value == "dashed" else "-", color=colour, linewidth=0.7)
     at = {keyframe.number: keyframe.T_map_keyframe for keyframe in place_map.keyframes}
     drive = {keyframe.number: keyframe.drive for keyframe in place_map.keyframes}
     for link in place_map.links:
@@ -45,6 +51,7 @@ def draw_map(place_map: PlaceMap, path: Path) -> None:
     axes.set_xlabel("to the right, m", color=INK)
     axes.set_ylabel("forward, m", color=INK)
     loops = sum(link.loop for link in place_map.links)
-    title = f"{len(place_map)} keyframes, {place_map.length_m:.0f} m, {place_map.drives} drives, {loops} loop links"
+    drives = f"{len(place_map)} keyframes, {place_map.length_m:.0f} m, {place_map.drives} drives"
+    title = f"{drives}, {loops} loop links, {len(lines)} lines"
     axes.set_title(title, color=INK, fontsize=11)
     figure.savefig(path, facecolor=PAPER)

@@ -78,7 +78,7 @@ class MapTrajectory:
             lost, estimate = self._waiting[place]
             step = later.T_world_ego.between(estimate.T_world_ego)
             way_m += math.hypot(step.x_m, step.y_m)
-            cov = moved(cov, step, later.valid)
+            cov = moved(cov, step, later.valid, later.scale_sigma_rel)
             if estimate.epoch != newest.epoch or way_m > MOST_BACK_M or not is_exact(cov):
                 return
             T_map_ego = found.T_map_ego @ newest.T_world_ego.between(estimate.T_world_ego)

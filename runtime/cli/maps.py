@@ -32,6 +32,7 @@ def info(options: argparse.Namespace) -> int:
         ("keyframes", f"{len(place_map)} of {place_map.drives} drives"),
         ("points", str(sum(len(keyframe.points_m) for keyframe in place_map.keyframes))),
         ("way", f"{place_map.length_m:.0f} m, {len(place_map.links) - loops} links and {loops} of loops"),
+        ("lines", str(len(place_map.lines()))),
         ("size", f"{size / 1e6:.3f} MB, {size / 1e3 / max(place_map.length_m, 1.0):.2f} MB a km"),
         ("words", str(0 if place_map.words is None else len(place_map.words))),
         (

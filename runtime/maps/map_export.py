@@ -1,9 +1,11 @@
-"""A map in the formats of others: its graph as g2o, its keyframes as TUM lines, its ways on Earth."""
+"""A map in the formats of others: its graph as g2o, its keyframes as TUM lines, its ways and lines."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from birdslam.loops.map_file import MapError
@@ -11,7 +13,8 @@ from birdslam.loops.place_map import PlaceMap
 from birdslam.outputs.earth_files import SUFFIXES, Way, write_ways
 from birdslam.trajectory import ego_pose, tum_row
 
-FORMATS = ".g2o, .tum.txt, .geojson, .gpx, .kml"
+IN_METRES = ".map.geojson"  # of the map
+FORMATS = ".g2o, .tum.txt, .map.geojson, .geojson, .gpx, .kml"
 
 
 def export_map(place_map: PlaceMap, path: Path) -> str:
@@ -25,13 +28,17 @@ def export_map(place_map: PlaceMap, path: Path) -> str:
             path.write_text("".join(f"{tum_row(*row)}\n" for row in rows), encoding="ascii")
             return f"{len(place_map)} keyframes"
         if path.suffix.lower() in SUFFIXES:
-            ways = [
-                way for drive in range(place_map.drives) for way in [_way(place_map, drive)] if len(way.degrees) > 1
-            ]
-            if not ways:
-                raise MapError(f"{path}: the map is not on Earth yet: drive with --map and --gnss")
-            write_ways(path, ways)
-            return f"{len(ways)} ways"
+            ways, lines = _ways(place_map), _lines(place_map)
+            if path.name.endswith(IN_METRES):
+                path.write_bytes(_in_metres([*ways, *lines]))
+            elif place_map.earth is None:
+                raise MapError(
+                    f"{path}: the map is not on Earth yet: drive with --map and --gnss, or export {IN_METRES}"
+                )
+            else:
+                earth = place_map.earth
+                write_ways(path, [replace(way, degrees=earth.wgs84(way.degrees)) for way in (*ways, *lines)])
+            return f"{len(ways)} ways and {len(lines)} lines"
     except OSError as error:
         raise MapError(f"{path}: can't be written: {error.strerror}") from None
     raise MapError(f"{path}: a map is exported as {FORMATS}")
@@ -50,8 +57,43 @@ def _g2o(place_map: PlaceMap) -> list[str]:
     return out
 
 
-def _way(place_map: PlaceMap, drive: int) -> Way:
-    own = [each.T_map_keyframe for each in place_map.keyframes if each.drive == drive and place_map.earth is not None]
-    xy = np.array([(T.x_m, T.y_m) for T in own]).reshape(-1, 2)
-    degrees = xy if place_map.earth is None else place_map.earth.wgs84(xy)
-    return Way(f"drive {drive}", degrees, about={"drive": drive, "keyframes": len(own)})
+def _ways(place_map: PlaceMap) -> list[Way]:
+    """The drives' ways, in metres of the map."""
+    out = []
+    for drive in range(place_map.drives):
+        own = [each.T_map_keyframe for each in place_map.keyframes if each.drive == drive]
+        if len(own) > 1:
+            about: dict[str, float | int | str] = {"drive": drive, "keyframes": len(own)}
+            out.append(Way(f"drive {drive}", np.array([(T.x_m, T.y_m) for T in own]), about=about))
+    return out
+
+
+def _lines(place_map: PlaceMap) -> list[Way]:
+    """The road's lines, in metres of the map."""
+    return [
+        Way(
+            f"{each.kind.value} {each.line}",
+            each.points_m,
+            about={
+                "drive": each.drive,
+                "line": each.line,
+                "kind": each.kind.value,
+                "colour": each.colour.value,
+                "sigma_m": round(each.sigma_m, 3),
+            },
+        )
+        for each in place_map.lines()
+    ]
+
+
+def _in_metres(ways: list[Way]) -> bytes:
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "LineString", "coordinates": way.degrees.round(3).tolist()},
+            "properties": {"name": way.name, **(way.about or {})},
+        }
+        for way in ways
+    ]
+    collection = {"type": "FeatureCollection", "birdslam": {"metres_of": "the map"}, "features": features}
+    return msgspec.json.encode(collection) + b"\n"
