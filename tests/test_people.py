@@ -20,8 +20,10 @@ from birdslam.graph.graph_config import GraphConfig
 from birdslam.graph.pose_graph import PoseGraph
 from birdslam.graph.weights import WeightsConfig
 from birdslam.people.people_boxes import PeopleBoxesConfig, people_boxes
+from birdslam.people.people_config import PeopleConfig
 from birdslam.people.people_records import followed_people
 from birdslam.people.people_tracker import PeopleTracker, PeopleTrackingConfig
+from birdslam.people.road_tilt import SharedRoad
 from birdslam.perception import Detections
 from birdslam.queries import nearby
 from birdslam.types import (
@@ -47,9 +49,13 @@ Box = tuple[float, float, float, float]
 HZ = 10.0
 
 
-def box_of(x_m: float, y_m: float, height_m: float = 1.72, width_m: float = 0.6, reach_m: float = 0.25) -> Box:
-    """Of somebody at a place in ego, over a level road; the feet reach out to the camera."""
-    foot, head = bev.ego_to_pixel(CAMERA, CAMERA.ground, np.array([[x_m - reach_m, y_m, 0.0], [x_m, y_m, height_m]]))
+def box_of(
+    x_m: float, y_m: float, height_m: float = 1.72, width_m: float = 0.6, reach_m: float = 0.25, rise: float = 0.0
+) -> Box:
+    """Of somebody at a place in ego, over a level road or one that rises; the feet reach out to the camera."""
+    near_m = x_m - reach_m
+    points = np.array([[near_m, y_m, rise * near_m], [x_m, y_m, rise * x_m + height_m]])
+    foot, head = bev.ego_to_pixel(CAMERA, CAMERA.ground, points)
     middle = bev.ego_to_pixel(CAMERA, CAMERA.ground, np.array([[x_m, y_m, 0.0]]))[0, 0]
     half = width_m / x_m * CAMERA.fx_px / 2.0
     return float(middle - half), float(head[1]), float(middle + half), float(foot[1])
@@ -136,6 +142,47 @@ def test_a_child_is_near_and_no_distant_adult() -> None:
     assert child.x_m == pytest.approx(8.0, rel=0.12)  # an adult's box of that height is one at 12.5 m
     assert child.child > 0.5
     assert child.height_m == pytest.approx(1.1, rel=0.15)
+
+
+RISE = 0.03  # of a street before a standing ego
+HEIGHTS = [1.8, 1.65, 1.72, 1.75, 1.68, 1.7]
+PASSERS_BY = [(9.0, -3.0), (12.0, 2.5), (16.0, -4.0), (20.0, 4.0), (25.0, -5.0), (30.0, 2.0)]
+
+
+def test_who_was_there_first_is_placed_by_the_rise_that_later_ones_tell_and_keeps_it_when_they_leave() -> None:
+    scene, first = Scene(), box_of(18.0, 0.5, rise=RISE)
+    for _ in range(10):
+        people = scene.see(found([first]))
+    (alone,) = people
+    others = [box_of(x_m, y_m, height_m, rise=RISE) for (x_m, y_m), height_m in zip(PASSERS_BY, HEIGHTS, strict=True)]
+    for _ in range(10):
+        people = scene.see(found([first, *others]))
+    together = next(p for p in people if p.person == alone.person)
+    for _ in range(25):
+        people = scene.see(found([first]))
+    (left,) = people
+    assert abs(together.x_m - 18.0) < 0.9 * abs(alone.x_m - 18.0)
+    assert abs(left.x_m - 18.0) < 0.9 * abs(alone.x_m - 18.0)
+    assert left.cov[0] < alone.cov[0]
+
+
+def test_near_ones_tell_how_tall_all_are_and_far_ones_the_tilt_and_nobody_tells_of_itself() -> None:
+    config = PeopleConfig()
+    road, camera_m = SharedRoad(config), CAMERA.height_m
+    places = [(x_m, y_m) for x_m in (6.5, 8.0, 11.0, 18.0, 28.0, 35.0) for y_m in (-2.0, 2.0)]
+    boxes = [box_of(*place, 1.72 * math.exp(0.08), rise=0.02) for place in places]
+    seen = people_boxes(found(boxes), CAMERA, CAMERA.ground, PeopleBoxesConfig())
+    road.predict(1.0, 0.0, 0.02)
+    road.begin(len(seen))
+    before = road.by_others()
+    road.tell(range(1), seen[:1], camera_m)
+    np.testing.assert_array_equal(road.by_others()[0], before[0])
+    road.tell(range(1, len(seen)), seen[1:], camera_m)
+    (tilt, tilt_var), (log_height, height_var) = road.by_others()[-1].tolist()
+    assert abs(tilt - 0.02) < 2.0 * math.sqrt(tilt_var) < 0.02
+    assert 0.02 < log_height < 0.08 + math.sqrt(height_var)
+    road.predict(1.0, 0.005, 0.02)  # the front end's ground now has a part of it
+    assert road.by_others()[-1, 0, 0] == pytest.approx(tilt - 0.005, abs=1e-3)
 
 
 def test_feet_that_the_images_border_cuts_tell_no_place() -> None:

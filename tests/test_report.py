@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import cv2
@@ -17,7 +16,11 @@ from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.drive_files import Recorder, ResultsError
 from birdslam.outputs.earth_files import Way, write_ways
+from birdslam.outputs.placed import Place, write_places
 from birdslam.outputs.report.drive_table import read_drive
+from birdslam.perf.browser import reports
+from birdslam.perf.browser.chromium import chromium
+from birdslam.perf.browser.reports import LOOKS, faults, moved
 from birdslam.runtime.cli.main import main
 from birdslam.types import Estimate, LaneLine, Lanes, LineKind, MapUpdate, Status, VehicleEstimate
 
@@ -64,6 +67,7 @@ def results(tmp_path: Path) -> Path:
                 )
             )
             recorder.add_map(MapUpdate(epoch=epoch, frame_id=k, lanes_m=((1.0 * k, 1.8),)))
+        write_places(directory, [place(k) for k in range(FRAMES)])
         stages = {f"perceive{EVIL}": {"p50": 4.0, "p99": 8.0, "max": 9.0}}
         recorder.finish(
             {
@@ -74,6 +78,12 @@ def results(tmp_path: Path) -> Path:
     write_ways(directory / "ego.geojson", [Way(EVIL, np.array([[49.0, 8.4], [49.001, 8.401]]))])
     (directory / "camera.toml").write_text(f"# {EVIL}\n")
     return directory
+
+
+def place(k: int) -> Place:
+    """Frame k on Earth: ahead is north, 1e-5 degrees a frame."""
+    T = SE2(0.5 * (k - RESET * (k >= RESET)), 0.0, 0.0)
+    return Place(k * 10**8, int(k >= RESET), T, T, (49.0 + 1e-5 * k, 8.4, np.pi / 2.0, 1.0))
 
 
 def film(path: Path) -> Path:
@@ -105,9 +115,13 @@ def test_the_drive_is_read_back_in_one_plane(results: Path) -> None:
     ]
     assert {kind for kind, _ in drive.lines} == {"solid"}
     assert all(np.abs(xy_m[:, 1] - 1.8).max() < 0.01 for _, xy_m in drive.lines)
-    assert drive.earth_deg is not None
-    assert drive.earth_deg.tolist() == [[49.0, 8.4], [49.001, 8.401]]
-    assert set(drive.files) == {"ego.tum.txt", "ego.kitti.txt", "ego.geojson", "frames.csv", "map.geojson"}
+    assert drive.earth is not None
+    assert drive.earth.t_s[[0, -1]] == pytest.approx([0.0, 0.1 * (FRAMES - 1)])
+    assert drive.earth.at(drive.t_s[[0, 30]]) == pytest.approx(np.array([[49.0, 8.4], [49.0003, 8.4]]), abs=1e-6)
+    assert len(drive.earth.tracks_deg) == 2
+    assert drive.earth.road_deg
+    files = {"ego.tum.txt", "ego.kitti.txt", "ego.geojson", "frames.csv", "map.geojson", "road.geojson"}
+    assert set(drive.files) == {*files, "tracks.geojson"}
     assert len(drive.lanes_m) == FRAMES
 
 
@@ -123,12 +137,29 @@ def test_the_page_is_whole_offline_and_escaped(results: Path, capsys: pytest.Cap
     assert "83 % is valid: 50 of 60 frames" in page
     assert "how long a metre is" in page
     assert own.count('"jpeg":') == FRAMES
-    for said in ("p50 4.0, p99 8.0 ms", "in all", "p50 20.0, p99 32.0 ms", "49.000000, 8.400000", "RMS 1.5 m"):
+    for said in (
+        "p50 4.0, p99 8.0 ms",
+        "in all",
+        "p50 20.0, p99 32.0 ms",
+        "49.000000, 8.400000",
+        "RMS 1.5 m",
+        "0.0 to 1.0 s",
+    ):
         assert said in page
     assert '"name":"people"' in page
     taken = re.search(r'download="frames.csv" href="data:text/plain;base64,([^"]*)"', page)
     assert taken is not None
     assert base64.b64decode(taken[1]) == (results / "frames.csv").read_bytes()
+
+
+def test_the_camera_is_that_of_the_configuration_where_no_file_was_written(results: Path) -> None:
+    (results / "camera.toml").unlink()
+    assert read_drive(results).camera == ""
+    summary = json.loads((results / "summary.json").read_text())
+    summary["configuration"] = {"camera": {"height_m": 1.4, "distortion": [0.1], "name": EVIL, "none": None}}
+    (results / "summary.json").write_text(json.dumps(summary))
+    assert "height_m = 1.4\ndistortion = [0.1]\n" in read_drive(results).camera
+    assert EVIL not in report(results).read_text(encoding="utf-8")
 
 
 def test_what_is_no_drive_is_one_line(tmp_path: Path, results: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -143,38 +174,30 @@ def test_what_is_no_drive_is_one_line(tmp_path: Path, results: Path, capsys: pyt
         read_drive(results)
 
 
-@pytest.mark.parametrize(("dark", "width_px"), [(False, 1280), (True, 1280), (False, 390)])
-def test_a_browser_draws_it_and_the_slider_moves(results: Path, dark: bool, width_px: int) -> None:
-    browser = shutil.which("chromium") or shutil.which("chromium-browser")
-    if browser is None:
-        pytest.skip("no Chromium (Debian: apt install chromium)")
+@pytest.mark.skipif(chromium() is None, reason="no Chromium (Debian: apt install chromium)")
+@pytest.mark.parametrize("way", LOOKS)
+def test_a_browser_draws_it_and_the_slider_moves(results: Path, tmp_path: Path, way: str) -> None:
     path = report(results, "--video", str(film(results / "film.avi")))
-    moved = """<script>
-      const first = document.getElementById("picture").src;
-      slider.value = "55"; slider.dispatchEvent(new Event("input"));
-      document.documentElement.dataset.moved = document.getElementById("picture").src === first ? "no" : "yes";
-      document.documentElement.dataset.at = String(document.getElementById("map").data.at(-1).y[0]);
-      document.documentElement.dataset.plots = String(document.querySelectorAll(".plot .main-svg").length);
-      document.documentElement.dataset.title = document.title;
-      document.documentElement.dataset.over = String(document.documentElement.scrollWidth - innerWidth);
-      document.documentElement.dataset.ground = getComputedStyle(document.body).backgroundColor;
-    </script>"""
-    path.write_text(path.read_text(encoding="utf-8").replace("</body>", moved + "</body>"), encoding="utf-8")
-    done = subprocess.run(
-        [browser, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom",
-         f"--blink-settings=preferredColorScheme={int(not dark)}", f"--window-size={width_px},900",
-         "--virtual-time-budget=8000", path.as_uri()],
-        capture_output=True, text=True, timeout=180, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []
-    head = re.search("<html[^>]*>", done.stdout)
-    assert head is not None
-    told = dict(re.findall(r'data-(\w+)="([^"]*)"', head[0]))
-    assert told["ready"] == told["moved"] == "yes"
-    assert float(told["at"]) == pytest.approx(0.5 * 54)  # ahead of the start, in the plane of both epochs
-    assert int(told["plots"]) >= 3
-    assert float(told["over"]) <= 0.0  # nothing stands out to the right
-    assert (sum(map(int, re.findall(r"\d+", told["ground"])[:3])) < 3 * 64) == dark
-    assert told["title"].startswith("BirdSLAM: drive")  # what the files hold has run nothing
-    assert "55" in re.findall(r'<output id="words">([^<]*)', done.stdout)[0]
+    seen = moved(path, tmp_path / "seen.png", way)
+    assert list(faults(seen, way)) == []  # the console, the slider, the film, the colours, nothing to the right
+    middle = (FRAMES - 1) // 2 + 1
+    assert seen.said["to"] == f"0,{0.5 * middle:g}"  # ahead of the start
+    assert [float(x) for x in seen.said["earth"].split(",")] == pytest.approx([49.0 + 1e-5 * middle, 8.4], abs=1e-6)
+    assert f"frame {middle}, 5.0 m/s" in seen.said["at"]
+    assert int(seen.said["plots"]) >= 4
+    assert seen.said["title"].startswith("BirdSLAM: drive")  # what the files hold has run nothing
+    picture = cv2.imread(str(tmp_path / "seen.png"))
+    assert picture is not None
+    assert picture.std() > 5.0
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium (Debian: apt install chromium)")
+def test_what_is_wrong_with_a_page_is_told(results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = report(results)
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace('slider.addEventListener("input", move);', 'console.log("here");'), encoding="utf-8")
+    assert reports.run([str(path), "--output", str(tmp_path / "pictures")]) == 1
+    said = capsys.readouterr().out
+    assert "light: the slider moves nothing" in said
+    assert "here" in said
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == len(LOOKS)

@@ -6,6 +6,8 @@ import msgspec
 
 from birdslam.people.people_boxes import PEDESTRIAN
 
+MIN_VARIANCE = 1e-6  # of a height that all share
+
 
 class Sizes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a kind of road user measures, and how it moves."""
@@ -72,12 +74,14 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     turns_after_s: float = 10.0  # from one way of moving to another
     stop_mps: float = 0.08  # 1-sigma of the velocity of who stands: they sway
     sigma_tilt_rad: float = 0.008  # of the road at somebody against the ego's, beside the front end's own sigma
+    sigma_common_tilt_rad: float = 0.004  # of the road under all people against the front end's, beside its own sigma
     tilt_memory_s: float = 5.0  # of driving: how long that lasts
     tilt_drift_rad: float = 0.003  # and by how much it changes within a second as people walk on
     driving_mps: float = 1.0  # as `GroundSizeConfig.driving_mps`
     sigma_roll_rad: float = 0.01  # of the front end's roll, which tilts what is aside
     kerb_m: float = -0.03  # people are on pavements too
     sigma_kerb_m: float = 0.1  # 1-sigma of it
+    sigma_pavement_rel: float = 0.036  # the part of it that all share, in heights of the camera: 0.06 m
     hidden_share: float = 0.3  # of a person's height, that is hidden where the feet are
     sigma_hidden_share: float = 0.35  # 1-sigma of it
     box_memory_s: float = 0.4  # for so long a box has the same error: this time counts as one box
@@ -85,8 +89,12 @@ class PeopleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     outline_memory_s: float = 2.0  # errors that last: a box that is drawn too low or too high, by
     sigma_outline_rel: float = 0.06  # of its height
     sure_feet: float = 0.01  # a box whose feet are hidden with less probability tells of the road
-    sigma_common_rel: float = 0.055  # of the mean height of those who are there
+    sigma_common_rel: float = 0.055  # of what the heights of all who are there have in common
 
     def sizes(self, label: str) -> Sizes:
         """Of a kind."""
         return self.pedestrian if label == PEDESTRIAN else self.cyclist
+
+    def own_height_var(self, sigma_height_rel: float) -> float:
+        """Of somebody's log height beside what all share."""
+        return float(max(sigma_height_rel**2 - self.sigma_common_rel**2, MIN_VARIANCE))

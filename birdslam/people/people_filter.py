@@ -39,6 +39,7 @@ from birdslam.people.people_state import (
     Y,
     merged,
 )
+from birdslam.people.road_tilt import SharedRoad
 
 DEPTH_UNKNOWN = 0.6  # 1-sigma at birth, as a fraction
 BIRTH_ITERATIONS, ITERATIONS = 4, 1
@@ -60,27 +61,42 @@ class PeopleFilter:
         self._P = np.zeros((0, FILTERS, len(STATES), len(STATES)))
         self._weight = np.zeros((0, FILTERS))
         self._unseen_s = np.zeros(0)
+        self._log_height = np.zeros((0, FILTERS))  # of a kind's grown-ups and children
         self._sizes = np.zeros((0, 4))  # reach, change, log width, sigma width
         self._moves = np.zeros((0, len(MOTIONS), 3))  # speed along the road, 1-sigma of it and of that across it
-        self._tilt_prior = np.zeros((0, 2))  # mean and variance, as the front end and the others have it
+        # Mean and variance of the tilt and of the log of all heights, as the others have them, and the variances of
+        # somebody's own parts beside them
+        self._shared, self._own_var = np.zeros((0, 2, 2)), np.zeros((0, FILTERS, 2))
+        self._driving = 1.0  # of a second
+        self.road = SharedRoad(config)
 
     def __len__(self) -> int:
         return len(self._x)
 
-    def keep_rows(self, rows: Sequence[int]) -> None:
-        """Forgets all others."""
+    def keep_rows(self, rows: Sequence[int], leaving: Sequence[int]) -> None:
+        """Forgets all others; what those in the rows `leaving` told of the road stays."""
+        self.road.keep_rows(rows, leaving)
         self._x, self._P, self._weight = self._x[rows], self._P[rows], self._weight[rows]
-        self._unseen_s, self._sizes = self._unseen_s[rows], self._sizes[rows]
-        self._tilt_prior, self._moves = self._tilt_prior[rows], self._moves[rows]
+        self._unseen_s, self._sizes, self._log_height = self._unseen_s[rows], self._sizes[rows], self._log_height[rows]
+        self._shared, self._own_var, self._moves = self._shared[rows], self._own_var[rows], self._moves[rows]
 
     def predict(
-        self, dt_s: float, T_world_ego: SE2, ego_cov: Floats | None, ground_shift_rad: float, ego_mps: float
+        self,
+        dt_s: float,
+        T_world_ego: SE2,
+        ego_cov: Floats | None,
+        ground_shift_rad: float,
+        ego_mps: float,
+        sigma_pitch_rad: float,
     ) -> None:
         """To the next frame: people move, and the ground's estimate moved by `ground_shift_rad` beside its own motion.
 
         `ego_cov` (3, 3) is of the ego's step, in its tangent.
         """
         config, n = self.config, len(self._x)
+        self._driving = -math.expm1(-ego_mps / config.driving_mps)
+        keep = math.exp(-self._driving * dt_s / config.tilt_memory_s)
+        self.road.predict(keep, ground_shift_rad, sigma_pitch_rad)
         if not n or dt_s <= 0.0:
             return
         self._unseen_s += dt_s
@@ -88,9 +104,8 @@ class PeopleFilter:
             self._x, self._P, self._weight, self._moves, dt_s, T_world_ego.yaw_rad, config
         )
         self._x, self._P = walk_on(self._x, self._P, self._sizes[:, 1], dt_s)
-        driving = -math.expm1(-ego_mps / config.driving_mps)
-        keep = math.exp(-driving * dt_s / config.tilt_memory_s)
-        mean, var = self._tilt_prior.T
+        self._shared[:, 0, 0] -= ground_shift_rad
+        mean, var = self._shared[:, 0].T
         self._x[..., TILT] = mean[:, None] + keep * (self._x[..., TILT] - ground_shift_rad - mean[:, None])
         self._P[..., TILT, :] *= keep
         self._P[..., TILT] *= keep
@@ -109,20 +124,19 @@ class PeopleFilter:
             J[..., 0, 2], J[..., 1, 2] = -from_ego[..., 1], from_ego[..., 0]
             self._P[..., :2, :2] += J @ ego_cov @ J.swapaxes(-1, -2)
 
-    def begin(self, boxes: Sequence[PersonBox], tilt_prior: Floats, T_world_ego: SE2, height_m: float) -> None:
-        """People seen for the first time, each in a row after the others, already corrected by their boxes.
-
-        `tilt_prior` (N, 2): mean and variance of the road's tilt there against the front end's ground.
-        """
+    def begin(self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float) -> None:
+        """People seen for the first time, each in a row after the others, already corrected by their boxes."""
         if not boxes:
             return
-        config, n, before = self.config, len(boxes), len(self._x)
+        config, n, before, shared = self.config, len(boxes), len(self._x), self.road.by_others()[-1]
         x, P = np.zeros((n, FILTERS, len(STATES))), np.zeros((n, FILTERS, len(STATES), len(STATES)))
         weight, rows = np.zeros((n, FILTERS)), np.zeros((n, 4))
-        moves = np.zeros((n, len(MOTIONS), 3))
+        log_height = np.zeros((n, FILTERS))
+        moves, own_var = np.zeros((n, len(MOTIONS), 3)), np.zeros((n, FILTERS, 2))
         for k, box in enumerate(boxes):
             sizes = config.sizes(box.label)
             moves[k] = motions_of(sizes, config)
+            own_var[k, :, 0] = config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
             rows[k] = [
                 sizes.reach_m, sizes.change_mps, math.log(sizes.width_m), sizes.sigma_width_rel
             ]  # fmt: skip
@@ -132,14 +146,13 @@ class PeopleFilter:
                 x_m = min(h_m / max(box.tan_height, MIN_SLOPE), bev.MAX_RANGE_M)
                 both = slice(len(MOTIONS) * child, len(MOTIONS) * (child + 1))
                 x[k, both, :2] = T_world_ego @ np.array([x_m, box.bearing * x_m])
-                x[k, both, HEIGHT], x[k, both, KERB] = math.log(h_m), config.kerb_m
+                log_height[k, both] = math.log(h_m)
+                x[k, both, HEIGHT], x[k, both, KERB] = math.log(h_m) + shared[1, 0], config.kerb_m
                 P[k, both, :2, :2] = np.eye(2) * (DEPTH_UNKNOWN * x_m) ** 2
-                P[k, both, HEIGHT, HEIGHT] = sigma**2
+                own_var[k, both, 1] = config.own_height_var(sigma)
                 weight[k, both] = (sizes.child if child else 1.0 - sizes.child) * shares(config)
-            x[k, :, TILT] = tilt_prior[k, 0]
-            P[k, :, TILT, TILT] = (
-                tilt_prior[k, 1] + config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
-            )
+            x[k, :, TILT] = shared[0, 0]
+            P[k, :, [TILT, HEIGHT], [TILT, HEIGHT]] = (shared[:, 1] + own_var[k]).T
             P[k, :, [FOOT, HEAD], [FOOT, HEAD]] = config.sigma_outline_rel**2
             P[k, :, KERB, KERB] = config.sigma_kerb_m**2
         self._moves = np.concatenate([self._moves, moves])
@@ -149,7 +162,10 @@ class PeopleFilter:
         self._x, self._P = np.concatenate([self._x, x]), np.concatenate([self._P, P])
         self._weight = np.concatenate([self._weight, weight])
         self._sizes = np.concatenate([self._sizes, rows])
-        self._tilt_prior = np.concatenate([self._tilt_prior, tilt_prior])
+        self._shared = np.concatenate([self._shared, np.tile(shared, (n, 1, 1))])
+        self.road.begin(n)
+        self._log_height = np.concatenate([self._log_height, log_height])
+        self._own_var = np.concatenate([self._own_var, own_var])
         self._unseen_s = np.concatenate([self._unseen_s, np.full(n, max(config.box_memory_s, config.width_memory_s))])
         self.correct(range(before, before + n), boxes, T_world_ego, height_m, BIRTH_ITERATIONS)
 
@@ -165,6 +181,7 @@ class PeopleFilter:
         if not boxes:
             return
         at = np.asarray(rows)
+        self.road.tell(rows, boxes, height_m)
         z, R = self._measured(at, boxes)  # (M, 4), (M, 4, 4)
         counts = np.minimum(1.0, self._unseen_s[at] / self.config.box_memory_s)[:, None, None]  # as so many boxes
         hidden = np.array([box.hidden for box in boxes])
@@ -228,9 +245,23 @@ class PeopleFilter:
             cov[:, [VX, VY], [VX, VY]] += (q * after_s)[:, None]
         return Moments(mean, cov, standing, self._weight[:, CHILD_FILTERS].sum(axis=1))
 
-    def expect_tilt(self, rows: Sequence[int], tilt_prior: Floats) -> None:
-        """What the next frames draw the tilts in `rows` to, (M, 2)."""
-        self._tilt_prior[np.asarray(rows, dtype=np.intp)] = tilt_prior
+    def share(self) -> None:
+        """What each shares with all others is known anew, and replaces what was known before.
+
+        Each filter has the old prior in it as information of rank one, in whose place the new one comes. That of the
+        tilt is forgotten as the ego drives, and predict() draws the tilt to the new one.
+        """
+        shared = self.road.by_others()[:-1]
+        means = ((TILT, np.zeros((1, 1)), 1.0 - self._driving), (HEIGHT, self._log_height, 1.0))
+        for k, (state, base, kept) in enumerate(means):
+            before, now = (1.0 / (self._own_var[..., k] + part[:, None, k, 1]) for part in (self._shared, shared))
+            Pa = self._P[..., state]  # (N, F, S)
+            change = np.maximum(kept * (now - before), -0.5 / Pa[..., state])
+            gain = Pa / (1.0 + change * Pa[..., state])[..., None]
+            drawn = kept * (now * shared[:, None, k, 0] - before * self._shared[:, None, k, 0])
+            self._x = self._x + gain * (drawn - change * (self._x[..., state] - base))[..., None]
+            self._P = self._P - change[..., None, None] * gain[..., :, None] * Pa[..., None, :]
+        self._shared = shared
 
     def distances(self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float) -> tuple[Floats, Floats]:
         """(N, M) squared Mahalanobis distances of boxes from everybody, and -2 log of their likelihoods.

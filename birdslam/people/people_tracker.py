@@ -13,13 +13,11 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
-from birdslam.geometry.arrays import Floats
 from birdslam.geometry.camera import Camera
 from birdslam.geometry.se2 import SE2
 from birdslam.people.people_boxes import BICYCLE, CYCLIST, PEDESTRIAN, PeopleBoxesConfig, PersonBox, people_boxes
 from birdslam.people.people_config import PeopleConfig
 from birdslam.people.people_filter import PeopleFilter
-from birdslam.people.road_tilt import tilts_of
 from birdslam.perception import Detections
 from birdslam.types import FIRST_PERSON
 from birdslam.vehicles.out_of_sequence import OpenFrame
@@ -100,16 +98,15 @@ class PeopleTracker:
         if detections is not None:
             boxes = people_boxes(detections, self.camera, ground, self.config.boxes)
             pairs = self._associate(boxes, ego.T_world_ego, ground.height_m)
-            tilts = tilts_of(boxes, road.sigma_pitch_rad, ground.height_m, self.config.people)
             rows = [row for row, _ in pairs]
-            self.filter.expect_tilt(rows, tilts[[k for _, k in pairs]])
             self.filter.correct(rows, [boxes[k] for _, k in pairs], ego.T_world_ego, ground.height_m)
             for row, k in pairs:
                 track = self.tracks[row]
                 track.box, track.seen_ns, track.seen_frame = boxes[k], ego.t_source_ns, ego.frame_id
                 track.hits += 1
                 track.votes[boxes[k].label] += 1
-            self._begin(boxes, tilts, {k for _, k in pairs}, frame, ground.height_m)
+            self.filter.share()
+            self._begin(boxes, {k for _, k in pairs}, frame, ground.height_m)
         self._conclude(frame)
 
     def _predict(self, frame: OpenFrame, road: GroundSizeFilter) -> None:
@@ -117,7 +114,7 @@ class PeopleTracker:
         shift_rad = 0.0 if self._pitch_rad is None else pitch_rad - self._pitch_rad - (frame.turn_rad or 0.0)
         self._pitch_rad = pitch_rad
         ego_mps = UNKNOWN_MPS if frame.travelled_m is None else frame.travelled_m / max(frame.dt_s, 1e-3)
-        self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, ego_mps)
+        self.filter.predict(frame.dt_s, ego.T_world_ego, ego.step_cov, shift_rad, ego_mps, road.sigma_pitch_rad)
 
     def _associate(self, boxes: Sequence[PersonBox], T_world_ego: SE2, height_m: float) -> list[tuple[int, int]]:
         """(row, box): the assignment of least total cost, the negative log-likelihood within the gate."""
@@ -132,9 +129,7 @@ class PeopleTracker:
             (int(i), int(j)) for i, j in zip(rows, columns, strict=True) if i < known and cost[i, j] < NEVER
         ]  # fmt: skip
 
-    def _begin(
-        self, boxes: list[PersonBox], tilts: Floats, matched: set[int], frame: OpenFrame, height_m: float
-    ) -> None:
+    def _begin(self, boxes: list[PersonBox], matched: set[int], frame: OpenFrame, height_m: float) -> None:
         followed = np.array([boxes[k].box_px for k in matched]).reshape(-1, 4)
         births: list[int] = []
         for k, box in enumerate(boxes):
@@ -144,7 +139,7 @@ class PeopleTracker:
                 continue
             births.append(k)
         ego = frame.ego
-        self.filter.begin([boxes[k] for k in births], tilts[births], ego.T_world_ego, height_m)
+        self.filter.begin([boxes[k] for k in births], ego.T_world_ego, height_m)
         self.tracks += [
             PersonTrack(boxes[k], ego.t_source_ns, ego.frame_id, votes=Counter({boxes[k].label: 1})) for k in births
         ]  # fmt: skip
@@ -168,8 +163,9 @@ class PeopleTracker:
                 alive.append((math.hypot(x_m, y_m), row))
         rows = sorted(row for _, row in sorted(alive)[: self.config.most])
         if len(rows) < len(self.tracks):
+            gone = set(range(len(self.tracks))) - set(rows)
+            self.filter.keep_rows(rows, [row for row in sorted(gone) if self.tracks[row].person >= 0])
             self.tracks = [self.tracks[row] for row in rows]
-            self.filter.keep_rows(rows)
         for track, standing in zip(self.tracks, moments.standing[rows].tolist(), strict=True):
             if track.person < 0 and track.hits >= self.config.confirm_hits:
                 track.person, self._next_id = self._next_id, self._next_id + 1

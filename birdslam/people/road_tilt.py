@@ -1,45 +1,112 @@
-"""The road's tilt at each person, as the boxes of everybody else have it."""
+"""The road's tilt and how tall people are, as far as all who are there share them.
+
+With T the road's tilt against the front end's ground and h the log of a factor on all heights, a box asks for the tilt
+
+    t = T + (H / depth) D + own,   D = h - kerb / H:
+
+far ones tell the tilt, near ones D: the height, or a pavement under all. A person is one sample, the mean of its boxes,
+so that its own height is not averaged away. What all others tell is the prior of each.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from birdslam.geometry import bev
 from birdslam.geometry.arrays import Floats
-from birdslam.people.box_model import MIN_SLOPE, NEAREST_M, UNUSED
+from birdslam.people.box_model import MIN_SLOPE, NEAREST_M
 from birdslam.people.people_boxes import PersonBox
 from birdslam.people.people_config import PeopleConfig
 
+ITERATIONS = 4
+_T, _D, _TILT = range(3)  # of a sample
+_SHARED = slice(_T, _D + 1)
 
-def tilts_of(boxes: Sequence[PersonBox], sigma_pitch_rad: float, height_m: float, config: PeopleConfig) -> Floats:
-    """(N, 2): mean and variance of the road's tilt against the front end's ground, as everybody else's box has it.
 
-    A box alone tells it by the height of its kind; its own must not be counted twice. Of several the mean is
-    known no better than the mean of heights is.
-    """
-    n = len(boxes)
-    if not n:
-        return np.zeros((0, 2))
-    tilt, variance, slope = np.zeros(n), np.full(n, UNUSED), np.zeros(n)
+def samples_of(boxes: Sequence[PersonBox], height_m: float, config: PeopleConfig) -> Floats:
+    """(N, 3, 3): of each box w a a', with a = (1, H / depth, t) and w the information of t; nothing of hidden feet."""
+    out = np.zeros((len(boxes), 3, 3))
     for k, box in enumerate(boxes):
-        if box.whole and box.hidden <= config.sure_feet and box.tan_height > MIN_SLOPE:
-            sizes = config.sizes(box.label)
-            depth = sizes.height_m / box.tan_height
-            tilt[k] = bev.road_slope(max(depth - sizes.reach_m, NEAREST_M), height_m + config.kerb_m)
-            tilt[k] -= box.slope_bottom
-            rel = math.hypot(sizes.sigma_height_rel, 2.0 * config.sigma_outline_rel)
-            slope[k] = height_m / depth
-            variance[k] = (slope[k] * rel) ** 2 + (config.sigma_kerb_m / depth) ** 2
-    weight = information = 1.0 / variance
-    for _ in range(2):  # a child, or feet that something hides, tells another tilt (Cauchy)
-        mean = float((weight * tilt).sum()) / (float(weight.sum()) + sigma_pitch_rad**-2)
-        weight = information / (1.0 + information * np.square(tilt - mean) / 4.0)
-    others = np.maximum(weight.sum() - weight, UNUSED**-2)
-    by_boxes = ((weight * tilt).sum() - weight * tilt) / others
-    by_heights = config.sigma_common_rel * ((weight * slope).sum() - weight * slope) / others
-    spread = 1.0 / others + np.square(by_heights)  # all are tall together: many know no better than that
-    share = sigma_pitch_rad**2 / (sigma_pitch_rad**2 + spread)  # against the front end's
-    return np.stack([share * by_boxes, share * spread], axis=1)
+        if not box.whole or box.hidden > config.sure_feet or box.tan_height <= MIN_SLOPE:
+            continue
+        sizes = config.sizes(box.label)
+        depth = sizes.height_m / box.tan_height
+        tilt = bev.road_slope(max(depth - sizes.reach_m, NEAREST_M), height_m + config.kerb_m) - box.slope_bottom
+        slope = height_m / depth
+        of_size = config.own_height_var(sizes.sigma_height_rel) + (2.0 * config.sigma_outline_rel) ** 2
+        variance = slope**2 * of_size + (config.sigma_kerb_m / depth) ** 2
+        variance += config.sigma_tilt_rad**2 + (config.sigma_roll_rad * box.bearing) ** 2
+        a = np.array([1.0, slope, tilt])
+        out[k] = np.outer(a, a) / variance
+    return out
+
+
+class SharedRoad:
+    """predict() once a frame, tell() it the boxes, then by_others(). Row k is the k-th person's.
+
+    State: T (rad) and D by those who left, with their covariance; until somebody has, they are of the prior. Of each
+    person the sum of the samples and how many they were.
+    """
+
+    def __init__(self, config: PeopleConfig) -> None:
+        self.config = config
+        self._x = np.zeros(2)
+        self._P = np.diag([config.sigma_common_tilt_rad**2, config.sigma_common_rel**2 + config.sigma_pavement_rel**2])
+        self._known = False
+        self._told, self._boxes = np.zeros((0, 3, 3)), np.zeros(0)
+
+    def begin(self, count: int) -> None:
+        """People seen for the first time, in rows after the others."""
+        self._told = np.concatenate([self._told, np.zeros((count, 3, 3))])
+        self._boxes = np.append(self._boxes, np.zeros(count))
+
+    def keep_rows(self, rows: Sequence[int], leaving: Sequence[int]) -> None:
+        """Forgets all others; of those in the rows `leaving` what they told stays."""
+        if len(leaving):
+            told, prior = self._samples()[leaving].sum(axis=0), np.linalg.inv(self._P)
+            P = np.linalg.inv(told[_SHARED, _SHARED] + prior)
+            self._x, self._P, self._known = P @ (told[_SHARED, _TILT] + prior @ self._x), P, True
+        self._told, self._boxes = self._told[rows], self._boxes[rows]
+
+    def predict(self, keep: float, shift_rad: float, sigma_pitch_rad: float) -> None:
+        """To the next frame: `keep` of the tilt lasts; the front end's ground, known to `sigma_pitch_rad`, got
+        `shift_rad` more pitch.
+        """
+        prior_var = sigma_pitch_rad**2 + self.config.sigma_common_tilt_rad**2
+        self._x[_T] = keep * (self._x[_T] - shift_rad) if self._known else 0.0
+        self._P *= np.outer([keep, 1.0], [keep, 1.0])
+        self._P[_T, _T] = self._P[_T, _T] + (1.0 - keep**2) * prior_var if self._known else prior_var
+        M = np.eye(3)
+        M[_TILT, _T] = -shift_rad
+        self._told, self._boxes = keep * (M @ self._told @ M.T), keep * self._boxes
+
+    def tell(self, rows: Sequence[int], boxes: Sequence[PersonBox], height_m: float) -> None:
+        """The boxes of the people in `rows`, one each; `height_m` is the camera's over the road."""
+        at, samples = np.asarray(rows), samples_of(boxes, height_m, self.config)
+        self._told[at] += samples
+        self._boxes[at] += samples[:, 0, 0] > 0.0
+
+    def by_others(self) -> Floats:
+        """(N + 1, 2, 2): means and variances of T and h as all others tell them; the last row is by all."""
+        samples = np.concatenate([self._samples(), np.zeros((1, 3, 3))])
+        others, prior = samples.sum(axis=0) - samples, np.linalg.inv(self._P)
+        P = np.linalg.inv(others[:, _SHARED, _SHARED] + prior)
+        x = (P @ (others[:, _SHARED, _TILT] + prior @ self._x)[..., None])[..., 0]
+        height_var = self.config.sigma_common_rel**2
+        share = height_var / (height_var + self.config.sigma_pavement_rel**2)  # of D, that is of heights
+        means, variances = x * [1.0, share], np.diagonal(P, axis1=1, axis2=2) * [1.0, share**2]
+        variances[:, _D] += (1.0 - share) * height_var
+        return np.stack([means, variances], axis=-1)
+
+    def _samples(self) -> Floats:
+        """(N, 3, 3) means of each one's boxes, with weights of Cauchy: a child, or hidden feet, tells another tilt."""
+        samples = self._told / np.maximum(self._boxes, 1.0)[:, None, None]
+        prior, weight = np.linalg.inv(self._P), np.ones(len(samples))
+        for _ in range(ITERATIONS):
+            told = (weight[:, None, None] * samples).sum(axis=0)
+            x = np.linalg.solve(told[_SHARED, _SHARED] + prior, told[_SHARED, _TILT] + prior @ self._x)
+            off = np.array([-x[_T], -x[_D], 1.0])
+            weight = 1.0 / (1.0 + off @ samples @ off / 4.0)
+        return weight[:, None, None] * samples

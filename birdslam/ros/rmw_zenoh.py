@@ -124,6 +124,11 @@ def attachment(sequence: int, t_ns: int, gid: bytes) -> bytes:
     return _ATTACHMENT.pack(sequence, t_ns, GID_BYTES, gid)
 
 
+def sequence_of(attached: bytes) -> int | None:
+    """A message's number among its publisher's; None where that is not attached."""
+    return int(_ATTACHMENT.unpack(attached)[0]) if len(attached) == _ATTACHMENT.size else None
+
+
 def check_topic(topic: str) -> str:
     """`topic` itself. Raises ValueError where it is no full name of ROS: it is to become part of a key."""
     if not _NAME.fullmatch(topic):

@@ -1,6 +1,6 @@
 """How good the shipped network is: against the truth of held-out worlds, and on real frames that it never learnt from.
 
-    python -m perf networks --provider all [--threads 2] [--models DIR]
+    python -m perf networks --provider all [--onnxruntime onnxruntime-openvino] [--threads 2] [--models DIR]
     python -m perf networks [--network F.onnx] [--frames 300] [--data DIR] [--models DIR] [--output F.json]
 
 Held-out worlds need the extra [train]; without it their rows are left out and said to be. Real frames are those of
@@ -26,12 +26,10 @@ from birdslam.geometry.camera import Camera
 from birdslam.perception import Detections, Findings, ModelSpec, Network, load_network
 from birdslam.perception.decoding.multitask import MultiTaskDecoder
 from birdslam.perception.manifest import SHIPPED_MULTITASK, SHIPPED_NETWORKS
-from birdslam.perception.session import providers_here
 from birdslam.perf.errors import PerfError
+from birdslam.perf.perception import providers
 from birdslam.perf.reporting.arguments import benchmark_parser
 from birdslam.perf.reporting.figures import Ledger
-from birdslam.perf.reporting.machine import describe
-from birdslam.runtime.models.providers import compared
 from birdslam.sources.opening import open_recording
 from birdslam.world.training.grading import LONG, Grades, box_ious, extents, overlap
 
@@ -61,9 +59,11 @@ def run(arguments: list[str]) -> None:
     parser.add_argument("--threads", type=int, default=2)
     text = "what computes networks here, how fast and how far off, in place of all else: one, or `all`"
     parser.add_argument("--provider", metavar="NAME|all", help=text)
+    parser.add_argument("--onnxruntime", metavar="PACKAGE", help="with --provider: by this package of it as well")
     options = parser.parse_args(arguments)
     if options.provider:
-        return _providers(options.provider, options.models, options.threads, options.output)
+        more = (options.threads, options.output, options.onnxruntime or "", label)
+        return providers.measure(options.provider, options.models, OTHERS, *more)
     network = load_network("multitask", ModelSpec(path=str(options.network), threads=options.threads))
     with Ledger(options.output, label, network=network.describe()) as ledger:
         if importlib.util.find_spec("numba") is None:
@@ -78,22 +78,6 @@ def run(arguments: list[str]) -> None:
                 ledger.add(f"real {name}", _summary(figures), **figures)
         else:
             print(f"real frames: left out, {options.data} is not there (set BIRDSLAM_DATA)")
-
-
-def _providers(asked: str, models: Path, threads: int, output: Path | None) -> None:
-    """A row a network and provider. Raises PerfError."""
-    here = providers_here()
-    wanted = here if asked == "all" else ("cpu", asked)
-    print(f"{describe()['cpu']}; this onnxruntime has {', '.join(here)}; {threads} threads")
-    files = {"multitask": SHIPPED_NETWORKS / SHIPPED_MULTITASK}
-    files |= {role: models / name for role, name in OTHERS.items() if (models / name).is_file()}
-    with Ledger(output, label, providers=list(here)) as ledger:
-        for role, file in files.items():
-            spec = ModelSpec(path=str(file), threads=threads)
-            for provider, found in compared(role, spec, wanted, within_s=3.0 * len(wanted)).items():
-                figures = {"ms": found.ms, "off_rel": found.off_rel}
-                said = found.problem or f"{found.ms:7.2f} ms a run, off by {found.off_rel:.2%} (RMS)"
-                ledger.add(f"{file.name} {provider}", said, **figures)
 
 
 def simulated(network: Network, frames: int, width_px: int, height_px: int) -> dict[str, float]:

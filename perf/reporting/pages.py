@@ -28,6 +28,7 @@ from birdslam.perf.cameras import lens
 from birdslam.perf.errors import PerfError
 from birdslam.perf.graph import agents, edges, edges_table
 from birdslam.perf.maps import loops
+from birdslam.perf.perception import providers
 from birdslam.perf.reporting import all as everything
 from birdslam.perf.reporting import foxglove, leave_one_out, measured, results
 from birdslam.perf.reporting.arguments import benchmark_parser
@@ -180,6 +181,16 @@ PAGES: tuple[Derived | Page, ...] = (
         ("python -m birdslam.perf agents --output {out}",),
         {"docs/agents.md": ("agents.md", None), "docs/agents.png": ("agents.png", None)},
         (agents.run,),
+    ),
+    Page(
+        "providers",
+        (
+            "python -m birdslam.perf networks --provider all --onnxruntime onnxruntime-openvino --models {models} "
+            "--output {out}/providers.json",
+        ),
+        {"docs/providers.md": ("providers.json", providers.page)},
+        (providers.measure, providers.page),
+        NETWORKS,
     ),
     Page(
         "films",

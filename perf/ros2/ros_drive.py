@@ -15,7 +15,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ from birdslam.perf.ros2.ros import LAST_S, Heard, check_peer, peer
 from birdslam.perf.ros2.ros_peer import IMAGE
 from birdslam.ros.messages import ODOMETRY
 from birdslam.ros.parts import Level
+from birdslam.runtime.transport.bus import Bus, BusClosed
 
 label = "images of ROS 2 through the whole system to a listener of ROS 2: lost ones, their age, a router that goes"
 VEHICLE = "ros-drive"
@@ -38,6 +39,7 @@ BEGIN_S, BACK_S, END_S = 90.0, 30.0, 60.0
 STEADY = 66  # valid estimates one after the other, before it counts
 SAME_NS = 1_000_000  # an estimate's time is its image's, over two clocks
 TURN_S = 0.05
+DEPTH = 1024  # of what this process reads on the vehicle's bus
 
 
 class Sent:
@@ -54,6 +56,26 @@ class Sent:
             self.t_ns.append(int(line))
 
 
+class OnTheBus:
+    """The times of a topic's frames (UTC, in ns) on the vehicle's own bus, read on a thread of its own; of capture's
+    also how many had given way to newer ones by then.
+    """
+
+    def __init__(self, bus: Bus, topic: str) -> None:
+        self.t_ns: list[int] = []
+        self.gave_way: list[int] = []
+        self._messages = bus.subscriber(topic, DEPTH)
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        with suppress(BusClosed):
+            while True:
+                if (message := self._messages.recv()) is not None:
+                    self.t_ns.append(message.record.t_utc_ns)
+                    self.gave_way.append(getattr(message.record, "dropped", 0))
+
+
 def valid_times(heard: Heard) -> list[int]:
     """The times of the estimates that may be driven by."""
     return [
@@ -66,8 +88,9 @@ def valid_times(heard: Heard) -> list[int]:
     ]
 
 
-def without(images_ns: Ints, estimates_ns: Ints) -> Ints:
-    """The images that no estimate is of."""
+def without(images_ns: Ints, of_ns: Iterable[int]) -> Ints:
+    """The images whose time is none of these."""
+    estimates_ns = np.array(sorted(of_ns), dtype=np.int64)
     if not estimates_ns.size:
         return images_ns
     after = np.clip(np.searchsorted(estimates_ns, images_ns), 1, max(estimates_ns.size - 1, 1))
@@ -113,6 +136,9 @@ def run(arguments: list[str]) -> int:
                 time.sleep(TURN_S)
 
         until(lambda: len(valid_times(heard)) >= STEADY, BEGIN_S, "no valid estimate is heard")
+        bus = stack.enter_context(Bus(VEHICLE, "ros-drive", runtime_dir=place / "rt"))
+        captured, estimated = OnTheBus(bus, "frame"), OnTheBus(bus, "estimate")
+        until(lambda: bool(captured.t_ns and estimated.t_ns), BEGIN_S, "nothing is heard on the bus")
         begin_ns = heard.begin()
         time.sleep(options.seconds)
         end_ns = time.time_ns()
@@ -120,8 +146,19 @@ def run(arguments: list[str]) -> int:
         images = np.array([t for t in sent.t_ns if begin_ns <= t < end_ns], dtype=np.int64)
         poses = [told for told in heard.told[POSES] if told.t_ns < end_ns]
         valid = sum(begin_ns <= t < end_ns for t in valid_times(heard))
-        lost = without(images, np.array(sorted(told.t_ns for told in poses), dtype=np.int64))
-        print(f"images sent {len(images)} in {options.seconds:g} s, without an estimate {len(lost)}, valid {valid}")
+        lost = without(images, (told.t_ns for told in poses))
+        not_captured, not_estimated = without(images, captured.t_ns), without(images, estimated.t_ns)
+        gave_way = captured.gave_way[-1] - captured.gave_way[0]
+        said = (
+            f"{not_captured.size} were not captured (of all since, {gave_way} gave way to newer ones there, others "
+            f"were lost on their way), "
+            f"{np.setdiff1d(not_estimated, not_captured).size} were captured and got none, "
+            f"{np.setdiff1d(lost, not_estimated).size} had one that was not heard"
+        )
+        print(f"images sent {len(images)} in {options.seconds:g} s, valid {valid}")
+        print(f"without an estimate {len(lost)}: {said}")
+        if lost.size:
+            print("sent at", *(f"{(t - begin_ns) / 1e9:.2f}" for t in lost), "s")
         print(f"age of an image when its pose is heard: {spread_text(spread([told.age_ms for told in poses]), 'ms')}")
         if options.router_gone:
             router.close()

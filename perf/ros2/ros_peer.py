@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 import tempfile
 import threading
@@ -38,6 +39,11 @@ CAR_TOPICS = {
     "/fix": "sensor_msgs/msg/NavSatFix",
 }
 SPEED_MPS = 5.0
+# Sender and router wait so long (microseconds) for a link that is busy. By their defaults, 1 ms, they drop an image
+# where another process has the core; "reliable" changes nothing of it, since rmw_zenoh blocks for KEEP_ALL alone
+_DROP = "transport/link/tx/queue/congestion_control/drop"
+PATIENT = {f"{_DROP}/wait_before_drop": 100_000, f"{_DROP}/max_wait_before_drop_fragments": 100_000}
+OVERRIDE = "ZENOH_CONFIG_OVERRIDE"  # by which a session of ROS is told so
 
 
 def write_definitions(folder: Path) -> None:
@@ -156,6 +162,8 @@ def route(port: int) -> None:
     config.insert_json5("mode", '"router"')
     config.insert_json5("listen/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
     config.insert_json5("scouting/multicast/enabled", "false")
+    for name, microseconds in PATIENT.items():
+        config.insert_json5(name, str(microseconds))
     with zenoh.open(config):
         print("ready", flush=True)
         sys.stdin.read()
@@ -168,5 +176,6 @@ if __name__ == "__main__":
     elif mode == "hear":
         hear(port, int(sys.argv[3]), sys.argv[4:])
     else:
+        os.environ.setdefault(OVERRIDE, ";".join(f"{name}={value}" for name, value in PATIENT.items()))
         with definitions(port):
             car(port, int(sys.argv[3]), sys.argv[4], float(sys.argv[5]))

@@ -23,7 +23,7 @@ from birdslam.runtime.configuration import Configuration, ConfigurationError, Fl
 from birdslam.runtime.fleet.link import check, open_link
 from birdslam.runtime.process import signals
 from birdslam.runtime.process.notify import LOOK_S
-from birdslam.runtime.process.sender import send
+from birdslam.runtime.process.sender import RateLimit, send
 from birdslam.runtime.topology import PROCESSES, QUERIES, TOPICS, alive_key, key_of
 from birdslam.runtime.transport.bus import Bus, BusClosed, BusError, Publisher, Subscriber
 from birdslam.runtime.transport.closing import Closing
@@ -49,7 +49,7 @@ class Uplink(Closing):
         self, vehicle: str, config: FleetConfig, session: zenoh.Session, runtime_dir: Path | None = None
     ) -> None:
         self._session, self._vehicle = session, vehicle
-        self._period_ns = 0 if config.estimates_hz is None else round(1e9 / config.estimates_hz)
+        self._estimates_hz = config.estimates_hz
         self._bus = Bus(vehicle, f"{_NODE}-{threading.get_native_id()}", runtime_dir=runtime_dir)
         self._subscribers = {topic: self._bus.subscriber(topic) for topic in FORWARDED}
         self._publishers = {
@@ -99,16 +99,15 @@ class Uplink(Closing):
     def _forward(self, topic: str) -> None:
         subscriber: Subscriber = self._subscribers[topic]
         publisher = self._publishers[topic]
-        period_ns, due_ns = self._period_ns if topic == "estimate" else 0, 0
+        due = RateLimit(self._estimates_hz if topic == "estimate" else None)
         while True:
             try:
                 message = subscriber.recv()
                 if message is None:
                     continue
                 now_ns = time.monotonic_ns()
-                if now_ns < due_ns:
+                if not due.passes(now_ns):
                     continue
-                due_ns = max(due_ns + period_ns, now_ns)  # the rate in the mean, and no burst after a pause
                 publisher.put(message.record, _lengthened(message.trace, message.t_received_ns, now_ns))
             except BusClosed:
                 return

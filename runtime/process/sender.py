@@ -18,6 +18,22 @@ REPORT_S = 60.0  # between two lines that say that there is no router
 _Link = TypeVar("_Link")
 
 
+class RateLimit:
+    """Lets so many a second through in the mean, and no burst after a pause; without a rate everything."""
+
+    def __init__(self, rate_hz: float | None) -> None:
+        self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
+        self._due_ns = 0
+
+    def passes(self, now_ns: int) -> bool:
+        """Whether what is to be sent now is sent."""
+        late_ns = now_ns - self._due_ns
+        if late_ns < 0:
+            return False
+        self._due_ns = (self._due_ns if late_ns < self._period_ns else now_ns) + self._period_ns
+        return True
+
+
 class Sender(AbstractContextManager["Sender"], Protocol):
     """What sends while it is entered."""
 

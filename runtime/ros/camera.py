@@ -6,6 +6,7 @@ the messages' headers, brought to CLOCK_MONOTONIC; while no image comes, frames 
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -32,6 +33,7 @@ from birdslam.ros.rmw_zenoh import (
     check_topic,
     publication_of,
     publishers_key,
+    sequence_of,
     type_of_key,
 )
 from birdslam.ros.sensor import CAMERA_INFO, FIX, IMAGES, SPEEDS, Lens, fix_row, is_rectified, lens, pixels, speed
@@ -51,6 +53,9 @@ GNSS_HEAD = "time_s,latitude_deg,longitude_deg,sigma_m"
 SAME_CLOCK_NS = NS_PER_S  # a header that is within so much of this computer's UTC is of its clock
 CLOCK_FRAMES = 100  # of another clock: the least delay of so many frames tells how far off it is
 RATE_FRAMES = 10  # the median of so many intervals is the frame rate, before the first frame is given
+
+
+log = logging.getLogger(__name__)
 
 
 class Arrived(NamedTuple):
@@ -108,6 +113,7 @@ class RosCamera:
         self._transforms: list[Arrived] = []
         self._readings: deque[tuple[int, SpeedReading]] = deque(maxlen=KEPT_READINGS)
         self._problem = ""
+        self._came = self._lost = self._number = 0  # images, those lost on their way here, the newest one's number
         self._closed = False
         self._clock = SenderClock()
         self.rate_hz = source.rate if isinstance(source.rate, float) else 0.0
@@ -171,8 +177,17 @@ class RosCamera:
 
     def _image_came(self, sample: zenoh.Sample) -> None:
         with self._arrived:
+            self._count(sample)
             self._images.append(_arrived(sample))
             self._arrived.notify_all()
+
+    def _count(self, sample: zenoh.Sample) -> None:
+        """The images, and by their numbers those that their sender or the router has dropped; another sender's begin
+        anew."""
+        number = None if sample.attachment is None else sequence_of(sample.attachment.to_bytes())
+        if number is not None and 0 < self._number < number:
+            self._lost += number - self._number - 1
+        self._came, self._number = self._came + 1, number or 0
 
     def _info_came(self, sample: zenoh.Sample) -> None:
         with self._arrived:
@@ -328,6 +343,8 @@ class RosCamera:
     def close(self) -> None:
         """Leaves the router."""
         with self._arrived:
+            if self._lost and not self._closed:
+                log.warning("%s: %d images came, %d were lost on their way here", self.name, self._came, self._lost)
             self._closed = True
             self._arrived.notify_all()
         if self._node is not None:

@@ -20,7 +20,7 @@ from birdslam.ros.parts import Level, Sent
 from birdslam.ros.rmw_zenoh import LATCHED_QOS, Qos
 from birdslam.runtime.configuration import Configuration
 from birdslam.runtime.process import signals
-from birdslam.runtime.process.sender import send
+from birdslam.runtime.process.sender import RateLimit, send
 from birdslam.runtime.ros.session import NoRouter, RosNode, RosPublisher
 from birdslam.runtime.topology import PROCESSES
 from birdslam.runtime.transport.bus import Bus, BusError
@@ -42,8 +42,7 @@ class RosBridge(Closing):
 
     def __init__(self, vehicle: str, node: RosNode, runtime_dir: Path | None = None, rate_hz: float | None = None):
         self._vehicle, self._node = vehicle, node
-        self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
-        self._due_ns = 0
+        self._estimates_due, self._map_poses_due = RateLimit(rate_hz), RateLimit(rate_hz)
         namespace = node.node.namespace
         own, self._frames = ("", "") if namespace == "/" else (namespace, f"{namespace.strip('/')}/")
         self._publishers: dict[str, RosPublisher] = {}
@@ -98,10 +97,8 @@ class RosBridge(Closing):
         if self._messages is None:
             return
         self._last_frame, self._told_ns = estimate.frame_id, estimate.t_capture_ns
-        now_ns = time.monotonic_ns()
-        if now_ns < self._due_ns:
+        if not self._estimates_due.passes(time.monotonic_ns()):
             return
-        self._due_ns = max(self._due_ns + self._period_ns, now_ns)  # the rate in the mean, and no burst after a pause
         motion = self._motions.pop(estimate.frame_id, None)
         for sent in self._messages.of_estimate(estimate, t_of(estimate, live=True), motion):
             self._send(sent)
@@ -127,7 +124,8 @@ class RosBridge(Closing):
             if self._messages is not None:
                 for sent in self._messages.of_map(update, time.time_ns()):
                     self._send(sent)
-        if (newest := self._map_poses.recv(0.0)) is not None and self._messages is not None:
+        newest = self._map_poses.recv(0.0)
+        if newest is not None and self._messages is not None and self._map_poses_due.passes(time.monotonic_ns()):
             for sent in self._messages.of_map_pose(newest.record, t_of(newest.record, live=True)):
                 self._send(sent)
 

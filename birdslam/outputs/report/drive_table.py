@@ -14,6 +14,7 @@ import numpy as np
 from birdslam.geometry.arrays import Bools, Floats, Ints
 from birdslam.geometry.se2 import SE2
 from birdslam.outputs.drive_files import FRAME_COLUMNS, FRAMES_FILE, ResultsError
+from birdslam.outputs.placed import PLACES_FILE
 
 PEOPLE = frozenset({"pedestrian", "person", "cyclist", "rider", "bicycle"})
 FILES = {  # what the page hands out, where it is there
@@ -31,6 +32,7 @@ FILES = {  # what the page hands out, where it is there
 MOST_FILE_BYTES = 1_500_000  # of one that the page holds
 MOST_TRACKS, FEWEST_ROWS = 150, 5  # a track of fewer frames is mostly a false alarm
 MOST_MAP_POINTS = 6000
+MOST_WAYS = 400  # on Earth, of lines and of vehicles
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,22 @@ class TrackTable:
     def is_person(self) -> bool:
         """Whether it is a pedestrian or a cyclist."""
         return self.label in PEOPLE
+
+
+@dataclass(frozen=True)
+class EarthTable:
+    """The drive on Earth: times (K,) in s with latitude and longitude (K, 2) in degrees; ways (M, 2) of what is beside
+    it.
+    """
+
+    t_s: Floats
+    degrees: Floats
+    road_deg: list[Floats]
+    tracks_deg: list[Floats]
+
+    def at(self, t_s: Floats) -> Floats:
+        """(N, 2) latitude and longitude at these times."""
+        return np.column_stack([np.interp(t_s, self.t_s, column) for column in self.degrees.T])
 
 
 @dataclass(frozen=True)
@@ -67,11 +85,21 @@ class DriveTable:
     tracks: list[TrackTable]
     lanes_m: Floats  # (M, 2)
     lines: list[tuple[str, Floats]]  # kind of each of the road's lines, and its vertices (K, 2)
-    earth_deg: Floats | None  # (K, 2) latitude and longitude along the way; None: no GNSS was there
+    earth: EarthTable | None  # None: no GNSS was there
     files: dict[str, str]  # text of those of FILES that are there
     landmarks_m: Floats
     summary: dict[str, Any]
-    camera: str  # the text of camera.toml; "": there is none
+    camera: str  # as a camera file has it; "": it is not known
+
+    @property
+    def step_s(self) -> float:
+        """Between two frames, in the median."""
+        return float(np.median(np.diff(self.t_s))) if len(self.t_s) > 1 else 0.1
+
+    def stretches(self, held: Bools) -> list[tuple[int, int]]:
+        """From which frame to before which one something holds without a break; `held` is (N,)."""
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]])))
+        return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
 
 
 def read_drive(directory: Path) -> DriveTable:
@@ -86,7 +114,7 @@ def read_drive(directory: Path) -> DriveTable:
         to_plane = _epochs(numbers)
         poses = [to_plane[int(row[2])] @ SE2(*row[3:6]) for row in numbers]
         lanes, landmarks = (_map_points(directory / "map.csv", kind, to_plane) for kind in ("lane", "landmark"))
-        camera, tracks = directory / "camera.toml", _tracks(directory / "tracks", to_plane, numbers[0, 1])
+        tracks = _tracks(directory / "tracks", to_plane, numbers[0, 1])
         return DriveTable(
             name=directory.resolve().name,
             frame=numbers[:, 0].astype(np.int64),
@@ -100,11 +128,11 @@ def read_drive(directory: Path) -> DriveTable:
             tracks=sorted(tracks, key=lambda track: -len(track.t_s))[:MOST_TRACKS],
             lanes_m=lanes,
             lines=_lines(directory / "map.geojson", to_plane),
-            earth_deg=_earth(directory / "ego.geojson"),
+            earth=_earth(directory, numbers[0, 1]),
             files=_files(directory),
             landmarks_m=landmarks,
             summary=summary,
-            camera=camera.read_text(encoding="utf-8") if camera.is_file() else "",
+            camera=_camera(directory / "camera.toml", summary),
         )
     except FileNotFoundError as error:
         raise ResultsError(f"{directory}: no results of `birdslam run` ({error.filename} is missing)") from None
@@ -148,11 +176,36 @@ def _lines(path: Path, to_plane: dict[int, SE2]) -> list[tuple[str, Floats]]:
     return out
 
 
-def _earth(path: Path) -> Floats | None:
+def _earth(directory: Path, begin_s: float) -> EarthTable | None:
+    path = directory / PLACES_FILE
     if not path.is_file():
         return None
-    (way,) = json.loads(path.read_text(encoding="utf-8"))["features"]
-    return np.array(way["geometry"]["coordinates"], np.float64)[:, ::-1]
+    with path.open(encoding="ascii", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["latitude_deg"]]
+    if not rows:
+        return None
+    table = np.array([[float(row[name]) for name in ("t_s", "latitude_deg", "longitude_deg")] for row in rows])
+    road, tracks = (_ways(directory / f"{name}.geojson") for name in ("road", "tracks"))
+    return EarthTable(table[:, 0] - begin_s, table[:, 1:], road, tracks)
+
+
+def _ways(path: Path) -> list[Floats]:
+    """(M, 2) latitude and longitude of each line of a GeoJSON file."""
+    if not path.is_file():
+        return []
+    features = json.loads(path.read_text(encoding="utf-8"))["features"]
+    return [np.array(each["geometry"]["coordinates"], np.float64)[:, ::-1] for each in features[:MOST_WAYS]]
+
+
+def _camera(path: Path, summary: dict[str, Any]) -> str:
+    """The camera file that the drive wrote, or what its configuration has."""
+    if path.is_file():
+        return path.read_text(encoding="utf-8")
+    configuration = summary.get("configuration")
+    camera = configuration.get("camera") if isinstance(configuration, dict) else None
+    if not isinstance(camera, dict):
+        return ""
+    return "".join(f"{name} = {json.dumps(value)}\n" for name, value in camera.items() if value is not None)
 
 
 def _files(directory: Path) -> dict[str, str]:

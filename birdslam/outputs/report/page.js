@@ -5,8 +5,10 @@ const words = document.getElementById("words");
 const picture = document.getElementById("picture");
 const dark = window.matchMedia("(prefers-color-scheme: dark)");
 const config = { responsive: true, displaylogo: false, scrollZoom: true };
-const here = { name: "now", type: "scatter", mode: "markers", x: [data.x[0]], y: [data.y[0]], hoverinfo: "skip",
+const ring = { name: "now", type: "scatter", mode: "markers", hoverinfo: "skip",
   marker: { size: 15, symbol: "circle-open", line: { width: 3 }, color: "#e8487f" } };
+// The places of which each has a ring that moves along, and the traces below it
+const ways = { map: { x: data.x, y: data.y, traces: data.map }, ...(data.earth ? { earth: data.earth } : {}) };
 
 const below = { orientation: "h", yref: "container", y: 0, yanchor: "bottom" };
 
@@ -26,12 +28,26 @@ const last = data.t[data.t.length - 1];
 const moment = (t) => [{ type: "line", x0: t, x1: t, yref: "paper", y0: 0, y1: 1,
   line: { color: "#e8487f", width: 2 } }];
 
+function drawWay(name, title, right, up, scaleratio, more) {
+  const { x, y, traces } = ways[name];
+  const here = { ...ring, x: [x[slider.value]], y: [y[slider.value]] };
+  Plotly.react(name, [...traces, here], layout({ title, legend: below, ...more.around,
+    xaxis: { title: { text: right }, ...more.axis },
+    yaxis: { title: { text: up }, scaleanchor: "x", scaleratio, ...more.axis } }), config);
+}
+
 function draw() {
   const time = { title: { text: "time (s)" }, range: [0, last] };
-  Plotly.react("map", [...data.map, here], layout({
-    title: "from above", legend: below,
-    xaxis: { title: { text: "right of the start (m)" } },
-    yaxis: { title: { text: "ahead of the start (m)" }, scaleanchor: "x", scaleratio: 1 } }), config);
+  // Room for a legend of several lines from the start: plotly does not always find it by itself
+  const low = document.getElementById("map").clientWidth < 800 ? 120 : 80;
+  drawWay("map", "from above", "right of the start (m)", "ahead of the start (m)", 1,
+    { around: { margin: { l: 60, r: 15, t: 40, b: low } } });
+  if (data.earth) {
+    // Degrees are as wide in every drive; margins that fit themselves to them do not settle on a narrow screen
+    drawWay("earth", "north is up, colours as above", "longitude (deg)", "latitude (deg)", data.earth.stretch,
+      { around: { showlegend: false, margin: { l: 90, r: 15, t: 40, b: 50 } },
+        axis: { tickformat: ".4f", nticks: 5, automargin: false } });
+  }
   Plotly.react("speed", data.speeds, layout({
     title: "speed (m/s)", legend: below,
     xaxis: time, yaxis: { rangemode: "tozero" }, shapes: moment(data.t[slider.value]) }), config);
@@ -42,10 +58,10 @@ function draw() {
 
 function move() {
   const k = Number(slider.value);
-  here.x = [data.x[k]];
-  here.y = [data.y[k]];
   words.textContent = new DOMParser().parseFromString(data.words[k], "text/html").documentElement.textContent;
-  Plotly.restyle("map", { x: [here.x], y: [here.y] }, [data.map.length]);
+  for (const [name, { x, y, traces }] of Object.entries(ways)) {
+    Plotly.restyle(name, { x: [[x[k]]], y: [[y[k]]] }, [traces.length]);
+  }
   for (const name of ["speed", "statuses"]) Plotly.relayout(name, { shapes: moment(data.t[k]) });
   if (picture && data.pictures.length) {
     let at = 0;
@@ -60,13 +76,13 @@ dark.addEventListener("change", draw);
 document.getElementById("statuses").style.height = `${160 + 26 * Math.max(1, data.statuses.length)}px`;
 draw();
 move();
-for (const name of ["map", "speed"]) {
+for (const name of [...Object.keys(ways), "speed"]) {
   document.getElementById(name).on("plotly_click", (event) => {
     const point = event.points[0];
     let best = 0;
     data.t.forEach((t, k) => {
       const far = (i) => name === "speed" ? Math.abs(data.t[i] - point.x)
-        : Math.hypot(data.x[i] - point.x, data.y[i] - point.y);
+        : Math.hypot(ways[name].x[i] - point.x, ways[name].y[i] - point.y);
       if (far(k) < far(best)) best = k;
     });
     slider.value = String(best);
