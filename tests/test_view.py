@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import importlib.util
+import re
+import subprocess
+import urllib.request
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
+from birdslam.perf.browser.chromium import SOFTWARE_GL, chromium
 from birdslam.runtime.configuration import RecordingConfig
 from birdslam.runtime.recording import scene
 from birdslam.runtime.recording.recording import Latency, Recording
@@ -92,3 +98,42 @@ def test_without_rerun_it_says_what_to_install(tape: Tape) -> None:
     assert answer.returncode == 2
     assert "birdslam[view]" in answer.stderr
     assert "Traceback" not in answer.stderr
+
+
+@needs_rerun
+@pytest.mark.processes
+@pytest.mark.skipif(chromium() is None, reason="no Chromium (Debian: apt install chromium)")
+def test_in_a_browser_the_viewer_begins_and_asks_nobody_elsewhere(tmp_path: Path) -> None:
+    """Whatever its page asks of other hosts the policy refuses, and that alone is wrong on the console."""
+    from birdslam.runtime.recording.rerun_web import POLICY, WebViewer
+
+    program, gl = str(chromium()), SOFTWARE_GL
+    with WebViewer(0) as viewer:
+        with urllib.request.urlopen(viewer.page) as answer:
+            assert answer.headers["Content-Security-Policy"] == POLICY
+            assert b"re_viewer" in answer.read()
+        heard = {
+            one.laddr.ip for one in psutil.net_connections("tcp") if one.status == psutil.CONN_LISTEN and is_ours(one)
+        }
+        assert heard == {"127.0.0.1"}
+        options = ("--headless", "--no-sandbox", "--enable-logging=stderr", f"--user-data-dir={tmp_path}", *gl)
+        said: list[str] = []
+        with subprocess.Popen([program, *options, viewer.page], stderr=subprocess.PIPE, text=True) as browser:
+            try:
+                assert browser.stderr is not None
+                for line in browser.stderr:
+                    said += [line] if "CONSOLE" in line else []
+                    if "App started" in line:
+                        break
+            finally:
+                browser.terminate()
+    assert "App started" in said[-1]
+    wrong = [line for line in said if re.search("error|violates|failed|refused", line, re.IGNORECASE)]
+    assert [line for line in wrong if "Content Security Policy" not in line and "Failed to fetch" not in line] == []
+    assert any("Content Security Policy" in line for line in wrong)  # it did ask
+
+
+def is_ours(connection: Any) -> bool:
+    """Of this process or one that it began."""
+    me = psutil.Process()
+    return connection.pid in {me.pid, *(child.pid for child in me.children(recursive=True))}
